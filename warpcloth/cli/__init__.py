@@ -1,13 +1,13 @@
-"""The command ``warpcloth``: runs scenes, lists them, says what is in one, deforms meshes, measures, compares, checks
-and draws animations, charts and benchmarks methods.
+"""The command ``warpcloth``: runs, lists and describes scenes, deforms meshes, measures, compares, checks and draws animations,
+charts and benchmarks methods.
 
-Exit codes: 0 success (converged, completed, or iterations used up, which the summary says), 1 diverged (the good frames are
-saved) or, of `check`, something was found, 2 wrong use (one line on stderr), 130 interrupted by Ctrl-C and 143 by SIGTERM, as
-in shells (a line says what is saved). Any other error ends with 2 and one line as well, because most come from a scene file;
-``--debug`` prints the traceback above the line.
+Exit codes: 0 success (converged, completed, or iterations used up, as the summary says); 1 diverged (the good frames are
+saved), or `check` found something; 2 wrong use (one line on stderr); 130 interrupted by Ctrl-C and 143 by SIGTERM, as in shells
+(a line says what is saved). Any other error also ends with 2 and one line, because most come from a scene file; ``--debug``
+prints the traceback above the line.
 
-Help and completion answer without Warp: modules of commands import what loads it where they use it, and `main` imports it all
-at once before it runs a command. No other part of the package defers an import of its own modules.
+Help and completion do not load Warp: modules of commands import it inside functions, and `main` imports everything before it
+runs a command. No other part of the package defers an import of its own modules.
 """
 
 import argparse
@@ -37,7 +37,7 @@ def main(argv=None):
     """
     with warnings.catch_warnings(), contextlib.redirect_stdout(Printable(sys.stdout)), Interrupts() as interrupts:
         warnings.showwarning = show_warning
-        # NumPy's warnings about numbers that are not finite: the code reports such numbers by name, or expects them.
+        # NumPy's warnings about infinite and NaN values, which the code reports itself or expects.
         warnings.filterwarnings("ignore", ".* encountered in ", RuntimeWarning)
         warnings.filterwarnings("default", category=DeprecationWarning, module=r"warpcloth\.")  # an option has another name now
         debug = False
@@ -55,7 +55,7 @@ def main(argv=None):
             debug = arguments.debug
             with interrupts.loading():
                 from .. import simulate  # noqa: F401  loads Warp, which takes most of the time
-            if argv is None:  # what this process has loaded stays to the end, where it need not be looked through either
+            if argv is None:  # modules stay until the process ends, so the collector need not search them
                 gc.freeze()
             if options.asks_for_help(arguments):
                 return options.show_help(arguments)
@@ -73,7 +73,7 @@ def main(argv=None):
 
 
 def _sentence(error, debug):
-    """Returns the sentence for an error: its message if it is ours, else with its kind and a hint at how to see more."""
+    """Returns the line for an error: its message if it is ours, else with its type and a hint at --debug."""
     if isinstance(error, OSError):
         if error.strerror is None:
             return error
@@ -84,7 +84,7 @@ def _sentence(error, debug):
         return f"there is not enough memory; {less}: {error}".removesuffix(": ")
     if isinstance(error, RecursionError):
         return f"the input is nested too deeply to be read: {error}"
-    if isinstance(error, ImportError) and error.name is None:  # a sentence about an extra, no module that broke
+    if isinstance(error, ImportError) and error.name is None:  # our message about a missing extra
         return error
     if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError):
         return error
@@ -93,7 +93,7 @@ def _sentence(error, debug):
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """A parser whose errors are one line."""
 
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, **options)

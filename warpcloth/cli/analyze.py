@@ -1,4 +1,4 @@
-"""The command ``analyze``: measures an animation, and writes what it found as a stage, tables, arrays and pictures."""
+"""The command ``analyze``: measures an animation, and writes results as a stage, tables, arrays and pictures."""
 
 import time
 from contextlib import closing
@@ -25,7 +25,7 @@ _SENTENCES = 8
 
 
 def add_arguments(parser):
-    """Adds what the command takes but for what all commands do."""
+    """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add(
         "input",
@@ -72,7 +72,7 @@ def add_arguments(parser):
 
 
 def add_measuring(parser):
-    """Adds the options that say what an animation is measured against, how, and how that is coloured."""
+    """Adds the options of references, measures and colours."""
     add = parser.add_argument
     add("--prim", help="path or name of the mesh, if the file has several")
     add("--fps", type=float, help="frames per second (default: that of the input); rates need it")
@@ -134,7 +134,7 @@ def analyze(arguments):
     check_apart(files.values(), [arguments.rest])
     check_writable(*files.values())
     if arguments.output:
-        frames_folder_of(arguments)  # refuses an ending that is none
+        frames_folder_of(arguments)  # checks the ending
     started = time.perf_counter()
     view = _view(arguments)
     analyzer = _analyzer(arguments)
@@ -201,7 +201,7 @@ def _analyzer(arguments):
 
 
 def measuring_of(arguments):
-    """The options of `add_measuring`, but for the rest shape, as :class:`warpcloth.Analyzer` takes them."""
+    """Returns the options of `add_measuring`, without the rest shape, for :class:`warpcloth.Analyzer`."""
     directions = arguments.directions
     if directions is not None and directions != "st":
         directions = [convert("--directions", number, (float,)) for number in directions.split(",")]
@@ -230,7 +230,7 @@ def _material(arguments):
 
 
 def _stills(arguments, analyzer):
-    """Paths of the pictures by frame."""
+    """Returns the paths of the pictures by frame."""
     labels = [analyzer.sequence.labels[pair.frame].item() for pair in analyzer.pairs]
     if arguments.still is None:
         if arguments.still_frames:
@@ -257,7 +257,7 @@ def _view(arguments):
 
 
 def _extremes(extremes):
-    """The smallest and the largest value of a scalar, and where they are."""
+    """Returns the smallest and the largest value of a scalar, and their positions."""
     facts = {}
     for end, summary in (("smallest", extremes.smallest), ("largest", extremes.largest)):
         if summary is None:

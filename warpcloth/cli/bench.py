@@ -1,4 +1,4 @@
-"""The command ``bench``: what frames cost, what they must move at least, and how that grows; ratios of two results."""
+"""The command ``bench``: the time and minimum memory traffic of frames, their growth with size, and ratios of two results."""
 
 from datetime import datetime, timezone
 
@@ -46,7 +46,7 @@ _OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": 
 
 
 def add_arguments(parser):
-    """Adds what the command takes but for what all commands do."""
+    """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add_scene(parser, nargs="?")
     add_solver(parser, "the solver (default: newton)")
@@ -105,7 +105,7 @@ def _benchmarks(arguments, device):
     """Returns the benchmarks that the arguments ask for.
 
     Raises:
-        ValueError: They do not go together, or one of them is wrong.
+        ValueError: Arguments exclude one another, or one is not allowed.
     """
     from ..lab.benchmarks import SolverBenchmark, contacts, self_contacts, standard
     from ..lab.measurements import SceneRef, Setup
@@ -125,19 +125,19 @@ def _benchmarks(arguments, device):
         chosen |= {} if step_given else {"substeps": solver.substeps}
     sizes = tuple(sorted(set(arguments.sizes)))
     benchmark = SolverBenchmark(SceneRef(arguments.scene, parameters), Setup(arguments.solver, chosen), sizes, **given)
-    benchmark.scenes()[0].load()  # what it refuses is said before anything is measured
+    benchmark.scenes()[0].load()  # raises its errors before anything is measured
     return [benchmark]
 
 
 def _refuse(arguments, names, why):
-    """Refuses options that are given."""
+    """Raises ValueError if one of these options is given."""
     for name in names:
         if getattr(arguments, name):
             raise ValueError(f"{'-' * min(len(name), 2)}{name} is given {why}")
 
 
 def _interrupted(run):
-    """Says which results an interrupted run has kept."""
+    """Returns a message about the results of an interrupted run."""
     if not run.rows:
         return "interrupted before the first row; nothing was measured"
     return f"interrupted after {len(run.rows)} of {run.total} rows, which are printed"
@@ -153,7 +153,7 @@ class _Rows(Bar):
 
 
 def _write(arguments, run, device):
-    """Writes and prints what rows there are."""
+    """Writes and prints the rows so far."""
     from ..lab.machine import machine
     from ..lab.results import growth, write_csv
 
@@ -194,7 +194,7 @@ def _text(facts):
 
 
 def _cells(row):
-    """A row as texts."""
+    """Returns a row as texts."""
     if row["status"] == "refused":
         return (_scene_of(row), row["label"], *[""] * (len(_HEAD) - 1), f"refused: {row['reason']}")
     low, high = row["spread"]
@@ -215,7 +215,7 @@ def _cells(row):
 
 
 def _contact(row):
-    """Describes the cost of contact, and what self-contact did; "" without either."""
+    """Describes the cost of contact and the counts of self-contact; "" without contact."""
     said = []
     if row.get("ms_without") is not None:
         ratio = row["ms"] / row["ms_without"]
@@ -240,7 +240,7 @@ def _number(value):
 
 
 def _aligned(table):
-    """Lines of two columns to the left, numbers to the right, and a remark."""
+    """Returns lines with two left-aligned columns, right-aligned numbers, and a remark."""
     return aligned(table, range(2, len(table[0]) - 1))
 
 
@@ -248,7 +248,7 @@ def _compare(arguments):
     """Prints the ratios of two results.
 
     Raises:
-        ValueError: A file is none, or the two have no row in common.
+        ValueError: A file has no result, or the two have no row in common.
     """
     from ..lab.results import ratios, read
 

@@ -1,4 +1,4 @@
-"""The command ``chart``: measurements of many settings, as pictures and tables; each chart is a command of its own."""
+"""The command ``chart``: pictures and tables of measurements of many settings. Each chart is a subcommand."""
 
 import sys
 from collections import Counter
@@ -62,7 +62,7 @@ def add_arguments(parser):
 
 
 def add(charts, name, command, text, epilog):
-    """A command of a chart, with what all of them take."""
+    """Adds the subcommand of a chart with the arguments of all charts, and returns its parser."""
     form = {"formatter_class": HelpFormatter, "allow_abbrev": False}
     sub = charts.add_parser(name, help=text, description=text, epilog=epilog, **form)
     sub.set_defaults(command=command)
@@ -130,13 +130,13 @@ def failure(arguments):
 
 
 def _failure_summary(found):
-    """Of each panel how many points there are, how far those with a law are from it at most, and what has no value."""
+    """Returns a summary: for each panel the number of points and the largest distance to their law, and missing values."""
     lines = [found["title"], f"  device        {found['machine']['device']}"]
     for key, panel in found["panels"].items():
         points = [row for row in found["rows"] if row["panel"] == key]
         followed = [row for row in points if row["expected"] is not None and row["value"] is not None]
         size = max((abs(row["expected"]) for row in followed), default=0.0)
-        # Relative, but where a law is 0, if for rounding, to the most that it is.
+        # Relative to the law; where that is 0 up to rounding, to its largest value.
         scales = [each if each > 1e-9 * size else size or 1.0 for each in (abs(row["expected"]) for row in followed)]
         apart = [abs(row["value"] - row["expected"]) / scale for row, scale in zip(followed, scales, strict=True)]
         met = f", {len(followed)} of them off their law by {max(apart):.1e} at most" if followed else ""
@@ -178,7 +178,7 @@ def work_precision(arguments):
 
 
 def _parts(diagram):
-    """The functions that measure a diagram, draw it and sum it up, by its name; another diagram is another row."""
+    """Returns the functions that measure, draw and summarise a diagram."""
     from ..chart import pareto
     from ..lab import work_precision as measured
 
@@ -197,7 +197,7 @@ def _plot_physics(path, found):
 
 
 def _physics_lines(found):
-    """The error of each point."""
+    """Returns lines with the error of each point."""
     known = [row for row in found["rows"] if row["error"] is not None]
     return [f"  error         {100.0 * row['error']:.3g} %, {row['ms'] or 0.0:.3g} ms: {row['label']}" for row in known]
 
@@ -218,7 +218,7 @@ def _summary(found, lines_of):
 
 
 def _time_lines(found):
-    """The settings that nothing beats, and the cheapest of each solver."""
+    """Returns lines with the Pareto front, and the cheapest setting of each solver."""
     from ..lab.work_precision import WITHIN, cheapest
 
     exact, rows = found["reference"], found["rows"]
@@ -233,7 +233,7 @@ def _time_lines(found):
 
 
 def _solver_lines(found):
-    """Of each method how near it came."""
+    """Returns lines with the final gap of each method."""
     lines = [f"  step          1/{found['rate']:g} s after frame {found['frame']}"]
     for row in found["rows"]:
         if row["points"]:
@@ -244,7 +244,7 @@ def _solver_lines(found):
 
 
 def _spectrum_lines(found):
-    """Of each step its slowest part, and the last factor of an iteration."""
+    """Returns lines with the slowest mode of each step, and the last factor of an iteration."""
     lines = []
     for row in found["rows"]:
         if row["measured"] is not None:

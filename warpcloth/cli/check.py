@@ -1,4 +1,4 @@
-"""The command ``check``: finds what intersects in an animation, exactly."""
+"""The command ``check``: finds intersections in an animation, exactly."""
 
 import time
 from contextlib import closing, nullcontext
@@ -33,7 +33,7 @@ _SENTENCES = 8
 
 
 def add_arguments(parser):
-    """Adds what the command takes but for what all commands do."""
+    """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to check")
     add("--prim", nargs="+", metavar="PRIM", help="paths or names of the meshes to check, if not those that are cloth")
@@ -62,7 +62,7 @@ def check(arguments):
     check_drawing(arguments.still)
     if arguments.still and Path(arguments.still).suffix.lower() != ".png":
         raise ValueError(f"--still is {arguments.still}; it must end with .png")
-    folder = frames_folder_of(arguments) if arguments.output else None  # refuses an ending that is none
+    folder = frames_folder_of(arguments) if arguments.output else None  # checks the ending
     started = time.perf_counter()
     rest = None if arguments.rest is None else Surface.load(arguments.rest)
     cloths = cloths_of(arguments.file, rest, arguments.prim, arguments.fps)
@@ -96,7 +96,7 @@ def check(arguments):
 
 
 def _writer(arguments, cloths):
-    """The writer of the stage, or nothing."""
+    """Returns the writer of the stage, or a null context."""
     if arguments.output is None:
         return nullcontext()
     from ..usd import MeasureWriter
@@ -115,10 +115,11 @@ def _writer(arguments, cloths):
 
 
 def _marks(cloths, each):
-    """Of each triangle how many others it intersects, how many of its vertices are inside colliders, and its colour.
+    """Returns marks of the triangles of a frame.
 
     Returns:
-        (T,), (T,), both NaN where that could not be judged, and (T, 3).
+        The number of others that each intersects and of its vertices inside colliders, (T,) each, NaN if it could not be
+        judged; and its colour (T, 3).
     """
     count, triangles = len(cloths.mesh.triangles), cloths.mesh.triangles
     pairs = np.bincount(each.pairs.ravel(), minlength=count).astype(float)
@@ -136,7 +137,7 @@ def _marks(cloths, each):
 
 
 def _append(writer, cloths, each):
-    """Adds a frame to the stage; without a stage below it a frame needs points."""
+    """Adds a frame to the stage; if that is not a layer over another stage, all points must be finite."""
     pairs, inside, colours = _marks(cloths, each)
     points = None if cloths.stages else cloths.read(each.index)
     if points is None or np.isfinite(points).all():
@@ -144,7 +145,7 @@ def _append(writer, cloths, each):
 
 
 def _draw(arguments, cloths, each):
-    """Draws a frame: a cloth of a stage with all that is about it, others alone."""
+    """Draws a frame: cloths of a stage with their surroundings, others alone."""
     colours, options = _marks(cloths, each)[2], {"size": SIZE}
     if len(cloths.stages) == 1:
         shown = np.broadcast_to(colours, (len(cloths.labels), *colours.shape))
@@ -156,7 +157,7 @@ def _draw(arguments, cloths, each):
 
 
 def _rows(cloths, checker, each):
-    """Rows of the table: a pair, a vertex inside a collider, an element beyond a limit or what could not be judged."""
+    """Yields rows of the table: pairs, vertices inside colliders, elements beyond a limit, and what could not be judged."""
     about = (each.frame, None if each.time != each.time else each.time)
     for one, other in each.pairs.tolist():
         yield (*about, "intersection", *cloths.face(one), *cloths.face(other), None)
@@ -174,7 +175,7 @@ def _rows(cloths, checker, each):
 
 
 def _counts(each):
-    """A frame as JSON has it."""
+    """Returns a frame as JSON values."""
     exceeded = {name: {"elements": len(elements), **_ends(stretches)} for name, (elements, stretches) in each.exceeded.items()}
     inside = {name: len(vertices) for name, vertices in each.inside.items()}
     found = {"frame": each.frame, "time": each.time, "pairs": len(each.pairs), "inside": inside, "stretch": exceeded}

@@ -22,7 +22,7 @@ Measurements are stored and reused.
 
 
 def add_arguments(parser):
-    """Adds what the command takes but for what all commands do."""
+    """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add_scene(parser)
     add(
@@ -49,7 +49,7 @@ def choose(arguments):
 
 
 def choice_for(arguments, device):
-    """The choice for the scene, tolerance and budget of the arguments, all that was measured, reference, and parameters."""
+    """Returns the choice for the arguments, all measurements, the reference, and the parameters of the scene."""
     from ..lab.choosing import choose
     from ..lab.measurements import SceneRef
 
@@ -78,10 +78,10 @@ def choice_for(arguments, device):
 
 
 def take_choice(arguments, device):
-    """Sets solver and options of a run to what is chosen for its tolerance and budget.
+    """Sets the solver and options of a run to those chosen for its tolerance and budget.
 
     Raises:
-        ValueError: They are given already, or nothing will do.
+        ValueError: They are given, or nothing meets tolerance and budget.
     """
     for name, given in (("--solver", arguments.solver), ("-s", arguments.s)):
         if given:
@@ -96,7 +96,7 @@ def take_choice(arguments, device):
 
 
 def command_line(arguments, values, setup):
-    """The command that runs a scene with a setup."""
+    """Returns the command line that runs a scene with a setup."""
     words = ["warpcloth", "run", arguments.scene]
     words += [word for module in arguments.imports for word in ("--import", module)]
     given = [f"{name}={value}" for name, value in values.items() if name in assignments(arguments.p)]

@@ -1,4 +1,4 @@
-"""The command ``compare``: how far two animations are apart."""
+"""The command ``compare``: measures the distance between two animations."""
 
 from contextlib import closing
 
@@ -12,7 +12,7 @@ from ..picture.figures import PICTURES, check_path
 from .options import values_of
 from .terminal import Progress, check_writable
 
-_SHOWN = 8  # frames or exclusions of each that the summary names
+_SHOWN = 8  # largest number of frames or exclusions of each in the summary
 
 EPILOG = """\
 A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames are
@@ -26,7 +26,7 @@ and the other Z up, B is rotated to the up axis of A.
 
 
 def add_arguments(parser):
-    """Adds what the command takes but for what all commands do."""
+    """Adds the arguments of this command, without those of all commands."""
     for name, of in (("a", "A"), ("b", "B")):
         parser.add_argument(name, metavar=of, help="the first animation" if of == "A" else "the second animation")
     for name, of in (("a", "A"), ("b", "B")):
@@ -85,7 +85,7 @@ def _open(arguments, name, opened):
 
 
 def _columns(found):
-    """Columns of the table by name, each (F,), in SI units: a and b of what is taken both ways, 1 and 2 of the stretches."""
+    """Returns the columns of the table by name, (F,) in SI units, with endings a and b, or 1 and 2 for stretches."""
     columns = {"time": found.times, "frame_a": found.labels[:, 0], "frame_b": found.labels[:, 1], "size": found.sizes}
     if found.same_topology:
         columns |= {name: getattr(found, name) for name in ("rms", "relative_rms", "largest", "largest_vertex")}
@@ -102,7 +102,7 @@ def _write_csv(path, columns):
 
 
 def _facts(arguments, found, sequences):
-    """Facts of the summary: the worst of each number with the frame that has it, and the root mean square over all."""
+    """Returns the facts of the summary: the largest value of each number with its frame, and the RMS over all frames."""
     facts = {
         "a": arguments.a,
         "b": arguments.b,
@@ -135,13 +135,13 @@ def _facts(arguments, found, sequences):
 
 
 def _over_frames(values):
-    """Root mean square over the frames that have a value, NaN where none has."""
+    """Returns the RMS over the frames with a value, NaN if there are none."""
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
 def _worst(found, values):
-    """The largest of the values (F,) and its frame, or None where there is none."""
+    """Returns the largest of the values (F,) and its frame, or None if there are none."""
     if np.isnan(values).all():
         return None
     row = int(np.nanargmax(values))

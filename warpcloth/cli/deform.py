@@ -1,4 +1,4 @@
-"""The command ``deform``: a mesh whose handles the command line moves, or a scene whose pins are moved already."""
+"""The command ``deform``: deforms a mesh by handles that the command line moves, or by the moving pins of a scene."""
 
 import argparse
 import math
@@ -47,7 +47,7 @@ class _Move:
 
 
 def add_arguments(parser):
-    """Adds what the command takes but for what all commands do."""
+    """Adds the arguments of this command, without those of all commands."""
     text = "a mesh file, a USD stage, or a scene with moving pins (a name or a .py file)"
     parser.add_argument("mesh", metavar="MESH", help=text)
     hold = "vertices to hold in place; may be repeated"
@@ -107,7 +107,7 @@ class _AddRotation(argparse.Action):
             axis = np.zeros(3)
         if len(axis) != 3 or not axis.any():
             raise ValueError(f"the AXIS of --rotate is {values[1]!r}; it must be x, y, z or a vector such as 1,0,-1")
-        axis = axis / np.abs(axis).max()  # squares of what is left do not overflow
+        axis = axis / np.abs(axis).max()  # so that squares do not overflow
         centre = _vector("the centre of --rotate", values[2:]) if len(values) == 5 else None
         move.turn = (_number("DEGREES of --rotate", values[0]), axis / np.linalg.norm(axis), centre)
 
@@ -118,7 +118,7 @@ class _AddTranslation(argparse.Action):
 
 
 def _last(namespace, option, field):
-    """The move that an option belongs to."""
+    """Returns the move to which an option belongs."""
     if not namespace.moves:
         raise ValueError(f"{option} stands before any --move; it says how the --move before it goes")
     move = namespace.moves[-1]
@@ -195,7 +195,7 @@ def _summary(facts):
 
 
 def _given(arguments):
-    """(name, values of a scene's parameters, arguments of `deform`) that the command line stands for."""
+    """Returns (name, parameters of the scene, arguments of `deform`) from the command line."""
     from ..scene.scene import Pins
 
     path = Path(arguments.mesh)
@@ -209,7 +209,7 @@ def _given(arguments):
             raise ValueError(
                 f"the pins of {scene.name} do not move; give a scene whose pins have keyframes, or a mesh and --move"
             )
-        if arguments.frames is not None:  # pins are at rest after the last keyframe
+        if arguments.frames is not None:  # pins do not move after the last keyframe
             _refuse_size(arguments.frames, scene.mesh, keyframes.shape[1])
             keyframes = keyframes[np.minimum(np.arange(arguments.frames + 1), len(keyframes) - 1)]
         pins = Pins(scene.pins.vertices, keyframes, scene.pins.axes)
@@ -273,12 +273,12 @@ def _handles(mesh, fixes, moves, frames):
 
 
 def _refuse_size(frames, mesh, handles):
-    """Refuses frames that exceed the free memory: positions of the handles, and points and angles of each frame."""
+    """Raises ValueError if positions of handles, points and angles of all frames exceed the free memory."""
     refuse_memory(f"frames is {frames:,}", 8 * frames * (3 * handles + 4 * len(mesh.points)))
 
 
 def _path(move, points, time):
-    """Positions (F, p, 3) of points that a move takes along, at times (F,) from 0 to 1."""
+    """Returns positions (F, p, 3) of points during a move, at times (F,) from 0 to 1."""
     from scipy.spatial.transform import Rotation
 
     path = np.tile(points, (len(time), 1, 1))

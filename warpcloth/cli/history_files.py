@@ -15,7 +15,7 @@ An unknown value is an empty cell in the table, and null in JSON.
 
 
 def record_of(arguments, scene):
-    """The words for what a run of a scene must record; refuses files that cannot be written."""
+    """Returns the words of ``record`` for a run of a scene, and checks that the files can be written."""
     files = [path for path in (arguments.csv, arguments.report) if path]
     check_apart([arguments.output, arguments.film, *files])
     check_writable(*files)
@@ -25,7 +25,7 @@ def record_of(arguments, scene):
 
 
 def write_history(arguments, scene, animation):
-    """Writes the table and the report of a run that recorded both."""
+    """Writes the table and the report of a run, those that are asked for."""
     energies, reactions, forces = animation.energies, animation.reactions, animation.collider_forces or {}
     pairs = animation.pairs or {}
     if arguments.csv:
@@ -56,5 +56,5 @@ def _by_name(found):
 
 
 def _known(values):
-    """Numbers as lists, None in place of those that are not finite."""
+    """Returns numbers as lists, with None for those that are not finite."""
     return np.where(np.isfinite(values), values, None).tolist()

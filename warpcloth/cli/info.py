@@ -1,4 +1,4 @@
-"""The command ``info``: says what is in a scene and what is built from it, and with ``--advise`` which of it matters."""
+"""The command ``info``: describes a scene and its model, and with ``--advise`` which of its parts matter."""
 
 import contextlib
 import sys
@@ -87,7 +87,7 @@ def _info_text(facts):
 
 
 def advise_on(arguments, source, values, scene, device):
-    """Says which terms, precision and resolution matter, by leaving out or changing each."""
+    """Prints which terms, precision, step and resolution matter, by leaving out or changing each."""
     from ..lab.advice import advise
 
     tolerance = 0.01 if arguments.tolerance is None else fraction("tolerance", arguments.tolerance)
@@ -126,12 +126,12 @@ def advise_on(arguments, source, values, scene, device):
 
 
 def _resolutions(source, values, vertices):
-    """The scene with half and twice the value of the first parameter that sets the number of vertices, by name."""
+    """Returns the scene with half and twice the value of the first parameter that sets its number of vertices, by name."""
     for name, value in values.items():
         if isinstance(value, int) and not isinstance(value, bool) and value > 1:
             found = {}
             for other in (value // 2, 2 * value):
-                with contextlib.suppress(ValueError):  # of a scene that cannot be so coarse
+                with contextlib.suppress(ValueError):  # the scene may refuse a coarse resolution
                     found[f"{name}={other}"] = source.scene(values | {name: other})
             if any(len(scene.mesh.points) != vertices for scene in found.values()):
                 return found

@@ -1,7 +1,6 @@
 """Lists options of solvers and parameters of scenes for ``-s help`` and ``-p help``, and completes them in a shell.
 
-Completion reads them from source files, so that it need not wait for Warp; the words that a parameter of a scene takes, alone,
-it has from running the scene.
+Completion parses source files, so that it need not load Warp. Only for the allowed words of a parameter, it runs the scene.
 """
 
 import argparse
@@ -19,11 +18,11 @@ from ..run.listing import folders, list_scenes, list_solvers
 from .terminal import aligned
 
 _HELP = "help"
-DEFAULT = "newton"  # solver
+DEFAULT = "newton"  # the default solver
 
 
 def asks_for_help(arguments):
-    """Whether ``-s`` or ``-p`` asks for help."""
+    """Returns whether ``-s`` or ``-p`` asks for help."""
     return any(_HELP in (getattr(arguments, key, None) or ()) for key in "sp")
 
 
@@ -88,19 +87,19 @@ def _default(row):
 
 
 def _values(row):
-    """The allowed values; the default None is left out, because it is what an option has that is not given."""
+    """Returns the allowed values, without None if that is the default."""
     return row["allowed"].removesuffix(", or none" if row["default"] is None and not row["needed"] else "")
 
 
 class _Refused:
-    """A value that no option takes; options that take words are probed with a text instead, so that the refusal lists them."""
+    """A value that no option takes, whose error lists the allowed values."""
 
 
 def _allowed(call, name, parameter):
-    """Returns the allowed values: from the error for a value that the solver or scene refuses, or else from the type."""
+    """Returns the allowed values: from the error for a value that is refused, or else from the type."""
     kinds = kinds_of_parameter(parameter)
     refused = "?" if str in kinds else _Refused()
-    for more in ({}, {"substeps": 1}):  # a record checks the step before the rest
+    for more in ({}, {"substeps": 1}):  # a record checks its step first
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -115,7 +114,7 @@ def _allowed(call, name, parameter):
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps the lines of notes, and puts SCENE before options that would take it as one of their values."""
+    """Keeps line breaks, and puts SCENE before options that take several values."""
 
     def add_usage(self, usage, actions, groups, prefix=None):
         first = [action for action in actions if not action.option_strings and not isinstance(action.choices, dict)]
@@ -168,10 +167,10 @@ def load_extensions(argv):
     load_installed()
     try:
         names = only.parse_known_args(argv)[0].imports
-    except argparse.ArgumentError:  # no name after it, as the parser of all options says better
+    except argparse.ArgumentError:  # a missing name, which the main parser reports better
         return
     for name in names:
-        with contextlib.suppress(*[ValueError] * completes):  # the name may be what is being completed
+        with contextlib.suppress(*[ValueError] * completes):  # the shell may be completing the name
             load_extension(name)
 
 
@@ -203,9 +202,9 @@ def _add_completers(parser, files):
 
 
 def solvers():
-    """Returns the options of each solver by its name: by option the words that it takes, or ()."""
+    """Returns a dict of solvers: by name a dict from options to the words that they take, or ()."""
     found, loaded = dict(list_solvers()), sys.modules.get("warpcloth.solvers")
-    for name, record in loaded.SOLVERS.items() if loaded else ():  # those of extensions too
+    for name, record in loaded.SOLVERS.items() if loaded else ():  # includes extensions
         found.setdefault(name, dict.fromkeys((field.name for field in fields(record)), ()) | words_of(record))
     return found
 

@@ -26,7 +26,7 @@ a stage are drawn. A second FILE is drawn to the right of the first. The extensi
 
 
 def add_arguments(parser):
-    """Adds what the command takes but for what all commands do."""
+    """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to draw")
     add("beside", metavar="FILE", nargs="?", help="a second one to draw beside it")
@@ -54,7 +54,7 @@ def add_arguments(parser):
 
 
 def size(text):
-    """Width and height of a text such as 640x360."""
+    """Returns width and height from a text such as 640x360."""
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdecimal() for part in parts):
         raise argparse.ArgumentTypeError(f"{text!r} is no size; it must be a width and a height, such as 1280x720")
@@ -62,7 +62,7 @@ def size(text):
 
 
 def frames(text):
-    """The ends of a text such as 10:50, None for one that is left out."""
+    """Returns the two ends of a text such as 10:50, None for one that is left out."""
     parts = text.split(":")
     try:
         first, last = (float(part) if part else None for part in parts)
@@ -112,7 +112,7 @@ def render(arguments):
 
 
 def check_drawing(path, others=(), size=SIZE):
-    """Finds out before anything is read or runs that a picture or film, or None, cannot be written."""
+    """Checks that a picture or film can be written, before anything is read or runs; does nothing for None."""
     from ..picture.films import check_film
 
     if path is not None:
@@ -122,7 +122,7 @@ def check_drawing(path, others=(), size=SIZE):
 
 
 def draw_film(source, output, **options):
-    """Draws by :func:`warpcloth.render`, counting the pictures on a terminal; returns how many they are."""
+    """Draws by :func:`warpcloth.render` with a progress bar on a terminal; returns the number of pictures."""
     from ..picture.render import render
 
     progress = _Drawing()

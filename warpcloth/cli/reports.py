@@ -1,4 +1,4 @@
-"""An analysis as files: a USD stage with its measures, tables, arrays, plots and pictures, written row by row."""
+"""Writes an analysis as a USD stage, tables, arrays, plots and pictures, row by row."""
 
 import warnings
 from contextlib import ExitStack, contextmanager
@@ -13,15 +13,15 @@ from ..base.outputs import check_apart
 from ..base.texts import camel_case
 from ..picture.measured import neutral_of, scalar_names, scale_of
 
-# Length of a principal direction of stretch 1 beside the square root of the median area of a triangle.
+# Drawn length of a principal direction with stretch 1, relative to the square root of the median triangle area.
 _SEGMENT = 0.7
-# Time codes that are nearer than this to the numbers of their frames are these.
+# Time codes nearer than this to the numbers of their frames are replaced by these.
 _EVEN = 1e-6
 
 
 @dataclass
 class Extremes:
-    """A scalar over all rows: its :class:`Summary` where it is smallest and where it is largest."""
+    """The extremes of a scalar over all rows: the :class:`Summary` with its smallest and its largest value."""
 
     smallest: Summary | None = None
     largest: Summary | None = None
@@ -41,10 +41,10 @@ class Report:
     Attributes:
         rows: Number of rows.
         extremes: :class:`Extremes` by name of scalar.
-        exclusions: Sentences, of the first rows that have any; no more than ``SENTENCES``.
+        exclusions: Sentences about the first exclusions, at most ``SENTENCES``.
         excluded: Number of exclusions.
-        coloured: The scalar that is shown as colour, or None.
-        scale: Its low and high, or None.
+        coloured: The scalar shown as colour, or None.
+        scale: Its (low, high), or None.
     """
 
     SENTENCES = 20
@@ -75,33 +75,33 @@ def write_report(
     both_sides=False,
     colormap=None,
 ):
-    """Measures all rows of an analysis and writes them, in memory that does not grow but for the plot's percentiles.
+    """Measures and writes all rows of an analysis, in constant memory but for the percentiles of the plot.
 
     Args:
         analyzer: The :class:`warpcloth.Analyzer`.
-        usd: Path of a stage, a layer over the one that was measured if it was one: each scalar as a primvar, and one as colour.
+        usd: Path of a stage, a layer over the measured stage if there is one: each scalar as a primvar, and one as colour.
         csv: Path of a table with a line for each row and scalar, see :class:`warpcloth.analysis.summaries.CsvWriter`.
-        json: Path of the same as one object, with the exclusions.
-        npz: Path of the measures themselves, (rows, E, *shape).
+        json: Path of the same data as one object, with the exclusions.
+        npz: Path of the measures as arrays, (rows, E, *shape).
         plot: Path of a picture of the percentiles over time, .png, .svg or .pdf.
         stills: Paths of pictures, .png, by number of the frame.
-        colour: The scalar to show, such as "stretch_1"; the first where not given; "none" for a stage without colours.
-        colour_range: (low, high) of its colours; else from the least first percentile to the largest ninety-ninth of all rows,
-            about the value of what is undeformed where there is one.
-        curves: Whether stage and pictures show the principal directions, as long as their stretches.
+        colour: The scalar to show, such as "stretch_1"; by default the first; "none" for a stage without colours.
+        colour_range: (low, high) of its colours; by default from the smallest 1st percentile to the largest 99th of all rows,
+            symmetric about the value without deformation, if there is one.
+        curves: Whether stage and pictures show the principal directions, with their stretches as lengths.
         single_file: Whether the stage is one file, see :class:`warpcloth.usd.AnimationWriter`.
-        up_axis: "Y" or "Z", for inputs that do not say theirs.
-        progress: Function called with (row, rows) after each, or None.
-        view: The :class:`warpcloth.chart.View` of the stills, if not its default; its up axis is that of the animation.
-        both_sides: Whether stills show the cloth from the opposite side too, see :func:`warpcloth.chart.draw`.
-        colormap: Name of a colour map of matplotlib, if not the default of :class:`warpcloth.chart.Scale`.
+        up_axis: "Y" or "Z", for inputs that have none.
+        progress: Function called with (row, rows) after each row, or None.
+        view: The :class:`warpcloth.picture.view.View` of the stills, or None; its up axis is that of the animation.
+        both_sides: Whether stills also show the opposite side of the cloth, see :func:`warpcloth.picture.picture.draw`.
+        colormap: Name of a colour map of matplotlib, or None, see :class:`warpcloth.picture.colour.Scale`.
 
     Returns:
         :class:`Report`.
 
     Raises:
-        ValueError: There is no such scalar or frame, ``curves`` without the measures "stretch" and "directions", a file is
-            given twice or is the input's, or as the writers have it.
+        ValueError: There is no such scalar or frame, ``curves`` is given without the measures "stretch" and "directions", a
+            file is given twice or is the input, or a writer refuses its file.
     """
     listed = {name: measure for measure in analyzer.measures for name in scalar_names(measure)}
     report = Report(extremes={name: Extremes() for name in listed})
@@ -156,7 +156,7 @@ def write_report(
                 if progress:
                     progress(report.rows, len(analyzer))
         except KeyboardInterrupt:
-            if not report.rows:  # earlier files are worth more than empty ones
+            if not report.rows:  # keep earlier files rather than write empty ones
                 for writer in filter(None, (*writers, archive)):
                     writer.discard()
             raise
@@ -173,7 +173,7 @@ def write_report(
 
 @contextmanager
 def _interruptible(report, rows, opened):
-    """At an interrupt, says which of the opened writers have saved the rows so far in a file."""
+    """Turns an interrupt into a message about which files have the rows so far."""
     try:
         yield
     except KeyboardInterrupt:
@@ -204,7 +204,7 @@ def _check(analyzer, listed, usd, stills, colour, curves):
 
 
 def _can_colour():
-    """Whether there are colour maps; without them a stage has its measures all the same."""
+    """Returns whether matplotlib has colour maps; without it, warns that the stage has no colours."""
     from ..picture.figures import require_matplotlib
 
     try:
@@ -216,7 +216,7 @@ def _can_colour():
 
 
 def _check_pictures(plot, stills):
-    """Refuses pictures that cannot be written, before anything is measured."""
+    """Checks that pictures can be written, before anything is measured."""
     if plot or stills:
         from ..picture.figures import PICTURES, check_path
 
@@ -227,12 +227,12 @@ def _check_pictures(plot, stills):
 
 
 def _count(analyzer, name):
-    """How many numbers an element has of a measure."""
+    """Returns the number of components of a measure."""
     return next(measure.shape[0] for measure in analyzer.measures if measure.name == name)
 
 
 def _rate(sequence):
-    """Numbers of frames a second; 24 where nobody says it."""
+    """Returns frame numbers per second; 24 if there are no times."""
     if sequence.times is None or len(sequence) < 2:
         return 24.0
     return float((sequence.labels[-1] - sequence.labels[0]) / (sequence.times[-1] - sequence.times[0]))
@@ -253,7 +253,7 @@ def _archive(analyzer, path):
 
 
 class _Shown:
-    """The outputs to look at: a stage and pictures, coloured by one scalar on one scale."""
+    """Writes the stage and the pictures, coloured by one scalar on one scale."""
 
     def __init__(self, analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack):
         view, self.both_sides, colormap = looks
@@ -307,7 +307,7 @@ class _Shown:
         """Adds a row, whose scalars (E,) are ``values``."""
         segments = self._segments(sample, positions) if self.curves else None
         finite = np.isfinite(sample.points).all()
-        if self.writer and (self.over or finite):  # without a stage below it a frame needs points
+        if self.writer and (self.over or finite):  # only a layer over a stage may lack points
             primvars = {camel_case(name): _single(numbers) for name, numbers in values.items()}
             colours = self.scale.linear(values[self.name]) if self.scale else None
             self.writer.append(self._time_code(sample), primvars, colours, segments, None if self.over else sample.points)
@@ -330,7 +330,7 @@ class _Shown:
             )
 
     def _time_code(self, sample):
-        """That of the stage below; without one the number of the frame, or where frames are not even in time what fits it."""
+        """Returns the time code of the source stage, or else the number of the frame, or its time in frames if uneven."""
         sequence = self.analyzer.sequence
         if self.over or sequence.times is None:
             return sample.frame
@@ -338,7 +338,7 @@ class _Shown:
         return sample.frame if abs(code - sample.frame) < _EVEN else code
 
     def _segments(self, sample, positions):
-        """Principal directions as long as their stretches, by name: centres and vectors (E, 3) [m]."""
+        """Returns the principal directions, with stretches as lengths, by name: centres and vectors (E, 3) [m]."""
         stretch, directions = sample.values["stretch"], sample.values["directions"]
         count = stretch.shape[1]
         vectors = [self.length * stretch[:, k, None] * directions[:, k] for k in range(count)]
@@ -346,5 +346,5 @@ class _Shown:
 
 
 def _single(values):
-    """Values of which those are NaN that float32 does not have."""
+    """Returns values with NaN for those that overflow in float32."""
     return np.where(np.abs(values) <= np.finfo(np.float32).max, values, np.nan)

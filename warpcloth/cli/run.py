@@ -50,7 +50,7 @@ def run(arguments):
             write_history(arguments, scene, animation)
         if arguments.film:
             try:
-                draw_film([arguments.output], arguments.film, device=device.alias)  # with all that a stage shows
+                draw_film([arguments.output], arguments.film, device=device.alias)  # draws everything in the stage
             except Interrupted as interrupted:
                 raise Interrupted(f"{interrupted}; frames 0 to {status.frame} are in {arguments.output}") from None
         crosses = scene.self_contact is not None and scene.self_contact.crossing_start == "run"
@@ -98,12 +98,12 @@ def _own_output(scene, resume):
 
 
 def _self_contact(found):
-    """A :class:`warpcloth.run.simulate.SelfContactSummary` as JSON; a gap of no pair is None."""
+    """Returns a :class:`warpcloth.run.simulate.SelfContactSummary` as JSON values; an infinite gap is None."""
     return found._asdict() | {"least_gap": found.least_gap if math.isfinite(found.least_gap) else None}
 
 
 def _lines_of(found):
-    """Lines of the summary about self-contact."""
+    """Yields the lines of the summary about self-contact."""
     gap = "no pair was listed" if found["least_gap"] is None else f"least gap {found['least_gap']:.3g} m"
     counts = f"up to {found['pairs']:,} pairs, {found['lists']:,} lists of them"
     yield f"  self-contact  {counts}, {100.0 * found['kept']:.4g} % of moves kept, {gap}"

@@ -1,4 +1,4 @@
-"""The scene and the solver that the arguments of a command name."""
+"""The scene and the solver of the arguments of a command."""
 
 import math
 import time
@@ -8,9 +8,9 @@ from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import assignments, options
 from .options import DEFAULT
 
-# A step that all solvers without a limit take well; where no step is given the substeps come nearest to it.
+# Default steps per second of solvers without a stability limit; substeps are chosen nearest to it.
 _STEPS_A_SECOND = 240
-# More substeps a frame than this, and the implicit solver is worth a hint.
+# With more substeps per frame than this, print a hint at the implicit solver.
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
@@ -22,12 +22,12 @@ dihedral bending and membranes, because it uses their stiffness at rest.
 
 
 def named_scene(arguments):
-    """(source, values of its parameters, scene) that the arguments name."""
+    """Returns (source, values of its parameters, scene) of the arguments."""
     from ..run.scene_files import find_source
 
     source = find_source(arguments.scene, getattr(arguments, "pins", None))
     prim = getattr(arguments, "prim", None)
-    if prim is not None:  # a parameter of a stage like others, so measurements in other processes get it too
+    if prim is not None:  # as a parameter, so that measurements in other processes get it too
         if source.path.suffix not in STAGE_ENDINGS:
             raise ValueError(f"--prim is given, but {arguments.scene} is not a stage; leave it out")
         arguments.p, arguments.prim = [*arguments.p, f"prim={prim}"], None
@@ -37,15 +37,15 @@ def named_scene(arguments):
 
 @dataclass
 class Chosen:
-    """A solver, and what had to be built to choose its step.
+    """A solver, with the model that was built to choose its step.
 
     Attributes:
-        solver: With its options, as they are shown.
-        checked: The same to be run; it does not look for limits again that are known to be kept.
-        chosen: How its step was chosen, or None where it was given.
-        model: Of the scene, if it is built already.
-        limits: As ``step_limits`` gives them, if they were asked for.
-        seconds: What building and the limits took.
+        solver: The solver with its options, as shown.
+        checked: The solver to run, without a check of limits that are known to hold.
+        chosen: How its step was chosen, or None if it was given.
+        model: The model of the scene, if it is built.
+        limits: The result of ``step_limits``, if it was computed.
+        seconds: Time to build the model and compute the limits [s].
     """
 
     solver: object = None
@@ -57,7 +57,7 @@ class Chosen:
 
 
 class Built:
-    """A scene whose model stands already."""
+    """A scene whose model is already built."""
 
     def __init__(self, scene, model):
         self._scene, self._model = scene, model
@@ -66,19 +66,19 @@ class Built:
         return getattr(self._scene, name)
 
     def build(self, **_):
-        """The model, whose device and precision are those of the whole command."""
+        """Returns the model, which has the device and precision of the command."""
         return self._model
 
 
 def solver_setup(arguments, scene, device, limits=False):
-    """Returns the solver that the arguments name; ``limits`` asks for those of a limited one even where its step is given."""
+    """Returns the solver of the arguments; ``limits`` asks for the limits of a limited solver even if its step is given."""
     from ..solvers import SOLVERS
 
     arguments.solver = arguments.solver or DEFAULT
     record = SOLVERS[arguments.solver]
     given = options(record, assignments(arguments.s))
     step_given = "dt" in given or "substeps" in given
-    solver = record(**given, **({} if step_given else {"substeps": 1}))  # a wrong option is said before anything is built
+    solver = record(**given, **({} if step_given else {"substeps": 1}))  # checks options before anything is built
     if not record.limited:
         if step_given:
             return Chosen(solver, solver)
@@ -100,17 +100,17 @@ def solver_setup(arguments, scene, device, limits=False):
         setup.chosen = f"by default the fewest stable ones, limits {rest:.3g} and {motion:.3g} s"
     setup.checked = setup.solver
     if setup.solver.stable(1.0 / (scene.fps * setup.solver.per_frame(scene.fps)), min(rest, motion)):
-        setup.checked = setup.solver.without_limits()  # which leaves out a second search for them
+        setup.checked = setup.solver.without_limits()  # so that they are not computed twice
     return setup
 
 
 def fewest_below(fps, limit):
-    """The fewest substeps a frame whose step is below ``limit``."""
+    """Returns the fewest substeps per frame with a step below ``limit`` [s]."""
     return math.floor(1.0 / (fps * limit)) + 1
 
 
 def hint_of(arguments, setup, scene):
-    """A line for those who may wait longer than they need, or None."""
+    """Returns a hint at a faster solver, or None."""
     substeps = setup.solver.per_frame(scene.fps)
     if not setup.solver.limited or substeps <= _MANY_SUBSTEPS:
         return None

@@ -1,4 +1,4 @@
-"""The command ``chart stability``: a map for each method over two axes."""
+"""The command ``chart stability``: a map of stability over two axes for each method."""
 
 from collections import Counter
 
@@ -13,7 +13,7 @@ _COUNT = 9
 
 
 def _axes():
-    """Lines of help on the axes."""
+    """Returns lines of help on the axes."""
     width = max(map(len, AXES))
     return "\n".join(f"  {name:<{width}}   {axis.low:g} to {axis.high:g}: {axis.label}" for name, axis in AXES.items())
 
@@ -43,7 +43,7 @@ stored and reused.
 
 
 def add_arguments(parser):
-    """Adds what the command takes but for what all charts do."""
+    """Adds the arguments of this chart, without those of all charts."""
     add_scene(parser)
     for of in "xy":
         parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"quantity on the {of} axis")
@@ -125,7 +125,7 @@ def chart(arguments):
 
 
 def _survey(arguments):
-    """Returns what the arguments name."""
+    """Returns the :class:`Survey` of the arguments."""
     from ..lab.measurements import SceneRef, Setup
     from ..lab.stability import Survey
     from ..solvers import SOLVERS

@@ -1,4 +1,4 @@
-"""Parts that all commands use: device, progress and results on a terminal, where results go, and what measurements run on."""
+"""Parts that all commands share: device, outputs, progress and results on a terminal, and where measurements run."""
 
 import contextlib
 import os
@@ -13,14 +13,14 @@ from ..base.interrupts import Interrupted
 from ..base.outputs import Output, check_apart
 from ..picture.figures import PICTURES, check_path
 
-# Those of :data:`warpcloth.model.model.DTYPES`, which loads Warp.
+# The same as :data:`warpcloth.model.precision.DTYPES`, which loads Warp.
 DTYPES = ("float32", "float64")
-# Unicode categories that are escaped: control, format (which can reverse the direction of text), surrogates, ends of lines.
+# Unicode categories to escape: control, format (which can reverse text), surrogates, line ends.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 def frames_folder_of(arguments):
-    """The folder that belongs to the output, or None where the output is one file."""
+    """Returns the folder of frames of the output, or None if the output is one file."""
     from ..usd.chunks import frames_folder
 
     output = Path(arguments.output)
@@ -28,7 +28,7 @@ def frames_folder_of(arguments):
 
 
 def location(facts):
-    """Where the output is, in the words of a summary."""
+    """Returns the location of the output, in the words of a summary."""
     if not facts["frames_folder"]:
         return facts["file"]
     folder, together = facts["frames_folder"], "(they belong together: move both, or make one file with --single-file)"
@@ -36,7 +36,7 @@ def location(facts):
 
 
 def check_writable(*outputs):
-    """Finds out before the first frame, and not after ten, that the folder of an output cannot be written; None is no file."""
+    """Checks, before the first frame, that the folders of outputs can be written; None is skipped."""
     for output in filter(None, outputs):
         folder = os.path.dirname(os.path.realpath(output))  # of a link the folder of the file that it stands for
         try:
@@ -47,12 +47,12 @@ def check_writable(*outputs):
 
 
 def check_outputs(arguments, inputs=()):
-    """Finds out before minutes of measurements that a result cannot be written, and that no process would measure.
+    """Checks, before measurements start, that results can be written, and the number of processes.
 
     Raises:
         FileNotFoundError: A folder does not exist.
         ImportError: matplotlib is not installed.
-        ValueError: A file cannot be written or is given twice, or the number of processes is none.
+        ValueError: A file cannot be written or is given twice, or the number of processes is not allowed.
     """
     if arguments.workers is not None:
         whole("workers", arguments.workers, least=1)
@@ -65,25 +65,25 @@ def check_outputs(arguments, inputs=()):
 
 
 class Bar:
-    """A bar of tqdm on a terminal, and nothing elsewhere."""
+    """A progress bar on a terminal; nothing elsewhere."""
 
     bar = None
 
     def open(self, total, text, counts):
-        """Shows another bar; ``counts`` is what stands after it."""
+        """Shows a new bar, followed by ``counts``."""
         self.close()
         if not sys.stderr.isatty():
             return
         from tqdm import tqdm
 
-        # tqdm hides the bar on a terminal that does not know its size.
+        # tqdm would hide the bar on a terminal of unknown size.
         size = shutil.get_terminal_size()
         shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
         form = "{desc}{percentage:3.0f}%|{bar}| " + counts
         self.bar = tqdm(total=total, desc=f"{text}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
 
     def move(self, done, note=None):
-        """Moves the bar on to so many that are done; ``note`` is shown after the counts."""
+        """Moves the bar to ``done``; ``note`` is shown after the counts."""
         if self.bar is not None:
             if note is not None:
                 self.bar.set_postfix_str(note, refresh=False)
@@ -95,17 +95,17 @@ class Bar:
 
 
 def add_dask(parser):
-    """Adds what runs measurements elsewhere."""
+    """Adds the option that runs measurements on a cluster."""
     text = "measure on a Dask cluster: the address of its scheduler, such as tcp://host:8786, or its scheduler file"
     parser.add_argument("--dask", metavar="ADDRESS", help=text)
 
 
 @contextlib.contextmanager
 def executing(arguments):
-    """Yields the keyword arguments of a sweep that say where it runs: a Dask cluster, or none for processes of this machine.
+    """Yields keyword arguments of a sweep: the executor of a Dask cluster, or none for processes on this machine.
 
     Raises:
-        ValueError: A number of processes is given beside a cluster.
+        ValueError: A number of processes is given with a cluster.
     """
     if arguments.dask is None:
         yield {}
@@ -120,11 +120,11 @@ def executing(arguments):
 
 @contextlib.contextmanager
 def measuring(arguments, device):
-    """Yields the keyword arguments of a sweep that say where it runs and what it shows; on a GPU one process.
+    """Yields keyword arguments of a sweep: where it runs, on a GPU with one process, and its progress.
 
     Raises:
-        Interrupted: The user did; it says what is kept.
-        ValueError: A number of processes is given beside a cluster.
+        Interrupted: The user interrupts; the message says what is kept.
+        ValueError: A number of processes is given with a cluster.
     """
     progress = Settings()
     try:
@@ -137,7 +137,7 @@ def measuring(arguments, device):
 
 
 class Settings(Bar):
-    """Counts the settings of a sweep, with the time that is left, on a terminal; before them, how far the reference is."""
+    """Shows the progress of the reference, and then of the settings of a sweep with the time left, on a terminal."""
 
     def __init__(self):
         self.done, self.total, self.substeps = 0, None, None

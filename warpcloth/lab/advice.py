@@ -1,4 +1,4 @@
-"""Which declarations of a scene matter: each is left out or changed in turn, and the result and its cost are compared."""
+"""Finds out which declarations of a scene matter, by leaving out or changing each and comparing result and cost."""
 
 from dataclasses import dataclass, replace
 
@@ -10,25 +10,25 @@ from ..run.simulate import simulate
 
 # Kinds of trials that leave something out.
 _LEFT_OUT = ("term", "collider", "friction", "all")
-# A cost that the whole scene itself changed by so much between its first and its last run says nothing.
+# If the cost of the whole scene changed by more than this between its first and last run, costs are not compared.
 _STEADY = 0.25
 _FRAMES = 7  # at which surfaces of other resolutions are compared
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A run of the scene with one thing changed, against the scene as it is.
+    """A run of the scene with one change, compared with the unchanged scene.
 
     Attributes:
-        kind: "term", "collider" or "friction" of a collider, which are left out, "all" that do not matter by themselves,
+        kind: Left out: a "term", a "collider", the "friction" of a collider, or "all" that do not matter alone; or changed:
             "precision", "step" or "resolution".
         name: The change, such as "without QuadraticBending", "without friction on ball" or "n=64".
-        change: RMS distance of the results over vertices and frames, over the longest side of the cloth; of another resolution
-            between the surfaces, both ways. NaN where there is no result.
-        cost: Time of a frame over that of the scene as it is.
-        matters: Whether the change is above the tolerance; None where there is no result.
-        reason: Why there is none, or "".
-        finer: Of another resolution whether it has more vertices, else None.
+        change: RMS distance of the results over vertices and frames, over the longest side of the cloth; for another
+            resolution, the distance between the surfaces, both ways. NaN without a result.
+        cost: Time of a frame over that of the unchanged scene.
+        matters: Whether the change is above the tolerance; None without a result.
+        reason: Why there is no result, or "".
+        finer: For another resolution, whether it has more vertices; else None.
     """
 
     kind: str
@@ -46,10 +46,10 @@ class Advice:
 
     Attributes:
         trials: List of :class:`Trial`.
-        frames: Frames that were run.
-        declared: Frames that the scene has.
-        milliseconds: Median of a frame of the scene as it is, of its first and of its last run [ms].
-        tolerance: Below which a change does not matter.
+        frames: Number of frames of each run.
+        declared: Number of frames of the scene.
+        milliseconds: Median time of a frame of the unchanged scene, in its first and its last run [ms].
+        tolerance: Tolerance below which a change does not matter.
     """
 
     trials: list
@@ -60,7 +60,7 @@ class Advice:
 
     @property
     def steady(self):
-        """Whether both runs of the scene as it is took about as long, so that costs can be compared."""
+        """Whether both runs of the unchanged scene took about the same time, so that costs can be compared."""
         first, last = self.milliseconds
         return abs(first - last) <= _STEADY * max(first, last)
 
@@ -109,23 +109,23 @@ class Advice:
 def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device="cpu", dtype="float32", progress=None):
     """Leaves out each term, each collider and its friction in turn, and changes precision, step and resolution.
 
-    Each change is compared to the scene as it is over a short run.
+    Each change is compared with the unchanged scene in a short run.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
-        solver: Its options, with `substeps`.
-        tolerance: Change of the result below which something does not matter, a share of the longest side of the cloth.
-        frames: Frames to run; those of the scene, but no more than 30, if not given.
+        solver: The record of a solver, with `substeps`.
+        tolerance: Change of the result below which something does not matter, as a fraction of the longest side of the cloth.
+        frames: Number of frames; by default those of the scene, but at most 30.
         resolutions: The same scene with coarser or finer meshes by name, such as {"n=16": scene}; or None.
         device: A Warp device.
-        dtype: "float32" or "float64"; the other one is tried.
+        dtype: "float32" or "float64"; the other one is a trial.
         progress: Function called with (trials done, trials) after each; or None.
 
     Returns:
         :class:`Advice`.
 
     Raises:
-        ValueError: An option is not allowed, or the scene as it is diverges.
+        ValueError: An option is not allowed, or the unchanged scene diverges.
     """
     number("tolerance", tolerance, above=0.0)
     frames = min(scene.frames, 30) if frames is None else frames
@@ -154,7 +154,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         if progress is not None:
             progress(done, len(plans))
         if done == len(parts):
-            # Of two parts that stand in for one another each by itself seems to do nothing.
+            # If two parts can replace one another, leaving out either alone changes nothing.
             needless = [part for part, trial in zip(parts, trials, strict=True) if trial.matters is False]
             needless = [(kind, k) for kind, k in needless if kind != "friction" or ("collider", k) not in needless]
             if len(needless) > 1:
@@ -166,7 +166,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
 
 
 def _parts(scene):
-    """Names of all that can be left out, by kind and index among the terms or colliders; one term alone cannot."""
+    """Returns names of everything that can be left out, by (kind, index); the only term cannot."""
     terms, colliders = _names(scene.terms), _names(scene.colliders)
     found = {("term", k): name for k, name in enumerate(terms) if len(terms) > 1}
     for k, (collider, name) in enumerate(zip(scene.colliders, colliders, strict=True)):
@@ -177,14 +177,14 @@ def _parts(scene):
 
 
 def _names(declared):
-    """Labels of terms or colliders, numbered where several have one."""
+    """Returns the labels of terms or colliders, numbered if equal."""
     labels = [each.label for each in declared]
     counted = [(label, labels[:k].count(label) + 1, labels.count(label)) for k, label in enumerate(labels)]
     return [f"{label} {k} of {count}" if count > 1 else label for label, k, count in counted]
 
 
 def _without(scene, parts):
-    """The scene without these, each a kind and an index, see :func:`_parts`."""
+    """Returns the scene without some parts, see :func:`_parts`."""
     terms = [term for k, term in enumerate(scene.terms) if ("term", k) not in parts]
     colliders = [
         replace(collider, friction=0.0) if ("friction", k) in parts else collider
@@ -204,7 +204,7 @@ def _trial(kind, name, options, run, base, first, scene, size, tolerance, device
     if not found.status.ok:
         if kind not in _LEFT_OUT:
             return Trial(kind, name, np.nan, cost, None, found.status.message, finer)
-        # Such as a term that holds the cloth together: it matters, by more than can be said.
+        # Such as a term that holds the cloth together.
         return Trial(kind, name, np.inf, cost, True, found.status.message)
     if kind == "resolution":
         if not (len(scene.mesh.triangles) and len(options["changed"].mesh.triangles)):
@@ -217,7 +217,7 @@ def _trial(kind, name, options, run, base, first, scene, size, tolerance, device
 
 
 def _surface_change(one, first, other, second, device):
-    """RMS distance between two surfaces, from the vertices of each, over some of the frames [m]."""
+    """Returns the RMS distance [m] between two surfaces, from the vertices of each, over some frames."""
     frames = np.unique(np.linspace(0, len(one.points) - 1, _FRAMES).round().astype(int))
     squares = []
     for frame in frames.tolist():

@@ -1,4 +1,4 @@
-"""Axes of a map of stability, and what holds where a map has no axis."""
+"""Axes of maps of stability, and default values of axes that a map does not have."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Axis:
-    """One direction of a map.
+    """One axis of a map.
 
     Attributes:
-        label: What is written along it.
-        low, high: The range where none is given.
+        label: Its label.
+        low, high: Default range.
         whole: Whether its values are whole numbers.
-        logarithmic: Whether they are spaced by a factor.
+        logarithmic: Whether they are spaced logarithmically.
     """
 
     label: str
@@ -27,10 +27,10 @@ class Axis:
     logarithmic: bool = True
 
     def values(self, low, high, count):
-        """``count`` values from low to high, fewer where whole numbers coincide.
+        """Returns ``count`` values from low to high; fewer if whole numbers coincide.
 
         Raises:
-            ValueError: The ends are no range of this axis.
+            ValueError: The range is not allowed on this axis.
         """
         whole("count", count, 1)
         number("low", low, **({"above": 0.0} if self.logarithmic else {}))
@@ -51,10 +51,10 @@ AXES = {
     "mass-ratio": Axis("mass of the vertex furthest from the pins, times the scene's", 1e-2, 1e4),
     "compression": Axis("initial compression, 1 − l/L", 0.0, 0.9, logarithmic=False),
 }
-# What copies of one model differ in; a row along such an axis is one run.
+# Axes along which copies of one model can differ, so that a row is one run.
 VARIED = ("stiffness", "mass-ratio", "compression")
 OPTIONS = ("iterations", "relaxation", "weight")
-# Where the map has no axis of that name.
+# Values of axes that a map does not have.
 FIXED = {"dt": 1 / 60}
-# RMS distance to the reference over the size of the cloth, above which a run is inaccurate.
+# A run is inaccurate if its RMS distance to the reference, over the size of the cloth, exceeds this.
 ACCURACY = 0.01

@@ -1,4 +1,4 @@
-"""The bandwidth of a device by copying: the measure of all that is bound by memory."""
+"""The memory bandwidth of a device, measured by copying."""
 
 import time
 
@@ -6,15 +6,15 @@ import warp as wp
 
 from ..kernels.copy import copy_rows
 
-# Of an array [bytes]: beyond the caches of either kind of device.
+# Size of an array [bytes], larger than the caches.
 _BYTES = {"cpu": 1 << 28, "cuda": 1 << 30}
 _REPEATS = 7
 
 
 def measure(device="cpu"):
-    """Bytes that a copy from array to array moves a second, read and written, by Warp's copy and by a kernel.
+    """Measures the bandwidth of a copy from array to array, bytes read and written, by Warp's copy and by a kernel.
 
-    Each is the fastest of seven: what slows a copy down is no property of the device. The first is not counted.
+    Each is the fastest of seven, because delays are no property of the device. The first copy does not count.
 
     Args:
         device: A Warp device.
@@ -34,7 +34,7 @@ def measure(device="cpu"):
 
 
 def _least(way, device):
-    """The least time of some calls [s]."""
+    """Returns the shortest time of several calls [s], without the first."""
     times = []
     for _ in range(1 + _REPEATS):
         wp.synchronize_device(device)

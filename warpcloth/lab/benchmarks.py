@@ -1,4 +1,4 @@
-"""Benchmarks as data, and their rows: each in a fresh process, one after another."""
+"""Benchmarks as data, and their measurement: each row in a fresh process, one after another."""
 
 import time
 from dataclasses import dataclass, replace
@@ -19,15 +19,15 @@ class SolverBenchmark:
     """A solver on a scene of several sizes.
 
     Attributes:
-        scene: Of any size.
-        setup: Of a limited solver without a step, the fewest stable substeps of each size.
-        sizes: Resolutions of the scene, see :func:`warpcloth.lab.cells.refined`; without any the scene as it is.
+        scene: The scene, of any size.
+        setup: The solver; a limited solver without a step takes the fewest stable substeps of each size.
+        sizes: Resolutions of the scene, see :func:`warpcloth.lab.cells.refined`; if empty, the scene as it is.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
-        frames: To time at most.
-        copies: How many of the scene run at once.
-        threads: That share the steps, on the CPU.
-        variants: Parameters of the scene by name, one dictionary each, beside which there are no sizes.
+        frames: Maximum number of frames to time.
+        copies: Number of copies of the scene in a batch.
+        threads: Number of CPU threads.
+        variants: Parameters of the scene by name, one dictionary for each variant, in place of sizes.
     """
 
     scene: SceneRef
@@ -41,17 +41,17 @@ class SolverBenchmark:
     variants: tuple = ()
 
     def scenes(self):
-        """The scene of each size or variant.
+        """Returns the scene of each size or variant.
 
         Raises:
-            ValueError: It has no resolution.
+            ValueError: The scene has no resolution.
         """
         if self.variants:
             return [replace(self.scene, parameters=self.scene.parameters | each) for each in self.variants]
         return [refined(self.scene, size) for size in self.sizes] or [self.scene]
 
     def setup_of(self, scene):
-        """The :class:`Setup` for one of the scenes."""
+        """Returns the :class:`Setup` for one of the scenes."""
         solver = self.setup.solver
         if not SOLVERS[solver].limited or {"dt", "substeps"} & set(self.setup.options):
             return self.setup
@@ -60,7 +60,7 @@ class SolverBenchmark:
 
 
 def standard(**given):
-    """Returns every solver on ``hanging`` of growing size, and what else their records measure.
+    """Returns benchmarks of every solver on ``hanging`` of growing size, and the others of their records.
 
     Args:
         given: Further fields of each :class:`SolverBenchmark`.
@@ -71,7 +71,7 @@ def standard(**given):
     return [SolverBenchmark(SceneRef(one.scene), Setup(name, one.options), getattr(one, kind), **given) for name, one in listed]
 
 
-# Of the sheet `resting`: one that touches, and one so far above that it falls for longer than is timed.
+# Gaps of the sheet `resting` [m]: one that touches, and one so high that it falls for longer than is timed.
 _GAPS = (0.9e-3, 100.0)
 _SHAPES = ("plane", "sphere", "capsule", "box", "mesh")
 _TRIANGLES = (1250, 5000, 20000, 80000)
@@ -79,7 +79,7 @@ _TOUCHING = {"explicit": {}, "newton": {"substeps": 4}, "xpbd": {"substeps": 4},
 
 
 def contacts(**given):
-    """Returns what contact costs on the scene ``resting``: shapes of colliders, near and far, and meshes of growing size.
+    """Returns benchmarks of contact on the scene ``resting``: shapes of colliders, near and far, and meshes of growing size.
 
     Args:
         given: Further fields of each :class:`SolverBenchmark`.
@@ -92,7 +92,7 @@ def contacts(**given):
     return [SolverBenchmark(SceneRef("resting"), setup, variants=variants, **given) for setup, variants in setups]
 
 
-# Of `folded_sheet`: solvers with their sizes, flat and folded in two.
+# Solvers and sizes of `folded_sheet`, flat and folded in two.
 _FOLDED = (
     ("explicit", {}, (32, 64, 128), (32, 64)),
     ("newton", {"substeps": 1}, (32, 64, 128), (32, 64)),
@@ -102,7 +102,7 @@ _FOLDED = (
 
 
 def self_contacts(**given):
-    """Returns what self-contact costs on the scene ``folded_sheet``: a sheet that falls flat, and one that is folded in two.
+    """Returns benchmarks of self-contact on the scene ``folded_sheet``: a sheet that falls flat, and one folded in two.
 
     Args:
         given: Further fields of each :class:`SolverBenchmark`.
@@ -115,18 +115,18 @@ def self_contacts(**given):
 
 
 class Run:
-    """The rows of benchmarks, which it has as far as it has come: whoever interrupts it keeps them.
+    """Measures the rows of benchmarks; after an interrupt it has the rows so far.
 
     Args:
-        benchmarks: :class:`SolverBenchmark`\\s, of one device.
+        benchmarks: :class:`SolverBenchmark`\\s, all on one device.
 
     Attributes:
-        total: How many rows there will be.
-        rows: Those that are measured: what :func:`warpcloth.lab.timing.measure` returns, with ``scene``, ``parameters``,
+        total: Total number of rows.
+        rows: The measured rows: the result of :func:`warpcloth.lab.timing.measure`, with ``scene``, ``parameters``,
             ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``threads``, ``benchmark`` (its index),
-            ``share`` (``bytes_per_s`` over the bandwidth) and, of the first of each benchmark, ``cold_start_s``, the start with
-            no kernel in any cache.
-        bandwidth: What :func:`warpcloth.lab.bandwidth.measure` returns.
+            ``share`` (``bytes_per_s`` over the bandwidth) and, in the first row of each benchmark, ``cold_start_s``, the time
+            to start without compiled kernels.
+        bandwidth: The result of :func:`warpcloth.lab.bandwidth.measure`.
     """
 
     def __init__(self, benchmarks):
@@ -136,11 +136,11 @@ class Run:
     def measure(self, progress=lambda done, total: None):
         """Measures all rows; ``progress`` is called with (rows, total) before the first and after each."""
         progress(0, self.total)
-        initialise_warp()  # of this process, whose cache stays as it is
+        initialise_warp()  # before the cache of child processes is set below
         device = self.benchmarks[0].device
         self.bandwidth = _alone(task(bandwidth.measure, device=device))
         for index, benchmark in enumerate(self.benchmarks):
-            # An empty folder for the kernels that are compiled meanwhile.
+            # An empty cache of kernels.
             with TemporaryDirectory(prefix="warpcloth-kernels-") as folder, environment({"WARP_CACHE_PATH": folder}):
                 for i, scene in enumerate(benchmark.scenes()):
                     row = self._row(benchmark, scene, cold=i == 0, compiles=i == 0 or bool(benchmark.variants))
@@ -163,6 +163,6 @@ class Run:
 
 
 def _alone(asked):
-    """The result of a task in a fresh process."""
+    """Returns the result of a task in a fresh process."""
     ((_, result),) = sweep([asked], workers=1)
     return result

@@ -1,4 +1,4 @@
-"""Runs measurements side by side, keeps what is finished, and goes on from there."""
+"""Runs measurements in parallel, stores results, and continues after an interruption."""
 
 import contextlib
 import json
@@ -15,20 +15,21 @@ from .measurements import run
 from .worker import begin
 
 _HEAD = b'{"key": "'  # of a line of results
-# One thread a process: more would take the cores of the others, and Warp's CPU kernels use one as it is.
+# One thread per process, because more would take cores from the others, and Warp's CPU kernels use one.
 _ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
 
 
 class Store:
-    """Results by key in a file, a line of JSON each, that several processes may add to at a time.
+    """Results by key in a file with a line of JSON for each, to which several processes may append at a time.
 
-    A line that was cut, by a crash or a full disk, is left out, and its result is measured again; the file is never rewritten.
+    A truncated line, after a crash or on a full disk, is ignored, and its result is measured again. The file is never
+    rewritten.
 
     Args:
-        path: The file, made with its folder where there is none; None keeps results in memory.
+        path: The file, which is made with its folder if it does not exist; None keeps results in memory.
 
     Raises:
-        ValueError: The path is no such file.
+        ValueError: The path is not such a file.
     """
 
     def __init__(self, path=None):
@@ -40,7 +41,7 @@ class Store:
             return
         if not self.path.is_file():
             raise ValueError(f"{self.path}: is no file; it must be one of results, or free")
-        # Text of JSON has no line ends but these; zeros are what a file system may leave of a line after a crash.
+        # JSON text has no other line ends. After a crash, a file system may leave zeros in place of a line.
         for number, line in enumerate(self.path.read_bytes().split(b"\n"), 1):
             line = line.strip(b"\0\r ")
             try:
@@ -60,11 +61,11 @@ class Store:
         return len(self._results)
 
     def machine(self, task):
-        """The name of the machine that measured it."""
+        """Returns the name of the machine that measured a task."""
         return self._machines[task.key]
 
     def keep(self, task, result, machine):
-        """Adds a result and the machine that it is of, on the disk before this returns."""
+        """Adds a result and the name of its machine; they are on the disk when this returns."""
         self._results[task.key], self._machines[task.key] = result, machine
         if self.path is None:
             return
@@ -74,8 +75,8 @@ class Store:
             with self.path.open("ab+", buffering=0) as file:
                 if file.seek(0, os.SEEK_END):
                     file.seek(-1, os.SEEK_END)
-                    text = text if file.read(1) == b"\n" else b"\n" + text  # what was cut is ended first
-                while text:  # one write, which no other process comes between, unless the disk is full
+                    text = text if file.read(1) == b"\n" else b"\n" + text  # ends a truncated line
+                while text:  # one atomic write, unless the disk is full
                     text = text[file.write(text) :]
                 os.fsync(file.fileno())
         except OSError as error:
@@ -83,19 +84,20 @@ class Store:
 
 
 def sweep(tasks, executor=None, store=None, progress=None, workers=None):
-    """Measures all tasks that the store does not have, and gives (task, result) as they are finished.
+    """Measures all tasks that are not in the store, and yields (task, result) in order of completion.
 
     Args:
         tasks: :class:`warpcloth.lab.measurements.Task`\\s.
-        executor: Any `concurrent.futures.Executor`, such as :func:`warpcloth.lab.cluster.connect` gives; without one,
-            processes of this machine. As with all of Python's, a script that starts them needs ``if __name__ == "__main__":``.
-            Threads of one process measure one after another.
+        executor: Any `concurrent.futures.Executor`, such as that of :func:`warpcloth.lab.cluster.connect`; by default,
+            processes on this machine, for which a script needs ``if __name__ == "__main__":``. Threads of one process measure
+            one after another.
         store: A :class:`Store`; without one nothing is kept.
-        progress: Function called with (finished, tasks, seconds left or None) at first and after each; or None.
-        workers: Processes side by side, where there is no executor: as many as cores. Times are of a machine that is as busy.
+        progress: Function called with (finished, tasks, seconds left or None) first and after each; or None.
+        workers: Number of parallel processes without an executor, by default that of cores. Measured times include the load
+            of the others.
 
     Raises:
-        Exception: What a task raises; those that are finished are kept, those that have not begun are dropped.
+        Exception: The error of a task. Finished results are kept, tasks that have not begun are dropped.
         ChildProcessError: A process was killed.
     """
     tasks = list(tasks)
@@ -132,15 +134,15 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
         finally:
             for future, task in futures.items():
                 if not future.cancel() and future.done() and future.exception() is None and task not in store:
-                    store.keep(task, *future.result())  # finished, and not looked at
+                    store.keep(task, *future.result())  # finished, but not yielded yet
 
 
 def collect(tasks, name, **run):
     """Measures all tasks and returns the (result, machine) of each in their order; ``run`` is that of :func:`sweep`.
 
     Args:
-        tasks: As of :func:`sweep`.
-        name: Of the :func:`kept_store` where ``run`` has no ``store``.
+        tasks: As for :func:`sweep`.
+        name: Name of the :func:`kept_store`, if ``run`` has no ``store``.
         **run: Arguments of :func:`sweep`.
     """
     if "store" not in run:
@@ -151,7 +153,7 @@ def collect(tasks, name, **run):
 
 @contextlib.contextmanager
 def environment(values):
-    """Sets variables of the environment meanwhile, which processes read when they start."""
+    """Sets environment variables inside the block, for processes that start there."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -166,7 +168,7 @@ def environment(values):
 
 @contextlib.contextmanager
 def _processes(workers):
-    """Fresh processes, each with one thread for arithmetic."""
+    """Starts fresh processes, each with one thread for arithmetic."""
     context = multiprocessing.get_context("spawn")
     with environment(_ONE_THREAD), ProcessPoolExecutor(workers, context, initializer=begin, initargs=(_own(),)) as pool:
         try:
@@ -177,17 +179,17 @@ def _processes(workers):
 
 
 def _own():
-    """Returns the extensions that a process must load; those of a script it has by running that again."""
+    """Returns the extensions that a process must load; it runs the main script again, and so has those of that."""
     script = getattr(sys.modules["__main__"], "__file__", None)
     return [name for name in extensions() if name != script]
 
 
 def kept_store(name, executor=None):
-    """The :class:`Store` of a chart in the folder for caches; of a cluster another one, for its times are of other machines."""
+    """Returns the :class:`Store` of a chart in the cache folder; another one for a cluster, because its times differ."""
     return Store(cache_folder() / getattr(executor, "folder", "") / f"{name}.jsonl")
 
 
 def cache_folder():
-    """Where results and reference solutions are kept: ``WARPCLOTH_CACHE``, else warpcloth in the user's folder for caches."""
+    """Returns the folder of results and reference solutions: ``WARPCLOTH_CACHE``, else warpcloth in the user's cache folder."""
     named = os.environ.get("WARPCLOTH_CACHE")
     return Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpcloth"

@@ -1,4 +1,4 @@
-"""Cells of a map of stability: what a value of each axis makes of a scene and of a solver."""
+"""Cells of maps of stability: applies values of axes to a scene and a solver."""
 
 import math
 from dataclasses import fields, replace
@@ -10,22 +10,23 @@ from ..run.scene_files import find_source
 from .axes import FIXED, OPTIONS, SEED, VARIED
 from .measurements import Setup
 
-# Approximate number of frames that are compared; a frame has as many steps as that needs.
+# Approximate number of frames to compare; the steps per frame follow from it.
 FRAMES = 64
-# Noise of the start, over the median edge: what is unstable grows out of it, a hundredfold in energy while springs are linear.
+# Noise of the initial positions, relative to the median edge, from which instabilities grow, a hundredfold in energy while
+# springs are linear.
 NOISE = 1e-6
-# Parameters of scenes that say how fine they are.
+# Names of parameters of scenes that set their resolution.
 _RESOLUTIONS = ("n", "links", "elements")
 
 
 def scene_at(ref, values, steps, duration=None):
-    """Returns the scene of a cell, with frames of one step or more and noise at the start.
+    """Returns the scene of a cell, with frames of one step or more and noise in the initial positions.
 
     Args:
         ref: :class:`warpcloth.lab.measurements.SceneRef`.
         values: Values by name of the axis, ``dt`` among them.
-        steps: Least number of steps, rounded up to whole frames.
-        duration: Least time of motion [s], which has about :data:`FRAMES` frames; by default that of ``steps``.
+        steps: Minimum number of steps, rounded up to whole frames.
+        duration: Minimum time of motion [s], with about :data:`FRAMES` frames; by default that of ``steps``.
 
     Raises:
         ValueError: The scene cannot have such a value.
@@ -59,10 +60,10 @@ def steps_in(duration, dt):
 
 
 def refined(ref, value):
-    """The :class:`SceneRef` with a resolution.
+    """Returns the :class:`SceneRef` with another resolution.
 
     Raises:
-        ValueError: The scene has no parameter for that.
+        ValueError: The scene has no parameter for the resolution.
     """
 
     known = find_source(ref.name).parameters
@@ -73,11 +74,11 @@ def refined(ref, value):
 
 
 def applied(scene, name, value):
-    """The scene with a value of one of :data:`VARIED`."""
+    """Returns the scene with a value of one of :data:`VARIED`."""
     if name == "stiffness":
         return replace(scene, terms=[replace(term, stiffness=value * np.asarray(term.stiffness)) for term in scene.terms])
     if name == "compression":
-        # About the middle of the pins, so that a cloth that hangs stays where it is held.
+        # About the middle of the pins, so that a hanging cloth stays at its pins.
         held = scene.positions[scene.pins.vertices] if len(scene.pins.vertices) else scene.positions
         middle = held.mean(axis=0)
         return replace(scene, positions=middle + (1.0 - value) * (scene.positions - middle))
@@ -87,7 +88,7 @@ def applied(scene, name, value):
 
 
 def vary(scene, name, values):
-    """``vary`` of a model whose copies differ in one of :data:`VARIED`, from the scene of :func:`scene_at` without it."""
+    """Returns the ``vary`` of a model whose copies differ in one of :data:`VARIED`, from the scene of :func:`scene_at`."""
     each = [applied(scene, name, value) for value in values]
     if name == "stiffness":
         stiffness = [[np.asarray(term.stiffness) for term in one.terms] for one in each]
@@ -101,16 +102,16 @@ def vary(scene, name, values):
 
 
 def together(scene, name):
-    """Whether copies of one model can differ in it: terms of one name cannot be told apart."""
+    """Returns whether copies of one model can differ in it; ``vary`` cannot tell apart terms of one name."""
     labels = [term.label for term in scene.terms]
     return name in VARIED and (name != "stiffness" or len(set(labels)) == len(labels))
 
 
 def record_at(setup, values):
-    """The options record of a cell.
+    """Returns the record of the solver of a cell.
 
     Raises:
-        ValueError: The solver has no option of that name, or a value breaks its rule.
+        ValueError: The solver has no such option, or a value is not allowed.
     """
     record = Setup(setup.solver, {**setup.options, "dt": values.get("dt", FIXED["dt"])}).record()
     known = {field.name for field in fields(record)}
@@ -123,7 +124,7 @@ def record_at(setup, values):
 
 
 def _furthest(scene):
-    """The vertex furthest from the pins, or without pins from the middle."""
+    """Returns the vertex furthest from the pins, or without pins from the middle."""
     points = scene.mesh.points
     pins = points[scene.pins.vertices] if len(scene.pins.vertices) else points.mean(axis=0)[None]
     return int(np.linalg.norm(points[:, None] - pins, axis=-1).min(axis=1).argmax())

@@ -11,24 +11,24 @@ from .measurements import Setup, task
 from .reference import reference
 from .setups import setups_of_runs
 
-# Rungs that each ladder goes on with above its last, each with twice the substeps.
+# Number of rungs by which each ladder is extended, each with twice the substeps.
 _MORE = 3
-# The reference is to be better than the tolerance by so much.
+# The reference must be more accurate than the tolerance by this factor.
 _FINER = 5.0
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A setup and what was measured of it.
+    """A setup and its measurements.
 
     Attributes:
         setup: The :class:`warpcloth.lab.measurements.Setup`.
-        error: Of the trajectory, a share of the size of the cloth; None where there is none.
-        milliseconds: Median of a frame [ms]; None where there is none.
-        spread: Quartiles of a frame [ms], (low, high), or None.
+        error: Error of the trajectory, relative to the size of the cloth, or None.
+        milliseconds: Median time of a frame [ms], or None.
+        spread: Quartiles of the time of a frame [ms], (low, high), or None.
         reason: Why there is no error, or "".
-        machine: What measured it, in few words.
-        final: Whether that holds for finer steps too: it took too long, or its method is refused.
+        machine: The machine that measured it, in a few words.
+        final: Whether finer steps would fail too: it took too long, or its method is refused.
     """
 
     setup: Setup
@@ -45,10 +45,10 @@ class Choice:
     """The result of :func:`pick`.
 
     Attributes:
-        chosen: The :class:`Measured`, or None where nothing will do.
-        meets: Whether it meets the tolerance and the budget, those that were given.
-        rivals: Those that are as good but for the spread of the times, the best first.
-        certainty: How sure that is, in a sentence.
+        chosen: The chosen :class:`Measured`, or None.
+        meets: Whether it meets the tolerance and the budget that were given.
+        rivals: Others that are as good within the spread of times, the best first.
+        certainty: A sentence about the certainty of the choice.
     """
 
     chosen: Measured | None
@@ -60,20 +60,20 @@ class Choice:
 def pick(measurements, tolerance=None, budget=None, floor=0.0):
     """Chooses among measurements.
 
-    With a tolerance the cheapest that meets it, and within a budget, if there is one too; without one that does, or with a
-    budget alone, the most accurate within the budget; of a tolerance alone that nothing meets, the most accurate.
+    With a tolerance, it chooses the cheapest setup that meets it, and the budget, if there is one. If nothing does, or with a
+    budget alone, it chooses the most accurate setup within the budget, if there is one.
 
     Args:
         measurements: :class:`Measured`\\s.
-        tolerance: Largest error, a share of the size of the cloth; or None.
-        budget: Longest frame [ms], or None.
-        floor: Error of the reference itself, which each error may be off by.
+        tolerance: Largest error allowed, relative to the size of the cloth; or None.
+        budget: Longest time of a frame allowed [ms], or None.
+        floor: Error of the reference, by which each error may be wrong.
 
     Returns:
         :class:`Choice`.
 
     Raises:
-        ValueError: Neither tolerance nor budget, or one of them is no number above 0.
+        ValueError: Neither tolerance nor budget is given, or one of them is not a number above 0.
     """
     if tolerance is None and budget is None:
         raise ValueError("tolerance, budget: give one of them, or both")
@@ -101,17 +101,17 @@ def pick(measurements, tolerance=None, budget=None, floor=0.0):
 
 
 def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=None):
-    """Measures as few setups as :func:`pick` needs: each ladder from its cheapest rung up, all ladders side by side.
+    """Measures only the setups that :func:`pick` needs: each ladder from its cheapest rung up, all ladders in parallel.
 
-    A ladder ends where it meets the tolerance, and where its rungs become dearer than the budget or than what meets it already.
+    A ladder ends when a rung meets the tolerance, exceeds the budget, or costs more than a setup that meets the tolerance.
 
     Args:
-        ladders: Lists of :class:`warpcloth.lab.measurements.Setup`, each from cheap and coarse to dear and accurate.
-        measure: Function from a list of setups to a list of :class:`Measured` in its order.
-        tolerance: As of :func:`pick`, and so the next two.
-        budget: As there.
-        floor: As there.
-        progress: Function called with all that is measured after each round, or None.
+        ladders: Lists of :class:`warpcloth.lab.measurements.Setup`, each from cheap and coarse to expensive and accurate.
+        measure: Function that returns a list of :class:`Measured` for a list of setups.
+        tolerance: As for :func:`pick`.
+        budget: As for :func:`pick`.
+        floor: As for :func:`pick`.
+        progress: Function called with all measurements so far after each round, or None.
 
     Returns:
         tuple: The :class:`Choice` and the list of all :class:`Measured`.
@@ -129,28 +129,28 @@ def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=Non
 
 
 def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device="cpu", dtype="float32", limit=60.0, **run):
-    """Measures setups of a scene until the choice among them is made, for this machine or, with an executor, for its workers.
+    """Measures setups of a scene until the choice is clear, on this machine or, with an executor, on its workers.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
-        tolerance: As of :func:`pick`.
-        budget: As there.
-        solvers: Names of solvers; all where not given.
-        frames: Frames to run, those of the scene where not given.
+        tolerance: As for :func:`pick`.
+        budget: As for :func:`pick`.
+        solvers: Names of solvers, by default all.
+        frames: Number of frames, by default those of the scene.
         device: A Warp device.
-        dtype: "float32" or "float64", of the runs.
-        limit: Seconds that a run may take.
-        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; without a store the one
-            in the folder for caches.
+        dtype: Precision of the runs, "float32" or "float64".
+        limit: Time limit of each run [s].
+        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; by default with the
+            store in the cache folder.
 
     Returns:
         tuple: :class:`Choice`, the list of :class:`Measured`, and the :class:`warpcloth.lab.reference.Reference`.
 
     Raises:
-        ValueError: As :func:`pick`, or a name is no solver's.
+        ValueError: As for :func:`pick`, or there is no solver of a name.
     """
-    pick([], tolerance, budget)  # refuses wrong ones before anything is measured
-    # One at a time: side by side they would slow one another.
+    pick([], tolerance, budget)  # checks the arguments before anything is measured
+    # One at a time, because parallel runs would slow one another.
     run = {"workers": 1} | run
     run = run if "store" in run else {"store": kept_store("trajectories", run.get("executor")), **run}
     rungs = ladders(setups_of_runs(scene, solvers, device, dtype))
@@ -169,7 +169,7 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
 
 
 def ladders(setups):
-    """Setups by what they have in common but substeps and iterations, from cheap to dear, and some beyond the last.
+    """Groups setups that differ only in substeps and iterations, from cheap to expensive, and extends each group.
 
     Args:
         setups: A list of :class:`warpcloth.lab.measurements.Setup`.
@@ -188,7 +188,7 @@ def ladders(setups):
 
 def _measured(setup, result, machine):
     spread = None if result["spread"] is None else tuple(result["spread"])
-    # Of a limited solver alone a finer step may be taken where one is refused.
+    # Only a limited solver may accept a finer step after it refused one.
     final = result["status"] == "slow" or (result["status"] == "refused" and not SOLVERS[setup.solver].limited)
     return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final)
 
@@ -203,10 +203,10 @@ def as_json(choice, found, exact):
 
 
 def _ends(last, tolerance, floor, most):
-    """Whether rungs above this one cannot be chosen."""
+    """Returns whether rungs above this one cannot be chosen."""
     if last.final or (last.milliseconds is not None and last.milliseconds > most):
         return True
-    return _meets(last, tolerance, floor)  # of one that diverged a finer one may do
+    return _meets(last, tolerance, floor)  # after divergence, a finer step may work
 
 
 def _meets(each, tolerance, floor):
@@ -214,7 +214,7 @@ def _meets(each, tolerance, floor):
 
 
 def _as_cheap(chosen, accurate):
-    """Others whose times overlap those of the chosen one, by their medians."""
+    """Returns others whose times overlap those of the chosen one, sorted by median."""
     if chosen.spread is None:
         return []
     others = [each for each in accurate if each is not chosen and each.spread and each.spread[0] <= chosen.spread[1]]
@@ -231,7 +231,7 @@ def _certainty(chosen, rivals, tolerance, floor):
 
 
 def percent(share):
-    """A share of the whole as text, with three digits however small it is."""
+    """Formats a fraction as a percentage with three significant digits."""
     return f"{100.0 * share:.3g}%"
 
 

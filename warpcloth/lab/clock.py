@@ -1,19 +1,19 @@
-"""An end to runs that take too long."""
+"""A time limit for runs."""
 
 import time
 
 
 class TooSlow(Exception):
-    """The time is up."""
+    """Raised when the time limit is exceeded."""
 
 
 class Clock:
-    """Ends a run once ``limit`` seconds have passed since its start was kept: what is compiled before does not count.
+    """Ends a run ``limit`` seconds after frame 0 is stored, so that compilation does not count.
 
-    To be called as ``progress`` of :func:`warpcloth.simulate`.
+    It is passed as ``progress`` to :func:`warpcloth.simulate`.
 
     Attributes:
-        frames: What each frame took [s].
+        frames: Time of each frame [s].
     """
 
     def __init__(self, limit, progress=None):

@@ -1,4 +1,4 @@
-"""Measurements on a Dask cluster, whose machines need this package, but no folder that they share."""
+"""Measurements on a Dask cluster, whose machines need this package but no shared folder."""
 
 import asyncio
 import contextlib
@@ -23,30 +23,30 @@ from ..run.scene_files import find_source
 from ..usd import flattened
 from .machine import processor
 
-# How long a scheduler and the first of its workers may take to answer [s].
+# Time in which a scheduler and its first worker must answer [s].
 _ANSWER = 5.0
 
 
 class Cluster(Executor):
-    """Runs tasks on the workers of a Dask client; the files that they name, a reference or a scene, are sent along, once each.
+    """Runs tasks on the workers of a Dask client, and sends the files that they name, references or scenes, once each.
 
     Args:
         client: A `distributed.Client`.
     """
 
-    folder = "dask"  # of its results in the one for caches
+    folder = "dask"  # folder of its results in the cache folder
 
     def __init__(self, client):
         self._client, self._sent = client, {}
-        # pure: two equal measurements are two.
+        # Not pure, so that equal measurements run twice.
         self._executor = client.get_executor(pure=False)
 
     def submit(self, function, task, *arguments):
-        """The future of ``function(task, *arguments)``."""
+        """Returns the future of ``function(task, *arguments)``."""
         files = {name: self._send(path) for name, path in files_of(task).items()}
         modules = {name: self._send(Path(name)) if name.endswith(".py") else None for name in extensions()}
 
-        def measure(packed, files, modules):  # by value, and all else packed: so the scheduler needs none of this package
+        def measure(packed, files, modules):  # pickled by value, so that the scheduler does not need this package
             from warpcloth.lab.cluster import unpack
 
             return unpack(packed, files, modules)
@@ -54,7 +54,7 @@ class Cluster(Executor):
         return self._executor.submit(measure, pickle.dumps((function, task, arguments)), files, modules)
 
     def _send(self, path):
-        """Name and content of a file, which each worker gets once."""
+        """Returns the name and content of a file, which each worker receives once."""
         if path not in self._sent:
             if path.suffix in STAGE_ENDINGS:
                 name, content = f"{path.stem}.usda", flattened(path).encode()
@@ -66,25 +66,25 @@ class Cluster(Executor):
 
 @contextlib.contextmanager
 def connect(address):
-    """The :class:`Cluster` at an address, as ``executor`` of a sweep, once its workers are found to be fit.
+    """Yields the :class:`Cluster` at an address, for ``executor`` of a sweep, after checking its workers.
 
     Args:
-        address: Of a scheduler, such as tcp://host:8786, or the file in which one keeps it.
+        address: Address of a scheduler, such as tcp://host:8786, or its scheduler file.
 
     Warns:
-        UserWarning: If processors differ, so that times do as well, or a worker has threads that will have nothing to do.
+        UserWarning: Processors differ, and so will times; or a worker has threads that will be idle.
 
     Raises:
         ImportError: Dask is not installed.
-        ConnectionError: Nothing answers there in time, there is no worker, or the cluster goes away amid measurements.
-        ValueError: The address is none, or a worker is not fit: it has no warpcloth or another one, or computes with threads.
+        ConnectionError: Nothing answers in time, there is no worker, or the cluster goes away during measurements.
+        ValueError: The address is invalid, or a worker has no warpcloth, another version of it, or computes with threads.
     """
     try:
         from distributed import Client, KilledWorker
     except ImportError:
         raise ImportError("a Dask cluster needs dask and distributed: pip install -e '.[dask]' in the checkout") from None
     scheduler = _scheduler(address)
-    log = logging.getLogger("distributed.client")  # tells with tracebacks what is raised below
+    log = logging.getLogger("distributed.client")  # logs tracebacks of errors that are raised below
     level = log.level
     log.setLevel(logging.CRITICAL)
     try:
@@ -100,7 +100,7 @@ def connect(address):
 
 
 def _scheduler(address):
-    """The address of a scheduler that answers; see :func:`connect`. A `Client` that fails takes longer and says less."""
+    """Returns the address of a scheduler that answers; see :func:`connect`. A `Client` would fail later and say less."""
     if os.path.isfile(address):
         try:
             address = json.loads(Path(address).read_text(encoding="utf-8"))["address"]
@@ -115,12 +115,12 @@ def _scheduler(address):
             return await asyncio.wait_for(scheduler.identity(), _ANSWER)
 
     try:
-        with ThreadPoolExecutor(1) as thread:  # in a notebook this one has a loop
+        with ThreadPoolExecutor(1) as thread:  # in a notebook, this thread has an event loop already
             found = thread.submit(asyncio.run, identity()).result()
     except (OSError, asyncio.TimeoutError):
         raise ConnectionError(f"no Dask scheduler answers at {address} within {_ANSWER:g} s") from None
     except Exception as error:
-        why = f": {error}" if isinstance(error, ValueError) else ""  # others are of what answers, and no word of Dask
+        why = f": {error}" if isinstance(error, ValueError) else ""  # other errors come from a server that is not Dask
         raise ValueError(f"{address!r} is no address of a Dask scheduler, such as tcp://host:8786{why}") from None
     if found.get("type") != "Scheduler":
         raise ValueError(f"{address} is the address of a Dask {found.get('type')}; give that of the scheduler")
@@ -128,7 +128,7 @@ def _scheduler(address):
 
 
 def _check(client, address):
-    """Finds out whether the workers are fit; see :func:`connect`."""
+    """Checks the workers; see :func:`connect`."""
     with contextlib.suppress(asyncio.TimeoutError):  # the built-in one since Python 3.11
         client.wait_for_workers(1, timeout=_ANSWER)
     found = client.run(_fitness, on_error="return")
@@ -161,7 +161,7 @@ def _check(client, address):
 
 
 def _fitness(dask_worker):
-    """In a worker: what it must be checked for. Its log need not have all that Warp loads."""
+    """Runs in a worker, and returns the facts to check."""
     initialise_warp()
     return {
         "source": package_digest(),
@@ -172,7 +172,7 @@ def _fitness(dask_worker):
 
 
 def files_of(task):
-    """Files that the arguments of a task name and that do not come with the package, by the name that stands there."""
+    """Returns the files that the arguments of a task name, and that are not part of the package, by name."""
     scene, reference = task.arguments.get("scene"), task.arguments.get("reference")
     found = {}
     if scene:
@@ -186,7 +186,7 @@ def files_of(task):
 
 
 def unpack(packed, files, modules):
-    """In a worker: calls what :meth:`Cluster.submit` packed, on files of its own and with the extensions of who asks."""
+    """Runs in a worker, and calls what :meth:`Cluster.submit` packed, with local files and the extensions of the client."""
     load_only(name if sent is None else _kept(*sent) for name, sent in modules.items())
     function, task, arguments = pickle.loads(packed)
     here = {name: _kept(*sent) for name, sent in files.items()}
@@ -194,7 +194,7 @@ def unpack(packed, files, modules):
 
 
 def _kept(file, content):
-    """Returns the path of a file of this worker with some content."""
+    """Returns the path of a local file of this worker with the given content."""
     from distributed import get_worker
 
     path = Path(get_worker().local_directory) / "warpcloth" / hashlib.sha256(content).hexdigest()[:24] / file
@@ -207,7 +207,7 @@ def _kept(file, content):
 
 
 def _moved(arguments, here):
-    """Arguments with other names of files."""
+    """Returns arguments with the names of files replaced by local paths."""
     moved = dict(arguments)
     if "scene" in moved:
         moved["scene"] = moved["scene"] | {"name": here.get(moved["scene"]["name"], moved["scene"]["name"])}

@@ -1,4 +1,4 @@
-"""How fast methods minimise one step of implicit Euler: the gap of its objective against iterations and against time."""
+"""Measures how fast methods minimise one step of implicit Euler: the gap of the objective over iterations and time."""
 
 import json
 import math
@@ -18,32 +18,33 @@ from ..run.simulate import simulate
 from ..solvers import Newton
 from .measurements import SceneRef, Setup
 
-# Iterations that are tried, about √2 apart.
+# Numbers of iterations to try, about a factor √2 apart.
 LADDER = sorted({k * 2**i for k in (2, 3) for i in range(17)} | {1})
-# A method ends where eight times the iterations, or six rungs, bring nothing; but it may rise before it falls.
+# A method ends if six rungs, or eight times the iterations, do not help. But the gap may rise before it falls, so that it gets
+# at least ENOUGH iterations.
 IDLE, ENOUGH = 6, 512
-LOST = 1e6  # a gap beyond which it has diverged
-SEED = 0  # of the changes by a rounding that say how well the minimum is known
+LOST = 1e6  # gap beyond which a method has diverged
+SEED = 0  # of the random roundings that give the accuracy of the minimum
 
 
 class OneStep:
     """A step of implicit Euler from a state of a scene in motion, and φ(d) = 1/(2h²)‖d‖²_M + U(x̃ + d), d = x − x̃, in float64.
 
-    Newton leads to the state, which is rounded to float32 so that all precisions begin at the same positions, and from there to
-    the minimiser.
+    The state, which Newton computes, is rounded to float32, so that all precisions start at the same positions. Newton also
+    computes the minimiser.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
-        frame: Frames before the state.
-        substeps: Steps a frame.
+        frame: Number of frames before the state.
+        substeps: Number of steps per frame.
         device: A Warp device.
 
     Attributes:
         h: Step [s].
-        base: x̃ (n) vectors on the device [m].
-        best: d where φ is least (n, 3) [m].
-        lowest, first: φ there and at d = 0 [J].
-        floor: What rounding makes of (φ − lowest)/(first − lowest).
+        base: x̃ (n,) vectors on the device [m].
+        best: The minimiser d (n, 3) [m].
+        lowest, first: φ at the minimiser and at d = 0 [J].
+        floor: Rounding of the gap (φ − lowest)/(first − lowest).
 
     Raises:
         ValueError: Newton does not take the scene, or does not reach the state or the minimiser.
@@ -72,7 +73,7 @@ class OneStep:
         self.base = model.array(stepper.state.x.numpy() - self.best, model.vec3)
         self._energy_of = Energy(self.model, Sums(self.model), corrected=True)
         self.lowest, self.first = self.objective(self.best), self.objective(np.zeros_like(self.best))
-        # The rounding of the state strains the cloth by itself.
+        # The rounding of the state alone strains the cloth.
         if not np.abs(self.best).max() > 10.0 * np.finfo(np.float32).eps * np.abs(x).max():
             raise ValueError(f"the step after frame {frame} of {scene.name} has nothing to minimise; take another frame")
         self.floor = self._rounding() / (self.first - self.lowest)
@@ -89,38 +90,38 @@ class OneStep:
             stepper.colliders.steps.fill_(self._count)
 
     def correction(self, stepper):
-        """d (n, 3) [m] of a step from the state: x − x̃ = h(v − v₀ − hg), g with loads, which float32 resolves better than x."""
+        """Returns d (n, 3) [m] of a step from the state: x − x̃ = h(v − v₀ − hg), g with loads, to keep digits in float32."""
         change = stepper.state.v.numpy() - self._start[1] - self.h * self.model.free_gravity[0].numpy()
         return np.where(self.free[:, None], self.h * change, 0.0)
 
     @in_turn
     def objective(self, d):
-        """φ(d) [J]."""
+        """Returns φ(d) [J]."""
         model = self.model
         energy = wp.zeros(1, dtype=wp.float64, device=model.device)
         self._energy_of.add(self.base, energy, model.array(d, model.vec3))
         return float(0.5 * (self._mass[:, None] * d**2).sum() / self.h**2 + energy.numpy()[0])
 
     def gap(self, d):
-        """(φ(d) − lowest)/(first − lowest): 1 at x̃, 0 where φ is least."""
+        """Returns (φ(d) − lowest)/(first − lowest): 1 at x̃, 0 at the minimiser."""
         return (self.objective(d) - self.lowest) / (self.first - self.lowest)
 
     def roundings(self):
-        """Changes of d by a rounding of every coordinate of x, eight of them, (8, n, 3) [m]."""
+        """Returns eight random changes of d by a rounding of every coordinate of x, (8, n, 3) [m]."""
         random = np.random.default_rng(SEED)
         epsilon = np.finfo(np.float64).eps * np.abs(self.base.numpy()).max()
         return epsilon * random.uniform(-1.0, 1.0, size=(8, *self.best.shape)) * self.free[:, None]
 
     def _rounding(self):
-        """The largest change of φ about the minimiser, where it has no slope."""
+        """Returns the largest change of φ at the minimiser by rounding."""
         return max(abs(self.objective(self.best + move) - self.lowest) for move in self.roundings())
 
 
 def one_step(scene, digest, frame, substeps, device):
-    """The :class:`OneStep` of a scene, the fields of a :class:`SceneRef`; all tasks of a process share it.
+    """Returns the :class:`OneStep` of a scene, the fields of a :class:`SceneRef`; all tasks of a process share it.
 
     Raises:
-        ValueError: The scene is another than ``digest`` says.
+        ValueError: The scene has another digest.
     """
     return _one_step(json.dumps(scene, sort_keys=True), digest, frame, substeps, device)
 
@@ -134,18 +135,18 @@ def _one_step(scene, digest, frame, substeps, device):
 
 
 def measure(scene, digest, setup, frame, substeps, device="cpu", dtype="float64", limit=20.0, repeats=5):
-    """The gap that more and more iterations of a method leave of one step from x̃.
+    """Measures the gap of one step from x̃ after increasing numbers of iterations.
 
     Args:
         scene: :class:`SceneRef` as a dictionary.
-        digest: Of the scene, see :func:`warpcloth.base.digest.scene_digest`: another scene has another key.
+        digest: Digest of the scene, see :func:`warpcloth.base.digest.scene_digest`, so that another scene has another key.
         setup: :class:`Setup` as a dictionary, without step and iterations.
-        frame: Frames before the step.
-        substeps: Steps a frame.
+        frame: Number of frames before the step.
+        substeps: Number of steps per frame.
         device: A Warp device.
-        dtype: Of the method; gaps are measured in float64.
-        limit: Seconds for all of it but the state and the minimum.
-        repeats: Warm steps of which the median counts.
+        dtype: Precision of the method; gaps are computed in float64.
+        limit: Time limit [s], without the state and the minimum.
+        repeats: Number of warm steps, of which the median counts.
 
     Returns:
         dict: ``status``, ``reason``, ``points`` with ``iterations``, ``gap``, ``ms`` and ``spread`` (quartiles) of the step,
@@ -188,7 +189,7 @@ def measure(scene, digest, setup, frame, substeps, device="cpu", dtype="float64"
 
 
 def _ended(points):
-    """Whether more iterations change nothing, or bring nothing any more."""
+    """Returns whether more iterations change or improve nothing."""
     gaps = [point["gap"] for point in points]
     if gaps[-2:] == 2 * gaps[-1:]:
         return True
@@ -196,7 +197,7 @@ def _ended(points):
 
 
 def _milliseconds(step, stepper, repeats):
-    """Quartiles of the warm time of a step [ms]."""
+    """Returns the quartiles of the time of a warm step [ms]."""
     taken = []
     for _ in range(repeats):
         step.set_state(stepper)

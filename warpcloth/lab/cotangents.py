@@ -1,8 +1,8 @@
 """Negative cotangent weights: w = ½(cot α + cot β) of an edge is negative iff the angles opposite it sum to more than 180°.
 
-With "spokes" an edge of negative weight adds a negative energy, so that what is deformed as rigidly as possible tears itself
-apart. "intrinsic" weights are positive inside (Fisher et al. 2007, *An algorithm for the construction of intrinsic Delaunay
-triangulations*), though not on the boundary; "clamped" ones give up linear precision; spokes and rims keep the energy of
+With "spokes", an edge of negative weight adds a negative energy, so that as-rigid-as-possible deformation pulls the mesh apart.
+"intrinsic" weights are positive inside (Fisher et al. 2007, *An algorithm for the construction of intrinsic Delaunay
+triangulations*), though not on the boundary. "clamped" weights lose linear precision. "spokes_and_rims" has the energy of
 triangles, which is never negative (Chao et al. 2010, *A simple geometric model for elastic deformations*).
 """
 
@@ -31,12 +31,12 @@ _BEND = np.pi / 2
 
 
 def edge_weight(degrees):
-    """½(cot α + cot β) of α = β, half of that sum each."""
+    """Returns ½(cot α + cot β) for α = β, each half of the given sum [°]."""
     return 1.0 / np.tan(np.radians(0.5 * degrees))
 
 
 def lost(degrees):
-    """‖Lx̄‖ at the hub without the spoke of negative weight w, |w| times its length sin α/sin(120° − α), α half the sum."""
+    """Returns ‖Lx̄‖ at the hub without the spoke of negative weight w: |w| times its length sin α/sin(120° − α)."""
     alpha = np.radians(0.5 * degrees)
     return max(0.0, -np.cos(alpha)) / np.sin(np.pi - np.radians(_HUB) - alpha)
 
@@ -86,7 +86,7 @@ def tasks(device):
 
 
 def measure(device, libigl):
-    """Points of all panels; those of intrinsic weights where there is libigl, which makes them."""
+    """Returns the points of all panels; those of intrinsic weights need libigl."""
     choices = {name: given for name, given in CHOICES.items() if libigl or given.get("weights") != "intrinsic"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what they say is drawn here
@@ -96,7 +96,7 @@ def measure(device, libigl):
 
 
 def kite(apex):
-    """Two triangles with that angle [°] opposite the edge (0, 1) that they share."""
+    """Returns two triangles with the angle ``apex`` [°] opposite their common edge (0, 1)."""
     height = 0.5 / np.tan(np.radians(0.5 * apex))
     return Mesh([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.0, height], [0.5, 0.0, -height]], [[0, 1, 2], [1, 0, 3]])
 
@@ -113,7 +113,7 @@ def _weights(choices, device):
 
 
 def _kites(choices, device):
-    """From a start that is off by 1e-3 of an edge."""
+    """Yields points from a start that is perturbed by 1e-3 of an edge."""
     noise = 1e-3 * np.random.default_rng(0).normal(size=(4, 3))
     for apex in np.arange(75.0, 110.1, 2.5):
         mesh = kite(apex)
@@ -143,7 +143,7 @@ def _bends(choices, device):
 
 
 def fan(degrees):
-    """A flat fan about vertex 0 whose spoke to vertex 1 lies opposite angles of that sum [°], all other spokes of length 1."""
+    """Returns a flat fan about vertex 0; the angles opposite its spoke to vertex 1 sum to ``degrees``, others have length 1."""
     alpha = np.radians(0.5 * degrees)
     length = np.sin(alpha) / np.sin(np.pi - np.radians(_HUB) - alpha)
     around = np.radians([_HUB, 140.0, -140.0, -_HUB])

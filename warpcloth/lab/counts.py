@@ -1,4 +1,4 @@
-"""The work of a step by counting: elements, the fewest bytes that it must move, and launches."""
+"""Counts the work of a step: elements, minimum memory traffic, and launches."""
 
 from contextlib import contextmanager
 
@@ -8,19 +8,19 @@ from ..core.capture import Segment
 
 
 def elements_of(model):
-    """Elements of all terms and copies."""
+    """Returns the number of elements of all terms and copies."""
     return sum(elements.count for elements in model.terms)
 
 
 def compulsory_bytes(model, iterations):
-    """Bytes that a step moves at least, with no cache between iterations, from the arrays of the model as it declares them.
+    """Returns the bytes that a step must at least move, without a cache between iterations.
 
-    An iteration reads positions, inverse masses and all arrays of the terms, and writes positions, each once; a step reads and
-    writes velocities once besides. Pins, gravity and what a solver keeps of its own do not count.
+    An iteration reads positions, inverse masses and all arrays of the terms, and writes positions, each once. A step also reads
+    and writes velocities once. Pins, gravity and arrays of the solver do not count.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        iterations: Of a step.
+        iterations: Number of iterations of a step.
     """
     terms = sum(term["bytes"] for term in model.report()["terms"])
     iteration = 2 * model.positions.capacity + model.inverse_mass.capacity + terms
@@ -28,9 +28,9 @@ def compulsory_bytes(model, iterations):
 
 
 def launches_of(run):
-    """Counts the launches of ``run()``: kernels, fills and copies within a device, those of loops on the device each time.
+    """Counts the launches of ``run()``: kernels, fills and copies within a device, including all repeats of device loops.
 
-    Segments launch what they recorded one by one meanwhile, so that loops are run, and counted, by the host.
+    During the call, segments launch their functions directly instead of replaying graphs, so that the host runs loops.
 
     Args:
         run: A function that steps.
@@ -42,7 +42,7 @@ def launches_of(run):
 
 @contextmanager
 def _one_by_one():
-    counted = []  # to append is one operation, so that no launch of several threads is lost
+    counted = []  # appending is atomic, so that no launch of a thread is lost
 
     def counting(function, counts=lambda *_, **__: True):
         def call(*args, **kwargs):

@@ -1,12 +1,13 @@
-"""Two sheets that fly at each other, over their relative speed and the step, with the filter of self-contact and without it.
+"""Two sheets that fly at each other, over relative speed and step, with the filter of self-contact and without it.
 
-Without the filter, pairs are found where a step begins, and nothing looks at the way between. Explicit steps know contact only
-within the distance r: from v h = r on a step can end beyond the other sheet, where the energy pushes on, and from 2r unnoticed.
-Their energy also gives way, if ½kr² is less than that of the motion, ½(ρ/2)v² of two free sheets of density ρ.
+Without the filter, pairs are found at the start of a step, and the path during the step is not tested. Explicit steps have
+contact only within the distance r. For v h ≥ r, a step can end beyond the other sheet, where the energy pushes it on; for
+v h ≥ 2r it can do so without contact. Contact also fails if its energy ½kr² is less than that of the motion, ½(ρ/2)v² of two
+free sheets of density ρ.
 
-The other methods know the side of each pair that is listed where the step begins: nearer than r and the skin. A minimiser of
-such a step has sheets apart by d where kτ²/d, with τ = r/2, stops half of v on each side, ρv/2h; below δ = r/1000 the energy
-is a parabola, with which they may end beyond one another.
+The other methods know the side of each pair listed at the start of the step, nearer than r plus the skin. The minimiser of such
+a step has a distance d at which kτ²/d, τ = r/2, stops half of v on each side, ρv/2h. Below δ = r/1000 the energy is a parabola,
+so that sheets may end beyond one another.
 """
 
 import numpy as np
@@ -25,7 +26,8 @@ from .tunnelling import DENSITY, DISTANCE, RATE, STIFFNESS
 
 TITLE = "17. Sheets that fly at each other: without the filter of self-contact they cross"
 SIDE = 0.1  # of the sheets [m]
-# Of one sheet against the other [°]: without the filter all of each is in contact, as theory has it, with it in no special way.
+# Rotation of one sheet relative to the other [°]: without the filter, all vertices are in contact at once, as in the theory;
+# with it, they are in general position.
 TURN = {"without": 0.0, "filter": 5.0}
 LISTED = DISTANCE + SKIN * 0.5 * SIDE * np.sqrt(2.0)  # from which pairs are listed [m]
 STEPS = np.geomspace(5e-4, 1.0 / 24.0, 7)  # [s]
@@ -73,7 +75,7 @@ def tasks(device):
 
 
 def measure(solver, kept, steps, speeds, device):
-    """Points of one panel: of flights from all phases the share that was cut, or in which sheets crossed [%]."""
+    """Returns the points of one panel: the fraction of flights that were cut short, or in which sheets crossed [%]."""
     panel, found = _panel(solver, kept).key, []
     for h in steps:
         try:
@@ -88,7 +90,7 @@ def measure(solver, kept, steps, speeds, device):
 
 
 def sheets(h, turn):
-    """A scene of two sheets of nine vertices, one of them turned by some degrees, with steps of h as frames."""
+    """Returns a scene of two sheets of nine vertices, one of them rotated by ``turn`` [°], with steps h as frames."""
     grid, (c, s) = Mesh.grid(3, 3, size=SIDE), (np.cos(np.radians(turn)), np.sin(np.radians(turn)))
     below = grid.points - [0.5 * SIDE, 0.0, 0.5 * SIDE]
     above = below @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) + [0.0, 2.0 * DISTANCE, 0.0]
@@ -105,9 +107,9 @@ def sheets(h, turn):
 
 @in_turn
 def meetings(solver, kept, h, speeds, device):
-    """Shares of the flights in which sheets ever end a step crossed or beyond one another, and that were cut, (S,) each.
+    """Returns the fractions of flights in which sheets end a step crossed or beyond one another, and that were cut, (S,) each.
 
-    Sheets start r and a part of a step apart. They fly until the slowest have passed one another, or turned round.
+    Sheets start at r plus a fraction of a step. They fly until the slowest have passed one another or turned back.
 
     Raises:
         ValueError: The solver refuses the step.
@@ -128,14 +130,14 @@ def meetings(solver, kept, h, speeds, device):
         stepper.step()
         x = stepper.state.x.numpy().reshape(positions.shape)
         below, above = x[:, :9], x[:, 9:]
-        aside = np.linalg.norm((above - below).mean(axis=1)[:, [0, 2]], axis=1)  # as sheets are that go round one another
+        aside = np.linalg.norm((above - below).mean(axis=1)[:, [0, 2]], axis=1)  # sheets may pass beside one another
         crossed |= (above[..., 1].max(axis=1) < below[..., 1].min(axis=1)) & (aside < 0.5 * SIDE)
         crossed |= cross(below, above, scene.mesh.triangles[:8])
     return (each.reshape(len(speeds), -1).mean(axis=1) for each in (crossed, stepper.cut > 0.0))
 
 
 def without_filter(stepper):
-    """Takes the filter of self-contact away from a stepper, at the end of steps and of the iterates of Newton's method."""
+    """Removes the filter of self-contact from a stepper, at the end of steps and in the iterates of Newton's method."""
     kept = stepper.pairs.filter
     kept.launch_end = kept.launch_relist = kept.launch_limit = lambda *given: None
     kept.launch_first = lambda base, d: d.zero_()
@@ -143,7 +145,7 @@ def without_filter(stepper):
 
 
 def cross(one, other, triangles):
-    """Whether an edge of one sheet goes through a triangle of the other, of positions (B, n, 3) of both; (B,)."""
+    """Returns whether an edge of one sheet crosses a triangle of the other, (B,), from positions (B, n, 3) of both."""
     edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     found = np.zeros(len(one), dtype=bool)
     for x, y in ((one, other), (other, one)):

@@ -1,11 +1,11 @@
 """The heavy elastica: a strip clamped horizontally that bends under its own weight (Romero et al. 2021, *Physical validation
 of simulators in computer graphics*).
 
-Γ = ρgL³/D. With u from the free tip in units of L and φ from vertical down,
+Γ = ρgL³/D. With the arc length u from the free tip in units of L, and the angle φ from the downward vertical,
 
     φ″ = Γ u sin φ,   φ′(0) = 0,   φ(1) = π/2;   H = ∫cos φ du,   W = ∫sin φ du.
 
-H/W goes to Γ/8 for small Γ. Above Γ of about 150 there are several solutions; this is for less.
+H/W tends to Γ/8 for small Γ. Above Γ of about 150 there are several solutions; this module is for smaller Γ.
 """
 
 import numpy as np
@@ -16,11 +16,11 @@ MOST = 100.0
 
 
 def curve(gamma, at=None):
-    """Points (k, 2) in units of L, from the clamp at the origin along x, y up.
+    """Returns points (k, 2) in units of L, from the clamp at the origin along x, y up.
 
     Args:
         gamma: Γ, up to 100.
-        at: Where on the strip (k,), from 0 at the clamp to 1 at the tip; without it at 101 positions.
+        at: Positions along the strip (k,), from 0 at the clamp to 1 at the tip; by default 101.
     """
 
     def shoot(tip, **options):
@@ -41,13 +41,13 @@ def curve(gamma, at=None):
 
 
 def aspect(gamma, at=1.0):
-    """H/W of the tip, or of another position on the strip."""
+    """Returns H/W of the tip, or of another position along the strip."""
     ((x, y),) = curve(gamma, [at])
     return -y / x
 
 
 def gamma_of(ratio, at, near):
-    """Γ of the strip that hangs with H/W = ``ratio`` there, within a factor of 20 of ``near``; or None."""
+    """Returns the Γ at which position ``at`` has H/W = ``ratio``, within a factor of 20 of ``near``; or None."""
 
     def gap(gamma):
         return aspect(gamma, at) - ratio

@@ -1,7 +1,7 @@
-"""Where terms, weights and fits fail, each failure as measured points beside the laws that explain them.
+"""Failures of terms, weights, fits and contact, as measured points with the laws that explain them.
 
-A chart is a module with a `TITLE`, `PANELS`, what is drawn, and `tasks`, what measures it: each task returns points,
-dictionaries with ``panel``, ``series``, ``x``, ``y`` (of maps), ``value`` (None where there is none) and ``reason``.
+A chart is a module with a `TITLE`, the `PANELS` to draw, and `tasks` that measure them. Each task returns points: dictionaries
+with ``panel``, ``series``, ``x``, ``y`` (for maps), ``value`` or None, and ``reason``.
 """
 
 from ..base.checks import choice
@@ -25,7 +25,7 @@ COLUMNS = ("panel", "series", "x", "y", "value", "law", "expected", "reason", "m
 
 
 def failure_chart(name, device="cpu", **run):
-    """Measures what a failure does.
+    """Measures a failure.
 
     Args:
         name: One of `FAILURES`.
@@ -33,7 +33,7 @@ def failure_chart(name, device="cpu", **run):
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
 
     Returns:
-        dict: JSON values; in ``rows`` the points, with the ``law`` that a series follows and what that ``expected``.
+        dict: JSON values; ``rows`` has the points, with the ``law`` of a series and the value ``expected`` from it.
 
     Raises:
         ValueError: There is no such failure.

@@ -1,8 +1,8 @@
-"""Sheets on slopes: where they stick, creep and slide, and how fast, with every solver that takes friction.
+"""Sheets on slopes that stick, creep or slide, with every solver that takes friction.
 
-A sheet slides for tan θ > μ, with the acceleration g(sin θ − μ cos θ). Below that friction is to hold it for good. A friction
-that depends on the speed below some ε_v creeps on any slope: with ρ = tan θ/μ at ε_v(1 − √(1 − ρ)) where the force is smoothed
-to C¹ (Li et al. 2020, *Incremental potential contact*), and at ρε_v by a Huber function. Friction with anchors does not creep.
+A sheet slides if tan θ > μ, with the acceleration g(sin θ − μ cos θ). Otherwise friction should hold it at rest. Friction that
+depends on the speed below some ε_v creeps on any slope: with ρ = tan θ/μ, at ε_v(1 − √(1 − ρ)) if the force is smoothed to C¹
+(Li et al. 2020, *Incremental potential contact*), and at ρε_v with a Huber function. Friction with anchors does not creep.
 """
 
 from types import SimpleNamespace
@@ -30,14 +30,14 @@ ITERATIONS = (1, 3, 10, 30, 100, 300)
 SPEED = 1e-3  # ε_v [m/s]
 DENSITY = 0.15  # [kg/m²]
 FRAMES = 60  # of 1/60 s
-# Below this a sheet sticks or does not accelerate: a tenth of what a method with ε_v may creep at [m/s].
+# Below this speed [m/s], a sheet sticks or does not accelerate: a tenth of ε_v.
 STILL = 0.1 * SPEED
 TAKERS = tuple(
     name
     for name, record in SOLVERS.items()
     if lacks(SimpleNamespace(term=FRICTION, hard=False, damping=None), record.needs) is None
 )
-# Such that steps are solved; what a solver has not, it does not take.
+# Options with which steps converge; a solver ignores those that it does not have.
 SETTINGS = {
     "explicit": {"substeps": 16},
     "newton": {"tolerance": 1e-9},
@@ -56,7 +56,7 @@ _LINE = "tan θ = μ"
 
 
 def acceleration(slope, coefficient=COEFFICIENT):
-    """Down a slope [°], from rest [m/s²]."""
+    """Returns the acceleration down a slope [°], from rest [m/s²]."""
     angle = np.radians(slope)
     return max(EARTH * (np.sin(angle) - coefficient * np.cos(angle)), 0.0)
 
@@ -117,7 +117,7 @@ def tasks(device):
 
 
 def mapped(solver, coefficient, device, slopes=None):
-    """Points of a row of the map of a solver; of the coefficient :data:`COEFFICIENT` those of the acceleration too."""
+    """Returns a row of the map of a solver; for :data:`COEFFICIENT`, also the points of the acceleration."""
     slopes = SLOPES.tolist() if slopes is None else slopes
     speeds, accelerations = slide(solver, coefficient, slopes, device)
     found = [
@@ -130,14 +130,14 @@ def mapped(solver, coefficient, device, slopes=None):
 
 
 def sticking(solver, ratios, device):
-    """Points of the panel of creep, of slopes by tan θ/μ."""
+    """Returns the points of the panel of creep, for slopes given by tan θ/μ."""
     slopes = np.degrees(np.arctan(COEFFICIENT * np.array(ratios))).tolist()
     speeds, _ = slide(solver, COEFFICIENT, slopes, device)
     return [point("creep", solver, ratio, 1e3 * speed) for ratio, speed in zip(ratios, speeds, strict=True)]
 
 
 def iterated(solver, counts, device):
-    """Points of the panel of iterations."""
+    """Returns the points of the panel of iterations."""
     found = []
     for count in counts:
         _, (a,) = slide(solver, COEFFICIENT, [STEEP], device, substeps=1, iterations=count)
@@ -147,7 +147,7 @@ def iterated(solver, counts, device):
 
 
 def kind(speed, acceleration):
-    """Whether a sheet sticks, creeps or slides, from its speed [m/s] in the last third of a run and its acceleration [m/s²]."""
+    """Returns whether a sheet sticks, creeps or slides, from its final speed [m/s] and its acceleration [m/s²]."""
     if acceleration * FRAMES / 180.0 > STILL:
         return KINDS[2]
     return KINDS[1] if abs(speed) > STILL else KINDS[0]
@@ -155,11 +155,11 @@ def kind(speed, acceleration):
 
 @in_turn
 def slide(solver, coefficient, slopes, device, **options):
-    """Speeds [m/s] and accelerations [m/s²] of sheets down slopes [°], each (S,).
+    """Returns speeds [m/s] and accelerations [m/s²] of sheets down slopes [°], each (S,).
 
-    The slopes are one plane and the directions of gravity in a batch. The sheets start at rest, pressed in by their weight.
-    Speeds and accelerations are differences of the means of the positions over each third of the time, in which the swing of
-    explicit steps about an anchor cancels; of a constant acceleration they are exact.
+    A batch with one plane and different directions of gravity stands for the slopes. The sheets start at rest, with contact in
+    balance with their weight. Speeds and accelerations are differences of mean positions over each third of the time, so that
+    the oscillation of explicit steps about an anchor cancels. They are exact for constant acceleration.
     """
     grid = Mesh.grid(3, 3, size=0.1)
     scene = Scene(

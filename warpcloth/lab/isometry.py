@@ -1,8 +1,8 @@
-"""Quadratic bending off isometry and off a flat rest shape, beside dihedral angles (Bergou et al. 2006, *A quadratic bending
-model for inextensible surfaces*; Grinspun et al. 2003, *Discrete shells*).
+"""Quadratic bending of stretched sheets and of curved rest shapes, compared with dihedral angles (Bergou et al. 2006, *A
+quadratic bending model for inextensible surfaces*; Grinspun et al. 2003, *Discrete shells*).
 
-Its energy is ½D‖Δx‖² an area, Δ that of a flat rest shape: it takes stretching that varies for bending, and any rest shape for
-flat. On an isometry of a flat sheet, where it is meant to hold, both agree.
+Its energy per area is ½D‖Δx‖², with the Laplacian Δ of a flat rest shape: non-uniform stretch counts as bending, and any rest
+shape as flat. On isometries of a flat sheet, for which it is made, both agree.
 """
 
 import numpy as np
@@ -54,7 +54,7 @@ def tasks(device):
 
 
 def measure(device):
-    """Points of all panels, on an equilateral net, where D is exact."""
+    """Returns the points of all panels, on an equilateral net, where D is exact."""
     flat, found = strip("equilateral", 0.0, _H).mesh, []
     shell = Mesh(rolled_up(flat.points, REST), flat.triangles)
 

@@ -1,20 +1,20 @@
-"""Locking: a net that cannot bend without straining bends too little, the more the stiffer its membrane is.
+"""Locking: a net that cannot bend without straining bends too little, and less the stiffer its membrane is.
 
-Chords of a cylinder are shorter than its arcs by κ²h²/24, and what that costs passes the bending energy ½Dκ² an area where
-κ²h⁴K = 576D. A regular net of three lengths of edge gives way to it at no cost and keeps its curvature; an irregular net
-keeps some of the strain, or loses curvature to wrinkles. Springs k of all edges are a membrane of K = 2k/√3 on an equilateral
-net, and are taken for one on others.
+Chords of a cylinder are shorter than its arcs by κ²h²/24. The energy of this strain exceeds the bending energy per area, ½Dκ²,
+if κ²h⁴K > 576D. A regular net with three edge lengths avoids it at no cost and keeps its curvature. An irregular net keeps some
+of the strain, or loses curvature to wrinkles. Springs k on all edges act as a membrane of K = 2k/√3 on an equilateral net; the
+same is assumed for others.
 
-Apart from it each net has its own bending stiffness, the error of its pattern, which no refinement cures; that is what a
-cantilever shows while its membrane is soft. Divided by it, what is left is locking, and falls with h⁴. Regular nets lock there
-too, though less: their curvature varies, and their sides curl.
+Apart from locking, each net has its own bending stiffness, an error of its pattern that refinement does not remove. A
+cantilever with a soft membrane shows it. The stiffness divided by that is due to locking, and falls with h⁴. Regular nets lock
+there too, though less, because their curvature varies and their sides curl.
 
-How far a net can give way depends on the degrees of freedom that its stiff edges leave (:mod:`warpcloth.scene.freedom`). Rows
-and columns alone leave more than one per vertex. All edges of triangles leave 3 plus the number of boundary edges, however fine
-the mesh is. A grid with both diagonals leaves only rigid motion. With so little freedom a net bends only if it is regular and
+How well a net can avoid strain depends on the degrees of freedom that its stiff edges leave (:mod:`warpcloth.scene.freedom`).
+Rows and columns alone leave more than one per vertex. All edges of triangles leave 3 plus the number of boundary edges, at any
+resolution. A grid with both diagonals leaves only rigid motion. With so little freedom, a net bends only if it is regular and
 bent along its own lines.
 
-Springs alone end in no shape: what is left has no stiffness, and slides on along its wrinkles.
+Springs alone reach no rest shape: they leave motion without stiffness, and the net keeps sliding along its wrinkles.
 """
 
 from dataclasses import replace
@@ -60,7 +60,7 @@ _ROWS, _EDGES, _RIGID = "n² + 2n, n = 1 + B/4", "3 + B", "6, rigid motion"
 
 
 def ratio(curvature, h, K):
-    """κ²h⁴K/576D, where K is over D [1/m²]."""
+    """Returns κ²h⁴K/576D, with K given over D [1/m²]."""
     return curvature**2 * h**4 * K / 576.0
 
 
@@ -154,7 +154,7 @@ def tasks(device):
 
 
 def imposed(device):
-    """Threads of a square grid that run round a cylinder, K = k, for κ, h and K of all sizes."""
+    """Returns points of threads of a square grid bent round a cylinder, K = k, for many κ, h and K."""
     found = []
     for n in (9, 17, 33):
         mesh = Mesh.grid(n, n, pattern="alternating")
@@ -173,7 +173,7 @@ def imposed(device):
 
 
 def relaxed(pattern, elements, moduli, device):
-    """A sheet whose hinges are at rest on the cylinder and whose springs are in the plane, for K of these values over D."""
+    """Returns points of a sheet whose hinges are at rest on a cylinder and whose springs are at rest when flat, over K/D."""
     h = 1.0 / elements
     flat = strip(pattern, np.radians(NETS[pattern]), h).mesh
     area = flat.triangle_areas.sum()
@@ -216,7 +216,7 @@ def held(holding, mesh):
 
 
 def counted(holding, n):
-    """Counts the degrees of freedom that the springs of a square net of n² vertices leave, or of a jittered one as large."""
+    """Counts the degrees of freedom that the springs of a square or jittered net of about n² vertices leave."""
     pattern = _HOLDING[holding]
     mesh = strip(pattern, 0.0, 1.0 / (n - 1)).mesh if pattern == "jittered" else Mesh.grid(n, n, pattern=pattern)
     return [point("freedom", holding, len(mesh.boundary_edges), _left(mesh, held(holding, mesh)))]
@@ -227,7 +227,7 @@ def _left(mesh, pairs):
 
 
 def nearly_rigid(holding, degrees, device):
-    """Measures the part of its curvature that a net of very stiff springs keeps at rest, by the freedom that they leave."""
+    """Measures the fraction of curvature that a net of very stiff springs keeps at rest, over the freedom that they leave."""
     flat = strip(_HOLDING[holding], np.radians(degrees), 1.0 / 8).mesh
     pairs = held(holding, flat)
     scene, rest = _at_rest(flat, pairs, _ALL_BUT_RIGID, device)
@@ -238,14 +238,14 @@ def nearly_rigid(holding, degrees, device):
 
 
 def kept_angles(mesh, imposed, points):
-    """Part of the angles of its hinges on an imposed shape that a mesh has, weighted by what they cost."""
+    """Returns the fraction of the hinge angles of an imposed shape that a mesh keeps, weighted by bending energy."""
     before, weights = rest_state(imposed, mesh.hinges).T
     after = rest_state(points, mesh.hinges)[:, 0]
     return float((weights * after) @ before / (weights * before @ before))
 
 
 def let_go(pattern, degrees, device):
-    """Springs alone, rolled up and let go for 20 s, by implicit Euler of 1/60 s, which brakes all but what costs nothing."""
+    """Simulates springs alone, rolled up and released, for 20 s with implicit Euler of 1/60 s, which damps stiff motion."""
     flat = strip(pattern, np.radians(degrees), 0.1).mesh
     start = rolled_up(flat.points, CURVATURE)
     terms = [Spring(stiffness=1e3)]
@@ -258,7 +258,7 @@ def let_go(pattern, degrees, device):
 
 
 def cantilever(pattern, elements, device):
-    """Apparent stiffness of a cantilever by the stiffness of its membrane, as it is and over that with a soft one."""
+    """Returns the apparent bending stiffness of a cantilever over its membrane stiffness, also relative to a soft membrane."""
     angle, found, unlocked = np.radians(NETS[pattern]), [], None
     for stretching in [10.0**e for e in _DECADES[elements]] if elements in _DECADES else (SOFT, STIFF):
         rest = physics.measure("cantilever", elements, "dihedral", pattern, angle, GAMMA, device, stretching=stretching)

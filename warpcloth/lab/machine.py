@@ -1,4 +1,4 @@
-"""The machine that a measurement ran on, for those who read it later."""
+"""Describes the machine of a measurement."""
 
 import os
 import platform
@@ -11,7 +11,7 @@ from ..base.version import installed_version
 
 
 def machine(device="cpu"):
-    """Names of processor and device, numbers of cores, and versions, by name.
+    """Returns the names of processor and device, numbers of cores, and versions, by name.
 
     Args:
         device: A Warp device.
@@ -37,7 +37,7 @@ def machine(device="cpu"):
 
 @cache
 def name(device="cpu"):
-    """Host, processor and, where it is no CPU, device, in few words: what stands beside each measurement."""
+    """Returns host, processor and, if it is not the CPU, device in a few words, to be kept with each measurement."""
     facts = machine(device)
     return ", ".join([platform.node(), facts["processor"], *([] if facts["device"] == "cpu" else [facts["device"]])])
 
@@ -49,7 +49,7 @@ def in_words(facts):
 
 
 def processor():
-    """The name on the package; Linux alone says it in a file."""
+    """Returns the model name of the processor, which only Linux has in a file."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

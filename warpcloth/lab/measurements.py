@@ -1,4 +1,4 @@
-"""Measurements as data: a scene, a solver with options, and a function that measures; each with a key by which it is kept."""
+"""Measurements as data: a scene, a solver with options, and a function that measures, with a key for storage."""
 
 import hashlib
 import json
@@ -14,17 +14,17 @@ from ..run import scene_files
 from ..solvers import SOLVERS
 from . import machine
 
-# One measurement at a time in a process: threads side by side slow one another, and Warp records one graph at a time.
+# One measurement at a time in a process, because threads slow one another, and Warp captures one graph at a time.
 _ALONE = threading.Lock()
 
 
 @dataclass(frozen=True)
 class SceneRef:
-    """A scene by its name, so that another process can make it.
+    """A reference to a scene by name, so that another process can build it.
 
     Attributes:
         name: A known name, a .py file or a USD stage.
-        parameters: Parameters of its function by name. Texts are converted, so "inf", which JSON lacks, is a number too.
+        parameters: Parameters of its function by name. Strings are converted, so that "inf", which JSON lacks, is a number.
         pins: A selection that replaces its pins, see :class:`warpcloth.run.scene_files.SceneSource`; or None.
     """
 
@@ -33,11 +33,11 @@ class SceneRef:
     pins: str | None = None
 
     def load(self):
-        """The :class:`warpcloth.Scene`.
+        """Builds the :class:`warpcloth.Scene`.
 
         Raises:
             FileNotFoundError: There is no such scene.
-            ValueError: It takes no such parameter.
+            ValueError: It has no such parameter.
         """
         source = scene_files.find_source(self.name, self.pins)
         for name in self.parameters:
@@ -57,14 +57,14 @@ class Setup:
 
     Attributes:
         solver: Its name on the command line, such as "projective-dynamics".
-        options: Of its record, by name; what is not given has its default.
+        options: Options of its record by name; others have their defaults.
     """
 
     solver: str
     options: dict = field(default_factory=dict)
 
     def record(self):
-        """The options record, such as ``wc.Newton(substeps=4)``.
+        """Returns the record, such as ``wc.Newton(substeps=4)``.
 
         Raises:
             ValueError: There is no such solver, or an option is not allowed.
@@ -94,19 +94,19 @@ class Task:
 
     @property
     def key(self):
-        """A hash of what is measured, of the code that measures it, and of the machine: on another it takes another time."""
+        """A hash of the measurement, of the code and of the machine, because times differ between machines."""
         here = _machine(self.arguments.get("device", "cpu"))
         text = json.dumps([self.function, self.arguments, source_digest(), here], sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
     def run(self):
-        """Measures, in this process."""
+        """Measures in this process, and returns the result."""
         module, name = self.function.split(":")
         return getattr(import_module(module), name)(**self.arguments)
 
 
 def task(function, **arguments):
-    """The :class:`Task` of a function of a module; records such as :class:`SceneRef` become dictionaries.
+    """Returns the :class:`Task` of a function of a module; records such as :class:`SceneRef` become dictionaries.
 
     Args:
         function: A function at the top of a module, which another process can import.
@@ -117,7 +117,7 @@ def task(function, **arguments):
 
 
 def finite(value):
-    """A number as JSON has it, None for what is not finite."""
+    """Returns a number for JSON, None if it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -126,10 +126,10 @@ def run(task, source):
 
     Args:
         task: The :class:`Task`.
-        source: The :func:`source_digest` of the process that asks.
+        source: The :func:`source_digest` of the calling process.
 
     Raises:
-        ValueError: This process has other code, whose results have other keys.
+        ValueError: This process has other code, so that its results would have other keys.
     """
     if source != source_digest():
         raise ValueError(

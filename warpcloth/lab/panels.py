@@ -1,4 +1,4 @@
-"""Panels: what a chart of failures shows, as data: measured points and the laws that explain them."""
+"""Panels of charts of failures as data: labels, and the laws that explain measured points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,12 +12,12 @@ class Panel:
         key: Its name in tables.
         title: A sentence that says what fails.
         x: Label of the axis, with its unit.
-        y: The same of the other axis.
-        scales: Of x and of y, "linear" or "log".
+        y: Label of the other axis, with its unit.
+        scales: Scales of x and y, "linear" or "log".
         laws: Functions of x by the label of their line.
-        follows: The law of a series, by label; not all have one.
+        follows: Label of the law of a series, by series; not all have one.
         marks: Labels of vertical lines by their x.
-        limits: Ends of y, None to fit.
+        limits: Limits of y, None to fit.
     """
 
     key: str
@@ -37,8 +37,8 @@ class Map(Panel):
 
     Attributes:
         value: Label of the value, with its unit.
-        colours: Name of the colours of values.
-        kinds: The series, where these are what is coloured.
+        colours: Name of the colour map of values.
+        kinds: The series, if cells are coloured by series.
         crossed: The series whose cells are crossed out, or None.
     """
 
@@ -49,6 +49,6 @@ class Map(Panel):
 
 
 def point(panel, series, x, value, reason="", y=None):
-    """A measured point as JSON; ``value`` None where there is none, and then the reason; ``y`` in a :class:`Map`."""
+    """Returns a measured point as JSON; ``value`` may be None, with a ``reason``; ``y`` is for a :class:`Map`."""
     value, y = (None if each is None else float(each) for each in (value, y))
     return {"panel": panel, "series": series, "x": float(x), "y": y, "value": value, "reason": reason}

@@ -1,25 +1,25 @@
-"""How far cloth at rest is from closed forms, against the mesh and the cost.
+"""Measures how far cloth at rest is from closed forms, over mesh size and cost.
 
 | Case | Closed form | Order |
 |---|---|---|
-| cylinder | ½Dκ² an area of a sheet that is rolled to a cylinder by κL = 1 | 2 |
-| cantilever | H/W of the heavy elastica at the tip of a wide strip under its weight | 1.5 to 3, to what its sides take |
-| chain | extension of N springs k by N masses m, (mg/k)·N(N + 1)/2 | none: exact |
+| cylinder | energy ½Dκ² per area of a sheet rolled to a cylinder with κL = 1 | 2 |
+| cantilever | H/W of the heavy elastica at the tip of a wide strip under its weight | 1.5 to 3, down to the effect of its sides
+| | chain | extension of N springs k by N masses m, (mg/k)·N(N + 1)/2 | none: exact |
 | catenary | sag of the elastic catenary | 2 |
-| patch | x = Gx̄ within, of a membrane whose boundary is moved so | none: exact |
+| patch | x = Gx̄ inside a membrane whose boundary is moved to Gx̄ | none: exact |
 
-Bending is calibrated on equilateral nets; on others what is wrong stays as the mesh is refined (:func:`strips.rolled`). What
-makes a cantilever something else than the elastica:
+Bending is calibrated on equilateral nets. On others, refinement does not remove the error (:func:`strips.rolled`). A cantilever
+differs from the elastica in these ways:
 
 - One row of triangles, or any strip much narrower than long, bends with 1 − ν² = 8/9 of D, because the Poisson's ratio ν of
   both energies is −1/3 (:func:`strips.plate`): it is the elastica of 9Γ/8. This strip is twice as wide as it is long.
-- Its sides curl as those of a narrow strip do, as far in as its membrane lets them: `sides` is what that takes of D, and the
-  error cannot be much less. The stiffer the membrane the smaller it is.
-- A stiff membrane locks: the mesh cannot bend without stretching, and an irregular one does so most, by κ²h²/24 a triangle,
-  which costs more than bending where h⁴ > 576D/(Kκ²). That goes away with h.
-- The clamp is half a row before the last pinned one, as a hinge bends when any of its vertices is free; the L of Γ begins
+- Its sides curl like those of a narrow strip, as far in as its membrane allows. `sides` is the fraction of D lost by that, and
+  the error cannot be much less. It falls with the stiffness of the membrane.
+- A stiff membrane locks: the mesh cannot bend without stretching, by κ²h²/24 per triangle, most of all if it is irregular. That
+  costs more than bending if h⁴ > 576D/(Kκ²), and vanishes with h.
+- The clamp is half a row before the last pinned one, because a hinge bends if any of its vertices is free. The L of Γ starts
   there.
-- Quadratic bending is for small Γ or stiff membranes: it resists stretching that varies, which dihedral angles do not.
+- Quadratic bending is for small Γ or stiff membranes, because unlike dihedral angles it resists non-uniform stretch.
 """
 
 import time
@@ -45,10 +45,10 @@ CASES = ("cylinder", "cantilever", "chain", "catenary", "patch")
 BENDING = {"dihedral": DihedralBending, "quadratic": QuadraticBending}
 D = 1e-3  # [N·m]
 G = 9.81  # [m/s²]
-SEED = 0  # of the changes that say how well an equilibrium is known
-# Newton iterations after which the time is looked at.
+SEED = 0  # of the perturbations that give the accuracy of an equilibrium
+# Number of Newton iterations between checks of the time.
 _CHUNK = 200
-# Solutions of which the median time counts, begun within so many seconds.
+# Largest number of solutions for the median time, and time in which they must begin [s].
 _REPEATS, _BRIEF = 5, 1.0
 
 
@@ -65,28 +65,27 @@ def measure(
     stretching=1e6,
     width=2.0,
 ):
-    """One point of the diagram.
+    """Measures one point of the diagram.
 
     Args:
         case: One of `CASES`.
-        resolution: Elements along L, 1 m.
+        resolution: Number of elements along L, 1 m.
         bending: "dihedral" or "quadratic".
-        pattern: Of the net, see :func:`strips.strip`; of no matter to a chain and a catenary.
-        angle: By which the net is turned [rad].
+        pattern: Pattern of the net, see :func:`strips.strip`; ignored for a chain and a catenary.
+        angle: Rotation of the net [rad].
         gamma: Γ = ρgL³/D of the cantilever, up to 100.
         device: A Warp device.
         dtype: "float32" or "float64".
-        limit: Seconds after which it stops, looked at every 200 iterations.
-        stretching: KL²/D of the cantilever's membrane; of the catenary EA/wL.
-        width: Of the cantilever over L.
+        limit: Time limit [s], checked every 200 iterations.
+        stretching: KL²/D of the membrane of the cantilever; EA/wL of the catenary.
+        width: Width of the cantilever over L.
 
     Returns:
-        dict: ``status`` "ok", "diverged" (which is also what does not settle) or "slow", and ``reason``; relative ``error``;
-        ``stiffness``, the bending stiffness that it seems to have, over D; ``sides``, see above; ``floor``, how far the
-        error of the equilibrium is known: the most it changes by where every coordinate is rounded, and where the shape is
-        shaken by a thousandth of an edge and settles again; ``ms``, the median time of a warm solution,
-        with building its model and recording its launches, and ``spread``, its quartiles, of as many as are brief;
-        ``elements``, ``h`` over L and ``iterations``. What is not known is None.
+        dict: ``status`` "ok", "diverged" (or did not settle) or "slow", and ``reason``; relative ``error``; ``stiffness``, the
+        apparent bending stiffness over D; ``sides``, see above; ``floor``, the accuracy of the equilibrium: the largest change
+        of the error when every coordinate is rounded, and when the shape is perturbed by a thousandth of an edge and settles
+        again; ``ms``, the median time of a warm solution, including building the model and capturing launches, and ``spread``,
+        its quartiles; ``elements``, ``h`` over L and ``iterations``. Unknown values are None.
 
     Raises:
         ValueError: An argument is not allowed.
@@ -117,14 +116,14 @@ def measure(
 
 
 class _Settling:
-    """Equilibria within a time."""
+    """Finds equilibria within a time limit."""
 
     def __init__(self, device, dtype, limit):
         self.options, self.limit = {"device": device, "dtype": dtype}, limit
         self.status, self.reason, self.ms, self.spread, self.iterations, self.floor = "ok", "", None, None, 0, None
 
     def __call__(self, scene, error, **options):
-        """``error`` of the points (n, 3) of a scene at rest, or where the time was up; a number with its sign, or an array."""
+        """Returns ``error(points)`` of a scene at rest, or when the time is up: a signed number, or an array."""
         points = self._rest(scene, options)
         found = error(points)
         if self.status == "ok":
@@ -136,7 +135,7 @@ class _Settling:
         return found
 
     def _rest(self, scene, options):
-        """Points (n, 3) of a scene at rest, or where the time was up."""
+        """Returns the points (n, 3) of a scene at rest, or when the time is up."""
         equilibrium(scene, iterations=1, **options, **self.options)  # compiles
         rest, self.iterations, seconds = self._solve(scene, options)
         taken = [seconds]
@@ -151,7 +150,7 @@ class _Settling:
         return rest.points
 
     def _solve(self, scene, options):
-        """The equilibrium, Newton iterations and seconds."""
+        """Returns the equilibrium, the number of Newton iterations and the time [s]."""
         started, iterations = time.perf_counter(), 0
         while True:
             rest = equilibrium(scene, iterations=_CHUNK, **options, **self.options)
@@ -162,29 +161,29 @@ class _Settling:
 
 
 def _moves(scene, size):
-    """Eight moves of every free coordinate by up to a size, the same at every call (8, n, 3) [m]."""
+    """Returns eight random displacements of free coordinates of up to ``size``, equal in every call, (8, n, 3) [m]."""
     moves = size * np.random.default_rng(SEED).uniform(-1.0, 1.0, size=(8, *scene.positions.shape))
     moves[:, scene.pins.vertices] = 0.0
     return moves
 
 
 def _cylinder(settle, bending, pattern, angle, resolution):
-    """Rolled up by κ = 1/m."""
+    """Measures a sheet rolled up with κ = 1/m."""
     mesh = strip(pattern, angle, 1.0 / resolution).mesh
     stiffness = bending_density(bending, mesh, rolled_up(mesh.points, 1.0), **settle.options)
     return {"error": abs(stiffness - 1.0), "stiffness": stiffness, "elements": len(mesh.triangles), "h": 1.0 / resolution}
 
 
 def rolled_up(points, curvature):
-    """Points (n, 3) of the plane y = 0, rolled to a cylinder along x of that curvature [1/m], or flat."""
+    """Returns points (n, 3) of the plane y = 0, rolled along x to a cylinder of a curvature [1/m], which may be 0."""
     x, _, z = points.T
-    # sin(κx)/κ and (1 − cos κx)/κ, which sinc knows at 0 too.
+    # sin(κx)/κ and (1 − cos κx)/κ, by sinc for κ = 0 too.
     half = np.sinc(curvature * x / (2.0 * np.pi))
     return np.stack([x * np.sinc(curvature * x / np.pi), -0.5 * curvature * (x * half) ** 2, z], axis=1)
 
 
 def bending_density(bending, mesh, positions, **options):
-    """Energy over ½D an area [1/m²] of a mesh moved there: of triangles that have all their hinges, with half of each."""
+    """Returns the bending energy per area over ½D [1/m²] of a mesh at ``positions``, over triangles with three hinges."""
     shares, area = inner_shares(mesh)
     scene = Scene(mesh, density=1.0, positions=positions, terms=[bending(stiffness=D * shares)])
     return float(energies(scene, **options)[0].sum() / (0.5 * D * area))
@@ -192,7 +191,7 @@ def bending_density(bending, mesh, positions, **options):
 
 @in_turn
 def energies(scene, **options):
-    """Energy [J] of each element of each term where the scene starts, a list of arrays."""
+    """Returns the energy [J] of each element of each term at the start of a scene, a list of arrays."""
     model = scene.build(**options)
     energy = Energy(model, Sums(model))
     energy.add(model.positions, wp.zeros(1, dtype=wp.float64, device=model.device))
@@ -200,7 +199,7 @@ def energies(scene, **options):
 
 
 def _cantilever(settle, bending, net, gamma, stretching, width):
-    """A wide strip; the tip is the mean of the vertices within h of the end, where the strip is all but straight."""
+    """Measures a wide strip; its tip is the mean of the vertices within h of the end, where the strip is almost straight."""
     pattern, angle, resolution = net
     cut = strip(pattern, angle, 1.0 / resolution, 1.0, width)
     L, x = cut.length, cut.mesh.points[:, 0]
@@ -224,18 +223,17 @@ def _cantilever(settle, bending, net, gamma, stretching, width):
 
 
 def side_loss(gamma, stretching, width):
-    """Estimates the part of D that the free sides of a wide cantilever take, for small Γ.
+    """Estimates the fraction of D that the free sides of a wide cantilever lose, for small Γ.
 
-    A side of a plate with curvature κ has no moment. It curls within a width of 1/α, α⁴ = Kκ²/4D, and saves ν²Dκ²/2α per length
-    (Lamb 1891, *On the flexure of a flat elastic spring*). Here ν = −1/3, and with κ = Γu²/2 the tip sinks further by that
-    much. A narrow strip loses ν² of D.
+    The free side of a plate with curvature κ has no moment. It curls within a width of 1/α, α⁴ = Kκ²/4D, and saves ν²Dκ²/2α per
+    length (Lamb 1891, *On the flexure of a flat elastic spring*). Here ν = −1/3 and κ = Γu²/2. A narrow strip loses ν² of D.
     """
     saved = 2.0 / 9.0 / width * (4.0 / stretching) ** 0.25
     return float(min(saved * 8.0 / (3.0 * np.sqrt(2.0 * gamma)), 1.0 / 9.0))
 
 
 def _chain(settle, links):
-    """Extension of the tip; each spring has a share of 1/N of the mass of 0.2 kg."""
+    """Measures the extension of a chain of N springs, each with 1/N of the mass of 0.2 kg."""
     mass, stiffness = 0.2 / links, 50.0 * links
     extension = mass * G / stiffness * links * (links + 1) / 2.0
     scene = chain.scene(links=links, mass=mass, stiffness=stiffness)
@@ -244,9 +242,9 @@ def _chain(settle, links):
 
 
 def _catenary(settle, links, stretching):
-    """Sag of a cable of S = 1.2 over a span d = 1 of weight w = 1 a length, EA = ``stretching``: with its tension T
+    """Measures the sag of a cable of length S = 1.2, span d = 1, weight w = 1 per length and EA = ``stretching``.
 
-    d = (2T/w) asinh(wS/2T) + TS/EA,   sag = (T/w)(√(1 + (wS/2T)²) − 1) + wS²/8EA.
+    With the horizontal tension T, d = (2T/w) asinh(wS/2T) + TS/EA and sag = (T/w)(√(1 + (wS/2T)²) − 1) + wS²/8EA.
     """
     S = 1.2
     T = brentq(lambda T: 2.0 * T * np.arcsinh(S / (2.0 * T)) + T * S / stretching - 1.0, 1e-6, 1e3, xtol=1e-14)
@@ -256,7 +254,7 @@ def _catenary(settle, links, stretching):
 
 
 def _patch(settle, pattern, angle, resolution):
-    """Largest distance of a vertex to Gx̄ over the length; within, vertices start moved by a tenth of an edge."""
+    """Measures the largest distance of a vertex to Gx̄ over the length; inner vertices start perturbed by 0.1 edges."""
     mesh = strip(pattern, angle, 1.0 / resolution).mesh
     affine = mesh.points @ np.array([[1.1, 0.05, 0.02], [0.0, 1.0, 0.0], [0.03, -0.1, 1.2]])
     moved = np.random.default_rng(0).uniform(-0.1, 0.1, affine.shape) / resolution

@@ -1,9 +1,10 @@
-"""Best rotations of points that lie in a plane, on a line or in one place (Kabsch 1976, *A solution for the best rotation to
-relate two sets of vectors*).
+"""Best rotations of points in a plane, on a line or at one position (Kabsch 1976, *A solution for the best rotation to relate
+two sets of vectors*).
 
-Points whose covariance has the singular values σ₁² ≥ σ₂² ≥ σ₃² fix the rotation about their line by σ₂² beside the rounding
-ε of σ₁², so that it is known to about ε(σ₁/σ₂)²; the line itself is turned to a few ε. A plane still fixes the rotation,
-but UVᵀ is as often the reflection once (σ₃/σ₁)² is below ε. On a line the least rotation is taken, of a point the identity.
+The covariance of the points has the singular values σ₁² ≥ σ₂² ≥ σ₃². The rotation about their main axis follows from σ₂², which
+has the rounding εσ₁², so that it is accurate to about ε(σ₁/σ₂)². The axis itself is rotated to within a few ε. Points in a
+plane determine the rotation, but UVᵀ is a reflection half of the time once (σ₃/σ₁)² is below ε. For points on a line, the
+smallest rotation is taken, for one point the identity.
 """
 
 import numpy as np
@@ -19,12 +20,12 @@ _SETS, _POINTS = 200, 20
 
 
 def known(ratio, dtype):
-    """ε(σ₁/σ₂)², at most π."""
+    """Returns ε(σ₁/σ₂)², at most π."""
     return min(EPS[dtype] / ratio**2, np.pi)
 
 
 def least(degrees):
-    """Angle between a line and itself turned about an axis at 45° to it [°]."""
+    """Returns the angle [°] between a line and the line rotated by ``degrees`` about an axis at 45° to it."""
     return np.degrees(np.arccos(0.5 + 0.5 * np.cos(np.radians(degrees))))
 
 
@@ -65,7 +66,7 @@ def tasks(device):
 
 
 def sets(ratios, dtype, seed=0):
-    """P and Q = R P (c, n, 3) of that type, R (c, 3, 3) and the first axis of P (c, 3); P has singular values as given."""
+    """Returns P and Q = R P (c, n, 3) of a dtype, R (c, 3, 3) and the first axis of P (c, 3); P has given singular values."""
     rng = np.random.default_rng(seed)
     centred = rng.normal(size=(_SETS, _POINTS, 3))
     axes, _ = np.linalg.qr(centred - centred.mean(axis=1, keepdims=True))
@@ -76,7 +77,7 @@ def sets(ratios, dtype, seed=0):
 
 
 def measure(device):
-    """Points of all panels."""
+    """Returns the points of all panels."""
     import warp as wp
 
     def fit(P, Q):

@@ -1,4 +1,4 @@
-"""Reference solutions: the motion of a scene as its mesh has it, without the error of a time step; kept in files."""
+"""Reference solutions: the motion of a scene on its mesh without the error of time steps, kept in files."""
 
 import hashlib
 import itertools
@@ -22,29 +22,30 @@ from ..solvers.explicit import step_limits
 from .campaign import cache_folder
 from .clock import Clock, TooSlow
 
-# A step of Newton's method takes as long as some 250 explicit ones, and 4, 8 and 16 a frame are the fewest that may do.
+# Largest number of explicit steps per frame. A Newton step takes as long as some 250 explicit ones, and 4, 8 and 16 per frame
+# are the fewest that may do.
 _MOST_EXPLICIT = 4096
-# What is solved in a step is solved to this, so that only the step itself counts.
+# Tolerance of solves within a step, so small that only the error of the step itself counts.
 _TOLERANCE = 1e-6
 _SOLVED = (Result.COMPLETED, Result.CONVERGED, Result.ROUNDED)
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The motion of a scene, as good as ``error`` says.
+    """The motion of a scene, with a bound of its error.
 
     Attributes:
         points: (F, n, 3) [m], the start and each frame after it, float64.
         times: (F,) [s].
         error: Bound of its own :func:`position_error`, see :func:`reference`.
-        strain_error: Of its own :func:`strain_error`, likewise.
-        substeps: Steps a frame of the finest run.
-        seconds: What all runs took [s].
+        strain_error: Bound of its own :func:`strain_error`.
+        substeps: Steps per frame of the finest run.
+        seconds: Time of all runs [s].
         path: The file.
         key: A hash of scene, frames and code.
         scene: :func:`warpcloth.base.digest.scene_digest` of the scene.
         method: The solver.
-        limit: Seconds that do not suffice for less error: 0 where less was not asked for, infinite where none would.
+        limit: Time [s] that was too short for a smaller error: 0 if none was needed, infinite if more time would not help.
     """
 
     points: np.ndarray
@@ -60,7 +61,7 @@ class Reference:
     limit: float
 
     def save(self):
-        """Writes the file, whole or not at all."""
+        """Writes the file, under a temporary name until it is complete."""
         Path(self.path).parent.mkdir(parents=True, exist_ok=True)
         output = Output(self.path, "wb")
         try:
@@ -72,10 +73,10 @@ class Reference:
 
     @classmethod
     def load(cls, path):
-        """The reference of a file that :meth:`save` wrote.
+        """Reads a file that :meth:`save` wrote.
 
         Raises:
-            FileNotFoundError: There is none.
+            FileNotFoundError: There is no such file.
             ValueError: It is broken.
         """
         names = [field.name for field in fields(cls) if field.name != "path"]
@@ -84,23 +85,23 @@ class Reference:
                 values = {name: file[name] if name in ("points", "times") else file[name].item() for name in names}
         except FileNotFoundError:
             raise
-        except Exception as error:  # zip, zlib and NumPy have one each
+        except Exception as error:  # zipfile, zlib and NumPy raise errors of their own
             raise ValueError(f"{path}: is no reference solution, or broken ({error}); remove it") from None
         return cls(path=str(path), **values)
 
 
 def cloth_size(mesh):
-    """The longest side of the box about the rest shape [m], the unit of :func:`position_error`."""
+    """Returns the longest side of the bounding box of the rest shape [m], by which :func:`position_error` divides."""
     return float(np.ptp(mesh.points, axis=0).max())
 
 
 def position_error(points, others, mesh):
-    """Root mean square over vertices and frames of the distance of points (F, n, 3) to others, over the size of the cloth."""
+    """Returns the RMS distance over vertices and frames of points (F, n, 3) to others, over the size of the cloth."""
     return float(np.sqrt(((points - others) ** 2).sum(axis=-1).mean()) / cloth_size(mesh))
 
 
 def strain_error(points, others, mesh):
-    """99th percentile over edges of the mesh and frames of the difference of their strain l/L − 1, of points (F, n, 3)."""
+    """Returns the 99th percentile over edges and frames of the difference of strains l/L − 1, for points (F, n, 3)."""
     a, b = mesh.edges[mesh.edge_lengths > 0.0].T
     lengths = mesh.edge_lengths[mesh.edge_lengths > 0.0]
     first, other = (np.linalg.norm(x[:, b] - x[:, a], axis=-1) for x in (points, others))
@@ -108,36 +109,35 @@ def strain_error(points, others, mesh):
 
 
 def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
-    """The reference solution of a scene, from its file if there is one that will do, else found and kept there.
+    """Returns the :class:`Reference` of a scene, from its file if that is accurate enough; otherwise computes and stores it.
 
-    Runs of h, h/2, h/4 … in float64 give e(h) = x(h) + (x(h) − x(2h))/(2ᵖ − 1) by Richardson's extrapolation, p the order of
-    the method (Hairer, Nørsett and Wanner 1993, *Solving ordinary differential equations I*). The last e(h) is the reference,
-    ‖e(h) − e(2h)‖ its error, which bounds what it lacks if each halving at least halves that.
+    Runs with steps h, h/2, h/4 … in float64 give e(h) = x(h) + (x(h) − x(2h))/(2ᵖ − 1) by Richardson extrapolation, with the
+    order p of the method (Hairer, Nørsett and Wanner 1993, *Solving ordinary differential equations I*). The last e(h) is the
+    reference. ‖e(h) − e(2h)‖ bounds its error if each halving of h at least halves the error.
 
-    The method is symplectic Euler where some 4000 steps a frame are stable: it resolves what BDF2 damps until ωh is small.
-    At ``hanging`` with 32 × 32 vertices over 20 frames 128 steps of BDF2 a frame are off by 4e-5 after 9 s, and 428 explicit
-    ones, extrapolated, by less than 4e-6 after 3 s. Stiffer scenes take Newton's method with BDF2, and hard constraints
-    :class:`warpcloth.ConstrainedDynamics`. Scenes with colliders take Newton's method too, as the contact of explicit steps
-    gives way under a pressure: the two motions of ``drape`` with 8 × 8 vertices are 0.6 % apart after half a second. Friction
-    takes its normal forces from the start of a step, which makes BDF2 a method of first order.
+    The method is symplectic Euler if some 4000 steps per frame are stable, because BDF2 damps high frequencies unless ωh is
+    small. For ``hanging`` with 32 × 32 vertices over 20 frames, 128 BDF2 steps per frame have an error of 4e-5 after 9 s, and
+    428 explicit ones, extrapolated, less than 4e-6 after 3 s. Stiffer scenes use Newton's method with BDF2, and hard
+    constraints :class:`warpcloth.ConstrainedDynamics`. Scenes with colliders also use Newton's method, because contact in
+    explicit steps is
+    softer: the two motions of ``drape`` with 8 × 8 vertices are 0.6 % apart after half a second. Friction uses the normal
+    forces at the start of a step, which makes BDF2 first order.
 
-    The file is in :func:`warpcloth.lab.campaign.cache_folder`, by a hash of the data of the scene, the frames and this code.
+    The file is in :func:`warpcloth.lab.campaign.cache_folder`, named by a hash of the scene, the frames and this code.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
-        frames: Number of frames, if not those of the scene.
-        tolerance: Steps are halved until ``error`` is no more than this,
-        limit: or for so long [s], or until two halvings have not made it less, the mark of chaotic motion or of rounding.
-        progress: Function called with (substeps, frame, frames) once each frame is known, or None.
-
-    Returns:
-        :class:`Reference`.
+        frames: Number of frames, by default those of the scene.
+        tolerance: Steps are halved until ``error`` is at most this, or until two halvings did not lower it, a sign of chaotic
+            motion or rounding.
+        limit: Time limit [s].
+        progress: Function called with (substeps, frame, frames) after each frame, or None.
 
     Warns:
-        UserWarning: If its error is above the tolerance, or a term makes it slow.
+        UserWarning: Its error is above the tolerance, or a term makes it slow.
 
     Raises:
-        ValueError: An argument is not allowed, no method takes the scene, or ``limit`` does not suffice for any estimate.
+        ValueError: An argument is not allowed, no method takes the scene, or ``limit`` is too short for any estimate.
     """
     number("tolerance", tolerance, above=0.0)
     number("limit", limit, above=0.0)
@@ -161,7 +161,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
 
 
 def _kept(path, key):
-    """The reference of a file, or None where there is none, or a broken one."""
+    """Returns the reference in a file, or None if there is none, or a broken one."""
     try:
         found = Reference.load(path)
     except (FileNotFoundError, ValueError):
@@ -171,12 +171,12 @@ def _kept(path, key):
 
 @dataclass(frozen=True)
 class _Method:
-    """How a reference is found.
+    """The method of a reference.
 
     Attributes:
-        record: Substeps → options of the solver.
-        first: The fewest substeps.
-        order: p.
+        record: Function (substeps) → record of the solver.
+        first: Smallest number of substeps.
+        order: Order p.
     """
 
     record: Callable
@@ -185,10 +185,10 @@ class _Method:
 
 
 def _method(scene):
-    """The :class:`_Method` for a scene.
+    """Returns the :class:`_Method` for a scene.
 
     Raises:
-        ValueError: There is none.
+        ValueError: No method takes the scene.
     """
     model = scene.build(dtype="float64")
     if any(elements.hard for elements in model.terms):
@@ -214,7 +214,7 @@ def _method(scene):
 
 
 def _solve(scene, frames, tolerance, limit, progress):
-    """``points``, ``error``, ``strain_error``, ``substeps``, ``seconds``, ``method`` and ``limit`` of a reference."""
+    """Computes ``points``, ``error``, ``strain_error``, ``substeps``, ``seconds``, ``method`` and ``limit`` of a reference."""
     method = _method(scene)
     started, substeps = time.perf_counter(), method.first
     runs, errors, best, trouble = [], [], None, ""  # points of up to three runs, each with half the step of the one before
@@ -227,7 +227,7 @@ def _solve(scene, frames, tolerance, limit, progress):
             break
         if run.status.result in _SOLVED:
             runs = [*runs[-2:], run.points]
-        else:  # too large a step: what is coarser has no order to go by
+        else:  # the step is too large, so coarser runs cannot be extrapolated
             runs, errors, best, trouble = [], [], None, f"; with {substeps} substeps: {run.status.message}"
         if len(runs) == 3:
             coarse, fine = (b + (b - a) / (2**method.order - 1) for a, b in itertools.pairwise(runs))
@@ -251,5 +251,5 @@ def _solve(scene, frames, tolerance, limit, progress):
 
 
 def _idle(errors):
-    """Whether the last two halvings have not made the error less, by a tenth at least."""
+    """Returns whether the last two halvings lowered the error by less than a tenth."""
     return len(errors) > 2 and errors[-1] > 0.9 * errors[-3]

@@ -7,9 +7,9 @@ import numpy as np
 
 from ..base.outputs import write_table
 
-# What tells a row from another, in two results.
+# Columns that identify a row in two results.
 _SAME = ("scene", "parameters", "solver", "options", "device", "dtype", "copies", "threads")
-# What a CSV has of a row, in this order; what is not known is empty.
+# Columns of a CSV; unknown values are empty.
 COLUMNS = (
     *("scene", "parameters", "solver", "options", "device", "dtype", "copies", "threads", "status", "reason"),
     *("vertices", "elements", "substeps", "iterations", "frames", "ms", "ms_low", "ms_high", "cloths_per_s", "ns", "bytes"),
@@ -20,14 +20,14 @@ COLUMNS = (
 
 
 def exponent(sizes, values):
-    """p of values ∝ sizesᵖ, by least squares over the logarithms, and its standard error.
+    """Fits values ∝ sizesᵖ by least squares of logarithms, and returns p and its standard error.
 
     Args:
         sizes: (m,), above 0.
         values: (m,), above 0.
 
     Returns:
-        (p, error): The error is None of two points, and both are None of fewer or where all sizes are one.
+        (p, error): The error is None for two points; both are None for fewer points or if all sizes are equal.
     """
     x, y = (np.log(np.asarray(each, dtype=np.float64)) for each in (sizes, values))
     x = x - x.mean() if len(x) else x
@@ -42,14 +42,14 @@ def exponent(sizes, values):
 
 
 def growth(rows):
-    """How the time of a frame and that of an iteration grow with the vertices, of each benchmark with two sizes or more.
+    """Returns how the times of a frame and of an iteration grow with the number of vertices, for benchmarks of several sizes.
 
-    They differ where finer scenes take more substeps or iterations. Of one cloth on meshes of several sizes, they grow with the
-    triangles of the meshes.
+    They differ if finer scenes take more substeps or iterations. For one cloth on mesh colliders of several sizes, growth is
+    relative to the triangles of the colliders.
 
     Returns:
-        list: Of each ``solver``, ``options`` that all sizes share, ``over``, "vertices" or "triangles", and ``frame`` and
-        ``iteration``, each [p, error] of :func:`exponent`; with self-contact also ``list`` and ``areas``.
+        list: For each benchmark ``solver``, the ``options`` that all sizes share, ``over``, "vertices" or "triangles", and
+        ``frame`` and ``iteration``, each [p, error] of :func:`exponent`; with self-contact also ``list`` and ``areas``.
     """
     found, known = [], [row for row in rows if row["status"] == "ok"]
     for number in dict.fromkeys(row["benchmark"] for row in known):
@@ -72,19 +72,19 @@ def growth(rows):
 
 
 def ratios(old, new):
-    """New over old, of the rows that two results both have and that are "ok" in both.
+    """Returns the ratios new over old of rows that are "ok" in both results.
 
-    The spread of a ratio of times goes from the lower quartile of the one over the upper of the other to the reverse: a
-    difference exceeds it where the quartiles do not overlap.
+    The spread of a ratio of times goes from lower quartile over upper quartile to the reverse. So a difference exceeds it if
+    the quartiles do not overlap.
 
     Args:
         old: A result, see :func:`read`.
         new: Another.
 
     Returns:
-        list: Of each row what it is, ``label``, ``ms`` (old, new), ``ratio``, ``spread`` (low, high), ``verdict`` ("faster",
-        "slower" or "" within the spread), and the ratios ``launches``, ``bytes``, ``start``, ``memory``, None of what either
-        does not know.
+        list: For each row the columns that identify it, ``label``, ``ms`` (old, new), ``ratio``, ``spread`` (low, high),
+        ``verdict`` ("faster", "slower" or "" within the spread), and the ratios ``launches``, ``bytes``, ``start`` and
+        ``memory``, None if unknown.
     """
     before, found = {_key(row): row for row in old["rows"] if row["status"] == "ok"}, []
     for row in new["rows"]:
@@ -106,10 +106,10 @@ def _key(row):
 
 
 def read(path):
-    """A result that ``warpcloth bench --json`` printed.
+    """Reads a result that ``warpcloth bench --json`` printed.
 
     Raises:
-        ValueError: The file is none.
+        ValueError: The file has no such result.
     """
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -9,23 +9,23 @@ from .measurements import Setup
 
 
 def setups_of_steps(solvers=None):
-    """Returns the :class:`Setup`\\s that minimise one step, or those of the solvers named.
+    """Returns the :class:`Setup`\\s that minimise one step, of all solvers or of those named.
 
     Raises:
-        ValueError: A name is none of a method that minimises.
+        ValueError: A name is not that of a solver that minimises.
     """
     names = _checked(solvers, [name for name, record in SOLVERS.items() if record.facts.one_step])
     return [Setup(name, options) for name in names for options in SOLVERS[name].facts.one_step]
 
 
 def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32"):
-    """Returns the :class:`Setup`\\s of runs, or those of the solvers named, each once.
+    """Returns the :class:`Setup`\\s of runs of a :class:`SceneRef`, of all solvers or of those named, each once.
 
-    Their steps are as long whatever the frame rate of the scene, a :class:`SceneRef`, if they are not longer than a frame; the
-    substeps of a limited solver are multiples of its fewest stable ones on a device.
+    Steps do not depend on the frame rate of the scene, unless they would be longer than a frame. The substeps of a limited
+    solver are multiples of its fewest stable substeps on a device.
 
     Raises:
-        ValueError: A name is no solver's.
+        ValueError: There is no solver of a name.
     """
     setups, fps = [], None
     for name in _checked(solvers, list(SOLVERS)):
@@ -43,7 +43,7 @@ def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32"):
 
 
 def label(setup):
-    """A setup in few words, such as "xpbd bdf2 80×1"."""
+    """Returns a setup in a few words, such as "xpbd bdf2 80×1"."""
     options = dict(setup.options)
     options.pop("tolerance", None)
     count = "×".join(str(options.pop(name)) for name in ("substeps", "iterations") if name in options)
@@ -61,7 +61,7 @@ def _checked(names, known):
 
 
 def _fewest(record, scene, device, dtype):
-    """Returns the fewest stable substeps of a limited solver; 1 where hard constraints leave none, which is refused then."""
+    """Returns the fewest stable substeps of a limited solver; 1 with hard constraints, which it refuses."""
     declared = scene.load()
     try:
         return fewest_substeps(declared.fps, *record.step_limits(declared.build(device=device, dtype=dtype)))

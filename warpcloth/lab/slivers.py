@@ -1,8 +1,8 @@
-"""Hinges of slivers and hinges that fold through: where dihedral bending becomes stiff without bound, and where it jumps.
+"""Dihedral bending of slivers, whose stiffness has no bound, and of hinges that fold through, whose angle jumps.
 
-The angle of a hinge changes by 1/height for each metre that its apex moves across the triangle. A sliver therefore has the
-largest forces and the least explicit step of a mesh; below 1e-6 of the longest side it has no force. Folded flat, the angle
-jumps from π to −π, and the force turns round.
+The angle of a hinge changes by 1/height per metre of motion of its apex normal to the triangle. So a sliver has the largest
+forces and the smallest explicit step of a mesh. With a height below 1e-6 of the longest side it has no force. When a hinge is
+folded flat, its angle jumps from π to −π, and the force changes sign.
 """
 
 import numpy as np
@@ -25,13 +25,13 @@ _TURN = 1.0  # [rad]
 
 
 def limit(height):
-    """2/ω of a flat hinge of unit edge, masses and D, one of its triangles equilateral: its Hessian is cD∇θ∇θᵀ."""
+    """Returns 2/ω of a flat hinge with unit edge, masses and D, one triangle equilateral; its Hessian is cD∇θ∇θᵀ."""
     a, b = 1.0 / height, 1.0 / _HEIGHT
     return 2.0 / np.sqrt(2.0 / (height + _HEIGHT) * (a**2 + b**2 + 0.5 * (a + b) ** 2))
 
 
 def folded(degrees, rest=0.0):
-    """θ − θ̄ in (−π, π] of a hinge folded by so many degrees [rad]."""
+    """Returns θ − θ̄ [rad] in (−π, π] of a hinge folded by some degrees."""
     turn = np.radians(degrees) - rest
     return turn - 2.0 * np.pi * np.ceil((turn - np.pi) / (2.0 * np.pi))
 
@@ -101,7 +101,7 @@ def tasks(device):
 
 
 def measure(device):
-    """Points of all panels, of one hinge."""
+    """Returns the points of all panels, for one hinge."""
     found = []
     for size, label in ((1.0, "1 m"), (1e-3, "1 mm")):
         for dtype in ("float32", "float64"):
@@ -118,7 +118,7 @@ def measure(device):
 
 
 def hinge(height=_HEIGHT, degrees=0.0, size=1.0):
-    """Points (4, 3) of an edge of length ``size`` along x and the apexes of two triangles; the first is folded up."""
+    """Returns the points (4, 3) of an edge of length ``size`` along x and two apexes, of which the first is folded up."""
     angle = np.radians(degrees)
     apex = [0.5, height * np.cos(angle), height * np.sin(angle)]
     return size * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], apex, [0.5, -_HEIGHT, 0.0]])
@@ -131,7 +131,7 @@ def _scene(rest, positions, bending):
 
 @in_turn
 def _force(scene, device, dtype):
-    """∂U/∂x of the first apex (3,)."""
+    """Returns ∂U/∂x of the first apex (3,)."""
     model = scene.build(device=device, dtype=dtype)
     gradient = model.vectors()
     Gradient(model).add(model.positions, gradient)
@@ -139,19 +139,19 @@ def _force(scene, device, dtype):
 
 
 def apex_gradient(height, size, device, dtype):
-    """|∂θ/∂x| of the apex [1/m], of a hinge equilateral at rest that is bent by 1 rad; 0 where it has no force."""
+    """Returns |∂θ/∂x| of the apex [1/m] of a hinge that is equilateral at rest and bent by 1 rad; 0 without a force."""
     scene = _scene(hinge(size=size), hinge(height, np.degrees(_TURN), size), DihedralBending)
     return float(np.linalg.norm(_force(scene, device, dtype)) / (_WEIGHT * _TURN))
 
 
 def step_limit(height, device):
-    """Largest stable step of the explicit solver about a flat hinge one of whose triangles is so high [s]."""
+    """Returns the largest stable explicit step [s] about a flat hinge with one triangle of a given height."""
     rest = hinge(height)
     return step_limits(_scene(rest, rest, DihedralBending).build(device=device, dtype="float64"))[0]
 
 
 def fold_of(term, degrees, rest, device):
-    """Energy and torque about the edge, both over cD, of an equilateral hinge folded by so much; ``rest`` is its own fold."""
+    """Returns energy and torque about the edge, both over cD, of an equilateral hinge folded by ``degrees``."""
     positions = hinge(degrees=degrees)
     scene = _scene(hinge(degrees=rest), positions, BENDING[term])
     (energy,) = energies(scene, device=device, dtype="float64")

@@ -1,10 +1,10 @@
-"""Why projective dynamics converges as it does: the spectrum of the true Hessian relative to its matrix, and errors beside it.
+"""Explains the convergence of projective dynamics by the spectrum of the true Hessian relative to its constant matrix.
 
-Near the minimiser an iteration d ← d − A⁻¹∇φ(d) takes the error e to (1 − A⁻¹H)e, H the Hessian of φ there and A the constant
-matrix. With the eigenvectors v of Hv = μAv each part of e shrinks by its own 1 − μ an iteration, the slowest by
-max |1 − μ|, in the norm ‖e‖²_A = eᵀAe; as A takes projections as fixed, H ≤ A and 0 ≤ 1 − μ (Liu et al. 2017, *Quasi-Newton
-methods for real-time simulation of hyperelastic materials*, for its view as a descent). With colliders A includes the
-semi-definite Hessian of contact at the minimiser, as that of the iterations does near it.
+Near the minimiser, an iteration d ← d − A⁻¹∇φ(d) maps the error e to (1 − A⁻¹H)e, with the Hessian H of φ and the constant
+matrix A. Each component of e along an eigenvector v of Hv = μAv is multiplied by 1 − μ, so that ‖e‖²_A = eᵀAe shrinks at worst
+by max |1 − μ| per iteration. As A takes projections as fixed, H ≤ A and 0 ≤ 1 − μ (Liu et al. 2017, *Quasi-Newton methods for
+real-time simulation of hyperelastic materials*, for the view as a descent). With colliders, A includes the semi-definite
+Hessian of contact at the minimiser, as in the iterations.
 """
 
 import time
@@ -17,23 +17,24 @@ from ..kernels.term import HessianPolicy
 from ..solvers import ProjectiveDynamics
 from .convergence import LADDER, one_step
 
-# Unknowns of which the spectrum is found, by a dense matrix.
+# Largest number of unknowns for the spectrum, which uses dense matrices.
 MOST = 2000
-# Of the error at x̃, between which iterations are linear and resolved: what comes later is predicted from the first below.
+# Range of errors, relative to that at x̃, in which iterations are linear and resolved. Predictions start at the first error
+# below LINEAR.
 LINEAR, RESOLVED = 1e-2, 1e-8
 
 
 def relative_spectrum(step):
-    """μ and v of Hv = μAv at the minimiser of a step, VᵀAV = 1.
+    """Returns μ and v of Hv = μAv at the minimiser of a step, VᵀAV = 1.
 
     Args:
         step: The :class:`warpcloth.lab.convergence.OneStep`.
 
     Returns:
-        tuple: (μ (f,) from small to large, V (f, f), A (f, f)), f the coordinates of the free vertices, x, y and z of each.
+        tuple: (μ (f,) ascending, V (f, f), A (f, f)), f the number of coordinates of free vertices.
 
     Raises:
-        ValueError: There are too many, or a term is none of projective dynamics.
+        ValueError: There are too many unknowns, or projective dynamics does not take a term.
     """
     from scipy.linalg import eigh
 
@@ -57,22 +58,21 @@ def relative_spectrum(step):
 
 
 def measure(scene, digest, frame, substeps, device="cpu", limit=20.0):
-    """Errors of plain projective dynamics after more and more iterations of one step, and what the spectrum makes of them.
+    """Measures errors of plain projective dynamics after increasing iterations of one step, and predicts them.
 
     Args:
         scene: :class:`SceneRef` as a dictionary.
-        digest: Of the scene, as of :func:`warpcloth.lab.convergence.measure`.
-        frame: Frames before the step.
-        substeps: Steps a frame.
+        digest: Digest of the scene, as for :func:`warpcloth.lab.convergence.measure`.
+        frame: Number of frames before the step.
+        substeps: Number of steps per frame.
         device: A Warp device.
-        limit: Seconds for the iterations.
+        limit: Time limit of the iterations [s].
 
     Returns:
-        dict: ``status`` ("ok" or "refused", also where the scene has no such step), ``reason``, ``eigenvalues`` μ,
+        dict: ``status`` ("ok", or "refused", also if the scene has no such step), ``reason``, ``eigenvalues`` μ,
         ``contraction`` max |1 − μ|, ``points`` with ``iterations``, ``error`` ‖d − d*‖_A over that at x̃, and ``predicted``,
-        the same from the first error that is small on, else None; ``floor``, the largest error that roundings of x alone make;
-        and ``measured`` and ``expected``, the factor of an
-        iteration between the last two points, of errors and of predictions.
+        the error predicted from the first small one, or None; ``floor``, the largest error by rounding of x alone; and
+        ``measured`` and ``expected``, the factor per iteration between the last two points, of errors and of predictions.
 
     Raises:
         ValueError: See :func:`relative_spectrum`.
@@ -85,7 +85,7 @@ def measure(scene, digest, frame, substeps, device="cpu", limit=20.0):
         return result | {"status": "refused", "reason": str(error)}
     mu, V, A = relative_spectrum(step)
     result |= {"eigenvalues": mu.tolist(), "contraction": float(np.abs(1.0 - mu).max())}
-    weights = A @ V  # of an error to its parts
+    weights = A @ V  # maps an error to its components
     unknowns = np.repeat(step.free, 3)
     first = np.linalg.norm(step.best.ravel()[unknowns] @ weights)
     result["floor"] = max(float(np.linalg.norm(move.ravel()[unknowns] @ weights) / first) for move in step.roundings())

@@ -1,4 +1,4 @@
-"""Where each method is stable, inaccurate or diverges: cells of a map over two axes, measured row by row."""
+"""Maps of where each method is stable, is inaccurate or diverges: cells over two axes, measured row by row."""
 
 import math
 import time
@@ -19,7 +19,7 @@ from .measurements import SceneRef, Setup, finite, task
 from .stability_limits import KNOWN, limit_ratios
 
 VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
-# Steps of the reference per step of the map, and the most steps that it takes in all (or as many as frames). A run with half as
+# Steps of the reference per step of the map, and its largest total number of steps (at least one per frame). A run with half as
 # many steps gives the error of the reference.
 _FINER, _MOST = 4, 2000
 _FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
@@ -27,13 +27,13 @@ _FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
 
 @dataclass(frozen=True)
 class BatchRun:
-    """The result of a run of B copies; a copy that diverged is NaN from there.
+    """The result of a run of B copies; a copy is NaN from the frame in which it diverged.
 
     Attributes:
         points: (frames+1, B, n, 3) [m].
         good: The last good frame of each copy (B,).
-        growth: Largest energy of motion and height in a good frame, divided by what the start, falling and rounding can have
-            put in, (B,), see :class:`warpcloth.run.balance.Balance`.
+        growth: Largest kinetic and potential energy in a good frame, over what the start, falling and rounding can have added,
+            (B,), see :class:`warpcloth.run.balance.Balance`.
         reasons: A sentence for each copy, or "".
         results: :class:`warpcloth.core.status.Result` of each copy.
         steps_per_frame: Steps per frame.
@@ -52,7 +52,7 @@ class Slow(Exception):
 
 
 def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", limit=60.0):
-    """Runs a scene as `simulate` does, with its criterion for divergence except strain, which the reference covers.
+    """Runs a scene like `simulate`, with its criteria of divergence except strain, which the reference covers.
 
     Raises:
         Slow: The run took more than ``limit`` seconds, which is checked at each frame.
@@ -61,7 +61,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
     began = time.perf_counter()
     model = scene.build(device=device, dtype=dtype, copies=copies, vary=varied)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of steps too large, which are the subject
+        warnings.simplefilter("ignore")  # about large steps, which are the subject
         stepper = record.bind(model)
     frames, B = scene.frames, copies
     watch = Watch(model, stepper, stretched=np.inf)
@@ -74,7 +74,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
                 if time.perf_counter() - began > limit:
                     raise Slow(f"stopped after {limit:g} s, in frame {number} of {frames}")
     said = [watch.messages.get(copy, each.value if each in _FAILED else "") for copy, each in enumerate(stepper.results)]
-    said = [text.replace(f", copy {copy}:", ":") for copy, text in enumerate(said)]  # which is of the row, not of the map
+    said = [text.replace(f", copy {copy}:", ":") for copy, text in enumerate(said)]  # copies mean nothing in the map
     return BatchRun(points, watch.good, watch.growth, said, list(stepper.results), stepper.steps_per_frame)
 
 
@@ -93,7 +93,7 @@ def measure(
     digests=None,
     duration=None,
 ):
-    """Cells that differ in one value, of each setup: a row of copies where one run can have them, else a run each.
+    """Measures cells that differ in one value, for each setup, in one run of several copies if possible.
 
     Args:
         scene: A dictionary of :class:`warpcloth.lab.measurements.SceneRef`.
@@ -101,15 +101,15 @@ def measure(
         fixed: Values by axis that all cells share; ``dt`` is among them or ``axis``.
         axis: The axis along which they differ.
         values: Values of that axis.
-        steps: The fewest steps of a run, however long they take, so that runs that diverge show it.
-        accuracy: RMS distance to the reference, over vertices and frames and over the size of the cloth, that is inaccurate.
-        device: Of the run.
-        dtype: Of the run; the reference has float64.
-        limit: Seconds for each run.
-        reference: Whether to compare with Newton and BDF2 at a quarter of the step, or in 2000 steps if that takes more. If
-            Newton refuses the scene there is no reference.
-        digests: Digests of the scene, see :func:`warpcloth.base.digest.scene_digest`: a scene that was changed has another
-            key.
+        steps: Minimum number of steps of a run, so that instabilities have time to grow.
+        accuracy: RMS distance to the reference over vertices and frames, over the size of the cloth, above which a run is
+            inaccurate.
+        device: Device of the run.
+        dtype: Precision of the run; the reference has float64.
+        limit: Time limit of each run [s].
+        reference: Whether to compare with Newton and BDF2 at a quarter of the step, but at most 2000 steps. If Newton refuses
+            the scene, there is no reference.
+        digests: Digests of the scene, see :func:`warpcloth.base.digest.scene_digest`, so that a changed scene has another key.
         duration: Time of motion that is compared with the reference, the same for all cells [s]; runs last at least as long. By
             default that of ``steps``.
 
@@ -150,7 +150,7 @@ def measure(
 
 
 def _attempt(ref, record, fixed, axis, group, length, device, dtype, limit):
-    """The :class:`BatchRun` of a group, or the cell of all its copies."""
+    """Returns the :class:`BatchRun` of a group, or the cell of all its copies if the run failed."""
     try:
         if len(group) == 1:
             scene = scene_at(ref, {**fixed, axis: group[0]}, *length)
@@ -192,7 +192,7 @@ def _apart(first, other, copy):
 
 
 def _judge(trial, copy, answer, accuracy):
-    """The cell of one copy; ``answer`` as of :func:`_reference`."""
+    """Returns the cell of one copy; ``answer`` is from :func:`_reference`."""
     growth, reason = finite(trial.growth[copy]), trial.reasons[copy]
     floor = _apart(*answer, copy) if isinstance(answer, list) else None
     if trial.good[copy] < len(trial.points) - 1:
@@ -228,10 +228,10 @@ class Survey:
         x, y: Names of the two axes, of :data:`warpcloth.lab.axes.AXES`.
         xs, ys: Their values.
         fixed: Values of other axes.
-        steps, duration: As in :func:`measure`; the default duration is half of the scene's.
+        steps, duration: As for :func:`measure`; the default duration is half of the scene's.
 
     Raises:
-        ValueError: The axes are not two, or unknown, or a method has a step of its own.
+        ValueError: The axes are equal or unknown, or a method has a step of its own.
     """
 
     scene: SceneRef
@@ -257,10 +257,10 @@ class Survey:
         number("duration", self.duration, above=0.0)
 
     def tasks(self, **options):
-        """One :class:`warpcloth.lab.measurements.Task` a row, along the axis that copies can differ in, if one can.
+        """Returns one :class:`warpcloth.lab.measurements.Task` for each row, along an axis in which copies can differ, if any.
 
         Args:
-            options: Of :func:`measure`.
+            options: Options of :func:`measure`.
         """
         scene = scene_at(self.scene, {**FIXED, **self.fixed} | self._first(), 1)
         along = self.y if together(scene, self.y) and not together(scene, self.x) else self.x
@@ -274,7 +274,7 @@ class Survey:
         return [task(measure, scene=self.scene, fixed={**rest, other: value}, **given) for value in others]
 
     def _digests(self):
-        """Of the scene at each of its resolutions."""
+        """Returns the digests of the scene at each of its resolutions."""
         values = {self.x: self.xs, self.y: self.ys}.get("resolution", [])
         refs = [refined(self.scene, value) for value in values] or [self.scene]
         return [scene_digest(ref.load()) for ref in refs]
@@ -283,11 +283,11 @@ class Survey:
         return {self.x: self.xs[0], self.y: self.ys[0]}
 
     def table(self, results, store=None):
-        """Cells (setup, y, x) as nested lists, from (task, result) in any order; None where there is none.
+        """Returns cells (setup, y, x) as nested lists, None if missing.
 
         Args:
-            results: As :func:`warpcloth.lab.campaign.sweep` gives them.
-            store: The :class:`warpcloth.lab.campaign.Store` that keeps them, which says the ``machine`` of each cell, or None.
+            results: (task, result) pairs of :func:`warpcloth.lab.campaign.sweep`, in any order.
+            store: Their :class:`warpcloth.lab.campaign.Store`, which gives the ``machine`` of each cell, or None.
         """
         cells = [[[None] * len(self.xs) for _ in self.ys] for _ in self.setups]
         for done, rows in results:
@@ -303,21 +303,21 @@ class Survey:
 
 
 def boundary(scene, setup, axis, low, high, steps=200, fixed=None, accuracy=1e-3, **options):
-    """The value of an axis between a run that holds and one that diverges, by bisection of its logarithm.
+    """Returns the value of an axis at which runs begin or cease to diverge, by bisection of its logarithm.
 
     Args:
         scene: :class:`warpcloth.lab.measurements.SceneRef`.
         setup: :class:`warpcloth.lab.measurements.Setup`.
-        axis: Its name.
-        low: A value that holds, or that does not.
-        high: A larger one, for which it is the other way round.
-        steps: Length of each run.
+        axis: Name of the axis.
+        low: Lower end of the bracket.
+        high: Upper end of the bracket; exactly one of the ends must diverge.
+        steps: Number of steps of each run.
         fixed: Values of other axes.
         accuracy: Relative width at which to stop.
-        options: Of :func:`run`.
+        options: Options of :func:`run`.
 
     Raises:
-        ValueError: Both ends hold, or both diverge.
+        ValueError: Neither end diverges, or both do.
     """
 
     def diverges(value):

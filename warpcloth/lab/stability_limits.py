@@ -1,4 +1,4 @@
-"""Where methods fail by theory: of a scene and a solver, numbers that are above 1 beyond the limit."""
+"""Theoretical limits of methods: ratios for a scene and a solver that are above 1 beyond the limit."""
 
 from functools import cached_property, lru_cache
 
@@ -13,14 +13,14 @@ from ..numerics.sweeps import IN_PLACE, colours
 from ..solvers.explicit import step_limits
 from ..terms import Spring
 
-# Beyond these a run diverges; beyond the others it is wrong, or need not be.
+# Limits beyond which a run diverges. Beyond the others, it may be inaccurate.
 DIVERGES = ("2/ω_max", "2/√(2 Σk/m)", "forward Euler", "ω λ_max = 2", "Gauss–Seidel, |z| = 1")
-# Not of a method: how far the reference of a map is known, over the accuracy that is asked for.
+# Not a limit of a method: the error of the reference of a map over the requested accuracy.
 KNOWN = "error of the reference = accuracy"
-# Growth in energy of the fastest mode of a net when the whole net, which starts as noise, has grown enough to count as diverged
-# (:data:`warpcloth.run.balance.GAIN`). Measured in runs of 40 to 400 steps it is 7 to 16 times.
+# Growth in energy of the fastest mode of a net, from noise, at which the whole net counts as diverged
+# (:data:`warpcloth.run.balance.GAIN`). In runs of 40 to 400 steps it is 7 to 16.
 GROWTH = 10.0
-# Most springs for which the eigenvalues of a sweep are computed, by a dense solver.
+# Largest number of springs for which the eigenvalues of a sweep are computed, by a dense solver.
 _MOST = 1000
 
 
@@ -38,7 +38,7 @@ def limit_ratios(scene, record, steps):
 
 
 class _Cell:
-    """A scene, a solver and the length of a run, with what limits need of them.
+    """A scene, a solver and the length of a run, with the quantities that limits need.
 
     Attributes:
         h: Step [s].
@@ -56,78 +56,75 @@ class _Cell:
 
     @cached_property
     def model(self):
-        """The model in float64; None where a stiffness is infinite."""
+        """The model in float64; None if a stiffness is infinite."""
         if any(np.isinf(term.stiffness).any() for term in self.scene.terms):
             return None
         return self.scene.build(dtype="float64")
 
     @cached_property
     def step_limits(self):
-        """As :func:`warpcloth.solvers.explicit.step_limits` gives them; None where a stiffness is infinite."""
+        """See :func:`warpcloth.solvers.explicit.step_limits`; None if a stiffness is infinite."""
         return self.model and step_limits(self.model)
 
 
 def _below_rest(cell):
-    """Divides h by the largest stable step of symplectic Euler about the rest shape."""
+    """Returns h over the largest stable step of symplectic Euler about the rest shape."""
     if cell.record.scheme == "symplectic" and cell.step_limits:
         return cell.h / cell.step_limits[0]
 
 
 def _below_motion(cell):
-    """Divides h by the largest stable step in motion, see :func:`warpcloth.solvers.explicit.step_limits`."""
+    """Returns h over the largest stable step in motion, see :func:`warpcloth.solvers.explicit.step_limits`."""
     if cell.record.scheme == "symplectic" and cell.step_limits:
         return cell.h / cell.step_limits[1]
 
 
 def _forward_growth(cell):
-    """The fastest mode grows by 1 + h²ω² a step and has grown by :data:`GROWTH` at the end; no line if damping stops it."""
+    """Returns log growth of the fastest mode, by 1 + h²ω² per step, over that of :data:`GROWTH`; None with damping."""
     if cell.record.scheme == "forward" and not cell.damped and cell.step_limits:
         return cell.steps * np.log1p((2.0 * cell.h / cell.step_limits[0]) ** 2) / np.log(GROWTH)
 
 
 def _jacobi_relaxation(cell):
-    """Relaxation of Jacobi sweeps over springs, averaged or not, see :func:`largest_relaxation`."""
+    """Returns the relaxation of Jacobi sweeps over springs divided by its limit, see :func:`largest_relaxation`."""
     if cell.springs and cell.record.sweep not in IN_PLACE:
         return cell.record.relaxation / largest_relaxation(cell.scene, cell.he, cell.record)
 
 
 def _ordered_relaxation(cell):
-    """Relaxation of Gauss–Seidel sweeps over springs; beyond it energy grows by :data:`GROWTH` in the steps of the run, see
-    :func:`largest_ordered`."""
+    """Returns the relaxation of Gauss–Seidel sweeps over springs divided by its limit, see :func:`largest_ordered`."""
     if cell.springs and cell.record.sweep in IN_PLACE:
         limit = largest_ordered(cell.scene, cell.he, cell.record, cell.steps)
         return None if limit is None else cell.record.relaxation / limit
 
 
 def _rings(cell):
-    """Divides how many edges lie between pins and the furthest vertex by the sweeps."""
+    """Returns the number of edges between pins and the furthest vertex over the number of sweeps."""
     if len(cell.scene.pins.vertices):
         return rings(cell.scene) / cell.record.iterations
 
 
 def _iterations_across(cell):
-    """Divides the iterations that projections need across springs, for accelerated ones the root, by those there are."""
+    """Returns the iterations that projections need across springs, or if accelerated the root, over those of the solver."""
     if cell.step_limits:
         needed = 1.0 + 2.0 * (cell.he / cell.step_limits[1]) ** 2
         return (needed if cell.record.acceleration == "none" else np.sqrt(needed)) / cell.record.iterations
 
 
 def _weight(cell):
-    """Divides the weight of ADMM by the smallest of :func:`warpcloth.numerics.local_weights.best_weights`, that of the stiffest
-    element. A larger weight stalls, a smaller one oscillates."""
+    """Returns the weight of ADMM over the best weight of the stiffest element; larger ones stall, smaller ones oscillate."""
     if cell.record.weight != "auto" and cell.model:
         return cell.record.weight / min(best_weights(cell.model, elements, cell.he).min() for elements in cell.model.terms)
 
 
 def _not_convex(cell):
-    """hₑ √−λ with λ the least eigenvalue of M⁻¹∂²U/∂x² at the start and hₑ the effective step of the integrator, beyond which
-    what a step minimises is not convex (Choi and Ko 2002)."""
+    """Returns hₑ√−λ, λ the lowest eigenvalue of M⁻¹∂²U/∂x² at the start; above 1 a step is not convex (Choi and Ko 2002)."""
     if cell.model:
         return cell.he * np.sqrt(concave_rate(cell.model))
 
 
-# Functions of a :class:`_Cell` that give the ratio, or None where the limit does not apply, by the name that the line has. The
-# record of a solver names those that it has.
+# Functions of a :class:`_Cell` that return the ratio, or None if the limit does not apply, by the name of the limit. The record
+# of a solver names its limits.
 LIMITS = {
     "2/ω_max": _below_rest,
     "2/√(2 Σk/m)": _below_motion,
@@ -143,10 +140,10 @@ LIMITS = {
 
 @in_turn
 def concave_rate(model):
-    """−λ of the least eigenvalue λ of M⁻¹∂²U/∂x² at the start of one copy [1/s²]; 0 where there is none below 0.
+    """Returns −λ for the lowest eigenvalue λ of M⁻¹∂²U/∂x² at the start of one copy [1/s²]; 0 if none is negative.
 
-    Of more than 100 vertices to 1e-4 of the sum of a row, which bounds the largest; a cloth that is flat and unstrained has a
-    multitude about 0, of which none is then found.
+    With more than 100 vertices, the error is up to 1e-4 of the largest row sum. A flat, unstrained cloth has many eigenvalues
+    near 0, which then count as 0.
     """
     hessian = Hessian(model, policy=HessianPolicy.RAW)
     hessian.assemble(model.positions, 0.0)
@@ -157,7 +154,7 @@ def concave_rate(model):
     from scipy.sparse import eye_array
     from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
-    # Errors are relative to what is looked for, so that the least is looked for as the largest of bound − λ.
+    # Errors are relative to the eigenvalue found, so find the largest of bound − λ.
     bound, start = float(abs(matrix).sum(axis=1).max()), np.random.default_rng(0).normal(size=matrix.shape[0])
     turned = bound * eye_array(matrix.shape[0], format="csr") - matrix
     try:
@@ -168,16 +165,16 @@ def concave_rate(model):
 
 
 def largest_relaxation(scene, he, record):
-    """The largest stable relaxation ω of Jacobi sweeps over springs about the rest shape.
+    """Returns the largest stable relaxation ω of Jacobi sweeps over springs about the rest shape.
 
-    A sweep multiplies what is wrong by 1 − ωλ, λ the eigenvalues of C(D + α̃)⁻¹JVWJᵀ, D the diagonal of JWJᵀ, α̃ = 1/(khₑ²) and
-    C and V what constraints and vertices are averaged by; of XPBD, whose multipliers count, C(D + α̃)⁻¹(JWJᵀ + α̃). It settles
-    iff ωλ_max < 2. Velocities are differences of positions, so that what n sweeps multiply x̃ by, q = 1 − ρ(1 − (1 − ωλ)ⁿ)
-    with ρ the part of JWJᵀ in λ, must be below 1, and above the ``least_factor`` of the integrator: of an even n
-    that is the same, of an odd one (ωλ_max − 1)ⁿ < (1 − q_min)/ρ − 1.
+    A sweep multiplies errors by 1 − ωλ. λ are the eigenvalues of C(D + α̃)⁻¹JVWJᵀ, with D the diagonal of JWJᵀ, α̃ = 1/(khₑ²),
+    and C and V the factors of constraints and vertices; for XPBD, with multipliers, those of C(D + α̃)⁻¹(JWJᵀ + α̃). Sweeps
+    converge iff ωλ_max < 2. Velocities are differences of positions. So the factor by which n sweeps multiply x̃,
+    q = 1 − ρ(1 − (1 − ωλ)ⁿ) with ρ the fraction of JWJᵀ in λ, must be below 1 and above the ``least_factor`` of the integrator.
+    For even n that is the same condition, for odd n it is (ωλ_max − 1)ⁿ < (1 − q_min)/ρ − 1.
 
     Args:
-        scene: Of springs alone, without damping.
+        scene: A scene of springs alone, without damping.
         he: Effective step hₑ [s].
         record: :class:`warpcloth.PBD` or :class:`warpcloth.XPBD` with a Jacobi sweep.
     """
@@ -196,7 +193,7 @@ def largest_relaxation(scene, he, record):
     J = (diags_array(np.sqrt(factor)) @ J @ diags_array(np.repeat(np.sqrt(inverse), 3))).tocsr()
     moved = J @ J.T
     n = record.iterations
-    # Of the first sweep λ is 0 before it.
+    # Before the first sweep, the multipliers are 0.
     largest, v = _largest(moved + diags_array(factor * compliance) if record.multipliers and n > 1 else moved)
     part = float(v @ (moved @ v)) / largest
     least = _integrator(record).least_factor
@@ -251,7 +248,7 @@ def _largest_ordered(J, count, diagonal, compliance, n, integrator, steps):
         q = np.linalg.eigvals(np.eye(B.shape[1]) + B.T @ moves).astype(complex)
         return abs(integrator.growth(q)).max() > GROWTH ** (0.5 / steps)
 
-    # Beyond the first unstable ω there may be stable ones again.
+    # There may be stable ω again beyond the first unstable one.
     trials = np.linspace(0.0, 2.0 * (1.0 + 3.0 ** (-1.0 / n)), 41)[1:] * (diagonal / np.diag(J @ J.T)).min()
     first = next((k for k, omega in enumerate(trials) if grows(omega)), None)
     if first is None:
@@ -304,12 +301,12 @@ def _range(J):
 
 
 def _integrator(record):
-    """The class of the integrator of a record; solvers without a choice have the velocities of Euler."""
+    """Returns the class of the integrator of a record; solvers without a choice use the velocities of Euler."""
     return INTEGRATORS[getattr(record, "integrator", "euler")]
 
 
 def _share(mobility, compliance, record):
-    """The share of the violation of a single constraint that a sweep corrects, without ω."""
+    """Returns the fraction of the violation of a single constraint that a sweep corrects, without ω."""
     if getattr(record, "correction", None) == "per-step":
         return 1.0 - (compliance / (mobility + compliance)) ** (1.0 / record.iterations)
     return mobility / (mobility + compliance)
@@ -322,7 +319,7 @@ def _inverse_masses(scene):
 
 
 def _largest(matrix):
-    """The largest eigenvalue of a symmetric matrix, and its vector."""
+    """Returns the largest eigenvalue of a symmetric matrix, and its eigenvector."""
     if matrix.shape[0] <= 300:
         values, vectors = np.linalg.eigh(matrix.toarray())
     else:
@@ -333,7 +330,7 @@ def _largest(matrix):
 
 
 def rings(scene):
-    """The most edges on the shortest way from a pin to a vertex."""
+    """Returns the largest number of edges on the shortest path from a pin to a vertex."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import dijkstra
 

@@ -1,4 +1,4 @@
-"""Strips cut from nets that are turned by any angle, and what a net makes of the bending stiffness."""
+"""Strips cut from rotated nets, and the bending stiffness of nets."""
 
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ from ..kernels.terms.quadratic_bending import rest_state
 from ..mesh.mesh import Mesh
 
 PATTERNS = ("equilateral", "diagonal", "alternating", "jittered")
-# Of the spacing: how far a vertex of a jittered net is moved at most, along either axis.
+# Largest displacement of a vertex of a jittered net along each axis, relative to the spacing.
 JITTER = 0.4
-# Rows of a clamp, in spacings: more than the longest hinge, so that each one that bends is whole.
+# Length of a clamp in spacings, longer than the longest hinge, so that all bending hinges are complete.
 _CLAMP = 3.0
 
 
@@ -22,8 +22,8 @@ class Strip(NamedTuple):
     Attributes:
         mesh: The :class:`warpcloth.Mesh`.
         pins: Vertices of the clamp.
-        clamp: Where along x the part that bends begins [m].
-        end: Where it ends [m].
+        clamp: x at which the bending part begins [m].
+        end: x at which it ends [m].
     """
 
     mesh: Mesh
@@ -38,26 +38,26 @@ class Strip(NamedTuple):
 
 
 def strip(pattern, angle, spacing, length=1.0, width=1.0):
-    """A strip whose vertices up to x = 0 are clamped.
+    """Returns a strip whose vertices up to x = 0 are clamped.
 
-    It has the whole triangles of the net that lie within length and width. Clipped ones would be slivers and would make a
-    regular net irregular, which locks; so the sides are jagged, and what a side lacks is of first order in the spacing.
+    It has all triangles of the net that are inside length and width. Clipped triangles would be slivers, and would make a
+    regular net irregular, which locks. So the sides are jagged, with an error of first order in the spacing.
 
-    The clamp begins where the strip of a smooth cylinder that is flat as far as the pins hold it would. A hinge bends as soon
-    as one of its vertices is free, so on average half its length before the last pin: the mean over hinges, weighted by their
-    share in the bending energy. The end is that of the rectangle with the same area, centre and second moment.
+    ``clamp`` is where an equivalent smooth strip would begin to bend. A hinge bends if one of its vertices is free, on average
+    half its length before the last pin; ``clamp`` is the mean over hinges, weighted by bending energy. The end is that of the
+    rectangle with the same area, centre and second moment.
 
     Args:
-        pattern: "equilateral", "diagonal" or "alternating" as of :meth:`warpcloth.Mesh.grid`, or "jittered": a Delaunay
-            triangulation of the equilateral net after its vertices are moved at random, the same at every call.
-        angle: By which the net is turned about +y [rad]; at 45° the diagonals of "diagonal" run along the strip.
-        spacing: Edge of the net [m]; of right triangles the shorter ones.
-        length: Of what is not pinned [m].
-        width: [m].
+        pattern: "equilateral", "diagonal" or "alternating" as for :meth:`warpcloth.Mesh.grid`, or "jittered": a Delaunay
+            triangulation of the equilateral net with random displacements, equal in every call.
+        angle: Rotation of the net about +y [rad]; at 45° the diagonals of "diagonal" run along the strip.
+        spacing: Edge length of the net [m]; for right triangles, that of the shorter edges.
+        length: Length of the free part [m].
+        width: Width [m].
 
     Raises:
-        ValueError: The pattern is unknown, or the spacing more than a quarter of length or width, where it might
-            hang together by a vertex.
+        ValueError: The pattern is unknown, or the spacing is more than a quarter of length or width, so that the strip might
+            be connected by a single vertex.
     """
     points, triangles = _net(pattern, angle, spacing, length, width)
     near = 1e-9 * length
@@ -102,14 +102,14 @@ def plate(pattern):
 
 
 def roll(mesh):
-    """Bending energy of each hinge of a flat mesh (H,) over D where it is curved by 1 along x."""
+    """Returns the bending energy of each hinge of a flat mesh (H,) over D, for a curvature of 1/m along x."""
     rest = rest_state(mesh.points, mesh.hinges)
     height = 0.5 * mesh.points[:, 0] ** 2
     return 0.5 * np.einsum("ij,ij->i", rest[:, :4], height[mesh.hinges]) ** 2 * rest[:, 4]
 
 
 def inner_shares(mesh):
-    """Of each hinge (H,) how many of its two triangles have three hinges, by half; and the area of all these [m²]."""
+    """Returns, for each hinge (H,), half the number of its triangles that have three hinges; and the area of these [m²]."""
     both = np.sort(mesh.hinges[:, [[0, 1, 2], [0, 1, 3]]], axis=2).reshape(-1, 3)
     triangles, of, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
     inner = count == 3
@@ -117,7 +117,7 @@ def inner_shares(mesh):
 
 
 def _net(pattern, angle, spacing, length, width):
-    """Points (n, 2) in x and z and triangles of a net that covers the strip, a vertex at the origin."""
+    """Returns points (n, 2) in x and z, and triangles, of a net that covers the strip, with a vertex at the origin."""
     choice("pattern", pattern, PATTERNS)
     number("angle", angle)
     number("spacing", spacing, above=0.0)
@@ -138,7 +138,7 @@ def _net(pattern, angle, spacing, length, width):
 
 
 def _end(mesh):
-    """Far end of the rectangle along x that has the area, centre and second moment of a mesh."""
+    """Returns the far end of the rectangle along x with the area, centre and second moment of a mesh."""
     x, areas = mesh.points[mesh.triangles, 0], mesh.triangle_areas / mesh.triangle_areas.sum()
     centre = areas @ x.mean(axis=1)
     second = areas @ ((x**2).sum(axis=1) + x.sum(axis=1) ** 2) / 12.0 - centre**2

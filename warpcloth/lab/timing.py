@@ -1,4 +1,4 @@
-"""One row: a scene with a solver in a process of its own, from its start to its warm frames."""
+"""Measures one row of a benchmark: a scene with a solver in its own process, from its start to warm frames."""
 
 import contextlib
 import time
@@ -17,46 +17,46 @@ from ..scene.mesh_collider import MeshCollider
 from .counts import compulsory_bytes, elements_of, launches_of
 from .measurements import SceneRef, Setup
 
-# Frames before the first that counts, and seconds after which no further one is begun once there are three.
+# Number of warm-up frames, time after which no further frame begins [s], and minimum number of frames.
 _WARM_UP, _SECONDS, _FEWEST = 2, 10.0, 3
 OF_SELF_CONTACT = ("pairs", "lists", "kept", "least_gap", "list_ns", "areas_ns")
 
 
 def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
-    """Runs warm frames of a scene with a setup, and counts what a step has to do. All values are such that JSON has them.
+    """Times warm frames of a scene with a setup, and counts the work of a step. Arguments and results are JSON values.
 
     Args:
         scene: Fields of a :class:`warpcloth.lab.measurements.SceneRef`, by name.
         setup: Fields of a :class:`warpcloth.lab.measurements.Setup`, by name.
-        frames: How many to time at most; after 10 s of them three are enough. 0 ends with the first frame.
+        frames: Maximum number of frames to time; after 10 s, three are enough. 0 ends with the first frame.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
-        started: ``time.time()`` when this process was asked for.
-        copies: How many of the scene run at once.
-        threads: That share the steps, on the CPU.
+        started: ``time.time()`` when this process was requested.
+        copies: Number of copies of the scene in a batch.
+        threads: Number of CPU threads.
 
     Returns:
-        dict: What is not known is None.
+        dict: Unknown values are None.
 
-        - ``status``: "ok", "diverged" or "refused", and ``reason``, a sentence, of the first "".
-        - ``vertices``, ``elements``: Of all terms. ``substeps``: Steps a frame. ``frames``: How many were timed.
-        - ``ms``, ``spread``: What a frame takes with its points on the host, median and quartiles [ms]; ``cloths_per_s``:
+        - ``status``: "ok", "diverged" or "refused"; ``reason``: a sentence, "" if ok.
+        - ``vertices``, ``elements``: Numbers for all copies and terms. ``substeps``: Steps per frame. ``frames``: Timed frames.
+        - ``ms``, ``spread``: Median and quartiles of the time of a frame with its points on the host [ms]; ``cloths_per_s``:
           copies over the median [1/s].
-        - ``iterations``: Of a step, the mean over the frames that were timed.
-        - ``ns``: Time of a frame over elements × iterations × substeps, the median [ns].
-        - ``bytes``: What a step moves at least, see :func:`warpcloth.lab.counts.compulsory_bytes`; ``bytes_per_s``: Over the
-          time of a step.
-        - ``launches``: Of a step, the mean over a frame, see :func:`warpcloth.lab.counts.launches_of`.
-        - ``start_s``: From ``started`` to the end of the first frame. ``bind_s``: Building the model and binding the solver
-          alone, with compiling what is in no cache, but without ``factorise_s``, that of constant matrices [s].
-        - ``triangles``: Of all mesh colliders.
-        - ``ms_without``, ``contact_ns``: Of a scene with colliders or self-contact the time of a frame of the same cloth
-          without any contact [ms], and the difference over vertices, substeps and colliders, of which self-contact is one [ns].
-        - ``pairs``, ``lists``, ``kept``, ``least_gap``: With self-contact the most pairs in a list, the number of lists of a
-          step, the fraction of moves that its filter kept, and the least gap in any frame [m], of all copies.
-        - ``list_ns``, ``areas_ns``: With self-contact the time per vertex of listing near pairs, and of finding their gaps and
-          areas, where the run ended [ns].
-        - ``memory``: The most that was taken, of the process on a CPU and of Warp's memory pool on CUDA [bytes].
+        - ``iterations``: Mean number of iterations of a step, over the timed frames.
+        - ``ns``: Median time of a frame over elements × iterations × substeps [ns].
+        - ``bytes``: Minimum memory traffic of a step, see :func:`warpcloth.lab.counts.compulsory_bytes`; ``bytes_per_s``: that
+          over the time of a step.
+        - ``launches``: Mean number of launches of a step, see :func:`warpcloth.lab.counts.launches_of`.
+        - ``start_s``: Time from ``started`` to the end of the first frame. ``bind_s``: Time to build the model and bind the
+          solver, including compilation, without ``factorise_s``, that of constant matrices [s].
+        - ``triangles``: Number of triangles of all mesh colliders.
+        - ``ms_without``, ``contact_ns``: With contact, the time of a frame of the same cloth without contact [ms], and the
+          difference over vertices, substeps and colliders, counting self-contact as one [ns].
+        - ``pairs``, ``lists``, ``kept``, ``least_gap``: With self-contact, the largest number of pairs in a list, lists per
+          step, the fraction of moves that the filter kept, and the smallest gap in any frame [m], of all copies.
+        - ``list_ns``, ``areas_ns``: With self-contact, the time per vertex to list near pairs, and to compute their gaps and
+          areas, in the last state [ns].
+        - ``memory``: Peak memory of the process on a CPU, and of Warp's memory pool on CUDA [bytes].
     """
     names = (
         "vertices",
@@ -82,7 +82,7 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
         warnings.simplefilter("ignore", UserWarning)
         try:
             solver = Setup(**setup).record()
-            order = order_of_run(declared, solver)  # as a run has it
+            order = order_of_run(declared, solver)  # as in a run
             model = declared.build(device=device, dtype=dtype, copies=copies, order=order, threads=threads)
             stepper = solver.bind(model)
         except ValueError as error:
@@ -107,7 +107,7 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
         found |= _self_contact(stepper)
     if frames and (declared.colliders or declared.self_contact):
         bare = replace(declared, colliders=(), contact=None, self_contact=None)
-        with contextlib.suppress(ValueError):  # of a solver that does not take what is left
+        with contextlib.suppress(ValueError):  # the solver may refuse the scene without contact
             without = solver.bind(bare.build(device=device, dtype=dtype, copies=copies, order=order, threads=threads))
             others = Mirror(without.state.x)
             _run_frame(without, others)
@@ -147,7 +147,7 @@ def _warm(stepper, model, points, frames, elements):
 
 
 def _self_contact(stepper):
-    """Counts of self-contact in all steps so far, the least gap, and what a list and the areas of its pairs take."""
+    """Returns counts of self-contact in all steps so far, the smallest gap, and the times of a list and of areas."""
     pairs = stepper.pairs
     lists, steps = (int(array.numpy().max()) for array in (pairs.lists, pairs.steps))
     gap = float(pairs.least_gap.min())
@@ -158,7 +158,7 @@ def _self_contact(stepper):
 
 
 def _seconds(segment):
-    """The time of a segment, a median [s]."""
+    """Returns the median time of a segment [s]."""
     times = []
     for _ in range(5):
         wp.synchronize_device(segment.device)
@@ -170,7 +170,7 @@ def _seconds(segment):
 
 
 def _run_frame(stepper, points):
-    """A frame, its points read into memory of the host that is kept; the iterations of all its steps."""
+    """Takes a frame, reads its points to a fixed host array, and returns the iterations of its steps."""
     iterations = 0
     if stepper.uniform:
         stepper.frame()
@@ -184,7 +184,7 @@ def _run_frame(stepper, points):
 
 
 def _memory(device):
-    """The most that was taken [bytes], or None; Linux alone says it of this process and not of the one that began it."""
+    """Returns the peak memory [bytes], or None; only Linux gives that of this process without its parent."""
     if device.is_cuda:
         return int(wp.get_mempool_used_mem_high(device)) if device.is_mempool_enabled else None
     try:

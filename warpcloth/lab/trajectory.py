@@ -1,4 +1,4 @@
-"""How far a setup strays from the reference solution of a scene, and what a frame costs it."""
+"""Measures the error of a setup relative to the reference solution of a scene, and the cost of a frame."""
 
 import warnings
 
@@ -13,36 +13,35 @@ from .reference import Reference, position_error, strain_error
 
 
 def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="float32", limit=60.0, repeats=1):
-    """Runs a scene with a setup. All values are such that JSON has them.
+    """Runs a scene with a setup. Arguments and results are JSON values.
 
     Args:
         scene: Fields of a :class:`warpcloth.lab.measurements.SceneRef`, by name.
         setup: Fields of a :class:`warpcloth.lab.measurements.Setup`, by name.
-        frames: Number of frames; if not given, those of the reference, without one those of the scene.
-        reference: Path of a :class:`warpcloth.lab.reference.Reference` with at least so many frames, or None.
+        frames: Number of frames, by default that of the reference, or without one that of the scene.
+        reference: Path of a :class:`warpcloth.lab.reference.Reference` with at least as many frames, or None.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
-        limit: Seconds that the frames may take, all runs together; what is compiled and factorised before does not count. It
-            is looked at once a frame.
-        repeats: Number of runs to take times from. When the time is up after the first, there are fewer.
+        limit: Time limit [s] of the frames of all runs, without compilation and factorisation, checked once per frame.
+        repeats: Number of runs to time; fewer if the limit is reached after the first.
 
     Returns:
-        dict: What is not known is None.
+        dict: Unknown values are None.
 
-        - ``status``: "ok", "diverged", "slow" or "refused", and ``reason``, a sentence, of the first "".
-        - ``error``: :func:`warpcloth.lab.reference.position_error` against the reference, of the frames after the start.
-        - ``strain_error``: :func:`warpcloth.lab.reference.strain_error` of the same.
-        - ``ms``: What a frame takes, the median of all but the first of each run, which warms up [ms]. Of one frame
-          the next is run too.
-        - ``spread``: Its lower and upper quartile [ms].
-        - ``ms_per_second``: ``ms`` for each second that is simulated.
-        - ``compile_s``: What it takes to build, bind and warm up before the first frame, with compiling what is in no cache,
-          but without ``factorise_s``, that of constant matrices [s].
-        - ``residual``, ``message``: Of the :class:`warpcloth.core.status.Status`, with what the solver warned of.
-        - ``frames``: How many are good.
+        - ``status``: "ok", "diverged", "slow" or "refused"; ``reason``: a sentence, "" if ok.
+        - ``error``: :func:`warpcloth.lab.reference.position_error` relative to the reference, of the frames after the start.
+        - ``strain_error``: :func:`warpcloth.lab.reference.strain_error` of the same frames.
+        - ``ms``: Median time of a frame, without the first of each run, which warms up [ms]. If there is one frame, a second
+          is run.
+        - ``spread``: Lower and upper quartile of that time [ms].
+        - ``ms_per_second``: ``ms`` per second of simulated time.
+        - ``compile_s``: Time to build, bind and warm up before the first frame, including compilation, without
+          ``factorise_s``, that of constant matrices [s].
+        - ``residual``, ``message``: Those of the :class:`warpcloth.core.status.Status`, with warnings of the solver.
+        - ``frames``: Number of good frames.
 
     Raises:
-        ValueError: An argument is not allowed, or the reference is that of another scene or too short.
+        ValueError: An argument is not allowed, or the reference is of another scene or too short.
         FileNotFoundError: There is no such scene or reference.
     """
     number("limit", limit, above=0.0)
@@ -89,10 +88,10 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
 
 
 def _checked_frames(frames, scene, exact):
-    """How many frames to run.
+    """Returns the number of frames to run.
 
     Raises:
-        ValueError: The reference is that of another scene, or too short.
+        ValueError: The reference is of another scene, or too short.
     """
     if exact is None:
         frames = scene.frames if frames is None else frames
@@ -109,7 +108,7 @@ def _checked_frames(frames, scene, exact):
 
 
 def _times(runs, fps):
-    """Medians and quartiles of the warm frames of runs, lists of seconds, [ms]."""
+    """Returns median and quartiles [ms] of the warm frames of runs, given as lists of seconds."""
     warm = np.concatenate([run[1:] if len(run) > 1 else run for run in runs])
     low, median, high = (1e3 * np.percentile(warm, [25, 50, 75])).tolist()
     return {"ms": median, "spread": [low, high], "ms_per_second": median * fps}

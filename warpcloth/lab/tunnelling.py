@@ -1,14 +1,14 @@
-"""Sheets that fly against a thin wall, over speed and step, with the filter of contact and by the energy of contact alone.
+"""Sheets that fly against a thin wall, over speed and step, with the filter of contact and with the energy of contact alone.
 
 The wall is a box of 1 µm, or a sheet of triangles without thickness.
 
-A test for contact at the end of each step knows nothing of what lies between. A vertex moves v h in a step and touches a wall
-within the contact distance r on either side: it can pass unnoticed from v h = 2r, and from v h = r it can end beyond the wall,
-where the energy pushes it further on. The energy also gives way where it is less than that of the motion. That of explicit
-steps is ½kr² for each area, that of the others kτ²(2 + ln τ/δ), with τ = r/2 and δ = r/1000, below which it is a parabola.
+A test for contact at the end of each step misses contact during the step. A vertex moves by v h in a step, and a wall has
+contact within the distance r on either side. So a vertex can pass without contact if v h ≥ 2r. If v h ≥ r, it can end beyond
+the wall, where the energy pushes it on. The energy also fails if it is less than that of the motion. Per area it is ½kr² for
+explicit steps and kτ²(2 + ln τ/δ) for the others, with τ = r/2 and δ = r/1000, below which it is a parabola.
 
-Implicit steps that see the wall ahead need the filter where their minimiser is nearer than δ. With the prediction v h beyond
-the wall and the pressure kτ²/d it is at d = kτ²h/(ρv).
+Implicit steps, which have contact with the wall ahead, need the filter if their minimiser is nearer than δ. With the prediction
+v h beyond the wall and the pressure kτ²/d, it is at d = kτ²h/(ρv).
 """
 
 from dataclasses import dataclass, replace
@@ -36,9 +36,9 @@ RATE = np.sqrt(STIFFNESS / DENSITY)  # ω [1/s]
 THICKNESS = 1e-6  # of the wall [m]
 STEPS = np.geomspace(1e-4, 1.0 / 24.0, 10)  # [s]
 SPEEDS = np.geomspace(0.1, 100.0, 13)  # [m/s]
-PHASES = np.arange(6) / 6.0  # of a step, by which sheets start farther away
-# Solvers by the wall against which they are shown: a box by the energy of contact alone, a box with the filter, triangles with
-# it. Those that are left out minimise the same energy as some of these.
+PHASES = np.arange(6) / 6.0  # fractions of a step by which sheets start farther away
+# Solvers by wall: a box with the energy of contact alone, a box with the filter, and triangles with it. Solvers that are left
+# out minimise the same energy as one of these.
 _FEW = ("explicit", "newton", "xpbd", "pbd")
 SHOWN = {"energy alone": _FEW, "filter": tuple(SOLVERS), "filter, triangles": _FEW}
 
@@ -54,7 +54,7 @@ LAWS = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PenaltyContact(VertexContact):
-    """Contact with the energy of explicit steps, ½k(r − d)² at all depths, as a term."""
+    """Contact with the energy of explicit steps, ½k(r − d)² at all depths."""
 
     term: ClassVar[Term] = CONTACT.bounded
 
@@ -89,7 +89,7 @@ def tasks(device):
 
 
 def measure(solver, wall, steps, speeds, device):
-    """Points of one panel: of sheets of all phases the share of vertices that were cut, or that passed the wall [%]."""
+    """Returns the points of one panel: the fraction of vertices that were cut short, or that passed the wall [%]."""
     panel, found = _panel(solver, wall).key, []
     for h in steps:
         try:
@@ -104,7 +104,7 @@ def measure(solver, wall, steps, speeds, device):
 
 
 def sheet(h, wall, solver):
-    """A scene of nine vertices and a wall at y = 0, with steps of h as frames; by the energy alone contact is a term."""
+    """Returns a scene of nine vertices and a wall at y = 0, with steps h as frames; without filter, contact is a term."""
     grid = Mesh.grid(3, 3, size=0.1)
     box = Box(size=(1.0, THICKNESS, 1.0))
     ground = Mesh.grid(5, 5, size=1.0)  # whose edges are none of the sheet
@@ -129,9 +129,9 @@ def sheet(h, wall, solver):
 
 @in_turn
 def flights(solver, wall, h, speeds, device):
-    """Shares of the vertices that ever end a step beyond the wall or inside, and that were cut short, for each speed, (S,).
+    """Returns the fractions of vertices that end a step beyond the wall or inside, and that were cut short, per speed, (S,).
 
-    Sheets start r and a part of a step above the wall. They fly until the slowest has passed it, or turned round.
+    Sheets start at r plus a fraction of a step above the wall. They fly until the slowest has passed it or turned back.
 
     Raises:
         ValueError: The solver refuses the step.
@@ -150,6 +150,6 @@ def flights(solver, wall, h, speeds, device):
     for _ in range(count):
         stepper.step()
         passed |= stepper.state.x.numpy().reshape(positions.shape)[:, :, 1] < top
-    # A sheet is flat, so that all of its vertices are cut in the same steps.
+    # All vertices of a sheet are cut in the same steps, because it is flat.
     cut = np.minimum(stepper.cut * count, 1.0)
     return passed.mean(axis=1).reshape(len(speeds), -1).mean(axis=1), cut.reshape(len(speeds), -1).mean(axis=1)

@@ -1,7 +1,7 @@
-"""Speed against accuracy: what all settings are measured by, which of them nothing beats, and the results as tables.
+"""Diagrams of accuracy against time: measurements, the Pareto front, and tables.
 
 Each diagram is a function of a :class:`warpcloth.lab.measurements.SceneRef` that returns a dictionary of JSON values, with a
-dictionary for each setting in ``rows``; :mod:`warpcloth.chart.pareto` draws it.
+dictionary for each setting in ``rows``. :mod:`warpcloth.chart.pareto` draws it.
 """
 
 import json
@@ -16,40 +16,40 @@ from .measurements import task
 from .reference import reference
 from .setups import label, setups_of_runs, setups_of_steps
 
-# The part of a scene's frames before the one step of "solver" and "spectrum", and the part that is run in "time": later motion
-# is chaotic, so that its error says little of a method.
+# Divisors of a scene's frames: the frames before the step of "solver" and "spectrum", and the frames of "time". Later motion is
+# chaotic, so that its error says little about a method.
 _BEFORE, _RUN = 3, 2
 SUBSTEPS = 4  # steps a frame of the one step
-WITHIN = 0.01  # the error of which the cheapest setting is named
-# How well the reference solution is to be known, relative to the size of the cloth, and how many times what a setting may
-# take it may, but no less than so many seconds.
+WITHIN = 0.01  # error at which the cheapest setting of each solver is named
+# Tolerance of the reference solution, relative to the size of the cloth; its time limit in time limits of a setting; and its
+# minimum time limit [s].
 _KNOWN, _TIMES, _SECONDS = 1e-4, 6.0, 120.0
-# What a CSV has of a setting, in this order; what it does not know is empty.
+# Columns of a CSV for a setting; unknown values are empty.
 COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
 COLUMNS += ("h", "stiffness", "ms_per_second", "iterations", "gap", "predicted", "floor", "compile_s", "factorise_s")
 COLUMNS += ("residual", "frames", "message", "machine")
-# And of all settings alike, in every line.
+# Columns that are equal for all settings.
 FACTS = ("scene", "dtype", "seed", "processor", "cores", "device", "system", "python", "numpy", "scipy", "warp", "warpcloth")
 FACTS += ("source",)
 
 
 def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float64", limit=20.0, **run):
-    """One step of implicit Euler from the same x̃ by every method that minimises it, see :func:`convergence.measure`.
+    """Measures one implicit Euler step from the same x̃ with every method that minimises it, see :func:`convergence.measure`.
 
     Args:
         scene: A :class:`SceneRef`.
-        solvers: Names as on the command line; None is all that minimise.
-        frames: Frames before the step; a third of the scene's where not given.
+        solvers: Names as on the command line; None for all that minimise.
+        frames: Number of frames before the step; by default a third of the scene's.
         device: A Warp device.
-        dtype: Of the methods.
-        limit: Seconds a setting.
+        dtype: Precision of the methods.
+        limit: Time limit of each setting [s].
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
 
     Returns:
         dict: See the module.
 
     Raises:
-        ValueError: A name is none of a method that minimises.
+        ValueError: A name is not that of a solver that minimises.
     """
     setups = setups_of_steps(solvers)
     declared = scene.load()
@@ -68,23 +68,23 @@ def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float6
 
 
 def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32", limit=20.0, watch=None, **run):
-    """The error of a trajectory against the time it takes, over steps and iterations, see :func:`trajectory.measure`.
+    """Measures the error of trajectories and their time, over steps and iterations, see :func:`trajectory.measure`.
 
     Args:
         scene: A :class:`SceneRef`.
-        solvers: Names as on the command line; None is all.
-        frames: Frames that are run, half of the scene's where not given.
+        solvers: Names as on the command line; None for all.
+        frames: Number of frames; by default half of the scene's.
         device: A Warp device.
-        dtype: Of the runs; the reference solution has float64.
-        limit: Seconds a setting; the reference solution may take six times as long, and 120 s in any case.
-        watch: Function that says how far the reference solution is, see :func:`reference`, or None.
+        dtype: Precision of the runs; the reference solution has float64.
+        limit: Time limit of each setting [s]; that of the reference solution is six times this, but at least 120 s.
+        watch: Function called with the progress of the reference solution, see :func:`reference`, or None.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
 
     Returns:
-        dict: See the module; with ``reference`` what the errors are measured against.
+        dict: See the module; ``reference`` describes the reference solution.
 
     Raises:
-        ValueError: A name is no solver's, or the scene has no reference solution.
+        ValueError: There is no solver of a name, or the scene has no reference solution.
     """
     setups = setups_of_runs(scene, solvers, device, dtype)
     frames = frames or max(scene.load().frames // _RUN, 1)
@@ -101,13 +101,13 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
 
 
 def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):
-    """Errors of plain projective dynamics of a step, for several of its lengths, beside what the spectrum predicts.
+    """Measures errors of plain projective dynamics within a step, for several step sizes, and predicts them by the spectrum.
 
     Args:
-        scene: A :class:`SceneRef`, of few vertices.
-        frames: Frames before the step; a third of the scene's where not given.
+        scene: A :class:`SceneRef`, with few vertices.
+        frames: Number of frames before the step; by default a third of the scene's.
         device: A Warp device.
-        limit: Seconds a length.
+        limit: Time limit of each step size [s].
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
 
     Returns:
@@ -136,7 +136,7 @@ def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):
     return {**_facts("spectrum", scene, device, "float64"), **facts, "rows": rows}
 
 
-# What the diagram "physics" measures of each scene: arguments of `physics.measure` but for the resolution, and resolutions.
+# Measurements of the diagram "physics" for each scene: arguments of `physics.measure`, and resolutions.
 PHYSICS = {
     "cantilever": (
         [
@@ -153,17 +153,17 @@ PHYSICS = {
 
 
 def physics_diagram(scene, device="cpu", dtype="float64", limit=20.0, **run):
-    """Errors of equilibria to closed forms against mesh size and time, see :func:`physics.measure`.
+    """Measures errors of equilibria relative to closed forms, over mesh size and time, see :func:`physics.measure`.
 
     Args:
-        scene: A :class:`SceneRef` of "cantilever", "chain" or "catenary", without parameters: sizes and nets are varied.
+        scene: A :class:`SceneRef` of "cantilever", "chain" or "catenary", without parameters, because these are varied.
         device: A Warp device.
         dtype: "float32" or "float64".
-        limit: Seconds a point.
+        limit: Time limit of each point [s].
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
 
     Returns:
-        dict: See the module; a row has ``arguments``, those of `physics.measure`.
+        dict: See the module; a row has the ``arguments`` of `physics.measure`.
 
     Raises:
         ValueError: The scene has no closed form here, or has parameters.
@@ -182,18 +182,18 @@ def physics_diagram(scene, device="cpu", dtype="float64", limit=20.0, **run):
 
 
 def _label_of(plan):
-    """A point of the diagram "physics" in few words, such as "cantilever quadratic diagonal 45° 16"."""
+    """Returns a point of the diagram "physics" in a few words, such as "cantilever quadratic diagonal 45° 16"."""
     words = [plan["case"], *(plan[name] for name in ("bending", "pattern") if name in plan)]
     words += [f"{math.degrees(plan['angle']):.0f}°"] if "angle" in plan else []
     return " ".join([*words, str(plan["resolution"])])
 
 
 def cheapest(rows, floor=0.0):
-    """Of each solver the row of least time with an error of no more than :data:`WITHIN`, the fastest first.
+    """Returns the fastest row of each solver with an error of at most :data:`WITHIN`, the fastest solver first.
 
     Args:
-        rows: Of :func:`time_diagram`.
-        floor: Error of the reference, which each error may be off by.
+        rows: Rows of :func:`time_diagram`.
+        floor: Error of the reference, by which each error may be wrong.
     """
     found = {}
     for row in sorted(filter(_has_error, rows), key=lambda row: row["ms_per_second"]):
@@ -208,7 +208,7 @@ def front(rows, floor=0.0, name="error"):
     A row is left out if another has a smaller error and its time is no longer, within the quartiles of both.
 
     Args:
-        rows: Of :func:`time_diagram`.
+        rows: Rows of :func:`time_diagram`.
         floor: Error of the reference; errors below it count as equal.
         name: The error, "error" or "strain_error".
     """
@@ -232,7 +232,7 @@ def quartiles(row):
 
 
 def without_point(found):
-    """(label, status and reason) of the rows of a diagram that have no point in the picture, one for all alike of a solver."""
+    """Returns (label, status and reason) of rows without a point in the picture, one for all equal rows of a solver."""
     groups = {}
     for row in found["rows"]:
         if row["status"] != "ok":
@@ -244,7 +244,7 @@ def without_point(found):
 
 
 def write_csv(path, found):
-    """Writes a line for each setting, in the diagram "solver" for each of its points, each with what it was measured on.
+    """Writes a line for each setting, or in the diagram "solver" for each of its points, with the machine.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -270,7 +270,7 @@ def _has_error(row):
 
 
 def _measured(function, scene, setups, given, run):
-    """A row for each setup, in their order."""
+    """Measures and returns a row for each setup, in order."""
     tasks = [task(function, scene=scene, setup=setup, **given) for setup in setups]
     return [
         {"solver": setup.solver, "options": setup.options, "label": label(setup), **result}
@@ -279,5 +279,5 @@ def _measured(function, scene, setups, given, run):
 
 
 def _results(tasks, run):
-    """The result of each task and the machine that measured it, in their order."""
+    """Returns the result of each task with its machine, in order."""
     return [{**result, "machine": where} for result, where in collect(tasks, "work-precision", **run)]

@@ -1,4 +1,4 @@
-"""How a process that measures starts. It imports little, so that it decides how Warp is loaded."""
+"""The start of a process that measures. This module imports little, because it sets how Warp is loaded."""
 
 import gc
 import multiprocessing
@@ -12,16 +12,16 @@ from ..base.quiet import initialise_warp
 
 
 def begin(modules):
-    """Begins in a process of a campaign: loads Warp and extensions.
+    """Starts a process of a campaign: loads Warp and extensions.
 
-    An interruption ends the process without a word, as the first process says what there is. It also ends when that was killed,
-    which would leave it waiting for ever.
+    An interrupt ends the process without a message, because the parent process reports it. It also ends if the parent is
+    killed, because otherwise it would wait forever.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     with collector_paused():
         initialise_warp()
-    gc.freeze()  # Warp's objects stay, as this process is ours
+    gc.freeze()  # Warp's objects are not garbage
     for module in modules:
         load_extension(module)
 
