@@ -1,7 +1,7 @@
-"""Factories of the kernels that quasi-Newton iterations with a constant matrix A need: histories, their products, candidates.
+"""Factories of the kernels of quasi-Newton iterations with a constant matrix A: histories, their products and candidates.
 
-With w = A⁻¹∇φ(d) the plain step is d − w. Slot j of a history of m pairs holds sⱼ, a step of d, the change yⱼ of ∇φ that it
-made, and zⱼ = A⁻¹yⱼ, which is the change of w, so that no acceleration needs a solve of its own.
+With w = A⁻¹∇φ(d), the plain step is d − w. A history has m slots. Slot j holds a step sⱼ of d, the change yⱼ of ∇φ, and
+zⱼ = A⁻¹yⱼ. zⱼ is the change of w, so acceleration needs no further solve.
 """
 
 from functools import cache
@@ -13,7 +13,7 @@ from .vectors import types
 
 @cache
 def plain_step(dtype):
-    """Kernel over vertices: out = d − w in copies that still iterate, d in the rest; out may be d."""
+    """Kernel over vertices: out = d − w in active copies, and d in the others; out may be d."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -38,7 +38,7 @@ def plain_step(dtype):
 
 @cache
 def note_change(dtype):
-    """Kernel over vertices: y and z of the slot are what ∇φ and w have changed by; their values of now are kept."""
+    """Kernel over vertices: y and z of the slot = changes of ∇φ and w; stores their present values for the next call."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -66,7 +66,7 @@ def note_change(dtype):
 
 @cache
 def partial_products(dtype):
-    """Kernel over (copies, chunks, 4m): sⱼ·∇φ, zⱼ·∇φ, sⱼ·y and zⱼ·y, m of each, with the y of the slot."""
+    """Kernel over (copies, chunks, 4m): out = sⱼ·∇φ, zⱼ·∇φ, sⱼ·y and zⱼ·y for j < m, with the y of the current slot."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -123,7 +123,7 @@ def finish_products():
 def combine(dtype):
     """Kernel over vertices: out = d − c₀ w + Σⱼ aⱼ sⱼ + bⱼ zⱼ with the coefficients (c₀, a, b) of the copy, (B, 1 + 2m).
 
-    A coefficient of 0 leaves out what it would multiply, whatever that slot holds.
+    Products with a coefficient of 0 are skipped, so their slots may hold NaN.
     """
     vec3, _ = types(dtype)
 
@@ -158,9 +158,10 @@ def combine(dtype):
 
 @cache
 def accept(dtype):
-    """Kernel over vertices: d becomes the accelerated candidate where its φ is no more than the plain one's, else that.
+    """Kernel over vertices: d = the accelerated candidate if its φ is at most that of the plain one, else the plain one.
 
-    A φ that is NaN is never chosen. The step is s of the slot; it is 0 in copies that have ``stayed``, which may be None.
+    A candidate with φ = NaN is never chosen. s of the slot is the step, 0 in copies with ``stayed`` = 1. ``stayed`` may be
+    None.
     """
     vec3, _ = types(dtype)
 
@@ -194,9 +195,9 @@ def accept(dtype):
 
 @cache
 def note_lowest():
-    """Kernel over copies: whether φ rises in both steps, by more than ``noise`` of it, so that d stays; else its lowest so far.
+    """Kernel over copies: stayed = 1 if both candidates raise φ by more than the fraction ``noise``; updates the lowest φ.
 
-    A φ that is NaN does not count as a rise, so that it is seen.
+    A φ of NaN does not count as a rise, so NaN reaches the result and is reported.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

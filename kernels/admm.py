@@ -1,4 +1,4 @@
-"""Factories of the kernels of ADMM: implicit Euler split into elements, each with a z of its own for y, and vertices."""
+"""Factories of the kernels of ADMM: implicit Euler, split into elements, each with its own copy z of y, and vertices."""
 
 from functools import cache
 from typing import Any
@@ -14,13 +14,13 @@ from .transpose import to_corner
 from .vectors import types
 
 CLAMP = wp.constant(int(HessianPolicy.CLAMP))
-# The most Newton steps of a local problem, and the most halvings of each.
+# Maximum number of Newton steps of a local problem, and of halvings of each step.
 STEPS = 30
 
 
 @wp.func
 def solve_definite(H: Any, b: Any, n: int):
-    """H⁻¹ b of a symmetric positive definite H by Cholesky; n, its size, is unknown to the compiler, or it would unroll."""
+    """H⁻¹ b for a symmetric positive definite H, by Cholesky; n is an argument so that loops are not unrolled."""
     L = H
     x = b
     for j in range(n):
@@ -50,11 +50,11 @@ def solve_definite(H: Any, b: Any, n: int):
 
 @cache
 def local_minimiser(term: Term, dtype):
-    """The device function (v, z, rest, r) → argmin u(z) + ½r‖v − z‖², r > 0, from a guess z.
+    """Device function (v, z, rest, r, steps) → argmin u(z) + ½r‖v − z‖², r > 0, from the initial guess z.
 
-    By the prox of a term that gives one; (p(v) + r v)/(1 + r) of one that projects; else by Newton's method with the
-    semi-definite Hessian of the term and a line search. NaN where a force or the energy is not finite, which would else pass
-    for the minimum: of what overflows CUDA's fused products make infinity where others make NaN.
+    A term with a prox uses it. A term with a projection p uses (p(v) + r v)/(1 + r). Other terms use Newton's method with their
+    semi-definite Hessian and a line search. The result is NaN if a force or the energy is not finite: CUDA's fused products
+    overflow to infinity where others give NaN, and infinity could pass for a minimum.
     """
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     flat = wp.types.vector(3 * term.rows, dtype)
@@ -106,7 +106,7 @@ def local_minimiser(term: Term, dtype):
             searching = halvings == 0
             while searching:
                 after = value(v, z + t * direction, rest, r)
-                # Near the minimum u resolves no decrease, and the step is right to rounding without one.
+                # Near the minimum rounding hides the decrease of u, so it may rise by some roundings.
                 if after <= now + dtype(1.0e-4) * t * slope + dtype(4.0) * epsilon(r) * wp.abs(now):
                     z = z + t * direction
                     now = after
@@ -125,7 +125,7 @@ def local_minimiser(term: Term, dtype):
 
 @cache
 def stiffness_scale(term: Term, dtype):
-    """Kernel over elements: out = ‖∂²u/∂y²‖, which says how stiff an energy is to y, whatever both are measured in."""
+    """Kernel over elements: out = ‖∂²u/∂y²‖, by which W² is scaled to the energy and to the unit of y."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, hessian = local_coordinate(term, dtype, False), term.hessian
@@ -150,9 +150,9 @@ def stiffness_scale(term: Term, dtype):
 
 @cache
 def admm_elements(term: Term, dtype):
-    """The struct of the elements of a term as ADMM has them: W² = r s k A, and z, u, gap = W²(y − z), change of W²z [N].
+    """Struct of the elements of a term: ratio r, scale s, W² = r s k A, z, u, gap = W²(y − z), and the change of W²z [N].
 
-    ``clear`` is that of :mod:`.clear_elements`, of terms that have it.
+    ``clear`` is that of :mod:`.clear_elements`, or empty.
     """
     y_type = wp.types.matrix((term.rows, 3), dtype)
 
@@ -198,9 +198,9 @@ def start_admm(term: Term, dtype):
 
 @cache
 def split(term: Term, dtype):
-    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², then u += y − z; gap and change.
+    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², u += y − z; writes gap and change.
 
-    An element whose vertex is within its ``clear`` has u, gap and change 0, and is passed over until it is not.
+    An element whose vertex is still within its ``clear`` is skipped: its u, gap and change are 0.
     """
     vec3, _ = types(dtype)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -243,7 +243,7 @@ def split(term: Term, dtype):
 
 @cache
 def admm_forces(term: Term, dtype):
-    """The device functions (elements, e) → max(1, 1/r) and (elements, e, rest) → gap + W²u, see :func:`scatter_admm`."""
+    """Device functions (elements, e) → max(1, 1/r) and (elements, e, rest) → gap + W²u, see :func:`scatter_admm`."""
     rest_type = wp.types.vector(term.parameters, dtype)
     measure, shared, take = term.measure, load_shared(dtype), load(wp.types.matrix((term.rows, 3), dtype))
 
@@ -264,7 +264,7 @@ def admm_forces(term: Term, dtype):
 def scatter_admm(term: Term, dtype):
     """Kernel over elements: adds max(1, 1/r) Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N].
 
-    For the CPU, in order: nothing is atomic.
+    For the CPU, where one thread takes the elements in order: no addition is atomic.
     """
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
@@ -304,7 +304,7 @@ def scatter_admm(term: Term, dtype):
 
 @cache
 def gather_admm(term: Term, dtype):
-    """Kernel over vertices: the sums of :func:`scatter_admm` in a fixed order, as :func:`.transpose.gather` makes one."""
+    """Kernel over vertices: the sums of :func:`scatter_admm` in a fixed order, see :func:`.transpose.gather`."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     (weight_of, pull_of), share_of = admm_forces(term, dtype), to_corner(term, dtype)

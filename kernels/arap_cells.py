@@ -1,9 +1,9 @@
-"""Factories of kernels over cells: any number of vertices each, that one rotation per cell turns.
+"""Factories of kernels over cells. A cell has any number of vertices and one rotation.
 
-Cells are compressed rows: entries offsets[c] to offsets[c+1] of ``members`` are the vertices of cell c, at least one each. Each
-entry has a moment gᵢ, a constant vector with Σᵢ gᵢ = 0 over the cell, so that S_c = Σᵢ (xᵢ − x_o) gᵢᵀ is its covariance for
-whatever reference x_o. With weights wᵢ and the centroid X̄ that they give, gᵢ = wᵢ(Xᵢ − X̄) makes it that of a weighted point set
-(Kabsch 1976); with edges of weight w_ij in the cell, gᵢ = Σⱼ w_ij (Xᵢ − Xⱼ) makes it that of the edges.
+Cells are compressed rows: entries offsets[c] to offsets[c+1] of ``members`` are the vertices of cell c, at least one. Each
+entry has a constant moment gᵢ with Σᵢ gᵢ = 0 over the cell. The covariance of the cell is S_c = Σᵢ (xᵢ − x_o) gᵢᵀ for any
+reference x_o. For a point set with weights wᵢ and weighted centroid X̄, gᵢ = wᵢ(Xᵢ − X̄) (Kabsch 1976). For edges with weights
+w_ij, gᵢ = Σⱼ w_ij (Xᵢ − Xⱼ).
 """
 
 from functools import cache
@@ -16,9 +16,9 @@ from .vectors import types
 
 @cache
 def set_moments(dtype):
-    """Kernel over cells: gᵢ = wᵢ(Xᵢ − X̄) of their members, with the centroid X̄ = Σ wᵢ Xᵢ / Σ wᵢ, the largest made 1 long.
+    """Kernel over cells: moments gᵢ = wᵢ(Xᵢ − X̄), X̄ = Σ wᵢ Xᵢ / Σ wᵢ, scaled so that the longest of a cell has length 1.
 
-    Their size does not matter to a rotation, and squares of small ones would underflow.
+    The scale does not change the rotation; without it, squares of small moments would underflow.
     """
     vec3, _ = types(dtype)
 
@@ -36,7 +36,7 @@ def set_moments(dtype):
         c = wp.tid()
         first, last = offsets[c], offsets[c + 1]
         total = dtype(0.0)
-        # From a member that counts, so that nothing is lost far from the origin.
+        # Relative to a member with a weight, so that positions far from the origin lose no digits.
         origin = X[members[first]]
         for k in range(first, last):
             if total == dtype(0.0):
@@ -61,7 +61,7 @@ def set_moments(dtype):
 def fit_rotations(dtype):
     """Kernel over cells: R_c = the rotation with the largest tr(RᵀS_c), S_c = Σᵢ (xᵢ − x_o) gᵢᵀ.
 
-    x_o is that of the first member with a moment, for one without may be anywhere.
+    x_o is the position of the first member with a nonzero moment; members without one may be far away.
     """
     vec3, mat33 = types(dtype)
 
@@ -92,9 +92,9 @@ def fit_rotations(dtype):
 
 @cache
 def gather_moments(dtype):
-    """Kernel over vertices, the transpose of the sums in :func:`fit_rotations`: b_i = start_i + Σ_{c∋i} R_c g_ic.
+    """Kernel over vertices: b_i = start_i + Σ_{c∋i} R_c g_ic, the transpose of the sums in :func:`fit_rotations`.
 
-    Entries offsets[i] to offsets[i+1] of ``cells`` and ``moments`` are the cells of vertex i and its moments in them.
+    Entries offsets[i] to offsets[i+1] of ``cells`` and ``moments`` are the cells of vertex i, and its moments in them.
     """
     vec3, mat33 = types(dtype)
 
@@ -121,9 +121,9 @@ def gather_moments(dtype):
 
 @cache
 def edge_energy(dtype):
-    """Kernel over edges: out[e] = w_ij (‖d − R_i D‖² + ‖d − R_j D‖²), d = xⱼ − xᵢ, D = Xⱼ − Xᵢ: in the cells of both ends.
+    """Kernel over edges: out[e] = w_ij (‖d − R_i D‖² + ‖d − R_j D‖²), d = xⱼ − xᵢ, D = Xⱼ − Xᵢ, for the cells of both ends.
 
-    A sum of squares, so that nothing cancels where the motion is nearly rigid.
+    It is a sum of squares, so no digits cancel when the motion is nearly rigid.
     """
     vec3, mat33 = types(dtype)
 
@@ -149,9 +149,9 @@ def edge_energy(dtype):
 
 @cache
 def triangle_energy(dtype):
-    """Kernel over triangles: out[t] = Σᵥ Σₑ w_e ‖dₑ − Rᵥ Dₑ‖² over its vertices and edges: in the cells of its vertices.
+    """Kernel over triangles: out[t] = Σᵥ Σₑ w_e ‖dₑ − Rᵥ Dₑ‖² over its vertices v and edges e.
 
-    With the edge vectors d and D of x and of the rest shape; edge k is opposite vertex k.
+    d and D are the edge vectors of x and of the rest shape. Edge k is opposite vertex k.
     """
     vec3, mat33 = types(dtype)
 
@@ -175,7 +175,7 @@ def triangle_energy(dtype):
         t = wp.tid()
         i, j, k = triangles[t][0], triangles[t][1], triangles[t][2]
         w = weights[t]
-        # Edge 1 runs from vertex 0 to 2, edge 2 from 0 to 1, edge 0 is their difference.
+        # Edge 1 goes from vertex 0 to 2, edge 2 from 0 to 1; edge 0 is their difference.
         d1, d2, D1, D2 = x[k] - x[i], x[j] - x[i], rest[k] - rest[i], rest[j] - rest[i]
         total = of_one_rotation(w, rotations[i], d1, d2, D1, D2)
         total += of_one_rotation(w, rotations[j], d1, d2, D1, D2)

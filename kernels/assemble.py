@@ -1,6 +1,6 @@
-"""Factories of the kernels that turn a term into sums over vertices and copies: energy, gradient, Hessian blocks.
+"""Factories of the kernels that assemble a term: energy, gradient and Hessian blocks.
 
-None of them knows a material, and each is compiled only when a solver asks for it.
+They work for every term. Each is compiled only when a solver asks for it.
 """
 
 from functools import cache
@@ -16,7 +16,7 @@ from .vectors import types
 
 @cache
 def energy(term: Term, dtype, corrected: bool = False):
-    """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in double precision for the sum that follows."""
+    """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in double precision, to be summed."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, u, measure = local_coordinate(term, dtype, corrected), term.energy, term.measure
@@ -43,7 +43,7 @@ def energy(term: Term, dtype, corrected: bool = False):
 
 @cache
 def elastic(term: Term, dtype):
-    """The struct of what the forces of a term are computed from: its elements, and the state x, d."""
+    """Struct of the inputs of the forces of a term: its elements, and the state x, d."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -76,13 +76,13 @@ def scatter_gradient(term: Term, dtype, corrected: bool = False):
 
 
 def gather_gradient(term: Term, dtype, corrected: bool = False):
-    """Kernel over vertices: the sum that :func:`scatter_gradient` makes, see :func:`.transpose.gather`."""
+    """Kernel over vertices: the same sum as :func:`scatter_gradient`, see :func:`.transpose.gather`."""
     return gather(term, dtype, forces(term, dtype, corrected))
 
 
 @cache
 def hessian_blocks(term: Term, dtype, corrected: bool = False):
-    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], under the policy of the element's copy."""
+    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], with the Hessian policy of the element's copy."""
     vec3, mat33 = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
@@ -105,7 +105,7 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
     ):
         e = wp.tid()
         r = rest[e]
-        corners = out.shape[1] // K  # K, but unknown to the compiler: unrolling all of this takes it seconds
+        corners = out.shape[1] // K  # K, but not a constant: the compiler would take seconds to unroll the loops
         h = (stiffness[e] * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, policy[e // elements_per_copy])
         for i in range(corners):
             wi = weight(r, i)
@@ -125,7 +125,7 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
 
 @cache
 def constant_blocks(term: Term, dtype):
-    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ wᵢ·wⱼ [N/m], the matrix kAGᵀG of the weights, in double precision."""
+    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ wᵢ·wⱼ [N/m], the blocks of kAGᵀG, in double precision."""
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
     weight, measure = term.weight, term.measure

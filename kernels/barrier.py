@@ -1,13 +1,13 @@
-"""A barrier within recorded graphs, on the CPU: threads that replay one each wait there for one another."""
+"""A barrier in recorded graphs on the CPU, where the threads that replay one graph each wait for one another."""
 
 from functools import cache
 
 import warp as wp
 
-# Indices into the state of a barrier, each in a cache line of its own: threads that have arrived, how often all have, whether
-# it is abandoned, so that nobody waits.
+# Indices into the state of a barrier, each in its own cache line: the number of threads that arrived, the number of times that
+# all did, and whether the barrier is abandoned, so that no thread waits. The last is the length of the state.
 ARRIVED, RELEASED, ABANDONED, NUMBERS = 0, 16, 32, 48
-# Looks before the core is left to others, some microseconds: a thread that is waited for may have none.
+# A thread polls this often, for some microseconds, then yields its core: the thread that it waits for may need one.
 _LOOKS = 4000
 
 
@@ -31,7 +31,7 @@ def wait_for_all(threads: int, leave: wp.uint64, barrier: wp.array(dtype=wp.int3
 
 @cache
 def wait_at_barrier():
-    """Kernel of one thread: ends when ``threads`` threads have launched it. ``leave`` is a C function that yields the core."""
+    """Kernel of one thread: returns when ``threads`` threads launched it. ``leave`` is a C function that yields the core."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def wait_all(

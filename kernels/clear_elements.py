@@ -1,7 +1,7 @@
-"""Factories of kernels over elements of K = 1 of which most are surely without force, on the CPU, where one thread takes all.
+"""Factories of CPU kernels over elements of one vertex, most of which have no force.
 
-``clear`` has for each element how far its vertex may move from x̃ before there can be a force, 0 or less where there may be one
-now. An element whose correction d is shorter is passed over before its rest state is read.
+``clear`` is the distance that the vertex of an element can move from x̃ without a force [m]. It is 0 or less where a force is
+possible at x̃. Elements with a shorter correction d are skipped before their rest state is read.
 """
 
 from functools import cache
@@ -19,13 +19,13 @@ CLAMP = wp.constant(int(HessianPolicy.CLAMP))
 
 @wp.func
 def is_clear(radius: Any, d: Any):
-    """Whether a vertex that moved by d is within its radius; not if either is not finite."""
+    """Whether ‖d‖ is below the radius; False if d is not finite or the radius is NaN."""
     return radius > type(radius)(0.0) and wp.dot(d, d) < radius * radius
 
 
 @cache
 def find_clear(term: Term, dtype):
-    """Kernel over elements at x̃, once the rest states of a step are there: clear, see above."""
+    """Kernel over elements: clear at x̃, from the rest states of the step."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, clearance, rest_of = local_coordinate(term, dtype, False), term.clearance, load(rest_type)
@@ -110,9 +110,9 @@ def add_gradient(term: Term, dtype):
 
 @cache
 def add_hessian(term: Term, dtype):
-    """Kernel over elements: out[vertex] += kₑ Aₑ ∂²u/∂y² [N/m], made semi-definite; on any device, as no two share a vertex.
+    """Kernel over elements: out[vertex] += kₑ Aₑ ∂²u/∂y² [N/m], projected to semi-definite.
 
-    ``clear`` may be None.
+    It works on any device, for no two elements share a vertex. ``clear`` may be None.
     """
     vec3, mat33 = types(dtype)
     rest_type, hessian, measure = wp.types.vector(term.parameters, dtype), term.hessian, term.measure

@@ -1,4 +1,4 @@
-"""Factory of the kernels that tell whether a step may come near a collider, by balls about vertices in which there is none."""
+"""Factory of the kernels that find whether a step may come near a collider, by balls around vertices that contain none."""
 
 from functools import cache
 
@@ -11,9 +11,9 @@ from .vectors import types
 
 @cache
 def balls(dtype):
-    """The struct of a center and a radius of each vertex, among the colliders before step ``found``.
+    """Struct of the balls of vertices: center and radius [m]. No collider is in the ball at the start of step ``found``.
 
-    From there the surface of none moves on by more than ``drift`` a step [m]. ``distance`` is the contact distance [m].
+    Surfaces of colliders move by at most ``drift`` per step [m]. ``distance`` is the contact distance [m].
     """
 
     @wp.struct
@@ -28,11 +28,11 @@ def balls(dtype):
 
 @cache
 def near_colliders(dtype, ended: bool):
-    """Kernel over vertices: near = 1 if one comes within the contact distance of a collider in a step.
+    """Kernel over vertices: near = 1 if a vertex may come within the contact distance of a collider in a step.
 
-    Before a step it is asked for twice the way of its prediction, 2‖h v + h² g‖; of one that has ``ended``, for the way from
-    ``x`` to ``end``. The distance from x to the colliders decides, and depends on the state alone; a ball spares finding it
-    where it is large enough for both ways one after another. Once one is near, no other need be looked at.
+    Before a step, a vertex is assumed to move by twice its prediction, 2‖h v + h² g‖. After a step (``ended``), it moved from
+    ``x`` to ``end``. The distance from x to the colliders decides. A ball that contains the motion makes this distance
+    unnecessary. When one vertex is near, the others are skipped.
     """
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)

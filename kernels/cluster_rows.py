@@ -1,11 +1,11 @@
-"""Factories of the constraint rows of rigid clusters: C = √mᵢ(xᵢ − c − R qᵢ), 3 rows a vertex, so that U = (κ/2)‖C‖².
+"""Factories of the constraint rows of rigid clusters: C = √mᵢ(xᵢ − c − R qᵢ), 3 rows per vertex, with U = (κ/2)‖C‖².
 
-What the best motion (c, R) cannot take up is what is left of a change of x when its rigid part is taken away,
+(c, R) is the best rigid motion, so J removes the rigid part of a change of x,
 
     J = (I − Q)√M,    Q v = √mᵢ(V + Ω × rᵢ),    V = Σ √mᵢ vᵢ/Σ mᵢ,    Ω = (Σ mᵢ(rᵢ²I − rᵢrᵢᵀ))⁻¹ Σ √mᵢ rᵢ × vᵢ,    rᵢ = R qᵢ,
 
-Q being the projection onto translations and turns, of a body on a line without those about it (pseudo-inverse). Six of the
-rows are redundant. For rows, see :mod:`.constraint_rows`; kernels are over clusters, of which each has a thread.
+where Q projects onto translations and rotations. The inverse is a pseudo-inverse: a cluster on a line has no rotation about it.
+Six rows are redundant. See :mod:`.constraint_rows` for rows. Each cluster has one thread.
 """
 
 from functools import cache
@@ -22,7 +22,7 @@ from .vectors import types
 
 @cache
 def linearise_clusters(dtype):
-    """Kernel over clusters: as :func:`.constraint_rows.linearise`, and the rotation R; 0 of a cluster without stiffness."""
+    """Kernel over clusters: as :func:`.constraint_rows.linearise`; also the rotation R, which is 0 without stiffness."""
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(4, dtype)
     fit_cluster = fit(dtype, True)
@@ -83,7 +83,7 @@ def linearise_clusters(dtype):
 
 @cache
 def motion(dtype):
-    """The device function that is given Σ √m v and Σ √m r × v of a cluster, and gives V and Ω as the rows of a matrix."""
+    """Device function (Σ √m v, Σ √m r × v, …) → matrix with the rows V and Ω of a cluster."""
     vec3, mat33 = types(dtype)
 
     @wp.func
@@ -141,7 +141,7 @@ def apply_cluster_rows(dtype):
 
 @cache
 def pull_clusters(dtype):
-    """Kernel over clusters: of Jᵀ λ the part of each element, (B·E,) matrices of one row."""
+    """Kernel over clusters: pulls (B·E,), the part of each element in Jᵀλ, as matrices of one row."""
     vec3, mat33 = types(dtype)
     y_type = wp.types.matrix((1, 3), dtype)
     rest_type = wp.types.vector(4, dtype)
@@ -187,5 +187,5 @@ def pull_clusters(dtype):
 
 
 def gather_pulls(term: Term, dtype):
-    """Kernel over vertices: adds the parts of the elements of a vertex to out, see :func:`.transpose.gather`."""
+    """Kernel over vertices: out += the parts of the elements at the vertex, see :func:`.transpose.gather`."""
     return gather(term, dtype, stored(term, dtype))

@@ -1,7 +1,7 @@
-"""Factories of kernels over rigid clusters: where their vertices are to go, and Gauss–Seidel sweeps over whole clusters.
+"""Factories of kernels over rigid clusters: target positions of their vertices, and Gauss–Seidel sweeps over clusters.
 
-A cluster c has the elements offsets[c] to offsets[c+1], one for each vertex, with rest positions ``shape`` about its centre of
-mass and rest states (t, m), see :mod:`.terms.rigid_cluster`.
+Cluster c has the elements offsets[c] to offsets[c+1], one for each vertex. An element has a rest position ``shape`` relative to
+the centre of mass, and a rest state (t, m), see :mod:`.terms.rigid_cluster`.
 """
 
 from functools import cache
@@ -15,9 +15,9 @@ from .vectors import types
 
 @cache
 def fit(dtype, corrected: bool):
-    """The device function that sets t = c + R q − (x + d) of the elements first to last, where d is 0 if not ``corrected``; R.
+    """Device function that sets t = c + R q − (x + d) of the elements first to last − 1 and returns R.
 
-    All from the first vertex, so that nothing is lost far from the origin.
+    d counts only if ``corrected``. Positions are relative to the first vertex, so that no digits are lost far from the origin.
     """
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(4, dtype)
@@ -59,7 +59,7 @@ def fit(dtype, corrected: bool):
 
 @cache
 def fit_targets(dtype, corrected: bool):
-    """Kernel over clusters: the targets t of their elements at x, or with ``corrected`` at x + d."""
+    """Kernel over clusters: targets t of their elements at x, or at x + d if ``corrected``."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(4, dtype)
     fit_cluster = fit(dtype, corrected)
@@ -84,10 +84,10 @@ def fit_targets(dtype, corrected: bool):
 
 @cache
 def correct_clusters(dtype, multipliers: bool, per_step: bool, axes: bool = False):
-    """Kernel of a Gauss–Seidel sweep: each cluster sees what those before it did, and all its vertices move at once.
+    """Kernel of a Gauss–Seidel sweep over clusters, see :func:`.project.correct_in_place`. The vertices of one move at once.
 
-    Δxᵢ = (tᵢ − α̃λᵢ/mᵢ)/(1 + α̃), α̃ = 1/(κh²), λᵢ += mᵢΔxᵢ; as :func:`.project.correct_in_place` for clusters, of which a thread
-    takes ``each``; with ``axes`` along those that are free.
+    Δxᵢ = (tᵢ − α̃λᵢ/mᵢ)/(1 + α̃), α̃ = 1/(κh²), λᵢ += mᵢΔxᵢ. A thread takes ``each`` clusters. With ``axes``, vertices move
+    only along their free axes.
     """
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(4, dtype), wp.types.matrix((1, 3), dtype)

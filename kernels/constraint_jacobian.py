@@ -1,4 +1,4 @@
-"""Factories of the Jacobian J of the constraint rows of a term, and of its transpose; see :mod:`.constraint_rows`.
+"""Factories of the kernels of J and Jᵀ, J the Jacobian of the constraint rows of a term, see :mod:`.constraint_rows`.
 
 They share the key (term, dtype, scalar, curved).
 """
@@ -17,7 +17,7 @@ from .vectors import types
 
 @cache
 def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: rows += J v, of the copies that are active, see :func:`.reduce.stands_aside`."""
+    """Kernel over elements: rows += J v in active copies, see :func:`.reduce.stands_aside`."""
     vec3, _ = types(dtype)
     M, Q = wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
@@ -59,7 +59,7 @@ def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def held_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """The struct of what the forces of the rows of a term are computed from: numbers λ of all rows, of the active copies."""
+    """Struct of the inputs of the forces of the rows of a term: slopes, λ of all rows, and the active copies."""
     slope = slope_type(term, dtype, scalar, curved)
 
     @wp.struct
@@ -74,7 +74,7 @@ def held_rows(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def pulls(term: Term, dtype, scalar: bool, curved: bool):
-    """The :class:`.transpose.LocalSource` of the force of the rows of an element over y (M, 3)."""
+    """:class:`.transpose.LocalSource` of the force of the rows of an element, as it acts on y (M, 3)."""
     M, Q = wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     data = held_rows(term, dtype, scalar, curved)
@@ -106,18 +106,18 @@ def pulls(term: Term, dtype, scalar: bool, curved: bool):
 
 
 def scatter_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: out += Jᵀλ, of active copies, see :func:`.transpose.scatter`."""
+    """Kernel over elements: out += Jᵀλ in active copies, see :func:`.transpose.scatter`."""
     return scatter(term, dtype, pulls(term, dtype, scalar, curved))
 
 
 def gather_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over vertices: the sum that :func:`scatter_rows` makes, see :func:`.transpose.gather`."""
+    """Kernel over vertices: the same sum as :func:`scatter_rows`, see :func:`.transpose.gather`."""
     return gather(term, dtype, pulls(term, dtype, scalar, curved))
 
 
 @cache
 def rows_in_full(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: out[e, rows·i + j] = row j of ∂/∂xᵢ, in double precision, to be assembled on the host."""
+    """Kernel over elements: out[e, rows·i + j] = ∂(row j)/∂xᵢ, in double precision, for assembly on the host."""
     K, M, Q = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
     weight = term.weight

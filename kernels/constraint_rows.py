@@ -1,12 +1,12 @@
 """Factories of the constraint rows of a term: their values and slopes, one element after another.
 
-A term with a scalar constraint C has one row an element, whose covector over y is ∂C/∂y, and when ``curved`` those of
-``stiffening``, whose value is 0 and whose compliance is 1: with tension −λ they add BᵀB ⪰ −λ∂²C to the masses. A term without
-has the 3M rows y − p(y), whose Jacobian is the constant G of weights, with p held. The rows of all terms are numbers of one
-array, copy after copy and in each term after term, see :class:`RowLayout`.
+An element of a term with a scalar constraint C has one row with the covector ∂C/∂y. If ``curved``, it also has the rows of
+``stiffening``, with value 0 and compliance 1: with tension −λ they add BᵀB ⪰ −λ∂²C to the masses. An element of another term
+has the 3M rows y − p(y) with p fixed, so their Jacobian is the constant matrix G of weights. The rows of all terms are in one
+array, by copy, then by term, see :class:`RowLayout`.
 
-A row that binds nothing is inactive: no stiffness, no gradient, within the range of a limit. Its covector is 0, its value 0,
-its compliance 1 and its λ 0.
+A row is inactive without stiffness, without gradient, or within the range of a limit. Its covector, value and λ are 0, and its
+compliance is 1.
 
 The factories share the key (term, dtype, scalar, curved). See :mod:`.constraint_jacobian` for J and Jᵀ.
 """
@@ -22,15 +22,15 @@ from .term import Term
 from .transpose import to_corner
 from .vectors import types
 
-# Roundings that a row takes: of the positions, of y, of C and of the force.
+# The number of roundings of a row: of positions, of y, of C and of the force.
 ROUNDINGS = wp.constant(4.0)
 
 
 @wp.struct
 class RowLayout:
-    """Where the rows of a term are: those of a copy from ``first`` on, of ``rows_per_copy`` of all terms.
+    """Where the rows of a term are. A copy has ``rows_per_copy`` rows of all terms; those of this term begin at ``first``.
 
-    ``per_copy`` is how many elements a copy has.
+    ``per_copy`` is the number of elements per copy.
     """
 
     per_copy: int
@@ -47,7 +47,7 @@ def first_row(e: int, layout: RowLayout, rows: int):
 
 @cache
 def row_values(dtype):
-    """The struct of what is known of all rows at x̃ + d, see :func:`linearise`."""
+    """Struct of the values of all rows at x̃ + d, see :func:`linearise`."""
 
     @wp.struct
     class RowValues:
@@ -63,20 +63,20 @@ def row_values(dtype):
 
 
 def row_count(term: Term, scalar: bool, curved: bool):
-    """Rows of one element."""
+    """Number of rows per element."""
     if not scalar:
         return 3 * term.rows
     return 1 + (term.stiffening_rows if curved else 0)
 
 
 def slope_type(term: Term, dtype, scalar: bool, curved: bool):
-    """The type of an element's Jacobian: covectors (rows, 3M), or of constant ones whether they are active, 0 or 1."""
+    """Type of the Jacobian of an element: covectors (rows, 3M), or for constant ones a number, 1 if active, else 0."""
     return wp.types.matrix((row_count(term, scalar, curved), 3 * term.rows), dtype) if scalar else dtype
 
 
 @cache
 def covector_row(term: Term, dtype, scalar: bool, curved: bool):
-    """The device function (covectors, j) → the j-th covector, as y is stored (M, 3)."""
+    """Device function (covectors, j) → covector j with the shape of y (M, 3); None if the covectors are constant."""
     M, y_type, slope = wp.constant(term.rows), wp.types.matrix((term.rows, 3), dtype), slope_type(term, dtype, scalar, curved)
 
     @wp.func
@@ -92,7 +92,7 @@ def covector_row(term: Term, dtype, scalar: bool, curved: bool):
 
 @wp.func
 def lowest_compliance(alpha: Any, least: Any):
-    """Of the diagonal of J W Jᵀ: ``least`` for hard rows, and for soft ones, whose α̃ determines λ, no more than rounding."""
+    """The smallest α̃, as a fraction of the diagonal of J W Jᵀ: ``least`` for hard rows (α̃ = 0), ε for soft rows."""
     return wp.where(alpha == type(alpha)(0.0), least, epsilon(least))
 
 
@@ -100,10 +100,10 @@ def lowest_compliance(alpha: Any, least: Any):
 def linearise(term: Term, dtype, scalar: bool, curved: bool):
     """Kernel over elements at x̃ + d: gap = C + α̃λ, the Jacobian, α̃ = 1/(kAh²), the inverse diagonal of J W Jᵀ + α̃.
 
-    α̃ of hard rows is no less than ``least`` of the diagonal of J W Jᵀ, or redundant ones would leave λ undetermined; carried
-    [m] is the move of a vertex by which that holds them open, next to nothing but where they contradict one another.
-    residual [m] is the move of a vertex that closes the gap by itself, rounding [m] what of that and of the force precision
-    does not hold. Of a hard row without direction the residual is |C|.
+    For hard rows α̃ is the fraction ``least`` of the diagonal of J W Jᵀ; without it redundant rows would leave λ undetermined.
+    ``carried`` [m] is the vertex displacement by which this α̃ leaves them open; it is small unless rows contradict one
+    another. ``residual`` [m] is the vertex displacement that would close the gap of this row alone; for a hard row without
+    gradient it is |C|. ``rounding`` [m] is the part of it, and of the force, that precision cannot resolve.
     """
     vec3, _ = types(dtype)
     K, M, N = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(term.stiffening_rows)
@@ -116,7 +116,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
 
     @wp.func
     def size_of(stencil: wp.array2d(dtype=wp.int32), e: int, r: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        """The size of the terms that y sums up, to whose ε it rounds."""
+        """Sum of the norms of the summands of y; y is rounded by ε of it."""
         size = dtype(0.0)
         for i in range(K):
             away = x[stencil[e, i]]
@@ -221,7 +221,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
         y = y_of(stencil, e, r, x, d)
         c = gradient(y, r)  # y − p(y), as u = ½‖y − p(y)‖²
         alpha = dtype(1.0) / (stiffness[e] * measure(r) * h * h)
-        if wp.static(secant is not None):  # the same force, of a softer spring to a farther point
+        if wp.static(secant is not None):  # the same force, as a softer spring to a farther point
             share = secant(y, r)
             c = c / share
             alpha = alpha / share

@@ -1,4 +1,4 @@
-"""Copies from array to array: rows, to measure what a kernel can move at most, and chosen vertices."""
+"""Copies between arrays: rows, to measure the memory bandwidth, and chosen vertices."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from .vectors import types
 
 @cache
 def copy_rows():
-    """Kernel over rows of four numbers, as much as a thread reads at once: out = source."""
+    """Kernel over rows of four numbers, which a thread reads at once: out = source."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def copy_each_row(
@@ -26,7 +26,7 @@ def copy_rows():
 
 @cache
 def take_vertices(dtype):
-    """Kernel over the vertices of all copies: out = the values of each copy at indices (n,)."""
+    """Kernel over (copies · n): out = the values of each copy at the vertices ``indices`` (n,)."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

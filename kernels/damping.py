@@ -1,4 +1,4 @@
-"""Factories of the kernels of damping: the rest state of damped elements where a step begins, and where it leads to."""
+"""Factory of the kernel of damping, which sets the rest states of damped elements at the start of a step."""
 
 from functools import cache
 
@@ -11,11 +11,11 @@ from .vectors import types
 
 @cache
 def set_damped_rest(term: Term, dtype, bdf2: bool, midpoint: bool):
-    """Kernel over elements: out[e], the rest state that :class:`..kernels.term.Dissipation` has of s̃, s at x but for a change.
+    """Kernel over elements: out[e] = the rest state of damping for s̃ = s(x) plus a change, see :class:`.term.Dissipation`.
 
-    With d = scale·move the change is 0 of Euler, where move may be None; (s(x) − s(x − d))/3 of BDF2 for the last move d; of
-    midpoint s(x) − ½(s(x + d) + s(x − d)) ≈ −½ddᵀ∂²s for d = hₑ v, without which s of the mean of two states would be
-    taken for the mean of s, which is of first order and brakes what turns.
+    With d = scale·move, the change is 0 for Euler, where move may be None. For BDF2, with the last move d, it is
+    (s(x) − s(x − d))/3. For midpoint, with d = hₑ v, it is s(x) − ½(s(x + d) + s(x − d)) ≈ −½ddᵀ∂²s. Without it, s at the mean
+    of two states would stand for the mean of s. That is of first order, and damps rotations.
     """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)

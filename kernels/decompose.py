@@ -1,7 +1,7 @@
 """Kernels that apply a device function of :mod:`.rotation` to every matrix of an array.
 
-Matrices lie one after another. A CUDA thread that reads or writes its own touches memory in strides of a matrix, and so blocks
-go through shared memory: on an H200 three times the bandwidth for writing U, S and V, and the whole SVD twice as fast.
+On CUDA, blocks of threads load and store matrices through shared memory, for a thread that accesses its own matrix makes
+strided accesses. On an H200 this triples the bandwidth of writing U, S and V, and the SVD is twice as fast.
 """
 
 from functools import cache
@@ -13,9 +13,9 @@ BLOCK = 32  # threads of a CUDA block; 64 and 96 are 3 and 10 % slower
 
 @cache
 def access(dtype, block):
-    """Device functions load(array, i) and store(array, i, value) of arrays of ``dtype``, for every thread of a block to call.
+    """Device functions load(array, i) and store(array, i, value) for ``dtype``. All threads of a block must call them.
 
-    A launch then has a multiple of ``block`` threads; what lies behind the end of the array is neither read nor written.
+    The number of threads must be a multiple of ``block``. Nothing beyond the end of the array is read or written.
     """
 
     @wp.func
@@ -46,7 +46,7 @@ def into_three(function, matrix, types, block):
     Args:
         function: The device function.
         matrix: Warp type of A.
-        types: Those of a, b and c.
+        types: Warp types of a, b and c.
         block: 1 on the CPU, :data:`BLOCK` on CUDA.
     """
     a_type, b_type, c_type = types
@@ -73,7 +73,7 @@ def into_three(function, matrix, types, block):
 
 @cache
 def into_two(function, matrix, types, block):
-    """Kernel over matrices: (a[i], b[i]) = function(A[i]); arguments as of :func:`into_three`."""
+    """Kernel over matrices: (a[i], b[i]) = function(A[i]); arguments as in :func:`into_three`."""
     a_type, b_type = types
     load, _ = access(matrix, block)
     (_, store_a), (_, store_b) = (access(dtype, block) for dtype in types)
@@ -95,7 +95,7 @@ def into_two(function, matrix, types, block):
 
 
 def launch(factory, function, A, out):
-    """Launches the kernel of a factory, over the matrices A (n,) and with results ``out`` (n,)."""
+    """Launches the kernel of a factory over the matrices A (n,); the results go to the arrays ``out`` (n,)."""
     block = BLOCK if A.device.is_cuda else 1
     kernel = factory(function, A.dtype, tuple(array.dtype for array in out), block)
     threads = -(-len(A) // block) * block

@@ -1,12 +1,12 @@
-"""Factories of kernels that measure how triangles deform. For neighbourhoods of points see :mod:`.neighbourhood_fit`.
+"""Factories of kernels that measure the deformation of triangles. For neighbourhoods of points see :mod:`.neighbourhood_fit`.
 
-A gradient is F̂ (3×3) in the tangent frame T = [t₁, t₂, N] of its element in the reference: its first two columns are the
-deformation gradient F (3×2) of the surface, F̂ Tᵀ maps reference to current vectors. Of a triangle the third column is the unit
-normal n, so that F̂ has an inverse; of a neighbourhood it is the least-squares image of N. An element without a reference, as a
-triangle flatter than :data:`FLATTEST`, has a gradient of NaN; one without a current normal has NaN in the last column alone.
-No fourth power of a length is taken: of 1e10 m or 1e-12 m it is no number of float32.
+F̂ (3×3) is the deformation gradient in the tangent frame T = [t₁, t₂, N] of an element in the reference. Its first two columns
+are the deformation gradient F (3×2) of the surface. F̂ Tᵀ maps reference vectors to current vectors. The third column is the
+unit normal n of a triangle, which makes F̂ invertible, or the least-squares image of N of a neighbourhood. F̂ is NaN if the
+element is degenerate in the reference, such as a triangle flatter than :data:`FLATTEST`. Its third column is NaN without a
+current normal. No kernel computes the fourth power of a length: for 1e10 m or 1e-12 m it is outside float32.
 
-An output that is None is not computed.
+Outputs that are None are not computed.
 """
 
 from functools import cache
@@ -17,7 +17,7 @@ import warp as wp
 from .rotation import epsilon, svd3x2
 from .vectors import types
 
-# A float32 coordinate is rounded by 6e-8 of its size, so a triangle flatter than this has an area made of rounding.
+# A float32 coordinate has a relative rounding of 6e-8, so the area of a flatter triangle is rounding error.
 FLATTEST = 1e-7
 
 
@@ -39,7 +39,7 @@ def undefined(x: Any):
 
 @wp.func
 def angle_of(R: Any):
-    """Angle of a rotation [rad], 0 to π, as precise near both ends."""
+    """Angle of a rotation [rad], from 0 to π, precise near both."""
     axial = wp.vector(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
     return wp.atan2(wp.length(axial), wp.trace(R) - R.dtype(1.0))
 
@@ -52,7 +52,7 @@ def angle_between(a: Any, b: Any):
 
 @wp.func
 def angle_of_threads(F: Any, A: Any):
-    """Angle between the columns of A = F a (3×2), NaN where one is made of rounding beside F."""
+    """Angle between the columns of A = F a (3×2); NaN if one is only rounding error of F."""
     a = column(A, 0)
     b = column(A, 1)
     found = angle_between(a, b)
@@ -63,7 +63,7 @@ def angle_of_threads(F: Any, A: Any):
 
 @wp.func
 def inverse_beside(A: Any, size: Any):
-    """A⁻¹, or NaN where det A is made of rounding beside that of matrices whose columns are as long as ``size``."""
+    """A⁻¹; NaN if det A is only rounding error for columns of the lengths ``size``."""
     a = column(A, 0)
     b = column(A, 1)
     c = column(A, 2)
@@ -82,10 +82,10 @@ def lengths(A: Any):
 
 @cache
 def frame_triangles(dtype):
-    """Kernel over triangles: their frames T in the reference X, Dm⁻¹ = [[r₀, r₁], [0, r₂]] [1/m] and the shortest altitude [m].
+    """Kernel over triangles: frames T in the reference X, Dm⁻¹ = [[r₀, r₁], [0, r₂]] [1/m] and the shortest altitude [m].
 
-    Dm are the edges [X₁ − X₀, X₂ − X₀] in t₁, t₂, with t₁ along the first. Of a triangle whose altitude may be made of what the
-    points are rounded by, ``rounding`` [m] each, all are NaN.
+    Dm are the edges [X₁ − X₀, X₂ − X₀] in t₁, t₂, with t₁ along the first. All outputs are NaN if the altitude may be only
+    rounding error of points, which is ``rounding`` [m] each.
     """
     vec3, mat33 = types(dtype)
 
@@ -124,7 +124,7 @@ def frame_triangles(dtype):
 
 @cache
 def triangle_gradients(dtype):
-    """Kernel over triangles: F̂ = [F, n], F = [x₁ − x₀, x₂ − x₀] Dm⁻¹ and n its unit normal."""
+    """Kernel over triangles: F̂ = [F, n], F = [x₁ − x₀, x₂ − x₀] Dm⁻¹ and n the unit normal."""
     vec3, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -181,7 +181,7 @@ def unit_directions(dtype):
 
 @cache
 def triangle_measures(dtype):
-    """The struct of the outputs of :func:`measure_triangles`, (E,) each, by the names of measures."""
+    """Struct of the outputs of :func:`measure_triangles`, (E,) each, named as the measures."""
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
     mat32, mat23 = wp.types.matrix((3, 2), dtype), wp.types.matrix((2, 3), dtype)
 
@@ -205,11 +205,11 @@ def triangle_measures(dtype):
 
 @cache
 def measure_triangles(dtype):
-    """Kernel over triangles: what follows from F = F̂'s first two columns, F = R U = W diag(λ) Vᵀ.
+    """Kernel over triangles: measures of F = R U = W diag(λ) Vᵀ, the first two columns of F̂.
 
-    Outputs: R = W Vᵀ (3×2), U = V diag(λ) Vᵀ and C = FᵀF and E = ½(C − I) (2×2), λ₁ ≥ λ₂, the directions T V and W as
-    rows (2×3), the angle of the rotation [r₁, r₂, r₁×r₂] Tᵀ, J = ‖f₁×f₂‖, the stretches ‖F a‖ of material directions and the
-    angle between them.
+    Outputs: R = W Vᵀ (3×2); U = V diag(λ) Vᵀ, C = FᵀF and E = ½(C − I) (2×2); λ₁ ≥ λ₂; the directions T V and W as rows (2×3);
+    the angle of the rotation [r₁, r₂, r₁×r₂] Tᵀ; J = ‖f₁×f₂‖; the stretches ‖F a‖ of the material directions a, and the angle
+    between the vectors F a.
     """
     _, mat33 = types(dtype)
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
@@ -233,7 +233,7 @@ def measure_triangles(dtype):
         C = wp.transpose(F) * F
         U, S, V = svd3x2(F)
         R = U * wp.transpose(V)
-        if wp.isnan(gradients[t][0, 2]):  # a line or a point has more than one
+        if wp.isnan(gradients[t][0, 2]):  # the rotation of a line or a point is not unique
             R = undefined(R[0, 0]) * R
         f1 = column(F, 0)
         f2 = column(F, 1)
@@ -248,7 +248,7 @@ def measure_triangles(dtype):
         if out.right_cauchy_green:
             out.right_cauchy_green[t] = C
         if out.green_strain:
-            # (‖f‖ − 1)(‖f‖ + 1) does not cancel.
+            # ‖f‖² − 1 as (‖f‖ − 1)(‖f‖ + 1), which does not cancel.
             a = wp.length(f1)
             b = wp.length(f2)
             out.green_strain[t] = half * mat22((a - one) * (a + one), C[0, 1], C[1, 0], (b - one) * (b + one))
@@ -278,7 +278,7 @@ def measure_triangles(dtype):
 
 @cache
 def stress_measures(dtype):
-    """The struct of the outputs of :func:`measure_stress`, (T,) each, by the names of measures."""
+    """Struct of the outputs of :func:`measure_stress`, (T,) each, named as the measures."""
     _, mat33 = types(dtype)
     mat32 = wp.types.matrix((3, 2), dtype)
 

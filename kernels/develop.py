@@ -1,4 +1,4 @@
-"""Pictures from the layers that rays have found: smoothing, and colours in sRGB."""
+"""Pictures from the layers that rays found: smoothing, and colours in sRGB."""
 
 from functools import cache
 
@@ -6,17 +6,17 @@ import warp as wp
 
 from .render import Layers, Viewer
 
-# Of the shares of the sky that two points see: a difference that may be noise.
+# Sky visibilities of two points that differ by less may differ only by noise.
 SIMILAR = wp.constant(wp.float32(0.08))
 
 
 @cache
 def smooth():
-    """Kernel over pixels, from ``first`` on: means of ``visible`` along a row or a column over what belongs to one surface.
+    """Kernel over pixels from ``first`` on: weighted means of ``visible`` over seven pixels of one surface in a row or column.
 
-    Weights 1, 2, 3, 4, 3, 2, 1 sum to the same for each of four neighbours in turn, whose samples are parts of one even
-    sequence. They fall where the normal turns and where a point is off the plane of the middle one. With steps of four pixels,
-    from square to square, only the sky's share is smoothed, and only where it is nearly the same.
+    Four neighbours have the four parts of one even sample sequence; the weights 1, 2, 3, 4, 3, 2, 1 give each part the same
+    sum. Weights decrease where the normal differs, and with the distance from the tangent plane. With ``step`` > 1, only the
+    visibility of the sky is smoothed, and only between pixels where it is similar.
     """
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -39,9 +39,9 @@ def smooth():
             out[pixel] = own
             return
         p = layers.point[pixel]
-        # Of a pixel, there
+        # Width of a pixel at that point.
         width = wp.length(p - viewer.origin) * wp.length(viewer.up)
-        sky = wp.vec2()  # sums of weights, and of weights times what is visible
+        sky = wp.vec2()  # sum of weights, and sum of weights times visibility
         sun = wp.vec2()
         at = wp.where(vertical != 0, pixel // viewer.width, pixel % viewer.width)
         count = wp.where(vertical != 0, viewer.height, viewer.width)
@@ -82,7 +82,7 @@ def to_srgb(x: float):
 
 @cache
 def develop():
-    """Kernel over pixels: the colour of each in sRGB."""
+    """Kernel over pixels: out = the colour in sRGB, in 8 bits."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def develop_pixel(

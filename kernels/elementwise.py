@@ -1,7 +1,7 @@
-"""Factories of kernels that take arrays entry by entry: negation, scaling, differences, steps.
+"""Factories of elementwise kernels: negation, scaling, differences, steps.
 
-Entries are vectors, or ``numbers``. Both are never in one module, where Warp would take them for one kernel; each is in that of
-the kernels that it runs with.
+Entries are vectors, or with ``numbers`` scalars. The two variants are in different modules, for Warp would take them for the
+same kernel in one. Each is in the module of the kernels that it runs with.
 """
 
 from functools import cache
@@ -52,7 +52,7 @@ def scale(dtype, numbers: bool = False):
 
 @cache
 def mismatch(dtype):
-    """Kernel over vertices: out = d − v; with v = W Jᵀλ what inertia and constraints disagree by [m]."""
+    """Kernel over vertices: out = d − v; for v = W Jᵀλ, the residual of the equation of motion [m]."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"warpcloth.constraint_step.{dtype.__name__}", enable_backward=False)
@@ -71,7 +71,7 @@ def mismatch(dtype):
 
 @cache
 def add_step(dtype, numbers: bool = False):
-    """Kernel over entries: a += step·change, step that of the copy."""
+    """Kernel over entries: a += step·change, with the step of the copy."""
     value = dtype if numbers else types(dtype)[0]
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -92,7 +92,7 @@ def add_step(dtype, numbers: bool = False):
 
 @cache
 def begin_step():
-    """Kernel over copies: step 1 for those that still iterate, 0 for the rest."""
+    """Kernel over copies: step = 1 for active copies, 0 for the others."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def begin(

@@ -1,4 +1,4 @@
-"""Factories of an explicit step, v += h(g − M⁻¹∇U), x += h v, after the gradient is known."""
+"""Factories of the kernels of an explicit step, v += h(g − M⁻¹∇U), x += h v, with a given gradient ∇U."""
 
 from functools import cache
 
@@ -9,10 +9,10 @@ from .vectors import types
 
 @cache
 def kick_and_drift(dtype, symplectic: bool, compensated: bool = False):
-    """The device function (x, residual, v, a, h) → x, residual, v after a step: kick, then drift, or both from one state.
+    """Device function (x, residual, v, a, h) → x, residual, v after a step.
 
-    ``compensated`` adds to x by compensated summation (Dekker 1971, *A floating-point technique for extending the available
-    precision*): the position is x + residual.
+    If ``symplectic``, x moves with the new v, else with the old one. ``compensated`` adds to x by compensated summation (Dekker
+    1971, *A floating-point technique for extending the available precision*): the position is x + residual.
     """
     vec3, _ = types(dtype)
 
@@ -35,7 +35,7 @@ def kick_and_drift(dtype, symplectic: bool, compensated: bool = False):
 
 @cache
 def explicit_step(dtype, symplectic: bool, compensated: bool = False):
-    """Kernel over vertices: x, v after a step, a = g − ∇U/m, and the gradient back to 0. Pins keep their x and v."""
+    """Kernel over vertices: x, v after a step with a = g − ∇U/m; resets the gradient to 0. Pins keep their x and v."""
     vec3, _ = types(dtype)
     step = kick_and_drift(dtype, symplectic, compensated)
 
@@ -71,7 +71,7 @@ def explicit_step(dtype, symplectic: bool, compensated: bool = False):
 
 @cache
 def move_ahead(dtype):
-    """Kernel over vertices: d = h v, the move after which damping is taken."""
+    """Kernel over vertices: d = h v, the displacement at which damping is computed."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

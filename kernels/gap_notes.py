@@ -1,6 +1,6 @@
-"""Factories of the kernels that note how near cloth comes to itself, at the end of frames.
+"""Factories of the kernels that record the gaps between cloth and cloth at the end of frames.
 
-Frames are stored in float32, which moves vertices by up to half a unit in the last place. So gaps are judged as stored.
+Frames are stored in float32, so gaps are computed from positions rounded to float32.
 """
 
 from functools import cache
@@ -20,10 +20,10 @@ FIRST = wp.constant(wp.int64(2**62))
 
 @wp.struct
 class GapNotes:
-    """The least gaps in the frames so far, (copies,).
+    """The smallest gaps in the frames so far, (copies,).
 
-    ``nearest`` is 1/d of the least [1/m]. Where a gap is too small for float32, ``too_near`` is FIRST − (frame·n + vertex), of
-    n vertices: the first frame with such a pair, and the first vertex of one in it; else it is 0.
+    ``nearest`` is 1/d for the smallest gap d [1/m]. ``too_near`` is 0 if float32 resolves all gaps. Else it is
+    FIRST − (frame·n + vertex) with n vertices: the first frame with an unresolved pair, and the first vertex of such a pair.
     """
 
     nearest: wp.array(dtype=wp.float64)
@@ -32,8 +32,10 @@ class GapNotes:
 
 @cache
 def stored_gap(dtype):
-    """The device function (of_vertex, s, x, d) → the gap of a pair as frames store it, in float32, and four units in the last
-    place of its farthest coordinate; d is that at x."""
+    """Device function (of_vertex, s, x, d) → the gap of a pair after rounding to float32, and four units in the last place.
+
+    d is the gap at x. The unit is that of the largest coordinate of the pair.
+    """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -59,7 +61,7 @@ def stored_gap(dtype):
 
 @cache
 def note_gaps(dtype):
-    """Kernel over pairs, where a step begins: notes their gaps if a frame ends there."""
+    """Kernel over pairs at the start of a step: records their gaps if a frame ends there."""
     vec3, _ = types(dtype)
     stored = stored_gap(dtype)
 
@@ -98,7 +100,7 @@ def note_gaps(dtype):
 
 @cache
 def count_pairs(dtype):
-    """Kernel over pairs, where a step begins: how many a copy has listed, how many are in contact, and 1/d of the nearest."""
+    """Kernel over pairs at the start of a step: for each copy the listed pairs, those in contact, and 1/d of the nearest."""
     vec3, _ = types(dtype)
     stored = stored_gap(dtype)
 

@@ -1,4 +1,4 @@
-"""The way from a coarse level of the vertices to the next finer one."""
+"""Interpolation from a coarse level of vertices to the next finer one."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from .vectors import types
 
 @cache
 def follow(dtype):
-    """Kernel over (copies, dropped vertices): d = Σ weight·d of the kept vertices that each follows."""
+    """Kernel over (copies, dropped vertices): d = Σ weight·d over the kept parents of each."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,10 +1,10 @@
-"""Factories of the kernels of a sparse system of 3×3 blocks: filling it, multiplying; of conjugate gradients per copy.
+"""Factories of the kernels of a sparse matrix of 3×3 blocks and of conjugate gradients in every copy.
 
-The matrix is in block compressed rows (offsets, columns, values); every copy is a diagonal block of it, so that nothing here
-but the sums knows of copies. ``active[copy]`` is 1 while that copy still iterates.
+The matrix has block compressed rows (offsets, columns, values). Every copy is a diagonal block of it, so only sums depend on
+copies. ``active[copy]`` is 1 while that copy iterates.
 
-Kernels that always run together share a module: one of ten compiles faster than ten of one. Those of conjugate gradients
-take unknowns that are vectors, with 3×3 blocks to precondition, or ``numbers``.
+Kernels that always run together share a module, which compiles faster. Conjugate gradients take vector unknowns with 3×3
+preconditioner blocks, or with ``numbers`` scalar ones.
 """
 
 from functools import cache
@@ -19,7 +19,7 @@ MODULE = "warpcloth.conjugate_gradients"  # of the kernels over copies
 
 @cache
 def set_inertia(dtype):
-    """Kernel over vertices: values[diagonal] = scale·m I, and I for a pinned vertex, which thereby stays."""
+    """Kernel over vertices: values[diagonal] = scale·m I, or I for a pinned vertex."""
     _, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -66,9 +66,10 @@ def add_blocks(dtype):
 
 @cache
 def lock_blocks(dtype):
-    """Kernel over the blocks of the matrix: rows and columns of locked coordinates are 0 but for the diagonal.
+    """Kernel over the blocks of the matrix: sets rows and columns of locked coordinates to 0, except the diagonal.
 
-    That keeps an entry above 0 or not finite, for it has the scale of the matrix, and is else 1.
+    A diagonal entry of 0 or less becomes 1. Others stay, for they have the scale of the matrix; so do entries that are not
+    finite.
     """
     vec3, mat33 = types(dtype)
 
@@ -99,7 +100,7 @@ def lock_blocks(dtype):
 
 @cache
 def take_axes(dtype):
-    """Kernel over vertices: out = a along the axes where ``taken`` is 1."""
+    """Kernel over vertices: out = a along the axes where ``taken`` is 1; the others stay."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -121,7 +122,7 @@ def take_axes(dtype):
 
 @cache
 def multiply(dtype):
-    """Kernel over block rows: q = A p, of the copies that are active."""
+    """Kernel over block rows: q = A p in active copies."""
     vec3, mat33 = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -151,10 +152,10 @@ def multiply(dtype):
 
 @cache
 def rounding(dtype):
-    """Kernel over block rows: what rounding makes of a force and of the energy.
+    """Kernel over block rows: estimates of the rounding errors of the force and of the energy.
 
-    ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖);  energy[i] = ½ρ²/‖A[i, i]‖ [J],  force[i] = (ρ + ε‖A[i, i]‖ edge)² [N²], where a
-    typical edge stands for neighbours that are pinned and so not in the matrix.
+    ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖);  energy[i] = ½ρ²/‖A[i, i]‖ [J],  force[i] = (ρ + ε‖A[i, i]‖ edge)² [N²]. The typical
+    edge length stands for pinned neighbours, which are not in the matrix.
     """
     vec3, mat33 = types(dtype)
 
@@ -192,11 +193,11 @@ def rounding(dtype):
 
 @cache
 def invert_diagonal(dtype):
-    """Kernel over block rows: inverse[i] = A[i, i]⁻¹, the block Jacobi preconditioner; I/‖A[i, i]‖ where that is indefinite.
+    """Kernel over block rows: inverse[i] = A[i, i]⁻¹, the block Jacobi preconditioner; I/‖A[i, i]‖ if A[i, i] is indefinite.
 
-    Conjugate gradients need a definite preconditioner even where the matrix is not (leading minors, Sylvester). A vertex deep
-    in contact has a block of condition 1e5 and more, whose minors cancel. Where the determinant of A[i, i]/‖A[i, i]‖ is below
-    ``lost``, float64 inverts it: else conjugate gradients find no direction.
+    Conjugate gradients need a definite preconditioner even for an indefinite matrix; leading minors decide (Sylvester). The
+    block of a vertex deep in contact has a condition number of 1e5 and more, and its minors cancel. If the determinant of
+    A[i, i]/‖A[i, i]‖ is below ``lost``, the inverse is computed in float64; else conjugate gradients would find no direction.
     """
     _, mat33 = types(dtype)
 
@@ -270,7 +271,7 @@ def start_iteration(dtype, numbers: bool = False):
 
 @cache
 def start_copies():
-    """Kernel over copies: every wanted copy with rᵀz > 0 is active; remember its rᵀz; the iteration count to 0."""
+    """Kernel over copies: active = 1 for wanted copies with rᵀz > 0; stores their rᵀz; resets the iteration count."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def start(
@@ -297,8 +298,7 @@ def start_copies():
 def advance(dtype, numbers: bool = False):
     """Kernel over unknowns: x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy.
 
-    In a direction without positive curvature the first step of a copy is x = p, later ones leave x: a descent direction
-    either way (Steihaug 1983).
+    If pᵀq ≤ 0, the first step sets x = p, and a later step leaves x. Both give a descent direction (Steihaug 1983).
     """
     vector, block, module = _unknowns(dtype, numbers)
 
@@ -337,7 +337,7 @@ def advance(dtype, numbers: bool = False):
 
 @cache
 def check_copies():
-    """Kernel over copies: stops those that are done; ratio = new rᵀz / old rᵀz; proceed = 1 while one is left."""
+    """Kernel over copies: deactivates those that are done; ratio = new rᵀz / old rᵀz; proceed = 1 if any is active."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def check(
@@ -362,7 +362,7 @@ def check_copies():
             if pq[copy] <= wp.float64(0.0):
                 negative[copy] = 1
                 active[copy] = 0
-            # Written so that NaN ends the iteration too; the caller sees it in the result.
+            # NaN also ends the iteration; the caller finds it in the result.
             if not (new_rz[copy] > tolerance[copy] * tolerance[copy] * first[copy]):
                 active[copy] = 0
             if active[copy] == 1:

@@ -1,4 +1,4 @@
-"""Local coordinates y = Dx of an element, Σᵢ wᵢ ⊗ xᵢ over its stencil; :mod:`.transpose` is the transpose."""
+"""Local coordinates y = Dx = Σᵢ wᵢ ⊗ xᵢ of an element, over its stencil; :mod:`.transpose` applies Dᵀ."""
 
 from functools import cache
 
@@ -11,7 +11,7 @@ from .vectors import types
 
 @cache
 def from_corner(term: Term, dtype):
-    """The device function (rest, i, x) → wᵢ ⊗ x, what vertex i of an element adds to y."""
+    """Device function (rest, i, x) → wᵢ ⊗ x, the part of vertex i in y."""
     vec3, _ = types(dtype)
     M, weight = wp.constant(term.rows), term.weight
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -29,9 +29,9 @@ def from_corner(term: Term, dtype):
 
 @cache
 def local_coordinate(term: Term, dtype, corrected: bool):
-    """The device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ of a term, or with ``corrected`` Σᵢ wᵢ ⊗ (xᵢ + dᵢ).
+    """Device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ of a term, or if ``corrected`` Σᵢ wᵢ ⊗ (xᵢ + dᵢ).
 
-    In float32 the sum x + d would lose the digits of d to the size of x; the difference of neighbouring x is nearly exact.
+    In float32 the sum x + d would lose digits of d. The difference of neighbouring x is nearly exact.
     """
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)

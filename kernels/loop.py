@@ -1,6 +1,6 @@
-"""Factories of the kernels of one thread by which a loop on the device counts its passes, before and after what decides.
+"""Factories of one-thread kernels that count the passes of a loop on the device, at the start and at the end of a pass.
 
-Each belongs to the module of the kernels that it runs with.
+Each is in the module of the kernels that it runs with.
 """
 
 from functools import cache
@@ -10,7 +10,7 @@ import warp as wp
 
 @cache
 def count_pass(module: str):
-    """Kernel of one thread: counts a pass; proceed = 0, until a copy asks for another."""
+    """Kernel of one thread: counts a pass and sets proceed = 0; a copy that needs another pass sets it to 1."""
 
     @wp.kernel(module=module, enable_backward=False)
     def count(
@@ -27,7 +27,7 @@ def count_pass(module: str):
 
 @cache
 def limit_passes(module: str):
-    """Kernel of one thread: proceed = 0 once there were ``most`` passes."""
+    """Kernel of one thread: proceed = 0 after ``most`` passes."""
 
     @wp.kernel(module=module, enable_backward=False)
     def limit(
@@ -46,7 +46,7 @@ def limit_passes(module: str):
 
 @cache
 def count_down():
-    """Kernel of one thread: passes that are left −= 1."""
+    """Kernel of one thread: left −= 1, the number of passes left."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def count_left(

@@ -1,4 +1,4 @@
-"""Functions of a triangle's deformation gradient that its energies share: F itself, and Hessians from its singular values.
+"""Functions of the deformation gradient F of a triangle that membrane energies share: F, and Hessians from singular values.
 
 Stencil: a triangle (x₀, x₁, x₂). F (3×2) = [x₁ − x₀, x₂ − x₀] Dm⁻¹ with Dm the rest edges in the triangle's own tangent frame,
 the first along an axis; the rows of y are the columns of F. The first numbers of a rest state are Dm⁻¹, which is upper
@@ -26,7 +26,7 @@ ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
 
 
 def side_axes(points, triangles):
-    """Two axes in the plane of each triangle (T, 3), the first along its first side, (T, 2, 3) unit vectors."""
+    """Two orthonormal axes in the plane of each triangle (T, 3), the first along its first side, (T, 2, 3)."""
     x = points[triangles]
     side, other = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
     side = side / np.linalg.norm(side, axis=1)[:, None]
@@ -115,7 +115,7 @@ def dyad(u: Any, v: Any):
 
 @wp.func
 def mended(value: Any, policy: int):
-    """An eigenvalue under a policy."""
+    """An eigenvalue after the Hessian policy: negative ones become 0 or positive, or stay."""
     if policy != RAW and value < type(value)(0.0):
         if policy == ABSOLUTE:
             value = -value
@@ -126,7 +126,7 @@ def mended(value: Any, policy: int):
 
 @wp.func
 def kept2(B: Any, policy: int):
-    """A symmetric 2×2 matrix under a policy, without its eigenvectors."""
+    """A symmetric 2×2 matrix after the Hessian policy, computed without eigenvectors."""
     half = B.dtype(0.5)
     mean = half * (B[0, 0] + B[1, 1])
     difference = half * (B[0, 0] - B[1, 1])
@@ -135,7 +135,7 @@ def kept2(B: Any, policy: int):
     low = mean - radius
     K = B
     if policy != RAW and low < B.dtype(0.0):
-        # Of unlike signs the eigenvalues are apart.
+        # Eigenvalues of opposite signs are distinct.
         if policy == ABSOLUTE:
             K = -B
             if high > B.dtype(0.0):
@@ -185,7 +185,7 @@ def range_energy(y: Any, sigma_min: Any, sigma_max: Any):
 
 @wp.func
 def range_gradient(y: Any, sigma_min: Any, sigma_max: Any):
-    """F − p, exactly 0 inside the range. What has no direction, σ = 0, takes that of U."""
+    """F − p, exactly 0 inside the range. For σ = 0, where the direction is not unique, it is that of U."""
     U, S, V = decompose(y)
     excess = S - clamped(S, sigma_min, sigma_max)
     return wp.transpose(U * wp.diag(excess) * wp.transpose(V))
@@ -193,7 +193,7 @@ def range_gradient(y: Any, sigma_min: Any, sigma_max: Any):
 
 @wp.func
 def secant(excess: Any, size: Any, target: Any):
-    """excess/size, and 1 of what is collapsed, size ≤ 1e-12 target; 0 where there is no excess."""
+    """excess/size; 0 without excess; 1 if size ≤ 1e-12 target, that is, collapsed."""
     k = excess
     if excess != type(excess)(0.0):
         k = type(excess)(1.0)
@@ -213,7 +213,7 @@ def tangent(size: Any, sigma_min: Any, sigma_max: Any):
 
 @wp.func
 def range_hessian(y: Any, sigma_min: Any, sigma_max: Any, policy: int):
-    """∂²u/∂y²; on the edge of the range that of outside. Only twist and the last two can be negative."""
+    """∂²u/∂y²; at a bound of the range, its limit from outside. Only twist and the last two eigenvalues can be negative."""
     U, S, V = decompose(y)
     c = clamped(S, sigma_min, sigma_max)
     excess = S - c

@@ -7,9 +7,9 @@ import warp as wp
 
 
 def _copied(dtype):
-    """How a snippet copies ``from`` [0] … to ``to`` [0] …: type of a number, numbers, type of all, the copy itself.
+    """The C type of a number, how many there are, the type of the whole value, and C code that copies ``from`` to ``to``.
 
-    Number by number: vectors and matrices copied as a whole keep the compiler from vectorising a loop.
+    The code copies number by number: copies of whole vectors or matrices keep the compiler from vectorising a loop.
     """
     number = f"wp::{getattr(dtype, '_wp_scalar_type_', dtype).__name__}"
     shape = getattr(dtype, "_shape_", ())
@@ -20,9 +20,9 @@ def _copied(dtype):
 
 @cache
 def load(dtype, ndim=1, stored=None):
-    """The device function (a, i) → element i of contiguous memory, without the arithmetic of strides and negative indices.
+    """Device function (a, i) → entry i of contiguous memory, without the arithmetic of strides and negative indices.
 
-    A sweep over springs takes 0.8 of the time so. ``stored`` is the type of the array, if that is numbers alone.
+    A sweep over springs then takes 0.8 of the time. ``stored`` is the dtype of the array, if it differs from ``dtype``.
     """
     number, numbers, kind, copy = _copied(dtype)
 
@@ -37,7 +37,7 @@ def load(dtype, ndim=1, stored=None):
 
 @cache
 def load_shared(dtype):
-    """The device function (array, i) → its i-th entry, for arrays of any stride, such as 0 where elements share a value."""
+    """Device function (array, i) → entry i, for any stride, such as 0 if elements share a value."""
 
     @wp.func_native("return *(decltype(a.data))((char*)a.data + size_t(i) * size_t(a.strides[0]));")
     def load_strided(a: wp.array(dtype=dtype), i: int) -> dtype: ...
@@ -47,7 +47,7 @@ def load_shared(dtype):
 
 @cache
 def store(dtype, stored=None):
-    """The device function (a, i, value): a[i] = value, as :func:`load`."""
+    """Device function (a, i, value) that sets a[i] = value; arguments as in :func:`load`."""
     number, numbers, _kind, copy = _copied(dtype)
 
     @wp.func_native(

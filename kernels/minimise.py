@@ -1,7 +1,7 @@
-"""Factories of the kernels that minimise φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d over the free vertices, per copy.
+"""Factories of the kernels that minimise φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d over the free vertices of each copy.
 
-With base = x̃, s = 1/h² and load = 0 this is the objective of implicit Euler; with base the start, s = 0 and load = 1 it is
-the potential energy under gravity.
+φ is the objective of implicit Euler for base = x̃, s = 1/h² and load = 0. It is the potential energy under gravity for base =
+the start, s = 0 and load = 1.
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ MODULE = "warpcloth.minimise"  # of the kernels over copies
 
 @cache
 def set_trial(dtype):
-    """Kernel over vertices: trial = d + step·p with the step length of the copy; clears the gradient."""
+    """Kernel over vertices: trial = d + step·p, with the step length of the copy; resets the gradient to 0."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -39,7 +39,7 @@ def set_trial(dtype):
 
 @cache
 def add_inertia(dtype):
-    """Kernel over vertices: gradient += s m d − load m g, and 0 for pins; work[i] = s/2 m d·d − load m g·d [J]."""
+    """Kernel over vertices: gradient += s m d − load m g, or = 0 for pins; work[i] = s/2 m d·d − load m g·d [J]."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -74,7 +74,7 @@ def add_inertia(dtype):
 
 @cache
 def begin_search():
-    """Kernel over copies: step 1 for those that still iterate and 0 for the rest."""
+    """Kernel over copies: step = 1 for active copies, 0 for the others; starts their line searches."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def begin(
@@ -97,10 +97,11 @@ def begin_search():
 
 @cache
 def check_trial():
-    """Kernel over copies: accepts a trial step, or halves it, and to 0 when ``most`` trials are used up.
+    """Kernel over copies: accepts a trial step or halves it; sets it to 0 after ``most`` trials.
 
-    Accepted is φ(α) ≤ φ(0) + 1e-4 α φ'(0) (Armijo), and, where φ no longer resolves the decrease, φ'(α) ≤ −(1 − 2e-4)·φ'(0)
-    with φ(α) ≤ φ(0) + noise (the approximate Wolfe condition of Hager and Zhang 2005). NaN is never accepted.
+    A step is accepted if φ(α) ≤ φ(0) + 1e-4 α φ'(0) (Armijo). It is also accepted if φ(α) ≤ φ(0) + noise and
+    φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe, Hager and Zhang 2005). NaN is never
+    accepted.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)

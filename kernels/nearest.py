@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-# By the square of its longest side, the least normal whose direction is more than rounding.
+# A triangle is flat if its normal, over the square of its longest side, is shorter: its direction is then rounding error.
 FLAT = wp.constant(wp.float64(1e-12))
 FAR = wp.constant(wp.float32(4.0))  # above the diagonal of [−1, 1]³
 
@@ -21,7 +21,7 @@ def from_segment(a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Squared distance of the origin to a triangle, which may be flat: that to its plane, or else to the nearest side."""
+    """Squared distance of the origin to a triangle, which may be flat: to its plane, or else to its sides."""
     nearest = wp.min(from_segment(a, b), wp.min(from_segment(b, c), from_segment(c, a)))
     n = wp.cross(b - a, c - a)
     longest_sq = wp.max(wp.length_sq(b - a), wp.max(wp.length_sq(c - b), wp.length_sq(a - c)))
@@ -37,9 +37,9 @@ def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 def distances():
     """Kernel over points: out[i] = distance of points[i] to the triangles of ``mesh``.
 
-    The mesh holds in float32 what ``x`` holds in float64. Its query finds the triangle, whose distance is then computed in
-    float64. It leaves out flat triangles and is wrong about those that are nearly so; ``flat`` names them, to be tried one by
-    one. All within [−1, 1]³.
+    All coordinates are in [−1, 1]³, in float32 in ``mesh`` and in float64 in ``x``. A query of the mesh finds the nearest
+    triangle; its distance is computed in float64. Queries omit flat triangles and can be wrong about nearly flat ones, so those
+    in ``flat`` are tested one by one.
     """
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -71,7 +71,7 @@ def distances():
 
 @cache
 def faces():
-    """Kernel over points: out[i] = the triangle of ``mesh`` that is nearest to points[i], all within [−1, 1]³."""
+    """Kernel over points: out[i] = the triangle of ``mesh`` nearest to points[i], with coordinates in [−1, 1]³."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def find(

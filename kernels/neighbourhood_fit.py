@@ -1,4 +1,4 @@
-"""Factories of kernels that fit maps to the neighbourhoods of vertices, see :mod:`.deformation` for F̂ and T."""
+"""Factories of kernels that fit linear maps to neighbourhoods of vertices; see :mod:`.deformation` for F̂ and T."""
 
 from functools import cache
 from typing import Any
@@ -12,7 +12,7 @@ from .vectors import types
 
 @cache
 def vertex_normals(dtype):
-    """Kernel over vertices: unit normals, those of their triangles weighted by area; NaN where these are none or cancel."""
+    """Kernel over vertices: unit normals, area-weighted means over triangles; NaN without a triangle, or if they cancel."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -49,9 +49,9 @@ def vertex_normals(dtype):
 
 @wp.func
 def only_rotation(R: Any, B: Any):
-    """R, or NaN where B has other nearest rotations: of the singular values of B, two with the sign of det B cancel.
+    """R, or NaN if the rotation nearest to B is not unique: the two smallest signed singular values of B then add to 0.
 
-    RᵀB has these, and tr(RᵀB) − RᵀB their sums of two as its eigenvalues.
+    The eigenvalues of tr(RᵀB) − RᵀB are the sums of two signed singular values.
     """
     C, size = scaled3(B)
     P = wp.transpose(R) * C
@@ -64,13 +64,14 @@ def only_rotation(R: Any, B: Any):
 
 @cache
 def neighbourhood_gradients(dtype):
-    """Kernel over vertices: fits of the map of a set of points to p = X − X̄ and q = x − x̄, X̄ and x̄ their centroids.
+    """Kernel over vertices: fits F to p = X − X̄ and q = x − x̄ of a set of points, X̄ and x̄ the centroids.
 
-    F = (Σ q pᵀ + l̄² n Nᵀ)(Σ p pᵀ + l̄² N Nᵀ)⁻¹, l̄² the mean of ‖p‖², the least squares of Σ‖q − Fp‖² (Müller et al.
-    2005, *Meshless deformations based on shape matching*) with one pair more, (l̄N, l̄n): a set may be planar, and its stretch
-    along the normal is then prescribed, to 1. Where p may lie on a line but for what points are rounded by, ``rounding`` [m],
-    F is NaN. The outputs are F̂ = F T with T = [t₁, t₂, N], T, the rotation R with the largest tr(RᵀΣqpᵀ) (Kabsch 1976), NaN
-    where others have as large a one, the residual √(mean ‖q − Rp‖²) [m], and H = Σ p qᵀ [m²].
+    F = (Σ q pᵀ + l̄² n Nᵀ)(Σ p pᵀ + l̄² N Nᵀ)⁻¹, l̄² the mean of ‖p‖², minimises Σ‖q − Fp‖² (Müller et al. 2005, *Meshless
+    deformations based on shape matching*) with the additional pair (l̄N, l̄n). The pair makes the fit unique for a planar set:
+    its stretch along the normal is 1. F is NaN if p may lie on a line within the rounding of points, ``rounding`` [m].
+
+    Outputs: F̂ = F T; T = [t₁, t₂, N]; the rotation R with the largest tr(RᵀΣqpᵀ) (Kabsch 1976), NaN if it is not unique; the
+    residual √(mean ‖q − Rp‖²) [m]; and H = Σ p qᵀ [m²].
     """
     vec3, mat33 = types(dtype)
 
@@ -114,10 +115,10 @@ def neighbourhood_gradients(dtype):
             t1, t2 = complement(N)
             T = wp.matrix_from_cols(t1, t2, N)
             one = dtype(1.0)
-            scale = one / wp.trace(A)  # l̄⁻²; no cube of a length underflows
+            scale = one / wp.trace(A)  # of order l̄⁻², so that determinants do not underflow
             weights = scale * A + share * wp.outer(N, N)
             inverse = inverse_beside(weights, vec3(one, one, one))
-            # Of a set in a plane det/share is the lesser of its two variances, over their sum.
+            # For a planar set det/share is the smaller of its two variances, over their sum.
             narrow = dtype(2.0) * rounding
             if not (wp.determinant(weights) > share * scale * narrow * narrow):
                 inverse = undefined(one) * inverse
@@ -141,7 +142,7 @@ def neighbourhood_gradients(dtype):
 
 @cache
 def neighbourhood_measures(dtype):
-    """The struct of the outputs of :func:`measure_neighbourhoods`, (N,) each, by the names of measures."""
+    """Struct of the outputs of :func:`measure_neighbourhoods`, (N,) each, named as the measures."""
     vec3, mat33 = types(dtype)
 
     @wp.struct
@@ -156,7 +157,7 @@ def neighbourhood_measures(dtype):
 
 @cache
 def measure_neighbourhoods(dtype):
-    """Kernel over vertices: F = F̂ Tᵀ (3×3), its singular values, those directions as rows (3×3) in the current frame, and the
+    """Kernel over vertices: F = F̂ Tᵀ (3×3), its singular values, their directions in the current frame as rows (3×3), and the
     angle of R."""
     _, mat33 = types(dtype)
     outputs = neighbourhood_measures(dtype)

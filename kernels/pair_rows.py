@@ -1,8 +1,8 @@
-"""Factories of the constraint rows of pairs of self-contact: C = −√(2φ(d)), as those of contact with colliders.
+"""Factories of the constraint rows of self-contact pairs: C = −√(2φ(d)), as for contact with colliders.
 
-Each copy has rows for all pairs of the list. Those of pairs of other copies, or farther apart than the contact distance, bind
-nothing, see :mod:`.constraint_rows`: λ ≥ 0 is that of pairs that touch. With ``curved`` each has a second row, which stiffens
-it along n by −λC″. Pairs with friction have two more, :func:`linearise_friction_rows`.
+Each copy has rows for all pairs of the list. Rows of pairs of other copies, or of pairs beyond the contact distance, are
+inactive, see :mod:`.constraint_rows`. With ``curved``, each pair has a second row, which adds the stiffness −λC″ along n. Pairs
+with friction have two more rows, see :func:`linearise_friction_rows`.
 """
 
 from functools import cache
@@ -23,7 +23,7 @@ ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
 @wp.struct
 class PairSlopes:
-    """Of pairs: w, and ∂C/∂y of their first row and of their second; 0 of those that bind nothing."""
+    """Weights w of pairs, and ∂C/∂y of their first and second rows; 0 for inactive rows."""
 
     weights: wp.array(dtype=wp.vec4d)
     first: wp.array(dtype=wp.vec3d)
@@ -37,7 +37,7 @@ def row_of_pair(copy: int, e: int, layout: RowLayout, rows: int):
 
 @cache
 def linearise_pair_rows(dtype, curved: bool):
-    """Kernel over copies and pairs at x̃ + d: the rows as :func:`.constraint_rows.linearise` makes them."""
+    """Kernel over copies and pairs at x̃ + d: rows as in :func:`.constraint_rows.linearise`."""
     vec3, _ = types(dtype)
     at, exact = vertex_of(dtype)
     Q = wp.constant(2 if curved else 1)
@@ -127,7 +127,7 @@ def linearise_pair_rows(dtype, curved: bool):
 def linearise_friction_rows(dtype):
     """Kernel over copies and pairs at x̃ + d: the rows of friction, C = (u·t, u·(n × t)), t along the edge of the pair.
 
-    Of one that slides they are those of a softer spring, which pulls as much.
+    For a sliding pair, they are those of a softer spring with the same force.
     """
     vec3, _ = types(dtype)
     stretch, (at, exact) = stretch_of(dtype), vertex_of(dtype)
