@@ -1,8 +1,8 @@
-"""Factories of the kernels that sweep over pairs of cloth with friction, see :mod:`.self_friction`, one by one or all at once.
+"""Factories of the kernels that sweep over self-contact pairs with friction, see :mod:`.self_friction`, Gauss–Seidel or Jacobi.
 
-u is linear in positions, u = Σ wᵢxᵢ + …, so the local step is that of all vector constraints. With û without the force of the
-pair and W = Σ wᵢ²/mᵢ, λ = −hₑ²∂U/∂u at the u* = û + Wλ that solves it, and Δxᵢ = wᵢλ/mᵢ. Where vertices are locked along some
-axes, W is that of an axis that moves: the fixed point is the same.
+u = Σ wᵢxᵢ + … is linear in positions, so the local step is that of a vector constraint. û is u without the force of the pair
+and W = Σ wᵢ²/mᵢ. Then λ = −hₑ²∂U/∂u(u*) at u* = û + Wλ, and Δxᵢ = wᵢλ/mᵢ. If vertices have locked axes, W is that of a free
+axis; the fixed point is the same.
 """
 
 from functools import cache
@@ -18,7 +18,7 @@ from .vectors import types
 
 @wp.func
 def multiplier_after(u: wp.vec3d, D: wp.float64, k: wp.float64, limit: wp.float64, h: wp.float64):
-    """λ = −h²∂U/∂u at the u* = u + Dλ that solves it: in closed form, that of :func:`.terms.friction.prox`."""
+    """λ = −h²∂U/∂u(u*) at u* = u + Dλ, in the closed form of :func:`.terms.friction.prox`."""
     found = wp.vec3d()
     l = wp.length(u)
     if D > ZERO and l > ZERO:
@@ -30,7 +30,7 @@ def multiplier_after(u: wp.vec3d, D: wp.float64, k: wp.float64, limit: wp.float6
 
 @cache
 def greatest_mobility(dtype, axes: bool):
-    """The device function (inverse masses, i) → 1/m, of an axis that has most."""
+    """Device function (inverse masses, i) → the largest 1/m of the axes of vertex i."""
     moved = free_move(dtype, axes)
     kind, _ = types(dtype)
 
@@ -43,9 +43,9 @@ def greatest_mobility(dtype, axes: bool):
 
 @cache
 def sweep_friction(dtype, axes: bool):
-    """Kernel of one thread: each acting pair in turn takes its force away, and gets that of the prox at the u that is left.
+    """Kernel of one thread: for each acting pair in turn, removes its λ and adds that of the prox at the remaining u.
 
-    M(x − x̃) = Σ wᵢλ holds, and a fixed point is the minimiser of the step.
+    M(x − x̃) = Σ wᵢλ always holds, and a fixed point minimises the objective of the step.
     """
     vec3, _ = types(dtype)
     stretch, moved, greatest = stretch_of(dtype), free_move(dtype, axes), greatest_mobility(dtype, axes)
@@ -89,7 +89,7 @@ def sweep_friction(dtype, axes: bool):
 
 @cache
 def count_rubbing(dtype):
-    """Kernel over vertices: how many pairs of a vertex have friction."""
+    """Kernel over vertices: rubbing = number of pairs of the vertex with friction."""
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def count_rubbing_pairs(
@@ -112,7 +112,7 @@ def count_rubbing(dtype):
 
 @cache
 def rub_pairs(dtype, axes: bool):
-    """Kernel over acting pairs of a Jacobi sweep: λ of the prox, as if W were D = Σ nᵢwᵢ²/mᵢ, nᵢ the ``rubbing`` ones at i."""
+    """Kernel over acting pairs of a Jacobi sweep: λ of the prox with D = Σ nᵢwᵢ²/mᵢ for W, nᵢ = ``rubbing`` of vertex i."""
     vec3, _ = types(dtype)
     stretch, greatest = stretch_of(dtype), greatest_mobility(dtype, axes)
 

@@ -1,28 +1,28 @@
-"""Factories of the local projections: sweeps over the elements of a term, Jacobi, by colour, or one after the other.
+"""Factories of the local steps of elements, and of the Gauss–Seidel sweep over the elements of a term.
 
-With ``assemble`` the only kernels that know stencils; none of them knows a material. The step of one element is
+They work for every term. The step of one element is
 
     Δλ = (G W Gᵀ + α̃ I)⁻¹ (p(y) − y − α̃ λ),   Δxᵢ = wᵢ-weighted rows of Δλ / mᵢ,   α̃ = 1/(k A h²)
 
-with G the weights of y and W the inverse masses, or on the scalar constraint of a term (Macklin et al. 2016, *XPBD*)
+with G the weights of y and W the inverse masses; or for the scalar constraint of a term (Macklin et al. 2016, *XPBD*)
 
     Δλ = −(C + α̃ λ)/(Σ wᵢ‖∇C‖² + α̃),   Δxᵢ = ∇ᵢC Δλ / mᵢ.
 
-or by the prox of a term that gives one, with s no less than any eigenvalue of G W Gᵀ (equal to it for M = 1),
+or for a term with a prox, with s at least the largest eigenvalue of G W Gᵀ (equal for M = 1),
 
     Δλ = (prox(y − s λ, s/α̃) − y)/s,   prox(v, c) = argmin u(y) + ‖y − v‖²/2c,
 
-or in its place ``prox_from``, where the term has that.
+or by ``prox_from`` instead of the prox, if the term has it.
 
-XPBD adds Δλ up in λ; for PBD λ is 0. With an infinite stiffness α̃ = 0 and, for springs, this is the projection of Müller et al.
-2006 (*Position based dynamics*). A stencil of pins alone has nothing to move and gives 0, and so does no stiffness; one with
-so few free vertices that the matrix is singular moves y as near to p(y) as they can take it, by the pseudo-inverse.
+XPBD accumulates Δλ in λ; for PBD λ is 0. With infinite stiffness α̃ = 0; for springs this is the projection of Müller et al.
+2006 (*Position based dynamics*). Δx is 0 if all vertices are pinned, or without stiffness. If so few vertices are free that the
+matrix is singular, the pseudo-inverse moves y as near to p(y) as possible.
 
-Where coordinates are locked W has an inverse mass for each axis, and the first of these steps is one for each column of y.
+If coordinates are locked, W has an inverse mass for each axis, and the first step is computed for each column of y.
 
-The factories share the key (term, dtype, scalar, multipliers, per_step, axes): whether the scalar constraint is used, which is
-for terms that have one; whether there is λ, else the array may be None; whether finite stiffness is spread over the sweeps of a
-step; whether inverse masses are vectors, one for each axis.
+The factories share the key (term, dtype, scalar, multipliers, per_step, axes). ``scalar``: the scalar constraint of the term is
+used. ``multipliers``: there is λ, else its array may be None. ``per_step``: finite stiffness is spread over the sweeps of a
+step. ``axes``: inverse masses are vectors with one entry for each axis.
 """
 
 from functools import cache
@@ -39,13 +39,13 @@ from .vectors import types
 
 
 def multiplier_type(term: Term, dtype, scalar: bool):
-    """The type of λ of one element: a number, or M rows of 3."""
+    """Type of λ of one element: a scalar, or a matrix (M, 3)."""
     return dtype if scalar else wp.types.matrix((term.rows, 3), dtype)
 
 
 @wp.func
 def pseudo_inverse2(A: Any):
-    """A⁻¹ of a symmetric semi-definite 2×2 A, or that of its larger eigenvalue alone where the other is below 4ε of it."""
+    """A⁻¹ for a symmetric semi-definite 2×2 A; the pseudo-inverse if the smaller eigenvalue is below 4ε of the larger one."""
     trace = wp.trace(A)
     B = A / trace
     determinant = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
@@ -56,9 +56,9 @@ def pseudo_inverse2(A: Any):
 
 @cache
 def spread_compliance(dtype):
-    """The device function (w, α̃, n) → α̃′ by which n sweeps move a constraint by itself as far as one with α̃ does.
+    """Device function (w, α̃, n) → α̃′ with which n sweeps move a single constraint as far as one sweep with α̃.
 
-    Of w/(w + α̃) = s it makes w/(w + α̃′) = s′ = 1 − (1 − s)^(1/n) (Müller et al. 2006). In double precision, for 1 − s ≈ 1.
+    For s = w/(w + α̃), w/(w + α̃′) = 1 − (1 − s)^(1/n) (Müller et al. 2006), in double precision since 1 − s may be near 1.
     """
 
     @wp.func
@@ -72,7 +72,7 @@ def spread_compliance(dtype):
 
 @cache
 def prox_step(term: Term, dtype):
-    """The device functions A (M, M) → s, its largest sum of a row, and (y, rest, s, α̃, λ) → rows. No eigenvalue is above s."""
+    """Device functions A (M, M) → s, the largest row sum and so a bound of the eigenvalues, and (y, rest, s, α̃, λ) → rows."""
     M, y_type = wp.constant(term.rows), wp.types.matrix((term.rows, 3), dtype)
     rest_type, square = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, term.rows), dtype)
     prox, prox_from = term.prox, term.prox_from
@@ -103,10 +103,10 @@ def prox_step(term: Term, dtype):
 
 @cache
 def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: bool = True):
-    """The device function (y, rest, inverse masses w of the corners, α̃, λ, sweeps) → (Δλ, rows (M, 3)); λ 0 if not
-    ``multipliers``.
+    """Device function (y, rest, inverse masses w of the corners, α̃, λ, sweeps) → (Δλ, rows (M, 3)).
 
-    Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]. Where G W Gᵀ is no multiple of I its mean diagonal stands for w when spreading.
+    Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]. Without ``multipliers`` λ is 0. If G W Gᵀ is not a multiple of I, the mean of its diagonal
+    is the w of :func:`spread_compliance`.
     """
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -131,8 +131,8 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
         gap = project(y, r) - y
         if wp.static(multipliers):
             gap -= compliance * before
-        if wp.static(term.rows == 1):  # without a branch, so that a GPU may take several constraints at once
-            if wp.static(multipliers):  # whose roundings add up over sweeps
+        if wp.static(term.rows == 1):  # branch-free, so that a GPU can overlap several constraints
+            if wp.static(multipliers):  # a division, for roundings of λ accumulate over sweeps
                 rows = wp.where(moves, gap / (system[0, 0] + compliance), rows)
             else:
                 rows = wp.where(moves, (dtype(1.0) / (system[0, 0] + compliance)) * gap, rows)
@@ -177,7 +177,7 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
 
 @cache
 def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
-    """The device function of :func:`multiplier` with inverse masses (K, 3) of the corners along each axis."""
+    """As :func:`multiplier`, with inverse masses (K, 3) of the corners along each axis."""
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     corners, system_type = wp.types.matrix((term.vertices, 3), dtype), wp.types.matrix((term.rows, term.rows), dtype)
@@ -248,7 +248,7 @@ def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
 
 @cache
 def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool = False):
-    """The device function (element data, x̃, d, h, λ, sweeps) → (Δλ, rows) of :func:`multiplier` for one element at x̃ + d."""
+    """Device function (element data, x̃, d, h, λ, sweeps) → (Δλ, rows) of :func:`multiplier` for one element at x̃ + d."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, mobility = wp.types.vector(term.parameters, dtype), vec3 if axes else dtype
@@ -286,9 +286,9 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool =
 
 @cache
 def sweep_turn(dtype):
-    """The struct of one launch of a Gauss–Seidel sweep: elements from ``first`` on, ``each`` of a thread; h, sweeps and ω.
+    """Struct of one launch of a Gauss–Seidel sweep: elements from ``first`` on, ``each`` per thread; h, sweeps and ω.
 
-    ``busy`` is the list of :func:`list_busy` of a term that has one.
+    ``busy`` is the list of :func:`list_busy`, if the term has one.
     """
 
     @wp.struct
@@ -305,22 +305,23 @@ def sweep_turn(dtype):
 
 @wp.func
 def nth_of_thread(first: int, each: int, thread: int, k: int):
-    """The k-th of what a thread takes in a sweep, see :func:`correct_in_place`."""
+    """Index of the k-th element of a thread in a sweep, see :func:`correct_in_place`."""
     e = first + thread * wp.abs(each) + k
     if each < 0:
         e = first - (thread + 1) * each - 1 - k
     return e
 
 
-LISTED_EVERY = wp.constant(16)  # sweeps, before which the elements with a force are listed anew, and before the third
+LISTED_EVERY = wp.constant(16)  # sweeps between two lists of the elements with a force; one more is made before the third
 
 
 @cache
 def list_busy(term: Term, dtype, multipliers: bool):
-    """Kernel of one thread: busy = (count, elements in order) that may have a force, of a term with ``clear``.
+    """Kernel of one thread: busy = (count, elements in order) that may have a force, for a term with ``clear``.
 
-    Such are those with λ, and those near where there is one: within the way of the prediction from ``before`` and of the
-    correction so far. It is found before the first and the third sweep, and before one in LISTED_EVERY; ``sweep`` counts them.
+    These are elements with λ ≠ 0, and elements that the prediction from ``before`` and the correction so far may take out of
+    their ``clear``. The list is made before the first and the third sweep, and every LISTED_EVERY sweeps; ``sweep`` counts
+    them.
     """
     vec3, _ = types(dtype)
     lambda_type = wp.types.matrix((term.rows, 3), dtype)
@@ -367,11 +368,12 @@ def correct_in_place(
     axes: bool = False,
     listed: bool = False,
 ):
-    """Kernel of a Gauss–Seidel sweep: each element sees what those before it did; d += ω Δx, λ += ω Δλ.
+    """Kernel of a Gauss–Seidel sweep: d += ω Δx, λ += ω Δλ, each element after the moves of those before it.
 
-    A thread takes ``each`` elements one after the other, from first + thread·each on: on a GPU 1 of a colour, in which no two
-    share a vertex that moves, or all of a copy, on the CPU all; of a negative ``each`` as many, from the last to the first.
-    Pins are never written, so elements may share them. With ``listed`` one thread takes those of :func:`list_busy` alone.
+    A thread takes ``each`` elements in order, from first + thread·each on; a negative ``each`` reverses the order. On a GPU a
+    thread takes one element of a colour, whose elements share no free vertex, or all of a copy. On the CPU one takes all. Pins
+    are never written, so elements of a colour may share them. With ``listed``, one thread takes only the list of
+    :func:`list_busy`.
     """
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
@@ -425,7 +427,7 @@ def correct_in_place(
 
 @cache
 def add_momentum(dtype):
-    """Kernel over vertices: out += s mᵢ dᵢ; with s = 1/h² the force [N] of the inertia that a correction d [m] calls up."""
+    """Kernel over vertices: out += s mᵢ dᵢ; with s = 1/h² the inertial force [N] of a correction d [m]."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

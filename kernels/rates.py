@@ -1,4 +1,4 @@
-"""Rates between two deformation gradients F̂, see :mod:`.deformation`: the velocity gradient and what else changes."""
+"""Rates between two deformation gradients F̂, see :mod:`.deformation`: the velocity gradient, and rates of measures."""
 
 from functools import cache
 from typing import Any
@@ -12,15 +12,15 @@ from .vectors import types
 
 MIDPOINT, FORWARD, LOGARITHM = (wp.constant(k) for k in range(3))
 
-# Padé's approximant of log(I + X) as a sum of fractions, good to float64 for ‖X‖ ≤ 0.264 (Higham 2008, Functions of Matrices,
-# §11.4): Gauss–Legendre's nodes and weights on [0, 1].
+# Padé approximant of log(I + X) as partial fractions, accurate to float64 for ‖X‖ ≤ 0.264 (Higham 2008, Functions of Matrices,
+# §11.4): Gauss–Legendre nodes and weights on [0, 1].
 _nodes, _weights = np.polynomial.legendre.leggauss(7)
 NODES, WEIGHTS = (wp.constant(wp.types.vector(7, wp.float64)(v)) for v in (0.5 * (_nodes + 1.0), 0.5 * _weights))
 
 
 @wp.func
 def square_root(A: Any):
-    """The principal square root, by the product form of Denman and Beavers' iteration, scaled (Higham 2008, §6.3)."""
+    """Principal square root, by the scaled product form of the Denman–Beavers iteration (Higham 2008, §6.3)."""
     one = A.dtype(1.0)
     half = A.dtype(0.5)
     I = wp.identity(n=3, dtype=A.dtype)
@@ -38,14 +38,14 @@ def square_root(A: Any):
             M = half * (I + half * (scaled + inverse))
             rest = M - I
             change = wp.sqrt(wp.ddot(rest, rest))
-    if not (change <= A.dtype(1.0e-3)):  # an eigenvalue that is negative, half a turn
+    if not (change <= A.dtype(1.0e-3)):  # not converged: a negative eigenvalue, such as of half a turn
         X[0, 0] = undefined(change)
     return X
 
 
 @wp.func
 def logarithm(A: Any):
-    """The principal logarithm, by inverse scaling and squaring (Higham 2008, §11.5); NaN where there is none."""
+    """Principal logarithm, by inverse scaling and squaring (Higham 2008, §11.5); NaN if it does not exist."""
     I = wp.identity(n=3, dtype=A.dtype)
     X = A
     factor = A.dtype(1.0)
@@ -64,7 +64,7 @@ def logarithm(A: Any):
 
 @wp.func
 def rate_of(before: Any, after: Any, dt: Any, method: int):
-    """ẏ/y of a positive number that goes from one value to another."""
+    """ẏ/y of a positive number y with two values ``dt`` apart."""
     change = after - before
     if method == MIDPOINT:
         r = type(dt)(2.0) * change / (after + before)
@@ -77,7 +77,7 @@ def rate_of(before: Any, after: Any, dt: Any, method: int):
 
 @cache
 def rate_measures(dtype):
-    """The struct of the outputs of :func:`measure_rates`, (E,) each, by the names of measures."""
+    """Struct of the outputs of :func:`measure_rates`, (E,) each, named as the measures."""
     vec3, mat33 = types(dtype)
     vec2 = wp.types.vector(2, dtype)
 
@@ -99,10 +99,10 @@ def rate_measures(dtype):
 def measure_rates(dtype):
     """Kernel over elements: the velocity gradient L = ḞF⁻¹ = D + Ω and other rates between the gradients F̂₀ and F̂₁.
 
-    L is 2(F̂₁ − F̂₀)(F̂₁ + F̂₀)⁻¹/dt by midpoint, (F̂₁ − F̂₀)F̂₀⁻¹/dt forward, log(F̂₁F̂₀⁻¹)/dt by logarithm. D = P ½(L + Lᵀ) P with
-    P the projection to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch of the normal is not measured; Ω = ½(L − Lᵀ).
-    Rates of stretches and of lengths are of the numbers themselves by the same method; of angles, differences. Points are
-    rounded by ``rounding`` [m], and elements in the reference as wide as ``sizes`` [m].
+    Methods: midpoint, L = 2(F̂₁ − F̂₀)(F̂₁ + F̂₀)⁻¹/dt; forward, L = (F̂₁ − F̂₀)F̂₀⁻¹/dt; logarithm, L = log(F̂₁F̂₀⁻¹)/dt. D =
+    P ½(L + Lᵀ) P, where P projects to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch along the normal is not
+    measured. Ω = ½(L − Lᵀ). Rates of stretches and lengths use the same method on the numbers; rates of angles are differences.
+    ``rounding`` [m] is the rounding of points, ``sizes`` [m] the widths of elements in the reference.
     """
     vec3, mat33 = types(dtype)
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
@@ -110,7 +110,7 @@ def measure_rates(dtype):
 
     @wp.func
     def turn(a0: vec2, a1: vec2, b0: vec3, b1: vec3, dt: dtype):
-        """Rates of the least turn of a line in the frame, and of one in space."""
+        """Angular velocities of the smallest rotation of a line: in the frame from a0 to a1, and in space from b0 to b1."""
         s = a0[0] * a1[1] - a0[1] * a1[0]
         c = wp.dot(a0, a1)
         if c < dtype(0.0):
@@ -180,7 +180,7 @@ def measure_rates(dtype):
                 a0 = wp.vector(V0[0, 0], V0[1, 0])
                 a1 = wp.vector(V1[0, 0], V1[1, 0])
                 in_frame, in_space = turn(a0, a1, column(U0, 0), column(U1, 0), dt)
-                # Of equal stretches every direction is principal, and of those that differ by rounding one is made of it.
+                # For equal stretches every direction is principal; for stretches that differ by rounding, rounding decides.
                 tiny = dtype(16.0) * epsilon(dt) + dtype(4.0) * rounding / sizes[e]
                 if not (S0[0] - S0[1] > tiny * S0[0] and S1[0] - S1[1] > tiny * S1[0]):
                     in_frame = dtype(wp.NAN)

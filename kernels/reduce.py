@@ -1,6 +1,6 @@
-"""Sums and maxima per copy, in double precision and in a fixed order, so that the same run gives the same bits.
+"""Sums and maxima per copy, in double precision and in a fixed order, so that results are bitwise reproducible.
 
-Two launches: (copies, chunks) threads sum every chunks-th entry of their copy, then one thread a copy adds the chunks.
+Two launches: (copies, chunks) threads sum every chunks-th entry of their copy, then one thread per copy adds the chunks.
 """
 
 from functools import cache
@@ -12,7 +12,7 @@ from .vectors import types
 
 @wp.func
 def stands_aside(active: wp.array(dtype=wp.int32), copy: int):
-    """Whether a copy is not among the active ones, (B,); none is left out where that is None."""
+    """Whether active[copy] is 0; False if ``active`` (B,) is None."""
     if active:
         return active[copy] == 0
     return False
@@ -20,7 +20,7 @@ def stands_aside(active: wp.array(dtype=wp.int32), copy: int):
 
 @wp.func
 def larger(most: wp.float64, value: wp.float64):
-    """The larger of two numbers; NaN stays."""
+    """The larger of two numbers; NaN if either is NaN."""
     return wp.where(most == most and not (value <= most), value, most)
 
 
@@ -48,8 +48,7 @@ def partial_sum():
 
 @cache
 def partial_dot(dtype, numbers: bool = False):
-    """Kernel over (copies, chunks): out[copy, chunk] = Σ a·b of vectors or ``numbers``; of the copies that are active, if any
-    are named."""
+    """Kernel over (copies, chunks): out[copy, chunk] = Σ a·b of vectors or ``numbers``, in active copies."""
     value = dtype if numbers else types(dtype)[0]
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -80,7 +79,7 @@ def partial_dot(dtype, numbers: bool = False):
 
 @cache
 def finish_sum():
-    """Kernel over copies: out[copy] = Σ partial[copy], and what out held too where ``accumulate`` is 1."""
+    """Kernel over copies: out[copy] = Σ partial[copy], or += if ``accumulate`` is 1."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def add_chunks(
@@ -93,7 +92,7 @@ def finish_sum():
     ):
         copy = wp.tid()
         total = wp.float64(0.0)
-        if accumulate == 1:  # a factor of 0 would keep a NaN
+        if accumulate == 1:  # not by a factor, for 0·NaN is NaN
             total = out[copy]
         for chunk in range(partial.shape[1]):
             total += partial[copy, chunk]
@@ -104,7 +103,7 @@ def finish_sum():
 
 @cache
 def partial_largest(dtype):
-    """Kernel over (copies, chunks): out[copy, chunk] = max wᵢ‖aᵢ‖ over vertices; NaN stays."""
+    """Kernel over (copies, chunks): out[copy, chunk] = max wᵢ‖aᵢ‖ over vertices; NaN if one is NaN."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -130,7 +129,7 @@ def partial_largest(dtype):
 
 @cache
 def partial_largest_number():
-    """Kernel over (copies, chunks): out[copy, chunk] = max of numbers of 0 or more; NaN stays."""
+    """Kernel over (copies, chunks): out[copy, chunk] = max of nonnegative numbers; NaN if one is NaN."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def largest_number_of_chunks(
@@ -152,7 +151,7 @@ def partial_largest_number():
 
 @cache
 def finish_largest():
-    """Kernel over copies: out[copy] = max partial[copy]; NaN stays."""
+    """Kernel over copies: out[copy] = max partial[copy]; NaN if one is NaN."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def largest_chunk(
@@ -172,7 +171,7 @@ def finish_largest():
 
 @cache
 def keep_largest():
-    """Kernel over copies: out[copy] = max(out[copy], value[copy]) of numbers of 0 or more; NaN stays."""
+    """Kernel over copies: out[copy] = max(out[copy], value[copy]) of nonnegative numbers; NaN if either is NaN."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def keep(

@@ -1,37 +1,37 @@
-"""Rays from a camera through each pixel, and from what they meet to the sun and the sky."""
+"""Ray casting: rays from a camera through each pixel, and from the points they meet to the sun and the sky."""
 
 from functools import cache
 
 import warp as wp
 
-# Of the coordinates that a point is computed from: what a ray starts above its surface, some tens of roundings of float32.
+# Offset of the start of a ray above a surface, as a fraction of the coordinates: some tens of roundings of float32.
 OFFSET = wp.constant(wp.float32(4e-6))
 FAR = wp.constant(wp.float32(1e30))
-# Of the light of the sky: what a ray brings that meets a surface instead.
+# Light of a sky ray that meets a surface, as a fraction of the light of the sky.
 BOUNCE = wp.constant(wp.float32(0.3))
 
 
 @wp.struct
 class Geometry:
-    """Triangles and tubes in coordinates of the picture; a ball is a tube of no length."""
+    """Triangles and tubes in coordinates of the picture; a ball is a tube of length 0."""
 
     mesh: wp.uint64  # 0 without triangles
     triangles: wp.array(dtype=wp.int32)
     points: wp.array(dtype=wp.vec3)
     normals: wp.array(dtype=wp.vec3)  # of the corners of triangles
-    tree: wp.uint64  # of tubes, 0 without
+    tree: wp.uint64  # bounding volume hierarchy of tubes, 0 without tubes
     ends: wp.array(dtype=wp.vec2i)
     radii: wp.array(dtype=wp.float32)
     colours: wp.array(dtype=wp.vec3)
-    corner_colours: wp.array(dtype=wp.int32)  # indices, three a triangle
+    corner_colours: wp.array(dtype=wp.int32)  # indices, three per triangle
     end_colours: wp.array(dtype=wp.vec2i)
-    shares: wp.array(dtype=wp.float32)  # of light and shadow in the colour, by triangles and then tubes
-    backs: wp.array(dtype=wp.vec3)  # factor of the colour on the back of triangles
+    shares: wp.array(dtype=wp.float32)  # share of the colour that is lit, for triangles, then tubes
+    backs: wp.array(dtype=wp.vec3)  # factor of the colour on the back side of triangles
 
 
 @wp.struct
 class Viewer:
-    """Rays of a camera: origin + t (forward + x right + y up), with x and y the pixel's coordinates from the middle."""
+    """Rays of a camera: origin + t (forward + x right + y up), with pixel coordinates x, y from the centre of the picture."""
 
     origin: wp.vec3
     forward: wp.vec3
@@ -44,55 +44,55 @@ class Viewer:
 
 @wp.struct
 class Light:
-    """A sun, an even sky and a ground."""
+    """A sun, a sky and a ground."""
 
     up: wp.vec3
-    sun: wp.vec3  # towards it
-    sun_rays: wp.array(dtype=wp.vec2)  # sideways from the middle of a sun at distance 1
-    sky_rays: wp.array(dtype=wp.vec3)  # unit vectors about +z, their density the cosine
-    sun_share: wp.float32  # of the light on a surface that faces it
+    sun: wp.vec3  # direction to the sun
+    sun_rays: wp.array(dtype=wp.vec2)  # lateral offsets from the centre of the sun at distance 1
+    sky_rays: wp.array(dtype=wp.vec3)  # unit vectors around +z with cosine-weighted density
+    sun_share: wp.float32  # share of the light on a surface that faces the sun
     sky_share: wp.float32
-    sky_tilt: wp.float32  # by which the sky is lighter above than below
-    sky_distance: wp.float32  # of rays towards the sky
+    sky_tilt: wp.float32  # by which the sky is brighter above than below
+    sky_distance: wp.float32  # length of rays to the sky
     has_ground: wp.int32
     ground: wp.float32  # height
     ground_colour: wp.vec3
-    ground_radius: wp.float32  # at which it has faded
+    ground_radius: wp.float32  # beyond which the ground is invisible
     background: wp.vec3
 
 
 @wp.struct
 class Sight:
-    """The point that a ray meets, and how it looks."""
+    """The point that a ray meets, and its appearance."""
 
     distance: wp.float32
     point: wp.vec3
-    normal: wp.vec3  # in which it is lit, towards the viewer
-    across: wp.vec3  # of the surface itself
+    normal: wp.vec3  # shading normal, towards the viewer
+    across: wp.vec3  # geometric normal
     colour: wp.vec3
-    share: wp.float32  # of the colour that light and shadow change; the rest is seen as it is
-    size: wp.float32  # of the coordinates that the point is computed from
+    share: wp.float32  # share of the colour that is lit; the rest is unshaded
+    size: wp.float32  # largest coordinate that the point is computed from
     is_ground: wp.bool
-    clear: wp.float32  # share of the background that is seen through the ground
+    clear: wp.float32  # transparency of the ground
 
 
 @wp.struct
 class Layers:
-    """Parts of the colour of each pixel: base + sky visible_sky + sun visible_sun."""
+    """Layers of the colour of each pixel: base + sky · visible_sky + sun · visible_sun."""
 
     base: wp.array(dtype=wp.vec3)
     sky: wp.array(dtype=wp.vec3)
     sun: wp.array(dtype=wp.vec3)
     visible: wp.array(dtype=wp.vec2)
-    # Normal and position of the one surface in the pixel; the normal is 0 where there is none, or several
+    # Normal and position of the surface in the pixel; the normal is 0 for no surface, or for several
     normal: wp.array(dtype=wp.vec3)
     point: wp.array(dtype=wp.vec3)
 
 
 @wp.func
 def meet_ball(o: wp.vec3, d: wp.vec3, r: float):
-    """Distance along the unit vector d at which a line enters a ball about the origin, FAR if it does not."""
-    # From the point of the line nearest to the centre: squares of what is far would cancel (Haines et al. 2019).
+    """Distance along the unit vector d at which a line enters a ball around the origin; FAR if it misses."""
+    # From the point of the line nearest to the centre, since squares of large distances would cancel (Haines et al. 2019).
     b = -wp.dot(o, d)
     q = o + b * d
     h = r * r - wp.dot(q, q)
@@ -104,7 +104,7 @@ def meet_ball(o: wp.vec3, d: wp.vec3, r: float):
 
 @wp.func
 def meet_tube(o: wp.vec3, d: wp.vec3, a: wp.vec3, b: wp.vec3, r: float):
-    """(distance, parameter from a to b) at which a ray enters a cylinder with round ends from outside, FAR if it does not."""
+    """(distance, parameter from a to b) at which a ray enters a capsule from outside; the distance is FAR if it misses."""
     start = wp.dot(0.5 * (a + b) - o, d)
     oa = o + start * d - a
     ba = b - a
@@ -116,7 +116,7 @@ def meet_tube(o: wp.vec3, d: wp.vec3, a: wp.vec3, b: wp.vec3, r: float):
         if tb < t:
             t = tb
             s = 1.0
-        # Across the axis
+        # Components perpendicular to the axis
         along_d = wp.dot(ba, d) / length_sq
         along_o = wp.dot(ba, oa) / length_sq
         dx = d - along_d * ba
@@ -140,7 +140,7 @@ def meet_tube(o: wp.vec3, d: wp.vec3, a: wp.vec3, b: wp.vec3, r: float):
 
 @wp.func
 def nearest_tube(g: Geometry, o: wp.vec3, d: wp.vec3, most: float):
-    """(distance, tube, parameter along it) of the first tube nearer than ``most``; the tube is −1 if there is none."""
+    """(distance, tube, parameter along it) of the first tube within the distance ``most``; the tube is −1 if there is none."""
     nearest = most
     tube = wp.int32(-1)
     s = wp.float32(0.0)
@@ -160,7 +160,7 @@ def nearest_tube(g: Geometry, o: wp.vec3, d: wp.vec3, most: float):
 
 @wp.func
 def is_hidden(g: Geometry, o: wp.vec3, d: wp.vec3, most: float):
-    """Whether a ray meets anything nearer than ``most``."""
+    """Whether a ray meets a surface within the distance ``most``."""
     hidden = wp.bool(False)
     if g.mesh != wp.uint64(0):
         hidden = wp.mesh_query_ray_anyhit(g.mesh, o, d, most)
@@ -179,7 +179,7 @@ def is_hidden(g: Geometry, o: wp.vec3, d: wp.vec3, most: float):
 
 @wp.func
 def beside(n: wp.vec3):
-    """A unit vector across a unit vector (Duff et al. 2017)."""
+    """A unit vector perpendicular to a unit vector (Duff et al. 2017)."""
     sign = wp.where(n[2] < 0.0, -1.0, 1.0)
     a = -1.0 / (sign + n[2])
     return wp.vec3(1.0 + sign * n[0] * n[0] * a, sign * n[0] * n[1] * a, -sign * n[0])
@@ -192,7 +192,7 @@ def size_of(p: wp.vec3):
 
 @wp.func
 def find_ground(light: Light, o: wp.vec3, d: wp.vec3):
-    """(distance, share that has not faded) at which a ray from above meets the ground, FAR if it does not."""
+    """(distance, opacity) of the ground where a ray from above meets it; the distance is FAR if it does not."""
     t = FAR
     share = wp.float32(0.0)
     if light.has_ground != 0:
@@ -208,7 +208,7 @@ def find_ground(light: Light, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: float):
-    """The point of a tube that a ray meets, from the parameter along it."""
+    """The point where a ray meets a tube, from the parameter along the tube."""
     ends = g.ends[tube]
     colours = g.end_colours[tube]
     axis = (1.0 - along) * g.points[ends[0]] + along * g.points[ends[1]]
@@ -225,7 +225,7 @@ def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: fl
 
 @wp.func
 def see_triangle(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, face: int, u: float, v: float):
-    """The point of a triangle that a ray meets, from barycentric coordinates of its first two corners."""
+    """The point where a ray meets a triangle, from the barycentric coordinates of the first two corners."""
     w = 1.0 - u - v
     a = g.points[g.triangles[3 * face]]
     b = g.points[g.triangles[3 * face + 1]]
@@ -249,7 +249,7 @@ def see_triangle(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, face: int, u: fl
         s.colour = wp.cw_mul(s.colour, g.backs[face])
     s.across = side * across
     s.normal = side * wp.normalize(u * na + v * nb + w * nc)
-    # Onto the round surface that the normals tell of, so that no flat one hides it (Hanika 2021)
+    # Moved to the smooth surface of the normals, so that flat triangles cast no shadow on it (Hanika 2021)
     p = u * a + v * b + w * c
     s.point = p + (
         (u * wp.max(0.0, side * wp.dot(a - p, na)) * side) * na
@@ -261,7 +261,7 @@ def see_triangle(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, face: int, u: fl
 
 @wp.func
 def see(g: Geometry, light: Light, o: wp.vec3, d: wp.vec3):
-    """The first point that a ray meets; its distance is FAR if there is none."""
+    """The first point that a ray meets; the distance is FAR if there is none."""
     t, share = find_ground(light, o, d)
     face = wp.int32(-1)
     u = wp.float32(0.0)
@@ -295,7 +295,7 @@ def see(g: Geometry, light: Light, o: wp.vec3, d: wp.vec3):
 def light_at(
     g: Geometry, light: Light, p: wp.vec3, n: wp.vec3, across: wp.vec3, offset: float, sun_sample: int, sky_sample: int
 ):
-    """(light of the sky, of the sun, share of each that is seen) at a point with normal n, ``across`` the surface itself."""
+    """(light of the sky, of the sun, visibility of each) at a point with shading normal n and geometric normal ``across``."""
     sky = light.sky_share * (1.0 + light.sky_tilt * (wp.dot(n, light.up) - 1.0))
     facing = wp.dot(n, light.sun)
     sun = wp.float32(0.0)
@@ -322,7 +322,7 @@ def light_at(
 
 @cache
 def trace():
-    """Kernel over pixels, from ``first`` on: the layers of each, the mean of its samples."""
+    """Kernel over pixels from ``first`` on: layers, as means over the samples of the pixel."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def trace_pixel(
@@ -341,14 +341,14 @@ def trace():
         base = wp.vec3()
         sky = wp.vec3()
         sun = wp.vec3()
-        # Sums of the layers' brightness, of all samples and of those that see the light
+        # Sums of the brightness of the layers, over all samples and over those that see the light
         lit = wp.vec2()
         visible = wp.vec2()
         normal = wp.vec3()
         point = wp.vec3()
         hits = wp.int32(0)
         mixed = wp.bool(False)
-        # Pixels of a square of 4×4 take parts of one sequence; 4×4 squares take parts of a longer one.
+        # The pixels of a 4×4 square share one sample sequence; 4×4 such squares share a longer one.
         count = viewer.samples.shape[0]
         in_square = ((7 * (column % 4 + 4 * (row % 4))) % 16) * count
         square = ((7 * ((column // 4) % 4 + 4 * ((row // 4) % 4))) % 16) * 16 * count
@@ -365,7 +365,7 @@ def trace():
             sky_here, sun_here, seen_sky, seen_sun = light_at(
                 g, light, s.point, s.normal, s.across, offset, in_square + sample, square + in_square + sample
             )
-            if s.is_ground:  # its colour is that in full light
+            if s.is_ground:  # the colour of the ground is that in full light
                 s.share = (1.0 - s.clear) / (sky_here + sun_here)
                 base += s.clear * light.background
             else:
@@ -388,7 +388,7 @@ def trace():
         out.base[pixel] = per_sample * base
         out.sky[pixel] = per_sample * sky
         out.sun[pixel] = per_sample * sun
-        # Where no light would come, seen or not, it says nothing.
+        # −1 if no light could arrive: the visibility is then undefined.
         out.visible[pixel] = wp.vec2(
             wp.where(lit[0] > 0.0, visible[0] / lit[0], -1.0), wp.where(lit[1] > 0.0, visible[1] / lit[1], -1.0)
         )

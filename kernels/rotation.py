@@ -1,24 +1,26 @@
 """Rotations and singular values of 3×3, 3×2 and 2×2 matrices: device functions for float32 and float64, without iteration.
 
-A = U diag(S) Vᵀ, S descending. One singular pair is split off, and the 2×2 block that is left has a closed form:
+A = U diag(S) Vᵀ, S descending. One singular pair is split off. The remaining 2×2 block has a closed form:
 
-1. The eigenvalues of AᵀA, less their mean and scaled, are the roots of x³ − 3x = 2r with |r| ≤ 1 (Smith 1961, *Eigenvalues of
-   a symmetric 3×3 matrix*). For r ≥ 0 the largest, for r < 0 the smallest is at least √3 from both others, so that it and its
-   eigenvector v, a column of an adjugate, are well conditioned for every A (the choice of Eberly 2014, *A robust eigensolver
-   for 3×3 symmetric matrices*).
-2. u = Av/‖Av‖ for the largest. For the smallest u = cof(A)v/‖cof(A)v‖, which divides by no small singular value and has the
-   orientation of UVᵀ.
-3. In right-handed frames (v, v₁, v₂) and (u, u₁, u₂) (Duff et al. 2017, *Building an orthonormal basis, revisited*) A is
-   σ ⊕ B to rounding. B is the sum of a multiple of a rotation, by atan2(B₁₀ − B₀₁, B₀₀ + B₁₁), and one of a reflection.
+1. The eigenvalues of AᵀA, shifted by their mean and scaled, are the roots of x³ − 3x = 2r with |r| ≤ 1 (Smith 1961,
+*Eigenvalues
+   of a symmetric 3×3 matrix*). The largest for r ≥ 0, and the smallest for r < 0, is at least √3 from both others. So it and
+   its eigenvector v, a column of an adjugate, are well conditioned for every A (the choice of Eberly 2014, *A robust
+   eigensolver for 3×3 symmetric matrices*).
+2. For the largest, u = Av/‖Av‖. For the smallest, u = cof(A)v/‖cof(A)v‖, which avoids division by a small singular value and
+has
+   the orientation of UVᵀ.
+3. In the right-handed frames (v, v₁, v₂) and (u, u₁, u₂) (Duff et al. 2017, *Building an orthonormal basis, revisited*), A is
+   σ ⊕ B up to rounding. B is a multiple of a rotation by atan2(B₁₀ − B₀₁, B₀₀ + B₁₁), plus a multiple of a reflection.
 
-The error is a few ε of the largest singular value. A is divided by its largest entry first, so that nothing depends on its
-size. A NaN or an infinity in A makes every number of the results NaN.
+The error is a few ε of the largest singular value. A is first divided by its largest entry, so results do not depend on its
+scale. If A has a NaN or an infinity, all results are NaN.
 
-The "rotation" convention has det U = det V = 1, and S[2] < 0 where det A < 0; UVᵀ is then the rotation nearest to A, which
-maximises tr(RᵀA): that of Kabsch 1976 for A = Σ w q pᵀ, which turns p to q. The plain one has S ≥ 0 and det U = ±1.
+The "rotation" convention has det U = det V = 1, and S[2] < 0 if det A < 0. UVᵀ is then the rotation R nearest to A, which
+maximises tr(RᵀA); for A = Σ w q pᵀ it is that of Kabsch 1976, which rotates p to q. The plain convention has S ≥ 0, det U = ±1.
 
-Where the nearest rotation is not unique because S[1] + S[2] is below 3ε S[0], as of rank 1, it is the least one that turns v to
-u; of A = 0 it is the identity.
+If S[1] + S[2] is below 3ε S[0], such as for rank 1, the nearest rotation is not unique. The result is then the smallest
+rotation that takes v to u, or the identity for A = 0.
 """
 
 from typing import Any
@@ -28,7 +30,7 @@ import warp as wp
 
 @wp.func
 def epsilon(x: wp.float32):
-    """The step from 1 to the next number of this precision."""
+    """Machine epsilon: the difference between 1 and the next larger number of this precision."""
     return wp.float32(wp.static(2.0**-23))
 
 
@@ -39,7 +41,7 @@ def epsilon(x: wp.float64):  # noqa: F811 - Warp chooses by type
 
 @wp.func
 def smallest(x: wp.float32):
-    """The smallest number of this precision with all its digits."""
+    """The smallest positive normal number of this precision."""
     return wp.float32(wp.static(2.0**-126))
 
 
@@ -50,9 +52,9 @@ def smallest(x: wp.float64):  # noqa: F811 - likewise
 
 @wp.func
 def unit(c: Any, s: Any, least: Any, c_else: Any, s_else: Any):
-    """(c, s) made a unit vector; where it is not longer than ``least`` the other one, and (1, 0) where that is below ε² too.
+    """(c, s) normalised if longer than ``least``; else (c_else, s_else) normalised; (1, 0) if that is below ε² too.
 
-    So that no square underflows of what is made longer.
+    The bounds keep squares from underflow.
     """
     length = wp.sqrt(c * c + s * s)
     if length <= least:
@@ -69,8 +71,8 @@ def unit(c: Any, s: Any, least: Any, c_else: Any, s_else: Any):
 
 @wp.func
 def half_angle(c: Any, s: Any, length: Any, least: Any):
-    """The unit vector at half the angle of (c, s), which has that length; (1, 0) where it is not above ``least``."""
-    # Of the two forms of tan(φ/2) the one that does not cancel.
+    """The unit vector at half the angle of (c, s), a vector of length ``length``; (1, 0) if that is not above ``least``."""
+    # tan(φ/2) has two forms; this takes the one without cancellation.
     x = length + c
     y = s
     if c < type(c)(0.0):
@@ -81,7 +83,7 @@ def half_angle(c: Any, s: Any, length: Any, least: Any):
 
 @wp.func
 def complement(n: Any):
-    """Two unit vectors t₁, t₂ such that (n, t₁, t₂) is a right-handed frame; of the first axis the other two axes."""
+    """Unit vectors t₁, t₂ such that (n, t₁, t₂) is a right-handed frame; for n = the first axis, the other two axes."""
     one = n.dtype(1.0)
     sign = wp.where(n[0] < n.dtype(0.0), -one, one)
     a = -one / (sign + n[0])
@@ -94,10 +96,10 @@ def complement(n: Any):
 
 @wp.func
 def separated_eigenvector(C: Any):
-    """Unit eigenvector of a symmetric 3×3 C, none of it large, for the eigenvalue farthest from the others.
+    """Unit eigenvector of a symmetric 3×3 C with small entries, for the eigenvalue farthest from the others.
 
     Returns:
-        It, and 1 where that eigenvalue is the largest, −1 where it is the smallest.
+        The eigenvector, and 1 if that eigenvalue is the largest, −1 if it is the smallest.
     """
     one = C.dtype(1.0)
     mean = C.dtype(0.3333333333333333) * wp.trace(C)
@@ -108,8 +110,8 @@ def separated_eigenvector(C: Any):
     e1 = C[0, 2]
     e2 = C[0, 1]
     spread = d0 * d0 + d1 * d1 + d2 * d2 + C.dtype(2.0) * (e0 * e0 + e1 * e1 + e2 * e2)
-    scale = C.dtype(2.449489742783178) / wp.sqrt(spread)  # √6, of the roots
-    # Far below rounding C is isotropic, and the square of the spread could underflow.
+    scale = C.dtype(2.449489742783178) / wp.sqrt(spread)  # √6 scales the roots
+    # If the spread is far below rounding, C is isotropic, and the square of the spread could underflow.
     tiny = epsilon(mean) * epsilon(mean) * mean
     if spread <= tiny * tiny:
         scale = C.dtype(0.0)
@@ -122,7 +124,7 @@ def separated_eigenvector(C: Any):
     r = C.dtype(0.5) * (d0 * (d1 * d2 - e0 * e0) + e2 * (e0 * e1 - e2 * d2) + e1 * (e2 * e0 - d1 * e1))
     side = wp.where(r < C.dtype(0.0), -one, one)
     r = wp.min(wp.abs(r), one)
-    # x = 2 cos(acos(r)/3): a cubic good to 8e-5, and Newton's method, which squares that twice.
+    # x = 2 cos(acos(r)/3): a cubic with an error of 8e-5, then two steps of Newton's method.
     x = C.dtype(1.732133) + r * (C.dtype(0.330661) + r * (C.dtype(-0.081382) + r * C.dtype(0.018639)))
     for _ in range(2):
         square = x * x
@@ -130,7 +132,7 @@ def separated_eigenvector(C: Any):
     d0 -= side * x
     d1 -= side * x
     d2 -= side * x
-    # The adjugate is v vᵀ times a number from 6 to 9: its longest column has the largest diagonal entry.
+    # The adjugate is v vᵀ times a number from 6 to 9, so its longest column has the largest diagonal entry.
     a00 = d1 * d2 - e0 * e0
     a11 = d0 * d2 - e1 * e1
     a22 = d0 * d1 - e2 * e2
@@ -147,19 +149,19 @@ def separated_eigenvector(C: Any):
 
 @wp.func
 def scaled3(A: Any):
-    """A 3×3 A divided by its largest entry, that entry; the identity and 0 of A = 0."""
+    """A 3×3 A divided by its largest entry, and that entry; the identity and 0 for A = 0."""
     size = wp.max(wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])), wp.abs(A[2])))
-    scale = wp.max(size, smallest(size))  # whose inverse is finite
+    scale = wp.max(size, smallest(size))  # has a finite inverse
     B = (A.dtype(1.0) / scale) * A
     if size == A.dtype(0.0):
-        B = wp.identity(n=3, dtype=A.dtype) + A  # beside zeros A may hold a NaN, which max leaves out
+        B = wp.identity(n=3, dtype=A.dtype) + A  # + A, for A may contain NaN, which max ignores
         scale = size
     return B, scale
 
 
 @wp.func
 def separated_pair(A: Any):
-    """The singular pair u, v of a scaled 3×3 A that is split off, its side, and ‖Av‖ or ‖cof(A)v‖, which is never small."""
+    """The singular pair u, v of a scaled 3×3 A to split off, its side (see above), and ‖Av‖ or ‖cof(A)v‖, never small."""
     v, side = separated_eigenvector(wp.transpose(A) * A)
     u = A * v
     if side < A.dtype(0.0):
@@ -173,7 +175,7 @@ def separated_pair(A: Any):
 
 @wp.func
 def frame(n: Any, a: Any, b: Any, side: Any):
-    """The right-handed columns (n, a, b), or (a, b, n) where the value of n is the smallest."""
+    """The matrix with the right-handed columns (n, a, b), or (a, b, n) if the value of n is the smallest."""
     columns = wp.matrix_from_cols(n, a, b)
     if side < type(side)(0.0):
         columns = wp.matrix_from_cols(a, b, n)
@@ -182,14 +184,14 @@ def frame(n: Any, a: Any, b: Any, side: Any):
 
 @wp.func
 def plane_rotation(c: Any, s: Any, size: Any, u1: Any, u2: Any, v1: Any, v2: Any):
-    """Cosine and sine of the rotation in the plane, of (c, s) or else the least one of the frames."""
+    """Cosine and sine of the rotation in the plane, from (c, s), or else of the smallest rotation between the frames."""
     least = type(c)(3.0) * epsilon(c) * size
     return unit(c, s, least, wp.dot(u1, v1) + wp.dot(u2, v2), wp.dot(u2, v1) - wp.dot(u1, v2))
 
 
 @wp.func
 def descending(s0: Any, s1: Any, s2: Any):
-    """Three values, which rounding may have put out of order, with |s₂| the least; its sign stays the last one's."""
+    """Three values in descending order, which rounding may have changed, with the smallest |s₂|; the last keeps its sign."""
     high = wp.max(s0, s1)
     low = wp.min(s0, s1)
     last = wp.min(low, wp.abs(s2))
@@ -199,7 +201,7 @@ def descending(s0: Any, s1: Any, s2: Any):
 
 @wp.func
 def nearest_rotation(A: Any):
-    """The rotation R nearest to a 3×3 A, which maximises tr(RᵀA): of Kabsch 1976 for A = Σ w q pᵀ, and the polar one."""
+    """The rotation R nearest to a 3×3 A, which maximises tr(RᵀA); for A = Σ w q pᵀ that of Kabsch 1976."""
     B, _size = scaled3(A)
     u, v, _side, size = separated_pair(B)
     v1, v2 = complement(v)
@@ -224,7 +226,7 @@ def rotation_svd3(A: Any):
     b01 = wp.dot(u1, w2)
     b10 = wp.dot(u2, w1)
     b11 = wp.dot(u2, w2)
-    # The rotation (p, q) and the reflection (f, g) that the block is the sum of, both twice.
+    # The block is half the sum of the scaled rotation (p, q) and the scaled reflection (f, g).
     p = b00 + b11
     q = b10 - b01
     f = b00 - b11
@@ -232,7 +234,7 @@ def rotation_svd3(A: Any):
     total = wp.sqrt(p * p + q * q)
     difference = wp.sqrt(f * f + g * g)
     c, s = plane_rotation(p, q, size, u1, u2, v1, v2)
-    # What the rotation leaves is symmetric, with axes at half the angle between the two.
+    # The factor beside the rotation is symmetric; its axes are at half the angle between the two.
     cos, sin = half_angle(c * f + s * g, c * g - s * f, difference, epsilon(size) * epsilon(size) * size)
     x1 = c * u1 + s * u2
     x2 = c * u2 - s * u1
@@ -259,7 +261,7 @@ def svd3(A: Any):
 
 @wp.func
 def polar3(A: Any):
-    """R, P of a 3×3 A = R P: the nearest rotation, and P symmetric; its least eigenvalue has the sign of det A."""
+    """R, P of a 3×3 A = R P: R the nearest rotation, P symmetric; the smallest eigenvalue of P has the sign of det A."""
     R = nearest_rotation(A)
     P = wp.transpose(R) * A
     return R, A.dtype(0.5) * P + A.dtype(0.5) * wp.transpose(P)
@@ -267,19 +269,19 @@ def polar3(A: Any):
 
 @wp.func
 def scaled2(A: Any):
-    """As :func:`scaled3`, of 2×2."""
+    """As :func:`scaled3`, for a 2×2 A."""
     size = wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])))
     scale = wp.max(size, smallest(size))
     B = (A.dtype(1.0) / scale) * A
     if size == A.dtype(0.0):
-        B = wp.identity(n=2, dtype=A.dtype) + A  # as there
+        B = wp.identity(n=2, dtype=A.dtype) + A  # keeps NaN, as in scaled3
         scale = size
     return B, scale
 
 
 @wp.func
 def nearest_rotation2(A: Any):
-    """The rotation R nearest to a 2×2 A; the identity where it is not unique, A being a multiple of a reflection."""
+    """The rotation R nearest to a 2×2 A; the identity if it is not unique, that is, A is a multiple of a reflection."""
     one = A.dtype(1.0)
     B, _scale = scaled2(A)
     f = B[0, 0] - B[1, 1]
@@ -321,7 +323,7 @@ def svd2(A: Any):
 
 @wp.func
 def polar2(A: Any):
-    """R, P of a 2×2 A = R P: the nearest rotation, and P symmetric; its lesser eigenvalue has the sign of det A."""
+    """R, P of a 2×2 A = R P: R the nearest rotation, P symmetric; the smaller eigenvalue of P has the sign of det A."""
     R = nearest_rotation2(A)
     P = wp.transpose(R) * A
     return R, A.dtype(0.5) * P + A.dtype(0.5) * wp.transpose(P)
@@ -331,7 +333,8 @@ def polar2(A: Any):
 def svd3x2(A: Any):
     """U (3×2), S, V (2×2) of a 3×2 A with S ≥ 0, UᵀU = I and det V = 1.
 
-    Of rank 1, U Vᵀ is that part of the least rotation in space that turns v to u; of A = 0 the first two axes.
+    For rank 1, U Vᵀ is the first two columns of the smallest rotation in space that takes v to u; for A = 0, the first two
+    axes.
     """
     zero = A.dtype(0.0)
     one = A.dtype(1.0)
@@ -353,7 +356,7 @@ def svd3x2(A: Any):
     u1, u2 = complement(u)
     p = wp.dot(u1, w)
     q = wp.dot(u2, w)
-    # The frame of v = (cos, sin, 0) is (−sin, cos, 0) and the third axis.
+    # v = (cos, sin, 0) has the frame (−sin, cos, 0) and the third axis.
     c, s = plane_rotation(p, q, size, u1, u2, wp.vector(-sin, cos, zero), wp.vector(zero, zero, one))
     U = wp.matrix_from_cols(u, c * u1 + s * u2)
     V = wp.matrix_from_cols(wp.vector(cos, sin), wp.vector(-sin, cos))
@@ -363,7 +366,7 @@ def svd3x2(A: Any):
 
 @wp.func
 def polar3x2(A: Any):
-    """R (3×2), P (2×2) of a 3×2 A = R P: the nearest matrix with RᵀR = I, and P symmetric and semi-definite."""
+    """R (3×2), P (2×2) of a 3×2 A = R P: R the nearest matrix with RᵀR = I, P symmetric and semi-definite."""
     U, _S, V = svd3x2(A)
     R = U * wp.transpose(V)
     P = wp.transpose(R) * A

@@ -1,4 +1,4 @@
-"""Kernels of sums from the first element on: of chunks, of the chunks' sums, and within each chunk."""
+"""Kernels of a prefix sum: sums of chunks, prefix sums of these, prefix sums within chunks."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ MODULE = "warpcloth.scan"
 
 @cache
 def sum_chunks():
-    """Kernel over chunks: the sum of each."""
+    """Kernel over chunks: sums of their values."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def sum_each(
@@ -31,7 +31,7 @@ def sum_chunks():
 
 @cache
 def add_chunks():
-    """Kernel of one thread: the sum before each chunk in place of its own."""
+    """Kernel of one thread: replaces the sum of each chunk by the sum of the chunks before it."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def add_all(
@@ -49,7 +49,7 @@ def add_chunks():
 
 @cache
 def write_sums():
-    """Kernel over chunks: out (n+1,) = the sum of the values before each, and of all."""
+    """Kernel over chunks: out (n+1,) = the sums of the values before each entry, and the total."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def write_each(

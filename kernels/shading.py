@@ -1,4 +1,4 @@
-"""Normals of triangles and their corners, and boxes about tubes."""
+"""Normals of triangles and of their corners, and bounding boxes of tubes."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @cache
 def tube_bounds():
-    """Kernel over tubes: boxes about them."""
+    """Kernel over tubes: axis-aligned bounding boxes."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def bound_tube(
@@ -32,7 +32,7 @@ def tube_bounds():
 
 @cache
 def face_normals():
-    """Kernel over triangles: unit normals, 0 of those without area, and the angles at their corners."""
+    """Kernel over triangles: unit normals (0 for a triangle without area), and the angles at the corners."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_face_normal(
@@ -60,10 +60,10 @@ def face_normals():
 
 @cache
 def corner_normals():
-    """Kernel over corners of triangles: the mean of the normals about a vertex, by their angles (Thürmer & Wüthrich 1998).
+    """Kernel over corners of triangles: mean of the normals around the vertex, weighted by angles (Thürmer & Wüthrich 1998).
 
-    Normals count only where the surface bends by less than some 75°, whichever side they are on: boxes keep their edges,
-    and triangles may be wound either way.
+    Only normals within about 75° of that of the triangle count, so boxes keep their edges. Their signs do not matter, so
+    triangles can have either winding.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

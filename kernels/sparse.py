@@ -1,7 +1,7 @@
-"""Factories of the kernels of terms whose elements have any number of vertices: cells in compressed rows, with weights.
+"""Factories of the kernels of terms whose elements are cells with any number of vertices, in compressed rows with weights.
 
 Cell c has the vertices stencil[e], e from offsets[c] to offsets[c+1], with the weights w[e] (M,): y = Σₑ w[e] ⊗ x[stencil[e]].
-Its u and ∂u/∂y are evaluated once for the cell; each vertex of it is then an element of its own, the :func:`share` of it.
+u and ∂u/∂y are evaluated once per cell. Each vertex of a cell is then an element of one vertex, see :func:`share`.
 """
 
 from functools import cache
@@ -16,7 +16,7 @@ from .vectors import types
 
 
 def _rest_state(points, stencil):
-    raise NotImplementedError  # only cells have one
+    raise NotImplementedError  # only cells have rest states
 
 
 @wp.func
@@ -41,9 +41,9 @@ def share_hessian(y: Any, rest: Any, policy: int):
 
 @cache
 def share(term: Term):
-    """The :class:`.term.Term` of one vertex of a cell of a term: its rest state is what the cell gives it, A∂u/∂x (3) and Au.
+    """The :class:`.term.Term` of one vertex of a cell. Its rest state is A∂u/∂x (3) and Au, which the cell computes.
 
-    The first vertex of a cell has all of the energy. The Hessian, which is not that of one vertex, is that of :func:`blocks`.
+    The first vertex of a cell has all of the energy. The Hessian couples vertices; :func:`blocks` gives it.
     """
     given = _rest_state, weight, measure, share_energy, share_gradient, share_hessian
     return Term(term.name, 1, 1, 4, *given, cells=True, cell=term)
@@ -51,7 +51,7 @@ def share(term: Term):
 
 @cache
 def cell_coordinate(term: Term, dtype, corrected: bool):
-    """The device function (first, last, stencil, weights, x, d) → y of a cell at x, or with ``corrected`` at x + d."""
+    """Device function (first, last, stencil, weights, x, d) → y of a cell at x, or at x + d if ``corrected``."""
     vec3, _ = types(dtype)
     M, weights_type, y_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype), wp.types.matrix((term.rows, 3), dtype)
 
@@ -79,7 +79,7 @@ def cell_coordinate(term: Term, dtype, corrected: bool):
 
 @cache
 def evaluate(term: Term, dtype, corrected: bool):
-    """Kernel over cells: the rest states of the shares of their vertices."""
+    """Kernel over cells: rest states of the elements of their vertices, see :func:`share`."""
     vec3, _ = types(dtype)
     M, weights_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype)
     rest_type, share_type = wp.types.vector(term.parameters, dtype), wp.types.vector(4, dtype)
@@ -115,7 +115,7 @@ def evaluate(term: Term, dtype, corrected: bool):
 
 @cache
 def blocks(term: Term, dtype, corrected: bool):
-    """Kernel over cells of n vertices: out[starts[c] + n·i + j] = k A ∂²u/∂xᵢ∂xⱼ [N/m], under the policy of the cell's copy."""
+    """Kernel over cells: out[starts[c] + n·i + j] = k A ∂²u/∂xᵢ∂xⱼ [N/m] for n vertices, with the copy's Hessian policy."""
     vec3, mat33 = types(dtype)
     M, weights_type, rest_type = (
         wp.constant(term.rows),
@@ -196,10 +196,9 @@ def constant_blocks(term: Term, dtype):
 
 @cache
 def correct_cells(term: Term, dtype, multipliers: bool, per_step: bool, axes: bool = False):
-    """Kernel of a Gauss–Seidel sweep over cells of a quadratic energy, as :func:`.project.correct_in_place`.
+    """Kernel of a Gauss–Seidel sweep over cells of a quadratic energy, see :func:`.project.correct_in_place`.
 
-    The rows of y are constraints one after the other: Δλ = −(y + α̃λ)/(Σ wᵢ² /mᵢ + α̃), each of which sees the moves of those
-    before it.
+    Each row of y is a constraint: Δλ = −(y + α̃λ)/(Σ wᵢ²/mᵢ + α̃). The rows are solved in order.
     """
     vec3, _ = types(dtype)
     M, weights_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype)

@@ -1,7 +1,7 @@
-"""Factories of the kernels that move vertices through time: predict, finish, pins.
+"""Factories of the kernels of time integration: prediction, end of step, pins.
 
-A pinned vertex has inverse mass 0. Fixed pins stay; moved ones take the position that their keyframes give. hₑ is the effective
-step of an implicit integrator, see :mod:`warpcloth.numerics.integrators`.
+A pinned vertex has inverse mass 0. Fixed pins stay; moved pins follow their keyframes. hₑ is the effective step of an implicit
+integrator, see :mod:`warpcloth.numerics.integrators`.
 """
 
 from functools import cache
@@ -13,7 +13,7 @@ from .vectors import types
 
 @cache
 def predict(dtype):
-    """Kernel over vertices: v += hₑ g, x += hₑ v, the position x̃ that inertia and gravity alone lead to."""
+    """Kernel over vertices: v += hₑ g, x += hₑ v, which gives x̃, the position from inertia and gravity alone."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -41,7 +41,7 @@ def predict(dtype):
 def start_bdf2(dtype):
     """Kernel over vertices: move ← x₀ − x₋₁ = h(v₁ − 7/4(v₂ − v₁)), v₋₁ ← v₀ − 3/2(v₁ − v₀), where v₋₁ has v₁ before.
 
-    v₁ and v₂ are those of two steps of implicit Euler of hₑ = 2h/3; see :class:`warpcloth.numerics.integrators.BDF2`.
+    v₁ and v₂ are from two steps of implicit Euler with hₑ = 2h/3, see :class:`warpcloth.numerics.integrators.BDF2`.
     """
     vec3, _ = types(dtype)
 
@@ -71,7 +71,8 @@ def start_bdf2(dtype):
 def predict_bdf2(dtype):
     """Kernel over vertices: v ← (4v₀ − v₋₁)/3 + hₑ g, move ← (x₀ − x₋₁)/3 + hₑ v, x += move, v₋₁ ← v₀.
 
-    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v; moves are kept instead of x₋₁, for they have the digits that large coordinates lose.
+    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v. Displacements are stored instead of x₋₁, for they keep digits that large coordinates
+    lose.
     """
     vec3, _ = types(dtype)
 
@@ -104,7 +105,7 @@ def predict_bdf2(dtype):
 
 @cache
 def keyframed_position(dtype):
-    """The device function (keyframes, pin, step, steps a keyframe) → the position; linear between keyframes, then at rest."""
+    """Device function (keyframes, pin, step, steps per keyframe) → position, linear between keyframes, constant after them."""
     vec3, _ = types(dtype)
 
     @wp.func
@@ -122,11 +123,10 @@ def keyframed_position(dtype):
 
 @cache
 def move_pins(dtype):
-    """Kernel over (copies, pins): puts the pinned vertices where the keyframes say they are h later.
+    """Kernel over (copies, pins): sets x of pinned vertices to their keyframes one step later, and v = (x − x before)/h.
 
-    Counted in whole steps of this h, in each copy by itself, ``steps_per_frame`` of them to a keyframe. x is set, and
-    v = (x − x before)/h. Pins that hold some ``axes`` move along these; what was before is then that of the keyframes too,
-    because a step may have moved x from where it was.
+    Each copy counts its steps; a keyframe has ``steps_per_frame``. Pins that hold only some ``axes`` are moved along these.
+    Their x before is then also that of the keyframes, because the step may have moved x.
     """
     vec3, _ = types(dtype)
     position = keyframed_position(dtype)
@@ -182,7 +182,7 @@ def count_step():
 def finish(dtype):
     """Kernel over vertices, after a prediction and a correction d: x += d, v += d/hₑ.
 
-    Of Euler the same as v = (x − x before)/h, but d keeps the digits that large coordinates lose. Pins keep their x and v.
+    For Euler this is v = (x − x before)/h, but d keeps digits that large coordinates lose. Pins keep their x and v.
     """
     vec3, _ = types(dtype)
 
@@ -210,7 +210,7 @@ def finish(dtype):
 def finish_midpoint(dtype):
     """Kernel over vertices, after a prediction to the midpoint and a correction d: x₁ = 2(x̃ + d) − x₀, v₁ = 2(ṽ + d/hₑ) − v₀.
 
-    With ṽ = v₀ + hₑ g of the prediction: x += 2d + hₑ ṽ, v += 2d/hₑ + hₑ g. Pins keep their x and v.
+    With ṽ = v₀ + hₑ g from the prediction: x += 2d + hₑ ṽ, v += 2d/hₑ + hₑ g. Pins keep their x and v.
     """
     vec3, _ = types(dtype)
 
@@ -239,7 +239,7 @@ def finish_midpoint(dtype):
 
 @cache
 def note_move(dtype):
-    """Kernel over vertices, after a correction d: move += d, which makes it x₁ − x₀; h v along axes that pins hold."""
+    """Kernel over vertices, after a correction d: move += d, which gives x₁ − x₀; along pinned axes move = h v."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -272,7 +272,7 @@ def note_move(dtype):
 
 @cache
 def lock(dtype):
-    """Kernel over vertices: the components of vectors along axes on which a vertex does not move become 0."""
+    """Kernel over vertices: sets the components of vectors along locked axes to 0."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -292,11 +292,11 @@ def lock(dtype):
 
 @cache
 def reset(dtype, led: bool):
-    """Kernel over vertices: those of the copies that the mask (B,) has true start again, and what else is carried of these too.
+    """Kernel over vertices: resets the state of the copies where the mask (B,) is true.
 
-    A pinned vertex stands still; where keyframes lead it (``led``) it starts where the model has it, whatever ``x_start`` says.
-    What is carried beside x and v are arrays by their addresses, all of whose bits start as those of another or as 0. Each has
-    so many words of 32 bits a vertex, or where that number is negative a copy.
+    A pinned vertex gets v = 0. If keyframes move it (``led``), it starts at its position in the model, not at ``x_start``.
+    Other state is given by addresses of arrays; its bits are set to those of another array, or to 0. Each array has a number of
+    32-bit words per vertex, or, if the number is negative, per copy.
     """
     vec3, _ = types(dtype)
 

@@ -1,7 +1,7 @@
 """The transpose of local coordinates, out += Dᵀz: vertex i of an element gets Σₘ wᵢ[m] z[m].
 
-A :class:`LocalSource` computes z from arrays of its own, such as forces kA∂u/∂y or multipliers of constraints. Two kernels add
-it up: over elements in order, for the CPU, and over vertices, for a GPU, each with its elements in order.
+A :class:`LocalSource` computes z, such as forces kA∂u/∂y or multipliers of constraints. One kernel sums over elements in order,
+for the CPU. The other has a thread per vertex, which sums over its elements in order, for a GPU.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from .vectors import types
 
 @cache
 def to_corner(term: Term, dtype):
-    """The device function (rest, i, z) → Σₘ wᵢ[m] z[m], what vertex i of an element gets of z (M, 3)."""
+    """Device function (rest, i, z) → Σₘ wᵢ[m] z[m], the part of z (M, 3) at vertex i of an element."""
     M, weight = wp.constant(term.rows), term.weight
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
 
@@ -33,12 +33,12 @@ def to_corner(term: Term, dtype):
 
 
 class LocalSource(NamedTuple):
-    """Where z comes from.
+    """How z is computed.
 
     Attributes:
-        data: The Warp struct of the arrays that it is computed from.
-        z_of: The device function (data, element, rest) → z (M, 3).
-        left_out: The device function (data, element) → whether the copy of the element takes no part; or None.
+        data: Warp struct of the input arrays.
+        z_of: Device function (data, element, rest) → z (M, 3).
+        left_out: Device function (data, element) → whether to skip the element; or None.
     """
 
     data: Any
@@ -48,7 +48,7 @@ class LocalSource(NamedTuple):
 
 @cache
 def stored(term: Term, dtype):
-    """The source of a z that is computed already."""
+    """The source of a z that is stored in an array."""
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
 
     @wp.struct
@@ -64,7 +64,7 @@ def stored(term: Term, dtype):
 
 @cache
 def scatter(term: Term, dtype, source: LocalSource):
-    """Kernel over elements: out += Dᵀz. For the CPU, which takes elements in order: nothing is atomic."""
+    """Kernel over elements: out += Dᵀz. For the CPU, where one thread takes the elements in order: no addition is atomic."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     share_of, z_of, left_out = to_corner(term, dtype), source.z_of, source.left_out
@@ -95,7 +95,7 @@ def scatter(term: Term, dtype, source: LocalSource):
 
 @cache
 def gather(term: Term, dtype, source: LocalSource):
-    """Kernel over vertices: out += Dᵀz in a fixed order, by :func:`warpcloth.model.elements.incidences_of`."""
+    """Kernel over vertices: out += Dᵀz in a fixed order, that of :func:`warpcloth.model.elements.incidences_of`."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     share_of, z_of, left_out = to_corner(term, dtype), source.z_of, source.left_out

@@ -1,4 +1,4 @@
-"""The types of a vertex's vectors and of the blocks between two vertices."""
+"""Vector and matrix types of a scalar type."""
 
 from functools import cache
 

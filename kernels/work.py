@@ -11,12 +11,12 @@ from .term import Term
 from .transpose import LocalSource, gather, scatter
 from .vectors import types
 
-UNCUT, NOW = wp.constant(0), wp.constant(2)  # whether the filter cut the move of a vertex in this step; 1 is in the one before
+UNCUT, NOW = wp.constant(0), wp.constant(2)  # the filter shortened no move of a vertex, or one in this step (1: in the last)
 
 
 @cache
 def multiplier_pull(term: Term, dtype, scalar: bool):
-    """The :class:`.transpose.LocalSource` of factor·λ of a term, or with ``scalar`` of factor·λ ∂C/∂y."""
+    """:class:`.transpose.LocalSource` of factor·λ of a term, or with ``scalar`` of factor·λ ∂C/∂y."""
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
     y_of, slope = local_coordinate(term, dtype, False), term.constraint_gradient
@@ -40,12 +40,12 @@ def multiplier_pull(term: Term, dtype, scalar: bool):
 
 
 def scatter_multipliers(term: Term, dtype, scalar: bool):
-    """Kernel over elements: adds factor·Gᵀλ to out, see :func:`.transpose.scatter`."""
+    """Kernel over elements: out += factor·Gᵀλ, see :func:`.transpose.scatter`."""
     return scatter(term, dtype, multiplier_pull(term, dtype, scalar))
 
 
 def gather_multipliers(term: Term, dtype, scalar: bool):
-    """Kernel over vertices: the sum that :func:`scatter_multipliers` makes, see :func:`.transpose.gather`."""
+    """Kernel over vertices: the same sum as :func:`scatter_multipliers`, see :func:`.transpose.gather`."""
     return gather(term, dtype, multiplier_pull(term, dtype, scalar))
 
 
@@ -71,7 +71,7 @@ def add_scaled(dtype):
 
 @cache
 def step_back(dtype):
-    """Kernel over vertices: d = h v, before = x − d, from where a step at the present velocity would lead to x."""
+    """Kernel over vertices: d = h v, before = x − d, the position from which a step at the present velocity leads to x."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
@@ -94,7 +94,7 @@ def step_back(dtype):
 
 @cache
 def past(dtype):
-    """The struct of the state before a step: positions, ∂U/∂x and the forces of loads."""
+    """Struct of the state before a step: positions, ∂U/∂x and the forces of loads."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -108,7 +108,7 @@ def past(dtype):
 
 @cache
 def wide_dot(dtype):
-    """The device function (a, b) → a·b in double precision."""
+    """Device function (a, b) → a·b in double precision."""
     vec3, _ = types(dtype)
 
     @wp.func
@@ -122,9 +122,9 @@ def wide_dot(dtype):
 def add_work(dtype):
     """Kernel over vertices, after a step: work of loads += f·Δx, of pins += (½(∇U₀ + ∇U₁) − m g − f)·Δx along held axes.
 
-    ∇U is the force that the cloth pulls a pin with. Where energies are quadratic the mean of both is that in the middle of the
-    step, where midpoint takes it, whose balance is then exact. f is the force of loads in the step, or the mean of it and that
-    before where ``share`` is ½, for steps that take it at their end.
+    −∇U is the force of the cloth on a pin. For quadratic energies, the mean of both ∇U is that at the middle of the step, where
+    midpoint evaluates it, so its energy balance is exact. f is the force of loads in the step. If ``share`` is ½, for steps
+    that evaluate it at their end, f is the mean of it and of that before.
     """
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
@@ -184,7 +184,7 @@ def half_way(dtype):
 
 @cache
 def collider_pulls(dtype):
-    """The struct of ∂U/∂x of contact and friction with a collider, of friction alone, and of the collider's moves, or None."""
+    """Struct of ∂U/∂x of contact and friction with a collider, of friction alone, and of the moves of the collider, or None."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -198,7 +198,7 @@ def collider_pulls(dtype):
 
 @cache
 def rigid_moves(dtype):
-    """Kernel over vertices: the moves in a step of the material of a collider at x, where ``poses`` has the collider then."""
+    """Kernel over vertices: displacement in a step of the material point of a collider at x, from its ``poses``."""
     vec3, _ = types(dtype)
     pose_type, _anchor = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
@@ -227,15 +227,15 @@ def rigid_moves(dtype):
 def add_collider_work(dtype):
     """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
 
-    ∇U is that of contact and friction, ∇H that of friction alone; δ is the move of the collider's material at the vertex. Both
-    are those where the step takes its forces, ``now``. With ``before`` the mean is taken of the products there and where the
-    step began, as the trapezoidal rule has it; ∇U and ∇H are then kept for the next step.
+    ∇U is that of contact and friction, ∇H that of friction alone. δ is the displacement of the collider's material at the
+    vertex. Both gradients are evaluated where the step takes its forces, ``now``. With ``before``, the trapezoidal rule takes
+    the mean of the products there and at the start of the step; ∇U and ∇H are then stored for the next step.
 
-    Contact acts within the ``distance``. A step in which the two come nearer or part by more has them in contact for a part of
-    it only, in which they share a move: the work of contact is then that of the part of Δx which δ has too.
+    Contact acts within ``distance``. If the gap changes by more in a step, the two are in contact for only a part of it, in
+    which they move together. The work of contact is then that of the part of Δx that δ shares.
 
-    Where the filter cut, Δx is the move without that, to ``uncut``, and forces are those of ``now`` alone, in this step and the
-    next. Δx then does not change the energy of contact by ∇U·(Δx − δ), which the filter has done: of_filter −= that.
+    If the filter shortened the move, Δx is the unshortened move, to ``uncut``, and only the forces of ``now`` count, in this
+    step and in the next. Δx then does not change the energy of contact by ∇U·(Δx − δ); the filter did, so of_filter −= that.
     """
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
@@ -293,7 +293,7 @@ def add_collider_work(dtype):
 
 @cache
 def add_rubbing_work(dtype):
-    """Kernel over vertices, after a step: work against friction += ∇H·Δx, ∇H where the step takes its forces."""
+    """Kernel over vertices, after a step: work against friction += ∇H·Δx, with ∇H where the step evaluates its forces."""
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
 
@@ -316,7 +316,7 @@ def add_rubbing_work(dtype):
 def add_filter_work(dtype):
     """Kernel over vertices, after a step: work of the filter += ½m(v² − v₋²) − (m g + f)·(x − x₋), x₋ and v₋ without it.
 
-    It sets ``uncut`` to x₋ and ``cuts``, and what the filter notes back to 0.
+    Sets ``uncut`` to x₋, updates ``cuts``, and resets the notes of the filter to 0.
     """
     vec3, _ = types(dtype)
 
@@ -369,7 +369,7 @@ def add_stored(
     before: wp.array(dtype=wp.float64),
     of_filter: wp.array(dtype=wp.float64),
 ):
-    """Kernel over elements of contact: work of the filter += the change of their energies in a step that it cut."""
+    """Kernel over elements of contact: work of the filter += the change of their energies in a step that it shortened."""
     e = wp.tid()
     i = stencil[e, 0]
     if cuts[i] == NOW:
@@ -379,10 +379,10 @@ def add_stored(
 
 @cache
 def limit_pulls(dtype):
-    """Kernel over vertices: scales ∇U of a collider by ‖f‖/‖∇U‖, ∇U of all, where that is below ½.
+    """Kernel over vertices: scales ∇U of a collider by ‖f‖/‖∇U‖ if that is below ½, with the ∇U of all colliders.
 
-    f is the force that a step gave the vertex by contact. It is −∇U where the step converged; else ∇U may be of a vertex that
-    is far inside, and millions of times as much.
+    f is the contact force that the step gave the vertex. If the step converged, f = −∇U. Else the vertex may be deep in a
+    collider, with a ∇U that is millions of times larger.
     """
     vec3, _ = types(dtype)
 
