@@ -1,4 +1,4 @@
-"""A bar with a closed surface, held at one end, whose other end is turned about its axis by keyframes."""
+"""A bar with a closed surface, fixed at one end. Keyframes rotate the other end about the axis of the bar."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ def scene(angle: float = 150.0, cells: int = 5, stiffness: float = 100.0, bendin
     wc.checks.whole("cells", cells, least=1)
     wc.checks.number("duration", duration, above=0.0)
     size, fps = np.array([5 * cells, cells, cells]), 24.0
-    squares = []  # of the six sides, on a lattice of whole numbers
+    squares = []  # of the six sides, on an integer lattice
     for axis, far in [(axis, far) for axis in range(3) for far in (0, 1)]:
         u, v = (axis + 1) % 3, (axis + 2) % 3
         first = np.argwhere(np.ones(size[[u, v]]))

@@ -1,8 +1,8 @@
 """A strip clamped at one end that bends under its own weight, Γ = ρgL³/D (Romero et al. 2021), on an equilateral mesh.
 
-The length runs along x. With a width of 0 it is one row of triangles, which bends with 1 − ν² = 8/9 of D, because the Poisson's
-ratio ν of both bending energies is −1/3; otherwise rows of edges lie across it. L is measured from the middle of the pins, half
-an element from x = 0 (to the mean end of a single row).
+The strip extends along x. With a width of 0 it is one row of triangles, which bends with 1 − ν² = 8/9 of D, because both
+bending energies have the Poisson's ratio ν = −1/3. Otherwise it has rows of edges across its width. L is measured from the
+middle of the pins, half an element from x = 0, to the free end (of a single row, its mean).
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def scene(
     length: float = 1.0,
     duration: float = 2.0,
 ):
-    """Γ, width [m], elements along, quadratic or dihedral, kL²/D of the springs' k, L [m], duration [s]."""
+    """Γ, width [m], elements along, quadratic or dihedral, kL²/D for the spring stiffness k, L [m], duration [s]."""
     wc.checks.number("width", width, least=0.0)
     wc.checks.choice("bending", bending, ("quadratic", "dihedral"))
     spacing = length / (elements - (0.25 if width == 0.0 else 0.5))

@@ -1,8 +1,8 @@
-"""A belt over a drum that stands still, drawn over it against a load: it slides when the pull is e^{μφ} times the load.
+"""A belt that is pulled over a fixed drum against a load: it slides when the pull is e^{μφ} times the load.
 
-At a vertex at which the belt turns by Δ, the tension ahead is up to (1 + μ tan Δ/2)/(1 − μ tan Δ/2) times that behind: a belt
-of ``turns`` edges around the drum pulls with up to that ratio to the power ``turns``. A tension T presses it on the drum with T
-over the radius of its mid-surface. The belt has no weight, and starts at rest under the load.
+At a vertex where the belt turns by Δ, the tension ahead is at most (1 + μ tan Δ/2)/(1 − μ tan Δ/2) times the tension behind.
+With ``turns`` edges around the drum, the pull is at most the load times that ratio to the power ``turns``. A tension T presses
+the belt on the drum with T over the radius of its mid-surface. The belt has no weight, and starts at rest under the load.
 """
 
 import numpy as np
@@ -29,27 +29,27 @@ def scene(
     fps, radius, width = 60.0, 0.1, 0.05
     turn, most = np.radians(angle) / turns, np.exp(friction * np.radians(angle))
     contact = wc.Contact(distance=distance, stiffness=10.0 * most * load / (radius * distance))
-    outer = radius + distance * (1.0 - 0.1 / most)  # where the load presses the belt
+    outer = radius + distance * (1.0 - 0.1 / most)  # radius of the belt under the load
     edge = 2.0 * outer * np.sin(0.5 * turn)
-    straight = int(np.ceil(0.2 / edge))  # edges on either side
+    straight = int(np.ceil(0.2 / edge))  # edges on each side of the drum
     edges = turns - 1 + 2 * straight
     directions = -turn * np.clip(np.arange(edges) - 0.5 * (edges - 1), -0.5 * turns, 0.5 * turns)
     steps = edge * np.stack([np.cos(directions), 0.0 * directions, -np.sin(directions)], axis=1)
     line = np.concatenate([[[0.0, 0.0, 0.0]], np.cumsum(steps, axis=0)])
-    first = 0.5 * turn * (turns - 1)  # of the vertices on the drum, from the middle
+    first = 0.5 * turn * (turns - 1)  # angle of the first vertex on the drum from the middle
     line += outer * np.array([-np.sin(first), 0.0, -np.cos(first)]) - line[straight]
     positions = np.concatenate([line, line]) + np.repeat([[0.0, 0.5 * width, 0.0], [0.0, 1.5 * width, 0.0]], edges + 1, axis=0)
     rest = edge / (1.0 + load / stretching)
     behind, ahead = np.array([[0, edges + 1], [edges, 2 * edges + 1]])
     times = np.arange(round(duration * fps) + 1) / fps
-    pull = speed * np.where(times < 0.1, 5.0 * times**2, times - 0.05)  # its speed grows for a tenth of a second
+    pull = speed * np.where(times < 0.1, 5.0 * times**2, times - 0.05)  # the speed increases for 0.1 s
     return wc.Scene(
         wc.Mesh.grid(edges + 1, 2, size=(edges * rest, width)),
         density=0.15,
         positions=positions,
         terms=[
             wc.Spring(pairs="structural", stiffness=0.5 * width * stretching / rest, damping=0.5),
-            wc.QuadraticBending(stiffness=1e-6, damping=2e-6),  # explicit steps damp contact by nothing else
+            wc.QuadraticBending(stiffness=1e-6, damping=2e-6),  # the only damping of contact in explicit steps
         ],
         pins=wc.Pins(ahead, positions[ahead] + pull[:, None, None] * steps[-1] / edge),
         loads=[wc.Force(vertices=behind, force=-0.5 * width * load * steps[0] / edge)],

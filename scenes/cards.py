@@ -1,7 +1,8 @@
-"""Two cards that lean on each other, on a floor: friction between them and on the floor holds them up.
+"""Two cards that lean on each other on a floor. Friction between them and on the floor keeps them upright.
 
-The top of the first rests on the face of the second, at ρ = 0.97 of its length, and is as much shorter. At an angle θ to the
-vertical they stand if friction between them is above (ρ² − cos 2θ)/sin 2θ, as moments about the floor say.
+The top of the first card rests on the face of the second, at ρ = 0.97 of its length; the first is shorter by the same ratio. By
+the balance of moments about the floor, they stand at an angle θ to the vertical if the coefficient of friction between them is
+above (ρ² − cos 2θ)/sin 2θ.
 """
 
 import numpy as np
@@ -10,11 +11,11 @@ import warpcloth as wc
 
 
 def scene(angle: float = 20.0, friction: float = 0.6, floor: float = 0.5, n: int = 4, duration: float = 2.0):
-    """Angle to the vertical [degrees], friction between the cards and on the floor, vertices a side, duration [s]."""
+    """Angle to the vertical [degrees], friction between the cards and on the floor, vertices per side, duration [s]."""
     wc.checks.whole("n", n, least=2)
     wc.checks.number("angle", angle, above=0.0)
     length, width, distance, theta = 0.088, 0.063, 1e-3, np.radians(angle)
-    c, s, gap = np.cos(theta), np.sin(theta), 0.9 * distance  # which the default stiffness leaves below a sheet
+    c, s, gap = np.cos(theta), np.sin(theta), 0.9 * distance  # gap below a resting sheet with the default stiffness
     top = 0.97 * length * np.array([-s, c]) - gap * np.array([c, s])
     cards = {}
     for name, high, side in (("first", top, s), ("second", length * np.array([-s, c]), -s)):

@@ -1,7 +1,7 @@
-"""An elastic cable hung by both ends, which are closer than it is long: at rest it is an elastic catenary.
+"""An elastic cable that hangs from both ends. At rest it is an elastic catenary.
 
-It starts as a V of its rest length. Span d, length S, weight per length w, stretching stiffness EA: the horizontal tension T
-solves d = (2T/w) asinh(wS/2T) + TS/EA; the sag is (T/w)(√(1 + (wS/2T)²) − 1) + wS²/(8EA).
+It starts as a V of its rest length. With the span d, length S > d, weight per length w and stretching stiffness EA, the
+horizontal tension T solves d = (2T/w) asinh(wS/2T) + TS/EA. The sag is (T/w)(√(1 + (wS/2T)²) − 1) + wS²/(8EA).
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
-"""A chain of length L that slides off a smooth table: the depth of its tip below the top is a₀ cosh(t√(g/L)).
+"""A chain of length L that slides off a smooth table: the depth of its tip below the top is x = a₀ cosh(t√(g/L)).
 
-This is so for any radius of the edge, from when the tip is below it, and until x = (L + √(L² + 8a₀²))/4, where the chain lifts
-off an edge of small radius.
+This holds for any radius of the edge once the tip is below the edge. At x = (L + √(L² + 8a₀²))/4 the chain lifts off an edge of
+small radius.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
-"""A skirt on a figure that walks: a stage with a skeleton, whose skinned legs and hips are colliders that deform.
+"""A skirt on a walking figure: a stage with a skeleton, whose skinned legs and hips are deforming colliders.
 
-The waist is pinned to the hips. The stage is made by docs/character_stage.py; the animation is a layer over it.
+The waist is pinned to the hips. docs/character_stage.py makes the stage; the animation is a layer over it.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
-"""A curtain on rings that slide along a rod: its last ring draws it shut, and a ball swings into it.
+"""A curtain on rings that slide along a rod. Its last ring pulls it shut, and a ball swings into it.
 
-Rings are pins that hold all axes but that of the rod. The first stays at the wall, and keyframes lead the last.
+Rings are pins that are free along the rod. The first ring is fixed, and keyframes move the last one.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ def scene(
     pleats: int = 6,
     duration: float = 3.0,
 ):
-    """Vertices across and down, width and height [m], part of the width that it covers at first, pleats, duration [s]."""
+    """Vertices across and down, width and height [m], initial fraction of the width, pleats, duration [s]."""
     for name, value in {"width": width, "height": height, "gathered": gathered, "duration": duration}.items():
         wc.checks.number(name, value, above=0.0)
     wc.checks.whole("pleats", pleats, 1)
@@ -26,7 +26,7 @@ def scene(
         raise ValueError(f"gathered is {gathered}; it must be below 1, the whole width")
     fps = 60.0
     mesh = wc.Mesh.grid(nx, ny, size=(width, height), pattern="alternating")
-    # Zigzag pleats, of which each edge has its length; rings are where they turn at the back.
+    # Zigzag pleats with the rest length of each edge. Rings are at their rear folds.
     along = mesh.points[:, 0] / width * 2.0 * pleats
     depth = 0.5 * width / pleats * np.sqrt(1.0 - gathered**2)
     positions = np.stack([gathered * mesh.points[:, 0], -mesh.points[:, 2], depth * np.abs((along + 1.0) % 2.0 - 1.0)], axis=1)

@@ -6,12 +6,12 @@ import warpcloth as wc
 
 
 def scene(n: int = 32, radius: float = 0.3, friction: float = 0.3, stiffness: float = 300.0, duration: float = 2.0):
-    """Vertices a side, radius of the ball [m], coefficient of friction, spring stiffness [N/m], duration [s]."""
+    """Vertices per side, radius of the ball [m], coefficient of friction, spring stiffness [N/m], duration [s]."""
     wc.checks.number("radius", radius, above=0.0)
     wc.checks.whole("n", n, 2)
     grid = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")
-    density, distance = 0.15, max(0.75 / (n - 1) ** 2 / radius, 1e-3)  # so that edges of triangles stay above the ball too
-    height = max(2.2 * radius, 2.0 * radius + 1.1 * distance)  # where it touches nothing yet
+    density, distance = 0.15, max(0.75 / (n - 1) ** 2 / radius, 1e-3)  # also keeps edges of triangles out of the ball
+    height = max(2.2 * radius, 2.0 * radius + 1.1 * distance)  # above the ball, without contact
     return wc.Scene(
         grid,
         density=density,

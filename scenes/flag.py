@@ -1,4 +1,4 @@
-"""A flag on a pole that is swung to and fro about its own axis: pins moved by keyframes. No wind."""
+"""A flag on a pole that oscillates about its axis: keyframes move the pins. There is no wind."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def scene(
     bending: float = 1e-5,
     duration: float = 3.0,
 ):
-    """Vertices along and down, swing to either side [°], its period [s], springs [N/m], bending [N·m], duration [s]."""
+    """Vertices along and down, amplitude [°], period [s], springs [N/m], bending [N·m], duration [s]."""
     wc.checks.number("swing", swing, least=0.0)
     wc.checks.number("period", period, above=0.0)
     wc.checks.number("duration", duration, above=0.0)
@@ -24,7 +24,7 @@ def scene(
     pole = np.arange(0, nx * ny, nx)
     times = np.arange(round(duration * fps) + 1)[:, None] / fps
     angle = np.radians(swing) * np.sin(2.0 * np.pi * times / period) * np.minimum(times / period, 1.0)
-    # The pole is as thick as the flag's first cell is wide, so that turning it turns the cloth.
+    # The pole is as thick as the first cell of the flag is wide, so that its rotation rotates the cloth.
     held = np.concatenate([pole, pole + 1])
     x = upright[held, 0]
     keyframes = np.stack([x * np.cos(angle), np.tile(upright[held, 1], (len(times), 1)), x * np.sin(angle)], axis=-1)

@@ -6,7 +6,7 @@ import warpcloth as wc
 
 
 def scene(n: int = 64, layers: int = 2, gap: float = 1e-3, distance: float = 1e-3, duration: float = 1.0):
-    """Vertices a side, layers (1 or 2), gap between them [m], contact distance [m], duration [s]."""
+    """Vertices per side, layers (1 or 2), gap between them [m], contact distance [m], duration [s]."""
     wc.checks.whole("n", n, 2)
     wc.checks.whole("layers", layers, 1, most=2)
     wc.checks.number("gap", gap, above=0.0)

@@ -1,4 +1,4 @@
-"""A square cloth that lies on a funnel and is pulled through its spout by its middle."""
+"""A square cloth on a funnel, which is pulled through the spout by its middle."""
 
 import numpy as np
 
@@ -6,14 +6,14 @@ import warpcloth as wc
 
 
 def scene(n: int = 33, size: float = 0.6, spout: float = 0.06, pull: float = 0.5, friction: float = 0.2, duration: float = 3.0):
-    """Vertices a side, side [m], radius of the spout [m], way of the middle [m], friction of the funnel, duration [s]."""
+    """Vertices per side, side [m], spout radius [m], displacement of the middle [m], friction of the funnel, duration [s]."""
     wc.checks.whole("n", n, 3)
     for name, value in {"size": size, "spout": spout, "duration": duration}.items():
         wc.checks.number(name, value, above=0.0)
     wc.checks.number("pull", pull)
     wc.checks.number("friction", friction, least=0.0)
     fps, around, distance = 25.0, 48, 3e-3
-    # Rings of the funnel, from the rim of its cone to the end of its spout, and their heights.
+    # Radii and heights of the rings of the funnel, from the rim of the cone to the end of the spout.
     radii = np.array([0.6 * size, spout, spout])
     heights = np.array([0.0, 0.5 * (spout - 0.6 * size), 0.5 * (spout - 0.6 * size) - 0.2 * size])
     angle = 2.0 * np.pi * np.arange(around) / around

@@ -1,7 +1,7 @@
-"""A square cloth of 1 m, horizontal at first, hung by two corners of one edge; it swings through.
+"""A square cloth of 1 m, initially horizontal, pinned at two corners of one side; it swings like a pendulum.
 
-Structural and shear springs, one mass for all vertices; for an odd number of vertices a side its halves are mirror images of
-each other. The pinned edge lies along x at z = 0.
+It has structural and shear springs, and equal masses. For an odd number of vertices per side it is mirror symmetric. The side
+with the pins lies along x at z = 0.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ def scene(
     duration: float = 1.0,
     fabric: str | None = None,
 ):
-    """n vertices a side, springs [N/m], bending [N·m], density [kg/m²], duration [s]; or one of 'warpcloth fabrics'."""
+    """n vertices per side, springs [N/m], bending [N·m], density [kg/m²], duration [s]; or one of 'warpcloth fabrics'."""
     mesh = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")
     if fabric is not None:
         return wc.Scene(mesh, fabric=fabric, pins=[0, n - 1], duration=duration, name="hanging")

@@ -1,6 +1,6 @@
-"""A sheet on a slope, at rest and pressed in by its weight: it sticks for tan(angle) < friction, else slides.
+"""A sheet on a slope, at rest at first, at the gap of its weight: it sticks for tan θ < μ, else it slides.
 
-Then its acceleration is g(sin θ − μ cos θ) down the slope, which descends along x.
+The acceleration of a sliding sheet is g(sin θ − μ cos θ) down the slope, which descends along x.
 """
 
 import numpy as np
@@ -9,12 +9,12 @@ import warpcloth as wc
 
 
 def scene(angle: float = 30.0, friction: float = 0.3, n: int = 9, size: float = 0.2, duration: float = 1.0):
-    """Slope [degrees], coefficient of friction, vertices a side, side [m], duration [s]."""
+    """Slope θ [degrees], coefficient of friction μ, vertices per side, side [m], duration [s]."""
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     contact = wc.Contact(distance=1e-3)
     grid = wc.Mesh.grid(n, n, size=size, pattern="alternating")
-    above = contact.distance * (1.0 - 0.1 * c)  # where the default stiffness carries its weight
+    above = contact.distance * (1.0 - 0.1 * c)  # the gap at which contact with the default stiffness carries the weight
     return wc.Scene(
         wc.Mesh((grid.points + np.array([0.0, above, 0.0])) @ turn.T, grid.triangles),
         density=0.15,

@@ -1,4 +1,4 @@
-"""Two strips in a loose reef knot, which is pulled tight by their ends, against the friction between them."""
+"""Two strips in a loose reef knot. Their ends pull it tight against friction."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -22,7 +22,7 @@ LINE = np.array(
 def scene(
     along: int = 120, across: int = 5, width: float = 0.02, pull: float = 0.1, friction: float = 0.02, duration: float = 2.0
 ):
-    """Edges along a strip and across it, its width [m], way of each end [m], friction of the strips, duration [s]."""
+    """Edges along a strip and across it, its width [m], displacement of each end [m], friction of the strips, duration [s]."""
     wc.checks.whole("along", along, 40)
     wc.checks.whole("across", across, 1)
     for name, value in {"width": width, "duration": duration}.items():

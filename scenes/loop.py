@@ -1,15 +1,14 @@
-"""A strip bent into a hanging loop: both ends are clamped at one point, and point down (pear), sideways (ring) or up (heart).
+"""A strip bent into a hanging loop. Both ends are clamped at one point, and point down (pear), sideways (ring) or up (heart).
 
-Its depth, from that point to the lowest one, over its length L is .424308, .318310 and .133860 without weight. For a heart with
-a weight of Γ = ρgL³/D it is .139540, .184043 and .275445 if Γ = 10, 100 and 400. The ends have the contact distance between
-them.
+Without weight, its depth from that point to the lowest one is .424308, .318310 and .133860 of its length L. For a heart with
+Γ = ρgL³/D of 10, 100 and 400 it is .139540, .184043 and .275445. The two ends are the contact distance apart.
 """
 
 import numpy as np
 
 import warpcloth as wc
 
-# Half turns of one half of the strip, what closes the loop at the start, and where the second end is from the first.
+# Half turns of one half of the strip, coefficient that closes the initial loop, direction from the first end to the second.
 KINDS = {"pear": (0.5, 1.171066, [1, 0, 0]), "ring": (1.0, 0.0, [0, 1, 0]), "heart": (1.5, -0.670103, [1, 0, 0])}
 
 

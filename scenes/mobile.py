@@ -1,6 +1,7 @@
-"""A mobile: two rigid bars hung from one another by strings carry three cloths sewn to rigid battens, pushed to turn.
+"""A mobile: two rigid bars, the second hung from the first, carry three cloths sewn to rigid battens. A push makes it rotate.
 
-A bar is three vertices, its two ends and a little above them where it hangs, which is where its loads balance: bars stay level.
+A bar has three vertices: its two ends, and slightly above them its suspension, where its loads balance, so that bars stay
+level.
 """
 
 import numpy as np
@@ -9,7 +10,7 @@ import warpcloth as wc
 
 
 def scene(n: int = 9, stiffness: float = 500.0, bending: float = 1e-5, push: float = 0.4, duration: float = 4.0):
-    """Vertices a side of a cloth, springs [N/m], bending [N·m], speed of the outer cloth at first [m/s], duration [s]."""
+    """Vertices per side of a cloth, springs [N/m], bending [N·m], initial speed of the outer cloth [m/s], duration [s]."""
     width, string, bar, batten = 0.3, 0.15, 1e-3, 5e-3  # m, m, kg a vertex, kg
     grid = wc.Mesh.grid(n, n, size=width, pattern="alternating")
     upright = (grid.points - [width / 2, 0.0, 0.0])[:, [0, 2, 1]] * [1.0, -1.0, 1.0]

@@ -1,6 +1,6 @@
-"""A limp sheet of length L on a table over whose edge a part hangs: it slips off where that is more than L m/(1 + m).
+"""A sheet of length L without bending stiffness on a table: it slips off if more than L m/(1 + m) hangs over the edge.
 
-m = μ e^{μπ/2} where the radius of the edge, which is as rough as the table, is small. The sheet starts at rest.
+m = μ e^{μπ/2} for a small radius of the edge, which has the same friction μ as the table. The sheet starts at rest.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ def scene(
     radius: float = 0.03,
     duration: float = 1.0,
 ):
-    """Friction, overhang over that at which it slips, elements along, L, width, radius of the edge [m], duration [s]."""
+    """Friction, overhang over L m/(1 + m), elements along, L, width, radius of the edge [m], duration [s]."""
     for name, value in {"friction": friction, "part": part, "length": length, "width": width, "radius": radius}.items():
         wc.checks.number(name, value, above=0.0)
     wc.checks.whole("elements", elements, 4)
@@ -31,7 +31,7 @@ def scene(
         )
     contact = wc.Contact(distance=distance, stiffness=10.0 * 9.81 * density * over / (radius * distance))
     mesh = wc.Mesh.grid(elements + 1, rows, size=(length, width), pattern="alternating")
-    along = mesh.points[:, 0] - (length - over)  # from where the edge begins
+    along = mesh.points[:, 0] - (length - over)  # measured from the start of the edge
     turned = np.clip(along, 0.0, arc) / outer
     positions = np.stack(
         [

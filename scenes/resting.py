@@ -1,4 +1,4 @@
-"""A sheet of 1 m at rest on a collider, which all of its vertices touch, or far above it: what contact costs."""
+"""A sheet of 1 m at rest on a collider, in contact with all vertices, or far above it, to measure the cost of contact."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ SHAPES = ("plane", "sphere", "capsule", "box", "mesh")
 
 
 def scene(collider: str = "plane", gap: float = 0.9e-3, n: int = 64, friction: float = 0.3, triangles: int = 20000):
-    """Shape of the collider, gap [m], vertices a side, coefficient of friction, triangles of a flat mesh about the sheet."""
+    """Shape of the collider, gap [m], vertices per side, coefficient of friction, triangles of the flat mesh collider."""
     wc.checks.choice("collider", collider, SHAPES)
     wc.checks.number("gap", gap, above=0.0)
     wc.checks.whole("triangles", triangles, least=2)

@@ -1,7 +1,7 @@
-"""A ring of radius R, bent from a flat strip, that a plate presses against another until it bears a load P on its width.
+"""A ring of radius R, bent from a flat strip, between two plates that close until the load is P per width.
 
-Without weight and stretch it is then H wide: along its arc s the angle φ to the plates is Dφ″ = P/2 cos φ. Up to P = 2.786 D/R²
-it touches each plate along a line; above, it lies flat on them, and P = 5.742 D/H². It stands upright and stays level.
+Without weight and stretch it then has the height H. The angle φ between its arc s and the plates satisfies Dφ″ = P/2 cos φ. Up
+to P = 2.786 D/R² the ring touches each plate along a line; above, it lies flat on them, and P = 5.742 D/H².
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ import warpcloth as wc
 
 
 def height(load):
-    """H/2R for PR²/D, by quadrature over a quarter of the ring, where (R dφ/ds)² = c + PR²/D sin φ."""
+    """H/2R as a function of PR²/D, by quadrature over a quarter of the ring, where (R dφ/ds)² = c + PR²/D sin φ."""
 
-    def integral(power, c):  # of sinᵖ φ ds/R; φ = t², which leaves no pole where c is 0
+    def integral(power, c):  # of sinᵖ φ ds/R; φ = t² removes the pole at c = 0
         return quad(lambda t: 2.0 * t * np.sin(t * t) ** power / np.sqrt(c + load * np.sin(t * t)), 0.0, np.sqrt(np.pi / 2))[0]
 
     flat = integral(0, 0.0) <= np.pi / 2
@@ -22,7 +22,7 @@ def height(load):
 
 
 def scene(load: float = 2.0, elements: int = 48, radius: float = 0.1, bending: float = 1.0, duration: float = 1.0):
-    """PR²/D, edges around, R [m], D [N·m], duration [s], in the first half of which the plates close."""
+    """PR²/D, edges around, R [m], D [N·m], duration [s]; the plates close in its first half."""
     for name, value in {"load": load, "radius": radius, "bending": bending, "duration": duration}.items():
         wc.checks.number(name, value, above=0.0)
     wc.checks.whole("elements", elements, 8)

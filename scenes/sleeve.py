@@ -1,4 +1,4 @@
-"""A lining that is pulled out of a sleeve: two tubes, of which the inner one is wider at rest than there is room for."""
+"""A lining that is pulled out of a sleeve: two tubes. The inner one has a larger rest radius than fits."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def scene(
     pull: float = 0.2,
     duration: float = 2.0,
 ):
-    """Edges around and along, radius and length [m], excess of the lining's radius, way that it is pulled [m], duration [s]."""
+    """Edges around and along, radius and length [m], relative excess of the lining's radius, pull [m], duration [s]."""
     wc.checks.whole("around", around, 4)
     wc.checks.whole("along", along, 2)
     for name, value in {"radius": radius, "length": length, "duration": duration}.items():

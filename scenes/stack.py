@@ -1,7 +1,7 @@
-"""Square sheets that fall onto one another on a floor, and a ball that then comes down and presses them.
+"""Square sheets that fall onto one another on a floor. A ball then moves down and presses them.
 
-Before the ball comes, each layer bears the weight of those above it: the sum of k(r − d), or kr²/4d below
-r/2, over the layers at distances d < r.
+Before that, each layer carries the weight of those above it: the sum over the layers at distances d < r of k(r − d), or of
+kr²/4d for d < r/2.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ import warpcloth as wc
 
 
 def scene(sheets: int = 5, n: int = 24, size: float = 0.4, press: float = 0.5, friction: float = 0.3, duration: float = 2.0):
-    """Sheets, vertices a side, side [m], gap under the ball over sheets times r, friction of all, duration [s]."""
+    """Sheets, vertices per side, side [m], gap under the ball over sheets times r, friction of all, duration [s]."""
     wc.checks.whole("sheets", sheets, 1)
     wc.checks.whole("n", n, 2)
     for name, value in {"size": size, "press": press, "duration": duration}.items():

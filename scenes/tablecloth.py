@@ -1,4 +1,4 @@
-"""A square tablecloth, laid turned on a square table: its corners hang over the sides."""
+"""A square tablecloth, rotated on a square table: its corners hang over the sides."""
 
 import numpy as np
 
@@ -14,12 +14,12 @@ def scene(
     bending: float = 1e-4,
     duration: float = 1.5,
 ):
-    """Vertices a side, side [m], its turn [°], side of the table [m], friction, bending stiffness [N·m], duration [s]."""
+    """Vertices per side, side [m], rotation [°], side of the table [m], friction, bending stiffness [N·m], duration [s]."""
     for name, value in {"table": table, "bending": bending}.items():
         wc.checks.number(name, value, above=0.0)
     wc.checks.whole("n", n, 3)
-    density, radius = 0.2, 0.05  # of the edges of the table
-    # Edges of the cloth across those of the table stay above it, where its weight presses it in by a fifth of the distance.
+    density, radius = 0.2, 0.05  # radius of the edges of the table
+    # Keeps edges of the cloth that cross those of the table outside it, when the weight takes a fifth of the distance.
     distance = min(1.5 * (size / (n - 1)) ** 2 / (4.0 * radius), radius)
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     grid = wc.Mesh.grid(n, n, size=size, pattern="alternating")

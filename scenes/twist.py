@@ -1,4 +1,4 @@
-"""A cylinder of cloth that is wrung: its ends turn about the axis against each other by keyframes, and then stay."""
+"""A twisted cylinder of cloth: keyframes rotate its ends about the axis in opposite directions, and then keep them."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def scene(
     stiffness: float = 100.0,
     duration: float = 4.0,
 ):
-    """Turns of the ends against each other, edges around and along, radius and length [m], springs [N/m], duration [s]."""
+    """Relative turns of the ends, edges around and along, radius and length [m], springs [N/m], duration [s]."""
     wc.checks.number("turns", turns)
     wc.checks.whole("around", around, 4)
     wc.checks.whole("along", along, 2)

@@ -1,6 +1,6 @@
-"""A real mesh from a stage: the square cloth among Warp's example assets, hung by the two corners of a long side.
+"""A mesh from a stage: the square cloth among Warp's example assets, pinned at the two corners of a long side.
 
-The file says 150 m by 100 m, z up: an awning over a street, level at first. The animation is a layer over the file.
+According to the file it is 150 m by 100 m, with z up; it starts level. The animation is a layer over the file.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Whole scenes read from USD stages and written as such. What stands where is said in `attributes`."""
+"""Reads scenes from USD stages and writes them. `attributes` lists the attributes."""
 
 import os
 import warnings
@@ -41,7 +41,7 @@ from .stage import (
 from .values import array_of, refuse_unknown, sentences, time_codes_of, value_of
 
 _SHEAR = "physics:surfaceShearStiffness"
-_THICKNESS = 1e-3  # [m], what the proposal says where there is none
+_THICKNESS = 1e-3  # [m], the default of the proposal
 
 
 def read_scene(path: FilePath, prim: str | None = None) -> Scene:
@@ -49,17 +49,17 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the cloth's prim. Else all prims with cloth attributes are the cloths of the scene, or the only
-            mesh is.
+        prim: Path or name of the prim of the cloth. By default all prims with cloth attributes are cloths of the scene, or
+            without any the only mesh.
 
     Returns:
-        Scene: With `stage` set. A result of `write_scene` gives the scene that was written, up to: the order of pins, which
-        is that of their indices; texture coordinates, which are float32, and of meshes of edges alone are lost.
+        Scene: With `stage` set. A file of `write_scene` gives the written scene, except that pins are sorted, and that texture
+        coordinates are float32 and are lost for edge meshes.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: As `read_stage_mesh`; there is no mass or no term; an attribute has another type than the table says, a
-            value that a scene or term refuses, or a name in the namespace "warpcloth" that is not in the table.
+        ValueError: See `read_stage_mesh`. Or there is no mass or no term. Or an attribute has a wrong type, an invalid value,
+            or an unknown name in the namespace "warpcloth".
     """
     with sentences(path):
         stage = open_stage(path)
@@ -71,7 +71,7 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
             fps = surroundings.fps or surroundings.time_codes_per_second
             duration = _duration(stage, _teller("duration", [Values(stage, cloth) for cloth in found]), fps)
             first = surroundings.start or 0.0
-            # One frame more, because there is a keyframe of colliders after all steps.
+            # One more frame, because colliders need a keyframe after the last step.
             stage = posed(stage, first, first + (duration + 1.0 / fps) * surroundings.time_codes_per_second)
         cloths = [stage.GetPrimAtPath(one.prim) for one in each]
         values = [Values(stage, cloth) for cloth in cloths]
@@ -80,7 +80,7 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
             with errors_at(f"{path}, prim {one.prim}"):
                 scenes.append(_scene(stage, cloth, of_cloth, one, fps, duration, values))
 
-        def codes(samples):  # one frame more than the scene has, so that all steps within it have a keyframe after them
+        def codes(samples):  # one more frame than the scene has, so that every step has a keyframe after it
             return frame_codes(samples, surroundings, scenes[0].frames + 1, fps)
 
         whole = {"colliders": read_colliders(stage, cloths, surroundings, codes)}
@@ -96,10 +96,10 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
 
 
 def _teller(field, values):
-    """Of the values of several cloths those of the first that says a field of the whole scene, else of the first.
+    """The values of the first cloth that gives a field of the whole scene, else those of the first cloth.
 
     Raises:
-        ValueError: Two say other things.
+        ValueError: Two cloths give different values.
     """
     telling = [(each, each.get(field)) for each in values if each.get(field) is not None]
     for _, value in telling[1:]:
@@ -109,14 +109,14 @@ def _teller(field, values):
 
 
 def _names_of(each):
-    """A name for each cloth: that of its prim, or where two have the same all of the path."""
+    """Names of the cloths: those of their prims, or if two are equal the paths."""
     paths = [one.prim.strip("/") for one in each]
     names = [path.rsplit("/", 1)[-1] for path in paths]
     return names if len(set(names)) == len(names) else [path.replace("/", "_") for path in paths]
 
 
 def _scene(stage, cloth, values, surroundings, fps, duration, of_all):
-    """The scene of one cloth without its colliders and contact; gravity may be said by any of all cloths."""
+    """The scene of one cloth without colliders and contact. Any of the cloths may give gravity."""
     rest = surroundings.mesh.points
     surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
     mesh = surroundings.mesh
@@ -146,12 +146,12 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all):
         fabric=fabric,
     )
     for term in scene.terms:
-        term.elements(mesh, scene.positions)  # refuses now, when the file is known, what would be refused later
+        term.elements(mesh, scene.positions)  # raises errors here, where the file is known
     return scene
 
 
 def read_limits(stage, cloth, surroundings):
-    """The limits of stretch that a cloth's prim declares, and the mesh that they are of.
+    """The strain limits that the prim of a cloth declares, and their mesh.
 
     Args:
         stage: The stage.
@@ -159,11 +159,11 @@ def read_limits(stage, cloth, surroundings):
         surroundings: Its `StageMesh`.
 
     Returns:
-        list: The `Limit` of each.
-        Mesh: The mesh.
+        list: The `Limit`s.
+        Mesh: Their mesh.
 
     Raises:
-        ValueError: As :func:`read_scene`.
+        ValueError: See :func:`read_scene`.
     """
     with errors_at(f"{surroundings.path}, prim {cloth.GetPath()}"):
         values = Values(stage, cloth)
@@ -187,7 +187,7 @@ def _refuse_missing(mass, term):
 
 
 def _cloth_prims(stage, path, prim):
-    """The prim that is named, or all with cloth attributes, or what `find_prim` takes."""
+    """The named prim, or all prims with cloth attributes, or that of `find_prim`."""
     if prim is None:
         of_colliders = {row.name for row in attributes() if row.location == "collider"}
         cloths = [
@@ -202,7 +202,7 @@ def _cloth_prims(stage, path, prim):
 
 
 def _exact_mesh(values, cloth, surroundings):
-    """The mesh with what the prim's float32 points and its curves lose, where that still agrees with them."""
+    """The mesh with the exact points and edges of attributes, if those of the prim still agree, and with its grid and parts."""
     mesh, transform = surroundings.mesh, surroundings.transform
     points, edges, grid_shape = (values.get(f"mesh.{name}") for name in ("points", "edges", "grid_shape"))
     if points is not None:
@@ -242,7 +242,7 @@ def _parts(values):
 
 
 def _duration(stage, values, fps):
-    """Seconds: our own, else the whole frames from start to end time code, else 1."""
+    """Duration [s]: from warpcloth:duration, else the whole frames from start to end time code, else 1."""
     duration = values.get("duration")
     if duration is None:
         seconds = stage.GetEndTimeCode() - stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
@@ -253,7 +253,7 @@ def _duration(stage, values, fps):
 
 
 def _density(values, mesh):
-    """Mass per area (of curves: per length), ours or from the standard names; or None."""
+    """Mass per area [kg/m²], or for curves per length [kg/m], from our attribute or the standard ones; or None."""
     density = values.get("density")
     if density is not None or values.get("masses") is not None:
         return density
@@ -267,7 +267,7 @@ def _density(values, mesh):
 
 
 def _terms(values, mesh):
-    """Our own terms, or else those of a surface material; warns if that has a stiffness in shear."""
+    """Terms from our attributes, else from a surface material; warns if that has a shear stiffness."""
     terms = [_term(values, key) for key in values.terms]
     if not terms and len(mesh.triangles):
         stretch, bend = values.get("(stretch stiffness)"), values.get("(bend stiffness)")
@@ -293,7 +293,7 @@ def _term(values, key):
     if "stiffness" not in given and known["stiffness"].default is MISSING:
         raise ValueError(f"{prefix}:stiffness is not given, must be a number or one for each element")
     given = {name: float(value) if isinstance(value, np.number) else value for name, value in given.items()}
-    # A term without a name of its own is called by its kind.
+    # A term without a name is named after its kind.
     given["name"] = given.get("name", "" if key == kind else key) or None
     try:
         return TERMS[kind](**given)
@@ -302,7 +302,7 @@ def _term(values, key):
 
 
 def _load(values, key, surroundings, frames, fps):
-    """A load, whose value has time samples where it has keyframes."""
+    """A load; time samples of its value are keyframes."""
     prefix, kind = f"{LOADS_NAMESPACE}:{key}", kind_of(values, key, LOADS, "loads")
     quantity, given = LOADS[kind].quantity, {"vertices": values.get("loads.vertices", key)}
     wrong = [load.quantity for load in LOADS.values() if load.quantity != quantity]
@@ -327,7 +327,7 @@ def _load(values, key, surroundings, frames, fps):
 
 
 def _value_at(attribute, code):
-    """The value of an attribute of numbers at a time code."""
+    """The value of a numeric attribute at a time code."""
     value = value_of(attribute, code)
     if value is None:
         raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
@@ -348,9 +348,9 @@ def _pinned(values, cloth, surroundings):
 
 
 def _motion(values, cloth, surroundings, vertices, frames, fps):
-    """Reads the motion of points: positions at the start (n, 3), and keyframes (F, p, 3) of the pinned vertices; or None.
+    """Initial positions (n, 3), and keyframes (F, p, 3) of the pinned vertices; each may be None.
 
-    Points move if they have time samples, and with an animated transform.
+    Points move if they have time samples or an animated transform.
     """
     animated, own = UsdGeom.PointBased(cloth).GetPointsAttr(), next(values.authored("pins.keyframes"), None)
     positions = keyframes = None
@@ -360,7 +360,7 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
         keyframes = np.array([points[vertices] for points in _frames(cloth, surroundings, frames, fps)])
         keyframes = None if (keyframes == keyframes[0]).all() else keyframes
     if own is not None:
-        # Pins of a scene that was written have a sample for each frame, even after the last frame.
+        # Pins written by `write_scene` have a sample for each keyframe, even after the last frame.
         most = max(frames, len(own[1].GetTimeSamples()) - 1)
         keyframes = list(_samples(own[1], surroundings, most, fps))
         wrong = [len(row) for row in keyframes if len(row) != len(vertices)]
@@ -370,7 +370,7 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
 
 
 def _frames(cloth, surroundings, frames, fps):
-    """Moving points of a prim, frame by frame, as positions of the mesh (n, 3) [m] in world space."""
+    """Yields the positions (n, 3) [m] of the mesh in world space, frame by frame."""
     attribute, moving, rest = UsdGeom.PointBased(cloth).GetPointsAttr(), moving_space(cloth), surroundings.mesh.points
     count, first = len(rest), np.arange(len(rest))
     if surroundings.point_vertices is not None:
@@ -388,12 +388,12 @@ def _frames(cloth, surroundings, frames, fps):
 
 
 def _samples(attribute, surroundings, frames, fps):
-    """Values of an attribute of vectors at frames 0, 1, …, up to a number of frames and no further than its last sample."""
+    """Values of a vector attribute at frames 0 to ``frames``, or to its last sample if that is earlier."""
     return (_vectors_at(attribute, code) for code in frame_codes(time_codes_of(attribute), surroundings, frames, fps))
 
 
 def _vectors_at(attribute, code):
-    """The vectors (…, 3) float64 of an attribute at a time code."""
+    """Vectors (…, 3) float64 of an attribute at a time code."""
     value = array_of(attribute, (3,), time=code)
     if value is None:
         raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
@@ -402,7 +402,7 @@ def _vectors_at(attribute, code):
 
 
 def _free_axes(values):
-    """Along which axes vertices may move, (n, 3) truth values, or None."""
+    """Axes along which vertices may move, (n, 3) bool, or None."""
     free_axes = values.get("free_axes")
     if free_axes is None:
         return None
@@ -412,7 +412,7 @@ def _free_axes(values):
 
 
 def _of_fields(kind, name, values):
-    """The record of a kind that values have under a name, or None."""
+    """The record of type ``kind`` from the values under a name; None without any."""
     given = {field.name: _teller(f"{name}.{field.name}", values).get(f"{name}.{field.name}") for field in fields(kind)}
     given = {field: value if isinstance(value, str) else float(value) for field, value in given.items() if value is not None}
     return kind(**given) if given else None
@@ -429,16 +429,16 @@ def _gravity(stage, values, up_axis):
     direction, magnitude = values.get("(gravity direction)"), values.get("(gravity magnitude)")
     if direction is None or not direction.any():
         direction = np.array(DOWN[up_axis])
-    if magnitude is None or magnitude < 0:  # as UsdPhysics has it: a negative value asks for that of the earth
+    if magnitude is None or magnitude < 0:  # in UsdPhysics a negative value means the gravity of the Earth
         magnitude = EARTH
     return magnitude * direction.astype(np.float64) / np.linalg.norm(direction)
 
 
 def write_scene(scene: Scene, path: FilePath) -> str:
-    """Writes a scene as a stage of its own: /World/Cloth at rest, in metres, with all of the scene as attributes.
+    """Writes a scene as a new stage: /World/Cloth at rest, in metres, with the whole scene as attributes.
 
     Args:
-        scene: The `Scene`. One that was read from a stage is written without the rest of that stage.
+        scene: The `Scene`. If it was read from a stage, the rest of that stage is not written.
         path: File to write: .usd, .usda or .usdc.
 
     Returns:
@@ -446,8 +446,8 @@ def write_scene(scene: Scene, path: FilePath) -> str:
 
     Raises:
         FileNotFoundError: The folder does not exist.
-        ValueError: The path has another ending or is the stage that the scene was read from, or the scene has no terms,
-            or one that does not fit its mesh.
+        ValueError: The path has another ending, or is the stage that the scene was read from. Or the scene has no terms, or one
+            that does not fit the mesh.
         OSError: The file could not be written.
     """
     path = Path(os.path.abspath(followed(path)))
@@ -460,7 +460,7 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     if not scene.terms:
         raise ValueError("scene.terms is empty; a scene in a stage must have one or more")
     for term in scene.terms:
-        term.elements(scene.mesh, scene.positions)  # or reading would refuse what was written
+        term.elements(scene.mesh, scene.positions)  # raises here what reading the file would raise
     up_axis = scene.stage.up_axis if scene.stage else scene.up_axis
     pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
     layer, target, _ = scene_layer(scene.mesh, pins, up_axis, "Cloth")
@@ -494,7 +494,7 @@ def write_scene(scene: Scene, path: FilePath) -> str:
                 author(cloth, f"loads.{field}", value, key)
         for frame, value in enumerate(() if load.keyframes is None else np.asarray(load.keyframes)):
             author(cloth, f"loads.{load.quantity}", value, key, time=frame)
-    # USD sorts properties by name, and this is how it is told of another order.
+    # USD sorts properties by name, so the order of terms is stored explicitly.
     of_terms = [f"{TERMS_NAMESPACE}:{key}:type" for key in keys]
     cloth.SetPropertyOrder(of_terms + [f"{LOADS_NAMESPACE}:{key}:type" for key in keys_of_loads])
     export(layer, path)
@@ -502,7 +502,7 @@ def write_scene(scene: Scene, path: FilePath) -> str:
 
 
 def _scene_values(scene):
-    """All that is to be written of a scene and its mesh but for terms and pins, by field."""
+    """Values of a scene and its mesh to write, by field, except terms and pins."""
     mesh = scene.mesh
     given = {"name": scene.name, "duration": scene.duration, "gravity": scene.gravity}
     given |= {"masses": scene.masses} if scene.density is None else {"density": scene.density}
@@ -534,13 +534,13 @@ def _scene_values(scene):
 
 
 def _kind_and_name(part, key):
-    """The type of a term or load, and its name where that is not ``key``."""
+    """The type of a term or load, and its name if that is not ``key``."""
     kind, name = type(part).__name__, part.name or ""
     return {"type": kind, "name": None if name == ("" if key == kind else key) else name}
 
 
 def _keys_of(terms):
-    """For each term or load a name that an attribute can have: its own, or else its kind, counted where that is taken."""
+    """Attribute names of terms or loads: their names, or else their kinds, with a number if taken."""
     keys = []
     for term in terms:
         kind = type(term).__name__

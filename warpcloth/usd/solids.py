@@ -1,4 +1,4 @@
-"""The surfaces of solids of a stage, such as a Sphere, as triangles."""
+"""Triangulated surfaces of the solids of a stage, such as Sphere prims."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from .modules import Usd
 
 
 def _solid(make, *sizes):
-    """Function that gives the surface of a solid from its prim, in the prim's own space, at a time code or else the first.
+    """Function (prim, time code) → the surface of a solid in the space of its prim; without a time code at the earliest one.
 
     Args:
-        make: Function of the module trimesh and of the sizes, which makes it along z.
-        sizes: Names of attributes.
+        make: Function (trimesh, sizes…) → the surface along z.
+        sizes: Names of the attributes with the sizes.
     """
 
     def made(prim, code=None):
@@ -33,7 +33,7 @@ def _plane(trimesh, width, length):
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
-# By the name of their type.
+# By type name of the prim.
 SOLIDS = {
     "Cube": _solid(lambda trimesh, size: trimesh.creation.box((size, size, size)), "size"),
     "Sphere": _solid(lambda trimesh, radius: trimesh.creation.icosphere(4, radius), "radius"),

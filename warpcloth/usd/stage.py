@@ -1,4 +1,4 @@
-"""A cloth prim of a USD stage: found, read in metres and world space, and described well enough to be written back."""
+"""Finds a cloth prim of a USD stage and reads it in metres and world space, with what is needed to write it back."""
 
 import os
 import warnings
@@ -23,24 +23,28 @@ from .values import (
     token_of,
 )
 
-# Where an animation keeps, in the root layer's customLayerData, the prim that it animates.
+# Key in the customLayerData of the root layer of an animation, which names the animated prim.
 METADATA_KEY = "warpcloth"
 # Metadata that USD reads from the root layer alone.
 _READ_FROM_ROOTS = ("startTimeCode", "endTimeCode", "metersPerUnit", "upAxis", "kilogramsPerUnit", "customLayerData")
-# Primvar of curves: the mesh vertex of each curve point, for curves repeat the vertices where several of them meet.
+# Primvar of curves: the mesh vertex of each curve point, for curves repeat vertices where they meet.
 VERTEX_PRIMVAR = "warpcloth:vertex"
 
 
 def read_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh) -> Mesh:
-    """The rest shape of a cloth: see `read_stage_mesh`, which also tells what the stage says about it.
+    """Reads the rest shape of a cloth. `read_stage_mesh` also returns its context in the stage.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the prim; may be left out where there is only one mesh.
+        prim: Path or name of the prim; optional if there is only one mesh.
         kind: `Mesh` or `Surface`.
 
     Returns:
-        Mesh: In metres and the stage's world space.
+        Mesh: In metres and in the world space of the stage.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: See `read_stage_mesh`.
     """
     return read_stage_mesh(path, prim, kind).mesh
 
@@ -48,27 +52,27 @@ def read_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh) 
 def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh, time: float | None = None) -> StageMesh:
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
-    The points at the default time are the rest shape. A stage with time samples alone is read at its first sample, with a
-    warning: support for that is deprecated, for nothing says that a first frame is at rest. Holes are left out. Polygons are
-    cut into fans of triangles from their first corner, and turned where the prim is left-handed or mirrored by its transform,
-    so that triangle normals point out of the front. The up axis is kept.
+    The points at the default time are the rest shape. If points have only time samples, the first is read, with a warning. This
+    is deprecated, for the first frame need not be at rest. Holes are omitted. Polygons are cut into fans of triangles from
+    their first corner. Their winding is reversed if the prim is left-handed or its transform mirrors, so that triangle normals
+    point to the front. The up axis is kept.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the prim; may be left out where the stage has one mesh (or no mesh and one curves prim),
-            and for a result of `AnimationWriter`, which names its own.
+        prim: Path or name of the prim. Optional if the stage has one mesh (or no mesh and one curves prim), and for a file of
+            `AnimationWriter`, which names it.
         kind: `Mesh` or `Surface`.
-        time: Time code at which an animated transform is taken, by default the stage's start, and the points without a
-            warning where they have no default.
+        time: Time code of an animated transform, by default the start of the stage. If given, points without a default value
+            are read at it without a warning.
 
     Returns:
-        StageMesh: The mesh and its surroundings.
+        StageMesh: The mesh and its context in the stage.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not a USD stage, has invalid units, rates or times, or has no mesh or several; the prim is
-            missing, is not a mesh or refers to a missing file; its transform cannot be inverted, its topology changes, or its
-            points and topology do not make a valid `Mesh`.
+        ValueError: The file is not a USD stage, has invalid units, rates or times, or has no mesh or several. Or the prim is
+            missing, is not a mesh, or refers to a missing file. Or its transform cannot be inverted, its topology changes, or
+            its points and topology do not make a valid `Mesh`.
     """
     with sentences(path):
         return _stage_mesh(open_stage(path), path, prim, kind, time)
@@ -90,7 +94,7 @@ def _stage_mesh(stage, path, prim, kind, time):
             refuse_moving_topology(found)
         if found.IsA(UsdGeom.Mesh):
             corners, triangles = face_corners(found, len(points))
-            if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # only the sign, because the determinant may overflow
+            if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # the sign alone, because the determinant may overflow
                 triangles = triangles[:, ::-1]
             at_vertices, at_corners = _texture_coordinates(found, len(points), corners)
             corner_coordinates = None if at_corners is None else at_corners[triangles]
@@ -122,7 +126,7 @@ def _stage_mesh(stage, path, prim, kind, time):
 
 
 def followed(path):
-    """The file that a link stands for, however many links lead there; another path as it is."""
+    """The target of a symbolic link, through all links; another path unchanged."""
     return os.path.realpath(path) if os.path.islink(path) else path
 
 
@@ -142,17 +146,17 @@ def open_stage(path):
         path: The file.
 
     Returns:
-        Usd.Stage: Keep it: prims of a stage that is gone are invalid.
+        Usd.Stage: The stage. Keep a reference: without one its prims become invalid.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no USD stage, or has units, rates or times that are none, see `values.check_stage`.
+        ValueError: It is not a USD stage, or has invalid units, rates or times, see `values.check_stage`.
     """
     path = os.fspath(path)
     refuse_path(path)
     if not os.path.isfile(path):
         raise FileNotFoundError(f"{path}: there is no such file")
-    # pxr keeps a layer while anyone uses it, and would show an earlier result that has been replaced since.
+    # pxr caches a layer that is in use, and would return the content from before the file was replaced.
     known = Sdf.Layer.Find(os.path.abspath(path))
     if known and not known.dirty:
         known.Reload()
@@ -166,29 +170,28 @@ def open_stage(path):
 
 
 def flattened(path: FilePath) -> str:
-    """The text of one .usda file with all that a stage takes from others, but for value clips.
+    """A stage as the text of one .usda file, with the contents of the files it refers to, except value clips.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no USD stage.
+        ValueError: It is not a USD stage.
     """
     return open_stage(path).ExportToString(addSourceFileComment=False)
 
 
 def find_prim(stage, path, prim=None):
-    """The prim that holds the cloth.
+    """Finds the prim of the cloth.
 
     Args:
         stage: The stage to search.
         path: Its file, for messages.
-        prim: Path or name of the prim, or of the Xform above it; or None for the only one or the one that an earlier run
-            animated.
+        prim: Path or name of the prim, or of the Xform above it. None: the only one, or the one that an earlier run animated.
 
     Returns:
         Usd.Prim: A Mesh, or linear BasisCurves.
 
     Raises:
-        ValueError: Missing, of another type, or several and none of them named.
+        ValueError: The prim is missing or of another type, or there are several and ``prim`` is None.
     """
     prims = list(stage.Traverse(Usd.TraverseInstanceProxies()))
     meshes = [p for p in prims if p.IsA(UsdGeom.Mesh)]
@@ -214,7 +217,7 @@ def find_prim(stage, path, prim=None):
 
 
 def animated_prims(stage):
-    """The prims of several cloths that an earlier run animated, as the root layer names them; none if it was one cloth."""
+    """Prims of several cloths that an earlier run animated, from the root layer; empty for a single cloth."""
     own = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY)
     named = str(own.get("prims", "")).split() if isinstance(own, dict) else []
     return [prim for prim in map(stage.GetPrimAtPath, named) if prim]
@@ -225,13 +228,13 @@ def _called(prim, name):
 
 
 def _listed(prims, types=False, most=12):
-    """Paths of prims as text, cut short."""
+    """Paths of prims as text, at most ``most``."""
     names = [f"{p.GetPath()} ({p.GetTypeName() or 'untyped'})" if types else str(p.GetPath()) for p in prims]
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def moving_space(prim):
-    """The prim, or prim above it, whose transform is animated; None where the prim's space stands still."""
+    """The prim or the ancestor whose transform is animated; None if the space of the prim is fixed."""
     ancestor = prim
     while ancestor and not ancestor.IsPseudoRoot():
         xformable = UsdGeom.Xformable(ancestor)
@@ -244,12 +247,12 @@ def moving_space(prim):
 
 
 def posed(stage, first, last):
-    """The stage, or if it has skinned characters a copy in memory in which their points move.
+    """The stage, or if it has skinned characters a copy in memory with their animated points.
 
     Args:
-        stage: The stage, which stays as it is.
-        first: Time code from which they move.
-        last: That up to which they move.
+        stage: The stage, which is not changed.
+        first: First time code of the animation.
+        last: Last time code.
     """
     if not any(prim.IsA(UsdSkel.Root) for prim in stage.Traverse(Usd.TraverseInstanceProxies())):
         return stage
@@ -260,7 +263,7 @@ def posed(stage, first, last):
     root.subLayerPaths = [own.identifier]
     copy = Usd.Stage.Open(root)
     while instances := [prim for prim in copy.Traverse() if prim.IsInstance() and _has_skeleton(prim)]:
-        for prim in instances:  # no points can be given to a part of an instance
+        for prim in instances:  # prims within an instance cannot be given points
             prim.SetInstanceable(False)
     for prim in list(copy.Traverse()):
         if prim.IsA(UsdSkel.Root):
@@ -273,12 +276,12 @@ def _has_skeleton(prim):
 
 
 def frame_codes(samples, surroundings, frames, fps):
-    """Time codes of frames 0, 1, …, up to a number of frames and no further than the last of some samples.
+    """Time codes of frames 0 to ``frames``, or to the last sample if that is earlier.
 
     Args:
-        samples: Time codes.
+        samples: Time codes of the samples.
         surroundings: The `StageMesh` of the cloth.
-        frames: The last frame, at most.
+        frames: The last frame.
         fps: Frames per second.
     """
     rate = surroundings.time_codes_per_second / fps
@@ -288,7 +291,7 @@ def frame_codes(samples, surroundings, frames, fps):
 
 
 def space_codes(prim):
-    """Time codes of the samples of the transforms of a prim and of those above it, sorted."""
+    """Sorted time codes of the transform samples of a prim and of its ancestors."""
     codes, ancestor = set(), prim
     while ancestor and not ancestor.IsPseudoRoot():
         xformable = UsdGeom.Xformable(ancestor)
@@ -302,25 +305,25 @@ def space_codes(prim):
 
 
 def local_to_metres(prim, where, time=None, shrinks=False):
-    """The transform (4, 4) float64 from a prim's own space and units to the stage's world space [m], for row vectors.
+    """The transform (4, 4) float64 for row vectors, from the space and units of a prim to the world space of the stage [m].
 
     Args:
         prim: The prim.
-        where: File and prim, for messages; or nothing.
-        time: Time code, or None where it must be the same at all of them.
+        where: File and prim, for messages; may be empty.
+        time: Time code; None if the transform must be constant.
         shrinks: Whether the scale may be 0.
 
     Returns:
         np.ndarray: The matrix; its last column is [0, 0, 0, 1].
 
     Raises:
-        ValueError: The transform is animated and no time is given, or it projects, or cannot be inverted.
+        ValueError: The transform is animated and ``time`` is None, or it is not affine or not finite, or cannot be inverted.
     """
     where = f"{where}: " if where else ""
     moving = moving_space(prim) if time is None else None
     if moving:
         raise ValueError(f"{where}the transform of {moving.GetPath()} is animated, must be fixed for a cloth")
-    # A transform of one sample stands still, and says nothing at the default time.
+    # A transform with one sample is constant, but has no value at the default time.
     code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(time)
     matrix = np.array(UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(code))
     if not np.isfinite(matrix).all() or (matrix[:, 3] != [0, 0, 0, 1]).any():
@@ -332,8 +335,8 @@ def local_to_metres(prim, where, time=None, shrinks=False):
 
 
 def placed(points, transform):
-    """Points (P, 3) where a transform (4, 4) puts them; what is not finite stays so."""
-    # The identity is left out, for it makes all of a point NaN where one coordinate is.
+    """Points (P, 3) after a transform (4, 4); entries that are not finite stay so."""
+    # Multiplication by the identity would spread NaN to all coordinates of a point.
     if not np.array_equal(transform[:3, :3], np.eye(3)):
         with np.errstate(invalid="ignore"):
             points = points @ transform[:3, :3]
@@ -341,7 +344,7 @@ def placed(points, transform):
 
 
 def carried(points, before, now):
-    """Ways (P, 3) [m] along which a moving space carries points (P, 3) of its own, from one transform (4, 4) to the next."""
+    """Displacements (P, 3) [m] of points (P, 3) that are fixed in a moving space, from one transform (4, 4) to the next."""
     return points @ (now - before)[:3, :3] + (now - before)[3, :3]
 
 
@@ -353,7 +356,7 @@ def curve_vertices(prim, count):
         count: Number P of its points.
 
     Returns:
-        np.ndarray: (P,) int32; the points' own order where nothing else is said.
+        np.ndarray: (P,) int32; without the primvar, the order of the points.
     """
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(VERTEX_PRIMVAR)
     if not (primvar and primvar.HasValue()):
@@ -366,12 +369,15 @@ def curve_vertices(prim, count):
 
 
 def first_points(point_vertices):
-    """For each vertex (n,) the first point that shows it."""
+    """The first point of each vertex, (n,)."""
     return np.unique(point_vertices, return_index=True)[1]
 
 
 def _rest_points(prim, where, time=None):
-    """Points (P, 3) float64 in the prim's own space at the default time, or else at the time or with a warning the first."""
+    """Points (P, 3) float64 in the space of the prim, at the default time.
+
+    Without a default value, those at ``time``, or if that is None the first sample, with a warning.
+    """
     attribute = UsdGeom.PointBased(prim).GetPointsAttr()
     codes = time_codes_of(attribute)
     points = array_of(attribute, (3,))
@@ -391,22 +397,22 @@ def _rest_points(prim, where, time=None):
 
 
 def topology(attribute, time=None):
-    """An integer array attribute at a time code, or at the default time or else its first sample; empty without a value.
+    """An integer array attribute at a time code, by default the default time, else the first sample; empty without a value.
 
     Raises:
-        ValueError: It holds no whole numbers, or cannot be read.
+        ValueError: It is not an array of integers, or cannot be read.
     """
     found = array_of(attribute, whole=True, time=time)
-    if time is None and (found is None or len(found) == 0):  # where the schema has a fallback it is empty
+    if time is None and (found is None or len(found) == 0):  # fallbacks of the schema are empty
         found = array_of(attribute, whole=True, time=Usd.TimeCode.EarliestTime())
     return np.array([], dtype=np.int32) if found is None else found
 
 
 def refuse_change(name, now, fixed, code):
-    """Refuses an integer array that has changed at a time code.
+    """Checks that an integer array is unchanged at a time code.
 
     Raises:
-        ValueError: Its length or an entry differs; the message names the first such entry.
+        ValueError: The length or an entry differs; the message names the first such entry.
     """
     if len(now) != len(fixed):
         raise ValueError(f"{len(now)} {name} at time code {code:g}, must stay {len(fixed)}")
@@ -416,10 +422,10 @@ def refuse_change(name, now, fixed, code):
 
 
 def refuse_moving_topology(prim):
-    """Refuses faces or curves that change over time: a cloth has one topology.
+    """Checks that faces or curves do not change over time.
 
     Raises:
-        ValueError: They change; the message names the first entry that does.
+        ValueError: They change; the message names the first changed entry.
     """
     if prim.IsA(UsdGeom.Mesh):
         mesh = UsdGeom.Mesh(prim)
@@ -433,8 +439,10 @@ def refuse_moving_topology(prim):
 
 
 def face_corners(prim, count):
-    """Vertices (C,) int32 of the corners of a Mesh prim's faces, and the three corners of each triangle (T, 3), which run
-    counter-clockwise seen from the front in the prim's own space."""
+    """Vertices (C,) int32 of the corners of the faces of a Mesh prim, and the corners of each triangle (T, 3).
+
+    Triangles are counter-clockwise seen from the front in the space of the prim.
+    """
     mesh = UsdGeom.Mesh(prim)
     counts, corners = topology(mesh.GetFaceVertexCountsAttr()), topology(mesh.GetFaceVertexIndicesAttr())
     if len(counts) == 0:
@@ -447,7 +455,7 @@ def face_corners(prim, count):
     refuse_outside("faceVertexIndices", corners, count, "vertex")
     fan = triangles_of_faces(prim)
     start = np.repeat(np.cumsum(counts) - counts, fan)
-    # Position of each triangle within its polygon's fan.
+    # Index of each triangle in the fan of its polygon.
     step = np.arange(len(start)) - np.repeat(np.cumsum(fan) - fan, fan)
     fans = np.stack([start, start + step + 1, start + step + 2], axis=1)
     sides = (UsdGeom.Tokens.rightHanded, UsdGeom.Tokens.leftHanded)
@@ -455,10 +463,10 @@ def face_corners(prim, count):
 
 
 def triangles_of_faces(prim):
-    """Returns the number of triangles (F,) that each face of a Mesh prim is cut into; a hole has none.
+    """Returns the number of triangles (F,) of each face of a Mesh prim, 0 for a hole.
 
     Raises:
-        ValueError: The index of a hole is not that of a face.
+        ValueError: The index of a hole is not the index of a face.
     """
     mesh = UsdGeom.Mesh(prim)
     triangles = topology(mesh.GetFaceVertexCountsAttr()) - 2
@@ -469,7 +477,7 @@ def triangles_of_faces(prim):
 
 
 def curve_edges(prim, count):
-    """Pairs of points (E, 2) that the segments of linear curves join."""
+    """Pairs of points (E, 2): the segments of linear curves."""
     curves = UsdGeom.BasisCurves(prim)
     counts = topology(curves.GetCurveVertexCountsAttr())
     if (counts < 2).any():
@@ -487,7 +495,7 @@ def curve_edges(prim, count):
 
 
 def _texture_coordinates(prim, count, corners):
-    """`primvars:st` of vertices (n, 2), or else, where one has several (a seam), of the corners (C, 2); None of the other."""
+    """`primvars:st` at vertices (n, 2), or at corners (C, 2) if a vertex has several values (a seam); the other is None."""
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
     if not (primvar and primvar.HasValue()):
         return None, None
@@ -504,16 +512,17 @@ def _texture_coordinates(prim, count, corners):
 
 
 def pinned_points(prim, count):
-    """Points (p,) that a prim pins: those of GeomSubsets in the family "pins" or of that name, and those of `primvars:pins`.
+    """Pinned points (p,) of a prim: those of GeomSubsets with the family or the name "pins", and those of `primvars:pins`.
 
-    A subset of faces pins their corners. The primvar, a vertex group in Blender, pins points whose weight is a half or more.
+    A subset of faces pins their corners. The primvar (a vertex group in Blender) pins points with a weight of at least ½.
 
     Args:
         prim: A Mesh, or BasisCurves.
         count: Number of its points.
 
     Raises:
-        ValueError: A subset is not one of points or faces; the primvar has not one number for each point, or changes.
+        ValueError: The elements of a subset are not points or faces. Or the primvar changes over time, or does not have one
+            number per point.
     """
     pinned = np.zeros(count, dtype=bool)
     for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
@@ -542,7 +551,7 @@ def pinned_points(prim, count):
 
 
 def pins_of(prim, point_vertices, count):
-    """Sorted vertices (p,) int32 of every GeomSubset of points, by name."""
+    """Sorted vertices (p,) int32 of each GeomSubset of points, by name."""
     pins = {}
     for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
         if subset.GetElementTypeAttr().Get() == UsdGeom.Tokens.point:

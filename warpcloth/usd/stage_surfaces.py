@@ -1,4 +1,4 @@
-"""The meshes of a stage that may cross each other, with its colliders and the limits of stretch that it declares."""
+"""The meshes of a stage that may intersect, with its colliders and strain limits."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ class StageSurface:
 
     Attributes:
         stage: The `StageMesh`; its mesh, a `Surface`, is the rest shape.
-        points: Function that gives the points (n, 3) [m] in world space at a time code.
-        faces: The face of the prim that each triangle is cut from (T,).
-        limits: The limits that the prim declares, and the mesh that they are of.
+        points: Function (time code) → points (n, 3) [m] in world space.
+        faces: The face of the prim of each triangle (T,).
+        limits: The strain limits that the prim declares, and their mesh.
     """
 
     stage: StageMesh
@@ -41,12 +41,12 @@ class StageSurfaces:
 
     Attributes:
         surfaces: The meshes.
-        codes: Time codes of the frames (F,): those of all meshes.
-        rate: Time codes a second.
-        colliders: The colliders, whose keyframes are these frames.
-        others: Paths of the meshes that it shows beside these and the colliders.
+        codes: Time codes of the frames (F,) of all meshes.
+        rate: Time codes per second.
+        colliders: The colliders, with a keyframe at each frame.
+        others: Paths of the other visible meshes.
         files: Real paths of the files of the stage.
-        stage: The stage, whose prims are invalid once it is gone.
+        stage: The stage; the reference keeps its prims valid.
     """
 
     surfaces: list[StageSurface]
@@ -59,18 +59,18 @@ class StageSurfaces:
 
 
 def read_surfaces(path, prims=None):
-    """Reads the meshes of a stage that are cloths as `read_drawn` has it and no colliders, or those that are named.
+    """Reads the meshes of a stage that `read_drawn` takes for cloth, without colliders, or those that are named.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
         prims: Paths or names of prims, or None.
 
     Returns:
-        StageSurfaces: Of the points nothing but the first frame is read yet.
+        StageSurfaces: The meshes. Only the first frame of points is read yet.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no stage, or shows no such mesh; there is no such prim, or it is no mesh; a prim is broken.
+        ValueError: It is not a stage, or has no such mesh. Or a named prim is missing, is not a visible mesh, or is invalid.
     """
     drawn = read_drawn(path)
     with sentences(path):

@@ -1,4 +1,4 @@
-"""A prim whose attributes are sampled, and how a frame is expressed in its own space and units."""
+"""An animated prim, and its attributes for a frame in its own space and units."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -12,27 +12,27 @@ Interpolation = Literal["vertex", "uniform"]
 # Types of the attributes with one sample for each frame.
 SAMPLED = {"points": "point3f[]", "velocities": "vector3f[]", "normals": "normal3f[]", "extent": "float3[]"}
 DISPLAY_COLOUR = "primvars:displayColor"
-# Primvars that say something else already.
+# Primvars with another meaning.
 _TAKEN = ("normals", "st", "displayColor", "displayOpacity", VERTEX_PRIMVAR)
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The prim to animate, and all that a frame needs to be expressed in its own space and units.
+    """The prim to animate, with what is needed to express a frame in its space and units.
 
     Attributes:
         prim: Path of the prim.
         triangles: (T, 3), for normals; empty for curves.
-        transform: (4, 4) from the prim's space to metres, as in `StageMesh`; None where they are the same.
-        point_vertices: Vertex of each point of the prim, or None where they are the same.
-        half_width: How far the shape reaches around its points, in the prim's units; curves have a width.
-        face_triangles: Number of triangles of each face of the prim (F,), a hole 0, or None where each has one.
-        vectors: Names of the vectors that are sampled, of `SAMPLED`; curves are drawn as tubes, which need no normals.
-        primvars: Interpolation of each sampled primvar, "vertex" or "uniform", by name.
-        history: Type of each further primvar that is sampled, by name: "float3[]" of vertices, or "double" or "double3" of the
-            whole cloth, in SI and in world space whatever the prim is in.
-        vertices: The vertices of the whole that it has, a slice, or None of all.
-        coloured: Name of the primvar that a sampled displayColor shows, or None: no colours are sampled.
+        transform: (4, 4) from the space of the prim to metres, as in `StageMesh`; None for the identity.
+        point_vertices: Vertex of each point of the prim; None if points are vertices.
+        half_width: Half the width of curves, in the units of the prim, for the extent.
+        face_triangles: Number of triangles of each face of the prim (F,), 0 for a hole; None if each has one.
+        vectors: Names of the sampled vectors, from `SAMPLED`. Curves need no normals: they are drawn as tubes.
+        primvars: Interpolation of each sampled primvar by name, "vertex" or "uniform".
+        history: Types of the other sampled primvars by name: "float3[]" per vertex, or "double" or "double3" for the whole
+            cloth. They are in SI units and in world space.
+        vertices: Slice of the vertices of the mesh that belong to the prim; None for all.
+        coloured: Name of the primvar that displayColor shows; None if colours are not sampled.
     """
 
     prim: str
@@ -57,7 +57,7 @@ class Target:
         return {name: Sdf.ValueTypeNames.Find(type_name) for name, type_name in own.items()}
 
     def declare(self, layer, names):
-        """Makes sure that a layer has some of the sampled attributes, without giving them values."""
+        """Adds some of the sampled attributes to a layer, without values, if they are missing."""
         prim = layer.GetPrimAtPath(self.prim) or Sdf.CreatePrimInLayer(layer, self.prim)
         for name in names:
             if name not in prim.attributes:
@@ -71,14 +71,14 @@ class Target:
         """The attribute values of a frame.
 
         Args:
-            vectors: "points" (n, 3) [m], world space, and "velocities" (n, 3) [m/s], those that are sampled.
-            primvars: Values by name, (n,) or, where uniform, one for each triangle (T,). NaN is a value that is not known: a
-                face has the mean of the others.
-            colours: (n, 3) or (T, 3), as the primvar that they show; a face has the mean over its triangles with a value.
-            history: Values by name, (n, 3), (3,) or a number. NaN is a value that is not known.
+            vectors: "points" (n, 3) [m] in world space, and "velocities" (n, 3) [m/s] if sampled.
+            primvars: Values by name, (n,), or (T,) if uniform. NaN is an unknown value. A face gets the mean over its triangles
+                with a value.
+            colours: (n, 3) or (T, 3), as the primvar that they show. A face gets the mean over its triangles with a value.
+            history: Values by name, (n, 3), (3,) or a number. NaN is an unknown value.
 
         Returns:
-            dict: An array of pxr for each of `attributes`.
+            dict: A pxr array for each of `attributes`.
         """
         own = self._vectors({name: self._own(values) for name, values in vectors.items()})
         for name, values in (primvars or {}).items():
@@ -96,19 +96,19 @@ class Target:
         if colours is not None:
             known = np.isfinite(primvars[self.coloured])
             if self.primvars[self.coloured] == "uniform" and self.face_triangles is not None:
-                # A face without any value has the colour that says so, the mean over all its triangles.
+                # A face without a value gets the mean over all its triangles, which have the colour of unknown values.
                 counts = self.face_triangles[self.face_triangles > 0]
                 known |= np.repeat(~np.logical_or.reduceat(known, _starts(counts)), counts)
             shown = self._shown(colours, self.coloured, known)
-            own[DISPLAY_COLOUR] = Vt.Vec3fArray.FromNumpy(np.nan_to_num(shown, copy=False))  # nobody sees the colour of a hole
+            own[DISPLAY_COLOUR] = Vt.Vec3fArray.FromNumpy(np.nan_to_num(shown, copy=False))  # holes are invisible
         return own
 
     def _own(self, values):
-        """The rows of its own vertices."""
+        """The rows of the vertices of the prim."""
         return values if self.vertices is None else values[self.vertices]
 
     def _shown(self, values, primvar, known):
-        """Values for the prim's own points or faces, in float32."""
+        """Values for the points or faces of the prim, in float32."""
         if self.primvars[primvar] == "vertex":
             values = values if self.point_vertices is None else values[self.point_vertices]
         elif self.face_triangles is not None:
@@ -123,7 +123,7 @@ class Target:
             linear, offset = self.transform[:3, :3], self.transform[3, :3]
             inverse = np.linalg.inv(linear)
             for name, value in values.items():
-                # Normals are covectors: they stay at right angles to the surface, and on its front, under the transpose.
+                # Normals are covectors: the transpose keeps them perpendicular to the surface, and on its front.
                 if name == "normals":
                     values[name] = _unit(value @ linear.T)
                 else:
@@ -136,16 +136,16 @@ class Target:
         return {name: Vt.Vec3fArray.FromNumpy(value) for name, value in values.items()}
 
     def _extent(self, points):
-        # A column at a time: NumPy reduces a short last axis several times slower.
+        # By column: NumPy reduces over a short last axis several times slower.
         low, high = [c.min() for c in points.T], [c.max() for c in points.T]
         return np.array([low, high], dtype=np.float32) + np.float32([[-self.half_width], [self.half_width]])
 
 
 def check_primvars(primvars, mesh):
-    """Refuses primvars, interpolation by name, that a mesh cannot have.
+    """Checks primvars, given as interpolation by name.
 
     Raises:
-        ValueError: A name that is none or is taken, or an interpolation that is not "vertex" or, of triangles, "uniform".
+        ValueError: A name is invalid or taken, or an interpolation is not "vertex" or, for triangles, "uniform".
     """
     for name, interpolation in primvars.items():
         valid = isinstance(name, str) and Sdf.Path.IsValidNamespacedIdentifier(name) and not name.endswith(":indices")
@@ -160,9 +160,9 @@ def check_primvars(primvars, mesh):
 
 
 def vertex_normals(points, triangles):
-    """Unit normals (n, 3) of vertices: the normals of their triangles, weighted by area.
+    """Unit normals (n, 3) of vertices: area-weighted means of the normals of their triangles.
 
-    A vertex without area (isolated, or all its triangles collapsed) has no normal, and gets +y so that all have length 1.
+    A vertex without area (isolated, or with collapsed triangles only) gets +y.
 
     Args:
         points: (n, 3).
@@ -171,7 +171,7 @@ def vertex_normals(points, triangles):
     Returns:
         np.ndarray: (n, 3) float64.
     """
-    # Columns one by one: NumPy takes twice as long for rows of three.
+    # By column: NumPy takes twice as long for rows of three.
     corners = triangles.T.astype(np.intp)
     columns = [np.ascontiguousarray(column) for column in np.asarray(points).T]
     a, b = ([column.take(end) - column.take(corners[0]) for column in columns] for end in corners[1:])
@@ -196,7 +196,7 @@ def _starts(counts):
 
 
 def _face_means(values, known, face_triangles):
-    """Mean of each face over those of its triangles that have a value, NaN where none has, as a hole: (T, …) to (F, …)."""
+    """Means (F, …) of values (T, …) over the triangles of each face with a value; NaN without one, such as for a hole."""
     known = known.reshape(-1, *[1] * (values.ndim - 1))
     cut = face_triangles > 0
     starts = _starts(face_triangles[cut])

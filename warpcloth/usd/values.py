@@ -1,4 +1,4 @@
-"""Reads values of a stage with checks, so that a wrong value is refused by its name before any arithmetic uses it."""
+"""Reads and checks values of a stage. Errors name the attribute."""
 
 import os
 import textwrap
@@ -12,7 +12,7 @@ import numpy as np
 from ..base.checks import shown
 from .modules import Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-# Beyond it neighbouring time codes, which are float64, are more than 1e-7 apart and cannot tell frames apart.
+# Beyond it, neighbouring float64 time codes are more than 1e-7 apart, too far to distinguish frames.
 MOST_TIME_CODE = 1e9
 # Range of frames and time codes per second: from one in eleven days to one per microsecond.
 _RATES = (1e-6, 1e6)
@@ -24,18 +24,18 @@ _listening = False
 
 @contextmanager
 def sentences(path, raised=ValueError, what=""):
-    """Turns what pxr says about a file into sentences: errors are raised, and warnings become Python warnings.
+    """Context that turns errors of pxr about a file into exceptions, and warnings of pxr into Python warnings.
 
     Args:
         path: The file.
         raised: Type of the exception.
-        what: Text before the words of pxr.
+        what: Text before the message of pxr.
 
     Raises:
-        ValueError: pxr has reported an error; ``raised`` gives another type.
+        ValueError: pxr reported an error; ``raised`` gives another type.
     """
     global _listening
-    heard = None if _listening else UsdUtils.CoalescingDiagnosticDelegate()  # nested delegates would all get every message
+    heard = None if _listening else UsdUtils.CoalescingDiagnosticDelegate()  # every nested delegate would get all messages
     _listening = True
     try:
         yield
@@ -48,7 +48,7 @@ def sentences(path, raised=ValueError, what=""):
             _listening = False
             said = heard.TakeUncoalescedDiagnostics()
     if heard:
-        for text in dict.fromkeys(_plain(each.commentary) for each in said):  # not where an error says what is wrong
+        for text in dict.fromkeys(_plain(each.commentary) for each in said):  # not after an error
             warnings.warn(f"{path}: {text}", stacklevel=4)
 
 
@@ -59,15 +59,15 @@ def reason_of(error):
 
 
 def _plain(text):
-    """Shortens a text of pxr, without its line breaks and the address of the stage in memory."""
+    """A message of pxr, shortened, without line breaks and without the memory address of the stage."""
     return textwrap.shorten(text.partition(" (instantiating stage on")[0], 500, placeholder=" …")
 
 
 def refuse_path(path):
-    """Refuses a path that no layer can refer to.
+    """Checks that a layer can refer to a path.
 
     Raises:
-        ValueError: It has control characters, such as a line break, or is not UTF-8.
+        ValueError: The path has control characters, such as a line break, or is not UTF-8.
     """
     text = os.fspath(path)
     if any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
@@ -75,10 +75,10 @@ def refuse_path(path):
 
 
 def check_stage(stage, path):
-    """Refuses units, rates and times that no stage can have.
+    """Checks the layers, the up axis, units, rates and times of a stage.
 
     Raises:
-        ValueError: One is not finite, or not above 0; the up axis is neither Y nor Z; a layer below is missing; the end is
+        ValueError: A sublayer is missing, the up axis is neither Y nor Z, a unit, rate or time is out of range, or the end is
             before the start.
     """
     for error in stage.GetCompositionErrors():
@@ -106,10 +106,10 @@ def check_stage(stage, path):
 
 
 def check_composed(prim, path):
-    """Refuses a prim that is incomplete because a file that it or a prim above it refers to is missing.
+    """Checks that no file is missing to which a prim or an ancestor refers.
 
     Raises:
-        ValueError: pxr could not compose it.
+        ValueError: pxr could not compose the prim.
     """
     for error in prim.GetStage().GetCompositionErrors():
         if prim.GetPath().HasPrefix(error.rootSite.path) or error.rootSite.path.HasPrefix(prim.GetPath()):
@@ -125,7 +125,7 @@ def value_of(attribute, time=None):
     """Returns the value of an attribute at a time code, or at the default time; None if it has none.
 
     Raises:
-        ValueError: The file is broken there, or holds a type that Python does not have.
+        ValueError: The file is broken there, or the value has a type that Python does not have.
     """
     try:
         with redirect_stderr(StringIO()):  # pxr prints a value that it cannot convert to Python
@@ -137,10 +137,10 @@ def value_of(attribute, time=None):
 
 
 def token_of(attribute, allowed):
-    """Returns the value of an attribute that takes one of some words.
+    """Returns the value of an attribute with a fixed set of tokens.
 
     Raises:
-        ValueError: It has another value.
+        ValueError: The value is not one of ``allowed``.
     """
     value = value_of(attribute)
     if value not in allowed:
@@ -168,10 +168,10 @@ def checked_rows(name, value, components=(), whole=False):
 
 
 def refuse_outside(name, numbers, count, what):
-    """Refuses numbers that are not indices from 0 to ``count`` − 1.
+    """Checks that numbers are indices from 0 to ``count`` − 1.
 
     Raises:
-        ValueError: One is out of range; the message names the first.
+        ValueError: A number is out of range; the message names the first.
     """
     wrong = (numbers < 0) | (numbers >= count)
     if wrong.any():
@@ -180,10 +180,10 @@ def refuse_outside(name, numbers, count, what):
 
 
 def refuse_unknown(name, values, where="", infinite=False):
-    """Refuses numbers that are not finite, or with ``infinite`` only NaN.
+    """Checks that numbers are finite, or with ``infinite`` only that none is NaN.
 
     Raises:
-        ValueError: There is one; the message names the first.
+        ValueError: A number is not; the message names the first.
     """
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     for entry in np.argwhere(wrong)[:1].tolist():
@@ -195,7 +195,7 @@ def time_codes_of(attribute):
     """Lists the time codes of the samples of an attribute.
 
     Raises:
-        ValueError: A time code is too large to be told from its neighbours.
+        ValueError: A time code is larger than `MOST_TIME_CODE`.
     """
     codes = attribute.GetTimeSamples()
     for code in codes:

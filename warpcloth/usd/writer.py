@@ -1,4 +1,4 @@
-"""Writing an animation: the motion of a cloth, and numbers that go with it."""
+"""Writes an animation: the motion of a cloth, and data per vertex, triangle or frame."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,22 +17,22 @@ from .targets import Interpolation, check_primvars
 
 
 class AnimationWriter(ChunkWriter):
-    """Writes frames of a cloth as USD: `ChunkWriter` says in what files.
+    """Writes frames of a cloth as USD; see `ChunkWriter` for the files.
 
-    With a source the result is a layer over the artist's stage, which it sublayers by a relative path and never
-    changes: it has opinions on points, velocities, normals, extent and subdivisionScheme of one prim, in that prim's
-    own space and units, and blocks accelerations and `primvars:normals`, which would be used instead. Time codes start
-    at the source's own first one (at the same second, where fps differs from its time codes per second), or else at 0.
+    With a source, the result is a layer over the artist's stage, a sublayer with a relative path that is never changed. The
+    layer has opinions on points, velocities, normals, extent and subdivisionScheme of one prim, in its space and units. It
+    blocks accelerations and `primvars:normals`, which would take precedence. Time codes start at the first one of the source
+    (at the same second, if fps differs from its time codes per second), else at 0.
 
-    Numbers that go with the motion are float primvars, `primvars:<name>`, sampled as the points are. An artist's faces
-    with more corners than three have the mean over the triangles that they were cut into.
+    Data are float primvars, `primvars:<name>`, sampled like the points. A face of a source with more than three corners gets
+    the mean over its triangles.
 
-    Edge meshes become linear BasisCurves along paths of edges (a chain: one curve, its vertices in order); where curves
-    meet each has a point for the vertex, and `primvars:warpcloth:vertex` says which vertex a point is. Lines are curves of the
-    same kind beside a mesh of triangles.
+    Edge meshes become linear BasisCurves along paths of edges; a chain is one curve with its vertices in order. Where curves
+    meet, each has its own point, and `primvars:warpcloth:vertex` gives the vertex of each point. Lines are such curves beside a
+    mesh of triangles.
 
     Attributes:
-        path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
+        path: The file to open: the output, or for .usdz before `close` a root layer in the folder.
         frames: Number of frames appended.
     """
 
@@ -53,31 +53,31 @@ class AnimationWriter(ChunkWriter):
         history: Mapping[str, str] | None = None,
         cloths: Mapping[str, str] | None = None,
     ) -> None:
-        """Checks everything that can be checked before the first frame; writes nothing yet.
+        """Checks the arguments. Nothing is written before the first frame.
 
         Args:
-            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file. Of a link the file that it stands
-                for is written, with the folder beside that; viewers find the frames through a link in the same folder only.
+            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file. For a symbolic link, its target is
+                written, with the folder beside it; viewers then find the frames only through a link in the same folder.
             mesh: The `Mesh`; its points are the rest shape. With a source: as read from it.
             fps: Frames per second; also time codes per second.
             source: A stage to write a layer over, or None.
-            prim: Of a source: path or name of the prim. Without: name of the prim under /World, "Cloth" if None.
-            pins: Vertex indices by name, written as GeomSubsets in the family "pins". A source has its own.
-            up_axis: "Y" or "Z", by default that of the mesh; a source has its own.
-            chunk: Frames of a chunk: what a killed process may lose, and what is held in memory.
-            metadata: More to keep in the root layer's customLayerData["warpcloth"]: names with numbers or texts.
-            primvars: Interpolation of each primvar that `append` will be given, by name: "vertex", a value for each
-                vertex, or "uniform", one for each triangle.
+            prim: With a source, path or name of the prim. Else name of the prim under /World, by default "Cloth".
+            pins: Vertex indices by name, written as GeomSubsets in the family "pins". Not used with a source.
+            up_axis: "Y" or "Z", by default that of the mesh. Not used with a source.
+            chunk: Number of frames that are held in memory and written together. A killed process loses at most these.
+            metadata: Further entries of customLayerData["warpcloth"] of the root layer: numbers or texts by name.
+            primvars: Interpolation of each primvar of `append` by name: "vertex", a value per vertex, or "uniform", one per
+                triangle.
             lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth;
                 `lines.lines_of` finds those of a scene. Not allowed with a source.
-            colliders: Drawn as gprims under /World/Colliders, with their motion; a layer over a source has none.
-            history: Type of each primvar of the history of a run, by name: "float3[]", a vector for each vertex, or "double3"
-                or "double", a vector or a number of the whole cloth; of several cloths the first has those of the whole.
-            cloths: For a mesh whose parts have a prim each, the prims by part: names under /World, or with a source paths.
-                Primvars are not allowed then.
+            colliders: Written as gprims under /World/Colliders, with their motion; not with a source.
+            history: Types of the primvars of the history of a run, by name: "float3[]", a vector per vertex, or "double3" or
+                "double", a vector or a number for the whole cloth. With several cloths, the first has those of the whole.
+            cloths: Prims by part, if each part of the mesh has its own prim: names under /World, or with a source paths.
+                Primvars are then not allowed.
 
         Raises:
-            FileNotFoundError: The output's folder or the source does not exist.
+            FileNotFoundError: The folder of the output or the source does not exist.
             ValueError: A parameter is not as above, or the output is a file of the source's stage.
         """
         super().__init__(output, mesh, chunk)
@@ -96,12 +96,12 @@ class AnimationWriter(ChunkWriter):
             for vertices, own, name in others:
                 target = define_cloth(rest, own, _pins_of(pins, vertices), name)
                 targets.append(replace(target, history=_of_vertices(history), vertices=vertices))
-            # Clips have samples alone; a name, type and interpolation have to stand on the stage itself.
+            # Clips contain only samples; name, type and interpolation must be on the stage itself.
             for target in targets:
                 target.declare(rest, [f"primvars:{name}" for name in (*target.primvars, *target.history)])
             targets += define_lines(rest, mesh, lines or {})
             define_colliders(rest, colliders, mesh)
-            if colliders:  # whose keyframes are in this layer, and would be read at 24 a second otherwise
+            if colliders:  # their keyframes are in this layer, which has 24 time codes per second by default
                 rest.timeCodesPerSecond = float(fps)
         else:
             for name, given in (("pins", pins), ("lines", lines)):
@@ -133,17 +133,17 @@ class AnimationWriter(ChunkWriter):
         primvars: Mapping[str, ArrayLike] | None = None,
         history: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        """Adds a frame; every `chunk` frames they are written.
+        """Adds a frame. Frames are written when there are `chunk` of them.
 
         Args:
             points: (n, 3) [m], world space.
             velocities: (n, 3) [m/s].
-            primvars: Values by name of all primvars that were declared, (n,) or, where uniform, (T,).
-            history: Values by name of all that `history` declared, (n, 3), (3,) or a number, in SI and in world space.
+            primvars: Values of all declared primvars by name, (n,), or (T,) if uniform.
+            history: Values of all declared history primvars by name, (n, 3), (3,) or a number, in SI units and world space.
 
         Raises:
-            ValueError: Other primvars than declared, a wrong shape, or a value that is not finite as float32, with the
-                frame and the vertex or triangle; the writer is closed.
+            ValueError: Primvars are not those declared, a shape is wrong, or a value is not finite as float32; the message
+                names the frame and the vertex or triangle. Or the writer is closed.
         """
         self._check_open()
         vectors = {"points": self._checked("points", points), "velocities": self._checked("velocities", velocities)}
@@ -162,14 +162,14 @@ class AnimationWriter(ChunkWriter):
 
 
 def _of_part(mesh, name, prim):
-    """The vertices of a part, its mesh and the prim."""
+    """The vertices of a part (a slice), its mesh and its prim."""
     own = mesh.part(name)
     first = (mesh.parts or {})[name].first
     return slice(first, first + len(own.points)), own, prim
 
 
 def _pins_of(pins, vertices):
-    """Pins by name, those among the vertices of a part, counted from its first."""
+    """Pins by name among the vertices of a part, as indices in the part."""
     if vertices is None or not pins:
         return pins
     found = {name: np.asarray(given) for name, given in pins.items()}
@@ -178,15 +178,15 @@ def _pins_of(pins, vertices):
 
 
 def _of_vertices(history):
-    """The types of the primvars of a history that have a value for each vertex."""
+    """The types of the history primvars with a value per vertex."""
     return {name: kind for name, kind in history.items() if kind == "float3[]"}
 
 
 class _MovingSpace:
-    """The space of an artist's prim whose transform is animated, frame by frame.
+    """The space of a prim of the source with an animated transform, frame by frame.
 
     Args:
-        transform_at: The transform (4, 4) at a time code.
+        transform_at: Function (time code) → transform (4, 4).
         stage: The `StageMesh`.
         fps: Frames per second.
     """
@@ -196,9 +196,9 @@ class _MovingSpace:
         self._first, self._rate = stage.start or 0.0, stage.time_codes_per_second / fps
 
     def at(self, frame, points, velocities):
-        """The transform (4, 4) at a frame, and velocities (n, 3) [m/s] relative to the space that carries the points there.
+        """The transform (4, 4) at a frame, and the velocities (n, 3) [m/s] relative to the moving space.
 
-        The velocity of the space is that of the way since the frame before, as that of moving pins.
+        The velocity of the space is its displacement since the frame before, times fps, as for moving pins.
         """
         now = self._transform_at(self._first + frame * self._rate)
         if frame == 0:
