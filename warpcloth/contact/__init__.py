@@ -1,1 +1,1 @@
-"""Contact on a device: the motion of colliders, anchors of friction, contact of cloth with itself, and the filters of steps."""
+"""Contact on a device: motion of colliders, anchors of friction, self-contact, and the filters of steps."""

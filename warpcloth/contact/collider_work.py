@@ -1,4 +1,4 @@
-"""The work of moving colliders, against friction, and of the filter of colliders, all summed over steps."""
+"""Work of moving colliders, work against friction, and work of the collider filter, summed over steps."""
 
 import warp as wp
 
@@ -13,13 +13,13 @@ from .present import ColliderPulls, PresentContact
 
 
 class ColliderWork:
-    """Sums the works of the steps of one stepper, with the forces that its steps took.
+    """Sums the work over the steps of one stepper, from the forces that its steps used.
 
     Args:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the stepper.
         terms: The elements as its steps take them.
-        cuts: The :class:`FilterWork` of the stepper, which is launched before.
-        of_colliders, against_friction, of_filter: Sums of each vertex, (N,) float64 [J].
+        cuts: The :class:`FilterWork` of the stepper, which must be launched before.
+        of_colliders, against_friction, of_filter: Sums per vertex, (N,) float64 [J].
         hard: See :class:`warpcloth.contact.present.ColliderPulls`.
     """
 
@@ -49,7 +49,7 @@ class ColliderWork:
         self._surface = model.kernel(surface_moves, model.dtype) if self._deform else None
 
     def begin(self, found, vertices):
-        """Begins where the pulls are ``found``, of which it has those in the slice ``vertices``."""
+        """Sets the state before the first step from the pulls ``found``, of which it takes the slice ``vertices``."""
         if self._at_end:
             for before, now in zip(self._before, found, strict=True):
                 wp.copy(before.all, now.all[vertices])
@@ -57,7 +57,7 @@ class ColliderWork:
                     wp.copy(before.friction, now.friction[vertices])
 
     def launch(self):
-        """Launches the sums, after a step."""
+        """Launches the sums after a step."""
         model, colliders = self.model, self.colliders
         if self._half_way:
             model.launch(self._half_way, model.count, [colliders.x_before, self._x], [self._x_step])
@@ -72,7 +72,7 @@ class ColliderWork:
             model.launch(self._add, model.count, given, [before, *self._sums])
 
     def _launch_limit(self):
-        """Limits what an unconverged step has as forces of contact: f = −M(x − x̃)/hₑ² − ∇U of all else."""
+        """Limits the contact forces of an unconverged step by f = −M(x − x̃)/hₑ² − ∇U of all other terms."""
         model, (momentum, add, limit) = self.model, self._limit
         self._given.zero_()
         self._taken.zero_()
@@ -85,7 +85,7 @@ class ColliderWork:
             model.launch(limit, model.count, [self._given, self._taken], [now])
 
     def _launch_moves(self, c, x, poses, when, out):
-        """The moves of the material of collider c at positions x, half steps after the step began."""
+        """Launches out = displacements of the material of collider c at x, ``when`` half steps after the start of the step."""
         model, colliders = self.model, self.colliders
         if c in self._deform:
             meshes = colliders.meshes
@@ -96,15 +96,15 @@ class ColliderWork:
 
 
 class FilterWork:
-    """Sums the energy that the filter of colliders gives to the cloth of one stepper, see :meth:`launch`.
+    """Sums the energy that the collider filter adds to the cloth of one stepper, see :meth:`launch`.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`, which follows contact.
-        of_filter: Sums of each vertex, (N,) float64 [J].
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`, with contact.
+        of_filter: Sums per vertex, (N,) float64 [J].
 
     Attributes:
-        uncut: Positions where the last step would have ended without the filter, (N,) [m].
-        cuts: Whether it cut the move of each vertex, (N,) int32, see :mod:`warpcloth.kernels.work`.
+        uncut: Positions (N,) [m] after the last step without the filter.
+        cuts: Whether the filter shortened the move of each vertex, (N,) int32, see :mod:`warpcloth.kernels.work`.
     """
 
     def __init__(self, stepper, of_filter):
@@ -132,10 +132,10 @@ class FilterWork:
             wp.copy(before, now)
 
     def launch(self):
-        """Launches the sums, after a step: ½Σ m v² − Σ (m g + f)·x + U of all but contact, less that of the unfiltered step.
+        """Launches the sums after a step: ½Σ m v² − Σ (m g + f)·x + U without contact, minus that of the unfiltered step.
 
-        Contact works up to where the filter cuts too, but stores nothing there. What it stores in the end, less what it stored
-        before and less this work, is therefore work of the filter; :class:`ColliderWork` adds the last.
+        The change of the contact energy in a filtered step, minus the work of contact along the unfiltered step, is also work
+        of the filter. :class:`ColliderWork` adds the latter.
         """
         model, colliders, (x, v) = self.model, self._stepper.colliders, self._stepper.state
         force = None if model.loads is None else model.loads.force
@@ -153,7 +153,7 @@ class FilterWork:
         self._contact.add(self._stepper.state.x, self._scratch)
 
     def elastic(self):
-        """The part of the sums that is U of all but contact, (B,) [J], which it sets back to 0."""
+        """Returns the part of the sums from U without contact, (B,) [J], and resets it to 0."""
         found = self._found.numpy() - self._without.numpy()
         for array in (self._found, self._without):
             array.zero_()

@@ -1,4 +1,4 @@
-"""Colliders that are triangle meshes in the steps of a solver."""
+"""Mesh colliders in the steps of a solver."""
 
 import numpy as np
 import warp as wp
@@ -8,18 +8,18 @@ from ..kernels.terms.contact import AREA
 
 
 class MeshSteps:
-    """The trees of meshes, the facets of vertices and the anchors on meshes, in the steps of one solver.
+    """The bounding volume hierarchies of mesh colliders, the facets of vertices and the friction anchors, for one solver.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model` of a scene with meshes among its colliders.
-        poses: Those of the step, a :func:`warpcloth.kernels.colliders.step_poses`.
-        bounded: Whether it is that of an explicit method.
-        resting: Whether it is that of an equilibrium, whose vertices may move any distance from where they are.
+        model: The :class:`warpcloth.model.model.Model` of a scene with mesh colliders.
+        poses: Poses of the step, a :func:`warpcloth.kernels.colliders.step_poses`.
+        bounded: Whether the method is explicit.
+        resting: Whether the solver finds an equilibrium, where vertices may move any distance.
         **given: The numbers and ``steps`` of :func:`warpcloth.kernels.mesh_colliders.motions`.
 
     Attributes:
         geometry: See :class:`warpcloth.model.device_meshes.DeviceMeshes`.
-        motion: The struct of these.
+        motion: Struct :func:`warpcloth.kernels.mesh_colliders.motions`.
         given: The numbers and ``steps``, by name.
     """
 
@@ -37,7 +37,7 @@ class MeshSteps:
             self._bound = model.kernel(kernels.bound_triangles, model.dtype)
 
     def _set_lists(self):
-        """Lists of the triangles near vertices, for explicit steps, which are short."""
+        """Allocates lists of the triangles near vertices, for explicit steps, in which vertices move little."""
         model, scene = self.model, self.model.scene
         meshes = [c for c, tree in enumerate(self._meshes.trees) if tree is not None]
         dim, rows = (len(meshes), model.count), np.full(len(scene.colliders), -1, np.int32)
@@ -45,7 +45,7 @@ class MeshSteps:
         balls = np.zeros((*dim, 4))
         balls[..., 3] = -1.0
         steps = self.motion.per_frame / 2
-        self._kept = {  # whose memory the struct does not keep
+        self._kept = {  # the struct holds no references
             "row": wp.array(rows, dtype=wp.int32, device=model.device),
             "drift": model.array([scene.colliders[c].deforms.max(initial=0.0) / steps for c in meshes], model.dtype),
             "ball": model.array(balls, wp.types.vector(4, model.dtype)),
@@ -57,7 +57,7 @@ class MeshSteps:
             setattr(self.lists, name, value)
 
     def launch_trees(self):
-        """Fits the trees of meshes that deform to the step."""
+        """Launches the refit of the hierarchies of deforming meshes to the step."""
         for c in self._meshes.deform:
             tree = self._meshes.trees[c]
             given = [self.geometry, c, self.motion.steps, self.motion.per_frame]
@@ -65,10 +65,10 @@ class MeshSteps:
             tree.refit()
 
     def contact(self, elements):
-        """The function (elements, x, v) that launches the rest states of contact with one facet where a step begins.
+        """Function (elements, x, v) that launches the rest states of contact with one facet at the start of a step.
 
         Args:
-            elements: Those of the model, in the order of their facets.
+            elements: The contact elements of the model, in the order of their facets.
         """
         model, c = self.model, elements.collider
         pose = model.kernel(kernels.pose_facets, model.dtype)
@@ -89,10 +89,10 @@ class MeshSteps:
         return launch
 
     def friction(self, elements, friction, anchors):
-        """The function (elements, x, v) that launches the anchors of a step on one mesh.
+        """Function (elements, x, v) that launches the friction anchors of a step on one mesh.
 
         Args:
-            elements: Those of the model.
+            elements: The friction elements of the model.
             friction: μ.
             anchors: The array of anchors (N,).
         """

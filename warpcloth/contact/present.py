@@ -1,4 +1,4 @@
-"""Contact and friction at the current state of a solver: their energies, and the forces on each collider."""
+"""Contact and friction in the current state of a solver: energies, and forces on each collider."""
 
 from dataclasses import replace
 from functools import partial
@@ -14,17 +14,17 @@ from .mesh_steps import MeshSteps
 
 
 class PresentContact:
-    """The elements of a model with the colliders where they are now, and the anchors that the next step would take.
+    """The elements of a model for the current poses of colliders, and the anchors that the next step would use.
 
-    Those of a step are not at hand: they may be half-way or of the start of the step, and are then not of one state.
+    Elements of a step cannot be used, for they may be those of the middle or the start of the step.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        parts: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of all copies, and the first copy and the one after
-            the last that each has; none for the colliders where they start.
+        parts: Tuples (:class:`warpcloth.contact.collider_steps.ColliderSteps`, first copy, last copy + 1), for all copies.
+            Empty for colliders at their start.
 
     Attributes:
-        terms: The elements of all terms, those of contact and friction with rest states of their own.
+        terms: The elements of all terms; contact and friction have their own rest states.
     """
 
     def __init__(self, model, parts=()):
@@ -38,7 +38,7 @@ class PresentContact:
         self._poses, self._moved = (kernels.step_poses(model.dtype)() for _ in range(2))
         self._poses.at, after = (wp.zeros(self._dim, dtype=pose_type, device=model.device) for _ in range(2))
         self._poses.before = self._poses.after = self._moved.before = self._moved.at = self._poses.at
-        self._moved.after = after  # of the next step, which nothing reads
+        self._moved.after = after  # poses after the next step, which are not read
         self._given = [declared.keyframes, declared.firsts, self._steps, steps.steps_per_frame, 0]
         self._move, self._shapes, self._least = model.kernel(kernels.move_colliders, model.dtype), steps.shapes, steps.least
         self._meshes = None
@@ -69,7 +69,7 @@ class PresentContact:
         return own
 
     def launch(self, x, v):
-        """Sets the rest states to those of positions x and velocities v, (N,)."""
+        """Launches the rest states at positions x (N,) [m] and velocities v (N,) [m/s]."""
         if not self._launches:
             return
         for steps, first, end in self._parts:
@@ -97,16 +97,16 @@ class PresentContact:
 
 
 class ColliderPulls:
-    """∂U/∂x of contact and friction with each collider, with which the cloth pulls at it.
+    """∂U/∂x of contact and friction with each collider, which is the force of the cloth on it.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        terms: Elements, of which it takes those of colliders that are not hard.
-        hard: Function of an index that makes what adds ∂U/∂x of hard contact with that collider to an array (N,) by its
-            multipliers, or None.
+        terms: Elements; those of soft contact and of friction are used.
+        hard: Function (index) → launcher that adds ∂U/∂x of hard contact with that collider to an array (N,), from its
+            multipliers; or None.
 
     Attributes:
-        found: A :func:`warpcloth.kernels.work.collider_pulls` of each collider.
+        found: A :func:`warpcloth.kernels.work.collider_pulls` for each collider.
         hard: Whether contact is hard.
     """
 
@@ -126,7 +126,7 @@ class ColliderPulls:
             self._adds.append((add, Gradient(model, terms=friction) if friction else None, hidden))
 
     def launch(self, x):
-        """Finds them at x (N,)."""
+        """Launches ∂U/∂x at x (N,)."""
         for found, (contact, friction, hidden) in zip(self.found, self._adds, strict=True):
             found.all.zero_()
             if contact is not None:
@@ -139,7 +139,7 @@ class ColliderPulls:
                 friction.add(x, found.friction)
 
     def sums(self, copies):
-        """The forces of the cloth on the colliders, and of them the part of friction, (B, C, 2, 3) [N]."""
+        """Forces of the cloth on the colliders: total, and the part of friction, (B, C, 2, 3) [N]."""
 
         def of(array):
             return array.numpy().astype(np.float64).reshape(copies, -1, 3).sum(axis=1) if array else np.zeros((copies, 3))

@@ -1,4 +1,4 @@
-"""Finds pairs of a vertex and a triangle, and of two edges, that are near one another, on the device and in a fixed order."""
+"""Finds vertex–triangle pairs and edge–edge pairs that are near one another, on the device and in a fixed order."""
 
 import numpy as np
 import warp as wp
@@ -13,27 +13,27 @@ BYTES_OF_A_PAIR = 56
 
 
 class Proximity:
-    """The pairs of a vertex and a triangle, and of two edges, that are near one another in a copy of a model.
+    """The vertex–triangle pairs and edge–edge pairs that are near one another in each copy of a model.
 
-    A pair is found if it is nearer than r_c + skin. r_c is the contact distance, but at most half of what two elements of one
-    connected piece are apart at rest. Pairs that share a vertex do not count, nor do coordinates that are not finite. Meshes of
-    edges alone have pairs of edges alone.
+    A pair is listed if its distance is below r_c + skin. r_c is the contact distance, but at most half the rest distance of two
+    elements of one connected piece. Pairs with a common vertex or with coordinates that are not finite are not listed. Edge
+    meshes have only edge–edge pairs.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         distance: The contact distance r [m].
-        skin: By how much more pairs are sought [m]: until two vertices have come nearer by so much, none is missing.
+        skin: Skin of the list [m]. The list is complete until two vertices have approached one another by the skin.
 
     Attributes:
-        capacity: How many pairs there is room for.
-        stencils: (capacity,) vertices of the model: (v, a, b, c) of the pairs of a vertex and a triangle, sorted, and then
-            (a, b, c, d) of the pairs of the edges ab and cd.
-        distances: (capacity,) r_c of each [m].
-        counts: (2,) int32: how many pairs of either kind were found, which may be more than the capacity.
-        rows: Pairs rows[i] to rows[i+1] are those of vertex i and a triangle; those of edges follow, by the first of the two.
-        found: Positions of the last list, (N,) [m]. Whoever sets them calls :meth:`launch_kept` before the list is used.
+        capacity: Number of pairs that the arrays can hold.
+        stencils: (capacity,) vertices of the model: (v, a, b, c) of vertex–triangle pairs, sorted, then (a, b, c, d) of
+            pairs of edges ab and cd.
+        distances: (capacity,) r_c of each pair [m].
+        counts: (2,) int32, numbers of pairs found of each kind, which may exceed the capacity.
+        rows: Pairs rows[i] to rows[i+1] are the vertex–triangle pairs of vertex i. Those of edges follow, by their first edge.
+        found: Positions of the last list, (N,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
         flag, copies: (1,) and (B,) int32, see :meth:`moved`.
-        listed: Positions of which the list in the arrays is, (N,) [m].
+        listed: Positions (N,) [m] of the list that is in the arrays.
         centre: The vertex in the middle of each connected piece of all copies.
     """
 
@@ -43,7 +43,7 @@ class Proximity:
         mesh, n, device = model.scene.mesh, model.per_copy, model.device
         self._triangles, self._edges = len(mesh.triangles) * model.copies, len(mesh.edges) * model.copies
         piece, points = self._connected(model.in_model(mesh.edges))
-        self._kept = {  # whose memory the struct does not keep
+        self._kept = {  # the struct holds no references
             "items": wp.array(self._items(), dtype=wp.vec4i, device=device),
             "rest": model.array(points, model.vec3),
             "piece": wp.array(piece, dtype=wp.int32, device=device),
@@ -54,8 +54,8 @@ class Proximity:
             setattr(self._surface, name, value)
         self._allocate_grid()
         self._set_pieces(piece, points)
-        self.found = model.vectors()  # no surface, from which all have moved
-        self.listed = model.vectors()  # those of the pairs in the arrays
+        self.found = model.vectors()  # all 0, so that the first call makes a list
+        self.listed = model.vectors()
         self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.copies = model.scalars(wp.int32)
         self._rows = Scan(model, model.count + self._edges)
@@ -73,7 +73,7 @@ class Proximity:
         self._allocate(max(1024, 4 * model.count))
 
     def _items(self):
-        """The vertices of the triangles of all copies, and then of the edges, with 2·copy + kind, (items, 4) int32."""
+        """Vertices of the triangles, then of the edges, of all copies, each with 2·copy + kind, (items, 4) int32."""
         model, mesh = self.model, self.model.scene.mesh
         kinds = []
         for kind, elements in enumerate((mesh.triangles, mesh.edges[:, [0, 1, 1]])):
@@ -83,7 +83,7 @@ class Proximity:
         return np.concatenate(kinds).astype(np.int32)
 
     def _connected(self, edges):
-        """The connected piece of each vertex, −1 of one of no element, and rest points about the middle of each piece."""
+        """The connected piece of each vertex (−1 without an element), and rest points relative to the middle of their piece."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -95,7 +95,7 @@ class Proximity:
         return np.where(sizes[piece] > 1, piece, -1).astype(np.int32), points - middle[piece]
 
     def _set_pieces(self, piece, points):
-        """Numbers the pieces of all copies, and takes the vertex nearest to the middle of each."""
+        """Numbers the pieces of all copies, and finds the vertex nearest to the middle of each."""
         model = self.model
         used, numbers = np.unique(piece[piece >= 0], return_inverse=True)
         number = np.full(model.per_copy, -1)
@@ -156,14 +156,14 @@ class Proximity:
             setattr(self._pairs, name, value)
 
     def set_skin(self, skin):
-        """Sets another skin; the list is then made anew wherever :meth:`launch_kept` is called."""
+        """Sets another skin [m]; the next :meth:`launch_kept` makes a new list."""
         self._surface.skin = skin
         self.listed.fill_(np.nan)
 
     def launch_moved(self, x):
-        """Launches the detection at x (N,) in ``copies``, and where it was before in the others.
+        """Launches the detection at x (N,) in ``copies``, and at the previous positions in the others.
 
-        So the pairs of a copy do not depend on the others.
+        So the pairs of a copy do not depend on other copies.
         """
         self._launch(kernels.take_moved, self.model.count, [x, self.copies, self.model.per_copy], [self.found])
         self.launch(self.found)
@@ -194,27 +194,31 @@ class Proximity:
         self._launch(kernels.extend_boxes, self.model.count, [x], [self._pieces])
 
     def launch_kept(self, x, part, launch):
-        """Launches ``launch`` of x where :meth:`moved` says so, else of ``found`` if the list is not that of ``found``.
+        """Calls ``launch`` at x if :meth:`moved` sets the flag, else at ``found`` if the list is not that of ``found``.
 
-        So the list is a function of x and ``found`` alone, whatever was listed since ``found`` was set.
+        So the list depends only on x and ``found``, not on lists made since ``found`` was set.
         """
         flag = self.moved(x, part)
         wp.capture_if(flag, launch, lambda x: wp.capture_if(self._stale, lambda: launch(self.found)), x=x)
 
     def moved(self, x, part=0.5, active=None):
-        """Launches flag = 1 where pairs may be missing at x (N,), else 0, and returns it; for :func:`warp.capture_if`.
+        """Launches flag = 1 if pairs may be missing at x (N,), else 0, and returns it, for :func:`warp.capture_if`.
 
-        ``copies`` are 1 of those of which pairs may be missing.
+        ``copies`` is 1 for copies in which pairs may be missing.
 
-        It is 0 while each vertex has moved by at most a ``part`` of the skin since the last detection, relative to the vertex
-        in the middle of its connected piece. Two pieces may have come nearer by twice that, and by as much as their boxes were
-        farther apart than the contact distance and the skin. So sheets that fall together, or far apart, need no detection.
+        The flag is 0 while each vertex has moved by at most the fraction ``part`` of the skin since the last detection,
+        relative to the vertex in the middle of its connected piece. Two pieces may also have approached one another by twice
+        that, plus the excess of the distance of their boxes over the contact distance and the skin. So sheets that fall
+        together, or far apart, need no detection.
 
         Args:
-            x: Positions [m].
-            part: At most ½, at which no pair within its r_c is missing where the flag is 0. With less, vertices may still move
-                by a ½ − ``part`` of the skin each, relative to one another, before one is.
-            active: The copies that count (B,) int32, or None for all.
+            x: Positions (N,) [m].
+            part: At most ½. If the flag is 0, no pair within its r_c is missing, also after each vertex moves by another
+                fraction ½ − ``part`` of the skin.
+            active: Copies that count (B,) int32; None for all.
+
+        Returns:
+            wp.array: The flag, (1,) int32.
         """
         for array in (self.flag, self.copies, self._stale):
             array.zero_()
@@ -231,16 +235,16 @@ class Proximity:
 
     @property
     def overflowed(self):
-        """Whether the last detection found more pairs than there is room for, read on the host."""
+        """Whether the last detection found more pairs than the capacity; waits for the device."""
         return self._mirror.read().sum(dtype=np.int64) > self.capacity
 
     @in_turn
     def grow(self, count=None):
-        """Allocates room for half as many pairs more than a ``count``, by default those that the last detection found.
+        """Allocates room for 1.5 times ``count`` pairs, by default the number that the last detection found.
 
-        What was recorded with the old arrays must be recorded anew.
+        Graphs recorded with the old arrays must be recorded again.
 
         Raises:
-            ValueError: There is no memory for it.
+            ValueError: There is not enough memory.
         """
         self._allocate(int(1.5 * (self._mirror.read().sum(dtype=np.int64) if count is None else count)))

@@ -1,4 +1,4 @@
-"""Forces of contact between near parts of cloth, in the steps of a solver."""
+"""Self-contact forces in the steps of a solver."""
 
 import numpy as np
 import warp as wp
@@ -10,14 +10,14 @@ from ..kernels.fast import pair_scatter
 class SelfForces:
     """Energy, gradient, second derivatives and sweeps of the pairs of a :class:`warpcloth.contact.self_steps.SelfSteps`.
 
-    They include friction, if there is any.
+    They include friction.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         bounded: Whether contact is that of explicit steps, without the logarithm.
 
     Attributes:
-        energies: Those of the pairs by their first vertex, (N,) [J].
+        energies: Energies of pairs, summed by their first vertex, (N,) [J].
         friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
     """
 
@@ -32,7 +32,7 @@ class SelfForces:
         self._find = model.kernel(self_contact.find_forces, model.dtype, bounded)
 
     def hold(self, pairs, begun):
-        """Takes the arrays of pairs, and allocates as much room for their forces.
+        """Takes the arrays of pairs, and allocates arrays for their forces.
 
         Args:
             pairs: :func:`warpcloth.kernels.self_pairs.near_pairs`.
@@ -60,7 +60,7 @@ class SelfForces:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_forces(self, x, correction=None):
-        """Finds the forces of the pairs at x, or x + correction, which the methods below add up."""
+        """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""
         if self.model.device.is_cpu:
             self._found.count.zero_()
         self.model.launch(self._find, len(self.pairs.stencils), [self.pairs, self.begun, x, correction], [self._found])
@@ -68,7 +68,7 @@ class SelfForces:
             self.friction.launch_forces(x, correction)
 
     def _sum(self, gather, scatter, inputs, outputs):
-        """Launches a sum over pairs: one thread of the CPU takes them in turn, other devices take vertices."""
+        """Launches a sum over pairs: ``scatter`` in one thread on the CPU, ``gather`` over vertices on other devices."""
         if self.model.device.is_cpu:
             self._launch(scatter, 1, inputs, outputs)
         else:
@@ -90,7 +90,7 @@ class SelfForces:
         sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
 
     def add_stored(self, sums, out):
-        """out (B,) += the part of U that is of the springs of friction."""
+        """out (B,) += the energy of the friction springs."""
         if self.friction is not None:
             self.energies.zero_()
             self.friction.add_energies(self.energies)
@@ -104,7 +104,7 @@ class SelfForces:
             self.friction.add_diagonal(diagonal, values)
 
     def add_products(self, p, q, active):
-        """q += A p of its blocks off the diagonal, for the copies that are ``active`` (B,)."""
+        """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
         given = [self.pairs, self.model.inverse_mass, self._found, p, active, self.model.per_copy]
         self._sum(self_contact.add_products, pair_scatter.scatter_products, given, [q])
         if self.friction is not None:
@@ -112,13 +112,12 @@ class SelfForces:
         self.model.lock(q)
 
     def rows(self):
-        """Of the pairs that press at the last :meth:`launch_forces`: J, whose rows are wᵢn, and kAφ″; the host reads them.
+        """The Hessian ∂²U/∂x² = JᵀDJ of the pairs in contact at the last :meth:`launch_forces`; waits for the device.
 
-        Friction has rows of its own, along the plane normal to n.
+        Rows of J are wᵢn, with kAφ″ in D. Friction adds rows in the plane normal to n.
 
         Returns:
-            J, scipy (pairs, 3N) without columns of what does not move, and D, scipy diagonal (pairs, pairs) [N/m]; ∂²U/∂x² is
-            JᵀDJ.
+            J, scipy (pairs, 3N), with columns of 0 for pinned coordinates, and D, scipy diagonal (pairs, pairs) [N/m].
         """
         from scipy.sparse import csr_matrix, diags
 
@@ -137,7 +136,7 @@ class SelfForces:
         return J, diags(bend)
 
     def sweeps(self, in_turn):
-        """Says that sweeps will move pairs in turn, or all at once, as devices with many threads must."""
+        """Prepares sweeps: Gauss–Seidel (``in_turn``), or Jacobi for devices with many threads."""
         model, key = self.model, (self.model.dtype, self.model.mobility is not None)
         if self.friction is not None:
             self.friction.sweeps(in_turn)
@@ -155,14 +154,14 @@ class SelfForces:
         self.hold(self.pairs, self.begun)
 
     def launch_sweep(self, x, correction, h, adds, backward=False):
-        """Moves the vertices of all pairs, see :func:`warpcloth.kernels.self_sweeps.sweep_pairs` and its neighbours.
+        """Launches a sweep over all pairs, see :mod:`warpcloth.kernels.self_sweeps`.
 
         Args:
             x: x̃ (N,) [m].
             correction: d (N,) [m].
             h: Step [s].
-            adds: Whether multipliers add up over sweeps; else pairs are hard.
-            backward: Whether pairs move from the last to the first, where they move in turn.
+            adds: Whether multipliers accumulate over sweeps; else pairs are hard.
+            backward: Whether a Gauss–Seidel sweep goes from the last pair to the first.
         """
         if self.friction is not None and backward:
             self.friction.launch_sweep(x, correction, h, backward)
@@ -171,7 +170,7 @@ class SelfForces:
             self.friction.launch_sweep(x, correction, h, backward)
 
     def launch_sweep_start(self, x):
-        """Launches λ = 0 of all pairs, where sweeps begin at x̃ (N,)."""
+        """Launches λ = 0 for all pairs before the first sweep, at x̃ (N,)."""
         self.multipliers.zero_()
         if self._touching is None:
             self._launch(self_sweeps.find_clearances, len(self.pairs.stencils), [self.pairs, self.begun, x], [self._clearance])

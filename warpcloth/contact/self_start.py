@@ -1,6 +1,6 @@
-"""Starts of cloth with self-contact: which are refused, because cloth crosses itself or is too near to itself.
+"""Checks that cloth with self-contact does not start with intersections or gaps that are too small.
 
-All is computed in float64, without exact predicates.
+Everything is computed in float64, without exact predicates.
 """
 
 import numpy as np
@@ -11,17 +11,17 @@ from .tangles import Tangles
 
 
 def check_start(contact, state):
-    """Refuses a start at which cloth crosses cloth, or is nearer than the filter lets it come; or finds its tangles.
+    """Checks that cloth does not start with intersections, or with gaps below the smallest gap of the filter.
 
     Args:
         contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
         state: The :class:`warpcloth.core.state.State` of the solver, to which tangles add their own arrays.
 
     Returns:
-        The :class:`warpcloth.contact.tangles.Tangles` of a start that ``crossing_start="run"`` takes, else None.
+        With ``crossing_start="run"``, the :class:`warpcloth.contact.tangles.Tangles` of such a start; else None.
 
     Raises:
-        ValueError: Naming the first pair.
+        ValueError: Such a pair exists, without ``crossing_start="run"``. The message names the first.
     """
     near, split, gap, through, least = _too_near(contact, contact.model.positions)
     if not len(near) and not through:
@@ -35,7 +35,7 @@ def check_start(contact, state):
 
 
 def check_reset(contact, mask, x):
-    """Refuses a reset of copies to positions at which cloth crosses or nearly touches cloth.
+    """Checks the positions of a reset of copies, as :func:`check_start`.
 
     Args:
         contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
@@ -43,10 +43,10 @@ def check_reset(contact, mask, x):
         x: Positions (B·n, 3) [m].
 
     Raises:
-        ValueError: Naming the first pair.
+        ValueError: Cloth intersects or nearly touches cloth; the message names the first pair.
     """
     model = contact.model
-    x = np.where(np.repeat(mask, model.per_copy)[:, None], x, np.nan)  # which has no pairs
+    x = np.where(np.repeat(mask, model.per_copy)[:, None], x, np.nan)  # NaN has no pairs
     tangles, contact.tangles = contact.tangles, None
     with contact.looking():
         found = _too_near(contact, wp.array(x, dtype=model.vec3, device=model.device))
@@ -72,13 +72,13 @@ def _refuse_pair(model, parts, why):
 
 
 def _too_near(contact, x):
-    """Lists the pairs at x (N,) and finds those that are too near, and edges that cross triangles.
+    """Lists the pairs at x (N,), and finds those that are too near, and edges that intersect triangles.
 
-    An edge that crosses a triangle is near an edge of it, and that pair is listed.
+    An edge that intersects a triangle is near one of its edges, so that this pair is listed.
 
     Returns:
-        Pairs nearer than the least distance, how many of them are of a vertex, the gap of the first [m], edges that go
-        through triangles, and the least distance [m].
+        Pairs below the smallest distance, the number of vertex–triangle pairs among them, the gap of the first [m], edges that
+        intersect triangles, and the smallest distance [m].
     """
     points = x.numpy().astype(np.float64)
     contact.launch_begin_at_start(x, _longest_edge(contact.model, points))
@@ -100,14 +100,14 @@ def _too_near(contact, x):
 
 
 def _longest_edge(model, points):
-    """The length [m] of the longest edge of all copies; edges may be longer than at rest where a run starts."""
+    """Length [m] of the longest edge of all copies at the start, which may be longer than at rest."""
     points = points.reshape(model.copies, -1, 3)[:, model.in_model(model.scene.mesh.edges)]
     lengths = np.linalg.norm(points[:, :, 1] - points[:, :, 0], axis=2)
     return lengths.max(initial=0.0, where=np.isfinite(lengths))
 
 
 def _triangles_of(model, edges):
-    """The triangles of the model that each of some edges (E, 2) is in, (E, m, 3); the last again where they are fewer."""
+    """The triangles (E, m, 3) that contain the edges (E, 2); the last is repeated if there are fewer than m."""
     mesh, n = model.scene.mesh, model.per_copy
     triangles = np.asarray(model.in_model(mesh.triangles), dtype=np.int64)
     sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -122,12 +122,12 @@ def _triangles_of(model, edges):
 
 
 def crossings(points, edges, triangles):
-    """Finds the edges that go through triangles.
+    """Finds the edges that intersect triangles.
 
     Args:
         points: (N, 3) [m].
         edges: (E, 2).
-        triangles: (E, m, 3): of each edge those that it is compared with.
+        triangles: (E, m, 3), the triangles to test with each edge.
 
     Returns:
         List of (edge (2,), triangle (3,)).

@@ -1,4 +1,4 @@
-"""Triangles that cross or touch where a run starts: which pairs contact leaves out for them, and until when."""
+"""Triangles that intersect or touch at the start of a run, and the pairs that contact therefore ignores at first."""
 
 import numpy as np
 import warp as wp
@@ -7,25 +7,25 @@ from ..kernels import tangles as kernels
 
 
 class Tangles:
-    """Pairs of triangles that cross or touch at the start, and the pairs of contact that are left out for them.
+    """Pairs of triangles that intersect or touch at the start, and the contact pairs that are ignored for them.
 
-    A vertex that goes through a triangle changes which triangles cross: each triangle of the vertex, with that triangle. Two
-    edges that go through one another change it for each triangle of the one with each of the other. The filter leaves out a
-    pair of contact only if all these pairs of triangles are tangled, so that no others come to cross; forces leave it out if
-    one of them is. Two triangles are free once they neither cross nor are nearer than ``least`` at the end of a step. Then they
-    stay so, for the filter has all their pairs.
+    A contact pair affects certain pairs of triangles. When a vertex passes through a triangle, each triangle of the vertex
+    starts or stops to intersect that triangle. When two edges pass through one another, this holds for each triangle of one
+    with each of the other. The filter ignores a contact pair only if all these pairs of triangles are tangled, so that no new
+    intersections arise. Forces ignore it if one of them is tangled. Two triangles become free when they do not intersect and
+    are at least ``least`` apart at the end of a step. They then stay free, for the filter has all their pairs.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds which pairs are free.
-        edges: Edges (E, 2) that go through triangles, vertices of the model.
+        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds the flags of free pairs.
+        edges: Edges (E, 2) that intersect triangles, vertices of the model.
         triangles: These triangles (E, 3).
-        near: Pairs of contact that are too near, two lists of (m, 4): of a vertex and a triangle, and of two edges.
+        near: Contact pairs that are too near, two lists of (m, 4): vertex–triangle pairs, and edge–edge pairs.
         least: Distance [m] from which two triangles are free.
 
     Attributes:
-        pairs: The triangles of each tangled pair, (K, 2) indices in the mesh.
-        copies: The copy of each, (K,).
+        pairs: The tangled pairs of triangles, (K, 2) indices in the mesh.
+        copies: The copy of each pair, (K,).
     """
 
     def __init__(self, model, state, edges, triangles, near, least):
@@ -57,32 +57,32 @@ class Tangles:
 
     @property
     def free(self):
-        """Which have come free, (K,) 0 or 1."""
+        """Whether each pair is free, (K,) 0 or 1."""
         return self._left.free.numpy()
 
     def left(self):
-        """How many pairs of triangles have not come free yet, (B,)."""
+        """The number of pairs of triangles that are not free, (B,)."""
         return np.bincount(self.copies[self.free == 0], minlength=self.model.copies)
 
     def start_again(self):
-        """Forgets which have come free."""
+        """Makes all pairs tangled again."""
         self._left.free.zero_()
 
     def launch_leave_out(self, stencils, counts, gap):
-        """Sets the gap [m] of pairs that are left out to infinity, at which there is no contact."""
+        """Launches gap = infinity [m] for ignored pairs, so that they have no contact."""
         self.model.launch(kernels.leave_out, len(stencils), [stencils, counts, self._left], [gap])
 
     def launch_open(self, stencils, counts, open):
-        """Finds the pairs that no plane divides."""
+        """Launches open = 1 for the pairs that the filter ignores."""
         self.model.launch(kernels.find_open, len(stencils), [stencils, counts, self._left], [open])
 
     def launch_free(self, x):
-        """Notes which triangles are free at x (N,)."""
+        """Launches the update of the free pairs at x (N,)."""
         self.model.launch(self._free, len(self._keys), [self._corners, x, self.least], [self._left.free])
 
 
 class _Incidence:
-    """Which triangles and edges of all copies meet, by indices that count through the copies."""
+    """Incidence of the triangles and edges of all copies, with indices that count through the copies."""
 
     def __init__(self, triangles, model):
         self.per_copy, n = len(triangles), model.per_copy
@@ -97,29 +97,29 @@ class _Incidence:
         self._of_edge = _table(self.edges, len(self._edge_keys))
 
     def edge(self, ends):
-        """Indices (m,) of edges by their ends (m, 2)."""
+        """Indices (m,) of the edges with the ends (m, 2)."""
         ends = np.sort(np.asarray(ends, dtype=np.int64).reshape(-1, 2), axis=1)
         return np.searchsorted(self._edge_keys, ends[:, 0] * self.vertices + ends[:, 1])
 
     def triangle(self, corners):
-        """Indices (m,) of triangles by their vertices (m, 3): those of an edge of each that have its third vertex too."""
+        """Indices (m,) of the triangles with the vertices (m, 3)."""
         corners = np.sort(np.asarray(corners, dtype=np.int64).reshape(-1, 3), axis=1)
         around = self._of_edge[self.edge(corners[:, :2])]
         has = (self.triangles[around] == corners[:, None, 2:]).any(axis=2) & (around >= 0)
         return around[np.arange(len(corners)), has.argmax(axis=1)]
 
     def key(self, one, other):
-        """A number for each pair of triangles, −1 where one is none, or both are one."""
+        """A unique number for each pair of triangles; −1 if one is missing, or both are the same."""
         keys = np.minimum(one, other) * self.count + np.maximum(one, other)
         return np.where((one >= 0) & (other >= 0) & (one != other), keys, -1)
 
     def of_crossings(self, edges, triangles):
-        """Pairs of triangles that cross where edges (m, 2) go through triangles (m, 3)."""
+        """Keys of the pairs of triangles that intersect if edges (m, 2) intersect triangles (m, 3)."""
         keys = self.key(self._of_edge[self.edge(edges)], self.triangle(triangles)[:, None])
         return keys[keys >= 0]
 
     def of_near(self, stencils, first):
-        """Pairs of triangles of which contact has these pairs (m, 4), the first side of which has so many vertices."""
+        """Keys of the pairs of triangles of contact pairs (m, 4), the first ``first`` vertices of which are one side."""
         stencils = np.asarray(stencils, dtype=np.int64).reshape(-1, 4)
         if first == 1:
             keys = self.of_vertices(stencils[:, 0], self.triangle(stencils[:, 1:]))
@@ -128,20 +128,20 @@ class _Incidence:
         return keys[keys >= 0]
 
     def of_vertices(self, vertices, triangles):
-        """Pairs of triangles that come to cross, or cease to, where vertices (m,) go through triangles (m,): (m, k) keys."""
+        """Keys (m, k) of the pairs of triangles affected if vertices (m,) pass through triangles (m,), see :class:`Tangles`."""
         return self.key(self._of_vertex[vertices], triangles[:, None])
 
     def of_edges(self, one, other):
-        """Likewise where edges (m,) go through edges (m,)."""
+        """As :meth:`of_vertices`, if edges (m,) pass through edges (m,)."""
         keys = self.key(self._of_edge[one][:, :, None], self._of_edge[other][:, None, :])
         return keys.reshape(len(one), self._of_edge.shape[1] ** 2)
 
     def left_out(self, tangled):
-        """The pairs of contact between triangles in ``tangled`` (K,), sorted keys.
+        """The contact pairs between the pairs of triangles ``tangled`` (K,), sorted keys.
 
         Returns:
-            How many are of a vertex and a triangle; their vertices (P, 4), sorted; whether all of their pairs of triangles are
-            tangled (P,); offsets (P + 1,) in the indices of those that are; these indices.
+            The number of vertex–triangle pairs; the vertices (P, 4), sorted; whether all of their pairs of triangles are
+            tangled (P,); offsets (P + 1,) in the indices of the tangled ones; these indices.
         """
         one, other = np.divmod(tangled, self.count)
         stencils, tables = [], []
@@ -170,7 +170,7 @@ class _Incidence:
 
 
 def _table(members, count):
-    """For each of ``count`` numbers the rows of ``members`` (T, 3) that have it, (count, k) with −1 after the last."""
+    """For each of ``count`` numbers, the rows of ``members`` (T, 3) that contain it, (count, k), filled with −1."""
     order = np.argsort(members.ravel(), kind="stable")
     numbers = members.ravel()[order]
     sizes = np.bincount(numbers, minlength=count)
