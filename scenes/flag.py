@@ -1,4 +1,4 @@
-"""A flag on a pole that oscillates about its axis: keyframes move the pins. There is no wind."""
+"""A flag on a pole that oscillates about its axis, by keyframes of its pins, or stands in the wind."""
 
 import numpy as np
 
@@ -13,8 +13,10 @@ def scene(
     stiffness: float = 1e3,
     bending: float = 1e-5,
     duration: float = 3.0,
+    wind: float = 0.0,
 ):
-    """Vertices along and down, amplitude [°], period [s], springs [N/m], bending [N·m], duration [s]."""
+    """Vertices along and down, amplitude [°], period [s], springs [N/m], bending [N·m], duration [s], wind [m/s]."""
+    wc.checks.number("wind", wind)
     wc.checks.number("swing", swing, least=0.0)
     wc.checks.number("period", period, above=0.0)
     wc.checks.number("duration", duration, above=0.0)
@@ -34,6 +36,7 @@ def scene(
         positions=upright,
         terms=[wc.Spring(pairs=("structural", "shear"), stiffness=stiffness), wc.QuadraticBending(stiffness=bending)],
         pins=wc.Pins(held, keyframes),
+        air=wc.Air(wind=(wind, 0.0, 0.3 * wind)) if wind else None,
         duration=duration,
         fps=fps,
         name="flag",

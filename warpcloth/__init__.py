@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .run.equilibrium import equilibrium as equilibrium
     from .run.simulate import Animation as Animation
     from .run.simulate import simulate as simulate
+    from .scene.air import Air as Air
     from .scene.colliders import Box as Box
     from .scene.colliders import Capsule as Capsule
     from .scene.colliders import Contact as Contact
@@ -79,6 +80,7 @@ _MODULES = {
     "equilibrium": "run.equilibrium",
     "Animation": "run.simulate",
     "simulate": "run.simulate",
+    "Air": "scene.air",
     "Box": "scene.colliders",
     "Capsule": "scene.colliders",
     "Contact": "scene.colliders",

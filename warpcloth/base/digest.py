@@ -22,7 +22,7 @@ def scene_digest(scene):
     if mesh.parts:
         facts += [(name, *part) for name, part in mesh.parts.items()]
     facts += [scene.colliders, scene.contact] if scene.colliders else []
-    facts += [] if scene.self_contact is None else [scene.self_contact]
+    facts += [each for each in (scene.self_contact, scene.air) if each is not None]
     return digest_of((*facts, scene.terms, scene.pins, scene.free_axes, scene.gravity, float(scene.fps), *scene.loads))
 
 

@@ -61,13 +61,13 @@ class ExplicitStep:
         self._move_ahead = model.kernel(kernels.move_ahead, model.dtype)
         self._step = model.kernel(kernels.explicit_step, model.dtype, symplectic, compensated)
         self._given = [model.inverse_mass, *model.free_gravity, h]
-        self._per_frame = round(1.0 / (model.scene.fps * h))
+        self._time = {"steps": count, "per_frame": round(1.0 / (model.scene.fps * h)), "he": h}
 
     def launch(self, steps, move_pins):
         """Launches this number of steps, and calls ``move_pins(pins, keyframes, count, x, v)`` after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
-            model.refresh(STEP, Moment(x, steps=self._pins[-1], per_frame=self._per_frame))
+            model.refresh(STEP, Moment(x, integrator="explicit", v=v, **self._time))
             model.refresh(STEP, Moment(x), self._damped)
             self._elastic.add(x, self.gradient, self.residual)
             if self._damped:

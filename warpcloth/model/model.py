@@ -11,6 +11,7 @@ from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..kernels.step import lock
 from ..kernels.term import Term
+from ..kernels.terms.air import AIR
 from ..kernels.vectors import types
 from ..mesh.selection import distinct_vertices
 from ..terms.refresh import STEP, Moment
@@ -120,15 +121,18 @@ class Model:
             if not scene.pins.held.all():
                 self.pin_axes = self.array(scene.pins.held, self.vec3)
         self.loads = None
-        if scene.loads:
+        if scene.loads or scene.air_terms:  # forces that explicit steps take of each vertex
             if self._vertex_gravity is None:
                 self._vertex_gravity = self._put("gravity", "m/s²", np.repeat(gravity, self.per_copy, axis=1), self.vec3)
+        if scene.loads:
             self.loads = loads_on(self, scene.loads, vary, self._vertex_gravity)
             self.loads.set(self, Moment(self.positions))
         for copy, start in enumerate(positions if vary.has("positions") else positions[:1]):
             scene.refuse_inside(start, f" in copy {copy}" if copies > 1 else "")
         self.colliders = colliders_on(self, scene)
-        self.terms = tuple(elements_on(self, term, positions, vary) for term in (*scene.terms, *scene.contact_terms))
+        declared = (*scene.terms, *scene.contact_terms, *scene.air_terms)
+        self.terms = tuple(elements_on(self, term, positions, vary) for term in declared)
+        self.refresh(STEP, Moment(self.positions), [each for each in self.terms if each.term is AIR])  # uploads keyframes
         vary.refuse_rest()
 
     def _set_order(self, order):
@@ -157,6 +161,13 @@ class Model:
     def uniform(self):
         """Whether gravity is the same for all vertices of a copy: there is no load and no locked coordinate."""
         return self._vertex_gravity is None
+
+    @property
+    def timed(self):
+        """Whether pins, loads or wind follow keyframes, so that steps are counted."""
+        air = self.scene.air
+        blown = air is not None and air.keyframes is not None
+        return self.pins is not None or blown or (self.loads is not None and self.loads.timed)
 
     @property
     def local_mobility(self):

@@ -60,7 +60,8 @@ class Euler:
 
     def _time(self, parts):
         """Fields of a Moment for loads with keyframes: one keyframe step ahead, of which a step has ``parts``."""
-        return {"steps": self.stepper.count, "per_frame": parts * self.stepper.steps_per_frame, "ahead": 1}
+        given = {"steps": self.stepper.count, "per_frame": parts * self.stepper.steps_per_frame, "ahead": 1}
+        return {**given, "v": self.stepper.state.v, "he": self.he}
 
     def launch_prediction(self):
         """Launches x = x̃, v = (x̃ − x₀)/hₑ, and the move of pins by a part of the step."""

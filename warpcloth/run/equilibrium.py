@@ -185,6 +185,11 @@ def equilibrium(
 
 def _with_colliders_at_rest(scene):
     """Returns the scene with static colliders at their last keyframes; raises ValueError if there is friction."""
+    if scene.air is not None:
+        raise ValueError(
+            "the scene has air, whose forces follow from velocities and normals and from no energy; run it with damping until "
+            "it rests"
+        )
     for collider in scene.colliders:
         if collider.friction:
             raise ValueError(

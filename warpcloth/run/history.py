@@ -17,6 +17,7 @@ from ..core.energy import Energy
 from ..core.sums import Sums
 from ..fast.plan import plan
 from ..kernels import work as kernels
+from ..kernels.terms.air import AIR
 from ..kernels.terms.friction import FRICTION
 from ..model.damping import dissipations
 from ..scene.scene import Scene
@@ -98,7 +99,9 @@ class Evaluation:
         self._pairs = pairs if stepper is None else stepper.pairs
         shares = [] if stepper is None or model.colliders is None else stepper.shares
         self._present = PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
-        self._terms = self._present.terms
+        present = self._present.terms
+        self._terms = tuple(each for each in present if each.term is not AIR)
+        self._blown = tuple(each for each in present if each.term is AIR)
         self.hidden = forces and stepper is not None and any(elements.hard for elements in model.terms)
         self._pins, self._held = model.in_model(model.scene.pins.vertices), model.scene.pins.held
         self._mass = model.mass.numpy().astype(np.float64).reshape(model.copies, -1)
@@ -107,7 +110,7 @@ class Evaluation:
         self.names = energy_names(model.scene)
         self._term_names = _term_names(model.scene)
         self.names_of_friction = [
-            name for name, each in zip(self._term_names, model.terms, strict=True) if each.term is FRICTION
+            name for name, each in zip(self._term_names, self._terms, strict=True) if each.term is FRICTION
         ]
         if not forces:
             return
@@ -118,6 +121,8 @@ class Evaluation:
             self.pulls = ColliderPulls(model, self._terms, stepper and stepper.constraint_forces)
         soft = tuple(elements for elements in self._terms if not elements.hard and elements.collider is None)
         self._elastic = plan(model).gradient(terms=soft) if soft else None
+        self._of_air = plan(model).gradient(terms=self._blown) if self._blown and h else None
+        self._time = {} if stepper is None else _time_of(stepper)
         self._damped = dissipations(model, h) if h else []
         if self._damped:
             self._dissipative = plan(model).gradient(corrected=True, terms=self._damped)
@@ -136,6 +141,10 @@ class Evaluation:
                 model.launch(self._add, model.count, [found.all, 1.0], [self.gradient])
         if self._elastic:
             self._elastic.add(x, self.gradient)
+        if self._of_air is not None:
+            moment = Moment(x, v=v, he=self._h, integrator="explicit", **self._time)
+            model.refresh(STEP, moment, self._blown)
+            self._of_air.add(x, self.gradient)
         if self._damped:
             model.launch(self._back, model.count, [x, v, self._h], [self._before, self._move])
             model.refresh(STEP, Moment(self._before), self._damped)
@@ -198,6 +207,17 @@ class Evaluation:
 
     def _host(self, array):
         return array.numpy().astype(np.float64).reshape(*self._mass.shape, 3)
+
+
+def _time_of(stepper):
+    """When the wind is taken after a step, as of a :class:`warpcloth.terms.refresh.Moment`."""
+    air = stepper.model.scene.air
+    if air is None or air.keyframes is None:
+        return {}
+    if len(stepper.shares) > 1:
+        raise ValueError("record has forces, and wind follows keyframes in a batch that threads share; take threads=1")
+    per_frame = stepper.steps_per_frame if stepper.integrator is None else stepper.integrator.moment.per_frame
+    return {"steps": stepper.count, "per_frame": per_frame}
 
 
 def _kept(name):

@@ -9,6 +9,7 @@ from functools import cached_property, singledispatch
 import numpy as np
 
 from ..numerics.rotation import kabsch
+from ..scene.air import Air
 from ..scene.colliders import Collider
 from ..scene.scene import Pins
 from ..solvers.solver import Stepper
@@ -269,3 +270,34 @@ class MovingCollider(Source):
         speeds = 2.0 * self._speeds[: frame + 1]
         lifted = self._gravity * self._lifts[min(frame, len(self._lifts) - 1)]
         return self._balance.total * (0.5 * (speeds**2).sum() + speeds.sum() * speed + lifted)
+
+
+@source_of.register
+def _blowing(air: Air, balance, _stepper):
+    return Wind(air, balance) if air.speed or balance.free else None
+
+
+class Wind(Source):
+    """Wind w on a cloth of area A, which gives at most the power Σ ½ρA(C_n + C_t)(w + |v|)w².
+
+    The force is c(w − v) with c ≤ ½ρAC(w + |v|), so its power is at most cw²/4; the factor 4 is for areas that grow and for
+    triangles that are faster than the mean. To a cloth that nothing holds, whose energy is that about its centre of mass, the
+    wind is the true one less the velocity of the centre, at most that of the start and of a free fall.
+    """
+
+    name = "wind"
+    carried = ("_given",)
+
+    def __init__(self, air, balance):
+        model = balance.model
+        self._given, self._fps, self._wind, self._faster = np.zeros(model.copies), model.scene.fps, air.speed, 0.0
+        if balance.free:
+            self._wind += np.linalg.norm(model.velocities.numpy(), axis=1).max(initial=0.0)
+            self._faster = np.linalg.norm(model.gravity.numpy(), axis=1) / self._fps
+        area = model.scene.mesh.triangle_areas.sum()
+        self._factor = 0.5 * air.density * area * (air.normal_drag + air.tangential_drag) / self._fps
+
+    def energy(self, frame, speed):
+        wind = self._wind + frame * self._faster
+        self._given = self._given + self._factor * (wind + speed) * wind**2
+        return self._given

@@ -12,7 +12,7 @@ from ..mesh.selection import distinct_vertices
 # Fields of the whole scene, which default to the value of the cloths if all have the same.
 _COMMON = ("gravity", "duration", "fps")
 # Fields of the whole scene that cloths must not set.
-_WHOLE = ("colliders", "contact", "self_contact")
+_WHOLE = ("colliders", "contact", "self_contact", "air")
 
 
 def fields_of_cloths(cloths, whole):

@@ -17,6 +17,8 @@ from ..model.model import Model
 from ..terms.contact import VertexContact, VertexFriction
 from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
+from ..terms.triangle_air import TriangleAir
+from .air import Air
 from .colliders import Collider, Contact, checked_colliders, default_stiffness, refuse_inside
 from .fabric import Fabric
 from .joining import fields_of_cloths, pins_of_cloths
@@ -115,6 +117,7 @@ class Scene:
             has no effect without colliders.
         self_contact: The :class:`warpcloth.SelfContact` of the cloth with itself; its stiffness is then computed. None if cloth
             passes through cloth.
+        air: The :class:`warpcloth.Air` around the cloth, with its wind; None for none.
         cloths: Names of the cloths of a scene that :meth:`join` made, the parts of the mesh; else empty. In files each is a
             prim of its own.
         fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, in place of ``density`` and ``terms``, which it sets.
@@ -147,6 +150,7 @@ class Scene:
     colliders: Converted[Iterable[Collider], tuple[Collider, ...]] = default(())
     contact: Contact | None = None
     self_contact: SelfContact | None = None
+    air: Air | None = None
     cloths: tuple[str, ...] = ()
     fabric: InitVar[Fabric | str | None] = None
 
@@ -161,7 +165,7 @@ class Scene:
         Args:
             cloths: A scene for each name, which must be an identifier. Cloths must not have colliders or contact.
             **whole: Fields of the whole scene: gravity, duration and fps, by default those of the cloths if all have the same;
-                colliders, contact, self_contact and name; and further terms, such as seams, on the vertices of all cloths.
+                colliders, contact, self_contact, air and name; and further terms, such as seams, on the vertices of all cloths.
 
         Raises:
             ValueError: There is no cloth, a name is not an identifier, meshes cannot be joined, or a field is not allowed.
@@ -179,7 +183,7 @@ class Scene:
     @property
     def declared(self) -> tuple[object, ...]:
         """Pins, terms, loads and colliders, all of which may do work on the cloth."""
-        return (self.pins, *self.terms, self.loads, *self.colliders)
+        return (self.pins, *self.terms, self.loads, *self.colliders, self.air)
 
     def __post_init__(self, fabric: Fabric | str | None) -> None:
         if not isinstance(self.mesh, Mesh):
@@ -225,6 +229,7 @@ class Scene:
         keep("colliders", checked_colliders(self.colliders))
         keep("contact", self._checked_contact())
         keep("self_contact", self._checked_self_contact())
+        self._check_air()
         self.refuse_inside(self.positions)
 
     def _refuse_with_fabric(self):
@@ -317,6 +322,25 @@ class Scene:
             if collider.friction:
                 found.append(VertexFriction(name=f"friction on {collider.label}", **given))
         return tuple(found)
+
+    def _check_air(self):
+        if not (self.air is None or isinstance(self.air, Air)):
+            raise ValueError(f"air is {shown(self.air)}; it must be an Air or None")
+        T = len(self.mesh.triangles)
+        if self.air is not None and not T:
+            raise ValueError("air is given for a mesh without triangles; it must be None")
+        if self.air is not None and self.air.keyframes is None and self.air.winds.shape not in ((3,), (T, 3)):
+            raise ValueError(f"air.wind has shape {self.air.winds.shape}; it must be (3,), or ({T}, 3), one for each triangle")
+
+    @property
+    def air_terms(self) -> tuple[TriangleAir, ...]:
+        """The term of the air, if there is some that resists."""
+        air = self.air
+        if air is None or not air.density:
+            return ()
+        given = {"keyframes": air.winds} if air.keyframes is not None else {"wind": air.winds}
+        given |= {"normal_drag": air.normal_drag, "tangential_drag": air.tangential_drag}
+        return (TriangleAir(name="Air", stiffness=air.density, **given),)
 
     @property
     def rubbing(self) -> list[int]:
@@ -423,6 +447,8 @@ class Scene:
             lines.append(f"  contact: distance {self.contact.distance:g} m, stiffness {self.contact.stiffness:.4g} Pa/m")
         if self.self_contact is not None:
             lines.append(f"  {_described(self.self_contact)}")
+        if self.air is not None:
+            lines.append(f"  {_described(self.air)}")
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
 
 

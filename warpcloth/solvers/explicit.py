@@ -10,6 +10,7 @@ import numpy as np
 from ..base.turns import in_turn
 from ..core.hessian import Hessian
 from ..fast.plan import plan
+from ..kernels.terms.air import AIR
 from ..model.damping import dissipations
 from ..model.host_values import host_values
 from ..model.model import Model
@@ -91,6 +92,7 @@ class Explicit(Step):
         """
         self.refuse(model)
         stepper = self._on(ExplicitStepper, model)
+        _refuse_strong_air(model, stepper.h)
         if self.above_limit == "refuse":
             self._refuse_unstable(model, stepper.h)
         return stepper
@@ -116,6 +118,32 @@ class Explicit(Step):
                 f"dt is {h:.6g} s; below {rest:.6g} s it is stable about the rest shape, but only below {motion:.6g} s "
                 "in motion, hinges and membranes counted as at rest",
                 stacklevel=4,
+            )
+
+
+def _refuse_strong_air(model, h):
+    """Refuses steps in which the force of air at their start would more than stop a vertex in the wind, or turn it back.
+
+    Raises:
+        ValueError: hΣ½ρAC|u|/3m is above 1 at a vertex, u the wind less the velocity at the start.
+    """
+    v = model.velocities.numpy().astype(np.float64)
+    for elements in (each for each in model.terms if each.term is AIR):
+        rest, stencil = host_values(elements.rest).astype(np.float64), host_values(elements.stencil)
+        wind = rest[:, 8:11]
+        air = model.scene.air
+        speed = np.full(len(wind), air.speed) if air.keyframes is not None else np.linalg.norm(wind, axis=1)
+        speed = speed + np.linalg.norm(v[stencil].mean(axis=1), axis=1)
+        areas = np.tile(model.scene.mesh.triangle_areas, model.copies)
+        drag = host_values(elements.stiffness) * 0.5 * areas * rest[:, 11:].max(axis=1) * speed / 3.0
+        rate = np.zeros(model.count)
+        np.add.at(rate, stencil, drag[:, None])
+        most = float((rate * model.inverse_mass.numpy()).max(initial=0.0))
+        if h * most > 1.0:
+            fewest = int(most / model.scene.fps) + 1
+            raise ValueError(
+                f"dt is {h:.6g} s; in this wind the forces of air need steps of at most {1.0 / most:.6g} s, that is {fewest} "
+                "substeps a frame; Newton, ADMM and XPBD take any"
             )
 
 

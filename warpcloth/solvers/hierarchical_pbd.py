@@ -10,7 +10,7 @@ from ..kernels.hierarchy import follow
 from ..model.model import Model
 from ..numerics.hierarchy import levels, on_device
 from ..numerics.sweeps import GaussSeidelSweep
-from ..terms.needs import LOCAL_STEP, MERGED_DAMPING, NORMAL_FORCE
+from ..terms.needs import LOCAL_STEP, MERGED_DAMPING, NO_AIR, NORMAL_FORCE
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
 from .step import Step
@@ -50,7 +50,7 @@ class HierarchicalPBD(Step):
     """
 
     name = "hierarchical-pbd"
-    needs, locks = (MERGED_DAMPING, LOCAL_STEP, NORMAL_FORCE), True
+    needs, locks = (MERGED_DAMPING, LOCAL_STEP, NORMAL_FORCE, NO_AIR), True
     ordered = closes = touches_itself = True
     facts = Facts(
         method="PBD that also sweeps over coarser levels of the mesh, so that fine cloth stretches less",

@@ -61,8 +61,7 @@ class Stepper:
         self.state = State(*motion, model.copies)
         if self.lead is not None:
             self.state.lent = self.lead.state.arrays
-        timed = model.pins is not None or (model.loads is not None and model.loads.timed)
-        self.count = self.state.add("steps of keyframes", model.scalars(wp.int32) if timed else None)
+        self.count = self.state.add("steps of keyframes", model.scalars(wp.int32) if model.timed else None)
         self._reset = None
         self.integrator, self.he = None, self.h
         self.colliders = None
@@ -152,7 +151,7 @@ class Stepper:
         model = self.model
         add_one = model.kernel(kernels.count_step) if count is not None else None
         if pins is None:
-            if model.loads is not None and model.loads.timed:
+            if count is not None and model.timed:
                 model.launch(add_one, model.copies, [], [count])
             return
         dim = (model.copies, len(pins))

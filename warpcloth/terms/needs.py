@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..kernels.terms.air import AIR
 from ..kernels.terms.friction import FRICTION
 
 
@@ -39,6 +40,10 @@ NORMAL_FORCE = Need(
     lambda elements: elements.term is not FRICTION,
     "{label}, whose normal force does not follow from positions",
     "leave friction at 0",
+)
+NO_AIR = Need(
+    lambda elements: elements.term is not AIR,
+    "{label}, whose drag grows with the number of its sweeps",
 )
 # A projection, a scalar constraint or a prox.
 LOCAL_STEP = Need(lambda elements: elements.term.whole.moves, "{label}, whose energy is no distance to a constraint")

@@ -20,12 +20,14 @@ class Moment(NamedTuple):
     Attributes:
         x: Positions (N,) vectors [m].
         correction: d (N,) [m] for an evaluation at x + d; None for one at x.
-        integrator: Integrator of the step that begins: ``"euler"``, ``"midpoint"`` or ``"bdf2"``.
+        integrator: Integrator of the step that begins: ``"euler"``, ``"midpoint"``, ``"bdf2"`` or ``"explicit"``.
         move: Array (N,) such that scale·move is the last displacement of BDF2, or hₑ v of midpoint [m]; None for Euler.
         scale: 1 if ``move`` is in metres, or a time [s] if it is a velocity.
         steps: Number of keyframe steps that each copy has made, (B,) int32; None if nothing follows keyframes.
         per_frame: Keyframe steps per frame.
         ahead: Keyframe steps from the start of the step to the time at which it takes forces.
+        v: Velocities (N,) [m/s] at the start of a step; None where nothing has a velocity yet.
+        he: hₑ [s], over which velocities are taken; for ``"explicit"``, whose forces are those at x, the step.
     """
 
     x: wp.array
@@ -36,6 +38,8 @@ class Moment(NamedTuple):
     steps: wp.array | None = None
     per_frame: int = 1
     ahead: int = 0
+    v: wp.array | None = None
+    he: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

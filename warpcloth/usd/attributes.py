@@ -91,6 +91,11 @@ ATTRIBUTES = (
     Attribute("self_contact.stiffness", "warpcloth:selfContact:stiffness", "cloth", ("double",)),
     Attribute("self_contact.friction", "warpcloth:selfContact:friction", "cloth", ("double",)),
     Attribute("self_contact.crossing_start", "warpcloth:selfContact:crossingStart", "cloth", ("token",)),
+    # The air around it; a wind that has time samples is that of keyframes, a sample for each frame.
+    Attribute("air.wind", "warpcloth:air:wind", "cloth", ("double3", "double3[]")),
+    Attribute("air.density", "warpcloth:air:density", "cloth", ("double",)),
+    Attribute("air.normal_drag", "warpcloth:air:normalDrag", "cloth", ("double",)),
+    Attribute("air.tangential_drag", "warpcloth:air:tangentialDrag", "cloth", ("double",)),
     # A selection or indices. The others are pinned too.
     Attribute("pins.vertices", "warpcloth:pins", "cloth", ("string", "int[]")),
     Attribute("(pin weights)", "primvars:pins", "cloth", ("float[]",)),

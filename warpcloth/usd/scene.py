@@ -12,6 +12,7 @@ from ..base.types import FilePath
 from ..mesh.mesh import Mesh
 from ..mesh.parts import Part
 from ..mesh.selection import distinct_vertices
+from ..scene.air import Air
 from ..scene.colliders import Contact
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..scene.self_contact import SelfContact
@@ -87,6 +88,7 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
         with errors_at(where):
             for name, kind in (("contact", Contact), ("self_contact", SelfContact)):
                 whole[name] = _of_fields(kind, name, values)
+            whole["air"] = _air(values, surroundings, scenes[0].frames, fps)
             if len(each) == 1:
                 return replace(scenes[0], **whole) if any(whole.values()) else scenes[0]
             name = _teller("name", values).get("name") or Path(path).stem
@@ -313,9 +315,7 @@ def _load(values, key, surroundings, frames, fps):
         raise ValueError(f"{prefix}:vertices is not given, must be a selection or indices")
     attribute = next((found for _, found in values.authored(f"loads.{quantity}", key)), None)
     if attribute is not None and attribute.GetNumTimeSamples():
-        most = max(frames, attribute.GetNumTimeSamples() - 1)
-        codes = list(frame_codes(time_codes_of(attribute), surroundings, most, fps))
-        given["keyframes"] = [_value_at(attribute, code) for code in codes]
+        given["keyframes"] = _keyframes_of(attribute, surroundings, frames, fps)
     else:
         given[quantity] = values.get(f"loads.{quantity}", key)
     name = values.get("loads.name", key)
@@ -418,6 +418,25 @@ def _of_fields(kind, name, values):
     return kind(**given) if given else None
 
 
+def _air(values, surroundings, frames, fps):
+    """The air around all cloths, or None. A wind has time samples where it has keyframes."""
+    names = ("density", "normal_drag", "tangential_drag")
+    given = {name: _teller(f"air.{name}", values).get(f"air.{name}") for name in names}
+    given = {name: float(value) for name, value in given.items() if value is not None}
+    attribute = next((found for each in values for _, found in each.authored("air.wind")), None)
+    if attribute is not None and attribute.GetNumTimeSamples():
+        given["keyframes"] = _keyframes_of(attribute, surroundings, frames, fps)
+    elif attribute is not None:
+        given["wind"] = _teller("air.wind", values).get("air.wind")
+    return Air(**given) if given else None
+
+
+def _keyframes_of(attribute, surroundings, frames, fps):
+    """The values of an attribute at each frame, up to its last time sample."""
+    most = max(frames, attribute.GetNumTimeSamples() - 1)
+    return [_value_at(attribute, code) for code in frame_codes(time_codes_of(attribute), surroundings, most, fps)]
+
+
 def _gravity(stage, values, up_axis):
     gravity = values.get("gravity")
     if gravity is not None:
@@ -480,6 +499,8 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     if scene.pins.keyframes is not None:
         for frame, positions in enumerate(scene.pins.keyframes[:, order]):
             author(cloth, "pins.keyframes", positions, time=frame)
+    for frame, wind in enumerate(scene.air.winds if scene.air is not None and scene.air.keyframes is not None else ()):
+        author(cloth, "air.wind", wind, time=frame)
     keys = _keys_of(scene.terms)
     for key, term in zip(keys, scene.terms, strict=True):
         given = {field.name: getattr(term, field.name) for field in fields(term)}
@@ -514,6 +535,10 @@ def _scene_values(scene):
     for name in ("friction", "crossing_start"):
         if scene.self_contact is not None and (value := getattr(scene.self_contact, name)) != getattr(SelfContact, name):
             given[f"self_contact.{name}"] = value
+    if scene.air is not None:
+        given |= {f"air.{name}": getattr(scene.air, name) for name in ("density", "normal_drag", "tangential_drag")}
+        if scene.air.keyframes is None:
+            given["air.wind"] = scene.air.winds
     if not np.array_equal(scene.positions, mesh.points):
         given["positions"] = scene.positions
     if scene.velocities.any():

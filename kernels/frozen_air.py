@@ -1,0 +1,78 @@
+"""Factory of the kernel that freezes the forces of air where a step begins, see :mod:`.terms.air`."""
+
+from functools import cache
+
+import warp as wp
+
+from .terms.air import AIR
+from .vectors import types
+
+
+@cache
+def set_air(dtype, moved: bool, explicit: bool):
+    """Kernel over triangles: a, n, κ_n and κ_t of rest, from x, v and the wind.
+
+    a is the centre after hₑ with the wind; the step begins at x, or where ``moved`` at x + move/3, from which BDF2 takes
+    velocities. Where ``explicit``, y stays at x while the force is taken, and a is that much farther back. A triangle without
+    an area has no force. Wind is that of the rest state or, if there are keyframes (F,), theirs ``ahead`` of the step.
+    """
+    vec3, _ = types(dtype)
+    rest_type = wp.types.vector(AIR.parameters, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def set_each(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        keyframes: wp.array(dtype=vec3),
+        # state in
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        step: wp.array(dtype=wp.int32),
+        # parameters
+        he: dtype,
+        ahead: int,
+        steps_per_frame: int,
+        per_copy: int,
+        # in and out
+        rest: wp.array(dtype=rest_type),
+    ):
+        e = wp.tid()
+        i = stencil[e, 0]
+        j = stencil[e, 1]
+        k = stencil[e, 2]
+        r = rest[e]
+        third = dtype(1.0) / dtype(3.0)
+        wind = vec3(r[8], r[9], r[10])
+        if keyframes:
+            after = ahead
+            if step:
+                after = step[i // per_copy] + ahead
+            frame = after // steps_per_frame
+            part = dtype(after - frame * steps_per_frame) / dtype(steps_per_frame)
+            last = keyframes.shape[0] - 1
+            wind = (dtype(1.0) - part) * keyframes[wp.min(frame, last)] + part * keyframes[wp.min(frame + 1, last)]
+        velocity = third * (v[i] + v[j] + v[k])
+        centre = third * (x[i] + x[j] + x[k])
+        away = wind - velocity
+        both = wp.cross(x[j] - x[i], x[k] - x[i])
+        double_area = wp.length(both)
+        n = vec3()
+        if double_area > dtype(0.0):
+            n = both / double_area
+        normal = wp.dot(n, away)
+        across = away - normal * n
+        if wp.static(moved):
+            centre += third * third * (move[i] + move[j] + move[k])
+        way = he * wind
+        if wp.static(explicit):
+            way = he * away
+        for c in range(3):
+            r[c] = centre[c] + way[c]
+            r[3 + c] = n[c]
+        share = double_area / (dtype(4.0) * he)
+        r[6] = share * r[11] * wp.abs(normal)
+        r[7] = share * r[12] * wp.length(across)
+        rest[e] = r
+
+    return set_each

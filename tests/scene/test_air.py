@@ -1,0 +1,185 @@
+"""Air: terminal velocity, a strip in the wind, moving frames, still air, and every solver that takes it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from support.steps import after_one_step, newton_step
+from warpcloth.usd import read_scene, write_scene
+
+DENSITY, GRAVITY, STILL = 0.1, 9.81, wc.Air()
+TERMINAL = np.sqrt(2.0 * DENSITY * GRAVITY / (STILL.density * STILL.normal_drag))  # 1.167 m/s
+# Of first order: the coefficient is that of the start of a step, too small by a step while the sheet is accelerated.
+SOLVERS = {
+    "newton": wc.Newton(substeps=16, tolerance=1e-8),
+    "midpoint": wc.Newton(substeps=16, tolerance=1e-8, integrator="midpoint"),
+    "bdf2": wc.Newton(substeps=32, tolerance=1e-8, integrator="bdf2"),
+    "admm": wc.ADMM(substeps=16, tolerance=1e-6, iterations=200),
+    "xpbd": wc.XPBD(substeps=16, iterations=10),
+    "explicit": wc.Explicit(substeps=64),
+}
+each_solver = pytest.mark.parametrize("name", SOLVERS)
+
+
+def sheet(n=4, air=STILL, **scene):
+    given = {"density": DENSITY, "terms": [wc.Spring(stiffness=100.0)], "duration": 0.2, "air": air}
+    return wc.Scene(wc.Mesh.grid(n, n, size=0.3, pattern="alternating"), **(given | scene))
+
+
+@each_solver
+def test_a_sheet_that_falls_flat_has_the_closed_form(name, device):
+    """v_t tanh(gt/v_t), to 0.1 %; and from terminal velocity it goes on with that, to rounding."""
+    fallen = wc.simulate(sheet(), SOLVERS[name], device=device, dtype="float64")
+    assert fallen.status.ok
+    v = fallen.velocities[-1]
+    assert -v[:, 1] == pytest.approx(TERMINAL * np.tanh(GRAVITY * 0.2 / TERMINAL), rel=1e-3)
+    assert np.abs(v[:, [0, 2]]).max() < 1e-6
+    falling = np.tile([0.0, -TERMINAL, 0.0], (16, 1))
+    steady = wc.simulate(sheet(velocities=falling, duration=0.05), SOLVERS[name], device=device, dtype="float64")
+    assert -steady.velocities[-1][:, 1] == pytest.approx(TERMINAL, rel=1e-5)
+
+
+def strip(wind, slope, n=7):
+    """A strip of 0.2 m that hangs by its upper edge, at an angle ``slope`` from the vertical."""
+    mesh = wc.Mesh.grid(3, n, size=(0.2 * 2 / (n - 1), 0.2), pattern="alternating")
+    across, along = mesh.points[:, 0], mesh.points[:, 2]
+    positions = np.stack([along * np.sin(slope), -along * np.cos(slope), across], axis=1)
+    terms = [wc.StVKMembrane(stiffness=5e3, damping=5.0), wc.QuadraticBending(stiffness=1e-4)]
+    air = wc.Air(wind=(wind, 0.0, 0.0), tangential_drag=0.0)
+    return wc.Scene(mesh, density=DENSITY, positions=positions, terms=terms, pins="z < 0.001", air=air, duration=3.0)
+
+
+@pytest.mark.parametrize(("wind", "degrees"), [(1.0, 31.92), (2.0, 57.57)])
+def test_a_hanging_strip_stands_at_the_angle_of_the_wind(wind, degrees, device):
+    """sin φ = (√(1 + 4N²) − 1)/2N, N = ½ρC_n w²/(mg): weight and pressure balance on every part of it, which is straight."""
+    N = 0.5 * STILL.density * STILL.normal_drag * wind**2 / (DENSITY * GRAVITY)
+    angle = np.arcsin((np.sqrt(1.0 + 4.0 * N**2) - 1.0) / (2.0 * N))
+    assert np.degrees(angle) == pytest.approx(degrees, abs=0.01)
+    scene = strip(wind, 0.8 * angle)
+    rest = wc.simulate(scene, wc.Newton(substeps=1, tolerance=1e-6), device=device, dtype="float64")
+    assert np.abs(rest.velocities[-1]).max() < 1e-3 * wind
+    down = rest.points[-1][scene.mesh.points[:, 2] > 0.19] - rest.points[-1][scene.mesh.points[:, 2] < 0.001]
+    assert np.arctan2(down[:, 0], -down[:, 1]) == pytest.approx(angle, rel=1e-3)
+
+
+@each_solver
+def test_a_moving_observer_sees_the_same(name, device):
+    """Wind, start and all else faster by V: the motion is the same but for V t."""
+    V, wind = np.array([3.0, 0.0, -1.0]), np.array([1.0, 2.0, 0.5])
+    solver = replace(SOLVERS[name], substeps=64 if name == "explicit" else 4)
+    start = np.random.default_rng(1).normal(scale=0.3, size=(16, 3))
+    seen = [
+        wc.simulate(
+            sheet(air=wc.Air(wind=wind + v), velocities=start + v, duration=0.1), solver, device=device, dtype="float64"
+        )
+        for v in (0.0 * V, V)
+    ]
+    assert seen[0].status.ok and seen[1].status.ok
+    moved = seen[1].points[-1] - seen[0].points[-1] - 0.1 * V
+    assert np.abs(moved).max() < (1e-6 if name in ("admm", "xpbd") else 1e-7)  # by what tolerances leave
+    still = wc.simulate(sheet(air=None, velocities=start, duration=0.1), solver, device=device, dtype="float64")
+    assert np.abs(still.points[-1] - seen[0].points[-1]).max() > 1e-3, "the air matters"
+
+
+@pytest.mark.parametrize("name", ["newton", "midpoint", "bdf2", "explicit"])
+def test_still_air_takes_energy(name, device):
+    """Without gravity: kinetic and elastic energy never rise, and fall by far more than the solver loses by itself.
+
+    Air 25 times as dense stops the sheet in a fraction of a second.
+    """
+    start = np.random.default_rng(2).normal(scale=0.5, size=(16, 3))
+    scene = sheet(velocities=start, gravity=(0.0, 0.0, 0.0), pins=[0], duration=0.1, air=wc.Air(density=30.0))
+    damped = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64", record="energies")
+    total = damped.energies["kinetic"] + damped.energies["Spring"]
+    assert np.diff(total).max() < (1e-2 if name == "explicit" else 1e-9) * total[0]  # symplectic Euler oscillates
+    none = wc.simulate(replace(scene, air=None), SOLVERS[name], device=device, dtype="float64", record="energies")
+    assert total[-1] < 0.9 * (none.energies["kinetic"] + none.energies["Spring"])[-1]
+
+
+MEET = {
+    "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=8000),
+    "xpbd": wc.XPBD(substeps=1, iterations=4000),
+}
+
+
+@pytest.mark.parametrize("name", MEET)
+def test_solvers_that_minimise_meet(name, device):
+    random = np.random.default_rng(3)
+    start = sheet().mesh.points + random.normal(scale=0.01, size=(16, 3))
+    scene = sheet(positions=start, velocities=random.normal(size=(16, 3)), air=wc.Air(wind=(5.0, 1.0, 2.0)), pins=[0])
+    exact = newton_step(scene, device)
+    assert np.abs(after_one_step(scene, MEET[name], device)[0] - exact).max() < 1e-8
+    assert np.abs(newton_step(replace(scene, air=None), device) - exact).max() > 1e-3
+
+
+def test_wind_by_keyframes_and_by_triangles(device):
+    """One keyframe is that wind; a triangle each is the wind of each; linear between frames."""
+    wind, solver = (2.0, 1.0, 0.0), wc.Newton(substeps=2, tolerance=1e-10)
+    triangles = len(sheet().mesh.triangles)
+    ends = [
+        wc.simulate(sheet(air=air, pins=[0], duration=0.1), solver, device=device, dtype="float64").points[-1]
+        for air in (
+            wc.Air(wind=wind),
+            wc.Air(keyframes=[wind]),
+            wc.Air(wind=np.tile(wind, (triangles, 1))),
+            wc.Air(keyframes=np.linspace(0.0, 2.0, 13)[:, None] * wind),
+        )
+    ]
+    assert np.abs(ends[1] - ends[0]).max() < 1e-12 and np.abs(ends[2] - ends[0]).max() < 1e-12
+    assert 1e-4 < np.abs(ends[3] - ends[0]).max() < 0.1
+
+
+def test_reactions_have_the_drag_of_pins(device):
+    """Of a sheet whose vertices are all pinned, at right angles to the wind: ½ρA(C_n u²)."""
+    mesh = wc.Mesh.grid(4, 4, size=0.3)
+    given = {"pins": "all", "gravity": (0.0, 0.0, 0.0), "air": wc.Air(wind=(0.0, 4.0, 0.0)), "duration": 0.05}
+    scene = wc.Scene(mesh, density=DENSITY, terms=[wc.Spring(stiffness=10.0)], **given)
+    found = wc.simulate(scene, wc.Newton(substeps=1), device=device, dtype="float64", record="reactions")
+    assert found.reactions[-1].sum(axis=0) == pytest.approx([0.0, -0.5 * 1.2 * 1.2 * 16.0 * 0.09, 0.0], abs=1e-9)
+
+
+def test_copies_vary_in_their_wind(device):
+    winds = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    solver = wc.Newton(substeps=2, tolerance=1e-10)
+    both = wc.simulate(
+        sheet(pins=[0], duration=0.05), solver, device=device, dtype="float64", copies=2, vary={"Air.wind": winds}
+    )
+    for copy, wind in enumerate(winds):
+        alone = wc.simulate(sheet(pins=[0], duration=0.05, air=wc.Air(wind=wind)), solver, device=device, dtype="float64")
+        assert np.abs(both.points[-1][copy] - alone.points[-1]).max() < 1e-9
+
+
+@pytest.mark.parametrize("air", [wc.Air(wind=(1.0, 2.0, 3.0), normal_drag=1.0), wc.Air(keyframes=[(0, 0, 0), (4, 0, 0)])])
+def test_stages_keep_it(air, tmp_path):
+    write_scene(sheet(air=air), tmp_path / "air.usda")
+    found = read_scene(tmp_path / "air.usda").air
+    assert np.array_equal(found.winds, air.winds) and (found.keyframes is None) == (air.keyframes is None)
+    assert (found.density, found.normal_drag, found.tangential_drag) == (1.2, air.normal_drag, 0.02)
+
+
+STRONG = wc.Air(wind=(100.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("attempt", "sentence"),
+    [
+        (lambda: wc.Air(wind=(1.0, 0.0)), r"air.wind has shape \(2,\)"),
+        (lambda: wc.Air(wind=(1.0, 0.0, np.nan)), r"air.wind\[2\] is nan; it must be finite"),
+        (lambda: wc.Air(wind=(1, 0, 0), keyframes=[(1, 0, 0)]), "air.wind and air.keyframes are given"),
+        (lambda: wc.Air(density=-1.0), "air.density is -1.0; it must be a number of 0 or more"),
+        (lambda: sheet(air=3), "air is 3; it must be an Air or None"),
+        (lambda: sheet(air=wc.Air(wind=np.zeros((5, 3)))), r"air.wind has shape \(5, 3\); it must be \(3,\), or \(18, 3\)"),
+        (lambda: wc.simulate(sheet(), wc.PBD(substeps=4)), "PBD cannot take Air, whose drag grows .*; Explicit, Newton"),
+        (lambda: wc.simulate(sheet(), wc.ProjectiveDynamics(substeps=4)), "cannot take Air, whose energy is no squared"),
+        (
+            lambda: wc.simulate(sheet(air=STRONG), wc.Explicit(substeps=8)),
+            "in this wind the forces of air need steps",
+        ),
+        (lambda: wc.equilibrium(sheet()), "the scene has air, whose forces follow from velocities"),
+    ],
+)
+def test_refusals(attempt, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        attempt()

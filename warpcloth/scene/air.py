@@ -1,0 +1,69 @@
+"""The air around a cloth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..base.checks import array, number, numeric, refuse
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Air:
+    """Air that resists the motion of the cloth and that wind moves.
+
+    Each triangle of area A receives F = ½ρA(C_n|u_n|u_n n + C_t|u_t|u_t). u is the wind minus the velocity of the triangle, u_n
+    its part along the normal n, u_t the rest. In a step, C|u| and n are those where the step begins, so that F is linear in the
+    velocity; implicit solvers take it with the velocity at the end of the step. In still air it never adds energy.
+
+    Attributes:
+        wind: [m/s], (3,), or (T, 3) with one for each triangle.
+        keyframes: (F, 3) [m/s], in place of ``wind``: a wind that is the same everywhere, at frames 0 … F−1 of the scene;
+            linear between them, and constant after the last.
+        density: ρ [kg/m³].
+        normal_drag: C_n, by default that of a flat plate across the wind.
+        tangential_drag: C_t, friction along the surface.
+
+    Raises:
+        ValueError: If a value is not allowed.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> breeze = wc.Air(wind=(3.0, 0.0, 0.0))
+        >>> wc.Scene(wc.Mesh.grid(3, 3), density=0.1, terms=[wc.Spring(stiffness=1e3)], pins=[0], air=breeze).air.density
+        1.2
+    """
+
+    wind: Sequence[float] | np.ndarray | None = None
+    keyframes: Sequence[Sequence[float]] | np.ndarray | None = None
+    density: float = 1.2
+    normal_drag: float = 1.2
+    tangential_drag: float = 0.02
+
+    def __post_init__(self):
+        if self.wind is not None and self.keyframes is not None:
+            raise ValueError("air.wind and air.keyframes are given; at most one of the two may be")
+        for name in ("density", "normal_drag", "tangential_drag"):
+            number(f"air.{name}", getattr(self, name), least=0.0)
+        if self.keyframes is not None:
+            frames = numeric("air.keyframes", self.keyframes, "have shape (F, 3)")
+            array("air.keyframes", frames, (max(len(np.atleast_1d(frames)), 1), 3))
+        else:
+            wind = self.winds
+            if wind.shape[-1:] != (3,) or wind.ndim > 2:
+                raise ValueError(f"air.wind has shape {wind.shape}; it must be (3,), or (T, 3) with one for each triangle")
+        refuse(
+            "air.wind" if self.keyframes is None else "air.keyframes", self.winds, ~np.isfinite(self.winds), "must be finite"
+        )
+
+    @property
+    def winds(self) -> np.ndarray:
+        """All winds that it has, (3,), (T, 3) or (F, 3) [m/s]; 0 if neither ``wind`` nor ``keyframes`` is given."""
+        if self.keyframes is not None:
+            return np.asarray(self.keyframes, dtype=np.float64)
+        return np.zeros(3) if self.wind is None else numeric("air.wind", self.wind, "be a vector or an array of vectors")
+
+    @property
+    def speed(self) -> float:
+        """The largest wind [m/s]."""
+        return float(np.linalg.norm(self.winds, axis=-1).max(initial=0.0))

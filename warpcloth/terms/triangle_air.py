@@ -1,0 +1,67 @@
+"""The forces of air on triangles, which a scene declares by its air."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+
+from ..kernels.frozen_air import set_air
+from ..kernels.term import Term
+from ..kernels.terms.air import AIR
+from ..mesh.mesh import Mesh
+from .declared import FINITE_FROM_0, Declared, Elements, quantity
+from .refresh import STEP, Refresh
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TriangleAir(Declared):
+    """Drag and lift of the air on each triangle, see :mod:`warpcloth.kernels.terms.air`.
+
+    Attributes:
+        stiffness: Density of the air [kg/m³].
+        wind: [m/s], (3,) or (T, 3).
+        keyframes: Of a wind that is the same everywhere, (F, 3) [m/s], in place of ``wind``; or None.
+        normal_drag, tangential_drag: C_n and C_t.
+    """
+
+    term: ClassVar[Term] = AIR
+
+    wind: Sequence[float] | np.ndarray = field(
+        default=(0.0, 0.0, 0.0), metadata=quantity("must be finite", np.isfinite, shape=(3,))
+    )
+    keyframes: np.ndarray | None = None
+    normal_drag: float = field(default=1.2, metadata=FINITE_FROM_0)
+    tangential_drag: float = field(default=0.02, metadata=FINITE_FROM_0)
+
+    def stencil(self, mesh: Mesh) -> np.ndarray:
+        return mesh.triangles
+
+    def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
+        given = (self.of_elements(name, len(stencil)) for name in ("wind", "normal_drag", "tangential_drag"))
+        return self.term.rest_state(mesh.points, stencil, *given)
+
+    def elements_on(self, mesh: Mesh, positions: np.ndarray) -> Elements:
+        return replace(super().elements_on(mesh, positions), refresh=Refresh(STEP, _Freeze(self.keyframes)))
+
+
+class _Freeze:
+    """Launches the forces of a step. Keyframes are put on the device by the first call, which the model makes."""
+
+    def __init__(self, keyframes):
+        self._keyframes, self._held = keyframes, {}
+
+    def __call__(self, model, elements, moment):
+        held = None
+        if self._keyframes is not None:
+            key = str(model.device), model.dtype
+            if key not in self._held:
+                self._held[key] = model.array(self._keyframes, model.vec3)
+            held = self._held[key]
+        if moment.v is None:  # of what has no velocity yet
+            return
+        moved, explicit = moment.integrator == "bdf2", moment.integrator == "explicit"
+        kernel = model.kernel(set_air, model.dtype, moved, explicit)
+        given = [elements.stencil, held, moment.x, moment.v, moment.move if moved else None, moment.steps]
+        given += [moment.he, moment.ahead, moment.per_frame, model.per_copy]
+        model.launch(kernel, elements.count, given, [elements.rest])
