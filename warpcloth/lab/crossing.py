@@ -20,9 +20,9 @@ from ..scene.scene import Scene
 from ..scene.self_contact import SelfContact
 from ..solvers import SOLVERS
 from ..terms import Spring
+from .flights import DENSITY, DISTANCE, RATE, STIFFNESS, Flights, count_steps
+from .flights import LAWS as BLIND
 from .measurements import task
-from .panels import Map, point
-from .tunnelling import DENSITY, DISTANCE, RATE, STIFFNESS
 
 TITLE = "17. Sheets that fly at each other: without the filter of self-contact they cross"
 SIDE = 0.1  # of the sheets [m]
@@ -37,32 +37,29 @@ SHOWN = {"without": ("explicit", "newton", "xpbd", "pbd"), "filter": tuple(SOLVE
 
 _QUADRATIC, _DEEP = "½ρv² = kr²", "v = kr²h/(2ρδ)"
 LAWS = {
-    "v h = r": lambda h: DISTANCE / h,
-    "v h = 2r": lambda h: 2.0 * DISTANCE / h,
+    **BLIND,
     "v h = r + skin": lambda h: LISTED / h,
     _QUADRATIC: lambda h: DISTANCE * RATE * np.sqrt(2.0),
     _DEEP: lambda h: 0.5 * RATE**2 * DISTANCE * h / FLOOR,
 }
+_FLIGHTS = Flights(
+    speed="relative speed v [m/s]",
+    fails="crosses",
+    holds="stays apart",
+    failed="flights in which sheets cross [%]",
+    cut="flights in which a move was cut short [%]",
+)
 
 
 def _panel(solver, kept):
     if solver == "explicit":
-        names = ["v h = r", "v h = 2r", _QUADRATIC]
+        names = [*BLIND, _QUADRATIC]
     else:
         # PBD has no stiffness of contact.
         names = ["v h = r + skin", *[_DEEP] * ("pbd" not in solver or solver == "xpbd")]
     filtered = kept == "filter"
-    return Map(
-        f"{solver}, {kept}",
-        f"{solver}, with the filter" if filtered else f"{solver}, without the filter",
-        "step h [s]",
-        "relative speed v [m/s]",
-        scales=("log", "log"),
-        laws={name: LAWS[name] for name in names},
-        value="flights in which a move was cut short [%]" if filtered else "flights in which sheets cross [%]",
-        colours="Blues" if filtered else "Reds",
-        crossed="crosses" if filtered else None,
-    )
+    title = f"{solver}, with the filter" if filtered else f"{solver}, without the filter"
+    return _FLIGHTS.panel(f"{solver}, {kept}", title, {name: LAWS[name] for name in names}, filtered)
 
 
 PANELS = tuple(_panel(solver, kept) for kept, solvers in SHOWN.items() for solver in solvers)
@@ -76,17 +73,7 @@ def tasks(device):
 
 def measure(solver, kept, steps, speeds, device):
     """Returns the points of one panel: the fraction of flights that were cut short, or in which sheets crossed [%]."""
-    panel, found = _panel(solver, kept).key, []
-    for h in steps:
-        try:
-            crossed, cut = meetings(solver, kept, h, speeds, device)
-        except ValueError as error:
-            found += [point(panel, "refused", h, None, str(error), y=v) for v in speeds]
-            continue
-        for v, through, short in zip(speeds, crossed, cut, strict=True):
-            series = "crosses" if through > 0.0 else "stays apart"
-            found.append(point(panel, series, h, 100.0 * (short if kept == "filter" else through), y=v))
-    return found
+    return _FLIGHTS.points(_panel(solver, kept), lambda h: meetings(solver, kept, h, speeds, device), steps, speeds)
 
 
 def sheets(h, turn):
@@ -126,7 +113,7 @@ def meetings(solver, kept, h, speeds, device):
     if kept != "filter":
         without_filter(stepper)
     crossed = np.zeros(len(speed), dtype=bool)
-    for _ in range(int(4.0 * DISTANCE / (min(speeds) * h) + 4.0 / (RATE * h)) + 8):
+    for _ in range(count_steps(h, speeds)):
         stepper.step()
         x = stepper.state.x.numpy().reshape(positions.shape)
         below, above = x[:, :9], x[:, 9:]

@@ -26,13 +26,11 @@ from ..scene.scene import Scene
 from ..solvers import SOLVERS
 from ..terms import Spring
 from ..terms.contact import VertexContact
+from .flights import DENSITY, DISTANCE, RATE, STIFFNESS, Flights, count_steps
+from .flights import LAWS as BLIND
 from .measurements import task
-from .panels import Map, point
 
 TITLE = "15. Fast cloth and thin colliders: contact alone lets cloth pass, the filter does not"
-DISTANCE, DENSITY = 1e-3, 0.15  # r [m], areal density ρ [kg/m²]
-STIFFNESS = 10.0 * 9.81 * DENSITY / DISTANCE  # the default of a contact, under gravity [Pa/m]
-RATE = np.sqrt(STIFFNESS / DENSITY)  # ω [1/s]
 THICKNESS = 1e-6  # of the wall [m]
 STEPS = np.geomspace(1e-4, 1.0 / 24.0, 10)  # [s]
 SPEEDS = np.geomspace(0.1, 100.0, 13)  # [m/s]
@@ -44,12 +42,18 @@ SHOWN = {"energy alone": _FEW, "filter": tuple(SOLVERS), "filter, triangles": _F
 
 _QUADRATIC, _LOGARITHM, _DEEP = "ρv² = kr²", "½ρv² = ¼kr²(2 + ln r/2δ)", "v = kr²h/(4ρδ)"
 LAWS = {
-    "v h = r": lambda h: DISTANCE / h,
-    "v h = 2r": lambda h: 2.0 * DISTANCE / h,
+    **BLIND,
     _QUADRATIC: lambda h: DISTANCE * RATE,
     _LOGARITHM: lambda h: 0.5 * DISTANCE * RATE * np.sqrt(2.0 * (2.0 + np.log(0.5 / FLOOR))),
     _DEEP: lambda h: 0.25 * RATE**2 * DISTANCE * h / FLOOR,
 }
+_FLIGHTS = Flights(
+    speed="speed v [m/s]",
+    fails="passes",
+    holds="stays outside",
+    failed="vertices that pass the wall [%]",
+    cut="vertices that were cut short [%]",
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,23 +64,13 @@ class PenaltyContact(VertexContact):
 
 
 def _panel(solver, wall):
-    names = ["v h = r", "v h = 2r"]
+    names, filtered = list(BLIND), wall != "energy alone"
     if solver == "explicit":
         names.append(_QUADRATIC)
     elif "pbd" not in solver or solver == "xpbd":  # the stiffness of the others is that of their sweeps
-        names.append(_LOGARITHM if wall == "energy alone" else _DEEP)
-    filtered = wall != "energy alone"
-    return Map(
-        f"{solver}, {wall}",
-        f"{solver}, with the {wall}" if filtered else f"{solver}, energy of contact alone",
-        "step h [s]",
-        "speed v [m/s]",
-        scales=("log", "log"),
-        laws={name: LAWS[name] for name in names},
-        value="vertices that were cut short [%]" if filtered else "vertices that pass the wall [%]",
-        colours="Blues" if filtered else "Reds",
-        crossed="passes" if filtered else None,
-    )
+        names.append(_DEEP if filtered else _LOGARITHM)
+    title = f"{solver}, with the {wall}" if filtered else f"{solver}, energy of contact alone"
+    return _FLIGHTS.panel(f"{solver}, {wall}", title, {name: LAWS[name] for name in names}, filtered)
 
 
 PANELS = tuple(_panel(solver, wall) for wall, solvers in SHOWN.items() for solver in solvers)
@@ -90,17 +84,7 @@ def tasks(device):
 
 def measure(solver, wall, steps, speeds, device):
     """Returns the points of one panel: the fraction of vertices that were cut short, or that passed the wall [%]."""
-    panel, found = _panel(solver, wall).key, []
-    for h in steps:
-        try:
-            passed, cut = flights(solver, wall, h, speeds, device)
-        except ValueError as error:
-            found += [point(panel, "refused", h, None, str(error), y=v) for v in speeds]
-            continue
-        for v, through, short in zip(speeds, passed, cut, strict=True):
-            series = "passes" if through > 0.0 else "stays outside"
-            found.append(point(panel, series, h, 100.0 * (through if wall == "energy alone" else short), y=v))
-    return found
+    return _FLIGHTS.points(_panel(solver, wall), lambda h: flights(solver, wall, h, speeds, device), steps, speeds)
 
 
 def sheet(h, wall, solver):
@@ -146,7 +130,7 @@ def flights(solver, wall, h, speeds, device):
     model = scene.build(device=device, dtype="float64", copies=len(velocity), vary=vary)
     stepper = SOLVERS[solver](substeps=1).bind(model)
     passed = np.zeros(positions.shape[:2], dtype=bool)
-    count = int(4.0 * DISTANCE / (min(speeds) * h) + 4.0 / (RATE * h)) + 8
+    count = count_steps(h, speeds)
     for _ in range(count):
         stepper.step()
         passed |= stepper.state.x.numpy().reshape(positions.shape)[:, :, 1] < top
