@@ -220,7 +220,8 @@ def test_the_rotations(tmp_path, monkeypatch):
 # Modules whose names differ from those of their packages.
 MODULES = {"libigl": "igl", "pillow": "PIL"}
 # Runs the blocks of a page one after the other, commands by the function behind them. Packages that the page does not say to
-# install are not found. Other commands are left out: .ci/run runs those of the README, and a cluster needs several machines.
+# install are not found. Other commands are left out: .ci/run runs those of the README, a cluster needs several machines, and
+# bench compiles again what it measures, as test_bench.py has it do.
 RUN = """
 import json, shlex, sys
 from importlib.machinery import PathFinder
@@ -236,7 +237,7 @@ for language, text in blocks:
     if language == "python":
         exec(compile(text, "page", "exec"), names)
     for line in text.splitlines() if language == "sh" else ():
-        if line.startswith("warpcloth "):
+        if line.startswith("warpcloth ") and not line.startswith("warpcloth bench "):
             print("+", line, flush=True)
             code = main(shlex.split(line, comments=True)[1:])
             assert code == 0, f"{line}: {code}"
@@ -273,7 +274,8 @@ def test_a_page_as_it_stands(page, tmp_path):
         text=True,
     )
     assert done.returncode == 0 and "Traceback" not in done.stderr, f"{done.stdout}\n{done.stderr}"
-    commands = [line for language, block in shown if language == "sh" for line in block.splitlines() if line[:9] == "warpcloth"]
+    lines = [line for language, block in shown if language == "sh" for line in block.splitlines()]
+    commands = [line for line in lines if line[:9] == "warpcloth" and line[10:15] != "bench"]
     for option, name in pairwise(shlex.split("\n".join(commands), comments=True)):
         if option in ("-o", "--csv", "--plot", "--npz", "--report"):
             assert (tmp_path / name).is_file(), name
