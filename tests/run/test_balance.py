@@ -1,6 +1,5 @@
 """A run that gains energy which no source put in is named, and no other run is."""
 
-import itertools
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
@@ -10,8 +9,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.meshes import PAIR
-from support.scenes import LIVELY, QUICK, scene, taken
-from support.scenes import SMALL as SIZES
+from support.scenes import LIVELY, QUICK, noisy
 from warpcloth.cli import main
 from warpcloth.core.energy import Energy
 from warpcloth.core.sums import Sums
@@ -24,18 +22,6 @@ from warpcloth.run.frames_ahead import Frame
 from warpcloth.run.sources import Source, source_of
 from warpcloth.run.watch import Watch
 from warpcloth.scenes import flag, hanging, net
-
-SMALL = SIZES | {"mobile": {"n": 5}, "net": {"n": 6}}
-# Frames of the larger of them; the others have 30.
-FRAMES = {"usd_cloth": 3, "bunny": 2, "bar_twist": 15, "mobile": 15, "cards": 5, "loop": 15, "stack": 5}
-
-
-def noisy(declared, size):
-    """A scene whose free vertices start with noise [m]."""
-    noise = size * np.random.default_rng(0).normal(size=declared.positions.shape)
-    noise[declared.pins.vertices] = 0.0
-    return replace(declared, positions=declared.positions + noise)
-
 
 BLOWN_UP = {
     "over-relaxed sweeps": (
@@ -86,33 +72,6 @@ def test_the_command_line_says_so_and_keeps_the_good_frames(tmp_path, capsys, mo
     said = capsys.readouterr().err
     assert "it has gained energy" in said and " J of motion and height" in said and "the last good frame is" in said
     assert (tmp_path / "out.usdc").is_file()
-
-
-# The settings that refuse a scene, and of what.
-REFUSED = dict.fromkeys(
-    itertools.product(("bar_twist", "bunny"), ("projective dynamics", "projective dynamics plain")),
-    "DihedralBending, whose energy is no squared distance",
-)
-REFUSED |= {
-    ("mobile", solver): "bars with infinite stiffness"
-    for solver in ("newton", "explicit", "projective dynamics", "projective dynamics plain", "constrained dynamics searching")
-}
-REFUSED[("mobile", "admm")] = "bars, whose bodies are no elements by themselves"
-
-
-@pytest.mark.host
-@pytest.mark.parametrize("solver", QUICK)
-@pytest.mark.parametrize("name", SMALL)
-def test_no_scene_that_holds_is_called_diverged(name, solver, device):
-    declared, record = taken(scene(name, **SMALL[name]), solver, device)
-    if name == "net":
-        declared = noisy(declared, 0.01)
-    if (name, solver) in REFUSED:
-        with pytest.raises(ValueError, match=f"cannot take {REFUSED[name, solver]}"):
-            record.bind(declared.build(device=device))
-        return
-    status = wc.simulate(declared, record, device=device, frames=FRAMES.get(name, 30)).status
-    assert status.ok, status.message
 
 
 @pytest.mark.host

@@ -14,6 +14,13 @@ def scene(name, **parameters):
     return import_module(f"warpcloth.scenes.{name}").scene(**parameters)
 
 
+def noisy(declared, size):
+    """A scene whose free vertices start with noise [m]."""
+    noise = size * np.random.default_rng(0).normal(size=declared.positions.shape)
+    noise[declared.pins.vertices] = 0.0
+    return replace(declared, positions=declared.positions + noise)
+
+
 LIVELY = {
     "springs shorter than the cloth": (
         lambda mesh: {
@@ -53,6 +60,8 @@ SMALL = {
     "cards": {"n": 3},
     "loop": {"elements": 16},
     "stack": {"sheets": 2, "n": 4},
+    "mobile": {"n": 5},
+    "net": {"n": 6},
 }
 TOUCHING = {
     "incline": {"n": 4},
