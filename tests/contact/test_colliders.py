@@ -301,19 +301,22 @@ def stretched(gravity, friction, mesh=False):
 EXACT = {
     "newton clamp": wc.Newton(substeps=1, tolerance=1e-12, hessian="clamp"),
     "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=1000),
-    "projective dynamics none": wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=3000, acceleration="none"),
     "xpbd": wc.XPBD(substeps=1, iterations=30_000),
     "admm": wc.ADMM(substeps=1, tolerance=1e-9, iterations=20_000),
     "constrained dynamics": wc.ConstrainedDynamics(substeps=1, tolerance=1e-9, iterations=60, linear="factorised"),
 }
+# Without acceleration projective dynamics takes thousands of iterations, which differ by one kernel.
+PLAIN = {
+    "projective dynamics none": wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=3000, acceleration="none"),
+}
 
 
-@pytest.mark.parametrize("name", EXACT)
 @pytest.mark.parametrize(
-    ("gravity", "friction", "mesh"),
+    ("name", "gravity", "friction", "mesh"),
     [
-        *[(300.0, 0.0, False), (981.0, 0.3, False), (200.0, 0.3, True)],
-        pytest.param(981.0, 30.0, False, marks=SLOW),
+        *((name, *load) for name in EXACT for load in [(300.0, 0.0, False), (981.0, 0.3, False), (200.0, 0.3, True)]),
+        ("projective dynamics none", 981.0, 0.3, False),
+        *(pytest.param(name, 981.0, 30.0, False, marks=SLOW) for name in EXACT),
     ],
 )
 def test_all_meet_at_one_minimiser(name, friction, gravity, mesh):
@@ -322,7 +325,7 @@ def test_all_meet_at_one_minimiser(name, friction, gravity, mesh):
     Contact alone would move a vertex by 0.26 m in the step, beyond the middle of the ball, whose far side is then nearer.
     """
     scene, found = stretched(gravity, friction, mesh), []
-    for solver in (wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), EXACT[name]):
+    for solver in (wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), (EXACT | PLAIN)[name]):
         stepper = solver.bind(scene.build(dtype="float64"))
         stepper.step()
         assert stepper.cut[0] == 0.0

@@ -321,13 +321,12 @@ def test_thrown_at_each_other(name, speed, dtype, device):
 
 
 @each_solver
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=SLOW)])
-def test_folded_sheet_closes(name, dtype, device):
-    """Thrown shut: the two halves meet, and their layers do not cross."""
+def test_folded_sheet_closes(name, device):
+    """Thrown shut at 100 m/s, in frames of 1/24 s: the two halves meet, and their layers do not cross."""
     scene = folded(gravity=np.zeros(3))
-    closing = -3.0 * np.sign(scene.positions[:, 1:2]) * [0.0, 1.0, 0.0]
-    stepper = SOLVERS[name].bind(replace(scene, velocities=closing).build(device=device, dtype=dtype))
-    for _ in range(6):
+    closing = -100.0 * np.sign(scene.positions[:, 1:2]) * [0.0, 1.0, 0.0]
+    stepper = SOLVERS[name].bind(replace(scene, velocities=closing).build(device=device, dtype="float32"))
+    for _ in range(4):
         stepper.frame()
         assert crossed(stepper.state.x.numpy(), scene.mesh.triangles) == 0
 
@@ -808,19 +807,24 @@ def crossing_pairs(points, triangles):
     ],
 )
 def test_starts_that_cross(name, start, device):
-    """In no frame do triangles cross that did not at the start, or that have been free, and what is left is counted."""
+    """In no frame do triangles cross that did not at the start, or that have been free, and what is left is counted.
+
+    Sheets that coincided are free at once, and are then thrown back at each other.
+    """
     scene = tangled(start)
     stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
     tangles, triangles = stepper.pairs.tangles, scene.mesh.triangles
     known = {tuple(sorted(pair)) for pair in tangles.pairs.tolist()}
     assert known >= crossing_pairs(scene.positions, triangles) and len(known) == tangles.left()[0] > 0
-    for _ in range(12):
+    for frame in range(12):
+        if start == "coincide" and frame == 6:
+            stepper.state.v.assign(-30.0 * scene.velocities)
         stepper.frame()
         left = {tuple(sorted(pair)) for pair in tangles.pairs[tangles.free == 0].tolist()}
         assert left <= known and crossing_pairs(stepper.state.x.numpy(), triangles) <= left
         known = left
     assert len(known) == tangles.left()[0]
-    if start == "corner":
+    if start != "tilted":
         assert not known
 
 
