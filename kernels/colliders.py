@@ -1,7 +1,7 @@
 """Factories of the kernels of colliders: their motion, the start of a step, and the filter at its end.
 
-A pose is a position and a quaternion (x, y, z, w), seven numbers. A step needs the poses at its start and at its end, and those
-where its forces are taken, see :func:`move_colliders`.
+A pose is a position and a quaternion (x, y, z, w), seven numbers. A step needs the poses at its start, at its end, and at the
+time of its forces, see :func:`move_colliders`.
 """
 
 from functools import cache
@@ -15,20 +15,20 @@ from .terms.contact import local_gap, turned
 from .vectors import types
 
 local_gap_of, turned_by, slope_of, DELTA, beyond_of = local_gap, turned, contact.slope, contact.DELTA, contact.beyond
-ROUNDS = wp.constant(6)  # in which a vertex that colliders stop is looked at again
-SLIDING = wp.constant(2)  # of these, in which it slides; then its way is only shortened, which ends
-MARCHES = wp.constant(32)  # planes that a vertex meets on its way past a collider, at most
+ROUNDS = wp.constant(6)  # maximum number of tests of a vertex that colliders stop
+SLIDING = wp.constant(2)  # in so many of these it slides; then its move is only shortened, which terminates
+MARCHES = wp.constant(32)  # maximum number of separating planes of a move past a collider
 
 
 @cache
 def pose_types(dtype):
-    """The types of a pose and of an anchor with its ε."""
+    """Types of a pose, and of an anchor with its ε."""
     return wp.types.vector(7, dtype), wp.types.vector(4, dtype)
 
 
 @cache
 def shapes(dtype):
-    """The struct of the shapes of C colliders, see :mod:`.terms.contact`: half sizes of the core, radius, and friction μ."""
+    """Struct of the shapes of C colliders, see :mod:`.terms.contact`: half sizes of the core, radius, and friction μ."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -42,7 +42,7 @@ def shapes(dtype):
 
 @cache
 def step_poses(dtype):
-    """The struct of the poses (copies, colliders) at the start and end of a step, and ``at`` where its forces are taken."""
+    """Struct of the poses (copies, colliders) at the start, at the end, and ``at`` the time of the forces of a step."""
     pose_type, _anchor = pose_types(dtype)
 
     @wp.struct
@@ -56,7 +56,7 @@ def step_poses(dtype):
 
 @cache
 def of_pose(dtype):
-    """The device functions (pose, x) → x in the frame of a pose, and (pose, X) → X in space."""
+    """Device functions (pose, x) → x in the frame of a pose, and (pose, X) → X in space."""
     vec3, _ = types(dtype)
     pose_type, _anchor = pose_types(dtype)
 
@@ -73,7 +73,7 @@ def of_pose(dtype):
 
 @cache
 def surely_apart(dtype):
-    """The device function (pose, core, radius, margin, x) → whether a collider is surely farther than ``margin`` from x."""
+    """Device function (pose, core, radius, margin, x) → whether a collider is surely farther than ``margin`` from x."""
     vec3, _ = types(dtype)
     pose_type, _anchor = pose_types(dtype)
 
@@ -86,7 +86,7 @@ def surely_apart(dtype):
 
 @cache
 def half_space(dtype):
-    """The device function (point, normal) → the pose of the half-space behind the plane with this point and normal."""
+    """Device function (point, normal) → the pose of the half-space behind the plane with this point and normal."""
     vec3, _ = types(dtype)
     pose_type, _anchor = pose_types(dtype)
 
@@ -107,9 +107,9 @@ def half_space(dtype):
 
 @cache
 def move_colliders(dtype):
-    """Kernel over (copies, colliders): the poses of a step, in a :func:`step_poses`, ``at`` being ``halves`` half steps on.
+    """Kernel over (copies, colliders): the :func:`step_poses` of a step, with ``at`` after ``halves`` half steps.
 
-    Between keyframes positions are linear and rotations turn at one speed; after the last they stand still.
+    Between keyframes, velocities and angular velocities are constant. After the last keyframe colliders are at rest.
     """
     pose_type, _anchor = pose_types(dtype)
     quat_type = wp.types.quaternion(dtype=dtype)
@@ -156,10 +156,11 @@ def move_colliders(dtype):
 
 @cache
 def kept_part(dtype):
-    """The device function (X, move, core, radius, least) → the part of a move from X, in the frame of a collider, that is kept.
+    """Device function (X, move, core, radius, least) → the fraction of a move from X that is kept, in the collider's frame.
 
-    As colliders are convex, the plane normal to the distance from the surface has all of the collider behind it. The move is
-    kept until it would come nearer to that plane than ``least``, or than where it started; from there the next plane decides.
+    Colliders are convex, so the plane through the nearest point, normal to the distance, has the whole collider behind it. The
+    move is kept until it is nearer to that plane than ``least``, or than its start if that is nearer. From there the next plane
+    decides.
     """
     vec3, _ = types(dtype)
 
@@ -189,11 +190,11 @@ def kept_part(dtype):
 
 @cache
 def pose_collider(dtype):
-    """Kernel over the elements of contact with one collider, at the start of a step: rest states with its pose, or a plane.
+    """Kernel over contact elements of one collider at the start of a step: rest states with its pose, or with a half-space.
 
-    A vertex whose prediction, x + h v + h² g, crosses the collider has contact with the half-space behind the plane that
-    touches the collider where it meets it: beyond a thin collider there would be no force that leads back. Where h is 0, as of
-    explicit steps, nothing is predicted. Other rest states are written where they change.
+    If the prediction x + h v + h² g of a vertex crosses the collider, it has contact with the half-space behind the tangent
+    plane where it meets the collider, for beyond a thin collider no force would lead it back. With h = 0, as in explicit steps,
+    there is no prediction. Other rest states are written only if they change.
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
@@ -231,7 +232,7 @@ def pose_collider(dtype):
             after = poses.after[copy, collider]
             t = dtype(1.0)
             X = x[i]
-            # The move relative to a collider that stands is the way.
+            # For a collider at rest, the relative move is the move.
             if not (before == after and surely_out(before, core, radius, wp.length(way) + least, X)):
                 ahead = X + way
                 X = to_local(before, X)
@@ -262,11 +263,11 @@ def pose_collider(dtype):
 
 @cache
 def anchor_vertices(dtype, bounded: bool):
-    """Kernel over the elements of friction on one collider, at the start of a step: anchors, and the rest states of the step.
+    """Kernel over friction elements of one collider at the start of a step: anchors, and the rest states of the step.
 
-    With N = −kAφ′(d) of the state, or kA(r − d) of ``bounded`` contact, ε = μN/(kA). A vertex that comes into contact is
-    anchored where it is. One that slid, ‖u‖ above the ε of the step before, drags its anchor after it, to that ε. Anchors are
-    in the frame of the collider, with ε, which is 0 without contact.
+    ε = μN/(kA), with N = −kAφ′(d) at the state, or kA(r − d) if ``bounded``. The anchor of a vertex that comes into contact is
+    its position. If a vertex slid, that is, ‖u‖ is above the ε of the last step, its anchor follows to a distance of that ε.
+    Anchors are stored in the frame of the collider, with ε, which is 0 without contact.
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
@@ -328,13 +329,13 @@ def anchor_vertices(dtype, bounded: bool):
 
 @wp.struct
 class FilterNotes:
-    """Notes of the filter after so many ``steps``: how often it cut, (copies,), the first that is inside, (copies, colliders).
+    """Notes of the filter after ``steps`` steps: the number of cuts (copies,), and the first vertex inside (copies, colliders).
 
-    Where something is inside, ``inside`` is FIRST − ((step·n + vertex)(C + 1) + other), of n vertices and C colliders: other is
-    the collider that held it back last, or C for a vertex that is not free. 0 where nothing is.
+    ``inside`` is 0 if no vertex is inside. Else it is FIRST − ((step·n + vertex)(C + 1) + other) with n vertices and C
+    colliders. other is the last collider that held the vertex back, or C for a vertex that is not free.
 
-    ``pushed`` and ``kicked``, (N,) or None, have what a cut changed in the position and the velocity of a vertex; others are
-    left as they are.
+    ``pushed`` and ``kicked``, (N,) or None, are the changes of the positions and velocities of vertices by cuts; entries of
+    other vertices are not written.
     """
 
     steps: wp.array(dtype=wp.int32)
@@ -349,7 +350,7 @@ FIRST = wp.constant(wp.int64(2**62))
 
 @wp.func
 def note_cut(notes: FilterNotes, copy: int, i: int, pushed: Any, kicked: Any):
-    """Notes that vertex i of a copy was cut short, which changed its position and velocity by this."""
+    """Notes that the move of vertex i of a copy was cut, with the changes of its position and velocity."""
     wp.atomic_add(notes.cut, copy, wp.int64(1))
     if notes.pushed.shape[0] > 0:
         notes.pushed[i] = wp.vec3d(wp.float64(pushed[0]), wp.float64(pushed[1]), wp.float64(pushed[2]))
@@ -358,7 +359,7 @@ def note_cut(notes: FilterNotes, copy: int, i: int, pushed: Any, kicked: Any):
 
 @wp.func
 def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex: int, per_copy: int, other: int):
-    """Notes that a vertex of a copy is inside a collider; of several the first in time, then in number, remains."""
+    """Notes that a vertex of a copy is inside a collider; the first in time, then by index, remains."""
     count = wp.int64(notes.inside.shape[1])
     key = wp.int64(step) * wp.int64(per_copy) + wp.int64(vertex)
     wp.atomic_max(notes.inside, copy, collider, FIRST - (key * (count + wp.int64(1)) + wp.int64(other)))
@@ -366,15 +367,15 @@ def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex:
 
 @cache
 def sliding(dtype):
-    """Device functions of a vertex that a surface stops, ``along`` and ``velocity``."""
+    """Device functions for a vertex that a surface stops: ``along`` and ``velocity``."""
     vec3, _ = types(dtype)
     zero = dtype(0.0)
 
     @wp.func
     def along(move: vec3, n: vec3, friction: dtype):
-        """The part of a move along a surface of normal n, and the push by which that takes the part towards it.
+        """The part of a move along a surface with the normal n, and the push, which removes the part into it.
 
-        Friction takes μ times as much as the push from the first, and never turns it back (Coulomb).
+        Friction reduces the first by up to μ times the push (Coulomb).
         """
         push = wp.max(-wp.dot(move, n), zero) * n
         left = move + push
@@ -385,10 +386,10 @@ def sliding(dtype):
 
     @wp.func
     def velocity(v: vec3, move: vec3, change: vec3, push: vec3, h: dtype):
-        """The velocity after a step whose ``move`` has had this change, by a push and friction.
+        """The velocity after a step whose ``move`` was changed by a push and friction.
 
-        Along the push it is that of the move. Of Euler it is v + change/h, but midpoint, where v is twice the mean velocity of
-        the step less that at its start, would throw the vertex back.
+        Along the push it is that of the move. For Euler it is v + change/h. For midpoint, v is twice the mean velocity of the
+        step minus that at its start, so v + change/h would throw the vertex back.
         """
         size = wp.dot(push, push)
         found = v + (change - push) / h
@@ -401,11 +402,11 @@ def sliding(dtype):
 
 @cache
 def stopped_by_shape(dtype):
-    """The device function (X, move, …) → where a move from X ends in the frame of a convex collider, its change and push.
+    """Device function (X, move, …) → the end of a move from X in the frame of a convex collider, its change, push, and stop.
 
-    A move that would come nearer than ``least`` stops where it is nearer than ``landing`` beyond, at most, and with
-    ``slides`` goes on along the plane through that point, as all of the collider is behind it, lifted to twice ``least`` or it
-    would stop for rounding. The fourth value is whether it was stopped.
+    A move that would come nearer than ``least`` stops before, at a distance of at most ``landing`` more. With ``slides``, it
+    continues along the plane through that point, which has the whole collider behind it, raised to twice ``least`` so that
+    rounding does not stop it. The fourth value is whether the move was stopped.
     """
     vec3, _ = types(dtype)
     kept = kept_part(dtype)
@@ -443,10 +444,10 @@ def stopped_by_shape(dtype):
 
 @cache
 def outside(dtype):
-    """The device function (x, end, v, …) → where a free vertex ends that moves from x to ``end``, and its velocity there.
+    """Device function (x, end, v, …) → final position and velocity of a free vertex that moves from x to ``end``.
 
-    In the frame of a collider it moves along a segment, and where that comes too near as :func:`stopped_by_shape` has it. The
-    third value is whether one has stopped it. ``notes`` counts that, and has the vertex if colliders leave no way out.
+    In the frame of a collider it moves along a segment, or, if that comes too near, as in :func:`stopped_by_shape`. The third
+    value is whether a collider stopped it. ``notes`` counts stops, and notes the vertex if colliders leave no way out.
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
@@ -476,12 +477,12 @@ def outside(dtype):
         cuts = wp.int32(0)
         last = wp.int32(0)
         rounds = wp.int32(0)
-        while rounds <= cuts and rounds < ROUNDS:  # another one after each that has cut
+        while rounds <= cuts and rounds < ROUNDS:  # another round after each cut
             rounds += 1
             for c in range(shape.radius.shape[0]):
                 pose = poses.after[copy, c]
                 began = poses.before[copy, c]
-                # The move relative to a collider that stands is the move.
+                # For a collider at rest, the relative move is the move.
                 margin = wp.length(end - x) + rounded
                 if not (began == pose and surely_out(pose, shape.core[c], shape.radius[c], margin, x)):
                     X = to_local(began, x)
@@ -517,7 +518,7 @@ def outside(dtype):
 
 @cache
 def entry(dtype):
-    """The device function (x, end, …) that notes a vertex that is not free and enters a collider from x to ``end``."""
+    """Device function (x, end, …) that notes a vertex that is not free if it enters a collider between x and ``end``."""
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)
     kept = kept_part(dtype)
@@ -540,7 +541,7 @@ def entry(dtype):
             X = to_local(poses.before[copy, c], x)
             way = to_local(poses.after[copy, c], end) - X
             d, _n = local_gap_of(X, shape.core[c], shape.radius[c])
-            deep = -rounding * wp.max(wp.max(wp.abs(end)), wp.max(wp.abs(X)))  # what moves along may touch
+            deep = -rounding * wp.max(wp.max(wp.abs(end)), wp.max(wp.abs(X)))  # a vertex that moves along may touch
             if d > deep and kept(X, way, shape.core[c], shape.radius[c], deep) < dtype(1.0):
                 note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, shape.radius.shape[0])
 
@@ -549,9 +550,9 @@ def entry(dtype):
 
 @cache
 def filter_step(dtype):
-    """Kernel over vertices, at the end of a step: no free vertex is inside a collider, and none has crossed its surface.
+    """Kernel over vertices at the end of a step: keeps free vertices outside colliders, also on their way.
 
-    Free ones end as :func:`outside` has it, with ``move``, which may be None. Others are noted by :func:`entry`.
+    Free vertices, and their ``move``, which may be None, end as in :func:`outside`. :func:`entry` notes others.
     """
     vec3, _ = types(dtype)
     end_outside, note_entry = outside(dtype), entry(dtype)
@@ -592,7 +593,7 @@ def filter_step(dtype):
 
 @cache
 def hold_locked(dtype):
-    """Kernel over vertices: undoes what the filter did along axes on which a vertex does not move, to what was before."""
+    """Kernel over vertices: undoes the filter along locked axes."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -624,7 +625,7 @@ def hold_locked(dtype):
 
 @cache
 def note_fixed(dtype):
-    """Kernel over vertices that are not free, of all copies: :func:`entry` of each, from where the step began."""
+    """Kernel over the vertices of all copies that are not free: :func:`entry`, from the start of the step."""
     vec3, _ = types(dtype)
     note_entry = entry(dtype)
 

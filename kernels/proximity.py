@@ -1,9 +1,9 @@
-"""Factories of the kernels that find the pairs of a vertex and a triangle, and of two edges, that are near one another.
+"""Factories of the kernels that find vertex–triangle pairs and edge–edge pairs that are near one another.
 
-Boxes about all triangles and edges of all copies, the *items*, triangles first, are sorted into the cells of a grid by their
-centres (count, scan, fill). Level l has boxes whose halves are no larger than ``size``·2ˡ, so a box can only meet those whose
-centres are so far off its own sides at most, in its level and above. Cells are hashed to buckets such that a row along x is a
-run of buckets; therefore they are a quarter as long as wide (measured on waves: 0.75 of the time of cubes).
+The *items* are the triangles and then the edges of all copies. Their bounding boxes are sorted by centre into the cells of a
+hierarchical grid (count, scan, fill). Level l has boxes with half sizes up to ``size``·2ˡ, so a box meets only boxes whose
+centres are at most this far from it, in its own level and those above. Cells are hashed to buckets such that a row along x is a
+sequence of buckets. So cells are a quarter as long as wide (measured on waves: 0.75 of the time with cubes).
 """
 
 from functools import cache
@@ -15,19 +15,19 @@ from .mesh_colliders import geometry
 from .rotation import epsilon
 from .vectors import types
 
-LEVELS = wp.constant(30)  # of the grid; the last has one cell
-MOST = wp.constant(1 << 29)  # pairs of a kind that are counted
-FARTHEST = 1e9  # cells from the origin; all beyond are in the outermost
+LEVELS = wp.constant(30)  # levels of the grid; the last has one cell
+MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
+FARTHEST = 1e9  # largest cell coordinate; the outermost cells contain everything beyond
 MODULE = "warpcloth.proximity"
 
 
 @cache
 def surfaces(dtype):
-    """The struct of the cloths: the vertices of each item, of an edge the last twice, with 2·copy + kind.
+    """Struct of the cloths: the vertices of each item (the last vertex of an edge twice), with 2·copy + kind.
 
-    A copy has n ``vertices``; ``rest`` is the rest position of each [m] and ``piece`` its connected piece, −1 of a vertex of no
-    element. The contact ``distance``, the ``skin``, and how ``far`` apart at rest two elements of a pair are surely twice the
-    distance apart, in m.
+    A copy has n ``vertices``. ``rest`` is the rest position of each [m], and ``piece`` its connected piece, −1 without an
+    element. ``distance`` is the contact distance and ``skin`` the skin [m]. Elements whose first vertices are more than ``far``
+    apart at rest are surely at least twice the contact distance apart [m].
     """
     vec3, _ = types(dtype)
 
@@ -46,11 +46,11 @@ def surfaces(dtype):
 
 @cache
 def grids(dtype):
-    """The struct of the grid: half the ``size`` of the largest boxes of level 0 [m], and 2ᵏ buckets of entries.
+    """Struct of the grid: ``size``, the half size of the largest boxes of level 0 [m], and 2ᵏ buckets of entries.
 
-    Bucket b has the entries from first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell and
-    kind, copy and level in one code. ``counts`` and ``keys`` are scratch. ``levels`` has a bit for each level that there is of
-    triangles, and one of edges.
+    Bucket b has the entries first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell; the
+    code combines kind, copy and level. ``counts`` and ``keys`` are scratch. ``levels`` has a bit for each level with triangles,
+    and one for each level with edges.
     """
     vec3, _ = types(dtype)
 
@@ -70,10 +70,10 @@ def grids(dtype):
 
 @cache
 def pair_lists(dtype):
-    """The struct of the pairs: ``counts`` (2,) that were found, and in no order (row, item) of those within the capacity.
+    """Struct of the pairs: ``counts`` (2,) of those found, and unordered (row, item) of those within the capacity.
 
-    Rows are vertices and then edges; row i has the items from ``first`` [i] on, sorted. ``row_counts`` is scratch, 0 where
-    nothing runs.
+    Rows are vertices, then edges. Row i has the items from ``first`` [i] on, sorted. ``row_counts`` is scratch, and 0 between
+    launches.
     """
 
     @wp.struct
@@ -91,9 +91,9 @@ def pair_lists(dtype):
 
 @cache
 def closest_points(dtype, of_edges: bool):
-    """The device function (x₀, x₁, x₂, x₃) → (w, y): y = Σ wᵢ xᵢ is the shortest vector between two primitives.
+    """Device function (x₀, x₁, x₂, x₃) → (w, y): y = Σ wᵢ xᵢ is the shortest vector between two primitives.
 
-    From the nearest point of triangle x₁ x₂ x₃ to vertex x₀, or from that of the edge x₂ x₃ to that of the edge x₀ x₁.
+    It goes from triangle x₁ x₂ x₃ to vertex x₀, or from edge x₂ x₃ to edge x₀ x₁.
     """
     vec3, mat33 = types(dtype)
     vec4 = wp.types.vector(4, dtype)
@@ -102,12 +102,12 @@ def closest_points(dtype, of_edges: bool):
 
     @wp.func
     def on_segment(along: dtype, squared: dtype):
-        """The parameter of the nearest point of a segment, 0 of one without length."""
+        """The parameter of the nearest point of a segment; 0 for a segment without length."""
         return wp.where(squared > zero, wp.clamp(along / squared, zero, one), zero)
 
     @wp.func
     def of_two_edges(a: vec3, b: vec3, c: vec3, d: vec3):
-        """Ericson 2004, *Real-time collision detection*, 5.1.9, and s once more, as parallel edges leave it to rounding."""
+        """Ericson 2004, *Real-time collision detection*, 5.1.9; then s once more, for parallel edges leave it to rounding."""
         e = b - a
         f = d - c
         r = a - c
@@ -134,25 +134,25 @@ def closest_points(dtype, of_edges: bool):
 
 @cache
 def boxes(dtype):
-    """Device functions of boxes: ``box_of``, ``level_of``, ``cell_at``, ``cells_about``."""
+    """Device functions on boxes: ``box_of``, ``level_of``, ``cell_at``, ``cells_about``."""
     vec3, _ = types(dtype)
     half, farthest = dtype(0.5), dtype(FARTHEST)
 
     @wp.func
     def box_of(surface: surfaces(dtype), a: vec3, b: vec3, c: vec3):
-        """The box about three points that meets all boxes within the distance and the skin, with a margin for rounding."""
+        """The box of three points, enlarged by half of the contact distance and the skin, and by a margin for rounding."""
         low = wp.min(wp.min(a, b), c)
         high = wp.max(wp.max(a, b), c)
         more = half * (surface.distance + surface.skin)
         more += dtype(4.0) * epsilon(more) * wp.max(wp.max(wp.abs(low)), wp.max(wp.abs(high)))
-        # The smaller of a number and NaN is the number, so NaN would be lost here.
+        # min and max ignore NaN; these products do not.
         more += wp.dot(a, vec3()) + wp.dot(b, vec3()) + wp.dot(c, vec3())
         edge = vec3(more, more, more)
         return low - edge, high + edge
 
     @wp.func
     def level_of(size: dtype, low: vec3, high: vec3):
-        """The level of a box, or −1 of one that is not finite."""
+        """The level of a box; −1 if the box is not finite."""
         own = half * wp.max(high - low)
         level = wp.int32(-1)
         if own < dtype(wp.inf):
@@ -180,7 +180,7 @@ def boxes(dtype):
 
     @wp.func
     def cells_about(size: dtype, low: vec3, high: vec3, level: int):
-        """The first and the last of the cells of a level that have the centres of boxes that meet a box."""
+        """The first and last cells of a level that can contain the centres of boxes that meet a box."""
         first = wp.vec3i()
         last = wp.vec3i()
         if level < LEVELS:
@@ -201,7 +201,7 @@ def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
 
 @cache
 def count_items(dtype):
-    """Kernel over items: how many each bucket has, the bucket of each or −1, and the levels that there are."""
+    """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist."""
     vec3, _ = types(dtype)
     box_of, level_of, cell_at, _about = boxes(dtype)
 
@@ -232,7 +232,7 @@ def count_items(dtype):
 
 @cache
 def fill_buckets(dtype):
-    """Kernel over items, in turns that leave ``counts`` 0: the entries of the buckets."""
+    """Kernel over items: the entries of the buckets; counts ``counts`` down to 0."""
     vec3, _ = types(dtype)
     box_of, level_of, cell_at, _about = boxes(dtype)
 
@@ -263,9 +263,9 @@ def fill_buckets(dtype):
 
 @cache
 def cutoffs(dtype, of_edges: bool):
-    """The device function (surface, stencil, first vertex of the copy) → contact distance of a pair [m].
+    """Device function (surface, stencil, first vertex of the copy) → contact distance of a pair [m].
 
-    It is half the rest distance, if that is less and both are of one piece.
+    For two elements of one piece, it is at most half the rest distance.
     """
     closest = closest_points(dtype, of_edges)
 
@@ -285,9 +285,9 @@ def cutoffs(dtype, of_edges: bool):
 
 @cache
 def find_pairs(dtype, of_edges: bool):
-    """Kernel over vertices, or edges: the pairs with triangles, or with edges, in the same level and any above.
+    """Kernel over vertices, or edges: pairs with triangles, or with edges, of the same level and those above.
 
-    Of two edges of one level that finds the other whose cell comes after along z, or whose index is higher.
+    Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices.
     """
     vec3, _ = types(dtype)
     box_of, level_of, cell_at, cells_about = boxes(dtype)
@@ -295,7 +295,7 @@ def find_pairs(dtype, of_edges: bool):
     closest, cutoff = closest_points(dtype, of_edges), cutoffs(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
-    # A module of its own: a graph of the CPU finds kernels of one module by their names, which both kinds share.
+    # Separate modules: graphs on the CPU find kernels of a module by name, and both kinds have the same name.
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}.{KIND}", enable_backward=False)
     def find_each_pair(
         # elements
@@ -341,7 +341,7 @@ def find_pairs(dtype, of_edges: bool):
                         run = bucket_of(one[0], cy, cz, code, buckets)
                         begin = number(grid.first, run)
                         end = number(grid.first, wp.min(run + width, buckets))
-                        # A run that passes the last bucket goes on at the first.
+                        # A sequence beyond the last bucket continues at the first.
                         for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
                             slot = wp.where(at < end, at, at - end)
                             l = corner(grid.lower, slot)
@@ -415,13 +415,13 @@ def sort(values: wp.array(dtype=wp.int32), first: int, end: int):
 
 @wp.func
 def kept(counts: wp.array(dtype=wp.int32), capacity: int):
-    """How many pairs there are within the capacity."""
+    """The number of pairs within the capacity."""
     return wp.min(wp.min(counts[0], capacity) + counts[1], capacity)
 
 
 @cache
 def fill_rows(dtype):
-    """Kernel over the capacity, in turns that leave ``row_counts`` 0: the items of each row."""
+    """Kernel over the capacity: the items of each row; counts ``row_counts`` down to 0."""
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def fill_each_row(
@@ -440,7 +440,7 @@ def fill_rows(dtype):
 
 @cache
 def write_pairs(dtype):
-    """Kernel over rows: their pairs in order, with the contact distance of each."""
+    """Kernel over rows: their sorted pairs, with the contact distance of each."""
     vertex_cutoff, edge_cutoff = (cutoffs(dtype, each) for each in (False, True))
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -477,10 +477,10 @@ def write_pairs(dtype):
 
 @cache
 def pieces(dtype):
-    """The struct of the connected pieces of all copies: the piece of each vertex, or −1, and the vertex in the middle of each.
+    """Struct of the connected pieces of all copies: the piece of each vertex, or −1, and the middle vertex of each piece.
 
-    If a copy has more than one, ``per_copy``, each also has a box, and the largest motion of a vertex relative to that in its
-    middle [m].
+    If a copy has more than one piece (``per_copy``), each also has a box, and the largest motion of its vertices relative to
+    the middle vertex [m].
     """
     vec3, _ = types(dtype)
 
@@ -498,7 +498,7 @@ def pieces(dtype):
 
 @cache
 def begin_boxes(dtype):
-    """Kernel over pieces: the vertex in the middle is the box."""
+    """Kernel over pieces: sets the box to the middle vertex."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -517,7 +517,7 @@ def begin_boxes(dtype):
 
 @cache
 def extend_boxes(dtype):
-    """Kernel over vertices: the boxes of their pieces have them."""
+    """Kernel over vertices: extends the boxes of their pieces."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -571,9 +571,11 @@ def take_moved(dtype):
 
 @cache
 def find_motion(dtype):
-    """Kernel over vertices: moved = 1 of the copies that are ``active``, or of all, in which one has moved on from ``found``,
-    relative to the middle of its piece, by more than ``most``; some = 1 if there is such a copy; stale = 1 if ``found`` is not
-    where the pairs were listed."""
+    """Kernel over vertices: finds copies in which a vertex has moved by more than ``most`` since ``found``.
+
+    The motion is relative to the middle vertex of the piece. moved = 1 for such copies, among the ``active`` ones if given;
+    some = 1 if there is one; stale = 1 if the pairs were not listed at ``found``.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -610,8 +612,11 @@ def find_motion(dtype):
 
 @cache
 def compare_motions(dtype):
-    """Kernel over pieces: moved and some as of :func:`find_motion` if it and a later one of its copy may have come nearer by
-    more than ``most``, and than what their boxes were farther apart than ``radius``, within which pairs are listed."""
+    """Kernel over pieces: moved and some as in :func:`find_motion`, if the piece and a later one of its copy may be too near.
+
+    That is, if their approach may exceed ``most`` plus the excess of the distance of their boxes over ``radius``, up to which
+    pairs are listed.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)

@@ -1,10 +1,10 @@
-"""Factories of the kernels of the energy of contact of cloth with itself, and of its derivatives.
+"""Factories of the kernels of the energy of self-contact and its derivatives.
 
-U = Σ kA φ(d) over the pairs that act. The gap d is that of :mod:`.self_gaps`, the area A that of :mod:`.self_pairs`, and φ that
-of contact with colliders (:mod:`.terms.contact`). The nearest points minimise ‖y‖, so their motion adds nothing to
-∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin). Of the second derivative the part kA φ″ wᵢwⱼnnᵀ is kept, which is semi-definite.
+U = Σ kA φ(d) over the acting pairs, with the gap d of :mod:`.self_gaps`, the area A of :mod:`.self_pairs`, and φ as for
+colliders (:mod:`.terms.contact`). The nearest points minimise ‖y‖, so their motion does not contribute to ∂U/∂xᵢ = kA φ′ wᵢn, n
+= y/d (Danskin's theorem). The Hessian is approximated by its semi-definite part kA φ″ wᵢwⱼnnᵀ.
 
-All is computed in float64, whatever the model has: the points are then exact.
+Everything is computed in float64 for every precision of the model, so that positions are exact.
 """
 
 from functools import cache
@@ -23,7 +23,7 @@ potential, slope, bend = contact.potential, contact.slope, contact.bend
 class PairForces:
     """n, w, kAφ [J], kAφ′ [N] and kAφ″ [N/m] of each pair at some positions.
 
-    On the CPU ``pressing`` lists the pairs that have a force, in order; there are ``count`` (1,) of them.
+    On the CPU ``pressing`` lists the ``count`` (1,) pairs with a force, in order.
     """
 
     normal: wp.array(dtype=wp.vec3d)
@@ -37,7 +37,7 @@ class PairForces:
 
 @cache
 def find_forces(dtype, bounded: bool):
-    """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; of ``bounded`` contact φ = ½(r − d)²."""
+    """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; φ = ½(r − d)² if ``bounded``."""
     vec3, _ = types(dtype)
     at, _exact = vertex_of(dtype)
 
@@ -115,7 +115,7 @@ def add_forces(dtype):
 
 @cache
 def sum_energies(dtype):
-    """Kernel over vertices: the energies of the pairs of which a vertex is the first [J]."""
+    """Kernel over vertices: sums of the energies [J] of the pairs whose first vertex it is."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def sum_energies_of_pairs(
@@ -138,7 +138,7 @@ def sum_energies(dtype):
 
 @cache
 def add_diagonal(dtype):
-    """Kernel over vertices: adds Σ kAφ″ wᵢ²nnᵀ to the diagonal blocks of a Hessian; nothing to those of pins."""
+    """Kernel over vertices: adds Σ kAφ″ wᵢ²nnᵀ to the diagonal blocks of a Hessian, except those of pins."""
     _, mat33 = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -168,7 +168,7 @@ def add_diagonal(dtype):
 
 @cache
 def add_products(dtype):
-    """Kernel over vertices: q += Σ kAφ″ wᵢ n Σⱼ wⱼ nᵀpⱼ over the other corners j of its pairs, of copies that are active."""
+    """Kernel over vertices: q += Σ kAφ″ wᵢ n Σⱼ wⱼ nᵀpⱼ over the other vertices j of its pairs, in active copies."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 

@@ -1,12 +1,12 @@
-"""Factories of the kernels of friction of cloth with itself: U = Σ kA H(‖u‖), u = (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)).
+"""Factories of the kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)).
 
-H is the Huber function of :mod:`.terms.friction` with ε = μN/(kA): a spring of the stiffness of contact whose force is no more
-than μN. The pairs are those near one another where the step began, at the positions xⁿ, and so are w, n, N and kA of each. ξ is
-the stretch that the spring had there, which steps pass on: ξ ← (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)), cut to ε where the next begins
-and it is longer. So a pair that sticks does not creep, and one that slides drags its spring along.
+H is the Huber function of :mod:`.terms.friction` with ε = μN/(kA): a spring with the stiffness of contact and a force of at
+most μN. Pairs, w, n, N and kA are those at the start of the step, at the positions xⁿ. ξ is the elongation of the spring there.
+A step updates it, ξ ← (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)), and the next one shortens it to at most ε. So a sticking pair does not
+creep, and the spring of a sliding pair slides along.
 
-ξ is kept relative to the edge between the last two vertices of a pair, by which it turns with the cloth. A pair without a ξ of
-its own begins with the mean of those pairs that touched between the same parts: that have a vertex in common on either side.
+ξ is stored relative to the edge between the last two vertices of a pair, so that it rotates with the cloth. A new pair starts
+with the mean ξ of the touching pairs between the same parts, which have a common vertex with it on each side.
 """
 
 from functools import cache
@@ -23,7 +23,7 @@ slope = contact.slope
 
 @wp.struct
 class RubbedPairs:
-    """Of pairs where the step began: n, w, kA [N/m], μN [N], 0 of those that do not touch, ξ [m], and kA of contact."""
+    """Values of pairs at the start of the step: n, w, kA [N/m], μN [N] (0 without contact), ξ [m], and kA of contact [N/m]."""
 
     normal: wp.array(dtype=wp.vec3d)
     weights: wp.array(dtype=wp.vec4d)
@@ -35,7 +35,7 @@ class RubbedPairs:
 
 @wp.struct
 class RubForces:
-    """Of pairs at some positions: kAH [J], ∂U/∂u [N], u/‖u‖, and the second derivatives along u and across it [N/m]."""
+    """Values of pairs at given positions: kAH [J], ∂U/∂u [N], u/‖u‖, and the second derivatives along and across u [N/m]."""
 
     energy: wp.array(dtype=wp.float64)
     pull: wp.array(dtype=wp.vec3d)
@@ -51,7 +51,7 @@ def friction_module(dtype):
 
 @wp.func
 def edge_tangent(edge: wp.vec3d, n: wp.vec3d):
-    """The direction of an edge in the plane normal to n, 0 of an edge along n."""
+    """Direction of an edge in the plane normal to n; 0 for an edge along n."""
     t = edge - wp.dot(n, edge) * n
     return t / wp.max(wp.length(t), wp.float64(1e-300))
 
@@ -72,7 +72,7 @@ def has(s: wp.vec4i, vertex: int, first: int, last: int):
 
 @wp.func
 def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_last: int):
-    """Whether two sides, given by the range of their corners, have a vertex in common."""
+    """Whether two sides, given by their ranges of corners, have a common vertex."""
     found = wp.bool(False)
     for i in range(s_first, s_last):
         if has(q, s[i], q_first, q_last):
@@ -82,11 +82,11 @@ def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_la
 
 @cache
 def begin_friction(dtype, bounded: bool):
-    """Kernel over pairs, where a step begins: w, n, kA and μN, and which are acting: those with an area or friction.
+    """Kernel over pairs at the start of a step: w, n, kA and μN, and which are acting, that is, have an area or friction.
 
-    kA is that of the contact of the last step, which ``kept`` it, so that the mean of N is the force of contact. It is that of
-    this step in three cases: in explicit steps, whose contact is evaluated where the step begins; in a copy that has made no
-    ``steps``; and for a pair that was not kept, if areas changed within the last step because the copy was ``relisted``.
+    kA is that of contact in the last step, from ``kept``, so that the mean of N is the force of contact. It is that of this
+    step in three cases: in explicit steps, which evaluate contact at their start; in the first step of a copy; and for a pair
+    that is not in ``kept``, if areas changed within the last step because the copy was ``relisted``.
     """
 
     @wp.kernel(module=f"{friction_module(dtype)}.{bounded}", enable_backward=False)
@@ -147,14 +147,14 @@ def note_relisted(
     # in and out
     relisted: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: relisted = 1 of these."""
+    """Kernel over copies: relisted = 1 for the given copies."""
     c = wp.tid()
     relisted[c] = wp.max(relisted[c], copies[c])
 
 
 @cache
 def set_stretch(dtype):
-    """Kernel over acting pairs, where a step begins: ξ, by what the last step ``kept`` of a copy that has made ``steps``."""
+    """Kernel over acting pairs at the start of a step: ξ, from ``kept`` of the last step, if the copy has made ``steps``."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -193,7 +193,7 @@ def set_stretch(dtype):
                 if slip[2] > ZERO and not own:
                     q = kept.stencils[e_kept]
                     kept_sides = wp.where(e_kept < kept.counts[0], 1, 2)
-                    # Of the other pairs some have their sides the other way round.
+                    # Some of the other pairs have their sides in the opposite order.
                     way = ZERO
                     if meet(s, 0, sides, q, 0, kept_sides) and meet(s, sides, 4, q, kept_sides, 4):
                         way = ONE
@@ -221,7 +221,7 @@ def set_stretch(dtype):
 
 @cache
 def set_contact(dtype):
-    """Kernel over acting pairs: kA of contact, as of another list of pairs, 0 of those that do not act there."""
+    """Kernel over acting pairs: kA of contact from another list of pairs, 0 for pairs that are not acting there."""
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def set_contact_of_pairs(
@@ -251,7 +251,7 @@ def set_contact(dtype):
 
 @cache
 def stretch_of(dtype):
-    """The device function (stencil, w, n, ξ, start, x, correction) → u."""
+    """Device function (stencil, w, n, ξ, start, x, correction) → u."""
     vec3, _ = types(dtype)
     at, exact = vertex_of(dtype)
 
@@ -344,7 +344,7 @@ def add_friction(dtype):
 
 @cache
 def sum_friction(dtype):
-    """Kernel over vertices: adds the energies of the pairs of which a vertex is the first [J]."""
+    """Kernel over vertices: adds the energies [J] of the pairs whose first vertex it is."""
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def sum_friction_of_pairs(
@@ -369,7 +369,7 @@ def sum_friction(dtype):
 
 @cache
 def add_friction_diagonal(dtype):
-    """Kernel over vertices: adds Σ wᵢ²∂²U/∂u² to the diagonal blocks of a Hessian; nothing to those of pins."""
+    """Kernel over vertices: adds Σ wᵢ²∂²U/∂u² to the diagonal blocks of a Hessian, except those of pins."""
     _, mat33 = types(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
@@ -403,7 +403,7 @@ def add_friction_diagonal(dtype):
 
 @cache
 def add_friction_products(dtype):
-    """Kernel over vertices: q += wᵢ ∂²U/∂u² Σⱼ wⱼpⱼ over the other corners j of its pairs, of copies that are active."""
+    """Kernel over vertices: q += wᵢ ∂²U/∂u² Σⱼ wⱼpⱼ over the other vertices j of its pairs, in active copies."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -448,10 +448,10 @@ def add_friction_products(dtype):
 
 @cache
 def end_friction(dtype):
-    """Kernel over acting pairs, where a step ends at x: what the next one needs.
+    """Kernel over acting pairs at the end x of a step: values for the next step.
 
-    Those are the parts of ξ along t, the edge of the pair in the plane normal to n, and along n × t; kA of friction, 0 of pairs
-    without; and kA of contact.
+    These are the components of ξ along t, the edge of the pair in the plane normal to n, and along n × t; kA of friction, 0
+    without friction; and kA of contact.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)

@@ -1,8 +1,8 @@
 """Nearest points of a vertex and a triangle, or of two edges, and the gap between them, in float64.
 
-A pair has four vertices and y = Σ wᵢxᵢ, the vector between its nearest points: w = (1, −β₁, −β₂, −β₃) of a vertex and a
-triangle, (1 − s, s, −(1 − t), −t) of two edges. Its gap is d = ±‖y‖. It is negative if the pair went through: then y points
-against the normal n of the start of the step.
+A pair has four vertices. y = Σ wᵢxᵢ is the vector between its nearest points, with w = (1, −β₁, −β₂, −β₃) for a vertex and a
+triangle, and (1 − s, s, −(1 − t), −t) for two edges. The gap is d = ±‖y‖. It is negative if the pair passed through one another
+in the step, that is, if y is opposite to the normal n at the start of the step.
 """
 
 from functools import cache
@@ -11,7 +11,7 @@ import warp as wp
 
 from .vectors import types
 
-# Numbers for all kernels of pairs.
+# Constants for all kernels of pairs.
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 SIDE = wp.constant(wp.float64(0.5))
 PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges below which they have no normal
@@ -19,7 +19,7 @@ PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges belo
 
 @wp.func
 def nearest_on_segment(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """The t from 0 to 1 of the point a + t(b − a) nearest to p."""
+    """The t in [0, 1] of the point a + t(b − a) nearest to p."""
     ab = b - a
     square = wp.dot(ab, ab)
     t = ZERO
@@ -30,7 +30,7 @@ def nearest_on_segment(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def vertex_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """w of the point of a triangle nearest to p, and whether it is inside of the triangle (Ericson 2005, section 5.1.5)."""
+    """w of p and the nearest point of a triangle, and whether that is in its interior (Ericson 2005, section 5.1.5)."""
     ab = b - a
     ac = c - a
     ap = p - a
@@ -51,7 +51,7 @@ def vertex_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     if va > ZERO and vb > ZERO and vc > ZERO and total > ZERO:
         w = wp.vec4d(ONE, -va / total, -vb / total, -vc / total)
         inside = 1
-    else:  # the nearest of the points of the edges
+    else:  # the nearest of the nearest points of the edges
         t = nearest_on_segment(p, a, b)
         away = p - a - t * ab
         least = wp.dot(away, away)
@@ -72,11 +72,11 @@ def vertex_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 @wp.func
 def edge_edge(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """w of the nearest points of two edges ab and cd, and whether both are inside of their edges."""
+    """w of the nearest points of two edges ab and cd, and whether both are in the interior of their edges."""
     ab = b - a
     cd = d - c
     ca = a - c
-    # sin² by the cross product, for |ab|²|cd|² − (ab·cd)² of nearly parallel edges has few digits.
+    # sin² from the cross product, because |ab|²|cd|² − (ab·cd)² cancels for nearly parallel edges.
     normal = wp.cross(ab, cd)
     determinant = wp.dot(normal, normal)
     w = wp.vec4d(ONE, ZERO, -ONE, ZERO)
@@ -87,7 +87,7 @@ def edge_edge(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
         if s > ZERO and s < ONE and t > ZERO and t < ONE:
             w = wp.vec4d(ONE - s, s, t - ONE, -t)
             inside = 1
-    if inside == 0:  # the nearest of an end of one and a point of the other
+    if inside == 0:  # an end of one edge is nearest to the other
         t = nearest_on_segment(a, c, d)
         away = a - c - t * cd
         least = wp.dot(away, away)
@@ -114,7 +114,7 @@ def edge_edge(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 @wp.func
 def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """w, y and whether the nearest points of a pair are inside; points are relative to the first, which keeps their digits."""
+    """w, y and whether the nearest points are interior; computed relative to the first vertex, which keeps digits."""
     zero = wp.vec3d()
     w = wp.vec4d()
     inside = wp.int32(0)
@@ -123,7 +123,7 @@ def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
     else:
         w, inside = edge_edge(zero, b - a, c - a, d - a)
     y = w[1] * (b - a) + w[2] * (c - a) + w[3] * (d - a)
-    if inside == 1:  # the weights of nearly parallel edges, and in thin triangles, have too few digits
+    if inside == 1:  # for nearly parallel edges and thin triangles, y from the weights would have too few digits
         normal = wp.cross(b - a, d - c)
         if of_vertex:
             normal = wp.cross(c - b, d - b)
@@ -135,7 +135,7 @@ def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
 
 @wp.func
 def signed_gap(y: wp.vec3d, normal: wp.vec3d, inside: int):
-    """d and n of a pair. If y points against its ``normal`` at the start of the step, it has gone through and d is below 0."""
+    """d and n of a pair. If y is opposite to its ``normal`` at the start of the step, it passed through, and d is negative."""
     d = wp.length(y)
     n = normal
     if d > ZERO:
@@ -149,7 +149,7 @@ def signed_gap(y: wp.vec3d, normal: wp.vec3d, inside: int):
 
 @wp.func
 def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """The gap between both sides of a pair along n, |n| ≤ 1: a lower bound of its d."""
+    """The gap between the two sides of a pair along n, |n| ≤ 1, which is a lower bound of d."""
     y = wp.dot(n, c - a)
     z = wp.dot(n, d - a)
     x = wp.dot(n, b - a)
@@ -161,7 +161,7 @@ def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3
 
 @cache
 def vertex_of(dtype):
-    """The device functions (x, correction, i) → xᵢ or xᵢ + dᵢ in float64, and (v) → v in float64."""
+    """Device functions (x, correction, i) → xᵢ or xᵢ + dᵢ in float64, and (v) → v in float64."""
     vec3, _ = types(dtype)
 
     @wp.func

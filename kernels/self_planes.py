@@ -1,4 +1,4 @@
-"""Factories of the kernels that find how much of its move each vertex may make, by a plane between both sides of each pair."""
+"""Factories of the kernels that limit the moves of vertices, by a plane between the two sides of each pair."""
 
 from functools import cache
 
@@ -8,18 +8,18 @@ from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
 from .self_pairs import module_of, near_pairs
 from .vectors import types
 
-# The share of its way to a plane that a vertex may go in one round of the filter.
+# Fraction of its distance to a plane that a vertex may move in one round of the filter.
 KEPT = wp.constant(wp.float64(0.9))
-CLAMPED = wp.constant(wp.float64(0.05))  # the least share of the gap that lies between either side and the plane
-# A pair needs no plane if its sides approach by less than this share of its gap. It is below 0.9²: y separates nine tenths of
-# the gap at least, and of these KEPT may be closed.
+CLAMPED = wp.constant(wp.float64(0.05))  # smallest distance of each side from the plane, as a fraction of the gap
+# A pair needs no plane if its sides approach by less than this fraction of the gap. It is below 0.9²: along y the sides are at
+# least 0.9 of the gap apart, and the fraction KEPT of this may be closed.
 WIDE = wp.constant(wp.float64(0.75))
-ULP = wp.constant(wp.float64(1.1920929e-07))  # of float32, over the number, at most
+ULP = wp.constant(wp.float64(1.1920929e-07))  # largest relative unit in the last place of float32
 
 
 @cache
 def wanted_move(dtype):
-    """The device function (x, target, direction, i) → the wanted move of vertex i: its direction, or to its target if None."""
+    """Device function (x, target, direction, i) → wanted move of vertex i: its direction, or if that is None target − x."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -37,7 +37,7 @@ def wanted_move(dtype):
 
 @cache
 def common_move(dtype):
-    """Kernel over copies: the mean of the moves of all vertices that are wanted [m]."""
+    """Kernel over copies: the mean of the wanted moves of all vertices [m]."""
     vec3, _ = types(dtype)
     wanted = wanted_move(dtype)
 
@@ -63,10 +63,10 @@ def common_move(dtype):
 
 @cache
 def find_ways(dtype):
-    """Kernel over vertices: a bound on how much each brings a pair nearer [m], its largest coordinate [m], and a share of 1.
+    """Kernel over vertices: a bound of its contribution to the approach of a pair [m], its largest coordinate [m]; share = 1.
 
-    The bound adds up two lengths: that of the wanted move less the ``common`` move, and WIDE times that of the motion since
-    ``begun``, where the gaps were found, less the motion of the first vertex of the copy.
+    The bound is the length of the wanted move minus the ``common`` move, plus WIDE times the length of the motion since
+    ``begun``, where the gaps were computed, minus the motion of the first vertex of the copy.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -102,9 +102,9 @@ def find_ways(dtype):
 
 @wp.func
 def margin_of(least: wp.float64, far: wp.float64):
-    """Half the distance that two sides keep, where no coordinate is above ``far``.
+    """Half the smallest distance of two sides with coordinates up to ``far``.
 
-    So 4 units in the last place of float32 remain between the sides; frames are stored in float32.
+    It keeps the sides 4 units in the last place of float32 apart, because frames are stored in float32.
     """
     ulp = ULP * far
     return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
@@ -112,15 +112,14 @@ def margin_of(least: wp.float64, far: wp.float64):
 
 @cache
 def cut_by_planes(dtype):
-    """Kernel over pairs: lowers the ``share`` of its wanted move from x that each vertex may make.
+    """Kernel over pairs: reduces the ``share`` of each vertex, the fraction of its wanted move from x that it may make.
 
-    A plane normal to y lies between the two sides, and divides their gap, less the distance that they keep, in the ratio of
-    their approaches; each side has at least CLAMPED of it. The ``common`` move of all vertices of a copy does not count as an
-    approach. A pair that is ``open`` gets no plane, nor does one whose ``gap`` is so wide that no plane would cut the moves
-    that :func:`find_ways` bounds.
+    A plane normal to y is placed between the two sides. It divides their gap, minus the smallest distance, in the ratio of
+    their approaches; each side gets at least CLAMPED of it. The ``common`` move of a copy does not count as an approach. There
+    is no plane for a pair that is ``open``, or whose ``gap`` is too wide for the moves that :func:`find_ways` bounds.
 
-    A vertex that is as near to a plane as it may be, and does not approach it, moves by the ``least_share`` or more, or not at
-    all: the roundings of shorter moves, which are alike in many steps, would take it nearer.
+    A vertex at the smallest distance from a plane that does not approach it moves by at least ``least_share``, or not at
+    all. Roundings of shorter moves, which can be equal in many steps, would take it nearer.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -162,7 +161,7 @@ def cut_by_planes(dtype):
                 way[1] = wp.max(way[1], each[0])
         margin = margin_of(least, far)
         if gap:
-            # However the gap is divided, approaches that add up to so much or less are not cut.
+            # For any division of the gap, approaches with at most this sum are not shortened.
             if way[0] + way[1] <= WIDE * gap[e] - KEPT / CLAMPED * margin:
                 return
         if open:
@@ -193,7 +192,7 @@ def cut_by_planes(dtype):
         part = SIDE
         if first + second > ZERO:
             part = wp.clamp(second / (first + second), CLAMPED, ONE - CLAMPED)
-        if lowest - highest < KEPT * wp.length(y):  # by rounding y does not separate the sides, which then stay
+        if lowest - highest < KEPT * wp.length(y):  # because of rounding y does not separate the sides, so they stay
             for i in range(4):
                 wp.atomic_min(share, s[i], ZERO)
             return

@@ -1,4 +1,4 @@
-"""Factories of the kernels that sweep over pairs of cloth with itself, one by one or, as Jacobi, all at once."""
+"""Factories of the kernels of Gauss–Seidel and Jacobi sweeps over self-contact pairs."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ gap_after = contact.gap_after
 
 @wp.struct
 class SweptPairs:
-    """Of each pair in a Jacobi sweep: whether it touches, its n, w and d, and the λ that it gets."""
+    """Values of each pair in a Jacobi sweep: whether it touches, n, w, d, and the new λ."""
 
     touches: wp.array(dtype=wp.int32)
     normal: wp.array(dtype=wp.vec3d)
@@ -26,7 +26,7 @@ class SweptPairs:
 
 @cache
 def free_move(dtype, axes: bool):
-    """The device function (inverse masses, i, v) → W v, in float64; inverse masses are those of each axis with ``axes``."""
+    """Device function (inverse masses, i, v) → W v, in float64; with ``axes``, inverse masses are vectors."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -43,7 +43,7 @@ def free_move(dtype, axes: bool):
 
 @cache
 def find_clearances(dtype):
-    """Kernel over acting pairs: by how much the gap at x along the n of the start of the step is above the contact distance."""
+    """Kernel over acting pairs: clearance = gap at x along n of the start of the step, minus the contact distance."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -70,13 +70,13 @@ def find_clearances(dtype):
 
 @cache
 def sweep_pairs(dtype, axes: bool):
-    """Kernel of one thread: each acting pair in turn takes its force away, then adds that of the prox at the gap without it.
+    """Kernel of one thread: for each acting pair in turn, removes its λ, then adds that of the prox at the remaining gap.
 
     With d̂ = n·Σwᵢxᵢ without the force of the pair and W = Σ wᵢ²/mᵢ, λ = (d* − d̂)/W, where d* solves
-    (d* − d̂)/W = −kAhₑ²φ′(d*) in closed form, and Δxᵢ = wᵢ λ n/mᵢ. M(x − x̃) = Σ wᵢλn then holds with the n and w that pairs have
-    at x, and a fixed point is the minimiser of the step. Without ``multipliers`` nothing is taken away (PBD).
+    (d* − d̂)/W = −kAhₑ²φ′(d*) in closed form, and Δxᵢ = wᵢ λ n/mᵢ. Then M(x − x̃) = Σ wᵢλn with n and w at x, and a fixed point
+    minimises the objective of the step. Without ``multipliers`` nothing is removed (PBD).
 
-    A pair whose ``clearance`` at x, see :func:`find_clearances`, corrections have not closed has no force, and costs little.
+    A pair is skipped quickly while corrections are smaller than its ``clearance``, see :func:`find_clearances`.
     """
     vec3, _ = types(dtype)
     at, exact = vertex_of(dtype)
@@ -155,7 +155,7 @@ def sweep_pairs(dtype, axes: bool):
 
 @cache
 def touch_pairs(dtype):
-    """Kernel over acting pairs of a Jacobi sweep: n, w and d where they touch or have a force; λ is of :func:`press_pairs`."""
+    """Kernel over acting pairs of a Jacobi sweep: n, w and d of those that touch or have a force."""
     vec3, _ = types(dtype)
     at, _exact = vertex_of(dtype)
 
@@ -201,7 +201,7 @@ def touch_pairs(dtype):
 
 @cache
 def count_touching(dtype):
-    """Kernel over vertices: how many pairs of a vertex touch."""
+    """Kernel over vertices: number of its pairs that touch."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def count_touching_pairs(
@@ -223,10 +223,9 @@ def count_touching(dtype):
 
 @cache
 def press_pairs(dtype, axes: bool):
-    """Kernel over acting pairs of a Jacobi sweep: the λ of the prox, with D = Σ nᵢwᵢ²/mᵢ for W; nᵢ pairs touch at i.
+    """Kernel over acting pairs of a Jacobi sweep: λ of the prox, with D = Σ nᵢwᵢ²/mᵢ for W, nᵢ the touching pairs of vertex i.
 
-    D is at least J W Jᵀ of all of them, so the sum of the moves never overshoots. The fixed point is that of
-    :func:`sweep_pairs`.
+    D ⪰ J W Jᵀ, so the sum of the moves does not overshoot. The fixed point is that of :func:`sweep_pairs`.
     """
     moved = free_move(dtype, axes)
     vec3, _ = types(dtype)
@@ -309,7 +308,7 @@ def move_by_pairs(dtype, axes: bool):
 
 @cache
 def keep_pairs(dtype):
-    """Kernel over acting pairs of a Jacobi sweep: keeps λ, w and n for the next sweep."""
+    """Kernel over acting pairs of a Jacobi sweep: stores λ, w and n for the next sweep."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def keep_each_pair(

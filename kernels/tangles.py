@@ -1,4 +1,4 @@
-"""Kernels of triangles that cross at the start: the pairs of contact that are left out for them, and whether they are free."""
+"""Kernels for triangles that intersect at the start: contact pairs ignored because of them, and whether they are free."""
 
 from functools import cache
 
@@ -12,10 +12,11 @@ MODULE = "warpcloth.tangles"
 
 @wp.struct
 class LeftOut:
-    """Pairs of contact by which tangled triangles move through one another: sorted, first those of a vertex.
+    """Contact pairs through which tangled triangles pass one another, sorted, vertex–triangle pairs first.
 
-    A pair of a vertex is (v, a, b, c) with a < b < c, one of edges (a, b, c, d) with a < b, c < d and (a, b) before (c, d). Its
-    ``tangles`` are those of ``first`` [i] to ``first`` [i + 1]; it is ``whole`` if no other triangles come to cross by it.
+    A vertex–triangle pair is (v, a, b, c) with a < b < c. An edge–edge pair is (a, b, c, d) with a < b, c < d and (a, b) before
+    (c, d). Pair i has the ``tangles`` from ``first`` [i] to ``first`` [i + 1]. It is ``whole`` if it affects no other
+    triangles.
     """
 
     stencils: wp.array(dtype=wp.vec4i)
@@ -28,7 +29,7 @@ class LeftOut:
 
 @wp.func
 def order_of(a: wp.vec4i, b: wp.vec4i):
-    """Below, at or above 0, as a comes before b, is b, or comes after it."""
+    """Negative, 0 or positive if a is before, equal to, or after b."""
     found = wp.int32(0)
     for i in range(4):
         if found == 0 and a[i] != b[i]:
@@ -56,7 +57,7 @@ def sorted_stencil(s: wp.vec4i, of_vertex: bool):
 
 @wp.func
 def row_of(s: wp.vec4i, of_vertex: bool, left: LeftOut):
-    """The row of a pair, found by bisection, or −1."""
+    """The row of a pair, by bisection; −1 if it is missing."""
     wanted = sorted_stencil(s, of_vertex)
     low = wp.where(of_vertex, 0, left.of_vertices)
     end = wp.where(of_vertex, left.of_vertices, left.stencils.shape[0])
@@ -76,7 +77,7 @@ def row_of(s: wp.vec4i, of_vertex: bool, left: LeftOut):
 
 @wp.func
 def free_of(row: int, left: LeftOut):
-    """How many of the tangles of a row are free."""
+    """The number of tangles of a row that are free."""
     found = wp.int32(0)
     for k in range(left.first[row], left.first[row + 1]):
         found += left.free[left.tangles[k]]
@@ -92,7 +93,7 @@ def leave_out(
     # out
     gap: wp.array(dtype=wp.float64),
 ):
-    """Over pairs: those that have a tangle which is not free are infinitely far apart."""
+    """Kernel over pairs: gap = ∞ for pairs with a tangle that is not free."""
     e = wp.tid()
     if e < counts[0] + counts[1]:
         row = row_of(stencils[e], e < counts[0], left)
@@ -110,7 +111,7 @@ def find_open(
     # out
     open: wp.array(dtype=wp.int32),
 ):
-    """Over pairs: those that are whole and have no free tangle are open, which no plane divides."""
+    """Kernel over pairs: open = 1 for whole pairs without a free tangle, which get no separating plane."""
     e = wp.tid()
     if e < counts[0] + counts[1]:
         open[e] = 0
@@ -127,7 +128,7 @@ def volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 @wp.func
 def goes_through(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Whether the edge pq goes through the triangle abc; certain where they are not as near as rounding."""
+    """Whether the edge pq intersects the triangle abc; exact unless they are within rounding of one another."""
     found = wp.bool(False)
     if volume(a, b, c, p) * volume(a, b, c, q) < ZERO:
         one = volume(p, q, a, b)
@@ -139,7 +140,7 @@ def goes_through(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d
 
 @cache
 def find_free(dtype):
-    """Kernel over pairs of triangles: notes those that do not cross and are farther apart than ``least``."""
+    """Kernel over pairs of triangles: free = 1 if they do not intersect and are farther apart than ``least``."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 

@@ -4,13 +4,13 @@ With the contact distance r and τ = r/2 (the two stages of Chen et al. 2025, *O
 
     φ = ½(r − d)²  for τ ≤ d < r,   ½τ² + τ² ln(τ/d)  for d < τ,   0  for d ≥ r
 
-φ is C² at τ and C¹ at r. The force is a pressure: a load p leaves the gap r − p/k, or τ²k/p below τ. Below δ = r/1000 φ goes
-on as its Taylor polynomial of second degree, so that what starts inside a collider has a force that leads out of it.
+φ is C² at τ and C¹ at r. The force is a pressure: under a load p the gap is r − p/k, or τ²k/p if that is below τ. Below δ =
+r/1000 φ is its Taylor polynomial of second degree, so that a vertex that starts inside a collider is pushed out.
 
 Stencil (x₀), y = x₀, measure A. Rest state: the pose of the collider (position, quaternion x, y, z, w), the half sizes of its
-core box, its radius, r and A. A collider is what is nearer to its core than its radius: a sphere has a core of no size, a
-capsule a segment, a box has radius 0. A core of infinite size is the half-space below y = 0. Colliders are convex, so that
-∂²d ⪰ 0 and φ′∂²d ⪯ 0: clamping drops that.
+core box, its radius, r and A. A collider is the set of points at most its radius from its core. The core of a sphere is a
+point, that of a capsule a segment; a box has radius 0. An infinite core is the half-space below y = 0. Colliders are convex, so
+∂²d ⪰ 0 and φ′∂²d ⪯ 0; clamping drops this part.
 """
 
 from typing import Any
@@ -23,10 +23,10 @@ from .attachment import weight
 
 RAW = wp.constant(int(HessianPolicy.RAW))
 CLAMP = wp.constant(int(HessianPolicy.CLAMP))
-# δ/r, below which φ is a parabola, and below which no vertex ends a step.
+# δ/r: below δ φ is a parabola, and no vertex ends a step below δ.
 FLOOR = 1e-3
 DELTA = wp.constant(FLOOR)
-# Where the rest state has what.
+# Offsets in the rest state.
 POSE, CORE, RADIUS, DISTANCE, AREA, PARAMETERS = 0, 7, 10, 11, 12, 13
 STANDING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -46,14 +46,14 @@ def measure(rest: Any):
 
 @wp.func
 def turned(u: Any, w: Any, v: Any):
-    """v turned by the quaternion (u, w)."""
+    """v rotated by the quaternion (u, w)."""
     t = type(w)(2.0) * wp.cross(u, v)
     return v + w * t + wp.cross(u, t)
 
 
 @wp.func
 def from_core(X: Any, half: Any):
-    """The vector from the nearest point of a core, a box of half sizes, to X in its frame; 0 inside."""
+    """The vector to X from the nearest point of a core, a box with half sizes, in its frame; 0 inside."""
     return X - wp.min(wp.max(X, -half), half)
 
 
@@ -82,7 +82,7 @@ def local_gap(X: Any, half: Any, radius: Any):
 
 @wp.func
 def gap(y: Any, rest: Any):
-    """Signed distance of a vertex and the outward normal, in space."""
+    """Signed distance of a vertex, and the outward normal, in world space."""
     u = wp.vector(rest[3], rest[4], rest[5])
     half = wp.vector(rest[7], rest[8], rest[9])
     away = y[0] - wp.vector(rest[0], rest[1], rest[2])
@@ -95,7 +95,7 @@ def gap(y: Any, rest: Any):
 
 @wp.func
 def curvature(y: Any, rest: Any, n: Any):
-    """∂²d, which is that of the distance to a point, a line or a plane, by the region in which the vertex is."""
+    """∂²d: that of the distance to a point, a line or a plane, according to the region of the vertex."""
     u = wp.vector(rest[3], rest[4], rest[5])
     H = wp.matrix(shape=(3, 3), dtype=y.dtype)
     if wp.isfinite(rest[7]):
@@ -147,7 +147,7 @@ def slope(d: Any, r: Any):
 
 @wp.func
 def bend(d: Any, r: Any):
-    """φ″; at r that of inside."""
+    """φ″; at r its limit from below."""
     tau = type(r)(0.5) * r
     found = type(r)(0.0)
     if d < tau:
@@ -160,7 +160,7 @@ def bend(d: Any, r: Any):
 
 @wp.func
 def beyond(x: Any, position: Any, u: Any, w: Any, half: Any, radius: Any, margin: Any):
-    """Whether x is farther than ``margin`` from a half-space, or from a ball about another collider; quicker than the gap."""
+    """Whether x is farther than ``margin`` from a half-space, or from a bounding ball; faster than the gap."""
     away = x - position
     found = wp.bool(False)
     if wp.isfinite(half[0]):
@@ -177,7 +177,7 @@ def beyond(x: Any, position: Any, u: Any, w: Any, half: Any, radius: Any, margin
 
 @wp.func
 def idle(y: Any, rest: Any, margin: Any):
-    """Whether a vertex is farther than r + margin from the half-space, or from a ball about the collider."""
+    """Whether a vertex is farther than r + margin from the half-space, or from a bounding ball of the collider."""
     position = wp.vector(rest[0], rest[1], rest[2])
     u = wp.vector(rest[3], rest[4], rest[5])
     half = wp.vector(rest[7], rest[8], rest[9])
@@ -186,7 +186,7 @@ def idle(y: Any, rest: Any, margin: Any):
 
 @wp.func
 def clearance(y: Any, rest: Any):
-    """d − r, less what rounding may take."""
+    """d − r, minus a bound of rounding."""
     d, _n = gap(y, rest)
     return y.dtype(0.999) * (d - rest[11])
 
@@ -223,7 +223,7 @@ def hessian(y: Any, rest: Any, policy: int):
 
 @wp.func
 def gap_after(d: Any, r: Any, compliance: Any):
-    """The distance d* with (d* − d)/c = −φ′(d*), in closed form in each stage; r where the compliance is infinite."""
+    """The distance d* with (d* − d)/c = −φ′(d*), in closed form in each stage; r for an infinite compliance c."""
     half = type(r)(0.5)
     tau = half * r
     after = d
@@ -234,7 +234,7 @@ def gap_after(d: Any, r: Any, compliance: Any):
             root = wp.sqrt(half * half * d * d + c)
             if d > type(r)(0.0):
                 after = half * d + root
-            else:  # without the difference of two numbers that are nearly the same
+            else:  # a form without cancellation
                 after = c / (root - half * d)
             delta = type(r)(DELTA) * r
             if after < delta:
@@ -244,7 +244,7 @@ def gap_after(d: Any, r: Any, compliance: Any):
 
 @wp.func
 def prox(v: Any, rest: Any, compliance: Any):
-    """Along n."""
+    """The prox, along n."""
     d, n = gap(v, rest)
     p = v
     p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
@@ -253,7 +253,7 @@ def prox(v: Any, rest: Any, compliance: Any):
 
 @wp.func
 def prox_from(y: Any, v: Any, rest: Any, compliance: Any):
-    """That of the half-space which touches the collider nearest to y: beyond its middle, v is nearer to another side."""
+    """The prox of the half-space tangent to the collider nearest to y, for v may be nearer to another side."""
     d, n = gap(y, rest)
     d += wp.dot(n, v[0] - y[0])
     p = v
@@ -263,7 +263,7 @@ def prox_from(y: Any, v: Any, rest: Any, compliance: Any):
 
 @wp.func
 def constraint(y: Any, rest: Any):
-    """C = −√(2φ), which is d − r from τ on."""
+    """C = −√(2φ), which is d − r for d ≥ τ."""
     d, _n = gap(y, rest)
     return -wp.sqrt(y.dtype(2.0) * potential(d, rest[11]))
 
@@ -303,7 +303,7 @@ def constraint_hessian(y: Any, rest: Any):
 
 @wp.func
 def stiffening(y: Any, rest: Any, tension: Any):
-    """Of a pressure, tension < 0, the half along n; a pull on the curvature of a collider is left out, as none lasts."""
+    """For tension < 0, a pressure, the stiffness along n. The part from the curvature of the collider is omitted."""
     d, n = gap(y, rest)
     return wp.matrix_from_rows(wp.sqrt(wp.max(tension * constraint_bend(d, rest[11]), y.dtype(0.0))) * n)
 
@@ -323,7 +323,7 @@ def bounded_gradient(y: Any, rest: Any):
 
 @wp.func
 def bounded_hessian(y: Any, rest: Any, policy: int):
-    """I, that of contact with friction wherever the vertex is and more than that of contact alone."""
+    """I: the Hessian of contact with friction at any distance, and a bound of that of contact alone."""
     return wp.identity(n=3, dtype=y.dtype)
 
 

@@ -1,10 +1,10 @@
 """Friction of a vertex on a collider: U = Σ kA H(‖u‖), u = (I − nnᵀ)(y − a), k in Pa/m.
 
-H is the Huber function, H = ½u² for u < ε and εu − ½ε² beyond, with ε = μN/(kA): a spring to the anchor a whose force is no
-more than μN (Cundall and Strack 1979, *A discrete numerical model for granular assemblies*). Anchor, normal n and N are those
-of the start of a step.
+H is the Huber function, H = ½u² for u < ε and εu − ½ε² beyond, with ε = μN/(kA): a spring to the anchor a with a force of at
+most μN (Cundall and Strack 1979, *A discrete numerical model for granular assemblies*). The anchor, the normal n and N are
+constant in a step.
 
-Stencil (x₀), y = x₀, measure A. Rest state: a, n, ε [m] and A. With ε = 0 there is neither energy nor force.
+Stencil (x₀), y = x₀, measure A. Rest state: a, n, ε [m] and A. With ε = 0, energy and force are 0.
 """
 
 from typing import Any
@@ -30,13 +30,13 @@ def measure(rest: Any):
 
 @wp.func
 def idle(y: Any, rest: Any, margin: Any):
-    """Whether the vertex has no contact in the step, wherever it is."""
+    """Whether the vertex has no friction in the step, at any position."""
     return wp.where(rest[6] > y.dtype(0.0), wp.int32(0), wp.int32(1))
 
 
 @wp.func
 def clearance(y: Any, rest: Any):
-    """Any distance where there is no contact in the step."""
+    """0 if the vertex has friction in the step, else infinite."""
     return wp.where(rest[6] > y.dtype(0.0), y.dtype(0.0), y.dtype(wp.inf))
 
 
@@ -80,7 +80,7 @@ def hessian(y: Any, rest: Any, policy: int):
 
 @wp.func
 def secant(y: Any, rest: Any):
-    """ε/‖u‖ of a vertex that slides: ∂u/∂y is that times the distance to the anchor."""
+    """ε/‖u‖ for a sliding vertex, else 1: the gradient is this times u."""
     l = wp.length(slip(y, rest))
     share = y.dtype(1.0)
     if l > rest[6] and rest[6] > y.dtype(0.0):
@@ -90,13 +90,13 @@ def secant(y: Any, rest: Any):
 
 @wp.func
 def project(y: Any, rest: Any):
-    """y − ∂u/∂y."""
+    """y minus the gradient of the energy."""
     return y - gradient(y, rest)
 
 
 @wp.func
 def prox(v: Any, rest: Any, compliance: Any):
-    """v moved along u by its part c/(1 + c), and by no more than cε."""
+    """v moved towards the anchor by the fraction c/(1 + c) of u, at most by cε."""
     u = slip(v, rest)
     l = wp.length(u)
     part = v.dtype(1.0) - v.dtype(1.0) / (v.dtype(1.0) + compliance)
