@@ -30,9 +30,9 @@ def balls(dtype):
 def near_colliders(dtype, ended: bool):
     """Kernel over vertices: near = 1 if a vertex may come within the contact distance of a collider in a step.
 
-    Before a step, a vertex is assumed to move by twice its prediction, 2‖h v + h² g‖. After a step (``ended``), it moved from
-    ``x`` to ``end``. The distance from x to the colliders decides. A ball that contains the motion makes this distance
-    unnecessary. When one vertex is near, the others are skipped.
+    Before a step, a vertex is assumed to move by twice its prediction, 2‖h v + h² g‖, and x, v and ``step`` are saved. After a
+    step (``ended``), it moved from ``x`` to ``end``. The distance from x to the colliders decides. A ball that contains the
+    motion makes this distance unnecessary. When one vertex is near, the others are skipped.
     """
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)
@@ -56,19 +56,28 @@ def near_colliders(dtype, ended: bool):
         # in and out
         clear: balls(dtype),
         near: wp.array(dtype=wp.int32),
+        # out
+        x_kept: wp.array(dtype=vec3),
+        v_kept: wp.array(dtype=vec3),
+        step_kept: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        if near[0] != 0:
-            return
         copy = i // per_copy
         x0 = x[i]
+        now = step[copy]
+        if wp.static(not ended):
+            x_kept[i] = x0
+            v_kept[i] = v[i]
+            if i == copy * per_copy:
+                step_kept[copy] = now
+        if near[0] != 0:
+            return
         way = clear.drift
         if wp.static(ended):
             way += wp.length(end[i] - x0)
         else:
             way += dtype(2.0) * h * wp.length(v[i] + h * gravity[i // per_gravity])
         ball = clear.balls[i]
-        now = step[copy]
         off = wp.length(x0 - vec3(ball[0], ball[1], ball[2])) + clear.drift * dtype(wp.abs(now - clear.found[i]))
         if not (off + way <= ball[3]):
             radius = dtype(wp.inf)

@@ -19,6 +19,7 @@ from warpcloth.core.sums import Sums
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.kernels.terms.contact import CONTACT
 from warpcloth.scenes import drape
+from warpcloth.lab.counts import launches_of
 from warpcloth.solvers.solver import Stepper
 
 R = 1e-3
@@ -420,6 +421,15 @@ def test_steps_without_contact_end_where_those_with_it_do(name, away, monkeypatc
     np.testing.assert_allclose(stepper.state.x.numpy(), other.state.x.numpy(), rtol=0.0, atol=1e-12 if away == 0.85 else 1e-3)
     assert (scene.colliders[0].distances(stepper.state.x.numpy()) < R).any() == (away == 0.85)
     assert stepper.colliders.steps.numpy() == [1] and (stepper.iterations == other.iterations or away == 2.0)
+
+
+@pytest.mark.parametrize("name", ("pbd", "xpbd", "newton"))
+def test_a_step_with_nothing_near_has_few_launches_more(name):
+    """Two tests with what they need and what keeps and counts, for any number of sweeps."""
+    scene = falling([wc.Plane(position=(0.0, -50.0, 0.0), friction=0.0 if name == "pbd" else 0.3)])
+    steppers = [SOLVERS[name].bind(each.build()) for each in (scene, replace(scene, colliders=(), contact=None))]
+    with_contact, without = (launches_of(stepper.step) for stepper in steppers)
+    assert without < with_contact <= without + 6
 
 
 @pytest.mark.filterwarnings("ignore:threads is . on . cores")

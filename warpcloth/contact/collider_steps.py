@@ -164,8 +164,8 @@ class ColliderSteps:
 
     def launch_release(self):
         """Launches the end of all anchors, where nothing is in contact."""
-        for array in self.anchors.values():
-            array.zero_()
+        if self.anchors:
+            self.anchor_rows.zero_()
 
     def launch_move(self):
         """Launches the poses of the step that begins."""

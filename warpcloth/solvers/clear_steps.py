@@ -11,6 +11,9 @@ from ..kernels.colliders import shapes
 from ..kernels.loop import count_down
 from ..terms.refresh import STEP
 
+# Largest number of sweeps of a step that are captured one by one; more become a loop on the device.
+UNROLLED = 64
+
 
 class TwinSteps:
     """The base class that lets a twin of a stepper, without contact, take the steps in which nothing comes near.
@@ -18,7 +21,7 @@ class TwinSteps:
     A test before a step decides. A second test, after the step, finds whether contact was missed; then the step is taken again
     with contact, so that every step ends at the minimiser of the same problem. A subclass has ``_launch_look``, the first test,
     which also saves the state in ``_kept``; ``_launch_check``, the second test; and ``_launch_count``, after a step without
-    contact.
+    contact, or None.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
@@ -36,8 +39,8 @@ class TwinSteps:
 
     def record(self):
         """Captures the launches of :meth:`step`."""
-        launches = self._launch_look, self._launch_check, self._restore, self._launch_count
-        self._segments = [Segment(self.stepper.model.device, launch) for launch in launches]
+        launches = self._launch_look, self._launch_check, self._launch_restore, self._launch_count
+        self._segments = [launch and Segment(self.stepper.model.device, launch) for launch in launches]
         self._read = Mirror(self.near)
 
     def step(self, touching):
@@ -50,7 +53,8 @@ class TwinSteps:
             twin.step()
             check()
             if not self._read.read()[0]:
-                count()
+                if count:
+                    count()
                 stepper.results, stepper.residual, stepper.iterations = twin.results, twin.residual, twin.iterations
                 return
             restore()
@@ -60,9 +64,37 @@ class TwinSteps:
         """Returns a function (array) that launches ``touching(array)`` if the last step had contact, else ``clear(array)``."""
         return lambda out: wp.capture_if(self.near, lambda: touching(out), lambda: clear(out))
 
-    def _restore(self):
+    def parts(self, touching):
+        """Returns the part of a step, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with contact.
+
+        A step has two conditions, however many sweeps it has.
+        """
+        return [(partial(self._launch_step, touching), 1)]
+
+    def _launch_step(self, touching):
+        self._launch_look()
+        wp.capture_if(self.near, None, self._launch_clear)
+        wp.capture_if(self.near, partial(self._launch_again, touching), self._launch_count)
+
+    def _launch_clear(self):
+        self._launch_parts(self.twin.parts)
+        self._launch_check()
+
+    def _launch_again(self, touching):
+        self._launch_restore()
+        self._launch_parts(touching)
+
+    def _launch_restore(self):
         for name, array in self.twin.state.arrays.items():
             wp.copy(array, self._kept[name])
+
+    def _launch_parts(self, parts):
+        for launch, times in parts:
+            if times <= UNROLLED:
+                for _ in range(times):
+                    launch()
+            else:
+                self._launch_in_turn(launch, times)
 
     def _launch_in_turn(self, launch, times):
         """Launches a loop on the device."""
@@ -80,12 +112,17 @@ class ClearSteps(TwinSteps):
     Before a step, vertices count as near if twice the displacement of the prediction reaches a collider.
     """
 
+    _launch_count = None  # the test after the step counts it
+
     def __init__(self, stepper, twin):
         super().__init__(stepper, twin)
         model, colliders, self._followed = stepper.model, stepper.colliders, False
+        self._others = [name for name in self._kept if name not in ("x", "v")]
+        self._steps_kept, self._moving = wp.zeros_like(colliders.steps), any(model.colliders.moves)
+        colliders.launch_move()  # once, where all stand
         radii = np.zeros((model.count, 4))
         radii[:, 3] = -1.0
-        if model.pins is None and not any(model.colliders.moves):
+        if model.pins is None and not self._moving:
             radii[model.inverse_mass.numpy() == 0.0, 3] = np.inf  # pins may stand near
         clear = kernels.balls(model.dtype)()
         clear.balls = model.array(radii, wp.types.vector(4, model.dtype))
@@ -104,48 +141,30 @@ class ClearSteps(TwinSteps):
         self._followed = True
         self.stepper.colliders.follow()
 
-    def parts(self, touching):
-        """Returns the parts of a step, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with contact.
-
-        The twin has as many parts.
-        """
-        found = [(self._launch_look, 1)]
-        for (own, times), (clear, _times) in zip(touching[:-1], self.twin.parts[:-1], strict=True):
-            found.append((partial(wp.capture_if, self.near, own, clear), times))
-        (own, times), (clear, _times) = touching[-1], self.twin.parts[-1]
-
-        def last():
-            clear()
-            self._launch_check()
-            wp.capture_if(self.near, lambda: self._launch_again(touching), self.stepper.colliders.launch_count)
-
-        return [*found, (partial(wp.capture_if, self.near, own, last), times)]
-
     def _launch_look(self):
         """Launches the test before a step, and saves the state."""
-        stepper = self.stepper
-        stepper.colliders.launch_move()
+        stepper, kept = self.stepper, self._kept
+        if self._moving:
+            stepper.colliders.launch_move()
         self.near.zero_()
         if self._followed:
             with stepper.colliders.reading_anchors():
                 stepper.model.refresh(STEP, stepper.integrator.moment, self._contact)
-        for name, array in self.twin.state.arrays.items():
-            wp.copy(self._kept[name], array)
-        self._launch(0, None)
+        for name in self._others:
+            wp.copy(kept[name], self.twin.state.arrays[name])
+        self._launch(0, *stepper.state, None, [kept["x"], kept["v"], self._steps_kept])
 
     def _launch_check(self):
-        """Launches the test after a step, and clears the friction anchors of earlier steps."""
-        self.stepper.colliders.launch_release()
-        self._launch(1, self.stepper.state.x)
+        """Launches the test after a step, clears the friction anchors of earlier steps, and counts the step."""
+        colliders = self.stepper.colliders
+        colliders.launch_release()
+        self._launch(1, self._kept["x"], self._kept["v"], self.stepper.state.x, [None, None, None])
+        colliders.launch_count()
 
-    def _launch(self, find, end):
+    def _launch_restore(self):
+        super()._launch_restore()
+        wp.copy(self.stepper.colliders.steps, self._steps_kept)
+
+    def _launch(self, find, x, v, end, kept):
         (elements, others), model = self._given, self.stepper.model
-        model.launch(self._finds[find], model.count, [*elements, self._kept["x"], self._kept["v"], end, *others], self._out)
-
-    def _launch_count(self):
-        self.stepper.colliders.launch_count()
-
-    def _launch_again(self, touching):
-        self._restore()
-        for launch, times in touching:
-            self._launch_in_turn(launch, times)
+        model.launch(self._finds[find], model.count, [*elements, x, v, end, *others], [*self._out, *kept])

@@ -1,16 +1,11 @@
 """Takes steps without self-contact while no pair of the cloth comes near."""
 
-from functools import partial
-
 import warp as wp
 
 from ..contact.self_filter import WAY
 from ..kernels.fast.far_step import far_limits, find_far, find_near
 from ..kernels.step import count_step
 from .clear_steps import TwinSteps
-
-# Largest number of sweeps of a step that are captured one by one; more become a loop on the device.
-UNROLLED = 64
 
 
 class FarSteps(TwinSteps):
@@ -39,31 +34,6 @@ class FarSteps(TwinSteps):
         pairs, model = stepper.pairs, stepper.model
         one = len(pairs.proximity.centre) == model.copies
         return one and stepper.count is None and model.colliders is None and pairs.tangles is None
-
-    def parts(self, touching):
-        """Returns the part of a step, see :meth:`warpcloth.solvers.solver.LaunchedStepper.record`, from those with contact."""
-        return [(partial(self._launch_step, touching), 1)]
-
-    def _launch_step(self, touching):
-        self._launch_look()
-        wp.capture_if(self.near, self._restore, self._launch_clear)
-        wp.capture_if(self.near, partial(self._launch_again, touching), self._launch_count)
-
-    def _launch_clear(self):
-        self._launch_parts(self.twin.parts)
-        self._launch_check()
-
-    def _launch_again(self, touching):
-        self._restore()
-        self._launch_parts(touching)
-
-    def _launch_parts(self, parts):
-        for launch, times in parts:
-            if times <= UNROLLED:
-                for _ in range(times):
-                    launch()
-            else:
-                self._launch_in_turn(launch, times)
 
     def _launch_look(self):
         """Launches the test before a step, and saves the state."""
