@@ -18,8 +18,8 @@ from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.kernels.terms.contact import CONTACT
-from warpcloth.scenes import drape
 from warpcloth.lab.counts import launches_of
+from warpcloth.scenes import drape
 from warpcloth.solvers.solver import Stepper
 
 R = 1e-3

@@ -5,6 +5,7 @@ import warp as wp
 
 from ..core.capture import Mirror, Segment
 from ..kernels.clear_elements import add_hessian
+from ..kernels.project import correct_in_place, sweep_turn
 from .search import HALVINGS, Search
 
 # An accurate solve ends at this residual, relative to b, in the norm of A⁻¹.
@@ -35,8 +36,9 @@ class CorrectedSystem:
         right, self._result = model.vectors(), model.vectors()
         self._right, self._found = Mirror(right), Mirror(self._result)
 
-    def _spread(self, values):
-        return np.repeat(values, self.model.per_copy)[:, None]
+    def _scaled(self, factors, array):
+        """Returns the vectors (N, 3) of each copy times the factor of the copy, (B,)."""
+        return (array.reshape(self.model.copies, -1) * factors[:, None]).reshape(array.shape)
 
     def _dot(self, one, other):
         B = self.model.copies
@@ -52,24 +54,19 @@ class CorrectedSystem:
             going: Which copies to solve for, (B,).
             closely: Which copies to solve accurately, (B,).
         """
-        B = self.model.copies
-
-        def over(one, other):
-            return np.divide(one, other, out=np.zeros(B), where=going & (other > 0.0))
-
-        w, Aw, r, p, Ap, fall = np.zeros_like(b), np.zeros_like(b), b.copy(), z, b.copy(), np.zeros(B)
+        p, Ap, r, w, Aw, fall = z, b, b, 0.0, 0.0, 0.0
         rz = first = self._dot(r, z)
         for iteration in range(ITERATIONS):
             q = Ap.copy()
             add_product(p, q)
-            step = over(rz, self._dot(p, q))
-            Aw += self._spread(step) * Ap
-            w, r = w + self._spread(step) * p, r - self._spread(step) * q
-            fall += step * rz
+            step = self._over(rz, self._dot(p, q), going)
+            w, Aw = w + self._scaled(step, p), Aw + self._scaled(step, Ap)
+            fall = fall + step * rz
             enough = (fall >= SHARE * first) | ((step * rz <= LAST * fall) & (iteration > 0))
             going = going & (closely | ~enough)
             if not going.any():
                 break
+            r = r - self._scaled(step, q)
             self._right.write(r)
             self._linear.solve(self._right.array, self._result)
             z = self._found.read().astype(np.float64)
@@ -77,9 +74,12 @@ class CorrectedSystem:
             going = going & (rz > TOLERANCE**2 * first)
             if not going.any():
                 break
-            ratio = self._spread(over(rz, before))
-            p, Ap = z + ratio * p, r + ratio * Ap
+            ratio = self._over(rz, before, going)
+            p, Ap = z + self._scaled(ratio, p), r + self._scaled(ratio, Ap)
         return w, Aw
+
+    def _over(self, one, other, where):
+        return np.divide(one, other, out=np.zeros(self.model.copies), where=where & (other > 0.0))
 
 
 class ContactSystem(CorrectedSystem):
@@ -105,10 +105,16 @@ class ContactSystem(CorrectedSystem):
     def __init__(self, model, x, linear, sums, s, pairs=None):
         super().__init__(model, linear)
         self.x, self._pairs = x, pairs
+        self._h, axes = s**-0.5, model.mobility is not None
         self._touching = [
             (elements, model.kernel(add_hessian, elements.term, model.dtype))
             for elements in model.terms
             if elements.collider is not None
+        ]
+        self._leaving = [
+            (elements, model.kernel(correct_in_place, elements.term, model.dtype, False, False, False, axes))
+            for elements, _kernel in self._touching
+            if elements.term.prox_from is not None
         ]
         self._search = Search(model, x, sums, s, pairs)
         free = model.coordinate_mobility().reshape(-1, 3) > 0.0
@@ -128,6 +134,17 @@ class ContactSystem(CorrectedSystem):
         self._assemble = Segment(device, self._launch_assemble)
         self._begin = Segment(device, search.launch_again)
         self._shorten = Segment(device, lambda: search.launch(self._active.array))
+
+    def launch_start(self, d):
+        """Moves d from 0 to where inertia and contact with colliders alone put each vertex.
+
+        Inside a collider, contact is so stiff that an iteration only doubles the distance to its surface.
+        """
+        model = self.model
+        for elements, kernel in self._leaving:
+            turn, threads = sweep_turn(model.dtype)(), 1 if model.device.is_cpu else elements.count
+            turn.each, turn.h, turn.sweeps, turn.relaxation = elements.count // max(threads, 1), self._h, 1, 1.0
+            model.launch(kernel, threads, [*elements.arguments, model.local_mobility, self.x, turn], [None, d])
 
     def _launch_assemble(self):
         self._blocks.array.zero_()
@@ -153,7 +170,8 @@ class ContactSystem(CorrectedSystem):
         self._assemble()
         blocks = self._blocks.read()
         blocks[self._held] = np.where(self._moves, blocks[self._held], 0.0)
-        touching = np.flatnonzero(blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2])  # trace 0 of a semi-definite block
+        trace = blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2]
+        touching = np.flatnonzero(trace != 0.0)  # a semi-definite block with trace 0 is 0
         J, D = (None, None) if self._pairs is None else self._pairs.forces.rows()
         pressing = len(touching) or (J is not None and J.shape[0])
         if not (pressing or self.careful.any()):
@@ -176,7 +194,7 @@ class ContactSystem(CorrectedSystem):
             self._direction.write(-found)
             self._active.write(active & self.careful)
             self._shorten()
-            found *= self._spread(np.where(self.careful, self._step.read(), 1.0))
+            found = self._scaled(np.where(self.careful, self._step.read(), 1.0), found)
         self._found.write(found)
         wp.copy(w, self._result)
 
@@ -232,7 +250,7 @@ class PairSystem(CorrectedSystem):
         slope, linear, square = (self._dot(one, found) for one in (b, b - pull, Aw))
         step, wanted = np.ones(self.model.copies), active & (slope > 0.0)
         for _ in range(HALVINGS):
-            after, now = self._pressed(d - self._spread(step) * found)
+            after, now = self._pressed(d - self._scaled(step, found))
             change = after - energy - step * linear + 0.5 * step**2 * square
             with np.errstate(invalid="ignore"):
                 level = np.abs(change) <= NOISE * (np.abs(energy) + step * np.abs(linear))
@@ -242,5 +260,5 @@ class PairSystem(CorrectedSystem):
             if not wanted.any():
                 break
             step = np.where(wanted, 0.5 * step, step)
-        self._found.write(self._spread(step) * found)
+        self._found.write(self._scaled(step, found))
         wp.copy(w, self._result)

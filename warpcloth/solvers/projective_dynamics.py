@@ -189,6 +189,8 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
     def _launch_start(self):
         self.launch_prediction()
         self.correction.zero_()
+        if self._contact:
+            self._contact.launch_start(self.correction)
         if self._accelerated:
             self._accelerated.launch_start()
         self._launch_gradient()
