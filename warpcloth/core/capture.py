@@ -28,6 +28,7 @@ class Mirror:
     def __init__(self, array):
         self.array = array
         self.host = array if array.device.is_cpu else wp.empty_like(array, device="cpu", pinned=True)
+        self._values = self.host.numpy()
 
     def read(self):
         """Returns the values as a NumPy array, valid until the next call or launch.
@@ -39,7 +40,7 @@ class Mirror:
         if self.host is not self.array:
             wp.copy(self.host, self.array)
             wp.synchronize_stream(self.array.device)
-        return self.host.numpy()
+        return self._values
 
     def write(self, values):
         """Sets the values from a NumPy array.
@@ -48,7 +49,7 @@ class Mirror:
             RuntimeError: A graph is being captured on the device.
         """
         on_host(self.array.device, "writing an array")
-        self.host.numpy()[...] = values
+        self._values[...] = values
         if self.host is not self.array:
             wp.copy(self.array, self.host)
             wp.synchronize_stream(self.array.device)  # before the next write changes the host array
