@@ -16,18 +16,59 @@ from ..vectors import types
 
 
 @cache
-def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False):
-    """Kernel over elements: adds factorₑ Δxᵢ [m] of every element to out, factorₑ Δλ to λ.
-
-    Elements whose vertex is within its ``clear``, of terms that have it, are passed over until it is not.
-    For the CPU, in order: nothing is atomic. One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
-    """
+def add_correction(term: Term, dtype, scalar: bool, multipliers: bool, per_step: bool):
+    """The device function (element, data, x̃, d, h, sweeps, λ, out) that adds factorₑ Δxᵢ [m] of an element to out, factorₑ Δλ
+    to λ."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
     change, share_of = element_change(term, dtype, scalar, per_step), to_corner(term, dtype)
     number, shared, vector, vertex = load(dtype), load_shared(dtype), load(vec3), load(wp.int32, 2)
     rest_of, put = load(rest_type), store(vec3)
+
+    @wp.func
+    def add(
+        e: int,
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        inverse_mass: wp.array(dtype=dtype),
+        factor: wp.array(dtype=dtype),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        h: dtype,
+        sweeps: int,
+        lambdas: wp.array(dtype=lambda_type),
+        out: wp.array(dtype=vec3),
+    ):
+        r = rest_of(rest, e)
+        before = lambda_type(dtype(0.0))
+        if wp.static(multipliers):
+            before = lambdas[e]
+        more, rows = change(stencil, e, shared(stiffness, e), r, inverse_mass, x, d, h, before, sweeps)
+        if wp.static(multipliers):
+            lambdas[e] = before + factor[e] * more
+        for i in range(K):
+            v = vertex(stencil, K * e + i)
+            put(out, v, vector(out, v) + (number(inverse_mass, v) * shared(factor, e)) * share_of(r, i, rows))
+
+    return add
+
+
+@cache
+def scatter_correction(
+    term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False, cleared: bool = False
+):
+    """Kernel over elements: adds factorₑ Δxᵢ [m] of every element to out, factorₑ Δλ to λ.
+
+    If ``cleared``, one thread passes over all elements, and over those whose vertex is within its ``clear`` until it is not: to
+    begin a thread takes longer than this test.
+    For the CPU, in order: nothing is atomic. One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
+    """
+    vec3, _ = types(dtype)
+    rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
+    add = add_correction(term, dtype, scalar, multipliers, per_step)
+    number, vector, vertex, put = load(dtype), load(vec3), load(wp.int32, 2), store(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def scatter(
@@ -48,22 +89,13 @@ def scatter_correction(term: Term, dtype, scalar: bool, multipliers: bool = Fals
         lambdas: wp.array(dtype=lambda_type),
         out: wp.array(dtype=vec3),
     ):
-        e = wp.tid()
-        if wp.static(term.clearance is not None):
-            if clear.shape[0] > 0:
-                if is_clear(clear[e], d[stencil[e, 0]]):
-                    return
-                clear[e] = dtype(0.0)
-        r = rest_of(rest, e)
-        before = lambda_type(dtype(0.0))
-        if wp.static(multipliers):
-            before = lambdas[e]
-        more, rows = change(stencil, e, shared(stiffness, e), r, inverse_mass, x, d, h, before, sweeps)
-        if wp.static(multipliers):
-            lambdas[e] = before + factor[e] * more
-        for i in range(K):
-            v = vertex(stencil, K * e + i)
-            put(out, v, vector(out, v) + (number(inverse_mass, v) * shared(factor, e)) * share_of(r, i, rows))
+        if wp.static(cleared):
+            for e in range(stencil.shape[0]):
+                if not is_clear(number(clear, e), vector(d, vertex(stencil, e))):
+                    put(clear, e, dtype(0.0))
+                    add(e, stencil, stiffness, rest, inverse_mass, factor, x, d, h, sweeps, lambdas, out)
+        else:
+            add(wp.tid(), stencil, stiffness, rest, inverse_mass, factor, x, d, h, sweeps, lambdas, out)
 
     return scatter
 

@@ -14,7 +14,11 @@ class ScatterSweeps(JacobiSweeps):
     def __init__(self, model, x, h, correction, multipliers, keys, factors, scale, spread):
         self.model, self.x, self.correction, self.multipliers = model, x, correction, multipliers
         more = any(array is not None for array in multipliers), spread is not None
-        self._kernels = [model.kernel(kernels.scatter_correction, *key, *more) for key in keys]
+        self._threads = [1 if elements.clear is not None else elements.count for elements in model.terms]
+        self._kernels = [
+            model.kernel(kernels.scatter_correction, *key, *more, elements.clear is not None)
+            for elements, key in zip(model.terms, keys, strict=True)
+        ]
         self._apply, self._total = model.kernel(kernels.apply_correction, model.dtype), model.vectors()
         self._given, self._factors, self._scale = [h, spread or 1], factors, scale
 
@@ -23,9 +27,8 @@ class ScatterSweeps(JacobiSweeps):
         model, d = self.model, self.correction
         for _ in range(sweeps):
             model.refresh(EVALUATION, Moment(self.x, d))
-            for elements, kernel, factor, lambdas in zip(
-                model.terms, self._kernels, self._factors, self.multipliers, strict=True
-            ):
+            of_terms = model.terms, self._kernels, self._threads, self._factors, self.multipliers
+            for elements, kernel, threads, factor, lambdas in zip(*of_terms, strict=True):
                 given = [*elements.arguments, model.inverse_mass, factor, elements.clear, self.x, d, *self._given]
-                model.launch(kernel, elements.count, given, [lambdas, self._total])
+                model.launch(kernel, threads, given, [lambdas, self._total])
             model.launch(self._apply, model.count, [self._scale], [self._total, d])
