@@ -37,7 +37,7 @@ class ProjectiveDynamics(ImplicitStep):
     minimum at S x = (M/h²) x̃ + Σ k A Gᵀp, with the matrix S = M/h² + Σ k A GᵀG. S is the same for all three coordinates and
     all steps, and is factorised once. As ∂u/∂y = y − p(y), one iteration is d ← d − S⁻¹∇φ(d) with d = x − x̃, so that later
     iterations correct the rounding of earlier ones. The objective φ never rises, and the fixed point is the x(t+h) of
-    :class:`warpcloth.Newton`.
+    :class:`warpcloth.Newton`. With colliders, the first iterate is where inertia and contact alone put each vertex.
 
     Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
     error perpendicular to it shrinks by the factor k(L/l)/(m/h² + k) in each iteration; the error along it is gone after one.
@@ -48,7 +48,7 @@ class ProjectiveDynamics(ImplicitStep):
         dt, substeps, integrator: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of the residual, as for :class:`warpcloth.Newton`: the largest unbalanced acceleration of any
-            vertex, divided by gravity (or without gravity by the largest at x̃).
+            vertex, divided by gravity (or without gravity by the largest of the first iterate).
         acceleration: ``"none"``; ``"chebyshev"`` (Wang 2015); ``"anderson"`` (Peng et al. 2018), in the norm of the matrix;
             ``"l-bfgs"`` (Liu et al. 2017), with the matrix as first Hessian.
         window: Number of iterations that Anderson and L-BFGS use.
