@@ -13,13 +13,17 @@ from .vectors import types
 def balls(dtype):
     """Struct of the balls of vertices: center and radius [m]. No collider is in the ball at the start of step ``found``.
 
-    Surfaces of colliders move by at most ``drift`` per step [m]. ``distance`` is the contact distance [m].
+    Surfaces of colliders move by at most ``drift`` per step [m]. ``distance`` is the contact distance [m]. ``x``, ``v`` and
+    ``step`` are those at the start of the last step.
     """
 
     @wp.struct
     class Balls:
         balls: wp.array(dtype=wp.types.vector(4, dtype))
         found: wp.array(dtype=wp.int32)
+        x: wp.array(dtype=types(dtype)[0])
+        v: wp.array(dtype=types(dtype)[0])
+        step: wp.array(dtype=wp.int32)
         drift: dtype
         distance: dtype
 
@@ -56,20 +60,16 @@ def near_colliders(dtype, ended: bool):
         # in and out
         clear: balls(dtype),
         near: wp.array(dtype=wp.int32),
-        # out
-        x_kept: wp.array(dtype=vec3),
-        v_kept: wp.array(dtype=vec3),
-        step_kept: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
         copy = i // per_copy
         x0 = x[i]
         now = step[copy]
         if wp.static(not ended):
-            x_kept[i] = x0
-            v_kept[i] = v[i]
+            clear.x[i] = x0
+            clear.v[i] = v[i]
             if i == copy * per_copy:
-                step_kept[copy] = now
+                clear.step[copy] = now
         if near[0] != 0:
             return
         way = clear.drift

@@ -128,6 +128,7 @@ class ClearSteps(TwinSteps):
         clear.balls = model.array(radii, wp.types.vector(4, model.dtype))
         clear.found = wp.zeros(model.count, dtype=wp.int32, device=model.device)
         clear.drift, clear.distance = colliders.drift, model.colliders.distance
+        clear.x, clear.v, clear.step = self._kept["x"], self._kept["v"], self._steps_kept
         self._bounds = shapes(model.dtype)()
         halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
         self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
@@ -143,7 +144,7 @@ class ClearSteps(TwinSteps):
 
     def _launch_look(self):
         """Launches the test before a step, and saves the state."""
-        stepper, kept = self.stepper, self._kept
+        stepper = self.stepper
         if self._moving:
             stepper.colliders.launch_move()
         self.near.zero_()
@@ -151,20 +152,20 @@ class ClearSteps(TwinSteps):
             with stepper.colliders.reading_anchors():
                 stepper.model.refresh(STEP, stepper.integrator.moment, self._contact)
         for name in self._others:
-            wp.copy(kept[name], self.twin.state.arrays[name])
-        self._launch(0, *stepper.state, None, [kept["x"], kept["v"], self._steps_kept])
+            wp.copy(self._kept[name], self.twin.state.arrays[name])
+        self._launch(0, *stepper.state, None)
 
     def _launch_check(self):
         """Launches the test after a step, clears the friction anchors of earlier steps, and counts the step."""
         colliders = self.stepper.colliders
         colliders.launch_release()
-        self._launch(1, self._kept["x"], self._kept["v"], self.stepper.state.x, [None, None, None])
+        self._launch(1, self._kept["x"], self._kept["v"], self.stepper.state.x)
         colliders.launch_count()
 
     def _launch_restore(self):
         super()._launch_restore()
         wp.copy(self.stepper.colliders.steps, self._steps_kept)
 
-    def _launch(self, find, x, v, end, kept):
+    def _launch(self, find, x, v, end):
         (elements, others), model = self._given, self.stepper.model
-        model.launch(self._finds[find], model.count, [*elements, x, v, end, *others], [*self._out, *kept])
+        model.launch(self._finds[find], model.count, [*elements, x, v, end, *others], self._out)
