@@ -7,6 +7,7 @@ from functools import cache
 
 import warp as wp
 
+from .gap_notes import FIRST
 from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
 from .vectors import types
@@ -96,18 +97,36 @@ def another_round(
     cuts[c, 1] = 0
 
 
+@wp.struct
+class HeldPins:
+    """The prescribed moves that the filter has cut short, (copies,).
+
+    ``first`` is FIRST − (step·n + vertex), of n vertices: the first step in which a pinned coordinate was held back, and the
+    first such vertex; it is 0 if there was none. ``farthest`` is the largest distance by which one was held back [m].
+    """
+
+    first: wp.array(dtype=wp.int64)
+    farthest: wp.array(dtype=wp.float64)
+
+
 @cache
 def end_filter(dtype):
-    """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and over h to v; counts them."""
+    """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and over h to v.
+
+    ``cut`` counts the free vertices that it changed, and ``held`` notes where it held back pins.
+    """
     vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def end_each_filter(
         # elements
         inverse_mass: wp.array(dtype=dtype),
+        mobility: wp.array(dtype=vec3),
         # state in
         target: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
+        steps: wp.array(dtype=wp.int32),
         # parameters
         per_copy: int,
         h: dtype,
@@ -115,11 +134,25 @@ def end_filter(dtype):
         v: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
         cut: wp.array(dtype=wp.int64),
+        held: HeldPins,
     ):
         i = wp.tid()
         change = x[i] - target[i]
         if wp.length_sq(change) > dtype(0.0):
-            wp.atomic_add(cut, i // per_copy, wp.int64(1))
+            copy = i // per_copy
+            pinned = exact(change)
+            if inverse_mass[i] > dtype(0.0):
+                wp.atomic_add(cut, copy, wp.int64(1))
+                for axis in range(3):
+                    free = True
+                    if mobility:
+                        free = mobility[i][axis] > dtype(0.0)
+                    if free:
+                        pinned[axis] = ZERO
+            if wp.length_sq(pinned) > ZERO:
+                key = wp.int64(steps[copy]) * wp.int64(per_copy) + wp.int64(i - copy * per_copy)
+                wp.atomic_max(held.first, copy, FIRST - key)
+                wp.atomic_max(held.farthest, copy, wp.length(pinned))
             v[i] = v[i] + change / h
             if move:
                 move[i] = move[i] + change

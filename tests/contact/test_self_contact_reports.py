@@ -100,6 +100,27 @@ def test_frames_too_coarse_for_the_gap_are_named(dtype, device):
     assert far.too_near.startswith("in frame 3 first, at vertex ") and "the least gap is 6e-06 m" in far.too_near
 
 
+@pytest.mark.parametrize("axes", ["xyz", "y"])
+def test_pins_that_cloth_holds_back(axes, device):
+    """Pins that are to go down through pins, by 0.08 m, stop above them: the run says so, and counts moves of free vertices."""
+    scene = sheets(turn=0.0)
+    keyframes = np.tile(scene.positions, (5, 1, 1))
+    keyframes[:, 16:, 1] -= np.linspace(0.0, 0.08, 5)[:, None]
+    pins = wc.Pins(np.arange(32), keyframes, axes=axes)
+    found = wc.simulate(replace(scene, pins=pins), SOLVER, device=device, dtype="float64", frames=5)
+    back = (found.points[-1] - keyframes[-1])[16:, 1].max()
+    assert back > 0.05 and 0.0 <= found.cut <= 1.0
+    said = found.self_contact.held_pins
+    assert said.startswith("from frame 1 on cloth holds back pins, vertex ")
+    assert float(said.split("by up to ")[1].split(" m")[0]) == pytest.approx(back, rel=1e-2)
+
+
+def test_pins_that_go_their_way(device):
+    """No pin is said to be held back while cloth only presses on it."""
+    scene = sheets(gravity=np.array([0.0, -9.81, 0.0]), pins=np.arange(16))
+    assert wc.simulate(scene, SOLVER, device=device).self_contact.held_pins is None
+
+
 @pytest.mark.parametrize("far", [0.0, 700.0])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_the_filter_leaves_the_least_gap(far, dtype, device):

@@ -109,6 +109,8 @@ def _lines_of(found):
     yield f"  self-contact  {counts}, {100.0 * found['kept']:.4g} % of moves kept, {gap}"
     if found["too_near"]:
         yield f"  too near      {found['too_near']}"
+    if found["held_pins"]:
+        yield f"  pins          {found['held_pins']}"
 
 
 def _summary(facts, inside):

@@ -91,8 +91,8 @@ class SelfFilter:
             self._launch_held(x)
             wp.capture_while(self._within, self._launch_let_out, x=x)
             self._colliders.launch_inside(x, self._from)
-        given = [model.inverse_mass, self._target, x, model.per_copy, self._contact.h]
-        self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut])
+        given = [model.inverse_mass, model.mobility, self._target, x, self._contact.steps, model.per_copy, self._contact.h]
+        self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
         model.launch(self._count, model.copies, [], [self._contact.steps])
         if self._contact.friction is not None:
             self._contact.friction.launch_end(x)

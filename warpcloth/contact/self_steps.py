@@ -12,6 +12,7 @@ from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels import gap_notes, self_pairs
 from ..kernels.proximity import take_moved
+from ..kernels.self_filter import HeldPins
 from .proximity import Proximity
 from .self_filter import WAY, SelfFilter
 from .self_forces import SelfForces
@@ -41,6 +42,22 @@ class TooNear(NamedTuple):
     vertex: int
 
 
+class PinHeld(NamedTuple):
+    """The first pin that cloth held back, as the filter let it go on no further.
+
+    Attributes:
+        copy: Index of its copy.
+        frame: The frame in which, or before which, it was held back first.
+        vertex: Its index in the order of the model, within the copy.
+        farthest: By how much cloth held back a pin at most, at the end of any step so far [m].
+    """
+
+    copy: int
+    frame: int
+    vertex: int
+    farthest: float
+
+
 class SelfSteps:
     """Pairs of near parts of cloth in the steps of one solver, with their forces and the filter.
 
@@ -63,6 +80,7 @@ class SelfSteps:
         begun: Normals, gaps, weights and areas of the pairs, :class:`warpcloth.kernels.self_pairs.StepPairs`.
         x_before: Positions where the step began, (N,) [m].
         begun_at: Positions at which the gaps of ``begun`` were found, (N,) [m].
+        held: :class:`warpcloth.kernels.self_filter.HeldPins`.
         lists: How many lists of pairs were made, (B,) int32, the same for all copies.
         listed: Whether the last list has pairs, (1,) int32.
         tangles: :class:`warpcloth.contact.tangles.Tangles` of a start at which cloth crosses or touches cloth, else None.
@@ -89,6 +107,9 @@ class SelfSteps:
         self._notes, self._per_frame = gap_notes.GapNotes(), steps_per_frame
         self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
         self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
+        self.held = HeldPins()
+        self.held.first = state.add("first pin held back", model.scalars(wp.int64))
+        self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
         made = (
             self_pairs.begin_pairs,
             self_pairs.set_areas,
@@ -224,6 +245,16 @@ class SelfSteps:
                 found.append(TooNear(copy, *divmod(int(gap_notes.FIRST) - int(value), n)))
         return found
 
+    @property
+    def pins_held(self):
+        """A :class:`PinHeld` of each copy in which cloth has held back a pin."""
+        found, n, farthest = [], self.model.per_copy, self.held.farthest.numpy()
+        for copy, value in enumerate(self.held.first.numpy()):
+            if value:
+                step, vertex = divmod(int(gap_notes.FIRST) - int(value), n)
+                found.append(PinHeld(copy, step // self._per_frame + 1, vertex, float(farthest[copy])))
+        return found
+
     def in_frame(self):
         """Of the last :meth:`launch_begin`, for each copy (B,): pairs listed, pairs in contact, and the least gap [m]."""
         model = self.model
@@ -236,7 +267,7 @@ class SelfSteps:
 
     def start_again(self):
         """Forgets the steps that an integrator made to find its past, and the list, as a reset does."""
-        for array in (self.cut, self.steps, *self._carried):
+        for array in (self.cut, self.steps, self.held.first, self.held.farthest, *self._carried):
             array.zero_()
         if self.tangles is not None:
             self.tangles.start_again()

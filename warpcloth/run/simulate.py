@@ -70,6 +70,8 @@ class SelfContactSummary(NamedTuple):
         least_gap: The smallest distance of a pair in any frame, as stored in float32 [m], or (B,); infinite if none was listed.
         too_near: None if all gaps in all frames are at least 4 units in the last place of the largest float32 coordinate of the
             pair. Else a sentence that names the first frame, a vertex there, and the smallest gap.
+        held_pins: None if cloth held back no pin. Else a sentence that names the first pin that it held back and the frame, and
+            the largest distance by which it held one back.
     """
 
     pairs: int
@@ -77,6 +79,7 @@ class SelfContactSummary(NamedTuple):
     kept: float | np.ndarray
     least_gap: float | np.ndarray
     too_near: str | None
+    held_pins: str | None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -296,15 +299,24 @@ def _self_contact(stepper, ok):
             if not pairs.overflowed:
                 break
             pairs.grow()
-    gaps, said = pairs.least_gap, []
+
+    def where(vertex, copy):
+        return int(vertex if model.order is None else model.order[vertex]), f" of copy {copy}" if model.copies > 1 else ""
+
+    gaps, said, held = pairs.least_gap, [], []
     for copy, frame, vertex in pairs.too_near:
-        vertex = int(vertex if model.order is None else model.order[vertex])
-        of_copy = f" of copy {copy}" if model.copies > 1 else ""
+        vertex, of_copy = where(vertex, copy)
         said.append(
             f"in frame {frame}{of_copy} first, at vertex {vertex}, cloth is nearer to itself than 4 units in the last place of "
             f"float32 coordinates, in which frames are stored; the least gap is {gaps[copy]:.3g} m"
         )
-    of_run = of_copies(1.0 - pairs.share), of_copies(gaps), "; ".join(said) or None
+    for copy, frame, vertex, farthest in pairs.pins_held:
+        vertex, of_copy = where(vertex, copy)
+        held.append(
+            f"from frame {frame}{of_copy} on cloth holds back pins, vertex {vertex} first, by up to {farthest:.3g} m; "
+            "no cloth may pass through cloth"
+        )
+    of_run = of_copies(1.0 - pairs.share), of_copies(gaps), "; ".join(said) or None, "; ".join(held) or None
     return SelfContactSummary(pairs.most, int(pairs.lists.numpy().max()), *of_run)
 
 
