@@ -1,15 +1,15 @@
-"""Factories of the kernels of colliders that are triangle meshes: the half-spaces that stand for one in a step, and the filter.
+"""Factories of the kernels of mesh colliders: the half-spaces that replace a mesh in a step, and the filter.
 
-For a step a mesh is replaced, for each vertex, by a few half-spaces, the *facets*, which have all of it behind them that is
-near. The first touches the point of the surface that is nearest to where the vertex will be, the next the nearest point in
-front of the first, and so on (Liu et al. 2017, *Planning dynamically feasible trajectories for quadrotors using safe flight
-corridors in 3-D complex environments*). A convex mesh needs one, a groove two, a corner three.
+In a step, and for each vertex, a mesh is replaced by a few half-spaces, the *facets*, which have the nearby part of the mesh
+behind them. The first touches the surface at the point nearest to the predicted vertex, the next at the nearest point in front
+of the first, and so on (Liu et al. 2017, *Planning dynamically feasible trajectories for quadrotors using safe flight corridors
+in 3-D complex environments*). A convex mesh needs one facet, a groove two, a corner three.
 
-Distances to a surface have no sign: vertices start on one side of it and the filter lets none cross, so that open and
-non-manifold meshes, or those with triangles that are turned over, are as good as closed ones.
+Distances are unsigned: a vertex starts on one side of the surface, and the filter never lets it cross. So open and non-manifold
+meshes, and meshes with inconsistent winding, work like closed ones.
 
-All is in the frame of the collider. Points of the mesh move linearly between its keyframes, and so within a step. ``halves``
-count half steps. The tree, a `wp.Bvh` in float32, only finds triangles, with a margin for rounding.
+Everything is in the frame of the collider. Points of the mesh move linearly between its keyframes, and so within a step.
+``halves`` are numbers of half steps. The hierarchy, a `wp.Bvh` in float32, only finds candidates, with a margin for rounding.
 """
 
 from functools import cache
@@ -37,23 +37,23 @@ from .terms.contact import turned
 from .vectors import types
 
 turned_by, slope_of = turned, contact.slope
-FAR = 1e30  # the distance to what is not there, of which a difference is a number
-LISTED = 32  # triangles near a vertex that are kept
-AHEAD = wp.constant(10)  # steps for which they are to last
-FACETS = 3  # the most, of a vertex and a mesh
-MARCHES = wp.constant(32)  # separating planes between a vertex and a triangle on its way, at most
-CARRIES = wp.constant(16)  # of a vertex by triangles that move, in a step
+FAR = 1e30  # distance to a missing facet; finite, so that differences are not NaN
+LISTED = 32  # maximum number of triangles in the list of a vertex
+AHEAD = wp.constant(10)  # number of steps for which a list should last
+FACETS = 3  # maximum number of facets of a vertex and a mesh
+MARCHES = wp.constant(32)  # maximum number of separating planes between a vertex and a triangle in a move
+CARRIES = wp.constant(16)  # how often moving triangles may carry a vertex along in a step
 SLIDES = wp.constant(3)  # surfaces along which a prediction or a vertex slides
-BEYOND = wp.constant(0.02)  # of r: how far in front of the facets found so far the nearest point of the next must be
-ALIKE = wp.constant(0.9)  # cosine between the normals of two facets that are one
+BEYOND = wp.constant(0.02)  # smallest distance of a further facet in front of the others, over r
+ALIKE = wp.constant(0.9)  # cosine between the normals from which two facets count as one
 
 
 @cache
 def meshes(dtype):
-    """The struct of the meshes of C colliders: ``points`` holds the keyframes of all, ``triangles`` those of all.
+    """Struct of the meshes of C colliders. ``points`` has the keyframes of all meshes, ``triangles`` their triangles.
 
-    Of collider c: the tree ``bvh`` or 0, index of the first triangle, index of the first point, points of a keyframe, number of
-    keyframes, and the margin of its tree for rounding.
+    For each collider: the hierarchy ``bvh`` or 0, the index of the first triangle, the index of the first point, the points per
+    keyframe, the number of keyframes, and the margin of the hierarchy for rounding.
     """
     vec3, _ = types(dtype)
 
@@ -73,10 +73,11 @@ def meshes(dtype):
 
 @cache
 def motions(dtype):
-    """The struct of a step: poses (copies, colliders) as :func:`.colliders.step_poses`, and what all kernels need of it.
+    """Struct of a step: the poses (copies, colliders) of :func:`.colliders.step_poses`, and parameters of all kernels.
 
-    Each copy has made so many ``steps`` of h [s]. A frame is ``per_frame`` half steps; forces are taken ``ahead`` half steps
-    on. ``r`` is the contact distance, ``least`` the nearest that the filter lets be, ``landing`` where it and predictions stop.
+    ``steps`` is the number of steps of h [s] of each copy. A frame has ``per_frame`` half steps. Forces are evaluated after
+    ``ahead`` half steps. ``r`` is the contact distance, ``least`` the smallest distance that the filter allows, ``landing`` the
+    distance at which it stops vertices, and predictions stop.
     """
     pose_type, _anchor = pose_types(dtype)
 
@@ -98,11 +99,11 @@ def motions(dtype):
 
 @cache
 def near_lists(dtype):
-    """The struct of the triangles near each vertex, for steps that are short: (meshes, N) lists of at most :data:`LISTED`.
+    """Struct of the triangles near each vertex, for short steps: (meshes, N) lists of at most :data:`LISTED` triangles.
 
-    A list has those within r + w of a ball's centre, ``ball`` (x, y, z, w), at the step ``built``: all that count until the
-    vertex and the mesh, by ``drift`` a step, have come nearer by w. ``count`` is −1 of one that is too long, w of none below 0.
-    ``row`` is the row of each collider. Without lists it has no entries.
+    A list has the triangles within r + w of the centre of a ``ball`` (x, y, z, w) at the step ``built``. It is complete until
+    the vertex and the mesh, which moves by ``drift`` per step, have approached by w. If a list is too long, ``count`` is −1. If
+    there is none, w is negative. ``row`` is the row of each collider, and empty without lists.
     """
 
     @wp.struct
@@ -119,19 +120,19 @@ def near_lists(dtype):
 
 @cache
 def facet_type(dtype):
-    """The type of a facet: a point, the normal, the weight."""
+    """Type of a facet: a point, the normal, the weight."""
     return wp.types.vector(7, dtype)
 
 
 @cache
 def geometry(dtype):
-    """Device functions of triangles: ``corners``, ``from_triangle``, ``carry``."""
+    """Device functions on triangles: ``corners``, ``from_triangle``, ``carry``."""
     vec3, mat33 = types(dtype)
     zero, one = dtype(0.0), dtype(1.0)
 
     @wp.func
     def corners(mesh: meshes(dtype), c: int, triangle: int, halves: int, per_frame: int):
-        """The corners of a triangle, as rows, after half steps of which a frame has ``per_frame``."""
+        """The corners of a triangle after ``halves`` half steps, as rows; a frame has ``per_frame`` half steps."""
         v = mesh.triangles[mesh.first_triangle[c] + triangle]
         first = mesh.first_point[c]
         frames = mesh.frames[c]
@@ -153,9 +154,9 @@ def geometry(dtype):
 
     @wp.func
     def nearer_side(p: vec3, a: vec3, b: vec3, best: dtype):
-        """Squared distance to the segment from a to b, where on it, and from there to p, if below ``best``; else −1.
+        """Squared distance of p to the segment from a to b, its parameter, and the vector to p, if below ``best``; else −1.
 
-        Where that is short, rounding must not tilt it along the segment, whose ends may be far.
+        A short vector must not be tilted along the segment by rounding, for the ends may be far.
         """
         e = b - a
         l = wp.dot(e, e)
@@ -170,7 +171,7 @@ def geometry(dtype):
 
     @wp.func
     def from_triangle(p: vec3, t: mat33):
-        """Distance to a triangle, the direction away from it, and the weights of its corners in the nearest point."""
+        """Distance to a triangle, direction away from it, and barycentric coordinates of the nearest point."""
         a = t[0]
         b = t[1]
         c = t[2]
@@ -223,7 +224,7 @@ def geometry(dtype):
 
     @wp.func
     def carry(n: vec3, before: mat33, after: mat33):
-        """A direction that turns with a triangle, unless it is flat."""
+        """A direction rotated with a triangle; unchanged for a degenerate triangle."""
         found = wp.transpose(frame_of(after)) * (frame_of(before) * n)
         return wp.where(wp.dot(found, found) > dtype(0.5), found, n)
 
@@ -232,7 +233,7 @@ def geometry(dtype):
 
 @cache
 def queries(dtype):
-    """Device functions that ask the tree or the list of a vertex."""
+    """Device functions that query the hierarchy or the list of a vertex."""
     vec3, mat33 = types(dtype)
     corners, from_triangle, _carry = geometry(dtype)
     ball_type = wp.types.vector(4, dtype)
@@ -240,7 +241,7 @@ def queries(dtype):
 
     @wp.func
     def is_point(t: mat33):
-        """Whether a triangle has shrunk to a point, and so is absent."""
+        """Whether a triangle is a point, and so does not count."""
         return t[0] == t[1] and t[1] == t[2]
 
     @wp.func
@@ -263,7 +264,7 @@ def queries(dtype):
         row: int,
         i: int,
     ):
-        """The nearest point within a radius in front of ``count`` facets: distance or −1, direction, triangle, weights."""
+        """The nearest point within a radius in front of ``count`` facets: distance or −1, direction, triangle, coordinates."""
         found = -one
         away = vec3()
         weights = vec3()
@@ -298,9 +299,9 @@ def queries(dtype):
 
     @wp.func
     def march(p: vec3, way: vec3, t: mat33, moves: mat33, least: dtype, most: dtype):
-        """The part of a move, ``most`` at most, that keeps ``least`` or where it starts from a triangle, whose corners move.
+        """The fraction of a move, at most ``most``, that keeps ``least``, or the initial distance, from a moving triangle.
 
-        The plane normal to the distance separates the two until one of the corners passes it; from there the next decides.
+        The plane normal to the distance separates the two until a corner passes it. From there the next plane decides.
         """
         done = zero
         d, n, w = from_triangle(p, t)
@@ -343,10 +344,10 @@ def queries(dtype):
         row: int,
         i: int,
     ):
-        """The part of a move that keeps ``least`` or where it starts, and what stops it: normal, triangle or −1, weights.
+        """The fraction of a move that keeps ``least`` or the initial distance; the stop: normal, triangle or −1, coordinates.
 
-        The move begins at the part ``start`` of the time from ``halves`` to ``after`` and ends with it. Of triangles that stop
-        it at once, as do several of a plane, it is the nearest.
+        The move starts at the fraction ``start`` of the time from ``halves`` to ``after``, and ends at ``after``. If several
+        triangles stop it at once, such as those of a plane, the nearest is returned.
         """
         kept = one
         nearest = dtype(wp.inf)
@@ -388,7 +389,7 @@ def queries(dtype):
 
     @wp.func
     def has_list(lists: near_lists(dtype), c: int, i: int, step: int, p: vec3, way: dtype):
-        """The row of the list of a vertex at p that has all that is within r on a way so long, or −1."""
+        """The row of the list of a vertex at p if it is complete within r along a way of this length, else −1."""
         row = wp.int32(-1)
         if lists.row.shape[0] > 0:
             row = lists.row[c]
@@ -401,7 +402,7 @@ def queries(dtype):
 
     @wp.func
     def is_alone(lists: near_lists(dtype), c: int, i: int, step: int, p: vec3, way: dtype):
-        """Whether the list of a vertex says that nothing is within r on its way."""
+        """Whether, by the list of a vertex, no triangle is within r along its way."""
         row = has_list(lists, c, i, step, p, way)
         alone = wp.bool(False)
         if row >= 0:
@@ -420,14 +421,14 @@ def queries(dtype):
         lists: near_lists(dtype),
         i: int,
     ):
-        """The row of the list of a vertex at p that moves by ``way`` a step, built anew where it has none, or −1."""
+        """The row of the list of a vertex at p that moves by ``way`` per step, rebuilt if necessary; or −1."""
         step = halves // 2
         row = lists.row[c]
         if has_list(lists, c, i, step, p, zero) < 0:
             ball = lists.ball[row, i]
             moved = wp.length(p - vec3(ball[0], ball[1], ball[2]))
             moved += dtype(wp.abs(step - lists.built[row, i])) * lists.drift[row]
-            if not (moved <= ball[3]):  # and not one that is too long
+            if not (moved <= ball[3]):  # too long lists are also kept until then
                 w = dtype(wp.max(dtype(AHEAD) * (way + lists.drift[row]), dtype(0.5) * r))
                 count = wp.int32(LISTED + 1)
                 tries = wp.int32(0)
@@ -456,7 +457,7 @@ def queries(dtype):
 
 @cache
 def bound_triangles(dtype):
-    """Kernel over the triangles of a mesh that deforms: their boxes from the first half step of any copy to the last."""
+    """Kernel over the triangles of a deforming mesh: their boxes from the first to the last half step of all copies."""
     corners, _from, _carry = geometry(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -488,7 +489,7 @@ def bound_triangles(dtype):
             for i in range(3):
                 low = wp.min(low, wp.vec3(t[i]))
                 high = wp.max(high, wp.vec3(t[i]))
-            next = (halves // per_frame + 1) * per_frame  # at which the motion turns
+            next = (halves // per_frame + 1) * per_frame  # the next keyframe, where the velocity changes
             if halves < last:
                 next = wp.min(next, last)
             halves = next
@@ -501,16 +502,16 @@ def bound_triangles(dtype):
 
 @cache
 def find_facets(dtype, at_vertex: bool, anywhere: bool = False):
-    """Kernel over the elements of contact with one mesh, at the start of a step: the facets of each vertex.
+    """Kernel over contact elements of one mesh at the start of a step: the facets of each vertex.
 
-    They are those ``at_vertex``, as explicit steps take them, or with ``anywhere`` those at the vertex, the nearest of them
-    however far it is, as equilibria take them; else those at its prediction, x + h v + h² g, which slides
-    along what it meets on its way. If it ends where the nearest facet is unlike the last along which it slid, or there is none,
-    that one comes first: beyond a thin collider there would be no force that leads back. If it meets nothing, they are
-    those at the vertex, from which other forces may pull it as far as it would go.
+    With ``at_vertex``, for explicit steps, facets are those at the vertex. With ``anywhere``, for equilibria, they are too,
+    with the nearest at any distance. Else they are those at the prediction x + h v + h² g, which slides along the surfaces that
+    it meets. If the nearest facet there differs from the last along which it slid, or is missing, that one becomes the first:
+    beyond a thin collider no force would lead the vertex back. If the prediction meets nothing, facets are those at the vertex,
+    for other forces may pull it as far.
 
-    The weights share the area of the vertex among facets: 1/Σ|nⱼ·nₖ| over those within r, so that two that are nearly one press
-    as one does, and no number of them is stiffer than one (Gershgorin).
+    The weights divide the area of the vertex among facets: 1/Σ|nⱼ·nₖ| over those within r. So two almost equal facets press as
+    one, and several are never stiffer than one (Gershgorin).
     """
     vec3, mat33 = types(dtype)
     facet = facet_type(dtype)
@@ -653,7 +654,7 @@ def find_facets(dtype, at_vertex: bool, anywhere: bool = False):
 
 @cache
 def pose_facets(dtype):
-    """Kernel over the elements of one facet: their rest states, a half-space far away where a vertex has fewer facets."""
+    """Kernel over the elements of one facet: rest states; a half-space far away if the vertex has fewer facets."""
     vec3, _ = types(dtype)
     facet = facet_type(dtype)
     behind, rest_type = half_space(dtype), wp.types.vector(contact.PARAMETERS, dtype)
@@ -693,10 +694,10 @@ def pose_facets(dtype):
 
 @cache
 def anchor_on_mesh(dtype, bounded: bool):
-    """Kernel over the elements of friction on one mesh, at the start of a step, as :func:`.colliders.anchor_vertices`.
+    """Kernel over friction elements of one mesh at the start of a step, see :func:`.colliders.anchor_vertices`.
 
-    N and n are the sum over the facets at the vertex and its direction. Anchors are on the surface, and move on with the
-    triangle that is nearest to the vertex.
+    N and n are the length and the direction of the sum over the facets at the vertex. Anchors are on the surface, and move with
+    the triangle nearest to the vertex.
     """
     vec3, mat33 = types(dtype)
     _pose, anchor_type = pose_types(dtype)
@@ -793,10 +794,10 @@ def anchor_on_mesh(dtype, bounded: bool):
 
 @cache
 def filter_meshes(dtype):
-    """Kernel over vertices, at the end of a step, as :func:`.colliders.filter_step`, of which some colliders are meshes.
+    """Kernel over vertices at the end of a step: :func:`.colliders.filter_step` for colliders that include meshes.
 
-    A vertex that a mesh has stopped goes on with the triangle that has stopped it, and slides along it until another stops it.
-    Each part of its way is tested against all triangles, so it crosses none.
+    A vertex that a mesh stops moves with the triangle that stopped it, and slides along it until another one stops it. Each
+    part of its way is tested against all triangles, so that it crosses none.
     """
     vec3, _mat33 = types(dtype)
     to_local, to_space = of_pose(dtype)
@@ -821,9 +822,9 @@ def filter_meshes(dtype):
         lists: near_lists(dtype),
         i: int,
     ):
-        """Where a move from p to ``end`` ends, its change and push, and whether something stops it.
+        """The end of a move from p to ``end``, its change, its push, and whether it is stopped.
 
-        That is 1, or 2 if it gets past that, of what is free.
+        The last is 0, 1, or, for a free vertex that gets past the obstacle, 2.
         """
         per_frame = motion.per_frame
         before = 2 * motion.steps[copy]
@@ -913,7 +914,7 @@ def filter_meshes(dtype):
         cuts = wp.int32(0)
         last = wp.int32(0)
         rounds = wp.int32(0)
-        while rounds <= cuts and rounds < most:  # another one after each that has cut
+        while rounds <= cuts and rounds < most:  # another round after each cut
             rounds += 1
             for c in range(count):
                 pose = motion.after[copy, c]
@@ -984,9 +985,9 @@ def filter_meshes(dtype):
 
 @cache
 def surface_moves(dtype):
-    """Kernel over vertices, after a step: the moves in it of the material of a mesh that deforms, at the points nearest to x.
+    """Kernel over vertices after a step: displacements in it of the material of a deforming mesh at the points nearest to x.
 
-    x is where the vertices are ``when`` half steps on, and ``poses`` are those of then. 0 beyond the contact distance.
+    x and ``poses`` are those after ``when`` half steps. The displacement is 0 beyond the contact distance.
     """
     vec3, mat33 = types(dtype)
     pose_type, _anchor = pose_types(dtype)
@@ -1012,7 +1013,7 @@ def surface_moves(dtype):
     ):
         i = wp.tid()
         copy = i // per_copy
-        first = 2 * motion.steps[copy] - 2  # of the step that is over
+        first = 2 * motion.steps[copy] - 2  # the first half step of the finished step
         p = to_local(poses[copy, collider], x[i])
         d, n, face, w = nearest_beyond(
             mesh, collider, first + when, motion.per_frame, p, motion.r, dtype(0.0), 0, mat33(), vec3(), lists, -1, i

@@ -74,9 +74,9 @@ def local_gradient(part: TermFacts, dtype, corrected: bool = False):
 def elements_struct(part: TermFacts, dtype):
     """The struct of the arrays of one term.
 
-    Swept: block b has the pieces from offsets[b] to offsets[b+1], and ``codes`` are the first element of each and how many,
-    see :mod:`.blocks`. Gathered: so many incidences has vertex i, and ``codes`` are K·element + corner, from offsets[i] on or,
-    padded, of the first slot of all vertices, then of the second …; of pairs the other vertex, or itself where there is none.
+    Swept: block b has the pieces offsets[b] to offsets[b+1]; ``codes`` are the first element and the count of each, see
+    :mod:`.block_forces`. Gathered: ``codes`` are K·element + corner of the incidences of vertex i from offsets[i] on. They
+    are stored slot by slot if padded. For pairs, they are the other vertex, or the vertex itself in an empty slot.
     """
 
     @wp.struct

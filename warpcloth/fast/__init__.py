@@ -1,1 +1,1 @@
-"""Faster ways to do what the core does, behind one door."""
+"""Faster implementations of the core, with one entry, `plan`."""

@@ -1,4 +1,4 @@
-"""Blocks of consecutive vertices and the elements of each term in the block of their lowest vertex, in pieces.
+"""Blocks of consecutive vertices, with the elements of each term in the block of their lowest vertex, in pieces.
 
 See :mod:`warpcloth.kernels.fast.block_forces` for the forces of a block.
 """
@@ -8,23 +8,23 @@ import numpy as np
 from ..model.host_values import host_values
 from .structs import int32_array
 
-NUMBERS = 6144  # of scratch, if no vertex needs more: 2048 springs, which fit into the first cache
-RUN = 8  # elements, from which on a run is faster than looking stencils up
+NUMBERS = 6144  # numbers of scratch, if no vertex needs more: 2048 springs, which fit into the first-level cache
+RUN = 8  # number of elements from which a run is faster than reading stencils
 
 
 def block_layout(terms, per_copy, copies):
-    """The first vertex of each block, the terms in the order of the blocks, and the arrays of each for a kernel.
+    """Divides the vertices and the elements of all terms into blocks.
 
-    A block ends before the coordinates of one of the terms are more than :data:`NUMBERS`; it has one vertex at least.
+    A block has at least one vertex. It ends before the local coordinates of a term exceed :data:`NUMBERS`.
 
     Args:
         terms: :class:`warpcloth.model.elements.DeviceElements` of each term; all copies have the same.
-        per_copy: Vertices of a copy.
-        copies: How many there are.
+        per_copy: Number of vertices per copy.
+        copies: Number of copies.
 
     Returns:
         (vertices (blocks + 1,), terms, the arrays of each term by the names of
-        :func:`warpcloth.kernels.fast.term_facts.elements_struct`, the most numbers that a term has in a block)
+        :func:`warpcloth.kernels.fast.term_facts.elements_struct`, the largest count of numbers of a term in a block)
     """
     totals = [_numbers_before(elements, per_copy) for elements in terms]
     vertices = [0]
@@ -44,13 +44,13 @@ def _one(elements):
 
 
 def _numbers_before(elements, per_copy):
-    """The numbers of the local coordinates of elements with a lowest vertex before each, (per_copy + 1,)."""
+    """Count of numbers in the local coordinates of the elements whose lowest vertex is before each vertex, (per_copy + 1,)."""
     counts = np.bincount(_one(elements).min(axis=1), minlength=per_copy)
     return 3 * elements.term.rows * np.append(0, np.cumsum(counts))
 
 
 def _in_pieces(elements, blocks, copies):
-    """The elements block by block, runs first, and their arrays for a kernel."""
+    """The elements by block, runs first, and their arrays for a kernel."""
     stencil = _one(elements)
     lowest = stencil.min(axis=1)
     block = np.searchsorted(blocks, lowest, side="right") - 1
@@ -78,6 +78,6 @@ def _in_pieces(elements, blocks, copies):
 
 
 def _changes(values):
-    """Whether each row differs from the one before; the first does."""
+    """Whether each row differs from the one before; True for the first."""
     values = values.reshape(len(values), -1)
     return np.append(np.full(min(len(values), 1), True), (values[1:] != values[:-1]).any(axis=1))

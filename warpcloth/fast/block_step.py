@@ -1,4 +1,4 @@
-"""Explicit steps by blocks of vertices, for the CPU: one launch a step, of one thread a copy."""
+"""Explicit steps by blocks of vertices, for the CPU: one launch per step, one thread per copy."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,7 +22,7 @@ class Window(NamedTuple):
     Attributes:
         terms: Their :class:`warpcloth.model.elements.DeviceElements`.
         inverse_mass: (N,) [1/kg].
-        pins, keyframes: Those of the moved pins that are among them, or None.
+        pins, keyframes: Moved pins among the vertices, and their keyframes; or None.
     """
 
     terms: Sequence
@@ -32,23 +32,23 @@ class Window(NamedTuple):
 
 
 class BlockStep:
-    """Steps of one launch, see :func:`warpcloth.kernels.fast.block_step.block_step`. Terms that are refreshed are added before.
+    """Explicit steps in one launch, see :func:`warpcloth.kernels.fast.block_step.block_step`.
 
-    Elements of a quadratic energy that is not damped are taken as the pairs of their matrix, see
+    Forces of refreshed terms are added before. An undamped quadratic energy is replaced by the pairs of its matrix, see
     :mod:`warpcloth.fast.quadratic_pairs`.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        state: x and v (N,), which steps move on.
+        state: x and v (N,), which steps update.
         h: Step [s].
-        symplectic: Whether x moves on by the v after the step.
-        count: Steps that moved pins have made (B,) int32, or None.
-        compensated: Whether x is moved on by compensated summation.
+        symplectic: Whether x is updated with v after the step.
+        count: Number of steps of the moved pins (B,) int32, or None.
+        compensated: Whether x is updated by compensated summation.
         guard: The :class:`warpcloth.fast.contact_guard.ContactGuard` of a model with colliders.
         window: The :class:`Window` of the vertices of ``state``, if these are not all of the model.
 
     Attributes:
-        gradient: ∂U/∂x (N,) [N] of what is not of the terms, to which steps add; 0 after each.
+        gradient: ∂U/∂x (N,) [N] of everything else, to which steps add; 0 after each step.
         residual: Position residual of compensated summation (N,) [m], or None.
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
@@ -65,12 +65,12 @@ class BlockStep:
         vertices, swept, arrays, numbers = block_layout(swept, len(state[0]) // model.copies, model.copies)
         damped = [elements.damping is not None for elements in swept]
         parts = [TermFacts(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
-        # Contracted as on CUDA, where a product is added without being rounded: springs then take 0.8 of the time.
+        # Fused multiply–add, as on CUDA: springs then take 0.8 of the time.
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
         guarded = guard is not None, guard is not None and guard.moving
         self._kernel = model.kernel(kernels.block_step, tuple(parts), model.dtype, symplectic, flags, compensated, *guarded)
         self.residual = wp.zeros_like(state[0]) if compensated else None
-        self._arrays = arrays  # whose memory the structs do not keep
+        self._arrays = arrays  # the structs hold no references
         scratch = [
             wp.zeros(size, dtype=model.dtype, device=model.device) for size in (numbers, numbers * (compensated or any(damped)))
         ]
@@ -79,7 +79,7 @@ class BlockStep:
         self._given += [guard.data if guard else NoGuard(), h, *scratch]
 
     def launch(self, steps, move_pins):
-        """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        """Launches a number of steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
             if self._guard:

@@ -1,22 +1,22 @@
-"""Which explicit steps add to positions by compensated summation, and in what unit the residual is packed."""
+"""Decides which explicit steps use compensated summation, and the unit of packed residuals."""
 
 import numpy as np
 import warp as wp
 
-# Largest rounding of positions, relative to the mean edge, without compensated summation.
+# Largest rounding of positions without compensated summation, relative to the mean edge.
 ROUNDING = 4e-5
-# A packed residual has units of this times the rounding of x, so that it holds the residual of positions so many times as
-# far from the origin as those known beforehand.
+# The unit of packed residuals over the rounding of x; and how many times farther from the origin than known beforehand
+# positions may get.
 FINER, FARTHER = 2.0**-6, 16.0
 
 
 def needs_compensation(model):
-    """Whether explicit steps have to keep the residual of x for the strain of edges to be right to half a point.
+    """Whether explicit steps need compensated summation, for edge strains with errors below half a percentage point.
 
-    In float32 positions are rounded by about the strain that a step makes, and nothing damps the noise: after a second 1 % of
-    the springs of ``hanging`` with 512 × 512 vertices are 0.81 percentage points off, compensated 0.31, as in float64; of
-    256 × 256 vertices 0.33. Rounding at the farthest vertex is then above 4e-5 of the mean edge. Steps of terms that are
-    damped or refreshed take forces at x alone and are not compensated; how far off these are has not been measured.
+    In float32, the rounding of positions is comparable to the strain of a step, and nothing damps this noise. After 1 s, 1 % of
+    the springs of ``hanging`` with 512 × 512 vertices have an error of 0.81 percentage points, with compensated summation 0.31,
+    as in float64. With 256 × 256 vertices it is 0.33. The limit is a rounding of 4e-5 of the mean edge at the farthest vertex.
+    Steps with damped or refreshed terms evaluate forces at x alone and are not compensated; their error has not been measured.
     """
     if model.dtype is not wp.float32 or any(elements.damping is not None or elements.refresh for elements in model.terms):
         return False
@@ -27,10 +27,10 @@ def needs_compensation(model):
 
 
 def packed_unit(model):
-    """The unit of packed residuals [m]; None if above an eighth of the rounding that :func:`needs_compensation` allows.
+    """The unit of packed residuals [m]; None if it is above an eighth of the rounding that :func:`needs_compensation` allows.
 
-    A unit of 1e-4 of the mean edge leaves a sheet of small steps 15 times as far off as vectors do. It is for where copies
-    start, where pins are led, and how far a scene without pins gets.
+    With a unit of 1e-4 of the mean edge, a sheet with small steps has 15 times the error of vector residuals. The unit follows
+    from the start of copies, the keyframes of pins, and the distance that a scene without pins can move.
     """
     scene, far = model.scene, _size(model.positions.numpy())
     if scene.pins.keyframes is not None:
@@ -43,10 +43,10 @@ def packed_unit(model):
 
 
 def _size(values):
-    """The largest magnitude of numbers."""
+    """The largest absolute value."""
     return float(np.abs(values).max(initial=0.0))
 
 
 def _rounding(positions):
-    """The distance of neighbouring numbers of float32 at the farthest of positions [m]."""
+    """The spacing of float32 at the farthest position [m]."""
     return float(np.spacing(np.float32(_size(positions))))

@@ -13,17 +13,17 @@ from .structs import int32_array
 
 
 class ContactGuard:
-    """The part of a step that concerns colliders, see :mod:`warpcloth.kernels.fast.contact_guard`.
+    """Collider contact in the kernels of explicit steps, see :mod:`warpcloth.kernels.fast.contact_guard`.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`, whose terms of contact it takes from the kernels of a step.
+        model: The :class:`warpcloth.model.model.Model`.
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`.
 
     Attributes:
-        data: The struct of a step.
-        terms: The elements that are left.
-        moving: Whether a collider moves, or a pin.
-        followed: Whether terms of contact are refreshed where a step begins, for those who read them.
+        data: The struct of the kernels.
+        terms: The elements of the other terms.
+        moving: Whether a collider or a pin moves.
+        followed: Whether contact terms are refreshed at the start of a step, because others read them.
     """
 
     def __init__(self, model, colliders):
@@ -42,7 +42,7 @@ class ContactGuard:
         balls = np.zeros((model.count, 4))
         balls[:, 3] = np.where(model.inverse_mass.numpy() > 0.0, -1.0, np.inf)
         data = self.data = kernels.guard_struct(model.dtype)()
-        self._kept = {  # whose memory the struct does not keep
+        self._kept = {  # the struct holds no references
             "stiffness": model.array(stiffness, model.dtype),
             "anchors": colliders.anchor_rows,
             "balls": model.array(balls, wp.types.vector(4, model.dtype)),
@@ -57,13 +57,13 @@ class ContactGuard:
         colliders.launch_move()
 
     def follow(self):
-        """Makes steps refresh the terms of contact as well."""
+        """Makes steps refresh the contact terms too."""
         self.followed = True
         self.data.notes = self.colliders.notes
         self.colliders.follow()
 
     def launch_start(self, x):
-        """Launches what moves colliders on, where a step begins from x (N,)."""
+        """Launches the motion of colliders at the start of a step from x (N,)."""
         if self.followed:
             with self.colliders.reading_anchors():
                 self.model.refresh(STEP, Moment(x), self._contact)
@@ -73,7 +73,7 @@ class ContactGuard:
             self.model.launch(self._copy, len(self._fixed), [self._fixed, self._numbers, x], [self._fixed_before])
 
     def launch_end(self, x):
-        """Launches, where pins have moved on, what notes those inside colliders, and counts the step if kernels do not."""
+        """Launches, after pins have moved, the notes of pins inside colliders, and the step count if kernels do not count."""
         colliders, model = self.colliders, self.model
         if len(self._fixed):
             given = [self._fixed, colliders.shapes, self._fixed_before, x, colliders.poses]

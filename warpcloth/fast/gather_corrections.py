@@ -1,4 +1,4 @@
-"""Jacobi sweeps of one launch, by gathering over the constraints of each vertex, for CUDA."""
+"""Jacobi sweeps in one launch each, which gather over the constraints of each vertex, for CUDA."""
 
 import warp as wp
 
@@ -8,19 +8,19 @@ from ..terms.refresh import EVALUATION, Moment
 from .gather_layout import gathered_in_rows
 from .structs import chained, filled
 
-RUN = 64  # sweeps of a graph, an even number
+RUN = 64  # sweeps per graph, an even number
 
 
 class GatherSweeps:
-    """Sweeps of one launch over vertices, see :mod:`warpcloth.kernels.fast.gather_corrections`.
+    """Sweeps in one launch over vertices each, see :mod:`warpcloth.kernels.fast.gather_corrections`.
 
-    d and λ go to and fro between two arrays. Arguments are those of :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`.
+    d and λ alternate between two arrays. The arguments are those of :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`.
     """
 
     def __init__(self, model, x, h, correction, multipliers, keys, factors, scale, spread):
         self.model, self.x, self.correction, self.multipliers = model, x, correction, multipliers
         more, count = any(array is not None for array in multipliers), model.count
-        self._found = [  # whose memory the structs do not keep
+        self._found = [  # the structs hold no references
             gathered_in_rows(elements, count, pairs=not more, factor=factor)
             for elements, factor in zip(model.terms, factors, strict=True)
         ]
@@ -47,7 +47,7 @@ class GatherSweeps:
                 array.zero_()
 
     def launch(self, sweeps=1):
-        """Launches so many sweeps; after an odd number the other arrays are copied back."""
+        """Launches a number of sweeps; after an odd number, the second arrays are copied back."""
         model = self.model
         for sweep in range(sweeps):
             (before, *_), (after, *_) = self._states[sweep % 2], self._states[1 - sweep % 2]
@@ -60,13 +60,13 @@ class GatherSweeps:
                     wp.copy(array, last)
 
     def parts(self, sweeps):
-        """Returns pairs of a function that launches and of how many times it runs, for so many sweeps."""
+        """Returns pairs (launcher, number of calls) for a number of sweeps."""
         each = min(sweeps - sweeps % 2, RUN) or 1
         return [(lambda: self.launch(each), sweeps // each), (lambda: self.launch(sweeps % each), int(sweeps % each > 0))]
 
 
 def _chained(parts, found, before, after, dtype):
-    """The struct of all terms, with λ before and after a sweep."""
+    """Struct of all terms, with λ before and after a sweep."""
     structs = []
     for of, (_part, arrays), *lambdas in zip(parts, found, before, after, strict=True):
         elements = filled(elements_struct(of.part, dtype), {name: array for name, array in arrays.items() if name != "factor"})

@@ -1,4 +1,4 @@
-"""The gradient of all terms in one launch, by gathering over the elements of each vertex."""
+"""The gradient of all terms in one launch, which gathers over the elements of each vertex."""
 
 from ..base.turns import in_turn
 from ..kernels.fast.gather_forces import gather_forces
@@ -8,26 +8,24 @@ from .structs import chained
 
 
 class GatherGradient:
-    """∂U/∂x of all terms [N], as :class:`warpcloth.core.gradient.Gradient`.
+    """∂U/∂x of all terms [N], with the methods of :class:`warpcloth.core.gradient.Gradient`.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        corrected: Whether it is taken at x + correction.
-        terms: :class:`warpcloth.model.elements.DeviceElements`, if not all of the model.
+        corrected: Whether it is evaluated at x + correction.
+        terms: :class:`warpcloth.model.elements.DeviceElements`, by default all of the model.
     """
 
     @in_turn
     def __init__(self, model, corrected=False, terms=None):
         self.model, self.terms, self._lanes = model, model.terms if terms is None else terms, lanes_of(model)
-        self._found = [
-            gathered(model, elements, rows=False) for elements in self.terms
-        ]  # whose memory the struct does not keep
+        self._found = [gathered(model, elements, rows=False) for elements in self.terms]  # the struct holds no references
         parts = tuple(part for part, _arrays in self._found)
         self._kernel = model.kernel(gather_forces, parts, model.dtype, corrected, self._lanes) if parts else None
         self._chain = chained(parts, [arrays for _part, arrays in self._found], model.dtype)
 
     def add(self, x, out, correction=None):
-        """out += ∂U/∂x at x, or at x + correction of one that is built ``corrected``."""
+        """Launches out += ∂U/∂x at x, or if ``corrected`` at x + correction."""
         model = self.model
         model.refresh(EVALUATION, Moment(x, correction), self.terms)
         if self._kernel:

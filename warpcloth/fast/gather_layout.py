@@ -1,4 +1,4 @@
-"""The elements of each vertex, as kernels read them that take all terms in one pass."""
+"""The elements of each vertex, in the layout of kernels that take all terms in one pass."""
 
 import numpy as np
 import warp as wp
@@ -10,21 +10,21 @@ from ..model.host_values import host_values
 from .quadratic_pairs import matrix_entries
 from .structs import int32_array
 
-SLOTS = 16  # of pairs, which are compiled one by one
-# On CUDA so many threads take a vertex of meshes of so many vertices or less: a step of the springs of 64² takes 2.0 µs, not
-# 3.0, of 128² 2.2, not 3.1, of 256² as long and of larger ones longer.
+SLOTS = 16  # maximum number of slots of pairs, each of which is compiled
+# On CUDA, LANES threads take a vertex of meshes with at most LANED vertices. A step of springs then takes 2.0 µs instead of 3.0
+# with 64² vertices, and 2.2 instead of 3.1 with 128². With 256² it takes the same time, with more it takes longer.
 LANES, LANED = 4, 50_000
 
 
 def gathered(model, elements, damped=False, rows=True):
-    """The :class:`warpcloth.kernels.fast.term_facts.TermFacts` of elements and the arrays of their struct, by name.
+    """The :class:`warpcloth.kernels.fast.term_facts.TermFacts` of elements, and the arrays of their struct by name.
 
-    Incidences are padded to as many for each vertex, which neighbouring threads read side by side, unless that makes them more
-    than twice as many, as a few vertices of many elements would. Padded pairs have the other vertex and the data of the
-    element at hand, unless elements are refreshed. A stiffness that all pairs of a copy share is stored once per vertex, so
-    that a copy gets the same bits as a model of its own. For a quadratic energy without damping the incidences are the rows of
-    its matrix, if ``rows`` allows it. Rows take a third of the time, but their rounding errors do not cancel between vertices:
-    in float32 this noise bends a strip of 40 elements by 1e-4 of its length, 30 times as far as with elements.
+    Incidences are padded to the same number for each vertex, so that neighbouring threads read neighbouring memory, unless this
+    more than doubles their number. Padded pairs store the other vertex and the data of the element, unless elements are
+    refreshed. A stiffness shared by all pairs of a copy is stored per vertex, so that a copy is bitwise equal to its own model.
+    For an undamped quadratic energy, the incidences are the rows of its matrix if ``rows`` is True. Rows take a third of the
+    time, but their rounding errors do not cancel between vertices. In float32 this noise bends a strip of 40 elements by 1e-4
+    of its length, 30 times as much as with elements.
     """
     part = TermFacts(elements.term, damped, shared=0 in elements.stiffness.strides)
     arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
@@ -46,14 +46,15 @@ def gathered(model, elements, damped=False, rows=True):
 
 
 def gathered_in_rows(elements, count, pairs, **others):
-    """As :func:`gathered`, for Jacobi sweeps: incidences of pairs are in rows, see
-    :func:`warpcloth.kernels.fast.gather_corrections.slot_rows`.
+    """As :func:`gathered`, for Jacobi sweeps, with the incidences of pairs in rows.
+
+    See :func:`warpcloth.kernels.fast.gather_corrections.slot_rows` for rows.
 
     Args:
         elements: :class:`warpcloth.model.elements.DeviceElements`.
-        count: Vertices, N.
-        pairs: Whether incidences may name the other vertex in place of the element.
-        others: Other numbers (B·E,) of the elements, by name.
+        count: Number of vertices N.
+        pairs: Whether incidences may store the other vertex instead of the element.
+        others: Further numbers (B·E,) of the elements, by name.
     """
     part = TermFacts(elements.term, shared=0 in elements.stiffness.strides)
     arrays = {"stiffness": elements.stiffness, "rest": elements.rest, **others}
@@ -65,7 +66,7 @@ def gathered_in_rows(elements, count, pairs, **others):
     codes, source = np.pad(codes, empty, constant_values=-1), np.pad(source, empty)
 
     def in_rows(values):
-        """Values (slots, N) or (slots, N, P) as they are stored: of each row P times the slots of each vertex."""
+        """Values (slots, N) or (slots, N, P) in storage order: row by row, P times the slots of each vertex."""
         parts = values.reshape(rows, width, count, -1).transpose(0, 3, 2, 1)
         return np.ascontiguousarray(parts).reshape(-1, *values.shape[2:])
 
@@ -77,7 +78,7 @@ def gathered_in_rows(elements, count, pairs, **others):
 
 
 def _by_element(elements, count, part, arrays):
-    """The part and the arrays of incidences that name elements."""
+    """The part and the arrays of incidences that store elements."""
     stencil = host_values(elements.stencil).ravel()
     offsets, codes = incidences_of(stencil, count)
     codes, padded = _slots(codes, stencil[codes], offsets, count)
@@ -86,10 +87,10 @@ def _by_element(elements, count, part, arrays):
 
 
 def _pairs(elements, count):
-    """Slots of a vertex as first and as second of a pair, and of each slot and vertex the other vertex and the element.
+    """Numbers of slots of a vertex as first and as second of a pair; other vertex and element for each slot and vertex.
 
-    -1 and 0 of an empty slot. None where elements are no pairs, or their rest state is set in each step, or there would be too
-    many slots.
+    An empty slot has −1 and 0. The result is None if elements are not pairs, if their rest states change in each step, or if
+    there would be too many slots.
     """
     stencil = host_values(elements.stencil)
     if stencil.shape[1] != 2 or elements.refresh is not None:
@@ -107,7 +108,7 @@ def _pairs(elements, count):
 
 
 def _slots(values, vertices, offsets, count):
-    """Values of incidences, one vertex after another, slot by slot if that is at most twice as many, and whether it is."""
+    """Values of incidences, slot by slot if padding at most doubles their number, else by vertex; and which of the two."""
     slots = int(np.diff(offsets).max(initial=0))
     if slots * count > 2 * len(values):
         return values, False
@@ -117,9 +118,9 @@ def _slots(values, vertices, offsets, count):
 
 
 def _of_matrix(model, elements):
-    """How long the longest row of kAGᵀG is off the diagonal, and its rows, where 0 of the vertex itself makes all as long.
+    """The largest number of off-diagonal entries in a row of kAGᵀG, and its rows, padded with 0 for the vertex itself.
 
-    None if that makes them more than twice as many, or there are none.
+    None if padding more than doubles their number, or if there are none.
     """
     n, count = model.per_copy, model.count
     rows, columns, entries_of_copies = matrix_entries(model, elements)
@@ -138,12 +139,12 @@ def _of_matrix(model, elements):
 
 
 def _of_incidences(array, source):
-    """The values of elements ``source``, if elements do not share one."""
+    """The values of the elements ``source``, unless elements share one."""
     if 0 in array.strides:
         return array
     return wp.array(host_values(array)[source], dtype=array.dtype, device=array.device)
 
 
 def lanes_of(model):
-    """How many threads take a vertex."""
+    """The number of threads per vertex."""
     return LANES if model.device.is_cuda and model.count <= LANED else 1

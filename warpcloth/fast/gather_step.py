@@ -1,4 +1,4 @@
-"""Explicit steps by gathering over the elements of each vertex, for CUDA: one launch a step, or one for several."""
+"""Explicit steps that gather over the elements of each vertex, for CUDA: one launch per step, or for several."""
 
 import warp as wp
 
@@ -10,27 +10,27 @@ from .compensation import packed_unit
 from .gather_layout import gathered, lanes_of
 from .structs import chained
 
-# Threads of a block that is a copy; of 1024 vertices 256 threads take 2.1 times as long, 1024 1.2 times (H200).
+# Threads of a block that takes a copy. For 1024 vertices, 256 threads take 2.1 times as long, 1024 threads 1.2 times (H200).
 THREADS = 512
-# Vertices of such a copy at most: 132 copies of 64² take 1.5 times as long by 512 threads as by launches.
+# Maximum number of vertices of such a copy. 132 copies of 64² vertices take 1.5 times as long as with launches.
 VERTICES = 1024
 
 
 class GatherStep:
-    """Steps by gathering, see :func:`warpcloth.kernels.fast.gather_step.gather_step`.
+    """Explicit steps that gather, see :func:`warpcloth.kernels.fast.gather_step.gather_step`.
 
-    x, the residual and, where a term is damped, v go to and fro between two arrays; the last of an odd number of steps is
-    copied back. The residual is packed where :func:`warpcloth.fast.compensation.packed_unit` says so, see
-    :mod:`warpcloth.kernels.fast.packed_residual`. Where :func:`block_of` says so a copy is a block of threads and takes all
-    steps in one launch.
+    x, the residual and, if a term is damped, v alternate between two arrays; after an odd number of steps they are copied back.
+    The residual is packed if :func:`warpcloth.fast.compensation.packed_unit` gives a unit, see
+    :mod:`warpcloth.kernels.fast.packed_residual`. If :func:`block_of` gives threads, a block of them takes all steps of a copy
+    in one launch.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        state: x and v (N,), which steps move on.
+        state: x and v (N,), which steps update.
         h: Step [s].
-        symplectic: Whether x moves on by the v after the step.
-        count: Steps that moved pins have made (B,) int32, or None.
-        compensated: Whether x is moved on by compensated summation.
+        symplectic: Whether x is updated with v after the step.
+        count: Number of steps of the moved pins (B,) int32, or None.
+        compensated: Whether x is updated by compensated summation.
         guard: The :class:`warpcloth.fast.contact_guard.ContactGuard` of a model with colliders.
 
     Attributes:
@@ -73,7 +73,7 @@ class GatherStep:
         self._unit = unit or 1.0
 
     def launch(self, steps, move_pins):
-        """Launches so many steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        """Launches a number of steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
         model = self.model
         if self._block:  # and nothing has to come between steps
             if self._guard:
@@ -98,11 +98,11 @@ class GatherStep:
 
 
 def block_of(model, parts):
-    """Threads of the block that takes a small copy through all steps of a launch; 0 where each step has to be a launch.
+    """Number of threads of the block that takes all steps of a small copy in one launch; 0 if each step needs a launch.
 
-    The arrays of a copy can then stay in the cache of its multiprocessor: springs of 132 copies of 32² vertices take 0.53 of
-    the time of launches, of 4096 copies 0.47. Few copies are as fast by several threads a vertex, and leave multiprocessors
-    idle.
+    The arrays of a copy then stay in the cache of the multiprocessor: the springs of 132 copies of 32² vertices take 0.53 of
+    the time of launches, those of 4096 copies 0.47. A few copies are as fast with several threads per vertex, since blocks
+    would leave multiprocessors idle.
     """
     between = model.pins is not None or any(elements.refresh for elements in model.terms)
     if between or lanes_of(model) > 1 or model.per_copy > VERTICES or not all(part.pairs for part in parts):

@@ -1,12 +1,12 @@
-"""The one entry to code that exists for speed alone: each backend computes the same as the core, up to rounding.
+"""The entry to code that only increases speed. Each backend computes the same as the core, up to rounding.
 
-- ``core``, the plain one: gradients and corrections term by term, then an update of the vertices.
-- ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices, and with several threads each has a
-  subdomain; Jacobi sweeps scatter corrections as they are computed; gradients are those of the core.
-- ``gather``, for CUDA: a gradient, a Jacobi sweep or an explicit step is one launch for all terms; one launch may do several
+- ``core``: gradients and corrections term by term, then an update of the vertices.
+- ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices; several threads have a subdomain each. Jacobi
+  sweeps scatter corrections while they compute them. Gradients are those of the core.
+- ``gather``, for CUDA: a gradient, a Jacobi sweep or an explicit step is one launch for all terms. One launch may do several
   explicit steps.
 
-Tests run each backend by its name and compare it with the core.
+Tests compare each backend with the core.
 """
 
 from ..base.checks import choice
@@ -54,14 +54,14 @@ class Plan:
             state: x and v (N,), which the steps update.
             h: Step [s].
             symplectic: Whether x is updated with v after the step.
-            count: Steps that moved pins have made (B,) int32, or None.
-            pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that shares them.
-            colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of a model that has some, for faster classes
-                to take contact themselves, or None to leave it to the terms and to the end of each step, as it is with meshes.
+            count: Number of steps of the moved pins (B,) int32, or None.
+            pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that divides the work.
+            colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`, with which faster classes handle contact
+                themselves. None: the terms and the end of each step handle it, as with mesh colliders.
             pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact, or None.
 
         Raises:
-            ValueError: If threads cannot share the steps; it names the term.
+            ValueError: Threads cannot divide the steps; the message names the term.
         """
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
         if pairs is not None:
@@ -94,7 +94,7 @@ def plan(model, backend="auto"):
         backend: One of :data:`BACKENDS`; ``"auto"`` is ``"gather"`` on CUDA and ``"blocks"`` on the CPU.
 
     Raises:
-        ValueError: If there is no such backend, or the device does not support it.
+        ValueError: There is no such backend, or the device does not support it.
     """
     choice("backend", backend, BACKENDS)
     if backend == "auto":
@@ -105,10 +105,10 @@ def plan(model, backend="auto"):
 
 
 def _refuse_undivided(model, backend, threads):
-    """Refuses terms that subdomains cannot take, and backends without subdomains.
+    """Checks that the steps of a model can be divided into subdomains.
 
     Raises:
-        ValueError: It names the term or the backend.
+        ValueError: A term or the backend does not support subdomains; the message names it.
     """
     if backend != "blocks":
         raise ValueError(f"threads is {threads} with backend {backend!r}; more than 1 is for 'blocks'")

@@ -1,4 +1,4 @@
-"""Quadratic energies by the entries of their matrix Q = kAGᵀG, of which elements that share vertices have one for all."""
+"""Quadratic energies as pairs of vertices, from the entries of their assembled matrix Q = kAGᵀG."""
 
 from dataclasses import replace
 
@@ -10,18 +10,18 @@ from ..kernels.assemble import constant_blocks
 from ..kernels.fast.quadratic_pair import QUADRATIC_PAIR
 from ..model.host_values import host_values
 
-CHUNK = 1 << 18  # elements whose blocks are added up at once
-# Pairs an element, up to which they are faster: a hinge takes 5 to 6 ns, a pair of vertices 1.2 (one core).
+CHUNK = 1 << 18  # number of elements whose blocks are summed at once
+# Pairs are faster up to this number per element: a hinge takes 5 to 6 ns, a pair of vertices 1.2 ns (one core).
 PAIRS = 4
-# Weights up to so much of the largest of an element are 0, as of cotangents that cancel in double precision.
+# Weights up to this fraction of the largest one of an element count as 0, such as cotangents that cancel in double precision.
 ZERO = 1e-12
 
 
 def matrix_entries(model, elements):
-    """The entries of Q off the diagonal, row by row, where elements of a copy share one stiffness without those that cancel.
+    """The off-diagonal entries of Q, row by row; if the elements of a copy share one stiffness, without entries that cancel.
 
     Returns:
-        (rows (m,), columns (m,), numbers (B, m) [N/m]) of the vertices of one copy.
+        (rows (m,), columns (m,), numbers (B, m) [N/m]) for the vertices of one copy.
     """
     from scipy.sparse import coo_matrix
 
@@ -29,7 +29,7 @@ def matrix_entries(model, elements):
     stencil = host_values(elements.stencil)
 
     def off_diagonal(some):
-        """Rows and columns of the entries off the diagonal, and whether each entry of the blocks is one."""
+        """Rows and columns of the off-diagonal entries, and a mask of these in the blocks."""
         rows, columns = np.repeat(some, K, axis=1), np.tile(some, K)
         apart = rows != columns
         return rows[apart], columns[apart], apart
@@ -53,21 +53,21 @@ def matrix_entries(model, elements):
         np.add.at(sizes, found, np.abs(own))
     if elements.stiffness_of_copies(model) is None:
         return rows, columns, numbers  # an entry that cancels in a copy need not in others, on which no copy may depend
-    # Elements at right angles cancel but for their own rounding. An entry may not be compared with others at its vertices: a
-    # few large elements may be all that joins two parts of small ones.
+    # Entries of right angles cancel up to the rounding of their elements. An entry must not be compared with others at its
+    # vertices: a few large elements may be the only connection between two parts with small ones.
     some = (np.abs(numbers) > 4.0 * np.finfo(model.numpy_dtype).eps * sizes).any(axis=0)
     return rows[some], columns[some], numbers[:, some]
 
 
 def _without_zeros(blocks, K):
-    """Blocks (E, K·K), 0 where a weight is 0 but for rounding, as of vertices in one line."""
+    """Blocks (E, K·K), set to 0 for weights that are 0 up to rounding, such as those of vertices on one line."""
     squares = blocks[:, :: K + 1]
     small = squares <= ZERO**2 * squares.max(axis=1, keepdims=True)
     return np.where((small[:, :, None] | small[:, None]).reshape(blocks.shape), 0.0, blocks)
 
 
 def _entries_of_cells(model, elements):
-    """As :func:`matrix_entries`, of cells with weights, all entries of the pattern."""
+    """As :func:`matrix_entries`, for cells with weights, with all entries of the sparsity pattern."""
     rows, columns, values = constant_entries(model, elements)
     keys, where = np.unique(rows * model.per_copy + columns, return_inverse=True)
     numbers = np.stack([np.bincount(where, each, len(keys)) for each in values])
@@ -77,7 +77,7 @@ def _entries_of_cells(model, elements):
 
 
 def as_pairs(model, elements):
-    """The pairs of vertices that have the same forces as elements of a quadratic energy, or these where they are no faster."""
+    """Pairs of vertices with the same forces as the elements of a quadratic energy, or the elements if pairs are not faster."""
     if not elements.term.whole.quadratic or elements.damping is not None:
         return elements
     if elements.term.cell:

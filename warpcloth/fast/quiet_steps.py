@@ -1,4 +1,4 @@
-"""Explicit steps of cloth with self-contact, of which those that nothing can touch are plain steps and one test."""
+"""Explicit steps of cloth with self-contact. A step in which no contact is possible is a plain step and one test."""
 
 import warp as wp
 
@@ -9,20 +9,19 @@ from ..kernels.step import count_step
 
 
 class QuietSteps:
-    """Takes plain steps while no pair is listed, and takes one again with contact and filter if the test says so.
+    """Takes plain steps while no pair is listed, and repeats a step with contact and filter if the test requires it.
 
-    The test is that of the list, by motion relative to the middle of the cloth: while it says that the list may be kept, no
-    pair can have a force. A vertex also may not move by more than the filter allows in a round. Steps of both kinds are then
-    the same, to the bit. If a copy has several pieces, colliders, moving pins or loads, or starts with crossings, all steps
-    are those with contact.
+    The test is that of the list, by motion relative to the middle vertex: while the list is valid, no pair can have a force.
+    Also, no vertex may move by more than the filter allows in a round. The steps of both kinds are then bitwise equal. With
+    several pieces, colliders, moving pins, loads, or a start with intersections, all steps have contact.
 
     Args:
         steps: The plain steps, with a ``gradient`` to which contact adds before a step.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`.
-        count: Number of steps of keyframes (B,) int32, or None.
+        count: Number of steps of the moved pins (B,) int32, or None.
 
     Attributes:
-        residual, record: As of the plain steps.
+        residual, record: Those of the plain steps.
     """
 
     residual = None
@@ -35,14 +34,14 @@ class QuietSteps:
         self._left, self._again = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self._test, size = model.kernel(find_unquiet, model.dtype), model.per_copy if model.device.is_cpu else 1
         self._dim = model.copies, -(-model.per_copy // size)
-        # Both below what the list and the filter allow, by more than rounding; all moves are then so near their mean.
+        # Below what the list and the filter allow, by more than rounding.
         way = (1.0 - 1e-4) * WAY * pairs.skin
         together = pairs.filter.moves_together
         self._given = [model.per_copy, size, way, 0.49 * way if together else way, together]
         self._count, self._count_down = model.kernel(count_step), model.kernel(count_down)
 
     def launch(self, steps, end):
-        """Launches so many steps, and ``end`` (pins, keyframes, count, x, v) after each that is not a plain one."""
+        """Launches a number of steps, and ``end`` (pins, keyframes, count, x, v) after each that is not plain."""
         step = self._launch_step if self._quiet else self._launch_full
         if steps == 1:
             step(end)

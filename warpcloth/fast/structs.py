@@ -1,4 +1,4 @@
-"""Structs of the arrays of all terms, which fast kernels read in one launch."""
+"""Structs of the arrays of all terms, for kernels that take all terms in one launch."""
 
 import numpy as np
 import warp as wp
@@ -7,13 +7,13 @@ from ..kernels.fast.term_facts import chain_of, elements_struct
 
 
 def chained(parts, arrays, dtype, struct_of=elements_struct):
-    """The struct of all terms: that of the first, and the chain of the others.
+    """Struct of all terms: that of the first, and the chain of the others.
 
     Args:
-        parts: The facts of each term, which ``struct_of`` takes.
+        parts: The facts of each term, for ``struct_of``.
         arrays: The values of each struct, by name.
         dtype: A Warp scalar type.
-        struct_of: As :func:`warpcloth.kernels.fast.term_facts.chain_of` takes it.
+        struct_of: See :func:`warpcloth.kernels.fast.term_facts.chain_of`.
     """
     made = chain_of(tuple(parts), dtype, struct_of)()
     if parts:
@@ -23,7 +23,7 @@ def chained(parts, arrays, dtype, struct_of=elements_struct):
 
 
 def filled(struct, values):
-    """A struct of these values, by name."""
+    """An instance of a struct with values by name."""
     made = struct()
     for name, value in values.items():
         setattr(made, name, value)
@@ -31,5 +31,5 @@ def filled(struct, values):
 
 
 def int32_array(values, device):
-    """Whole numbers (n,) on the device."""
+    """An int32 array (n,) on the device."""
     return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=device)

@@ -1,4 +1,4 @@
-"""Explicit steps of one cloth by several threads: a subdomain of consecutive vertices each, and the elements that touch it."""
+"""Explicit steps of one cloth by several threads, each with a subdomain of consecutive vertices and its elements."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -13,19 +13,19 @@ from .structs import int32_array
 
 
 class SubdomainSteps:
-    """Steps in which each thread of a pool moves its subdomain on, in memory of its own, by blocks as a whole cloth is.
+    """Steps in which each thread of a pool updates its subdomain in its own memory, by blocks (:class:`BlockStep`).
 
-    Elements that touch two subdomains are taken by both, so that threads exchange positions alone, through arrays that they
-    write and read in turns, with one barrier a step. Sums are taken in another order than of one subdomain, the same in every
-    run. Neighbours that are far apart in number make a subdomain take more elements, at worst all of them.
+    Elements between two subdomains are computed by both, so that threads exchange only positions, through alternating arrays
+    with one barrier per step. The order of sums differs from that of one subdomain, but is the same in every run. If neighbours
+    have distant indices, subdomains have more elements, at worst all of them.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`, of one copy and without terms that are refreshed.
-        state: x and v (N,), which steps move on.
+        model: The :class:`warpcloth.model.model.Model`, of one copy and without refreshed terms.
+        state: x and v (N,), which steps update.
         h: Step [s].
-        symplectic: Whether x moves on by the v after the step.
-        count: Steps that moved pins have made (1,) int32, or None.
-        compensated: Whether x is moved on by compensated summation.
+        symplectic: Whether x is updated with v after the step.
+        count: Number of steps of the moved pins (1,) int32, or None.
+        compensated: Whether x is updated by compensated summation.
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool`.
 
     Attributes:
@@ -42,7 +42,7 @@ class SubdomainSteps:
         self.record = self._subdomains[0].steps.record._replace(threads=threads)
         shared = np.unique(np.concatenate([each.ghosts for each in self._subdomains]))
         damped = any(elements.damping is not None for elements in model.terms)
-        # Some threads may have passed the barrier before others: even steps go through one array, odd ones through the other.
+        # Some threads may pass the barrier before others, so even and odd steps use different arrays.
         each_way = 2 if damped or compensated else 1
         self._exchanged = [
             [wp.zeros(len(shared), dtype=model.vec3, device=model.device) for _ in range(each_way)] for _ in range(2)
@@ -52,7 +52,7 @@ class SubdomainSteps:
         self._counting = next((each for each in self._subdomains if each.moves_pins), None)
 
     def launch(self, steps, move_pins):
-        """Launches so many steps of this thread, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        """Launches a number of steps of this thread, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
         model, pool = self.model, self._pool
         own = self._subdomains[pool.thread]
         own.load()
@@ -68,12 +68,12 @@ class SubdomainSteps:
 
 
 class _Subdomain:
-    """The vertices from ``first`` to ``end``, and ghosts: those around them that their elements touch and other threads move.
+    """The vertices from ``first`` to ``end``, and ghosts: other vertices of their elements, which other threads move.
 
     Attributes:
-        ghosts: Their vertices.
+        ghosts: The vertices of the ghosts.
         steps: The :class:`warpcloth.fast.block_step.BlockStep` of the window from the lowest to the highest of all these.
-        moves_pins: Whether moved pins are among its vertices.
+        moves_pins: Whether moved pins are among the vertices.
     """
 
     def __init__(self, model, state, h, symplectic, count, first, end):
@@ -98,7 +98,7 @@ class _Subdomain:
         self._state = [x, v] if self.steps.residual is None else [x, v, self.steps.residual]
 
     def _window(self, terms, vertices):
-        """The :class:`warpcloth.fast.block_step.Window` of ``vertices``, where ghosts do not move."""
+        """The :class:`warpcloth.fast.block_step.Window` of ``vertices``, in which ghosts are fixed."""
         model, device = self.model, self.model.device
         terms = [
             replace(elements, stencil=wp.array((stencil - self.low).astype(np.int32), device=device), per_copy=len(stencil))
@@ -116,7 +116,7 @@ class _Subdomain:
         return Window(terms, model.array(inverse_mass, model.dtype), pins, keyframes)
 
     def share(self, shared, damped):
-        """Finds its ghosts, and its vertices that are ghosts of others, among those that are ``shared``."""
+        """Finds its ghosts, and its vertices that are ghosts of others, among the ``shared`` vertices."""
         given = np.flatnonzero((shared >= self.first) & (shared < self.end))
         taken = np.searchsorted(shared, self.ghosts)
         device = self.model.device
@@ -126,14 +126,14 @@ class _Subdomain:
         self._copy, self._arrays = self.model.kernel(copy_chosen, self.model.dtype), [x, *([v] if damped else residual)]
 
     def load(self):
-        """Reads the state, which others than steps may have changed."""
+        """Reads the state, which may have changed outside of steps."""
         for array, part in zip(self._state, self._parts, strict=True):
             wp.copy(array, part)
         if self._count is not None:
             wp.copy(self._count, self._whole_count)
 
     def store(self, counts):
-        """Writes its vertices into the state, and the count if it ``counts`` for all."""
+        """Writes its vertices to the state, and the step count if it ``counts`` for all."""
         number = self.end - self.first
         for array, whole in zip(self._state, self._whole, strict=True):
             wp.copy(whole, array, dest_offset=self.first, src_offset=self.first - self.low, count=number)
