@@ -59,6 +59,20 @@ def stored_gap(dtype):
     return stored
 
 
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def find_frames(
+    # state in
+    steps: wp.array(dtype=wp.int32),
+    # parameters
+    per_frame: int,
+    # out
+    some: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies, where a step begins: some = 1 if a frame of one ends there."""
+    if steps[wp.tid()] % per_frame == 0:
+        some[0] = 1
+
+
 @cache
 def note_gaps(dtype):
     """Kernel over pairs at the start of a step: records their gaps if a frame ends there."""

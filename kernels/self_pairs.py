@@ -26,7 +26,7 @@ def near_pairs(dtype):
 
     ``acting`` lists the pairs that have an area in a step; there are ``number`` of them, which are few. On the CPU they are in
     order. ``corners`` lists 4·pair + corner of the acting pairs at vertex i from ``first`` [i] to first[i+1], sorted.
-    ``corner_counts`` is scratch that is 0 between launches.
+    ``corner_counts`` is scratch that is 0 between launches. Where no kernel sums over vertices there are none of these three.
     """
 
     @wp.struct
@@ -141,14 +141,17 @@ def set_areas(dtype):
             end = pairs.rows[s[0] + 1]
             least = gap
             for other in range(first, end):
-                if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
-                    least = wp.min(least, step.gap[other])
+                if step.gap[other] < least:
+                    if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                        least = step.gap[other]
             own = part_of_area(gap, least, r)
             if own > ZERO:
                 total = ZERO
                 for other in range(first, end):
-                    if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
-                        total += part_of_area(step.gap[other], least, r)
+                    part = part_of_area(step.gap[other], least, r)
+                    if part > ZERO:
+                        if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                            total += part
                 area = SIDE * areas[s[0]] * own / total
         else:
             least = wp.float64(wp.inf)
@@ -172,8 +175,9 @@ def set_areas(dtype):
         step.stiffness[e] = stiffness * area
         if area > ZERO:
             pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
-            for i in range(4):
-                wp.atomic_add(pairs.corner_counts, s[i], 1)
+            if pairs.corner_counts:
+                for i in range(4):
+                    wp.atomic_add(pairs.corner_counts, s[i], 1)
 
     return set_each_area
 

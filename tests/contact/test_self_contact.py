@@ -247,6 +247,7 @@ def test_pins_that_cloth_holds_back(device):
 def test_acting_pairs(device):
     """They are those of the list that have an area, and their corners are in order at each vertex."""
     pairs, model = steps_of(layers(3, turn=17.0, gap=2e-3), device)
+    pairs.list_corners()
     for _ in range(2):
         pairs.launch_begin(model.positions)
         count = pairs.proximity.counts.numpy().sum()

@@ -13,9 +13,10 @@ ROWS = {"stencils": 1, "corners": 4, "slips": 1}
 LISTS = "stencils", "counts", "first", "corners"
 
 
-def acting_sizes(model, room):
-    """Sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.self_pairs.near_pairs`, by name."""
-    return {"acting": room, "number": 1, "corner_counts": model.count, "first": model.count + 1, "corners": 4 * room}
+def acting_sizes(model, room, corners=True):
+    """Sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.self_pairs.near_pairs`, with corners or not."""
+    sizes = {"acting": room, "number": 1}
+    return sizes | {"corner_counts": model.count, "first": model.count + 1, "corners": 4 * room} if corners else sizes
 
 
 class Slips:

@@ -103,7 +103,7 @@ class SelfSteps:
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32))
         self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
-        self.listed = wp.zeros(1, dtype=wp.int32, device=device)
+        self.listed, self._ends = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self._notes, self._per_frame = gap_notes.GapNotes(), steps_per_frame
         self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
         self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
@@ -120,6 +120,7 @@ class SelfSteps:
         )
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._vertices, self._counted = Scan(model, model.count), None
+        self._corners = model.device.is_cuda or declared.friction > 0.0
         self.forces, self.filter = SelfForces(model, bounded), SelfFilter(self, colliders)
         self.friction, self.tangles, self.stale = None, None, False
         self._hold()
@@ -181,13 +182,19 @@ class SelfSteps:
         self.pairs = self_pairs.near_pairs(self.model.dtype)()
         for name in ("stencils", "counts", "rows", "distances"):
             setattr(self.pairs, name, getattr(found, name))
-        for name, size in acting_sizes(self.model, capacity).items():
+        for name, size in acting_sizes(self.model, capacity, self._corners).items():
             setattr(self.pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
         self.begun = self_pairs.StepPairs()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
         self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
         self.forces.hold(self.pairs, self.begun)
         self.filter.hold(capacity)
+
+    def list_corners(self):
+        """Says that kernels will sum over the pairs of each vertex, for which its corners are listed where a step begins."""
+        if not self._corners:
+            self._corners = True
+            self._hold()
 
     def grow(self):
         """Makes room for the pairs that did not fit; what was recorded must be recorded again.
@@ -284,10 +291,18 @@ class SelfSteps:
         self.filter.launch_begin()
         self.proximity.launch_kept(x, WAY, self.launch_list)
         self.launch_areas(x)
-        given = [self.pairs, self.begun, x, self.steps, self._per_frame, self.model.per_copy]
-        self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [self._notes])
+        if self._per_frame > 1:
+            self._ends.zero_()
+            self.model.launch(gap_notes.find_frames, self.model.copies, [self.steps, self._per_frame], [self._ends])
+            wp.capture_if(self._ends, self._launch_notes, x=x)
+        else:
+            self._launch_notes(x)
         if self.friction is not None:
             self.friction.launch_begin(self.pairs, self.begun, x)
+
+    def _launch_notes(self, x):
+        given = [self.pairs, self.begun, x, self.steps, self._per_frame, self.model.per_copy]
+        self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [self._notes])
 
     def launch_begin_at_start(self, x, longest):
         """Lists all pairs near x (N,) where a run starts, and makes room for them; ``longest`` [m] is the longest edge."""
@@ -316,9 +331,10 @@ class SelfSteps:
         self.pairs.number.zero_()
         given = [self.pairs, self._areas, self.begun_at, self.declared.stiffness]
         self._launch(self_pairs.set_areas, count, given, [self.begun])
-        self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
-        self._launch(self_pairs.fill_corners, count, [], [self.pairs])
-        self._launch(self_pairs.sort_corners, self.model.count, [], [self.pairs])
+        if self._corners:
+            self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
+            self._launch(self_pairs.fill_corners, count, [], [self.pairs])
+            self._launch(self_pairs.sort_corners, self.model.count, [], [self.pairs])
 
     def launch_sides(self, x, copies=None):
         """Fixes the side of each listed pair, and its gap: in ``copies`` at x, in the others where they were fixed before."""

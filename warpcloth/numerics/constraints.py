@@ -117,6 +117,7 @@ class Constraints:
         ]
         sizes = [elements.per_copy for elements in model.terms]
         if pairs is not None:
+            pairs.list_corners()
             self.parts.append(PairRows(model, pairs, curved))
             if pairs.friction is not None:
                 self.parts.append(FrictionRows(model, pairs.friction))

@@ -125,6 +125,7 @@ class JacobiSweep(_Sweep):
         self.launch_start, self.launch, self.parts = sweeps.launch_start, sweeps.launch, sweeps.parts
         if pairs is not None:
             self._elements, self.pairs, self._adds = sweeps, pairs, multipliers
+            pairs.list_corners()
             pairs.forces.sweeps(in_turn=False)
             self.launch_start, self.launch, self.parts = self._launch_start, self._launch, self._parts
 
