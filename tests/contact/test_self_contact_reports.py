@@ -14,7 +14,7 @@ from support.usd_validation import validate
 from warpcloth.cli import main
 from warpcloth.contact import proximity
 from warpcloth.core.status import Result
-from warpcloth.run.history import PAIRS
+from warpcloth.run.history import PAIRS, History
 from warpcloth.usd import write_scene
 from warpcloth.usd.stage import find_prim
 
@@ -215,3 +215,26 @@ def test_bits_repeat(solver, device):
         x, v = (array.numpy().reshape(copies, -1, 3) for array in stepper.state)
         ends += [x[copy].tobytes() + v[copy].tobytes() for copy in range(copies)]
     assert len(ends) == 5 and len(set(ends)) == 1
+
+
+def test_work_of_pins_where_a_step_makes_room(device):
+    """Recorded launches are recorded again if a step itself makes room for pairs."""
+    grid = wc.Mesh.grid(10, 10)
+    falling = sheets(n=10, gap=0.05, velocity=(0.0, -3.0, 0.0))
+    way = np.linspace(0.0, 0.05, 7)[:, None, None] * [0.0, 1.0, 0.0]
+    pins = wc.Pins(np.arange(len(grid.points)), falling.mesh.points[: len(grid.points)] + way)
+    works = []
+    for room in (None, 10_000):
+        model = replace(falling, pins=pins).build(device=device)
+        stepper = SOLVER.bind(model)
+        if room:
+            stepper.pairs.grow_to(room)
+            stepper.record_again()
+        history = History(stepper, model, ("energies",))
+        before = len(stepper.pairs.pairs.stencils)
+        for _ in range(3):
+            history.frame()
+            history.keep(np.ones(1, dtype=bool))
+        assert (len(stepper.pairs.pairs.stencils) > before) == (room is None)
+        works.append(history.energies)
+    assert (works[0] == works[1]).all() and works[0][-1, 0, history.names.index("work of pins")] != 0.0

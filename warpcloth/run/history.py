@@ -288,6 +288,7 @@ class History:
         if self._moving or self._driven or self._filtered or self._pulls_itself:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
+            self._room = None if stepper.pairs is None else stepper.pairs.proximity.capacity
         self._note()
 
     def _recorded_step(self, x, v):
@@ -375,9 +376,9 @@ class History:
         while pairs.overflowed:
             pairs.grow()
             self._stepper.record_again()
-            if self._each_step is not None:
-                self._each_step = Segment(self.model.device, self._each_step.record)
             pairs.launch_begin(self._stepper.state.x)
+        if self._each_step is not None and self._room != pairs.proximity.capacity:  # which steps enlarge too
+            self._each_step, self._room = Segment(self.model.device, self._each_step.record), pairs.proximity.capacity
 
     def _note(self):
         """Evaluates the present state."""
