@@ -304,6 +304,43 @@ def limit_direction(dtype):
     return limit_each_direction
 
 
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def find_blocked(
+    # state in
+    share: wp.array(dtype=wp.float64),
+    # parameters
+    per_copy: int,
+    # out
+    blocked: wp.array(dtype=wp.int32),
+):
+    """Kernel over vertices: blocked = 1 in copies of which planes leave a vertex less than half of its move."""
+    i = wp.tid()
+    if share[i] < wp.float64(0.5):
+        blocked[i // per_copy] = 1
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def take_blocked(
+    # parameters
+    active: wp.array(dtype=wp.int32),
+    most: int,
+    # in and out
+    blocked: wp.array(dtype=wp.int32),
+    turns: wp.array(dtype=wp.int32),
+    # out
+    taken: wp.array(dtype=wp.int32),
+    some: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies: taken = 1 in active copies that are blocked, in up to ``most`` turns, else 0; some = 1 if any is."""
+    c = wp.tid()
+    taken[c] = 0
+    if active[c] != 0 and blocked[c] != 0 and turns[c] < most:
+        turns[c] = turns[c] + 1
+        taken[c] = 1
+        some[0] = 1
+    blocked[c] = 0
+
+
 @cache
 def precondition(dtype):
     """Kernel over vertices: p = P r."""

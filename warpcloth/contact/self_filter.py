@@ -12,6 +12,9 @@ SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
 # The longest way of a vertex in a round, relative to the common motion, over the skin. It may have gone as far since the list
 # was made, and so may the other vertex: both together come nearer by at most the skin.
 WAY = 0.25
+# An iterate finds the areas of contact anew where planes left less than half of a move on the way to it, at most RENEWALS times
+# in a step. Then its energy stays as it is.
+RENEWALS = 32
 # Vertices that cloth holds back in a collider are let out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
 # keeps a gap to other cloth of LEFT times the contact distance, or that of before if it was less.
 OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
@@ -179,6 +182,8 @@ class SelfFilter:
 
     def launch_first(self, base, d):
         """d such that base + d is as far on the way from where the step began to base as pairs stay apart."""
+        self._blocked.zero_()
+        self._renewed.zero_()
         wp.copy(self._target, base)
         self._walk(self._contact.x_before)
         self._add(self._contact.x_before, base, -1.0, d)
@@ -188,21 +193,37 @@ class SelfFilter:
         self._iterates, model = True, self.model
         self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)
         self._longest, self._ones = model.scalars(), wp.ones(model.count, dtype=model.dtype, device=model.device)
+        self._blocked, self._renewed = (model.scalars(wp.int32) for _ in range(2))
+        self._renewing, self._renew = model.scalars(wp.int32), wp.zeros(1, dtype=wp.int32, device=model.device)
         if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 
     def launch_relist(self, base, d, active, launch):
         """Lists the pairs at base + d of copies that are ``active`` (B,), and launches ``launch``, if vertices have moved far
-        since the last list."""
-        self._add(base, d, 1.0, self._contact.x_before, active)
+        since the last list.
+
+        Areas alone are found anew if planes have cut many moves of the last direction. Layers that a step presses flat leave
+        pairs of crossing edges hardly an area, and so nothing but planes between them where they bend.
+        """
+        model, x = self.model, self._contact.x_before
+        self._add(base, d, 1.0, x, active)
 
         def relist(x):
             self._contact.launch_list(x)
             self._launch_areas_again(x, self._contact.proximity.copies)
             launch()
 
-        self.launch_fresh(self._contact.x_before, relist, active)
+        self.launch_fresh(x, relist, active)
+
+        def renew(x):
+            self._launch_areas_again(x, self._renewing)
+            launch()
+
+        self._renew.zero_()
+        noted = [self._blocked, self._renewed, self._renewing, self._renew]
+        model.launch(self_filter.take_blocked, model.copies, [active, RENEWALS], noted)
+        wp.capture_if(self._renew, renew, x=x)
 
     def launch_limit(self, sums, gradient, preconditioner, right, direction):
         """Cuts the direction from the positions of :meth:`launch_relist` short, so that pairs stay apart along all of it.
@@ -216,6 +237,8 @@ class SelfFilter:
             sums.largest(self._ones, each, self._longest)
             self._launch(self_filter.shorten, N, [self._longest, model.per_copy, WAY * self._contact.skin], [each])
             self._launch_planes(self._contact.x_before, None, each)
+            if each is direction:
+                model.launch(self_filter.find_blocked, N, [self._share, model.per_copy], [self._blocked])
             given = [self._share, self._common, model.per_copy, WAY * self._contact.skin]
             self._launch(self_filter.limit_direction, N, given, [each])
         sums.dot(gradient, direction, self._slope)
