@@ -58,7 +58,8 @@ def check_reset(contact, mask, x):
 def _refuse_pairs(model, near, split, gap, through, least, rule):
     for stencil in near[:1]:
         parts = (stencil[:1], stencil[1:]) if split else (stencil[:2], stencil[2:])
-        _refuse_pair(model, parts, f"start {gap:.3g} m apart; self_contact needs more than {least:.3g} m{rule}")
+        wanted = f"more than {least:.3g} m, a thousandth of its distance and rounding"
+        _refuse_pair(model, parts, f"start {gap:.3g} m apart; self_contact needs {wanted}{rule}")
     _refuse_pair(model, through[0], f"cross at the start; self_contact needs a start without crossings{rule}")
 
 
