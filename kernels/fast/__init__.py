@@ -1,1 +1,1 @@
-"""Kernels that exist for speed alone; the others compute the same."""
+"""Faster kernels, which compute the same as the others."""

@@ -1,8 +1,8 @@
-"""Factories of functions that add the forces of a block of elements in stages, loops that the compiler can vectorise.
+"""Factories of functions that add the forces of a block of elements in stages, as loops that the compiler can vectorise.
 
-Local coordinates are gathered into scratch, forces computed there, and scattered. The elements of a block come in pieces: runs,
-where each element has all vertices one higher than the last, so that memory is read and written in order, and others, whose
-stencils are looked up.
+Local coordinates are gathered into scratch, forces are computed there, then scattered. A block has two kinds of pieces. In a
+run, the vertices of each element are one higher than those of the last, so memory is accessed in order. For others, stencils
+are read.
 """
 
 from functools import cache
@@ -18,11 +18,10 @@ from .term_facts import TermFacts, chain_of, elements_struct, local_gradient
 
 @cache
 def gather_piece(part: TermFacts, dtype, corrected: bool = False):
-    """The device function (elements, first, count, base, x, v, h, y, dy): y of a piece; dy = h Σ wᵢ ⊗ vᵢ too
-    if it is damped or ``corrected``.
+    """Device function (elements, first, count, base, x, v, h, y, dy) that sets y of a piece.
 
-    The piece is a run from element ``first`` on if its ``count`` is positive, and of -count elements if not; ``base`` is the
-    element that the scratch begins with.
+    If the term is damped, or ``corrected``, it also sets dy = h Σ wᵢ ⊗ vᵢ. The piece is a run of ``count`` elements from
+    ``first`` on if ``count`` is positive, else −count other elements. The scratch begins with the element ``base``.
     """
     vec3, _ = types(dtype)
     term = part.term
@@ -79,9 +78,9 @@ def gather_piece(part: TermFacts, dtype, corrected: bool = False):
 
 @cache
 def compute_forces(part: TermFacts, dtype, corrected: bool = False):
-    """The device function (elements, first, last, h, y, dy): kA ∂u/∂y and the force of damping, in place of y.
+    """Device function (elements, first, last, h, y, dy) that replaces y by kA ∂u/∂y plus the force of damping.
 
-    Of the elements of a block, from ``first`` up to ``last``; with ``corrected`` at y + dy.
+    It takes the elements from ``first`` to ``last`` − 1 of a block. With ``corrected``, forces are those at y + dy.
     """
     term = part.term
     damped, shared = part.damped, part.shared
@@ -119,7 +118,7 @@ def compute_forces(part: TermFacts, dtype, corrected: bool = False):
 
 @cache
 def scatter_piece(part: TermFacts, dtype):
-    """The device function (elements, first, count, base, forces, out): out += wᵢ·force, of a piece of such."""
+    """Device function (elements, first, count, base, forces, out): out += wᵢ·force for a piece, see :func:`gather_piece`."""
     vec3, _ = types(dtype)
     term = part.term
     K = wp.constant(term.vertices)
@@ -159,9 +158,9 @@ def scatter_piece(part: TermFacts, dtype):
 
 @cache
 def add_block(part: TermFacts, dtype, corrected: bool = False):
-    """The device function (elements, block, x, v, h, y, dy, out): out += ∂U/∂x + ∂D/∂x [N] of the elements of a block.
+    """Device function (elements, block, x, v, h, y, dy, out): out += ∂U/∂x + ∂D/∂x [N] of the elements of a block.
 
-    With ``corrected`` the first at x + h v.
+    With ``corrected``, ∂U/∂x is that at x + h v.
     """
     vec3, _ = types(dtype)
     gather, compute = gather_piece(part, dtype, corrected), compute_forces(part, dtype, corrected)
@@ -202,7 +201,7 @@ def add_block(part: TermFacts, dtype, corrected: bool = False):
 
 @cache
 def add_block_forces(parts: tuple[TermFacts, ...], dtype, corrected: bool = False):
-    """As :func:`add_block`, of all terms."""
+    """As :func:`add_block`, for all terms."""
     vec3, _ = types(dtype)
     chain_type = chain_of(parts, dtype)
     key = dtype, corrected

@@ -1,7 +1,7 @@
-"""Factories of the explicit step by blocks: one thread a copy takes the forces of all terms and the update in one pass.
+"""Factories of the explicit step by blocks: one thread per copy computes the forces of all terms and the update in one pass.
 
-It handles each element in the block of its lowest vertex. When a block is done no later element adds to the forces on its
-vertices or reads their positions, so that x, v move on in place.
+Each element is in the block of its lowest vertex. After a block, no element adds to the forces on its vertices or reads their
+positions, so x and v are updated in place.
 """
 
 from functools import cache
@@ -26,11 +26,11 @@ def block_step(
     guarded: bool = False,
     moving: bool = False,
 ):
-    """Kernel over copies, each block by block: v, x after a step, a = g − ∇U/m.
+    """Kernel over copies, block by block: v, x after a step with a = g − ∇U/m.
 
-    ``gradient`` is that of other terms, and 0 afterwards. ``flags`` are those of the compiler, on the CPU. ``compensated`` is
-    as in :func:`.explicit_step.kick_and_drift`, for terms without damping, and takes forces at x + residual. ``guarded`` is for
-    contact with colliders, see :mod:`.contact_guard`, and ``moving`` if some move.
+    ``gradient`` is that of the other terms, and is reset to 0. ``flags`` are compiler flags for the CPU. ``compensated`` is as
+    in :func:`..explicit_step.kick_and_drift`, for terms without damping, and evaluates forces at x + residual. ``guarded``
+    includes contact with colliders, see :mod:`.contact_guard`; ``moving``: some colliders move.
     """
     vec3, _ = types(dtype)
     add, step = add_block_forces(parts, dtype, compensated), kick_and_drift(dtype, symplectic, compensated)

@@ -1,7 +1,7 @@
-"""Factories of contact with colliders inside an explicit step, behind a clearance: a ball about each vertex without colliders.
+"""Factories of contact with colliders inside an explicit step, with a ball around each vertex that contains no collider.
 
-A step that begins and ends in the ball of a vertex feels no collider. Another takes contact, friction and the filter as the
-core does, and finds the ball anew. Balls need no state: wherever a vertex is set to, it is in its ball or not.
+If a step of a vertex begins and ends in its ball, there is no contact. Else contact, friction and the filter are computed as in
+the core, and the ball anew. Balls are not part of the state: they remain valid when vertices are set.
 """
 
 from functools import cache
@@ -17,10 +17,10 @@ from ..vectors import types
 
 @cache
 def guard_struct(dtype):
-    """The struct of contact of vertices with C colliders.
+    """Struct of contact of vertices with C colliders.
 
-    ``stiffness`` is kA (C, N) [N/m]. ``balls`` have a center and a radius, infinite for pins, of the colliders before step
-    ``found`` (N,), from which the surface of none moves on by more than ``drift`` a step [m].
+    ``stiffness`` is kA (C, N) [N/m]. ``balls`` are the center and the radius [m] at the start of step ``found`` (N,); the
+    radius is infinite for pins. Surfaces of colliders move by at most ``drift`` per step [m].
     """
     _pose, anchor_type = pose_types(dtype)
 
@@ -45,19 +45,19 @@ def guard_struct(dtype):
 
 @wp.struct
 class NoGuard:
-    """The struct of steps without colliders, which have fewer parameters to pass."""
+    """Struct of steps without colliders, which has fewer parameters."""
 
     per_copy: int
 
 
 def guard_type(dtype, guarded: bool):
-    """:func:`guard_struct` of steps that are ``guarded``, :class:`NoGuard` of others."""
+    """:func:`guard_struct` if ``guarded``, else :class:`NoGuard`."""
     return guard_struct(dtype) if guarded else NoGuard
 
 
 @cache
 def in_ball(dtype, moving: bool):
-    """The device function (guard, i, step, before, after) → 1 if a step begins and ends in the ball of vertex i, else 0."""
+    """Device function (guard, i, step, before, after) → 1 if a step begins and ends in the ball of vertex i, else 0."""
     vec3, _ = types(dtype)
     ball_of, step_of = load(wp.types.vector(4, dtype)), load(wp.int32)
 
@@ -78,9 +78,9 @@ def in_ball(dtype, moving: bool):
 
 @cache
 def touching_step(dtype, symplectic: bool):
-    """The device function (guard, i, w, x, v, a, h) → x, v of vertex i after a step, a = g − ∇U/m of all but contact.
+    """Device function (guard, i, w, x, v, a, h) → x, v of vertex i after a step, with a = g − ∇U/m without contact.
 
-    As the core has it: see :func:`..colliders.anchor_vertices`, ``bounded``, and :func:`..colliders.outside`.
+    It computes the same as :func:`..colliders.anchor_vertices` (``bounded``) and :func:`..colliders.outside`.
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
@@ -124,7 +124,7 @@ def touching_step(dtype, symplectic: bool):
         end, velocity, _short = end_outside(
             x, after, velocity, h, i, now, guard.shape, guard.poses, guard.per_copy, guard.least, guard.landing, guard.notes
         )
-        radius = dtype(-1.0)  # the anchor of what is held is let go in a step of its own
+        radius = dtype(-1.0)  # no ball while there is an anchor: a later step must release it
         if held == 0:
             radius = dtype(wp.inf)
             for c in range(guard.shape.radius.shape[0]):

@@ -1,4 +1,4 @@
-"""Factories of the tests of a step without self-contact: whether it could need any, and whether it could have needed any."""
+"""Factories of the tests whether a step without self-contact may need it: before the step, and after it."""
 
 from functools import cache
 
@@ -10,7 +10,7 @@ from ..vectors import types
 
 @cache
 def far_limits(dtype):
-    """The struct of what a step without contact may do, see :func:`find_near`, with the vertices of a copy and of a range."""
+    """Struct of the limits of a step without contact, see :func:`find_near`, with the vertices per copy and per range."""
 
     @wp.struct
     class FarLimits:
@@ -26,11 +26,11 @@ def far_limits(dtype):
 
 @cache
 def find_near(dtype):
-    """Kernel over copies and ranges of ``size`` vertices, where a step begins: near = 1 if it may need contact; keeps x and v.
+    """Kernel over copies and ranges of ``size`` vertices at the start of a step: near = 1 if contact is possible; stores x, v.
 
-    That is, if the list is not that of ``found``, if a vertex has moved by more than ``way`` since, relative to that in the
-    ``centre`` of its copy, or if h v is longer than ``most``, relative to the first of its copy if all move ``together``. A
-    range is a loop without branches, for the CPU.
+    That is the case if the list is not that of ``found``; if a vertex has moved by more than ``way`` since then, relative to
+    the ``centre`` vertex of its copy; or if h v is longer than ``most``, relative to the first vertex of the copy if all move
+    ``together``. A range is a loop without branches, for the CPU.
     """
     vec3, _ = types(dtype)
     vector = load(vec3)
@@ -83,8 +83,10 @@ def find_near(dtype):
 
 @cache
 def find_far(dtype):
-    """Kernel over copies and ranges of ``size`` vertices, where a step ends: near = 1 if the move from ``x_before`` to x of one
-    is longer than ``most``, relative to the first of its copy if all move ``together``."""
+    """Kernel over copies and ranges of ``size`` vertices at the end of a step: near = 1 if a move is longer than ``most``.
+
+    Moves are x − ``x_before``, relative to that of the first vertex of the copy if all move ``together``.
+    """
     vec3, _ = types(dtype)
     vector = load(vec3)
 

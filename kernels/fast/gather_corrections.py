@@ -1,7 +1,7 @@
 """Factories of a Jacobi sweep in one launch: each vertex gathers the corrections of its elements, and moves by their sum.
 
-x̃ and the inverse mass of a vertex are one row of four numbers, which a thread reads at once. d is read from one array and
-written to another, for neighbours still read it; so is λ, which the thread of an element's first corner moves on.
+x̃ and the inverse mass of a vertex are a row of four numbers, which a thread reads at once. d and λ are read from one array and
+written to another, for neighbours still read them. The thread of the first corner of an element updates its λ.
 """
 
 from functools import cache
@@ -18,10 +18,10 @@ from .term_facts import TermFacts, chain_of, elements_struct
 
 
 def slot_rows(slots):
-    """How many rows of how many slots a vertex has of pairs: 2 or 4 that a thread reads at once, some of them empty.
+    """The number of rows of pairs of a vertex, and of slots per row: 2 or 4, which a thread reads at once; some are empty.
 
-    Numbers are stored row by row, of a row vertex by vertex, of a vertex slot by slot. A sweep over springs takes 0.8 of the
-    time that it does slot by slot (H200, 1024² vertices).
+    Numbers are ordered by row, then vertex, then slot. A sweep over springs takes 0.8 of the time that it takes with the order
+    by slot (H200, 1024² vertices).
     """
     slots += slots % 2
     width = 2 if slots % 4 else 4
@@ -30,9 +30,9 @@ def slot_rows(slots):
 
 @cache
 def load_row(dtype, scalar, width):
-    """The device function (a, i) → the i-th ``width`` scalars of contiguous memory, of whatever type; on CUDA 16 bytes at once.
+    """Device function (a, i) → the i-th ``width`` scalars of contiguous memory of any type; on CUDA 16 bytes at once.
 
-    The compiler does not put loads together by itself where it is short of registers.
+    The compiler does not combine loads if it is short of registers.
     """
     row, number = f"wp::vec_t<{width}, wp::{scalar.__name__}>", {wp.float64: "double", wp.float32: "float"}.get(scalar, "int")
     each = min(width, 16 // wp.types.type_size_in_bytes(scalar))
@@ -50,8 +50,8 @@ def load_row(dtype, scalar, width):
 
 @cache
 def row_functions(part: TermFacts, dtype):
-    """The device functions of pairs: (codes, q) → codes of row q; (a, q) → numbers of row q; (rest, row, i, N) → rest states
-    (P, width) of a row of vertex i; (those, k) → that of the k-th slot."""
+    """Device functions for pairs: (codes, q) → codes of row q; (a, q) → numbers of row q; (rest, row, i, N) → rest states
+    (P, width) of a row of vertex i; (rest states, k) → that of slot k."""
     P, (_rows, width) = wp.constant(part.term.parameters), slot_rows(sum(part.pairs))
     rest_type = wp.types.vector(part.term.parameters, dtype)
     rests_type = wp.types.matrix((part.term.parameters, width), dtype)
@@ -75,11 +75,11 @@ def row_functions(part: TermFacts, dtype):
 
 
 class Projected(NamedTuple):
-    """Facts about the elements of one term by which the kernel of a sweep is compiled.
+    """Facts about the elements of one term, for which the kernel of a sweep is compiled.
 
     Attributes:
-        part: Their :class:`.term_facts.TermFacts`; all that is not shared is in rows of :func:`slot_rows` for pairs.
-        scalar, multipliers, per_step: As in :mod:`.project`.
+        part: Their :class:`.term_facts.TermFacts`. For pairs, everything that is not shared is in rows, see :func:`slot_rows`.
+        scalar, multipliers, per_step: As in :mod:`..project`.
         even: Whether all elements share one factor.
     """
 
@@ -96,7 +96,7 @@ class Projected(NamedTuple):
 
 @cache
 def constraints_of(of: Projected, dtype):
-    """The struct of one term for a sweep: elements, the factors of their Δλ, and λ before and after."""
+    """Struct of one term for a sweep: elements, the factors of their Δλ, and λ before and after."""
     lambda_type = multiplier_type(of.term, dtype, of.scalar)
 
     @wp.struct
@@ -134,7 +134,7 @@ def set_vertex_rows(dtype):
 
 @cache
 def correct_elements(of: Projected, dtype):
-    """The device function (constraints, i, N, rows, d, h, sweeps) → m Δx of vertex i, the sum over its elements; λ moves on."""
+    """Device function (constraints, i, N, rows, d, h, sweeps) → m Δx of vertex i, summed over its elements; updates λ."""
     if of.part.pairs:
         return correct_pairs(of, dtype)
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
@@ -202,7 +202,7 @@ def correct_elements(of: Projected, dtype):
 
 @cache
 def correct_pairs(of: Projected, dtype):
-    """As :func:`correct_elements`, of pairs as in :func:`.gather_forces.gather_pairs`; without λ, which no incidence has."""
+    """As :func:`correct_elements`, for pairs as in :func:`.gather_forces.gather_pairs`, without λ."""
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     term, (firsts, seconds) = of.term, of.part.pairs
     (rows_each, width), firsts = map(wp.constant, slot_rows(firsts + seconds)), wp.constant(firsts)
@@ -241,7 +241,7 @@ def correct_pairs(of: Projected, dtype):
             if wp.static(not even):
                 factor = numbers_of(constraints.factor, q)
             for n in range(width):
-                corner = wp.where(row * width + n < firsts, 0, 1)  # known to the compiler, and so are the weights
+                corner = wp.where(row * width + n < firsts, 0, 1)  # constant for the compiler, and so are the weights
                 j = wp.max(codes[n], 0)
                 r = rest_of(rests, n)
                 there = quad(rows, j)
@@ -262,7 +262,7 @@ def correct_pairs(of: Projected, dtype):
 
 @cache
 def correct_terms(parts: tuple[Projected, ...], dtype):
-    """As :func:`correct_elements`, of all terms."""
+    """As :func:`correct_elements`, for all terms."""
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     chain_type = chain_of(parts, dtype, constraints_of)
     first, others = (correct_elements(parts[0], dtype), correct_terms(parts[1:], dtype)) if parts else (None, None)

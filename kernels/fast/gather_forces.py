@@ -1,4 +1,4 @@
-"""Factories of sums over the elements of a vertex, of all terms in one launch, in a fixed order: deterministic on a GPU."""
+"""Factories of sums over the elements of a vertex for all terms in one launch, in a fixed order, so deterministic on a GPU."""
 
 from functools import cache
 
@@ -14,7 +14,7 @@ from .term_facts import TermFacts, chain_of, elements_struct, local_gradient
 
 @cache
 def sum_of_lanes(dtype, lanes: int):
-    """The device function (value) → its sum over the ``lanes`` threads, neighbours in a warp, that take one vertex."""
+    """Device function (value) → sum over the ``lanes`` neighbouring threads of a warp that take one vertex."""
     vec3, _ = types(dtype)
     shuffle = "value.c[{0}] += __shfl_xor_sync(mask, value.c[{0}], n);"
 
@@ -29,7 +29,7 @@ def sum_of_lanes(dtype, lanes: int):
 
 @cache
 def move_of(dtype, ahead):
-    """The device function (v, i, h) → the move of xᵢ: h vᵢ, or of int32 the residual packed in vᵢ in units of h."""
+    """Device function (v, i, h) → displacement of xᵢ: h vᵢ, or if v is int32, the residual packed in vᵢ in units of h."""
     vec3, _ = types(dtype)
     if ahead is wp.int32:
         whole = load(wp.int32)
@@ -50,10 +50,10 @@ def move_of(dtype, ahead):
 
 @cache
 def gather_term(part: TermFacts, dtype, ahead=None, lanes: int = 1):
-    """The device function (elements, i, lane, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term.
+    """Device function (elements, i, lane, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term.
 
-    The first is taken at x, or where :func:`move_of` has moved it if the type of v is given as ``ahead``. Of ``lanes`` threads
-    for a vertex each takes every so manieth element.
+    ∂U/∂x is that at x, or, if ``ahead`` is the type of v, at x moved by :func:`move_of`. Each of the ``lanes`` threads of a
+    vertex takes every ``lanes``-th element.
     """
     if part.rows:
         return gather_matrix_rows(part, dtype, ahead, lanes)
@@ -119,9 +119,9 @@ def gather_term(part: TermFacts, dtype, ahead=None, lanes: int = 1):
 
 @cache
 def gather_pairs(part: TermFacts, dtype, ahead, lanes: int):
-    """As :func:`gather_term`, of pairs, without a branch: an empty slot pairs the vertex with itself, where forces are 0.
+    """As :func:`gather_term`, for pairs, without branches: an empty slot pairs the vertex with itself, so its force is 0.
 
-    So all slots are read at once; one after another they take 1.2 times as long (H200, 64² vertices).
+    All slots can then be read at once. One after another they take 1.2 times as long (H200, 64² vertices).
     """
     vec3, _ = types(dtype)
     v_type = ahead or vec3
@@ -157,7 +157,7 @@ def gather_pairs(part: TermFacts, dtype, ahead, lanes: int):
             s = n * lanes + lane
             if wp.static(ragged):
                 s = wp.min(s, slots - 1)
-            corner = wp.where(s < firsts, 0, 1)  # of one lane known to the compiler, and so are the weights
+            corner = wp.where(s < firsts, 0, 1)  # with one lane constant for the compiler, and so are the weights
             slot = s * count + i
             code = whole(elements.codes, slot)
             if wp.static(ragged):
@@ -181,7 +181,7 @@ def gather_pairs(part: TermFacts, dtype, ahead, lanes: int):
 
 @cache
 def gather_matrix_rows(part: TermFacts, dtype, ahead, lanes: int):
-    """As :func:`gather_term`, by the rows of the matrix Q of a quadratic energy, which add up to 0: Σⱼ Qᵢⱼ (xⱼ − xᵢ)."""
+    """As :func:`gather_term`, from the rows of the matrix Q of a quadratic energy, whose sums are 0: Σⱼ Qᵢⱼ (xⱼ − xᵢ)."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     vector, whole, number, moves = load(vec3), load(wp.int32), load(dtype), move_of(dtype, ahead)
@@ -233,7 +233,7 @@ def gather_matrix_rows(part: TermFacts, dtype, ahead, lanes: int):
 
 @cache
 def gather_terms(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1):
-    """As :func:`gather_term`, of all terms."""
+    """As :func:`gather_term`, for all terms."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     chain_type = chain_of(parts, dtype)
@@ -254,7 +254,7 @@ def gather_terms(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1
 
 @cache
 def sum_at_vertices(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1):
-    """The device function (thread, chain, N, x, v, h) → that sum of vertex ``thread // lanes``, in all its threads."""
+    """Device function (thread, chain, N, x, v, h) → the sum at vertex ``thread // lanes``, in all its threads."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     total_of = gather_terms(parts, dtype, ahead, lanes)
@@ -278,7 +278,7 @@ def sum_at_vertices(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int 
 
 @cache
 def gather_forces(parts: tuple[TermFacts, ...], dtype, corrected: bool = False, lanes: int = 1):
-    """Kernel over vertices, ``lanes`` threads each: adds ∂U/∂x [N] of all terms, at x or if ``corrected`` at x + d, to out."""
+    """Kernel over vertices, ``lanes`` threads each: out += ∂U/∂x [N] of all terms, at x, or if ``corrected`` at x + d."""
     vec3, _ = types(dtype)
     total_of = sum_at_vertices(parts, dtype, vec3 if corrected else None, lanes)
     vector, put = load(vec3), store(vec3)

@@ -1,4 +1,4 @@
-"""Factories of the explicit step by gathering: each vertex sums over its elements; x is written to another array than read."""
+"""Factories of the explicit step that gathers: each vertex sums over its elements; x is read and written in two arrays."""
 
 from functools import cache
 
@@ -17,9 +17,9 @@ from .term_facts import TermFacts, chain_of
 def gather_vertex(
     parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: int = 1, residual_type=None, guarded=False, moving=False
 ):
-    """The device function by which ``lanes`` threads set x, v of a vertex after a step, a = g − ∇U/m, in other arrays.
+    """Device function with which ``lanes`` threads set x, v of a vertex after a step, with a = g − ∇U/m, in other arrays.
 
-    ``residual_type``, ``guarded`` and ``moving`` are those of :func:`gather_step`.
+    ``residual_type``, ``guarded`` and ``moving`` are as in :func:`gather_step`.
     """
     vec3, _ = types(dtype)
     compensated, packed, stored = residual_type is not None, residual_type is wp.int32, residual_type or vec3
@@ -45,7 +45,7 @@ def gather_vertex(
         v_after: wp.array(dtype=vec3),
         residual_after: wp.array(dtype=stored),
     ):
-        # Of pins too, so that the sum need not wait for w.
+        # For pins too, so that the sum does not wait for w.
         total = vec3()
         if wp.static(compensated):
             total = total_of(thread, chain, inverse_mass.shape[0], x, residual, unit)
@@ -99,15 +99,17 @@ def gather_step(
 ):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
-    Where nothing is damped v may be ``v_after``. ``fast`` takes approximate quotients and roots, of the last bit or two; NaN
-    stays. ``alone`` is for one copy. ``residual_type`` is None, or for terms without damping, in float32, the type of the
-    residual of :func:`.explicit_step.kick_and_drift`: vectors, with a ``unit`` of 1, or int32 as :mod:`.packed_residual` packs
-    them in units of ``unit``. ``guarded`` is for contact with colliders, see :mod:`.contact_guard`, ``moving`` if some move.
+    Without damping v may be ``v_after``. ``fast`` allows errors of the last one or two bits in quotients and roots; NaN stays
+    NaN. ``alone`` is for one copy. ``residual_type`` is None, or, for terms without damping in float32, the type of the
+    residual of :func:`..explicit_step.kick_and_drift`: vectors, with a ``unit`` of 1, or int32, packed by
+    :mod:`.packed_residual` in units of ``unit``. ``guarded`` includes contact with colliders, see :mod:`.contact_guard`;
+    ``moving``: some colliders move.
     """
     vec3, _ = types(dtype)
     stored = residual_type or vec3
     gather_one = gather_vertex(parts, dtype, symplectic, lanes, residual_type, guarded, moving)
-    # Rows of bending one after another in a loop take 1.3 times as long with compensated positions, else as long (H200, 512²).
+    # A loop over the rows of bending that is not unrolled takes 1.3 times as long with compensation, else the same (H200,
+    # 512²).
     options = {"fast_math": fast, "max_unroll": 32 if residual_type else 16}
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=options)
@@ -132,7 +134,7 @@ def gather_step(
         thread = wp.tid()
         copy = 0
         if wp.static(not alone):
-            copy = thread // (lanes * guard.per_copy)  # a tenth of the instructions of a step of springs
+            copy = thread // (lanes * guard.per_copy)  # takes a tenth of the instructions of a step of springs
         gather_one(thread, chain, inverse_mass, gravity[copy], guard, h, unit, x, v, residual, x_after, v_after, residual_after)
 
     return step_vertices
@@ -150,9 +152,9 @@ def wait_for_block(): ...
 def gather_steps_of_copies(
     parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, threads: int, guarded: bool = False
 ):
-    """Kernel over (copies, threads): x, v after several steps. A copy is a block of ``threads``, which wait for one another.
+    """Kernel over (copies, threads): x, v after several steps. A block of ``threads``, which synchronise, takes a copy.
 
-    x_other and v_other are where every other step ends; where nothing is damped v may be v_other.
+    Every other step writes x_other and v_other. Without damping v may be v_other.
     """
     vec3, _ = types(dtype)
     gather_one = gather_vertex(parts, dtype, symplectic, guarded=guarded)
@@ -190,7 +192,7 @@ def gather_steps_of_copies(
             while i < end:
                 if left > 1:
                     gather_one(i, chain, inverse_mass, g, guard, h, h, x_other, v_other, x, x, v, x)
-                else:  # the last of an odd number
+                else:  # the last step of an odd number
                     put(x, i, vector(x_other, i))
                     put(v, i, vector(v_other, i))
                 i += threads

@@ -1,13 +1,13 @@
-"""Position residuals of compensated summation, packed: three numbers of 10 bits in an int32, from −512 to 511 units each.
+"""Packed position residuals of compensated summation: three 10-bit integers in an int32, from −512 to 511 units each.
 
-Beside x in float32 these take a third of the memory of a vector, of which large cloth on a GPU never has enough. A unit is a
-power of two [m]. Numbers are changed as the last bits of floats, of which the least is a unit: a GPU converts whole numbers
-four times as slowly as it adds.
+They take a third of the memory traffic of a vector, which limits large cloth on a GPU. A unit is a power of two [m]. Numbers
+are converted through the last bits of floats whose last bit is a unit, for a GPU converts integers four times as slowly as it
+adds.
 """
 
 import warp as wp
 
-FIRST = wp.constant(8388608.0)  # 2²³, from which on the least bit of a float32 is 1
+FIRST = wp.constant(8388608.0)  # 2²³, from which the last bit of a float32 is 1
 MIDDLE = wp.constant(512.0)
 
 
@@ -32,5 +32,5 @@ def pack_one(value: float, unit: float):
 
 @wp.func
 def pack_residual(value: wp.vec3, unit: float):
-    """The numbers nearest to value [m], at most 511 units; NaN becomes some number, and x is NaN then as well."""
+    """The integers nearest to value [m], at most 511 units; NaN becomes any number, since x is NaN too."""
     return pack_one(value[0], unit) | (pack_one(value[1], unit) << 10) | (pack_one(value[2], unit) << 20)

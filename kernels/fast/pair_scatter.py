@@ -1,7 +1,7 @@
-"""Sums over the pairs of self-contact that have a force, by one thread of the CPU, which adds to the vertices of each.
+"""Sums over the self-contact pairs with a force, by one thread of the CPU, which adds to the vertices of each pair.
 
-They are those of :mod:`warpcloth.kernels.self_contact` up to rounding. Of the pairs that have an area few have a force, and of
-a product of the Hessian each is taken once and not once for each of its vertices.
+They equal those of :mod:`warpcloth.kernels.self_contact` up to rounding. They are faster because few acting pairs have a force,
+and because products with the Hessian take each pair once, not once for each of its vertices.
 """
 
 from functools import cache
@@ -41,7 +41,7 @@ def scatter_forces(dtype):
 
 @cache
 def scatter_energies(dtype):
-    """Kernel of one thread: energies += those of the pairs, at the first vertex of each [J]."""
+    """Kernel of one thread: energies[first vertex] += the energy of each pair [J]."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def scatter_energies_of_pairs(
@@ -62,7 +62,7 @@ def scatter_energies(dtype):
 
 @cache
 def scatter_diagonal(dtype):
-    """Kernel of one thread: adds kAφ″ wᵢ²nnᵀ to the diagonal blocks of a Hessian; nothing to those of pins."""
+    """Kernel of one thread: adds kAφ″ wᵢ²nnᵀ to the diagonal blocks of a Hessian, except those of pins."""
     _, mat33 = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -90,7 +90,7 @@ def scatter_diagonal(dtype):
 
 @cache
 def scatter_products(dtype):
-    """Kernel of one thread: q += kAφ″ wᵢ n Σⱼ wⱼ nᵀpⱼ over the other corners j of pairs, of copies that are active."""
+    """Kernel of one thread: q += kAφ″ wᵢ n Σⱼ wⱼ nᵀpⱼ over the other vertices j of pairs, in active copies."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 

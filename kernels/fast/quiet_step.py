@@ -1,4 +1,4 @@
-"""Factory of the one test of an explicit step without contact: whether it could have needed any."""
+"""Factory of the test whether an explicit step without contact may have needed it."""
 
 from functools import cache
 
@@ -12,9 +12,9 @@ from ..vectors import types
 def find_unquiet(dtype):
     """Kernel over copies and ranges of ``size`` vertices: again = 1 if a step from ``x_before`` to x may have needed contact.
 
-    That is, if the list is not that of ``found``, if a vertex had moved by more than ``way`` since, relative to that in the
-    ``centre`` of its copy, or if one has moved by more than ``most``, relative to the first of its copy if all move
-    ``together``. A range is a loop without branches, for the CPU.
+    That is the case if the list is not that of ``found``; if a vertex had moved by more than ``way`` since then, relative to
+    the ``centre`` vertex of its copy; or if one moved by more than ``most``, relative to the first vertex of the copy if all
+    move ``together``. A range is a loop without branches, for the CPU.
     """
     vec3, _ = types(dtype)
     vector = load(vec3)

@@ -1,6 +1,6 @@
 """Functions of one element, and structs of the arrays of several terms, for kernels that take all terms in one pass.
 
-Such a kernel is made of one function and one struct of arrays a term, each with those of the terms after it inside.
+Such a kernel has one function and one struct of arrays per term, each of which contains those of the following terms.
 """
 
 from functools import cache
@@ -12,18 +12,18 @@ from ..term import Term
 
 
 class TermFacts(NamedTuple):
-    """Facts about the elements of one term by which a kernel is compiled.
+    """Facts about the elements of one term, for which a kernel is compiled.
 
     Attributes:
         term: The :class:`.term.Term`.
-        damped: Whether it has damping, taken at x + h v about the state x, see :class:`.term.Dissipation`.
+        damped: Whether it has damping, evaluated at x + h v relative to the state x, see :class:`..term.Dissipation`.
         shared: Whether all elements share one stiffness. For gathered pairs without damping, whether all pairs of a vertex do;
             ``stiffness`` then has one value per vertex.
-        pairs: Slots of a vertex, for gathering, as first and as second of a pair, where incidences name the other vertex and
-            have a rest state of their own, slot by slot; None where they name elements.
-        rows: Slots of a vertex, for gathering, where incidences name the other vertices of a row of the matrix of a quadratic
-            energy, slot by slot, and ``stiffness`` is its numbers; 0 where they do not.
-        padded: Whether incidences that name elements have as many slots for each vertex, slot by slot.
+        pairs: For gathered pairs, the numbers of slots of a vertex as first and as second of a pair. Incidences then store the
+            other vertex and a rest state, slot by slot. None if they store elements.
+        rows: For the rows of the matrix of a quadratic energy, the number of slots of a vertex. Incidences then store the other
+            vertices of the row, slot by slot, and ``stiffness`` its numbers. 0 otherwise.
+        padded: Whether incidences that store elements have the same number of slots for each vertex, slot by slot.
     """
 
     term: Term
@@ -36,9 +36,9 @@ class TermFacts(NamedTuple):
 
 @cache
 def local_gradient(part: TermFacts, dtype, corrected: bool = False):
-    """The device function (k, β, rest, y, dy, h) → kA ∂u/∂y (M, 3) and the force of damping at y + dy.
+    """Device function (k, β, rest, y, dy, h) → kA ∂u/∂y at y plus the force of damping at y + dy, (M, 3).
 
-    With ``corrected`` all of it is taken at y + dy.
+    Without damping, ``corrected`` evaluates the first at y + dy.
     """
     term = part.term
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -72,7 +72,7 @@ def local_gradient(part: TermFacts, dtype, corrected: bool = False):
 
 @cache
 def elements_struct(part: TermFacts, dtype):
-    """The struct of the arrays of one term.
+    """Struct of the arrays of one term.
 
     Swept: block b has the pieces offsets[b] to offsets[b+1]; ``codes`` are the first element and the count of each, see
     :mod:`.block_forces`. Gathered: ``codes`` are K·element + corner of the incidences of vertex i from offsets[i] on. They
@@ -93,18 +93,18 @@ def elements_struct(part: TermFacts, dtype):
 
 @wp.struct
 class Nothing:
-    """The end of a chain."""
+    """The end of a chain of structs."""
 
     unused: int
 
 
 def chain_of(parts: tuple[TermFacts, ...], dtype, struct_of=elements_struct):
-    """The struct of the arrays of all terms: that of the first, and the chain of the others.
+    """Struct of the arrays of all terms: that of the first, and the chain of the others.
 
     Args:
         parts: The facts of each term.
         dtype: A Warp scalar type.
-        struct_of: (part, dtype) → the struct of one.
+        struct_of: Function (part, dtype) → the struct of one term.
     """
     return _chain(tuple(struct_of(part, dtype) for part in parts))
 
