@@ -316,7 +316,7 @@ PLAIN = {
     ("name", "gravity", "friction", "mesh"),
     [
         *((name, *load) for name in EXACT for load in [(300.0, 0.0, False), (981.0, 0.3, False), (200.0, 0.3, True)]),
-        ("projective dynamics none", 981.0, 0.3, False),
+        pytest.param("projective dynamics none", 981.0, 0.3, False, marks=SLOW),
         *(pytest.param(name, 981.0, 30.0, False, marks=SLOW) for name in EXACT),
     ],
 )

@@ -689,6 +689,7 @@ def test_08_forces_have_noise(device):
 # Seconds of a fall, over 490 m. Factorised, which differs in its linear solves alone, a step takes five times as long.
 SECONDS = 10.0
 COSTLY = {"newton factorised": 1.0}
+ACCELERATED = tuple(f"projective dynamics {way}" for way in ("chebyshev", "l-bfgs", "matrix-free"))
 
 
 def strain_of_fall(name, seconds, device):
@@ -712,7 +713,9 @@ def strain_of_fall(name, seconds, device):
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("name", STEPPING)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in ACCELERATED else name for name in STEPPING]
+)
 def test_08_rounding_of_a_fall(name, device):
     """float32: what solves for x − x̃ and damps keeps strain at the rounding of a position, 1.3 ε|x|/edge = 1e-5.
 
