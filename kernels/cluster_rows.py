@@ -12,7 +12,7 @@ from functools import cache
 
 import warp as wp
 
-from .clusters import fit
+from .clusters import cluster_fit
 from .constraint_rows import ROUNDINGS, RowLayout, first_row, lowest_compliance, row_values
 from .rotation import epsilon
 from .term import Term
@@ -25,7 +25,7 @@ def linearise_clusters(dtype):
     """Kernel over clusters: as :func:`.constraint_rows.linearise`; also the rotation R, which is 0 without stiffness."""
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(4, dtype)
-    fit_cluster = fit(dtype, True)
+    fit_cluster = cluster_fit(dtype, True)
 
     @wp.kernel(module="unique", enable_backward=False)
     def linearise(

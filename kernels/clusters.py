@@ -14,7 +14,7 @@ from .vectors import types
 
 
 @cache
-def fit(dtype, corrected: bool):
+def cluster_fit(dtype, corrected: bool):
     """Device function that sets t = c + R q − (x + d) of the elements first to last − 1 and returns R.
 
     d counts only if ``corrected``. Positions are relative to the first vertex, so that no digits are lost far from the origin.
@@ -62,7 +62,7 @@ def fit_targets(dtype, corrected: bool):
     """Kernel over clusters: targets t of their elements at x, or at x + d if ``corrected``."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(4, dtype)
-    fit_cluster = fit(dtype, corrected)
+    fit_cluster = cluster_fit(dtype, corrected)
 
     @wp.kernel(module="unique", enable_backward=False)
     def fit_all(
@@ -91,7 +91,7 @@ def correct_clusters(dtype, multipliers: bool, per_step: bool, axes: bool = Fals
     """
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(4, dtype), wp.types.matrix((1, 3), dtype)
-    fit_cluster, spread = fit(dtype, True), spread_compliance(dtype)
+    fit_cluster, spread = cluster_fit(dtype, True), spread_compliance(dtype)
     mass_type = vec3 if axes else dtype
 
     @wp.func

@@ -35,6 +35,8 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .picture.render import render as render
     from .run.equilibrium import Equilibrium as Equilibrium
     from .run.equilibrium import equilibrium as equilibrium
+    from .run.fit import Fit as Fit
+    from .run.fit import fit as fit
     from .run.simulate import Animation as Animation
     from .run.simulate import simulate as simulate
     from .scene.air import Air as Air
@@ -78,6 +80,8 @@ _MODULES = {
     "render": "picture.render",
     "Equilibrium": "run.equilibrium",
     "equilibrium": "run.equilibrium",
+    "Fit": "run.fit",
+    "fit": "run.fit",
     "Animation": "run.simulate",
     "simulate": "run.simulate",
     "Air": "scene.air",
