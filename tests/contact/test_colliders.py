@@ -608,6 +608,7 @@ REFUSED = {
     ),
     "friction": (lambda: wc.Plane(friction=-0.1), "Plane.friction is -0.1; it must be a number of 0 or more"),
     "distance": (lambda: wc.Contact(distance=0.0), "contact.distance is 0.0"),
+    "elements": (lambda: wc.Contact(elements="edges"), "contact.elements is 'edges'"),
     "stiffness": (lambda: wc.Contact(stiffness=0.0), "contact.stiffness is 0.0; it must be a number above 0"),
     "stiffness as a text": (lambda: wc.Contact(stiffness="a"), "contact.stiffness is 'a'; it must be a number above 0"),
     "ragged": (lambda: wc.Plane(position=[[0, 0, 0], [1, 2]]), "Plane.position is [[0, 0, 0], [1, 2]], which is not numeric"),

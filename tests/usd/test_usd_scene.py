@@ -180,7 +180,7 @@ def colliders():
             wc.MeshCollider([cube.vertices + np.array([0, -9 - k / 3, 0]) for k in range(3)], cube.faces),
             wc.MeshCollider(np.float32(cube.vertices), cube.faces[1:], position=(9, 9, 9)),
         ],
-        contact=wc.Contact(distance=2e-3),
+        contact=wc.Contact(distance=2e-3, elements="triangles"),
         duration=4 / 60,
     )
 

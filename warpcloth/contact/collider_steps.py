@@ -14,6 +14,7 @@ from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..kernels.terms.friction import FRICTION
 from ..terms.refresh import STEP, Refresh
+from .mesh_faces import MeshFaces
 from .mesh_steps import MeshSteps
 
 # Where a vertex stops that would end in a collider, relative to the contact distance: where it comes to rest, a deep gap would
@@ -47,6 +48,7 @@ class ColliderSteps:
         shapes: A :func:`warpcloth.kernels.colliders.shapes`.
         anchors: Those of friction on each collider that has it, by its index; rows of ``anchor_rows`` (C, N).
         least: Distance below which no vertex ends a step [m].
+        faces: :class:`warpcloth.contact.mesh_faces.MeshFaces` that keeps triangles from crossing meshes, or None.
         steps_per_frame: As given.
         notes: :class:`warpcloth.kernels.colliders.FilterNotes`.
         steps: Steps that the colliders have made, (B,) int32.
@@ -81,11 +83,13 @@ class ColliderSteps:
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
         self.bounded = part == 0.0
         self._move, self._count = model.kernel(kernels.move_colliders, model.dtype), model.kernel(count_step)
-        self.meshes = None
+        self.meshes = self.faces = None
         if declared.meshes is not None:
             given = {"steps": self.steps, "per_frame": 2 * steps_per_frame, "ahead": self._given[-1], "h": h}
             given |= {"r": declared.distance, "least": self.least, "landing": LANDING * declared.distance}
             self.meshes = MeshSteps(model, self.poses, self.bounded, resting, **given)
+            if model.scene.contact.elements == "triangles" and not resting:
+                self.faces = MeshFaces(model, self.meshes, h)
         self._filter = model.kernel(kernels.filter_step if self.meshes is None else mesh_kernels.filter_meshes, model.dtype)
         if model.mobility is not None:
             self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(kernels.hold_locked, model.dtype)
@@ -202,6 +206,8 @@ class ColliderSteps:
         if model.mobility is not None:  # those who then end inside are noted like pins
             model.launch(self._hold, model.count, [model.mobility, *self._wanted], [x, v, move, self.notes])
             self._launch_filter(self._fixed, x, v, move, self.notes)
+        if self.faces is not None:
+            self.faces.launch_end(self.x_before, x, v, move, self.notes)
         if not self._again:
             self.launch_count()
 

@@ -177,6 +177,8 @@ class SelfFilter:
         given = [self._contact.pairs, gap, open, *wanted, self._common, self._ways]
         given += [model.per_copy, FLOOR * self._contact.declared.distance]
         self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
+        if target is not None and self._colliders is not None and self._colliders.faces is not None:
+            self._colliders.faces.launch_least(x, target, self._share)
 
     # Of methods whose iterates base + d stay apart too.
 
@@ -195,7 +197,8 @@ class SelfFilter:
         self._longest, self._ones = model.scalars(), wp.ones(model.count, dtype=model.dtype, device=model.device)
         self._blocked, self._renewed = (model.scalars(wp.int32) for _ in range(2))
         self._renewing, self._renew = model.scalars(wp.int32), wp.zeros(1, dtype=wp.int32, device=model.device)
-        if self._colliders is not None and not self._lets_out:
+        faces = self._colliders is not None and self._colliders.faces is not None
+        if self._colliders is not None and (not self._lets_out or (faces and not any(self.model.colliders.moves))):
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 

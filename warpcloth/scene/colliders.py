@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from ..base.checks import array, as_array, number, shown
+from ..base.checks import array, as_array, choice, number, shown
 from ..base.types import Converted, default
 
 # With the default stiffness, the weight of one layer compresses the contact distance by this fraction.
@@ -24,6 +25,8 @@ class Contact:
         distance: Contact distance r [m].
         stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default 10 w/r, where w is the weight of the
             cloth per area, so that one layer rests at a gap of 0.9 r.
+        elements: What the filter keeps from crossing meshes: ``"vertices"`` of the cloth, or also its ``"triangles"``, which
+            spikes and edges of a mesh can otherwise pierce between the vertices. No energy belongs to this.
 
     Raises:
         ValueError: If a value is not allowed.
@@ -31,8 +34,10 @@ class Contact:
 
     distance: float = 1e-3
     stiffness: float | None = None
+    elements: Literal["vertices", "triangles"] = "vertices"
 
     def __post_init__(self) -> None:
+        choice("contact.elements", self.elements, ("vertices", "triangles"))
         number("contact.distance", self.distance, above=0.0)
         if self.stiffness is not None and (np.ndim(self.stiffness) or self.stiffness != np.inf):
             number("contact.stiffness", self.stiffness, above=0.0)

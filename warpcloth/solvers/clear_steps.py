@@ -13,6 +13,8 @@ from ..terms.refresh import STEP
 
 # Largest number of sweeps of a step that are captured one by one; more become a loop on the device.
 UNROLLED = 64
+# How far edges may be stretched, at most, where triangles far from the meshes among the colliders are told by their vertices.
+STRETCHED = 4.0
 
 
 class TwinSteps:
@@ -131,6 +133,10 @@ class ClearSteps(TwinSteps):
         clear.x, clear.v, clear.step = self._kept["x"], self._kept["v"], self._steps_kept
         self._bounds = shapes(model.dtype)()
         halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
+        if colliders.faces is not None:
+            # Points of a triangle are no farther from one of its vertices than its longest edge over √3.
+            reach = STRETCHED / np.sqrt(3.0) * float(model.scene.mesh.edge_lengths.max())
+            bounding = np.array(bounding) + [reach if collider.facets else 0.0 for collider in model.scene.colliders]
         self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
         self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy, stepper.h]]
         self._out = [clear, self.near]

@@ -86,6 +86,7 @@ ATTRIBUTES = (
     # Contact with colliders.
     Attribute("contact.distance", "warpcloth:contact:distance", "cloth", ("double",)),
     Attribute("contact.stiffness", "warpcloth:contact:stiffness", "cloth", ("double",)),
+    Attribute("contact.elements", "warpcloth:contact:elements", "cloth", ("token",)),
     # Self-contact.
     Attribute("self_contact.distance", "warpcloth:selfContact:distance", "cloth", ("double",)),
     Attribute("self_contact.stiffness", "warpcloth:selfContact:stiffness", "cloth", ("double",)),

@@ -1,0 +1,178 @@
+"""Meshes whose corners and edges lie between the vertices of the cloth: no triangle of the cloth crosses one, in any step."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpcloth as wc
+from warpcloth.core.status import Result
+from warpcloth.kernels.mesh_faces import between, meet
+from warpcloth.scene.colliders import turned
+
+FRAMES, N, SIZE = 8, 6, 0.5
+SLOW = pytest.mark.slow
+EDGE = SIZE / (N - 1)
+# A pyramid and a roof, both narrower than an edge of the cloth, below the middle of some triangles.
+CORNERS = np.array([[-1.0, -8.0, -1.0], [1.0, -8.0, -1.0], [1.0, -8.0, 1.0], [-1.0, -8.0, 1.0], [0.0, 0.0, 0.0]]) * 0.1 * EDGE
+SPIKE = CORNERS, [[1, 0, 4], [2, 1, 4], [3, 2, 4], [0, 3, 4], [0, 1, 2], [0, 2, 3]]
+ROOF = np.array([[-6.0, -8.0, -1.0], [6.0, -8.0, -1.0], [6.0, -8.0, 1.0], [-6.0, -8.0, 1.0], [-6.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
+KNIFE = ROOF * 0.1 * EDGE, [[1, 0, 5], [5, 0, 4], [3, 2, 4], [4, 2, 5], [2, 1, 5], [0, 3, 4], [0, 1, 2], [0, 2, 3]]
+HERE = np.array([0.27, 0.0, 0.23])
+t = np.linspace(0.0, 1.0, FRAMES + 1)
+UP = HERE + np.stack([0.05 * np.sin(5.0 * t), 0.3 * t - 0.1, 0.0 * t], axis=1)
+ROLL = np.stack([0.0 * t, 0.0 * t, np.sin(0.5 * t), np.cos(0.5 * t)], axis=1)
+TIP = np.stack([0.05 * np.sin(8.0 * t), 0.2 * t, 0.0 * t], axis=1)
+GROWN = CORNERS + np.eye(5)[4][:, None] * TIP[:, None]
+MESHES = {
+    "spike": wc.MeshCollider(*SPIKE, position=HERE),
+    "knife": wc.MeshCollider(*KNIFE, position=HERE, friction=0.3),
+    "open knife": wc.MeshCollider(KNIFE[0], KNIFE[1][:4], position=HERE),
+    "spike that rises": wc.MeshCollider(*SPIKE, position=UP, rotation=ROLL),
+    "spike that grows": wc.MeshCollider(GROWN, SPIKE[1], position=HERE - [0.0, 0.1, 0.0]),
+}
+
+
+SOLVERS = {
+    "explicit": wc.Explicit(substeps=40),
+    "newton": wc.Newton(substeps=1),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=1, iterations=30),
+    "xpbd": wc.XPBD(substeps=1, iterations=20),
+    "pbd": wc.PBD(substeps=1, iterations=20),
+    "hierarchical pbd": wc.HierarchicalPBD(substeps=1, iterations=20),
+    "admm": wc.ADMM(substeps=1, iterations=30),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=1, iterations=20),
+}
+
+
+def falling(mesh, speed, fps=24.0, height=0.02, **fields):
+    """A sheet that is stiff enough not to be torn to ten times its length where a point of it is stopped at 10 m/s."""
+    grid = wc.Mesh.grid(N, N, size=SIZE, pattern="alternating")
+    return wc.Scene(
+        grid,
+        density=0.15,
+        terms=[wc.Spring(pairs=("structural", "shear"), stiffness=300.0), wc.QuadraticBending(stiffness=1e-5)],
+        positions=grid.points + np.array([0.0, height, 0.0]),
+        velocities=np.tile([0.1 * speed, -speed, 0.0], (N * N, 1)),
+        colliders=[mesh],
+        contact=wc.Contact(distance=2e-3, stiffness=3e4, elements="triangles"),
+        fps=fps,
+        duration=FRAMES / fps,
+        **fields,
+    )
+
+
+def crossing(points, triangles, mesh):
+    """Pairs of a triangle of the cloth and one of the mesh that cross, by frames (F, n, 3), with exact predicates."""
+    frames = range(len(points))
+    poses, shapes = (each[np.minimum(frames, len(each) - 1)] for each in (mesh.poses, mesh.frames))
+    solid = np.stack([pose[:3] + turned(pose[3:], shape) for pose, shape in zip(poses, shapes, strict=True)])
+    both = np.concatenate([points, solid.astype(np.float32)], axis=1)
+    found = wc.intersections(both, np.concatenate([triangles, mesh.triangles + points.shape[1]])).pairs
+    return [int(((each < len(triangles)).sum(axis=1) == 1).sum()) for each in found]
+
+
+CASES = [
+    pytest.param(name, what, dtype, marks=[] if name == "newton" or (what, dtype) == ("spike", "float32") else SLOW)
+    for name in SOLVERS
+    for what in MESHES
+    for dtype in ("float32", "float64")[: 2 if what == "spike" else 1]
+    if not (MESHES[what].friction and name in ("pbd", "hierarchical pbd"))  # which refuse it
+]
+
+
+@pytest.mark.parametrize(("name", "what", "dtype"), CASES)
+def test_nothing_pierces_cloth(name, what, dtype):
+    """At 1 m/s in steps of 1/24 s, which are 0.04 m; without the filter of triangles a spike and a knife go through."""
+    solver, mesh = SOLVERS[name], MESHES[what]
+    scene = falling(mesh, 1.0)
+    animation = wc.simulate(scene, solver, dtype=dtype)
+    assert animation.status.result is not Result.DIVERGED
+    assert crossing(animation.points, scene.mesh.triangles, mesh) == [0] * (FRAMES + 1)
+    assert 0.0 < animation.cut < 1.0 and not animation.inside
+
+
+@pytest.mark.parametrize("speed", (10.0, 100.0))
+@pytest.mark.parametrize("what", ("spike", "knife"))
+def test_nothing_pierces_fast_cloth(what, speed):
+    scene = falling(MESHES[what], speed)
+    points = wc.simulate(scene, wc.Explicit(substeps=60)).points  # the spike tears the sheet to divergence at 100 m/s, later
+    assert len(points) > FRAMES // 2 and crossing(points, scene.mesh.triangles, MESHES[what]) == [0] * len(points)
+
+
+@SLOW
+def test_cloth_that_touches_itself_is_not_pierced():
+    scene = falling(MESHES["spike"], 1.0, self_contact=wc.SelfContact(distance=2e-3))
+    animation = wc.simulate(scene, wc.XPBD(substeps=1, iterations=30))
+    assert crossing(animation.points, scene.mesh.triangles, MESHES["spike"]) == [0] * (FRAMES + 1)
+
+
+def test_copies_are_independent():
+    """One of two copies is hit at once, so the rounds of its filter go on where the other has none; to the bit."""
+    scene, solver = falling(MESHES["spike"], 1.0), wc.XPBD(substeps=1, iterations=10)
+    both = np.stack([scene.positions, scene.positions + np.array([0.0, 0.05, 0.0])])
+    found = wc.simulate(scene, solver, copies=2, vary={"positions": both}).points
+    for copy in range(2):
+        alone = wc.simulate(scene, solver, copies=1, vary={"positions": both[copy : copy + 1]}).points
+        np.testing.assert_array_equal(found[:, copy], alone.reshape(found[:, copy].shape))
+
+
+def test_an_edge_mesh_is_not_cut():
+    """A chain across a knife, with the edge of this between two of its beads; the segments are tested as flat triangles."""
+    beads = np.stack([np.arange(-3.0, 4.0) * EDGE + 0.4 * EDGE, np.full(7, 0.02), np.zeros(7)], axis=1)
+    across = wc.MeshCollider(KNIFE[0][:, [2, 1, 0]] * np.array([1.0, 1.0, -1.0]), KNIFE[1])
+    chain = wc.Mesh(beads, edges=np.stack([np.arange(6), np.arange(1, 7)], axis=1))
+    terms, contact = [wc.Spring(stiffness=300.0)], wc.Contact(distance=2e-3, stiffness=3e4, elements="triangles")
+    scene = wc.Scene(chain, masses=np.full(7, 1e-3), terms=terms, colliders=[across], contact=contact, fps=24.0, duration=0.25)
+    points = wc.simulate(scene, wc.Newton(substeps=2)).points
+    flat = np.array([[i, i + 1, i + 1] for i in range(6)])
+    thick = np.concatenate([points, points + np.array([0.0, 1e-7, 0.0])], axis=1)  # as segments have no area
+    flat[:, 2] += 7
+    assert crossing(thick, flat, across) == [0] * len(points)
+
+
+@wp.kernel
+def search(
+    p: wp.array(dtype=wp.mat33d),
+    move: wp.array(dtype=wp.mat33d),
+    q: wp.array(dtype=wp.mat33d),
+    drift: wp.array(dtype=wp.mat33d),
+    least: wp.float64,
+    when: wp.array(dtype=wp.float64),
+    gap: wp.array(dtype=wp.float64),
+):
+    e = wp.tid()
+    found, _first, _n, _start = meet(p[e], move[e], q[e], drift[e], least)
+    when[e] = found
+    d, _along, apart = between(
+        p[e] + wp.min(found, wp.float64(1.0)) * move[e], q[e] + wp.min(found, wp.float64(1.0)) * drift[e]
+    )
+    gap[e] = wp.where(apart, d, -wp.float64(1.0))
+
+
+@SLOW
+def test_triangles_meet_when_they_come_near():
+    """Triangles that move past one another, against distances at 400 times: none is nearer than ``least`` before it meets.
+
+    Where they meet, their distance is ``least`` up to the step at which the search ends, 2 % of it.
+    """
+    random, count, least = np.random.default_rng(2), 400, 1e-3
+    p, q = (random.uniform(-1.0, 1.0, (count, 3, 3)) for _ in range(2))
+    p[..., 1] += 2.5
+    move, drift = (random.uniform(-0.4, 0.4, (count, 3, 3)) for _ in range(2))
+    move[..., 1] -= 2.5
+    arrays = [wp.array(each, dtype=wp.mat33d, device="cpu") for each in (p, move, q, drift)]
+    when, gap = (wp.zeros(count, dtype=wp.float64, device="cpu") for _ in range(2))
+    wp.launch(search, count, [*arrays, least, when, gap], device="cpu")
+    when, gap = when.numpy(), gap.numpy()
+    met = when <= 1.0
+    assert 0.2 * count < met.sum() < count
+    assert (gap[met] > 0.9 * least).all() and np.median(gap[met]) < 1.1 * least and (gap[~met] > least).all()
+    for part in np.linspace(0.0, 1.0, 41):
+        now = [
+            wp.array(a + np.minimum(part, when)[:, None, None] * b, dtype=wp.mat33d, device="cpu")
+            for a, b in ((p, move), (q, drift))
+        ]
+        still = [wp.zeros(count, dtype=wp.mat33d, device="cpu") for _ in range(2)]
+        there, apart = (wp.zeros(count, dtype=wp.float64, device="cpu") for _ in range(2))
+        wp.launch(search, count, [now[0], still[0], now[1], still[1], least, there, apart], device="cpu")
+        assert (apart.numpy() > 0.9 * least).all()
