@@ -307,7 +307,7 @@ def test_the_comparison_can_fail():
 def test_every_field_has_a_row():
     known = {row.field for row in attributes()}
     # The prim, other rows, other rows, a GeomSubset, the file, the stage's rate, other rows, other prims, prims
-    elsewhere = {"mesh", "terms", "loads", "pins", "stage", "fps", "contact", "self_contact", "colliders", "cloths"}
+    elsewhere = {"mesh", "air", "terms", "loads", "pins", "stage", "fps", "contact", "self_contact", "colliders", "cloths"}
     assert {field.name for field in fields(wc.Scene)} <= known | elsewhere
     assert {f"contact.{field.name}" for field in fields(wc.Contact)} <= known
     for term in TERMS.values():
