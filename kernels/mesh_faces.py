@@ -27,6 +27,15 @@ ULP = wp.constant(wp.float64(1.1920929e-07))  # of float32, over the number, at 
 ROUNDS = wp.constant(16)
 
 
+@wp.struct
+class Faces:
+    """The vertices of all faces, and which faces vertex i has: those in ``of_vertex`` from ``first`` [i] to first[i+1]."""
+
+    vertices: wp.array(dtype=wp.vec3i)
+    first: wp.array(dtype=wp.int32)
+    of_vertex: wp.array(dtype=wp.int32)
+
+
 @wp.func
 def between(p: wp.mat33d, q: wp.mat33d):
     """Distance d of two triangles, the direction from q to p, and whether they do not cross."""
@@ -72,7 +81,7 @@ def most_along(n: wp.vec3d, p: wp.mat33d):
 
 
 @wp.func
-def parts(m: wp.vec3d, p: wp.mat33d, p_end: wp.mat33d, q: wp.mat33d, q_end: wp.mat33d, least: wp.float64):
+def stays_between(m: wp.vec3d, p: wp.mat33d, p_end: wp.mat33d, q: wp.mat33d, q_end: wp.mat33d, least: wp.float64):
     """Whether a plane of a normal of any length, that moves along it, separates two triangles all the time."""
     side = wp.where(wp.dot(m, p[0] - q[0]) < ZERO, -m, m)
     gap = wp.min(least_along(side, p) - most_along(side, q), least_along(side, p_end) - most_along(side, q_end))
@@ -83,24 +92,24 @@ def parts(m: wp.vec3d, p: wp.mat33d, p_end: wp.mat33d, q: wp.mat33d, q_end: wp.m
 def passes_beside(p: wp.mat33d, p_end: wp.mat33d, q: wp.mat33d, q_end: wp.mat33d, least: wp.float64):
     """Whether the plane of either triangle, or one through an edge and normal to that, separates them, as is so for most."""
     m = wp.cross(q[1] - q[0], q[2] - q[0])
-    if parts(m, p, p_end, q, q_end, least):
+    if stays_between(m, p, p_end, q, q_end, least):
         return True
     k = wp.cross(p[1] - p[0], p[2] - p[0])
-    if parts(k, p, p_end, q, q_end, least):
+    if stays_between(k, p, p_end, q, q_end, least):
         return True
     i = wp.int32(0)
     while i < 3:
         j = wp.where(i == 2, 0, i + 1)
-        if parts(wp.cross(m, q[j] - q[i]), p, p_end, q, q_end, least):
+        if stays_between(wp.cross(m, q[j] - q[i]), p, p_end, q, q_end, least):
             return True
-        if parts(wp.cross(k, p[j] - p[i]), p, p_end, q, q_end, least):
+        if stays_between(wp.cross(k, p[j] - p[i]), p, p_end, q, q_end, least):
             return True
         i += 1
     return False
 
 
 @wp.func
-def meet(p: wp.mat33d, move: wp.mat33d, q: wp.mat33d, drift: wp.mat33d, least: wp.float64):
+def first_contact(p: wp.mat33d, move: wp.mat33d, q: wp.mat33d, drift: wp.mat33d, least: wp.float64):
     """When two triangles that move would be nearer than ``least``, or than they are; a number above 1 if they never are.
 
     The plane normal to the distance separates them until one of the vertices passes it; from there the next decides. Also the
@@ -145,7 +154,7 @@ def meet(p: wp.mat33d, move: wp.mat33d, q: wp.mat33d, drift: wp.mat33d, least: w
 
 
 @cache
-def frames_of(dtype):
+def local_frames(dtype):
     """The device functions (pose, x) → x in the frame of a pose, and (pose, X) → X in space, in float64."""
     pose_type, _anchor = pose_types(dtype)
 
@@ -205,7 +214,7 @@ def ways_of(dtype):
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
     pose_type, _anchor = pose_types(dtype)
-    to_local, _to_space = frames_of(dtype)
+    to_local, _to_space = local_frames(dtype)
 
     @wp.func
     def way(v: wp.vec3i, x: wp.array(dtype=vec3), end: wp.array(dtype=vec3), before: pose_type, after: pose_type, r: dtype):
@@ -242,7 +251,7 @@ def find_planes(dtype):
     @wp.kernel(module=f"warpcloth.mesh_faces.{dtype.__name__}", enable_backward=False)
     def find_each_plane(
         # elements
-        faces: wp.array(dtype=wp.vec3i),
+        faces: Faces,
         mesh: meshes_of(dtype),
         # state in
         x_before: wp.array(dtype=vec3),
@@ -259,7 +268,7 @@ def find_planes(dtype):
         latest: wp.array(dtype=wp.int32),
     ):
         f = wp.tid()
-        v = faces[f]
+        v = faces.vertices[f]
         planes[f] = wp.vec4d()
         if wp.max(wp.max(moved[v[0]], moved[v[1]]), moved[v[2]]) < round[0]:
             return
@@ -281,7 +290,7 @@ def find_planes(dtype):
                 continue  # absent
             if passes_beside(p, p_end, q, q_end, least):
                 continue
-            when, first, n, d = meet(p, p_end - p, q, q_end - q, least)
+            when, first, n, d = first_contact(p, p_end - p, q, q_end - q, least)
             if when < soonest or (when == soonest and when <= ONE and k < face):
                 soonest = when
                 face = k
@@ -304,15 +313,14 @@ def follow_planes(dtype):
     """Kernel over vertices: moves x to the allowed sides of the planes of the faces of each."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    to_local, to_space = frames_of(dtype)
+    to_local, to_space = local_frames(dtype)
 
     @wp.kernel(module=f"warpcloth.mesh_faces.{dtype.__name__}", enable_backward=False)
     def follow_each_plane(
         # elements
         mobility: wp.array(dtype=vec3),
         inverse_mass: wp.array(dtype=dtype),
-        first: wp.array(dtype=wp.int32),
-        of_vertex: wp.array(dtype=wp.int32),
+        faces: Faces,
         # state in
         motion: motions(dtype),
         planes: wp.array(dtype=wp.vec4d),
@@ -337,8 +345,8 @@ def follow_planes(dtype):
         while again and passes < 8:
             passes += 1
             again = wp.bool(False)
-            for k in range(first[i], first[i + 1]):
-                plane = planes[of_vertex[k]]
+            for k in range(faces.first[i], faces.first[i + 1]):
+                plane = planes[faces.of_vertex[k]]
                 n = wp.vec3d(plane[0], plane[1], plane[2])
                 short = plane[3] - wp.dot(n, end)
                 if short > ZERO and wp.dot(n, n) > ZERO:
@@ -346,8 +354,8 @@ def follow_planes(dtype):
                     again = wp.bool(True)
                     changed = wp.bool(True)
         if changed:
-            place = to_space(pose, end)
-            at = vec3(dtype(place[0]), dtype(place[1]), dtype(place[2]))
+            position = to_space(pose, end)
+            at = vec3(dtype(position[0]), dtype(position[1]), dtype(position[2]))
             if mobility:
                 for axis in range(3):
                     if mobility[i][axis] == dtype(0.0):
@@ -396,7 +404,7 @@ def find_shares(dtype):
     @wp.kernel(module=f"warpcloth.mesh_faces.{dtype.__name__}", enable_backward=False)
     def find_each_share(
         # elements
-        faces: wp.array(dtype=wp.vec3i),
+        faces: Faces,
         mesh: meshes_of(dtype),
         # state in
         x: wp.array(dtype=vec3),
@@ -410,7 +418,7 @@ def find_shares(dtype):
         shares: wp.array(dtype=wp.vec3d),
     ):
         f = wp.tid()
-        v = faces[f]
+        v = faces.vertices[f]
         copy = v[0] // per_copy
         when = 2 * motion.steps[copy]
         start = motion.before[copy, collider]
@@ -450,16 +458,14 @@ def keep_shares(dtype):
     share of the faces of each."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    to_local, to_space = frames_of(dtype)
+    to_local, to_space = local_frames(dtype)
 
     @wp.kernel(module=f"warpcloth.mesh_faces.{dtype.__name__}", enable_backward=False)
     def keep_each_share(
         # elements
         mobility: wp.array(dtype=vec3),
         inverse_mass: wp.array(dtype=dtype),
-        faces: wp.array(dtype=wp.vec3i),
-        first: wp.array(dtype=wp.int32),
-        of_vertex: wp.array(dtype=wp.int32),
+        faces: Faces,
         # state in
         x: wp.array(dtype=vec3),
         motion: motions(dtype),
@@ -474,10 +480,10 @@ def keep_shares(dtype):
     ):
         i = wp.tid()
         share = ONE
-        for k in range(first[i], first[i + 1]):
-            f = of_vertex[k]
+        for k in range(faces.first[i], faces.first[i + 1]):
+            f = faces.of_vertex[k]
             for j in range(3):
-                if faces[f][j] == i:
+                if faces.vertices[f][j] == i:
                     share = wp.min(share, shares[f][j])
         if least:
             least[i] = wp.min(least[i], share)
@@ -485,8 +491,8 @@ def keep_shares(dtype):
             copy = i // per_copy
             p = to_local(motion.before[copy, collider], exact(x[i]))
             p_end = to_local(motion.after[copy, collider], exact(end[i]))
-            place = to_space(motion.after[copy, collider], p + share * (p_end - p))
-            at = vec3(dtype(place[0]), dtype(place[1]), dtype(place[2]))
+            position = to_space(motion.after[copy, collider], p + share * (p_end - p))
+            at = vec3(dtype(position[0]), dtype(position[1]), dtype(position[2]))
             if mobility:
                 for axis in range(3):
                     if mobility[i][axis] == dtype(0.0):

@@ -6,7 +6,7 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.core.status import Result
-from warpcloth.kernels.mesh_faces import between, meet
+from warpcloth.kernels.mesh_faces import between, first_contact
 from warpcloth.scene.colliders import turned
 
 FRAMES, N, SIZE = 8, 6, 0.5
@@ -141,7 +141,7 @@ def search(
     gap: wp.array(dtype=wp.float64),
 ):
     e = wp.tid()
-    found, _first, _n, _start = meet(p[e], move[e], q[e], drift[e], least)
+    found, _first, _n, _start = first_contact(p[e], move[e], q[e], drift[e], least)
     when[e] = found
     d, _along, apart = between(
         p[e] + wp.min(found, wp.float64(1.0)) * move[e], q[e] + wp.min(found, wp.float64(1.0)) * drift[e]

@@ -21,10 +21,15 @@ class MeshFaces:
     def __init__(self, model, meshes, h):
         self.model, self._meshes, self._h, device = model, meshes, h, model.device
         faces = self._faces_of(model)
-        self._faces = wp.array(faces.astype(np.int32), dtype=wp.vec3i, device=device)
         offsets, codes = incidences_of(faces.ravel(), model.count)
-        self._first = wp.array(offsets, dtype=wp.int32, device=device)
-        self._of_vertex = wp.array(codes // 3, dtype=wp.int32, device=device)
+        self._count, self._faces = len(faces), kernels.Faces()
+        self._kept = {  # whose memory the struct does not keep
+            "vertices": wp.array(faces.astype(np.int32), dtype=wp.vec3i, device=device),
+            "first": wp.array(offsets.astype(np.int32), dtype=wp.int32, device=device),
+            "of_vertex": wp.array((codes // 3).astype(np.int32), dtype=wp.int32, device=device),
+        }
+        for name, value in self._kept.items():
+            setattr(self._faces, name, value)
         self._colliders = [c for c, collider in enumerate(model.scene.colliders) if collider.facets]
         self._planes = wp.zeros(len(faces), dtype=wp.vec4d, device=device)
         self._shares = wp.zeros(len(faces), dtype=wp.vec3d, device=device)
@@ -63,8 +68,8 @@ class MeshFaces:
         for k, c in enumerate(self._colliders):
             found = self._found[k : k + 1]
             given = [self._faces, geometry, x_before, x, motion, self._round, self._moved, c, model.per_copy]
-            self._launch(kernels.find_planes, len(self._faces), given, [self._planes, found, self._latest])
-            given = [model.mobility, model.inverse_mass, self._first, self._of_vertex, motion]
+            self._launch(kernels.find_planes, self._count, given, [self._planes, found, self._latest])
+            given = [model.mobility, model.inverse_mass, self._faces, motion]
             given += [self._planes, found, self._round, c, model.per_copy]
             self._launch(kernels.follow_planes, model.count, given, [x, self._moved])
         model.launch(self._end_round, 1, [], [self._found, self._round, self._proceed, self._unfinished])
@@ -81,6 +86,6 @@ class MeshFaces:
     def _launch_shares(self, c, x, end, latest, least):
         model, motion = self.model, self._meshes.motion
         given = [self._faces, self._meshes.geometry, x, end, motion, latest, c, model.per_copy]
-        self._launch(kernels.find_shares, len(self._faces), given, [self._shares])
-        given = [model.mobility, model.inverse_mass, self._faces, self._first, self._of_vertex, x, motion, self._shares]
+        self._launch(kernels.find_shares, self._count, given, [self._shares])
+        given = [model.mobility, model.inverse_mass, self._faces, x, motion, self._shares]
         self._launch(kernels.keep_shares, model.count, [*given, c, model.per_copy], [least, end, self._moved])

@@ -135,8 +135,8 @@ class ClearSteps(TwinSteps):
         halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
         if colliders.faces is not None:
             # Points of a triangle are no farther from one of its vertices than its longest edge over √3.
-            reach = STRETCHED / np.sqrt(3.0) * float(model.scene.mesh.edge_lengths.max())
-            bounding = np.array(bounding) + [reach if collider.facets else 0.0 for collider in model.scene.colliders]
+            max_length = STRETCHED / np.sqrt(3.0) * float(model.scene.mesh.edge_lengths.max())
+            bounding = np.array(bounding) + [max_length if collider.facets else 0.0 for collider in model.scene.colliders]
         self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
         self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy, stepper.h]]
         self._out = [clear, self.near]
