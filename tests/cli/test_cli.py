@@ -155,7 +155,7 @@ WRONG_USES = [
     ("info hanging -p density=__import__('os')", "it must be a number"),
     ("info hanging -p n", "'n' is not of the form name=value"),
     ("info hanging -p n=3 n=4", "n is given twice, as '3' and '4'"),
-    ("info hanging -p n=1", "hanging.py, line 14: ValueError: nx is 1; it must be"),
+    ("info hanging -p n=1", "hanging.py, line 21: ValueError: nx is 1; it must be"),
     ("info hanging -p duration=0.01", "ValueError: duration is 0.01 s; at fps 60.0 it must be a whole number of frames"),
     # parameters that make no sense, of each scene that comes with the package
     ("info cantilever -p width=-1", "ValueError: width is -1.0; it must be a number of 0 or more"),

@@ -5,7 +5,6 @@ import warp as wp
 
 from ..core.capture import Mirror, Segment
 from ..kernels.clear_elements import add_hessian
-from ..kernels.project import correct_in_place, sweep_turn
 from .search import HALVINGS, Search
 
 # An accurate solve ends at this residual, relative to b, in the norm of A⁻¹.
@@ -105,16 +104,10 @@ class ContactSystem(CorrectedSystem):
     def __init__(self, model, x, linear, sums, s, pairs=None):
         super().__init__(model, linear)
         self.x, self._pairs = x, pairs
-        self._h, axes = s**-0.5, model.mobility is not None
         self._touching = [
             (elements, model.kernel(add_hessian, elements.term, model.dtype))
             for elements in model.terms
             if elements.collider is not None
-        ]
-        self._leaving = [
-            (elements, model.kernel(correct_in_place, elements.term, model.dtype, False, False, False, axes))
-            for elements, _kernel in self._touching
-            if elements.term.prox_from is not None
         ]
         self._search = Search(model, x, sums, s, pairs)
         free = model.coordinate_mobility().reshape(-1, 3) > 0.0
@@ -134,17 +127,6 @@ class ContactSystem(CorrectedSystem):
         self._assemble = Segment(device, self._launch_assemble)
         self._begin = Segment(device, search.launch_again)
         self._shorten = Segment(device, lambda: search.launch(self._active.array))
-
-    def launch_start(self, d):
-        """Moves d from 0 to where inertia and contact with colliders alone put each vertex.
-
-        Inside a collider, contact is so stiff that an iteration only doubles the distance to its surface.
-        """
-        model = self.model
-        for elements, kernel in self._leaving:
-            turn, threads = sweep_turn(model.dtype)(), 1 if model.device.is_cpu else elements.count
-            turn.each, turn.h, turn.sweeps, turn.relaxation = elements.count // max(threads, 1), self._h, 1, 1.0
-            model.launch(kernel, threads, [*elements.arguments, model.local_mobility, self.x, turn], [None, d])
 
     def _launch_assemble(self):
         self._blocks.array.zero_()

@@ -99,9 +99,9 @@ class Evaluation:
         self._pairs = pairs if stepper is None else stepper.pairs
         shares = [] if stepper is None or model.colliders is None else stepper.shares
         self._present = PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
-        present = self._present.terms
-        self._terms = tuple(each for each in present if each.term is not AIR)
-        self._blown = tuple(each for each in present if each.term is AIR)
+        terms = [(present, own) for present, own in zip(self._present.terms, model.terms, strict=True) if own.term is not AIR]
+        self._terms = tuple(present for present, _own in terms)
+        self._blown = tuple(own for own in model.terms if own.term is AIR)
         self.hidden = forces and stepper is not None and any(elements.hard for elements in model.terms)
         self._pins, self._held = model.in_model(model.scene.pins.vertices), model.scene.pins.held
         self._mass = model.mass.numpy().astype(np.float64).reshape(model.copies, -1)
@@ -110,7 +110,7 @@ class Evaluation:
         self.names = energy_names(model.scene)
         self._term_names = _term_names(model.scene)
         self.names_of_friction = [
-            name for name, each in zip(self._term_names, self._terms, strict=True) if each.term is FRICTION
+            name for name, (_present, own) in zip(self._term_names, terms, strict=True) if own.term is FRICTION
         ]
         if not forces:
             return

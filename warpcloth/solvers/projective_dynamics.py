@@ -37,7 +37,7 @@ class ProjectiveDynamics(ImplicitStep):
     minimum at S x = (M/h²) x̃ + Σ k A Gᵀp, with the matrix S = M/h² + Σ k A GᵀG. S is the same for all three coordinates and
     all steps, and is factorised once. As ∂u/∂y = y − p(y), one iteration is d ← d − S⁻¹∇φ(d) with d = x − x̃, so that later
     iterations correct the rounding of earlier ones. The objective φ never rises, and the fixed point is the x(t+h) of
-    :class:`warpcloth.Newton`. With colliders, the first iterate is where inertia and contact alone put each vertex.
+    :class:`warpcloth.Newton`.
 
     Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
     error perpendicular to it shrinks by the factor k(L/l)/(m/h² + k) in each iteration; the error along it is gone after one.
@@ -189,8 +189,6 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
     def _launch_start(self):
         self.launch_prediction()
         self.correction.zero_()
-        if self._contact:
-            self._contact.launch_start(self.correction)
         if self._accelerated:
             self._accelerated.launch_start()
         self._launch_gradient()
