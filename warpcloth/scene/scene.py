@@ -338,7 +338,7 @@ class Scene:
         air = self.air
         if air is None or not air.density:
             return ()
-        given = {"keyframes": air.winds} if air.keyframes is not None else {"wind": air.winds}
+        given: dict[str, Any] = {"keyframes" if air.keyframes is not None else "wind": air.winds}
         given |= {"normal_drag": air.normal_drag, "tangential_drag": air.tangential_drag}
         return (TriangleAir(name="Air", stiffness=air.density, **given),)
 
