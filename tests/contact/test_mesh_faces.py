@@ -81,11 +81,11 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "what", "dtype"), CASES)
-def test_nothing_pierces_cloth(name, what, dtype):
+def test_nothing_pierces_cloth(name, what, dtype, device):
     """At 1 m/s in steps of 1/24 s, which are 0.04 m; without the filter of triangles a spike and a knife go through."""
     solver, mesh = SOLVERS[name], MESHES[what]
     scene = falling(mesh, 1.0)
-    animation = wc.simulate(scene, solver, dtype=dtype)
+    animation = wc.simulate(scene, solver, dtype=dtype, device=device)
     assert animation.status.result is not Result.DIVERGED
     assert crossing(animation.points, scene.mesh.triangles, mesh) == [0] * (FRAMES + 1)
     assert 0.0 < animation.cut < 1.0 and not animation.inside
@@ -93,9 +93,10 @@ def test_nothing_pierces_cloth(name, what, dtype):
 
 @pytest.mark.parametrize("speed", (10.0, 100.0))
 @pytest.mark.parametrize("what", ("spike", "knife"))
-def test_nothing_pierces_fast_cloth(what, speed):
+def test_nothing_pierces_fast_cloth(what, speed, device):
     scene = falling(MESHES[what], speed)
-    points = wc.simulate(scene, wc.Explicit(substeps=60)).points  # the spike tears the sheet to divergence at 100 m/s, later
+    # At 100 m/s the spike tears the sheet to divergence, later.
+    points = wc.simulate(scene, wc.Explicit(substeps=60), device=device).points
     assert len(points) > FRAMES // 2 and crossing(points, scene.mesh.triangles, MESHES[what]) == [0] * len(points)
 
 
@@ -106,24 +107,24 @@ def test_cloth_that_touches_itself_is_not_pierced():
     assert crossing(animation.points, scene.mesh.triangles, MESHES["spike"]) == [0] * (FRAMES + 1)
 
 
-def test_copies_are_independent():
+def test_copies_are_independent(device):
     """One of two copies is hit at once, so the rounds of its filter go on where the other has none; to the bit."""
     scene, solver = falling(MESHES["spike"], 1.0), wc.XPBD(substeps=1, iterations=10)
     both = np.stack([scene.positions, scene.positions + np.array([0.0, 0.05, 0.0])])
-    found = wc.simulate(scene, solver, copies=2, vary={"positions": both}).points
+    found = wc.simulate(scene, solver, device=device, copies=2, vary={"positions": both}).points
     for copy in range(2):
-        alone = wc.simulate(scene, solver, copies=1, vary={"positions": both[copy : copy + 1]}).points
+        alone = wc.simulate(scene, solver, device=device, copies=1, vary={"positions": both[copy : copy + 1]}).points
         np.testing.assert_array_equal(found[:, copy], alone.reshape(found[:, copy].shape))
 
 
-def test_an_edge_mesh_is_not_cut():
+def test_an_edge_mesh_is_not_cut(device):
     """A chain across a knife, with the edge of this between two of its beads; the segments are tested as flat triangles."""
     beads = np.stack([np.arange(-3.0, 4.0) * EDGE + 0.4 * EDGE, np.full(7, 0.02), np.zeros(7)], axis=1)
     across = wc.MeshCollider(KNIFE[0][:, [2, 1, 0]] * np.array([1.0, 1.0, -1.0]), KNIFE[1])
     chain = wc.Mesh(beads, edges=np.stack([np.arange(6), np.arange(1, 7)], axis=1))
     terms, contact = [wc.Spring(stiffness=300.0)], wc.Contact(distance=2e-3, stiffness=3e4, elements="triangles")
     scene = wc.Scene(chain, masses=np.full(7, 1e-3), terms=terms, colliders=[across], contact=contact, fps=24.0, duration=0.25)
-    points = wc.simulate(scene, wc.Newton(substeps=2)).points
+    points = wc.simulate(scene, wc.Newton(substeps=2), device=device).points
     flat = np.array([[i, i + 1, i + 1] for i in range(6)])
     thick = np.concatenate([points, points + np.array([0.0, 1e-7, 0.0])], axis=1)  # as segments have no area
     flat[:, 2] += 7
