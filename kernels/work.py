@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .colliders import of_pose, pose_types, step_poses
+from .contact.colliders import of_pose, pose_types, step_poses
 from .local import local_coordinate
 from .project import multiplier_type
 from .term import Term

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from ..colliders import FilterNotes, local_gap_of, of_pose, outside, pose_types, shapes, step_poses, turned_by
+from ..contact.colliders import FilterNotes, local_gap_of, of_pose, outside, pose_types, shapes, step_poses, turned_by
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..rotation import epsilon
@@ -80,7 +80,7 @@ def in_ball(dtype, moving: bool):
 def touching_step(dtype, symplectic: bool):
     """Device function (guard, i, w, x, v, a, h) → x, v of vertex i after a step, with a = g − ∇U/m without contact.
 
-    It computes the same as :func:`..colliders.anchor_vertices` (``bounded``) and :func:`..colliders.outside`.
+    It computes the same as :func:`..contact.colliders.anchor_vertices` (``bounded``) and :func:`..contact.colliders.outside`.
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)

@@ -1,16 +1,16 @@
 """Sums over the self-contact pairs with a force, by one thread of the CPU, which adds to the vertices of each pair.
 
-They equal those of :mod:`warpcloth.kernels.self_contact` up to rounding. They are faster because few acting pairs have a force,
-and because products with the Hessian take each pair once, not once for each of its vertices.
+They equal those of :mod:`..contact.self_contact` up to rounding. They are faster because few acting pairs have a force, and
+because products with the Hessian take each pair once, not once for each of its vertices.
 """
 
 from functools import cache
 
 import warp as wp
 
-from ..self_contact import PairForces
-from ..self_gaps import vertex_of
-from ..self_pairs import module_of, near_pairs
+from ..contact.self_contact import PairForces
+from ..contact.self_gaps import vertex_of
+from ..contact.self_pairs import module_of, near_pairs
 from ..vectors import types
 
 

@@ -6,7 +6,7 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.core.status import Result
-from warpcloth.kernels.mesh_faces import between, first_contact
+from warpcloth.kernels.contact.mesh_faces import between, first_contact
 from warpcloth.scene.colliders import turned
 
 FRAMES, N, SIZE = 8, 6, 0.5

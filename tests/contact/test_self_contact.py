@@ -12,7 +12,7 @@ from warpcloth.contact.self_start import crossings
 from warpcloth.contact.self_steps import SelfSteps
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
-from warpcloth.kernels.self_gaps import nearest
+from warpcloth.kernels.contact.self_gaps import nearest
 from warpcloth.solvers.solver import Stepper
 
 SLOW = pytest.mark.slow

@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from ..kernels import colliders as kernels
-from ..kernels import mesh_colliders as mesh_kernels
-from ..kernels.clear_elements import find_clear
+from ..kernels.contact import colliders as kernels
+from ..kernels.contact import mesh_colliders as mesh_kernels
+from ..kernels.fast.clear_elements import find_clear
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..kernels.terms.friction import FRICTION
@@ -44,13 +44,13 @@ class ColliderSteps:
         bounded: Whether contact is that of explicit steps.
         part: As given.
         x_before: Positions where the step began, (N,) [m].
-        poses: Those of the step, a :func:`warpcloth.kernels.colliders.step_poses`.
-        shapes: A :func:`warpcloth.kernels.colliders.shapes`.
+        poses: Those of the step, a :func:`warpcloth.kernels.contact.colliders.step_poses`.
+        shapes: A :func:`warpcloth.kernels.contact.colliders.shapes`.
         anchors: Those of friction on each collider that has it, by its index; rows of ``anchor_rows`` (C, N).
         least: Distance below which no vertex ends a step [m].
         faces: :class:`warpcloth.contact.mesh_faces.MeshFaces` that keeps triangles from crossing meshes, or None.
         steps_per_frame: As given.
-        notes: :class:`warpcloth.kernels.colliders.FilterNotes`.
+        notes: :class:`warpcloth.kernels.contact.colliders.FilterNotes`.
         steps: Steps that the colliders have made, (B,) int32.
         correction: x − x̃ of the steps with contact (N,) [m], or None for explicit steps; of the effective step ``he`` [s].
         pushed, kicked: What the filter changed in positions [m] and velocities [m/s] since these were 0, (N,) double precision,

@@ -6,7 +6,7 @@ from ..core.energy import Energy
 from ..core.gradient import Gradient
 from ..core.sums import Sums
 from ..kernels import work as kernels
-from ..kernels.mesh_colliders import surface_moves
+from ..kernels.contact.mesh_colliders import surface_moves
 from ..kernels.project import add_momentum
 from ..kernels.terms.friction import FRICTION
 from .present import ColliderPulls, PresentContact

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..kernels import mesh_faces as kernels
+from ..kernels.contact import mesh_faces as kernels
 from ..model.elements import incidences_of
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..kernels import mesh_colliders as kernels
+from ..kernels.contact import mesh_colliders as kernels
 from ..kernels.terms.contact import AREA
 
 
@@ -12,14 +12,14 @@ class MeshSteps:
 
     Args:
         model: The :class:`warpcloth.model.model.Model` of a scene with mesh colliders.
-        poses: Poses of the step, a :func:`warpcloth.kernels.colliders.step_poses`.
+        poses: Poses of the step, a :func:`warpcloth.kernels.contact.colliders.step_poses`.
         bounded: Whether the method is explicit.
         resting: Whether the solver finds an equilibrium, where vertices may move any distance.
-        **given: The numbers and ``steps`` of :func:`warpcloth.kernels.mesh_colliders.motions`.
+        **given: The numbers and ``steps`` of :func:`warpcloth.kernels.contact.mesh_colliders.motions`.
 
     Attributes:
         geometry: See :class:`warpcloth.model.device_meshes.DeviceMeshes`.
-        motion: Struct :func:`warpcloth.kernels.mesh_colliders.motions`.
+        motion: Struct :func:`warpcloth.kernels.contact.mesh_colliders.motions`.
         given: The numbers and ``steps``, by name.
     """
 

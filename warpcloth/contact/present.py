@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..core.gradient import Gradient
-from ..kernels import colliders as kernels
+from ..kernels.contact import colliders as kernels
 from ..kernels.terms.friction import FRICTION
 from ..kernels.work import collider_pulls
 from .mesh_steps import MeshSteps

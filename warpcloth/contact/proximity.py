@@ -7,7 +7,7 @@ from ..base.limits import refuse_memory
 from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.scan import Scan
-from ..kernels import proximity as kernels
+from ..kernels.contact import proximity as kernels
 
 BYTES_OF_A_PAIR = 56
 

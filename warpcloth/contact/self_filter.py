@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..kernels import self_filter, self_planes
+from ..kernels.contact import self_filter, self_planes
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 

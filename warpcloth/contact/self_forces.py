@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..kernels import self_contact, self_sweeps
+from ..kernels.contact import self_contact, self_sweeps
 from ..kernels.fast import pair_scatter
 
 
@@ -35,8 +35,8 @@ class SelfForces:
         """Takes the arrays of pairs, and allocates arrays for their forces.
 
         Args:
-            pairs: :func:`warpcloth.kernels.self_pairs.near_pairs`.
-            begun: :class:`warpcloth.kernels.self_pairs.StepPairs`.
+            pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
+            begun: :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
         """
         self.pairs, self.begun, device = pairs, begun, self.model.device
 
@@ -154,7 +154,7 @@ class SelfForces:
         self.hold(self.pairs, self.begun)
 
     def launch_sweep(self, x, correction, h, adds, backward=False):
-        """Launches a sweep over all pairs, see :mod:`warpcloth.kernels.self_sweeps`.
+        """Launches a sweep over all pairs, see :mod:`warpcloth.kernels.contact.self_sweeps`.
 
         Args:
             x: x̃ (N,) [m].

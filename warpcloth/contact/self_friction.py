@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 
 from ..core.scan import Scan
-from ..kernels import friction_sweeps
-from ..kernels import self_friction as kernels
-from ..kernels.self_pairs import fill_corners, near_pairs, sort_corners
+from ..kernels.contact import friction_sweeps
+from ..kernels.contact import self_friction as kernels
+from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
 
 # Rows of the arrays of a list for each pair that there is room for.
 ROWS = {"stencils": 1, "corners": 4, "slips": 1}
@@ -14,7 +14,7 @@ LISTS = "stencils", "counts", "first", "corners"
 
 
 def acting_sizes(model, room, corners=True):
-    """Sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.self_pairs.near_pairs`, with corners or not."""
+    """Sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, with corners or not."""
     sizes = {"acting": room, "number": 1}
     return sizes | {"corner_counts": model.count, "first": model.count + 1, "corners": 4 * room} if corners else sizes
 
@@ -28,8 +28,8 @@ class Slips:
 
     Attributes:
         room: As given.
-        pairs: A :func:`warpcloth.kernels.self_pairs.near_pairs`, without distances.
-        slips: (room,), see :func:`warpcloth.kernels.self_friction.end_friction`.
+        pairs: A :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, without distances.
+        slips: (room,), see :func:`warpcloth.kernels.contact.self_friction.end_friction`.
         relisted: (B,) int32, whether pairs were listed again within the step.
         grow: A function of a number of pairs that makes room for as many, by default that of this object alone.
     """
@@ -101,8 +101,8 @@ class SelfFriction:
         bounded: Whether contact is that of explicit steps.
 
     Attributes:
-        pairs: Those of the step, a :func:`warpcloth.kernels.self_pairs.near_pairs` without distances.
-        rubbed: :class:`warpcloth.kernels.self_friction.RubbedPairs`.
+        pairs: Those of the step, a :func:`warpcloth.kernels.contact.self_pairs.near_pairs` without distances.
+        rubbed: :class:`warpcloth.kernels.contact.self_friction.RubbedPairs`.
         start: Positions where the step began, (N,) [m].
     """
 

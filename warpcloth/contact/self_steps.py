@@ -10,9 +10,9 @@ from ..core.capture import Mirror
 from ..core.scan import Scan
 from ..core.status import Stopped
 from ..core.sums import Sums
-from ..kernels import gap_notes, self_pairs
-from ..kernels.proximity import take_moved
-from ..kernels.self_filter import HeldPins
+from ..kernels.contact import gap_notes, self_pairs
+from ..kernels.contact.proximity import take_moved
+from ..kernels.contact.self_filter import HeldPins
 from .proximity import Proximity
 from .self_filter import WAY, SelfFilter
 from .self_forces import SelfForces
@@ -76,11 +76,11 @@ class SelfSteps:
         proximity: :class:`warpcloth.contact.proximity.Proximity`.
         forces: :class:`warpcloth.contact.self_forces.SelfForces`.
         filter: :class:`warpcloth.contact.self_filter.SelfFilter`.
-        pairs: :func:`warpcloth.kernels.self_pairs.near_pairs`.
-        begun: Normals, gaps, weights and areas of the pairs, :class:`warpcloth.kernels.self_pairs.StepPairs`.
+        pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
+        begun: Normals, gaps, weights and areas of the pairs, :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
         x_before: Positions where the step began, (N,) [m].
         begun_at: Positions at which the gaps of ``begun`` were found, (N,) [m].
-        held: :class:`warpcloth.kernels.self_filter.HeldPins`.
+        held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
         lists: How many lists of pairs were made, (B,) int32, the same for all copies.
         listed: Whether the last list has pairs, (1,) int32.
         tangles: :class:`warpcloth.contact.tangles.Tangles` of a start at which cloth crosses or touches cloth, else None.

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..kernels import tangles as kernels
+from ..kernels.contact import tangles as kernels
 
 
 class Tangles:

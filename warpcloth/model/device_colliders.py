@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..kernels.colliders import pose_types
+from ..kernels.contact.colliders import pose_types
 from .device_meshes import DeviceMeshes, meshes_on
 from .precision import refuse_large
 

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror, Segment
-from ..kernels.clear_elements import add_hessian
+from ..kernels.fast.clear_elements import add_hessian
 from .search import HALVINGS, Search
 
 # An accurate solve ends at this residual, relative to b, in the norm of A⁻¹.

@@ -3,11 +3,11 @@
 import numpy as np
 import warp as wp
 
-from ..kernels import pair_rows as kernels
+from ..kernels.contact import pair_rows as kernels
 
 
 class PairRows:
-    """The rows of pairs, see :mod:`warpcloth.kernels.pair_rows`, with the methods of :class:`.constraints.TermRows`.
+    """The rows of pairs, see :mod:`warpcloth.kernels.contact.pair_rows`, with the methods of :class:`.constraints.TermRows`.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -73,7 +73,7 @@ class PairRows:
 
 
 class FrictionRows(PairRows):
-    """The rows of friction between pairs, see :func:`warpcloth.kernels.pair_rows.linearise_friction_rows`.
+    """The rows of friction between pairs, see :func:`warpcloth.kernels.contact.pair_rows.linearise_friction_rows`.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.

@@ -75,9 +75,9 @@ def equilibrium(
     came there, and free vertices must start outside them. With friction there are many rest shapes, and the motion decides
     among them, so colliders and self-contact with friction are refused: run such a scene with damping until it rests.
 
-    A mesh collider is approximated near each vertex by half-spaces that touch it, see :mod:`warpcloth.kernels.mesh_colliders`.
-    They are updated after the cloth has settled, and it settles again, until they no longer change the balance. No vertex
-    crosses a triangle on the straight line between two of these rounds.
+    A mesh collider is approximated near each vertex by half-spaces that touch it, see
+    :mod:`warpcloth.kernels.contact.mesh_colliders`. They are updated after the cloth has settled, and it settles again, until
+    they no longer change the balance. No vertex crosses a triangle on the straight line between two of these rounds.
 
     With self-contact, no iterate crosses itself, pins included: pins with keyframes move as far as cloth lets them, and if they
     do not arrive, the iterations are used up. The areas of contact are held constant while the cloth settles, then computed

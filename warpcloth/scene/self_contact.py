@@ -13,9 +13,9 @@ class SelfContact:
     """Contact of cloth with itself and with other pieces of cloth, with the φ of :class:`warpcloth.Contact`.
 
     The energy is U = Σ kA φ(d) over vertex–triangle pairs and edge–edge pairs at distance d, see
-    :mod:`warpcloth.kernels.self_contact`. Pairs that share a vertex do not collide. Within a connected piece, the contact
-    distance of a pair is at most half its distance at rest, so that neighbours do not push one another. At the end of each step
-    a filter shortens moves that would cross, so that cloth never passes through cloth.
+    :mod:`warpcloth.kernels.contact.self_contact`. Pairs that share a vertex do not collide. Within a connected piece, the
+    contact distance of a pair is at most half its distance at rest, so that neighbours do not push one another. At the end of
+    each step a filter shortens moves that would cross, so that cloth never passes through cloth.
 
     Attributes:
         distance: Contact distance r [m].

@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror, Segment
-from ..kernels import clearance as kernels
-from ..kernels.colliders import shapes
+from ..kernels.contact import clearance as kernels
+from ..kernels.contact.colliders import shapes
 from ..kernels.loop import count_down
 from ..terms.refresh import STEP
 

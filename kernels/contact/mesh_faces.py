@@ -12,12 +12,12 @@ from functools import cache
 
 import warp as wp
 
+from ..terms.contact import turned
+from ..vectors import types
 from .colliders import FilterNotes, pose_types
 from .mesh_colliders import meshes as meshes_of
 from .mesh_colliders import motions
 from .self_gaps import ONE, ZERO, nearest, vertex_of
-from .terms.contact import turned
-from .vectors import types
 
 turned_by = turned
 SEARCHES = wp.constant(32)  # separating planes between two triangles in a step, at most

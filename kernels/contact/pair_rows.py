@@ -1,21 +1,21 @@
 """Factories of the constraint rows of self-contact pairs: C = −√(2φ(d)), as for contact with colliders.
 
 Each copy has rows for all pairs of the list. Rows of pairs of other copies, or of pairs beyond the contact distance, are
-inactive, see :mod:`.constraint_rows`. With ``curved``, each pair has a second row, which adds the stiffness −λC″ along n. Pairs
-with friction have two more rows, see :func:`linearise_friction_rows`.
+inactive, see :mod:`..constraint_rows`. With ``curved``, each pair has a second row, which adds the stiffness −λC″ along n.
+Pairs with friction have two more rows, see :func:`linearise_friction_rows`.
 """
 
 from functools import cache
 
 import warp as wp
 
-from .constraint_rows import ROUNDINGS, RowLayout, lowest_compliance, row_values
-from .rotation import epsilon
+from ..constraint_rows import ROUNDINGS, RowLayout, lowest_compliance, row_values
+from ..rotation import epsilon
+from ..terms import contact
+from ..vectors import types
 from .self_friction import RubbedPairs, edge_tangent, stretch_of
 from .self_gaps import nearest, signed_gap, vertex_of
 from .self_pairs import StepPairs, near_pairs
-from .terms import contact
-from .vectors import types
 
 constraint_slope, constraint_bend, potential = contact.constraint_slope, contact.constraint_bend, contact.potential
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
@@ -37,7 +37,7 @@ def row_of_pair(copy: int, e: int, layout: RowLayout, rows: int):
 
 @cache
 def linearise_pair_rows(dtype, curved: bool):
-    """Kernel over copies and pairs at x̃ + d: rows as in :func:`.constraint_rows.linearise`."""
+    """Kernel over copies and pairs at x̃ + d: rows as in :func:`..constraint_rows.linearise`."""
     vec3, _ = types(dtype)
     at, exact = vertex_of(dtype)
     Q = wp.constant(2 if curved else 1)

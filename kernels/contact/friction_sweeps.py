@@ -9,16 +9,16 @@ from functools import cache
 
 import warp as wp
 
+from ..vectors import types
 from .self_friction import RubbedPairs, friction_module, stretch_of
 from .self_gaps import ONE, ZERO
 from .self_pairs import near_pairs
 from .self_sweeps import free_move
-from .vectors import types
 
 
 @wp.func
 def multiplier_after(u: wp.vec3d, D: wp.float64, k: wp.float64, limit: wp.float64, h: wp.float64):
-    """λ = −h²∂U/∂u(u*) at u* = u + Dλ, in the closed form of :func:`.terms.friction.prox`."""
+    """λ = −h²∂U/∂u(u*) at u* = u + Dλ, in the closed form of :func:`..terms.friction.prox`."""
     found = wp.vec3d()
     l = wp.length(u)
     if D > ZERO and l > ZERO:

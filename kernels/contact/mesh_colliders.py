@@ -16,6 +16,10 @@ from functools import cache
 
 import warp as wp
 
+from ..rotation import epsilon
+from ..terms import contact
+from ..terms.contact import turned
+from ..vectors import types
 from .colliders import (
     ROUNDS,
     SLIDING,
@@ -31,10 +35,6 @@ from .colliders import (
     sliding,
     stopped_by_shape,
 )
-from .rotation import epsilon
-from .terms import contact
-from .terms.contact import turned
-from .vectors import types
 
 turned_by, slope_of = turned, contact.slope
 FAR = 1e30  # distance to a missing facet; finite, so that differences are not NaN

@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from .vectors import types
+from ..vectors import types
 
 # Constants for all kernels of pairs.
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))

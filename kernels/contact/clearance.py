@@ -4,9 +4,9 @@ from functools import cache
 
 import warp as wp
 
+from ..rotation import epsilon
+from ..vectors import types
 from .colliders import local_gap_of, of_pose, shapes, step_poses
-from .rotation import epsilon
-from .vectors import types
 
 
 @cache

@@ -9,10 +9,10 @@ from typing import Any
 
 import warp as wp
 
-from .local import local_coordinate
-from .memory import load, load_shared
-from .term import HessianPolicy, Term
-from .vectors import types
+from ..local import local_coordinate
+from ..memory import load, load_shared
+from ..term import HessianPolicy, Term
+from ..vectors import types
 
 CLAMP = wp.constant(int(HessianPolicy.CLAMP))
 

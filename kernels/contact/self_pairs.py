@@ -7,9 +7,9 @@ from functools import cache
 
 import warp as wp
 
+from ..vectors import types
 from .proximity import sort
 from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
-from .vectors import types
 
 # Triangles that meet share the area of a vertex. The part of one falls to 0 where it is farther than the nearest by SHARING·r.
 SHARING = wp.constant(wp.float64(0.25))

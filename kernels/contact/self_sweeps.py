@@ -4,11 +4,11 @@ from functools import cache
 
 import warp as wp
 
+from ..terms import contact
+from ..vectors import types
 from .self_contact import PairForces
 from .self_gaps import ZERO, gap_along, nearest, signed_gap, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
-from .terms import contact
-from .vectors import types
 
 gap_after = contact.gap_after
 

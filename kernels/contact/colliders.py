@@ -9,10 +9,10 @@ from typing import Any
 
 import warp as wp
 
-from .rotation import epsilon
-from .terms import contact
-from .terms.contact import local_gap, turned
-from .vectors import types
+from ..rotation import epsilon
+from ..terms import contact
+from ..terms.contact import local_gap, turned
+from ..vectors import types
 
 local_gap_of, turned_by, slope_of, DELTA, beyond_of = local_gap, turned, contact.slope, contact.DELTA, contact.beyond
 ROUNDS = wp.constant(6)  # maximum number of tests of a vertex that colliders stop
@@ -28,7 +28,7 @@ def pose_types(dtype):
 
 @cache
 def shapes(dtype):
-    """Struct of the shapes of C colliders, see :mod:`.terms.contact`: half sizes of the core, radius, and friction μ."""
+    """Struct of the shapes of C colliders, see :mod:`..terms.contact`: half sizes of the core, radius, and friction μ."""
     vec3, _ = types(dtype)
 
     @wp.struct

@@ -1,8 +1,8 @@
 """Factories of the kernels of the energy of self-contact and its derivatives.
 
 U = Σ kA φ(d) over the acting pairs, with the gap d of :mod:`.self_gaps`, the area A of :mod:`.self_pairs`, and φ as for
-colliders (:mod:`.terms.contact`). The nearest points minimise ‖y‖, so their motion does not contribute to ∂U/∂xᵢ = kA φ′ wᵢn, n
-= y/d (Danskin's theorem). The Hessian is approximated by its semi-definite part kA φ″ wᵢwⱼnnᵀ.
+colliders (:mod:`..terms.contact`). The nearest points minimise ‖y‖, so their motion does not contribute to the gradient
+∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian is approximated by its semi-definite part kA φ″ wᵢwⱼnnᵀ.
 
 Everything is computed in float64 for every precision of the model, so that positions are exact.
 """
@@ -11,10 +11,10 @@ from functools import cache
 
 import warp as wp
 
+from ..terms import contact
+from ..vectors import types
 from .self_gaps import SIDE, ZERO, gap_along, nearest, signed_gap, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
-from .terms import contact
-from .vectors import types
 
 potential, slope, bend = contact.potential, contact.slope, contact.bend
 

@@ -7,11 +7,11 @@ from functools import cache
 
 import warp as wp
 
+from ..vectors import types
 from . import self_gaps
 from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
 from .self_planes import ULP
-from .vectors import types
 
 nearest_points = self_gaps.nearest
 FOUR = wp.constant(wp.float64(4.0))

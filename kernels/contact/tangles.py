@@ -4,8 +4,8 @@ from functools import cache
 
 import warp as wp
 
+from ..vectors import types
 from .self_gaps import ZERO, nearest, vertex_of
-from .vectors import types
 
 MODULE = "warpcloth.tangles"
 

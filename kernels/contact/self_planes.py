@@ -4,9 +4,9 @@ from functools import cache
 
 import warp as wp
 
+from ..vectors import types
 from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
 from .self_pairs import module_of, near_pairs
-from .vectors import types
 
 # Fraction of its distance to a plane that a vertex may move in one round of the filter.
 KEPT = wp.constant(wp.float64(0.9))

@@ -7,10 +7,10 @@ from functools import cache
 
 import warp as wp
 
+from ..vectors import types
 from .gap_notes import FIRST
 from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
-from .vectors import types
 
 
 @wp.func

@@ -10,10 +10,10 @@ from functools import cache
 
 import warp as wp
 
-from .memory import load
+from ..memory import load
+from ..rotation import epsilon
+from ..vectors import types
 from .mesh_colliders import geometry
-from .rotation import epsilon
-from .vectors import types
 
 LEVELS = wp.constant(30)  # levels of the grid; the last has one cell
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted

@@ -1,6 +1,6 @@
 """Factories of the kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)).
 
-H is the Huber function of :mod:`.terms.friction` with ε = μN/(kA): a spring with the stiffness of contact and a force of at
+H is the Huber function of :mod:`..terms.friction` with ε = μN/(kA): a spring with the stiffness of contact and a force of at
 most μN. Pairs, w, n, N and kA are those at the start of the step, at the positions xⁿ. ξ is the elongation of the spring there.
 A step updates it, ξ ← (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)), and the next one shortens it to at most ε. So a sticking pair does not
 creep, and the spring of a sliding pair slides along.
@@ -13,10 +13,10 @@ from functools import cache
 
 import warp as wp
 
+from ..terms import contact
+from ..vectors import types
 from .self_gaps import ONE, SIDE, ZERO, vertex_of
 from .self_pairs import StepPairs, near_pairs
-from .terms import contact
-from .vectors import types
 
 slope = contact.slope
 
