@@ -1,6 +1,6 @@
-"""Factories of the kernels of the filter, which moves cloth as far as the planes of :mod:`.self_planes` let each vertex go.
+"""Factories of the kernels of the filter, which moves each vertex only as far as the planes of :mod:`.self_planes` allow.
 
-The filter ends each step. It also shortens the directions of a minimiser whose iterates must stay apart.
+The filter ends each step. It also shortens the search directions of a minimiser whose iterates must stay apart.
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ from .self_pairs import StepPairs, module_of, near_pairs
 
 @wp.func
 def bounded_share(move: wp.vec3d, most: wp.float64):
-    """The largest share of a move, up to 1, that is no longer than ``most``."""
+    """Returns min(1, most/‖move‖), the fraction of a move that is at most ``most`` long."""
     size = wp.length(move)
     far = ONE
     if size > most:
@@ -25,10 +25,10 @@ def bounded_share(move: wp.vec3d, most: wp.float64):
 
 @cache
 def keep_apart(dtype):
-    """Kernel over vertices: x ← x + u + t(δ − u), u the ``common`` move, t at most the ``share`` that planes leave.
+    """Kernel over vertices: x ← x + u + t(δ − u), with the ``common`` move u and t at most the ``share`` that planes allow.
 
-    ``most`` bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B, 2) counts the vertices that planes
-    cut short, and those that this bound alone cut short. Copies that do not ``walk`` stay.
+    ``most`` bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B, 2) counts the vertices whose move
+    planes shortened, and those whose move this bound alone shortened. Copies whose ``walk`` is 0 do not move.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -82,10 +82,10 @@ def another_round(
     walk: wp.array(dtype=wp.int32),
     proceed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: whether a copy walks on in another round.
+    """Kernel over copies: ``walk`` is 1 if a copy makes another round.
 
-    It does so while planes cut more than ``few`` vertices, for at most ``near_rounds``, and while the bound of the list cuts
-    one, for at most ``far_rounds``. ``proceed`` is 1 if any copy walks on.
+    It does so while planes shorten the moves of more than ``few`` vertices, in at most ``near_rounds`` rounds, and while the
+    bound of the list shortens one, in at most ``far_rounds`` rounds. ``proceed`` is 1 if any copy makes another round.
     """
     c = wp.tid()
     rounds[c] = rounds[c] + 1
@@ -99,10 +99,11 @@ def another_round(
 
 @wp.struct
 class HeldPins:
-    """The prescribed moves that the filter has cut short, (copies,).
+    """The prescribed moves that the filter has shortened, (copies,).
 
-    ``first`` is FIRST − (step·n + vertex), of n vertices: the first step in which a pinned coordinate was held back, and the
-    first such vertex; it is 0 if there was none. ``farthest`` is the largest distance by which one was held back [m].
+    ``first`` is FIRST − (step·n + vertex), with n vertices a copy, for the first step in which a pinned coordinate was held
+    back, and the first such vertex. It is 0 if there was none. ``farthest`` is the largest distance by which one was held back
+    [m].
     """
 
     first: wp.array(dtype=wp.int64)
@@ -111,9 +112,9 @@ class HeldPins:
 
 @cache
 def end_filter(dtype):
-    """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and over h to v.
+    """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and the change over h to v.
 
-    ``cut`` counts the free vertices that it changed, and ``held`` notes where it held back pins.
+    ``cut`` counts the free vertices that the filter moved. ``held`` notes the pins that it held back.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -162,7 +163,7 @@ def end_filter(dtype):
 
 @cache
 def walk_from_start(dtype):
-    """Kernel over vertices: sets x to where the step began, in copies whose colliders have cut a move since ``before``."""
+    """Kernel over vertices: x = x_before, the start of the step, in copies whose colliders have cut a move since ``before``."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -185,9 +186,9 @@ def walk_from_start(dtype):
 
 @cache
 def find_held(dtype):
-    """Kernel over vertices: sets ``within`` if any must move to get ``outside`` of colliders; ``mobile`` is 1/m, 0 of those.
+    """Kernel over vertices: ``mobile`` is 0 for vertices that are not at their position ``outside`` of colliders, else 1/m.
 
-    After ``most`` turns ``within`` is not set any more.
+    It sets ``within`` to 1 if there is such a vertex and fewer than ``most`` turns were made.
     """
     vec3, _ = types(dtype)
 
@@ -218,7 +219,7 @@ def find_held(dtype):
 
 @cache
 def push_pairs(dtype):
-    """Kernel of one thread: each pair in turn moves its targets apart along n, to its gap at x or to ``left`` if less."""
+    """Kernel of one thread: each pair in turn moves its targets apart along n, to its gap at x or ``left``, the smaller one."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -256,7 +257,7 @@ def push_pairs(dtype):
 
 @cache
 def shorten(dtype):
-    """Kernel over vertices: p ← p most/max‖pⱼ‖ in copies where that shortens it."""
+    """Kernel over vertices: p ← p·min(1, most/max‖pⱼ‖), with the maximum over the vertices of a copy."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -278,7 +279,7 @@ def shorten(dtype):
 
 @cache
 def limit_direction(dtype):
-    """Kernel over vertices: p ← u + t(p − u), as :func:`keep_apart`."""
+    """Kernel over vertices: p ← u + t(p − u), with u and t as in :func:`keep_apart`."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -313,7 +314,7 @@ def find_blocked(
     # out
     blocked: wp.array(dtype=wp.int32),
 ):
-    """Kernel over vertices: blocked = 1 in copies of which planes leave a vertex less than half of its move."""
+    """Kernel over vertices: blocked = 1 in copies where planes allow some vertex less than half of its move."""
     i = wp.tid()
     if share[i] < wp.float64(0.5):
         blocked[i // per_copy] = 1
@@ -331,7 +332,7 @@ def take_blocked(
     taken: wp.array(dtype=wp.int32),
     some: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: taken = 1 in active copies that are blocked, in up to ``most`` turns, else 0; some = 1 if any is."""
+    """Kernel over copies: taken = 1 in active copies that are blocked, at most ``most`` times, else 0; some = 1 if any is."""
     c = wp.tid()
     taken[c] = 0
     if active[c] != 0 and blocked[c] != 0 and turns[c] < most:
@@ -362,7 +363,7 @@ def precondition(dtype):
 
 @cache
 def take_descent(dtype):
-    """Kernel over vertices: p = the other direction, in copies where the slope along p is not below 0."""
+    """Kernel over vertices: p = other, in copies where the slope along p is not negative."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)

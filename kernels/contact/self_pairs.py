@@ -1,6 +1,6 @@
-"""Factories of the kernels that fix the pairs of cloth with itself where a step begins: their gaps, their areas, which act.
+"""Factories of the kernels that compute, at the start of a step, the gaps and areas of the pairs of self-contact.
 
-A pair acts if it has an area A, which stays as it is within the step.
+A pair acts if its area A is positive. A stays constant in the step.
 """
 
 from functools import cache
@@ -11,22 +11,23 @@ from ..vectors import types
 from .proximity import sort
 from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
 
-# Triangles that meet share the area of a vertex. The part of one falls to 0 where it is farther than the nearest by SHARING·r.
+# Triangles with a common vertex share the area of a vertex near them. The part of a triangle falls linearly to 0 at a gap that
+# exceeds the smallest one by SHARING·r.
 SHARING = wp.constant(wp.float64(0.25))
-# Two edges count less if sin² of the angle between them is below this, and not at all if they are parallel.
+# The area of two edges decreases if sin² of their angle is below this, to 0 for parallel edges.
 PARALLEL = wp.constant(wp.float64(1e-3))
 
 
 @cache
 def near_pairs(dtype):
-    """The struct of the pairs that are near, see :class:`warpcloth.contact.proximity.Proximity`.
+    """Returns the struct of near pairs, see :class:`warpcloth.contact.proximity.Proximity`.
 
-    ``counts`` has the number of pairs of a vertex and a triangle, which come first, and that of pairs of edges. Those of vertex
-    i with triangles are from ``rows`` [i] to rows[i+1]. The contact of a pair begins at its distance in ``distances`` [m].
+    ``counts`` has the numbers of vertex–triangle pairs, which come first, and of edge–edge pairs. The triangles near vertex i
+    are in rows ``rows`` [i] to rows[i+1]. Contact of a pair begins at its distance in ``distances`` [m].
 
-    ``acting`` lists the pairs that have an area in a step; there are ``number`` of them, which are few. On the CPU they are in
-    order. ``corners`` lists 4·pair + corner of the acting pairs at vertex i from ``first`` [i] to first[i+1], sorted.
-    ``corner_counts`` is scratch that is 0 between launches. Where no kernel sums over vertices there are none of these three.
+    ``acting`` lists the pairs with an area in the step; ``number`` has their number. On the CPU they are in order. ``corners``
+    lists 4·pair + corner of the acting pairs at vertex i, from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is
+    scratch, 0 between launches. The last three are empty if no kernel sums over vertices.
     """
 
     @wp.struct
@@ -46,7 +47,7 @@ def near_pairs(dtype):
 
 @wp.struct
 class StepPairs:
-    """n, d, w and kA [N/m] of each pair at the start of a step."""
+    """Normal n, gap d [m], weights w and stiffness kA [N/m] of each pair at the start of a step."""
 
     normal: wp.array(dtype=wp.vec3d)
     gap: wp.array(dtype=wp.float64)
@@ -61,7 +62,7 @@ def module_of(dtype):
 
 @cache
 def begin_pairs(dtype):
-    """Kernel over pairs, where a step begins: n, d and w at x."""
+    """Kernel over pairs: n, d and w at the positions x at the start of a step."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -105,12 +106,13 @@ def part_of_area(gap: wp.float64, least: wp.float64, r: wp.float64):
 
 @cache
 def set_areas(dtype):
-    """Kernel over pairs, where a step begins: kA, and which are acting.
+    """Kernel over pairs, at the start of a step: kA, and the list of acting pairs.
 
-    Half the area of a vertex goes to triangles on each side of it. Triangles that meet share this half if they are about
-    equally near. The area of a pair of edges is (A₁ + … + A₄)/12. It counts only as far as the pair is nearer than those of its
-    vertices with triangles on the same side, and less if the edges are nearly parallel. So crossed folds have contact too, and
-    where two layers lie flat on one another the areas of all pairs add up to that of one layer.
+    A vertex gives half of its area to the triangles on each side of it. Triangles with a common vertex share this half if they
+    are about equally near. The area of a pair of edges is (A₁ + … + A₄)/12 if the pair is nearer by SHARING·r than the
+    vertex–triangle pairs of its vertices on the same side; it falls linearly to 0 where they are as near. It is smaller if the
+    edges are nearly parallel. So crossed folds are in contact too, and the areas of all pairs of two flat layers in contact sum
+    to the area of one layer.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -159,7 +161,7 @@ def set_areas(dtype):
                 sign = wp.where(i < 2, ONE, -ONE)
                 for other in range(pairs.rows[s[i]], pairs.rows[s[i] + 1]):
                     if least <= gap and least < wp.float64(wp.inf):
-                        break  # most end here
+                        break  # most pairs end here
                     if step.gap[other] < least and sign * wp.dot(n, step.normal[other]) > SIDE:
                         least = step.gap[other]
             nearer = ONE
@@ -184,7 +186,7 @@ def set_areas(dtype):
 
 @cache
 def fill_corners(dtype):
-    """Kernel over pairs: lists the corners of acting pairs at each vertex. It counts ``corner_counts`` down to 0."""
+    """Kernel over pairs: lists the corners of acting pairs at each vertex, and counts ``corner_counts`` down to 0."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def fill_each_corner(
@@ -203,7 +205,7 @@ def fill_corners(dtype):
 
 @cache
 def sort_corners(dtype):
-    """Kernel over vertices: sorts the corners of each."""
+    """Kernel over vertices: sorts the corners of each vertex."""
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def sort_each(
@@ -228,7 +230,7 @@ def note_list(
     # out
     listed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: the most pairs in any list; how many lists, ``made`` of them new; and whether this has pairs."""
+    """Kernel over copies: the most pairs in any list, the number of lists, to which it adds ``made``, and ``listed``."""
     c = wp.tid()
     if c == 0:
         listed[0] = wp.min(counts[0] + counts[1], 1)

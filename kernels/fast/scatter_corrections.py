@@ -1,6 +1,6 @@
-"""Factories of a Jacobi sweep that scatters corrections while it computes them, in order, as one thread of the CPU can.
+"""Factories of a Jacobi sweep that adds each correction to the vertices as soon as it is computed, in one thread of the CPU.
 
-They have the key (term, dtype, scalar, multipliers, per_step) of :mod:`..project`.
+The factories take (term, dtype, scalar, multipliers, per_step), as those of :mod:`..project` do.
 """
 
 from functools import cache
@@ -17,8 +17,7 @@ from .clear_elements import is_clear
 
 @cache
 def add_correction(term: Term, dtype, scalar: bool, multipliers: bool, per_step: bool):
-    """The device function (element, data, x̃, d, h, sweeps, λ, out) that adds factorₑ Δxᵢ [m] of an element to out, factorₑ Δλ
-    to λ."""
+    """Returns the device function that adds factorₑ Δxᵢ [m] of an element to out, and factorₑ Δλ to λ."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
@@ -59,11 +58,12 @@ def add_correction(term: Term, dtype, scalar: bool, multipliers: bool, per_step:
 def scatter_correction(
     term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False, cleared: bool = False
 ):
-    """Kernel over elements: adds factorₑ Δxᵢ [m] of every element to out, factorₑ Δλ to λ.
+    """Kernel over elements: adds factorₑ Δxᵢ [m] of each element to out, and factorₑ Δλ to λ.
 
-    If ``cleared``, one thread passes over all elements, and over those whose vertex is within its ``clear`` until it is not: to
-    begin a thread takes longer than this test.
-    For the CPU, in order: nothing is atomic. One factor for all vertices of an element keeps linear momentum, and M d = Gᵀλ.
+    If ``cleared``, one thread loops over all elements, as starting a thread takes longer than testing an element. It skips
+    those whose vertex has moved less than its ``clear``; an element that was not skipped once is never skipped again.
+    It is for the CPU, which takes the elements in order, so nothing is atomic. One factor for all vertices of an element
+    conserves linear momentum and M d = Gᵀλ.
     """
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
@@ -102,9 +102,9 @@ def scatter_correction(
 
 @cache
 def apply_correction(dtype):
-    """Kernel over vertices: d += scaleᵢ Σ Δx, and the sum back to 0.
+    """Kernel over vertices: d += scaleᵢ Σ Δx, then sets the sum to 0.
 
-    scaleᵢ is 1, or 1/(nᵢ + α) when averaged over the nᵢ constraints of the vertex.
+    scaleᵢ is 1, or 1/(nᵢ + α) if corrections are averaged over the nᵢ constraints of the vertex.
     """
     vec3, _ = types(dtype)
 

@@ -17,44 +17,44 @@ from ..terms.refresh import STEP, Refresh
 from .mesh_faces import MeshFaces
 from .mesh_steps import MeshSteps
 
-# Where a vertex stops that would end in a collider, relative to the contact distance: where it comes to rest, a deep gap would
-# be a strong force, and in float32 a noisy one.
+# The filter puts a vertex that would end in a collider at this gap, relative to the contact distance. At a much smaller gap the
+# logarithm would push hard, and in float32 noisily.
 LANDING = 0.1
-# What held a vertex back in a collider where no other collider did.
+# The name of what held a vertex back in a collider, where other cloth did.
 CLOTH = "other cloth"
 
 
 class ColliderSteps:
     """The motion of colliders, anchors of friction and the filter, in the steps of one solver.
 
-    Where a step begins (a ``Refresh`` of the terms) colliders move on, the positions of the vertices are kept, and friction
-    anchors them. Where it ends, :meth:`launch_end` keeps vertices out of colliders.
+    At the start of a step, a ``Refresh`` of the terms moves the colliders, stores the positions of the vertices, and sets the
+    anchors of friction. At the end of the step, :meth:`launch_end` moves vertices out of colliders.
 
     Args:
         model: The :class:`warpcloth.model.model.Model` of a scene with colliders.
-        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds its own arrays.
-        h: Step [s].
-        steps_per_frame: Steps a frame.
-        part: Where in a step its forces are taken, from 0, its start, to 1; 0 is that of explicit steps, whose contact is
-            ``bounded``.
-        resting: Whether it is not a solver but an equilibrium, whose rounds are its steps, with h = 0.
+        state: The :class:`warpcloth.core.state.State` of the solver. This object adds its own arrays to it.
+        h: Time step [s].
+        steps_per_frame: Steps per frame.
+        part: The time within a step at which forces are evaluated, from 0 (its start) to 1 (its end). It is 0 for explicit
+            steps, whose contact is ``bounded``.
+        resting: Whether this is for an equilibrium instead of a solver. Its rounds are the steps, and h is 0.
 
     Attributes:
-        terms: The elements of the model, those of contact as steps take them.
-        bounded: Whether contact is that of explicit steps.
+        terms: The elements of the model. Those of contact have rest states of their own.
+        bounded: Whether contact has no logarithm, as in explicit steps.
         part: As given.
-        x_before: Positions where the step began, (N,) [m].
-        poses: Those of the step, a :func:`warpcloth.kernels.contact.colliders.step_poses`.
+        x_before: Positions at the start of the step, (N,) [m].
+        poses: Poses of the colliders in the step, a :func:`warpcloth.kernels.contact.colliders.step_poses`.
         shapes: A :func:`warpcloth.kernels.contact.colliders.shapes`.
-        anchors: Those of friction on each collider that has it, by its index; rows of ``anchor_rows`` (C, N).
-        least: Distance below which no vertex ends a step [m].
+        anchors: The anchors of friction, by the index of each collider with friction. They are rows of ``anchor_rows`` (C, N).
+        least: The smallest distance from a collider at which a vertex may end a step [m].
         faces: :class:`warpcloth.contact.mesh_faces.MeshFaces` that keeps triangles from crossing meshes, or None.
         steps_per_frame: As given.
         notes: :class:`warpcloth.kernels.contact.colliders.FilterNotes`.
-        steps: Steps that the colliders have made, (B,) int32.
-        correction: x − x̃ of the steps with contact (N,) [m], or None for explicit steps; of the effective step ``he`` [s].
-        pushed, kicked: What the filter changed in positions [m] and velocities [m/s] since these were 0, (N,) double precision,
-            after :meth:`note_pushes`.
+        steps: The number of steps so far, (B,) int32.
+        correction: x − x̃ of steps with contact (N,) [m], or None for explicit steps. ``he`` is their effective step [s].
+        pushed, kicked: Sums of what the filter changed in positions [m] and velocities [m/s] since they were last set to 0,
+            (N,) double precision. They exist after :meth:`note_pushes`.
     """
 
     def __init__(self, model, state, h, steps_per_frame, part, resting=False):
@@ -63,7 +63,7 @@ class ColliderSteps:
         declared = model.colliders
         pose_type, self._anchor_type = kernels.pose_types(model.dtype)
         self.shapes = kernels.shapes(model.dtype)()
-        self._friction = model.array(declared.friction, model.dtype)  # whose memory the struct does not keep
+        self._friction = model.array(declared.friction, model.dtype)  # the struct does not keep it alive
         self.shapes.core, self.shapes.radius, self.shapes.friction = declared.core, declared.radius, self._friction
         self._dim, self.poses = (model.copies, len(declared.radius)), kernels.step_poses(model.dtype)()
         for name in ("before", "at", "after"):
@@ -79,7 +79,7 @@ class ColliderSteps:
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
         self._spare, self._reads, self._again = None, False, False
         self.least = FLOOR * declared.distance
-        # Of midpoint forces are those half-way, of others at the end.
+        # Midpoint evaluates forces at the middle of a step, other integrators at its end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
         self.bounded = part == 0.0
         self._move, self._count = model.kernel(kernels.move_colliders, model.dtype), model.kernel(count_step)
@@ -101,7 +101,7 @@ class ColliderSteps:
             self.terms.append(elements if c is None else self._bound(elements, c, state))
 
     def _bound(self, elements, c, state):
-        """The elements of contact or friction with collider c, with rest states of their own."""
+        """Returns the elements of contact or friction with collider c, with rest states of their own."""
         model, declared = self.model, self.model.colliders
         first = all(each.refresh is None or each.collider is None for each in self.terms)
         if elements.term is FRICTION:
@@ -127,7 +127,7 @@ class ColliderSteps:
         return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=refresh, clear=clear)
 
     def _refresh(self, first, launch, model, elements, moment):
-        """Where a step begins: by the first of the terms for all of them, then for each."""
+        """Launches what the start of a step needs. The first of the terms also moves the colliders, once for all terms."""
         if first:
             self.launch_move()
             if self.meshes is not None:
@@ -154,7 +154,7 @@ class ColliderSteps:
 
     @contextmanager
     def reading_anchors(self):
-        """Meanwhile terms that are refreshed leave anchors as they are, which steps then move themselves."""
+        """Within this context, refreshing terms does not change the anchors; the steps themselves do."""
         self._reads = True
         try:
             yield
@@ -162,48 +162,48 @@ class ColliderSteps:
             self._reads = False
 
     def follow(self):
-        """Allocates what terms need to do so."""
+        """Allocates what :meth:`reading_anchors` needs."""
         if self._spare is None:
             self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
 
     def launch_release(self):
-        """Launches the end of all anchors, where nothing is in contact."""
+        """Launches the removal of all anchors, for a step without contact."""
         if self.anchors:
             self.anchor_rows.zero_()
 
     def launch_move(self):
-        """Launches the poses of the step that begins."""
+        """Launches the computation of the poses of colliders at the start of a step."""
         self.model.launch(self._move, self._dim, self._given, [self.poses])
 
     def launch_clear(self, terms, x):
-        """Launches what finds how far the vertices of ``terms`` may move from x̃ in this step before they touch."""
+        """Launches the computation of the distances by which vertices of ``terms`` can move from x̃ before they touch."""
         for elements in terms:
             if elements.clear is not None:
                 kernel = self.model.kernel(find_clear, elements.term, self.model.dtype)
                 self.model.launch(kernel, elements.count, [elements.stencil, elements.rest, x], [elements.clear])
 
     def launch_count(self):
-        """Launches what counts a step."""
+        """Launches an increment of the number of steps."""
         self.model.launch(self._count, self.model.copies, [], [self.steps])
 
     @property
     def drift(self):
-        """By how much the bounds of a collider move on in a step, at most [m]."""
+        """An upper bound on the distance by which a point of a collider moves in a step [m]."""
         return max(collider.centred().most_move for collider in self.model.scene.colliders) / self.steps_per_frame
 
     def note_pushes(self):
-        """Allocates ``pushed`` and ``kicked``, which the filter then keeps; steps that were recorded are recorded again."""
+        """Allocates ``pushed`` and ``kicked``, to which the filter then adds. Graphs must be recorded again."""
         self.pushed, self.kicked = (wp.zeros(self.model.count, dtype=wp.vec3d, device=self.model.device) for _ in range(2))
         self.notes.pushed, self.notes.kicked = self.pushed, self.kicked
 
     def launch_end(self, x, v, move=None):
-        """Keeps vertices that would end in a collider or cross one out of it, in x, v and ``move`` (N,)."""
+        """Moves vertices that would end in a collider, or cross one, out of it; corrects x, v and ``move``, (N,)."""
         model = self.model
         if model.mobility is not None:
             for wanted, array in zip(self._wanted, (x, v), strict=True):
                 wp.copy(wanted, array)
         self._launch_filter(model.inverse_mass, x, v, move, self.notes)
-        if model.mobility is not None:  # those who then end inside are noted like pins
+        if model.mobility is not None:  # vertices that locked axes hold inside are noted like pins
             model.launch(self._hold, model.count, [model.mobility, *self._wanted], [x, v, move, self.notes])
             self._launch_filter(self._fixed, x, v, move, self.notes)
         if self.faces is not None:
@@ -221,10 +221,10 @@ class ColliderSteps:
             given += [self.meshes.motion, self.meshes.lists, model.per_copy]
         model.launch(self._filter, model.count, given, [x, v, move, notes])
 
-    # Of cloth that touches itself, which may hold vertices back in a collider that comes over them.
+    # For self-contact, which can hold vertices back inside a collider that moves onto them.
 
     def end_again(self):
-        """Says that these methods are used, the last of which then counts the step."""
+        """Prepares :meth:`launch_out` and :meth:`launch_inside`. From now on the latter counts the step."""
         device, model = self.model.device, self.model
         self._again, self._unread = True, kernels.FilterNotes()
         self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
@@ -232,23 +232,25 @@ class ColliderSteps:
         self._unread.inside = wp.zeros(self._dim, dtype=wp.int64, device=device)
 
     def launch_out(self, x, v):
-        """Moves vertices in x and v as :meth:`launch_end`, and notes nothing."""
+        """Moves vertices in x and v as :meth:`launch_end` does, and notes nothing."""
         self._launch_filter(self.model.inverse_mass, x, v, None, self._unread)
 
     def launch_inside(self, x, v):
-        """Notes vertices that colliders have come over in the step, and changes nothing; the step is over."""
+        """Notes vertices that are inside colliders at the end of the step, and counts the step. It does not move them."""
         self._launch_filter(self._fixed, x, v, None, self.notes)
         self.launch_count()
 
     @property
     def share(self):
-        """The share of the moves of free vertices in all steps that were cut short, (B,)."""
+        """The fraction of the moves of free vertices, in all steps, that the filter cut short, (B,)."""
         free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
         return self.notes.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
 
     def inside(self):
-        """The first vertex that ended a step inside each collider: tuples of its copy, collider, step, index, and the collider
-        that held it back, None for a vertex that is not free, or CLOTH for one that other cloth held back."""
+        """The first vertex that ended a step inside each collider: (copy, collider, step, vertex, what held it back).
+
+        What held it back is the index of another collider, CLOTH for other cloth, or None for a vertex that is not free.
+        """
         colliders, found, n = self._dim[1], [], self.model.per_copy
         free = self.model.inverse_mass.numpy() > 0.0 if self._again else np.zeros(self.model.count, dtype=bool)
         for (copy, c), value in np.ndenumerate(self.notes.inside.numpy()):
@@ -260,6 +262,6 @@ class ColliderSteps:
         return found
 
     def start_again(self):
-        """Forgets the steps that an integrator made to find its past."""
+        """Clears counts and anchors after the steps that an integrator makes to find its past state."""
         for array in (self.steps, self.notes.cut, self.notes.inside, *self.anchors.values()):
             array.zero_()

@@ -1,4 +1,4 @@
-"""The filter, which keeps cloth apart from itself in the steps of a solver and in its iterates."""
+"""The filter of self-contact: it shortens moves that would cross, in the steps of a solver and in its iterates."""
 
 import warp as wp
 
@@ -6,29 +6,30 @@ from ..kernels.contact import self_filter, self_planes
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 
-# Rounds of the filter: planes are set anew in at most NEAR_ROUNDS, as long as they cut more than SHARE of the vertices; a way
-# that is longer than one list allows is walked in at most FAR_ROUNDS.
+# The filter works in rounds. While planes cut the moves of more than SHARE of the vertices, they are found again, in at most
+# NEAR_ROUNDS rounds. A move that is longer than one list of pairs allows is made in at most FAR_ROUNDS rounds.
 SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
-# The longest way of a vertex in a round, relative to the common motion, over the skin. It may have gone as far since the list
-# was made, and so may the other vertex: both together come nearer by at most the skin.
+# The longest move of a vertex in a round, relative to the common motion, over the skin. The vertex may have moved as far since
+# the list was made, and so may the other side of a pair: together they approach by at most the skin.
 WAY = 0.25
-# An iterate finds the areas of contact anew where planes left less than half of a move on the way to it, at most RENEWALS times
-# in a step. Then its energy stays as it is.
+# The areas of contact are found again at an iterate if planes left less than half of some move on the way to it, at most
+# RENEWALS times in a step. After that the energy no longer changes within the step.
 RENEWALS = 32
-# Vertices that cloth holds back in a collider are let out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
-# keeps a gap to other cloth of LEFT times the contact distance, or that of before if it was less.
+# Vertices that cloth holds back in a collider are moved out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
+# keeps a gap of LEFT times the contact distance to other cloth, or its present gap if that is smaller.
 OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
 
 
 class SelfFilter:
-    """Moves cloth as far as the pairs of a :class:`warpcloth.contact.self_steps.SelfSteps` stay apart.
+    """Moves cloth only as far as the pairs of a :class:`warpcloth.contact.self_steps.SelfSteps` stay apart.
 
     Args:
         contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
-        moves_together: Whether moves are relative to their mean, as nothing is pinned.
+        moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
+            an axis and there are no colliders.
     """
 
     def __init__(self, contact, colliders):
@@ -58,7 +59,7 @@ class SelfFilter:
         self._count = model.kernel(count_step)
 
     def hold(self, room):
-        """Allocates room for so many pairs."""
+        """Allocates arrays for ``room`` pairs."""
         run = self._contact.declared.crossing_start == "run"
         self._open = wp.zeros(room, dtype=wp.int32, device=self.model.device) if run else None
 
@@ -66,18 +67,18 @@ class SelfFilter:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self):
-        """Notes where a step begins how often colliders have cut moves."""
+        """Stores, at the start of a step, how many moves colliders have cut so far."""
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
     def launch_end(self, x, v, move=None):
-        """Walks from where the step began to x as far as pairs stay apart; v and ``move`` (N,) follow.
+        """Moves the cloth from its start of the step towards x, as far as pairs stay apart; corrects x, v and ``move``, (N,).
 
-        After iterates that stay apart, the walk starts at the last of them. But this may be inside a collider, out of which the
-        filter of colliders has moved x: then too the walk starts where the step began, since that way is outside.
+        If the iterates of the solver stay apart, the move starts at the last iterate. But that may be inside a collider, out of
+        which the filter of colliders has moved x. Then the move starts at the start of the step, which is outside.
         """
         model = self.model
-        if self._contact.friction is not None and self._iterates:  # whose areas may be those of a list that was made on the way
+        if self._contact.friction is not None and self._iterates:  # its areas may be those of a list made within the step
             self._contact.friction.launch_contact(self._contact.pairs, self._contact.begun)
         if self._cut_before is not None:
             colliders = self._colliders
@@ -103,12 +104,14 @@ class SelfFilter:
             self._contact.tangles.launch_free(x)
 
     def launch_fresh(self, x, launch, active=None):
-        """Calls ``launch`` with x if a vertex, of a copy that is ``active`` or of any, has moved so far since the last list
-        that the next walk might miss a pair."""
+        """Calls ``launch`` with x if the next round might miss a pair, as a vertex has moved far since the last list.
+
+        Copies that are not ``active`` (B,) do not count; None means that all do.
+        """
         wp.capture_if(self._contact.proximity.moved(x, WAY, active), launch, x=x)
 
     def _walk(self, x):
-        """Moves x towards the target as far as pairs stay apart. On a long way lists are made anew."""
+        """Moves x towards the target as far as pairs stay apart. On a long move pairs are listed again."""
         self._rounds.zero_()
         self._cuts.zero_()
         self._walking.fill_(1)
@@ -142,7 +145,7 @@ class SelfFilter:
         self._launch(self_filter.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
-        """Finds the vertices that cloth holds back in a collider that has come over them, and where they would be outside."""
+        """Finds the vertices that cloth holds back inside a collider, and the positions outside to which they must move."""
         model, out = self.model, self._other
         wp.copy(out, x)
         self._colliders.launch_out(out, self._from)
@@ -151,7 +154,7 @@ class SelfFilter:
         self._launch(self_filter.find_held, model.count, given, [self._mobile, self._within])
 
     def _launch_let_out(self, x):
-        """Walks on to where the vertices that are held back are outside, and other cloth makes way for them."""
+        """Moves vertices that are held back towards the outside, and other cloth out of their way."""
         model, out = self.model, self._other
         self.launch_fresh(x, self._contact.launch_list)
         self._contact.launch_sides(x)
@@ -164,7 +167,7 @@ class SelfFilter:
         self._launch_held(x)
 
     def _launch_planes(self, x, target, direction):
-        """Finds the share of each wanted move that planes leave."""
+        """Finds the fraction of each move, to ``target`` or along ``direction``, that planes allow."""
         model, wanted = self.model, [x, target, direction]
         if self.moves_together:
             self._launch(self_planes.common_move, model.copies, [*wanted, model.per_copy], [self._common])
@@ -172,7 +175,7 @@ class SelfFilter:
         self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
         gap, open = self._contact.begun.gap, None
         if self._contact.tangles is not None:
-            gap, open = None, self._open  # gaps are infinite where a pair is left out of contact
+            gap, open = None, self._open  # the gap of a pair that is left out of contact is infinite
             self._contact.tangles.launch_open(self._contact.pairs.stencils, self._contact.pairs.counts, open)
         given = [self._contact.pairs, gap, open, *wanted, self._common, self._ways]
         given += [model.per_copy, FLOOR * self._contact.declared.distance]
@@ -180,10 +183,10 @@ class SelfFilter:
         if target is not None and self._colliders is not None and self._colliders.faces is not None:
             self._colliders.faces.launch_least(x, target, self._share)
 
-    # Of methods whose iterates base + d stay apart too.
+    # For methods whose iterates base + d stay apart too.
 
     def launch_first(self, base, d):
-        """d such that base + d is as far on the way from where the step began to base as pairs stay apart."""
+        """Sets d so that base + d lies between the start of the step and base, as far along as pairs stay apart."""
         self._blocked.zero_()
         self._renewed.zero_()
         wp.copy(self._target, base)
@@ -191,7 +194,7 @@ class SelfFilter:
         self._add(self._contact.x_before, base, -1.0, d)
 
     def iterates(self):
-        """Says that these methods are used."""
+        """Prepares the methods below for a solver whose iterates stay apart."""
         self._iterates, model = True, self.model
         self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)
         self._longest, self._ones = model.scalars(), wp.ones(model.count, dtype=model.dtype, device=model.device)
@@ -203,11 +206,11 @@ class SelfFilter:
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 
     def launch_relist(self, base, d, active, launch):
-        """Lists the pairs at base + d of copies that are ``active`` (B,), and launches ``launch``, if vertices have moved far
-        since the last list.
+        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if vertices have moved far enough.
 
-        Areas alone are found anew if planes have cut many moves of the last direction. Layers that a step presses flat leave
-        pairs of crossing edges hardly an area, and so nothing but planes between them where they bend.
+        Otherwise, if planes have cut moves of the last direction, it finds the areas alone again. In layers that a step presses
+        flat, pairs of crossing edges have hardly any area; where the layers then bend, planes alone would keep these edges
+        apart. In both cases it calls ``launch``.
         """
         model, x = self.model, self._contact.x_before
         self._add(base, d, 1.0, x, active)
@@ -229,10 +232,11 @@ class SelfFilter:
         wp.capture_if(self._renew, renew, x=x)
 
     def launch_limit(self, sums, gradient, preconditioner, right, direction):
-        """Cuts the direction from the positions of :meth:`launch_relist` short, so that pairs stay apart along all of it.
+        """Shortens the direction from the positions of :meth:`launch_relist`, so that pairs stay apart all along it.
 
-        A direction longer than lists allow is shortened as a whole: cut at each vertex alone it would stretch stiff cloth. Of a
-        copy where energy does not fall along what is left it is P·right, with the preconditioner P, cut short likewise.
+        A direction that is longer than the list of pairs allows is scaled as a whole: to cut it at each vertex would stretch
+        stiff cloth. In copies where the energy does not decrease along the result, the direction becomes P·right, with the
+        preconditioner P, shortened in the same way.
         """
         model, N = self.model, self.model.count
         self._launch(self_filter.precondition, N, [preconditioner, right], [self._other])

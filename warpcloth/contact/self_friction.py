@@ -1,4 +1,4 @@
-"""Friction of cloth with itself in the steps of a solver."""
+"""Friction of self-contact in the steps of a solver."""
 
 import numpy as np
 import warp as wp
@@ -8,30 +8,30 @@ from ..kernels.contact import friction_sweeps
 from ..kernels.contact import self_friction as kernels
 from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
 
-# Rows of the arrays of a list for each pair that there is room for.
+# Rows of each array of a list, per pair of its capacity.
 ROWS = {"stencils": 1, "corners": 4, "slips": 1}
 LISTS = "stencils", "counts", "first", "corners"
 
 
 def acting_sizes(model, room, corners=True):
-    """Sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, with corners or not."""
+    """Returns the sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, by name."""
     sizes = {"acting": room, "number": 1}
     return sizes | {"corner_counts": model.count, "first": model.count + 1, "corners": 4 * room} if corners else sizes
 
 
 class Slips:
-    """Pairs of a step, and how far friction is stretched in each where it ends: what a step passes to the next.
+    """Pairs of a step, and the stretch of the friction spring of each at its end, which the next step takes over.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        room: Pairs that there is room for.
+        room: The number of pairs for which it allocates memory.
 
     Attributes:
         room: As given.
         pairs: A :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, without distances.
         slips: (room,), see :func:`warpcloth.kernels.contact.self_friction.end_friction`.
-        relisted: (B,) int32, whether pairs were listed again within the step.
-        grow: A function of a number of pairs that makes room for as many, by default that of this object alone.
+        relisted: (B,) int32, 1 if pairs were listed again within the step.
+        grow: A function that takes a number of pairs and allocates memory for them, by default for this object alone.
     """
 
     def __init__(self, model, room):
@@ -41,7 +41,7 @@ class Slips:
         self.hold(room)
 
     def hold(self, room):
-        """Allocates room for so many pairs, and keeps those that are there."""
+        """Allocates memory for ``room`` pairs, and keeps the pairs that it has."""
         before, self.room = dict(self._arrays), room
         for (name, rows), dtype in zip(ROWS.items(), (wp.vec4i, wp.int32, wp.vec4d), strict=True):
             self._arrays[name] = wp.zeros(rows * room, dtype=dtype, device=self.model.device)
@@ -53,7 +53,7 @@ class Slips:
             setattr(self.pairs, name, self._arrays[name])
 
     def launch_lists(self, pairs, names):
-        """Launches copies of lists of other pairs, with as much room."""
+        """Copies the arrays ``names`` of other pairs, which have the same capacity."""
         for name in names:
             wp.copy(getattr(self.pairs, name), getattr(pairs, name))
 
@@ -66,14 +66,14 @@ class Slips:
         return other
 
     def assign(self, other):
-        """Copies the values of another one of the same model."""
+        """Copies the values of another object of the same model."""
         if other.room > self.room:
             self.grow(other.room)
         for name, array in other._arrays.items():
             wp.copy(self._arrays[name], array, count=len(array))
 
     def to_host(self):
-        """Returns copies of what the arrays hold, by name; the room does not matter to them."""
+        """Returns copies of the arrays, by name, without unused rows."""
         found = {name: array.numpy() for name, array in self._arrays.items()}
         count, corners = int(found["counts"].sum()), int(found["first"][-1])
         sizes = {"stencils": count, "slips": count, "corners": corners}
@@ -91,19 +91,19 @@ class Slips:
 
 
 class SelfFriction:
-    """Forces of friction between near parts of cloth, and how far they are stretched, in the steps of one solver.
+    """Friction between parts of cloth in contact, and the stretch of its springs, in the steps of one solver.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        slips: :class:`Slips`, which belong to the state of the solver.
+        slips: :class:`Slips`, a part of the state of the solver.
         steps: Steps since the start of each copy, (B,) int32.
         friction: μ.
-        bounded: Whether contact is that of explicit steps.
+        bounded: Whether contact has no logarithm, as in explicit steps.
 
     Attributes:
-        pairs: Those of the step, a :func:`warpcloth.kernels.contact.self_pairs.near_pairs` without distances.
+        pairs: The pairs of the step, a :func:`warpcloth.kernels.contact.self_pairs.near_pairs` without distances.
         rubbed: :class:`warpcloth.kernels.contact.self_friction.RubbedPairs`.
-        start: Positions where the step began, (N,) [m].
+        start: Positions at the start of the step, (N,) [m].
     """
 
     def __init__(self, model, slips, steps, friction, bounded):
@@ -119,7 +119,7 @@ class SelfFriction:
         self.hold(slips.room)
 
     def hold(self, room):
-        """Arrays of so many pairs; what is kept stays as it is."""
+        """Allocates arrays for ``room`` pairs. The slips of the last step are kept."""
         self._kept.hold(room)
         self._step.hold(room)
         self.pairs = self._step.pairs
@@ -143,7 +143,7 @@ class SelfFriction:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self, pairs, begun, x):
-        """Where a step begins at x: takes the pairs of the list, with their n, w and kA, and what is kept of the last step."""
+        """At the start of a step, at x: takes the listed pairs, their n, w and kA, and the slips of the last step."""
         model, kept = self.model, self._kept
         wp.copy(self.start, x)
         self._step.launch_lists(pairs, ("stencils", "counts"))
@@ -160,31 +160,31 @@ class SelfFriction:
             self._launch(friction_sweeps.count_rubbing, model.count, [self.pairs, self.rubbed], [self._rubbing])
 
     def launch_release(self):
-        """Launches the end of all that is kept, where a step had no pairs."""
+        """Launches the removal of all slips, for a step without pairs."""
         self._kept.pairs.first.zero_()
 
     def launch_relisted(self, copies):
-        """Notes that pairs, and so their areas, are others within the step, in these copies (B,) int32."""
+        """Notes in which ``copies``, (B,) int32, pairs or areas have changed within the step."""
         self.model.launch(kernels.note_relisted, self.model.copies, [copies], [self._step.relisted])
 
     def launch_contact(self, pairs, begun):
-        """Takes kA of the contact of the step from another list of pairs, which may have been made within it."""
+        """Takes kA from another list of pairs, which may have been made within the step."""
         wp.copy(self._kept.relisted, self._step.relisted)
         self._launch(kernels.set_contact, self._kept.room, [self.pairs, pairs, begun], [self.rubbed])
 
     def launch_forces(self, x, correction):
-        """Finds the forces at x, or x + correction, which the methods below add up."""
+        """Finds the forces of each pair at x, or at x + correction. The methods below add them up."""
         given = [self.pairs, self.rubbed, self.start, x, correction]
         self._launch(kernels.find_friction, self._kept.room, given, [self._forces])
 
     def launch_acting(self, x, out):
-        """Sets out (N,) to ∂U/∂x where the step that ended at x took its forces: explicit ones where it began, others at x."""
+        """Sets out (N,) to ∂U/∂x where the step evaluated its forces: at its start if it is explicit, else at its end x."""
         self.launch_forces(self.start if self._bounded else x, None)
         out.zero_()
         self.add_gradient(out)
 
     def launch_end(self, x):
-        """Keeps the pairs of the step, and how far they are stretched at x."""
+        """Stores the pairs of the step and the stretch of their springs at x, for the next step."""
         self._kept.slips.zero_()
         given = [self.pairs, self.rubbed, self.start, x]
         self._launch(kernels.end_friction, self._kept.room, given, [self._kept.slips])
@@ -199,7 +199,10 @@ class SelfFriction:
         self._launch(kernels.sum_friction, self.model.count, [self.pairs, self.rubbed, self._forces], [out])
 
     def add_diagonal(self, diagonal, values):
-        """Adds as :meth:`warpcloth.contact.self_forces.SelfForces.add_diagonal`, and the next two as their namesakes there."""
+        """Does the same for friction as :meth:`warpcloth.contact.self_forces.SelfForces.add_diagonal`.
+
+        ``add_products`` and ``rows`` also do what the methods of these names do there.
+        """
         given = [self.pairs, self.model.inverse_mass, diagonal, self.rubbed, self._forces]
         self._launch(kernels.add_friction_diagonal, self.model.count, given, [values])
 
@@ -208,12 +211,12 @@ class SelfFriction:
         self._launch(kernels.add_friction_products, self.model.count, given, [q])
 
     def rows(self):
-        """Returns stencils, w, directions and second derivatives of the rows of all pairs that touch, two a pair."""
+        """Returns stencils, w, directions and second derivatives of the rows of all pairs with friction, two rows a pair."""
         count = min(int(self.pairs.counts.numpy().sum()), self._kept.room)
         rubs = np.flatnonzero(self.rubbed.limit.numpy()[:count])
         found = self.pairs.stencils, self.rubbed.weights, self.rubbed.normal, self._forces.direction
         stencils, w, n, u = (array.numpy()[rubs] for array in found)
-        still = ~u.any(axis=1)  # any direction in the plane is one along which it is stretched
+        still = ~u.any(axis=1)  # without stretch, any direction in the plane will do
         axis = np.eye(3)[np.abs(n).argmin(axis=1)]
         u = np.where(still[:, None], np.cross(n, axis), u)
         u /= np.linalg.norm(u, axis=1)[:, None]
@@ -226,7 +229,7 @@ class SelfFriction:
         )
 
     def sweeps(self, in_turn):
-        """Prepares as :meth:`warpcloth.contact.self_forces.SelfForces.sweeps`; :meth:`launch_sweep` moves as there."""
+        """Prepares sweeps for :meth:`launch_sweep`, as :meth:`warpcloth.contact.self_forces.SelfForces.sweeps` does."""
         model, key = self.model, (self.model.dtype, self.model.mobility is not None)
         if in_turn and model.device.is_cpu:
             self._sweep = model.kernel(friction_sweeps.sweep_friction, *key)

@@ -1,4 +1,4 @@
-"""Contact of cloth with itself in the steps of a solver: the pairs that are near where a step begins."""
+"""Self-contact in the steps of a solver: the pairs that are near at the start of a step."""
 
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -19,22 +19,23 @@ from .self_forces import SelfForces
 from .self_friction import SelfFriction, Slips, acting_sizes
 from .self_start import check_reset, check_start
 
-# The skin, over the longest edge of the rest shape. Pairs are listed that are nearer than the contact distance plus the skin.
-# It is more than 0.29: an edge that goes through a triangle with sides of at most 1 is nearer than that to one of them. And it
-# is less than 0.5, the height of a right-angled triangle on its longest side if that is 1, so that a flat grid has no pairs.
+# The skin, over the longest edge of the rest shape. All pairs nearer than the contact distance plus the skin are listed. The
+# skin must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one of them. It
+# must be below 0.5, so that a flat grid has no pairs: a right-angled triangle with a longest side of 1 has that height.
 SKIN = 0.35
-# The least skin, over the contact distance. While a list is kept, two parts come nearer by up to half of the skin, and areas
-# depend on pairs up to a quarter of the contact distance (SHARING) farther apart than it: else they would depend on its age.
+# The smallest skin, over the contact distance. While a list is kept, two parts approach by up to half of the skin. Areas depend
+# on pairs that are up to a quarter (SHARING) of the contact distance farther apart than it. With a smaller skin areas would
+# depend on the age of the list.
 THICK = 0.5
 
 
 class TooNear(NamedTuple):
-    """The first frame in which cloth is nearer to itself than float32 can tell apart; frames are stored in float32.
+    """The first frame with a gap in cloth that float32, in which frames are stored, can hardly resolve.
 
     Attributes:
-        copy: Index of its copy.
+        copy: Index of the copy.
         frame: Index of the frame.
-        vertex: Index of a vertex there, in the order of the model, within the copy.
+        vertex: Index of a vertex of the pair, in the order of the model, within the copy.
     """
 
     copy: int
@@ -43,13 +44,13 @@ class TooNear(NamedTuple):
 
 
 class PinHeld(NamedTuple):
-    """The first pin that cloth held back, as the filter let it go on no further.
+    """The first pin that the filter of self-contact stopped on its way.
 
     Attributes:
-        copy: Index of its copy.
-        frame: The frame in which, or before which, it was held back first.
+        copy: Index of the copy.
+        frame: The frame whose steps held it back first.
         vertex: Its index in the order of the model, within the copy.
-        farthest: By how much cloth held back a pin at most, at the end of any step so far [m].
+        farthest: The largest distance of a pin from its prescribed position at the end of a step so far [m].
     """
 
     copy: int
@@ -61,15 +62,15 @@ class PinHeld(NamedTuple):
 class SelfSteps:
     """Pairs of near parts of cloth in the steps of one solver, with their forces and the filter.
 
-    Where a step begins, :meth:`launch_begin` lists the pairs that are near and fixes the areas of their contact. Where it ends,
-    the filter keeps them apart.
+    At the start of a step, :meth:`launch_begin` lists the near pairs and computes the areas of their contact, which stay
+    constant in the step. At its end, the filter keeps the pairs apart.
 
     Args:
         model: The :class:`warpcloth.model.model.Model` of a scene with self-contact.
-        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds its own arrays.
-        h: Step [s].
-        steps_per_frame: Steps a frame.
-        bounded: Whether contact is that of explicit steps, without the logarithm.
+        state: The :class:`warpcloth.core.state.State` of the solver. This object adds its own arrays to it.
+        h: Time step [s].
+        steps_per_frame: Steps per frame.
+        bounded: Whether contact has no logarithm, as in explicit steps.
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
@@ -78,14 +79,14 @@ class SelfSteps:
         filter: :class:`warpcloth.contact.self_filter.SelfFilter`.
         pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
         begun: Normals, gaps, weights and areas of the pairs, :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
-        x_before: Positions where the step began, (N,) [m].
+        x_before: Positions at the start of the step, (N,) [m].
         begun_at: Positions at which the gaps of ``begun`` were found, (N,) [m].
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
-        lists: How many lists of pairs were made, (B,) int32, the same for all copies.
-        listed: Whether the last list has pairs, (1,) int32.
-        tangles: :class:`warpcloth.contact.tangles.Tangles` of a start at which cloth crosses or touches cloth, else None.
+        lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
+        listed: 1 if the last list has pairs, else 0, (1,) int32.
+        tangles: :class:`warpcloth.contact.tangles.Tangles` if cloth crosses or touches cloth at the start, else None.
         friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
-        stale: Whether lists have got more room outside of steps, so that what was recorded must be recorded again.
+        stale: Whether the capacity of lists has grown outside of steps, so that graphs must be recorded again.
     """
 
     def __init__(self, model, state, h, steps_per_frame, bounded, colliders):
@@ -138,7 +139,7 @@ class SelfSteps:
         """Refuses a reset of copies in ``mask`` (B,) to positions x (B·n, 3) at which cloth crosses or nearly touches cloth.
 
         Returns:
-            Whether lists have got more room, so that what was recorded must be recorded again.
+            Whether the capacity of lists has grown, so that graphs must be recorded again.
 
         Raises:
             ValueError: Naming the first pair.
@@ -148,7 +149,7 @@ class SelfSteps:
         return len(self.pairs.stencils) > before
 
     def at_start(self):
-        """U [J] at the start, and how many pairs touch there times ½Σ(r − d)² [m²], both (B,)."""
+        """Returns, at the start, U [J] and the number of pairs that touch times ½Σ(r − d)² [m²], both (B,)."""
         x, energy = self.model.positions, self.model.scalars()
         with self.looking():
             self.launch_begin(x)
@@ -163,7 +164,7 @@ class SelfSteps:
 
     @contextmanager
     def looking(self):
-        """Leaves the state as it was, whatever is listed meanwhile."""
+        """Restores the state at the end of this context, whatever was listed within it."""
         kept = [wp.clone(array) for array in self._carried]
         try:
             yield
@@ -172,7 +173,7 @@ class SelfSteps:
                 wp.copy(array, before)
 
     def _hold(self):
-        """Arrays of as many pairs as the list has room for."""
+        """Allocates arrays for as many pairs as the list can hold."""
         found, device = self.proximity, self.model.device
         capacity = len(found.stencils)
 
@@ -191,13 +192,13 @@ class SelfSteps:
         self.filter.hold(capacity)
 
     def list_corners(self):
-        """Says that kernels will sum over the pairs of each vertex, for which its corners are listed where a step begins."""
+        """Prepares the lists of the corners of pairs at each vertex, for kernels that sum over the pairs of a vertex."""
         if not self._corners:
             self._corners = True
             self._hold()
 
     def grow(self):
-        """Makes room for the pairs that did not fit; what was recorded must be recorded again.
+        """Grows the lists for the pairs that did not fit. Graphs must then be recorded again.
 
         Raises:
             Stopped: There is no memory for them.
@@ -208,7 +209,7 @@ class SelfSteps:
             raise Stopped(str(error)) from None
 
     def grow_to(self, pairs):
-        """Makes room for half as many pairs more than these."""
+        """Grows the lists to 1.5 times this number of pairs."""
         self.proximity.grow(pairs)
         self._hold()
         if self.friction is not None:
@@ -220,7 +221,7 @@ class SelfSteps:
 
     @property
     def overflowed(self):
-        """Whether a list since this was last asked did not have room for all pairs; the host reads it."""
+        """Whether the lists so far had more pairs than their capacity. The host reads the device."""
         most = int(self._most.read().max())
         if most > len(self.pairs.stencils):
             self._wanted = most
@@ -229,23 +230,23 @@ class SelfSteps:
 
     @property
     def share(self):
-        """The share of the moves of free vertices in all steps that were cut short, (B,)."""
+        """The fraction of the moves of free vertices, in all steps, that the filter cut short, (B,)."""
         free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
         return self.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
 
     @property
     def most(self):
-        """The largest number of pairs in any list of the steps so far, of all copies."""
+        """The largest number of pairs in a list so far, over all copies."""
         return int(self._most.read().max())
 
     @property
     def least_gap(self):
-        """The least distance of a pair in any frame so far, as stored in float32, (B,) [m]; infinite where none was listed."""
+        """The smallest distance of a pair in any frame so far, as stored in float32, (B,) [m]; infinite without pairs."""
         return _gaps(self._notes.nearest)
 
     @property
     def too_near(self):
-        """A :class:`TooNear` of each copy in which a pair came nearer than 4 units in the last place of float32 coordinates."""
+        """A :class:`TooNear` for each copy with a gap below 4 units in the last place of float32 coordinates."""
         found, n = [], self.model.per_copy
         for copy, value in enumerate(self._notes.too_near.numpy()):
             if value:
@@ -254,7 +255,7 @@ class SelfSteps:
 
     @property
     def pins_held(self):
-        """A :class:`PinHeld` of each copy in which cloth has held back a pin."""
+        """A :class:`PinHeld` for each copy in which cloth has held back a pin."""
         found, n, farthest = [], self.model.per_copy, self.held.farthest.numpy()
         for copy, value in enumerate(self.held.first.numpy()):
             if value:
@@ -263,7 +264,7 @@ class SelfSteps:
         return found
 
     def in_frame(self):
-        """Of the last :meth:`launch_begin`, for each copy (B,): pairs listed, pairs in contact, and the least gap [m]."""
+        """Returns the pairs listed, the pairs in contact and the least gap [m] at the last :meth:`launch_begin`, each (B,)."""
         model = self.model
         if self._counted is None:
             self._counted = model.kernel(gap_notes.count_pairs, model.dtype)
@@ -273,7 +274,7 @@ class SelfSteps:
         return *counts.numpy().T, _gaps(nearest)
 
     def start_again(self):
-        """Forgets the steps that an integrator made to find its past, and the list, as a reset does."""
+        """Clears counts and the list, after a reset and after the steps in which an integrator finds its past state."""
         for array in (self.cut, self.steps, self.held.first, self.held.farthest, *self._carried):
             array.zero_()
         if self.tangles is not None:
@@ -283,9 +284,9 @@ class SelfSteps:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self, x):
-        """Lists the pairs near x, (N,), where a step begins.
+        """Lists the pairs near x, (N,), at the start of a step.
 
-        Keeps an earlier list as long as the walk at the end of this step cannot miss a pair with it.
+        It keeps an earlier list as long as the filter at the end of this step cannot miss a pair with it.
         """
         wp.copy(self.x_before, x)
         self.filter.launch_begin()
@@ -305,7 +306,7 @@ class SelfSteps:
         self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [self._notes])
 
     def launch_begin_at_start(self, x, longest):
-        """Lists all pairs near x (N,) where a run starts, and makes room for them; ``longest`` [m] is the longest edge."""
+        """Lists all pairs near x (N,) at the start of a run, and grows the lists. The longest edge is ``longest`` [m]."""
         self.proximity.set_skin(max(self.skin, SKIN * longest))
         self.launch_begin(x)
         while self.overflowed:
@@ -314,16 +315,16 @@ class SelfSteps:
         self.proximity.set_skin(self.skin)
 
     def launch_list(self, x):
-        """Lists the pairs and notes their number: at x in the copies that have moved. A list at ``found`` does not count again.
+        """Lists the pairs again at x, in copies that have moved, and notes their number. It does not count a list at ``found``.
 
-        Follows :meth:`warpcloth.contact.proximity.Proximity.moved`.
+        Call it after :meth:`warpcloth.contact.proximity.Proximity.moved`.
         """
         self.proximity.launch_moved(x)
         given = [self.proximity.counts, int(x is not self.proximity.found)]
         self.model.launch(self_pairs.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
 
     def launch_areas(self, x, copies=None):
-        """Fixes the side and the area of each listed pair, and so which are acting, in all or some ``copies`` (B,) int32."""
+        """Computes the side and the area of each listed pair, and which pairs act, in all or some ``copies`` (B,) int32."""
         count = len(self.pairs.stencils)
         self.launch_sides(x, copies)
         if self.tangles is not None:
@@ -337,7 +338,7 @@ class SelfSteps:
             self._launch(self_pairs.sort_corners, self.model.count, [], [self.pairs])
 
     def launch_sides(self, x, copies=None):
-        """Fixes the side of each listed pair, and its gap: in ``copies`` at x, in the others where they were fixed before."""
+        """Computes the side and the gap of each listed pair: in ``copies`` at x, in others where the last call did."""
         if copies is None:
             wp.copy(self.begun_at, x)
         else:
@@ -345,12 +346,12 @@ class SelfSteps:
         self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), [self.pairs, self.begun_at], [self.begun])
 
     def relist(self, x):
-        """Lists the pairs at x of copies that have moved, and fixes their sides and gaps, but no areas."""
+        """Lists the pairs again at x, in copies that have moved, and computes their sides and gaps, but no areas."""
         self.launch_list(x)
         self.launch_sides(x, self.proximity.copies)
 
 
 def _gaps(nearest):
-    """Distances [m] by their inverses, an array on the device."""
+    """Returns distances [m], given an array of their inverses on the device."""
     with np.errstate(divide="ignore"):
         return 1.0 / nearest.numpy()
