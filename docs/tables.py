@@ -49,7 +49,7 @@ def solvers():
         else:
             takes += "; infinite stiffness too" + (f", but not for {listed(hard)}" if hard else "")
         rows.append([f"`{record.__name__}`", record.facts.method, takes])
-    return table(("Solver", "Method", "Takes"), rows)
+    return table(("Solver", "Method", "Supports"), rows)
 
 
 def methods():

@@ -49,7 +49,7 @@ class Explicit(Step):
     needs = (FINITE,)
     limited = locks = touches_itself = True
     facts = Facts(
-        method="symplectic Euler, or forward Euler; a step above the stability limit is refused",
+        method="symplectic or forward Euler; refuses steps above the stability limit",
         suits="cloth so soft that 100 to 1000 steps a frame suffice: no other method is then cheaper or more accurate",
         weakness=(
             "diverges if h is above 2/ω_max (measured to 0.03 %); stiff cloth needs too many steps: `cantilever` 5700 a frame"

@@ -71,7 +71,7 @@ class ProjectiveDynamics(ImplicitStep):
     touches_itself = True
     residual = Residual(UNBALANCED, "times its value at the start of the step")
     facts = Facts(
-        method="implicit steps by local projections and global solves with a constant matrix, optionally accelerated",
+        method="implicit steps by local projections and global solves with a constant matrix",
         suits="animation with few iterations; stretches little from the first iteration on",
         weakness=(
             "motion perpendicular to stiff springs lags: each iteration multiplies its error by 1 − μ, where μ is only 0.008 "
