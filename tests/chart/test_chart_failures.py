@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from support.rows import slow_but
 from warpcloth.chart.failures import plot_failure
 from warpcloth.cli import main
 from warpcloth.lab import cotangents, crossing, friction, isometry, locking, physics, rank, tunnelling
@@ -45,6 +46,7 @@ def test_an_imposed_cylinder_costs_its_chords(device):
     assert ((cost > 1.0) == (x > 1.0)).all()
 
 
+@pytest.mark.slow
 def test_irregular_nets_lose_curvature_where_theory_says(device):
     """Of a sheet at rest when rolled up: nothing is lost below κ²h⁴K/576D = 1e-2, and by regular nets nowhere.
 
@@ -64,6 +66,7 @@ def test_irregular_nets_lose_curvature_where_theory_says(device):
         assert len(soft) == 3 and np.ptp(soft) < 0.15 * soft.max() and (np.diff(stiff) < 0.0).all()
 
 
+@pytest.mark.slow
 def test_a_cantilever_locks_apart_from_its_pattern(device):
     """Jittered nets are stiffer than D while the membrane is soft, which refinement leaves; locking falls with it."""
     stiffness = {}
@@ -82,6 +85,7 @@ def test_a_cantilever_locks_apart_from_its_pattern(device):
     assert stiffness["jittered", 6, "1e8"] > 1.2 * stiffness["equilateral", 6, "1e8"]
 
 
+@pytest.mark.slow
 def test_locking_alone_is_over_the_same_net_with_a_soft_membrane(device):
     points = locking.cantilever("alternating", 8, device)
     x, value = of(points, "apparent", "alternating")
@@ -271,6 +275,7 @@ def test_contact_alone_passes_where_theory_says(device):
     assert all(p["value"] is None and p["series"] == "refused" and "stable below 0.0062958 s" in p["reason"] for p in points)
 
 
+@pytest.mark.slow
 def test_the_filter_cuts_what_theory_says(device):
     """Explicit steps where the energy gives way, implicit ones where the minimiser of a step is nearer than r/1000."""
     assert shares("explicit", "filter", 1e-3, [0.28, 0.35, 50.0], device) == ([0.0, 100.0, 100.0], {"stays outside"})
@@ -289,6 +294,7 @@ def tunnels(device):
         return failure_chart("tunnelling", device, store=Store(), executor=executor)
 
 
+@pytest.mark.slow
 def test_no_solver_lets_a_sheet_pass(tunnels):
     """At 1 and 100 m/s, of steps to 1/24 s, a box of 1 µm and triangles."""
     kept = [row for row in tunnels["rows"] if "filter" in row["panel"]]
@@ -320,7 +326,7 @@ def test_kinds_of_motion():
 slow = pytest.mark.slow
 
 
-@pytest.mark.parametrize("solver", [pytest.param(s, marks=[slow] * (s not in ("explicit", "xpbd"))) for s in friction.TAKERS])
+@pytest.mark.parametrize("solver", [pytest.param(s, marks=[slow] * (s != "xpbd")) for s in friction.TAKERS])
 def test_sheets_stick_below_the_line_and_slide_above_it(solver, device):
     """tan θ = 0.9 and 1.1 μ, and 30°. What iterations leave of a step is 1e-6 of gravity, or less."""
     slopes = [*np.degrees(np.arctan([0.27, 0.33])).tolist(), 30.0]
@@ -350,6 +356,7 @@ def test_lines_of_crossing():
     assert len(by_key["pbd, filter"]) == 1 and len(by_key) == 12
 
 
+@pytest.mark.slow
 def test_sheets_cross_without_the_filter_where_theory_says(device):
     """Explicit steps of 1 ms by the energy, from 0.443 m/s; those of 20 ms of Newton's method from 1.29 m/s, by the phase."""
 
@@ -370,6 +377,7 @@ def crossings(device):
         return failure_chart("crossing", device, store=Store(), executor=executor)
 
 
+@pytest.mark.slow
 def test_no_solver_lets_sheets_cross(crossings):
     """At 1 and 100 m/s, of steps to 1/24 s; without the filter they cross with each that is shown."""
     kept = [row for row in crossings["rows"] if "filter" in row["panel"]]
@@ -407,7 +415,7 @@ def test_rows_have_their_laws_and_a_table_a_line_for_each(charts, tmp_path):
         assert [float(row["x"]) for row in table] == [row["x"] for row in found["rows"]]
 
 
-@pytest.mark.parametrize("name", ["isometry", "slivers", "cotangents", "rank"])
+@pytest.mark.parametrize("name", slow_but(["isometry"], ["isometry", "slivers", "cotangents", "rank"]))
 def test_points_and_laws_are_drawn(name, charts, tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
@@ -427,6 +435,7 @@ def test_points_and_laws_are_drawn(name, charts, tmp_path, monkeypatch):
             assert lines[series].get_linewidth() == 0.0 and panel.laws[law](1.0) is not None
 
 
+@pytest.mark.slow
 def test_maps_are_drawn(tunnels, tmp_path, monkeypatch):
     """A cell for each point, its lines, a cross where a sheet passes, and each key once."""
     from matplotlib.figure import Figure

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.contact.self_start import crossings
 from warpcloth.contact.self_steps import SelfSteps
@@ -48,10 +49,9 @@ PRESSED = {
     "flung_apart": {"gap": 5e-4},
     "deep": {"gap": 1e-4, "shrink": 0.6, "stiffness": 1e3, "speed": 0.3},
 }
-FAST = pytest.param(100.0, "float64", marks=SLOW)
-each_solver = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=SLOW) if name == "constrained_dynamics" else name for name in SOLVERS]
-)
+# One that is explicit, one that minimises and one that sweeps, for what contact does alike for all.
+FEW = ("explicit", "newton", "xpbd")
+each_solver = pytest.mark.parametrize("name", slow_but(FEW, SOLVERS))
 
 
 def layers(count=2, n=6, gap=0.02, speed=0.0, turn=0.0, distance=5e-3, stiffness=1e5, size=0.5, shrink=1.0, **fields):
@@ -261,11 +261,16 @@ def test_acting_pairs(device):
         assert (np.diff(corners)[np.diff(vertices) == 0] > 0).all()
 
 
-@pytest.mark.parametrize("fields", PRESSED.values(), ids=PRESSED)
-@pytest.mark.parametrize("name", MEET)
-def test_minimiser_is_the_same(name, fields, device):
+@pytest.mark.parametrize(
+    ("name", "pressed"),
+    slow_but(
+        [(name, "both_stages") for name in ("newton_factorised", "admm", "projective_dynamics", "constrained")],
+        [(name, pressed) for name in MEET for pressed in PRESSED],
+    ),
+)
+def test_minimiser_is_the_same(name, pressed, device):
     """Where no vertex is cut: the x(t + h) of Newton's method, which moves, and to 1e-8 m."""
-    scene, ends = layers(n=4, turn=17.0, **fields), []
+    scene, ends = layers(n=4, turn=17.0, **PRESSED[pressed]), []
     for solver in (wc.Newton(substeps=10, tolerance=1e-13), MEET[name]):
         stepper = solver.bind(scene.build(device=device, dtype="float64"))
         stepper.step()
@@ -275,7 +280,7 @@ def test_minimiser_is_the_same(name, fields, device):
     assert ends[1] == pytest.approx(ends[0], abs=1e-8)
 
 
-@pytest.mark.parametrize("name", MEET)
+@pytest.mark.parametrize("name", slow_but(("newton_factorised", "constrained"), MEET))
 def test_minimiser_with_locked_axes(name, device):
     """Every third vertex keeps its x, and every fifth its y, to the bit; all solvers meet as above."""
     free = np.ones((32, 3), dtype=bool)
@@ -303,14 +308,16 @@ def test_locked_axes(name, device):
     assert crossed(x, scene.mesh.triangles) == 0
 
 
-@each_solver
+# What steps mean for the filter is told by all at 100 m/s, and what the speed and the precision do by few.
 @pytest.mark.parametrize(
-    ("speed", "dtype"),
-    [
-        (1.0, "float32"),
-        (100.0, "float32"),
-        FAST,
-    ],
+    ("name", "speed", "dtype"),
+    slow_but(
+        [*((name, 100.0, "float32") for name in SOLVERS if name != "constrained_dynamics"), ("xpbd", 1.0, "float32")],
+        [
+            *((name, 100.0, "float32") for name in SOLVERS),
+            *((name, *how) for name in FEW for how in ((1.0, "float32"), (100.0, "float64"))),
+        ],
+    ),
 )
 def test_thrown_at_each_other(name, speed, dtype, device):
     """Two sheets, at ``speed`` each, with frames of 1/24 s, in which they would move 100 times as far as they are apart."""
@@ -332,14 +339,17 @@ def test_folded_sheet_closes(name, device):
         assert crossed(stepper.state.x.numpy(), scene.mesh.triangles) == 0
 
 
-@each_solver
 @pytest.mark.parametrize(
-    "collider",
-    [wc.Sphere(radius=0.3, position=(0.0, -0.31, 0.0)), wc.Box(size=(0.3, 0.3, 0.3), position=(0.0, -0.16, 0.0))],
-    ids=["ball", "box"],
+    ("name", "collider"),
+    slow_but([*((name, "box") for name in FEW), ("xpbd", "ball")], [*((name, "box") for name in SOLVERS), ("xpbd", "ball")]),
 )
 def test_thrown_on_a_collider(name, collider, device):
     """The filters of colliders and of self-contact together leave no vertex inside, and no crossing."""
+    shapes = {
+        "ball": wc.Sphere(radius=0.3, position=(0.0, -0.31, 0.0)),
+        "box": wc.Box(size=(0.3, 0.3, 0.3), position=(0.0, -0.16, 0.0)),
+    }
+    collider = shapes[collider]
     given = {"colliders": [collider], "contact": wc.Contact(stiffness=1e4)}
     scene = layers(count=3, n=4, stiffness=500.0, **given)
     scene = replace(scene, velocities=np.tile([1.0, -10.0, 0.5], (48, 1)))
@@ -365,8 +375,14 @@ MOVING = {
 }
 
 
-@pytest.mark.parametrize("kind", MOVING)
-@pytest.mark.parametrize("name", [name if name in ("xpbd", "pbd") else pytest.param(name, marks=SLOW) for name in SOLVERS])
+# The filters are the same for all, and the solvers for any collider: each kind with one that sweeps, and each solver once.
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    slow_but(
+        [("xpbd", kind) for kind in MOVING],
+        [*(("xpbd", kind) for kind in MOVING), *((name, "moving mesh") for name in SOLVERS if name != "xpbd")],
+    ),
+)
 def test_thrown_on_a_collider_that_comes_towards_it(name, kind, device):
     """At 3 m/s on one that is a mesh or moves, by up to 1.6 m/s: no vertex ends a frame inside, and no cloth crosses cloth."""
     collider, given = MOVING[kind], {"contact": wc.Contact(stiffness=1e4)}
@@ -381,7 +397,7 @@ def test_thrown_on_a_collider_that_comes_towards_it(name, kind, device):
     assert stepper.inside == []
 
 
-@pytest.mark.parametrize("name", list(SOLVERS)[:4])
+@pytest.mark.parametrize("name", slow_but(("xpbd",), list(SOLVERS)[:4]))
 def test_contact_in_a_frame_that_moves(name, device):
     """Two sheets that fall on a plane at rest, and at rest on a plane that rises as fast, move the same relative to it."""
     ends = []
@@ -415,8 +431,10 @@ def test_what_colliders_close_on(name, device):
         assert crossed(points, scene.mesh.triangles) == 0
 
 
-@each_solver
-@pytest.mark.parametrize("gap", [2.5e-3, 5e-5])
+@pytest.mark.parametrize(
+    ("name", "gap"),
+    slow_but([(name, 5e-5) for name in FEW], [*((name, 5e-5) for name in SOLVERS), *((name, 2.5e-3) for name in FEW)]),
+)
 def test_starts_pressed_together(name, gap, device):
     """Sheets within the contact distance fly apart with the energy of contact at the start, which is no divergence."""
     animation = wc.simulate(layers(n=3, gap=gap, duration=0.125), SOLVERS[name], device=device)
@@ -456,7 +474,7 @@ def test_free_fall(name, device):
     assert moved == pytest.approx(np.tile([0.0, -0.5 * 9.81 * t * (t + stepper.h), 0.0], (36, 1)), abs=1e-11)
 
 
-@pytest.mark.parametrize("substeps", [100, 200])
+@pytest.mark.parametrize("substeps", slow_but([200], [100, 200]))
 def test_energy_is_conserved(substeps, device):
     """Sheets that part at a gap of r/2, without cuts: what explicit steps lose of the energy at the start is of order h²."""
     scene = layers(n=3, gap=2.5e-3, duration=1 / 24)
@@ -597,8 +615,12 @@ def test_quiet_explicit_steps_are_those_with_contact(speed, device):
     assert stepper.pairs.steps.numpy().tolist() == [240, 240]
 
 
-@pytest.mark.parametrize("speed", [0.0, 0.02, 5.0])
-@pytest.mark.parametrize("name", ["xpbd", "newton"])
+@pytest.mark.parametrize(
+    ("name", "speed"),
+    slow_but(
+        [("xpbd", 0.02), ("newton", 0.0), ("xpbd", 5.0)], [(name, v) for name in ("xpbd", "newton") for v in (0.0, 0.02, 5.0)]
+    ),
+)
 def test_far_steps_are_those_with_contact(name, speed, device, monkeypatch):
     """To the bit, of sheets that fall, that bend within the bounds of the list and beyond, and whose moves are long."""
     scene = layers(1, gravity=np.array([0.0, -9.81, 0.0]))
@@ -618,15 +640,20 @@ def test_far_steps_are_those_with_contact(name, speed, device, monkeypatch):
     assert (alone > 0) == (speed < 1.0)
 
 
-@each_solver
-@pytest.mark.parametrize("fields", [{}, {"distance": 0.15, "stiffness": 100.0}], ids=["thin", "thick"])
-def test_copies(name, fields, device):
+@pytest.mark.parametrize(
+    ("name", "distance"),
+    slow_but(
+        [("explicit", 5e-3), ("newton", 5e-3), ("xpbd", 0.15)],
+        [*((name, 5e-3) for name in SOLVERS), *((name, 0.15) for name in FEW)],
+    ),
+)
+def test_copies(name, distance, device):
     """Each of two copies, at speeds of their own, moves as one alone, to the bit, and again after it was put back.
 
     Of these the filter cuts one and not the other, and lists are made anew at other times; of thick sheets the areas are of
     pairs that are farther apart than the skin.
     """
-    scene = layers(turn=17.0, speed=1.0, n=5, **fields)
+    scene = layers(turn=17.0, speed=1.0, n=5, distance=distance, stiffness=1e5 if distance < 0.1 else 100.0)
     velocities = np.stack([3.0 * scene.velocities, 0.1 * scene.velocities])
     steppers = [SOLVERS[name].bind(scene.build(device=device, copies=copies)) for copies in (1, 1, 2)]
     for stepper, given in zip(steppers, (velocities[:1], velocities[1:], velocities), strict=True):
@@ -822,7 +849,7 @@ def crossing_pairs(points, triangles):
 @pytest.mark.parametrize(
     ("name", "start"),
     [
-        *(pytest.param(name, "corner", marks=SLOW if name == "constrained_dynamics" else ()) for name in SOLVERS),
+        *slow_but([(name, "corner") for name in FEW], [(name, "corner") for name in SOLVERS]),
         *(pytest.param(name, start, marks=SLOW) for start in ("tilted", "coincide") for name in ("explicit", "newton", "pbd")),
     ],
 )

@@ -14,6 +14,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.rows import slow_but
 from support.setups import SOLVERS, allocations, square
 from support.sheets import SPRINGS, TERMS, declared, precisions
 from warpcloth.cli import main
@@ -55,7 +56,7 @@ def same(steppers):
     return all(np.array_equal(a, b) for other in others for a, b in zip(expected, other, strict=True))
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("explicit", "xpbd"), SOLVERS))
 def test_copies_shared_out_are_those_of_one_thread(name, device):
     """To the bit, of uneven shares and of more threads than copies; when some are put back, too."""
     record = replace(SOLVERS[name], substeps=2)

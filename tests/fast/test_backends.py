@@ -9,6 +9,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.energies import damping_forces
+from support.rows import slow_but
 from support.setups import SOLVERS, allocations, square
 from support.sheets import FEW, SPRINGS, TERMS, N, declared, precisions
 from warpcloth.core.gradient import Gradient
@@ -70,7 +71,17 @@ def backend(request, device, monkeypatch):
 @pytest.mark.parametrize("backend", BACKENDS, indirect=True)
 @pytest.mark.parametrize(
     ("name", "dtype", "scheme"),
-    [*[(*each, "symplectic") for each in precisions(TERMS)], *[(name, "float64", "forward") for name in FEW]],
+    slow_but(
+        [
+            *((name, "float32", "symplectic") for name in FEW),
+            ("limits", "float64", "symplectic"),
+            ("springs", "float64", "forward"),
+        ],
+        [
+            *[(*each, "symplectic") for each in precisions(TERMS)],
+            *[(name, "float64", "forward") for name in ("nothing", "springs")],
+        ],
+    ),
 )
 def test_explicit_steps_are_those_of_the_core(name, backend, scheme, dtype, device):
     """And those of the core are forces, and the update in NumPy."""
@@ -105,7 +116,7 @@ def draped(moving):
     return replace(scene, colliders=[ball, other])
 
 
-@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("moving", slow_but([True], [False, True]))
 @pytest.mark.parametrize("backend", ["blocks", "gather"], indirect=True)
 def test_contact_in_explicit_steps_is_that_of_the_core(moving, backend, device):
     """Anchors of friction and cuts too; also where positions are set in between. To follow contact changes no bit, and
@@ -171,7 +182,7 @@ def test_the_plan_takes_the_fast_backend_of_the_device(device):
     assert record(scene, device, "core") == found._replace(backend="core", lanes=1, pairs=())
 
 
-@pytest.mark.parametrize(("name", "dtype"), precisions(TERMS))
+@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in FEW], precisions(TERMS)))
 def test_gradients_are_those_of_the_core(name, dtype, device):
     """At x, and at x + d."""
     model = declared(TERMS[name]).build(device=device, dtype=dtype)
@@ -201,7 +212,7 @@ def test_backends_that_are_not_there_are_refused(backend, threads, message):
         record(declared([]), "cpu", backend, threads)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", slow_but(["float32"], ["float32", "float64"]))
 @pytest.mark.parametrize("backend", ["core", "blocks", "gather"], indirect=True)
 def test_a_soft_crease_joins_stiff_parts(backend, dtype, device):
     """What is left out of a matrix is not what is small beside all else at its vertices: the torque that unfolds is there."""
@@ -225,7 +236,7 @@ def test_a_soft_crease_joins_stiff_parts(backend, dtype, device):
     assert torques[0] and torques[1] == pytest.approx(torques[0], rel=1024.0 * eps)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", slow_but(["float32"], ["float32", "float64"]))
 @pytest.mark.parametrize(
     "name", ["nothing", "springs", "springs, the higher vertex first, each of its own stiffness", "damped springs"]
 )
@@ -268,7 +279,7 @@ def test_which_copies_are_blocks(scene, one, device, monkeypatch):
 LAUNCHED = [name for name, made in SOLVERS.items() if isinstance(made, (wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD))]
 
 
-@pytest.mark.parametrize("launches", [1, 10, 10_000])
+@pytest.mark.parametrize("launches", slow_but([10], [1, 10, 10_000]))
 @pytest.mark.parametrize("name", [*LAUNCHED, "xpbd midpoint", "newton"])
 def test_frames_are_steps_to_the_bit(name, launches, device, monkeypatch):
     """In graphs of one step, of some with some over, and of all; with pins that move, a counter of their own, and damping."""
@@ -287,7 +298,7 @@ def test_frames_are_steps_to_the_bit(name, launches, device, monkeypatch):
     assert steppers[0].results == steppers[1].results
 
 
-@pytest.mark.parametrize("name", LAUNCHED)
+@pytest.mark.parametrize("name", slow_but(("explicit", "xpbd"), LAUNCHED))
 def test_a_frame_allocates_nothing(name, device):
     record = replace(SOLVERS[name], substeps=5)
     stepper = record.bind(square(solver=record, damping=0.01, fps=120.0, pins="corners").build(device=device))
@@ -318,12 +329,19 @@ WIDELY = (*FEW, "limits", "dihedral bending")
 
 @pytest.mark.parametrize(
     ("name", "dtype", "options"),
-    [
-        (name, dtype, options)
-        for name, dtype in precisions(PROJECTED)
-        for options in SWEEPS
-        if options in ("plain", "multipliers") or (name in WIDELY and dtype == "float64")
-    ],
+    slow_but(
+        [
+            *(("several", "float64", options) for options in SWEEPS),
+            ("limits", "float64", "plain"),
+            ("springs", "float32", "plain"),
+        ],
+        [
+            (name, dtype, options)
+            for name, dtype in precisions(PROJECTED)
+            for options in SWEEPS
+            if options in ("plain", "multipliers") or (name in WIDELY and dtype == "float64")
+        ],
+    ),
 )
 def test_jacobi_sweeps_are_those_of_the_core(name, dtype, options, device):
     """d and λ, whether sweeps run one by one, which copies what they leave in other arrays back, or in pairs."""

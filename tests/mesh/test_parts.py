@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.usd import read_scene, write_scene
 
 SKIRT, BELT = wc.Mesh.grid(6, 5, size=(0.5, 0.4)), wc.Mesh.grid(7, 4, size=0.6, pattern="equilateral")
@@ -75,7 +76,7 @@ SOLVERS = {
 NEAR = dict.fromkeys(("newton", "projective-dynamics", "admm", "constrained-dynamics"), 1e-9)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("newton", "xpbd"), SOLVERS))
 def test_parts_move_as_each_does_alone(name):
     """Two sheets that nothing joins, one of springs and one of a membrane, beside each sheet by itself."""
     mesh, belt = garment()

@@ -14,6 +14,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.energies import DECLARED, energy_and_gradient
+from support.rows import slow_but
 from warpcloth.base.kernel_cache import HEADERS
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import RowSums, Sums
@@ -519,7 +520,7 @@ TERMS = {
 
 
 @pytest.mark.parametrize("terms", TERMS.values(), ids=TERMS)
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", slow_but(["float32"], DTYPES))
 @pytest.mark.parametrize("copies", [1, 3])
 @pytest.mark.filterwarnings("error")
 def test_report_counts_what_was_built(terms, dtype, copies, device):
@@ -669,7 +670,7 @@ def test_sums_of_any_number_of_chunks(chunks, dtype, device):
 
 
 @pytest.mark.parametrize("names", [[name] for name in VARIED] + [list(VARIED)], ids=[*VARIED, "all at once"])
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", slow_but(["float64"], DTYPES))
 def test_a_copy_is_a_scene_of_its_own(names, dtype, device):
     """Copy b has the arrays, the energy and the forces of a single scene with its parameters, to the bit."""
     fields = {"terms": all_terms(), "pins": [0], "positions": STARTS[0]}
@@ -832,6 +833,7 @@ def probed(tmp_path_factory, device):
     return dict(zip(BUILDS, json.loads(run.stdout.splitlines()[-1]), strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BUILDS)
 def test_nothing_undeclared_exists(name, probed):
     found, (_solver, _declared, homes, names) = probed[name], BUILDS[name]
@@ -852,7 +854,7 @@ def test_nothing_is_compiled_that_is_not_launched(probed):
     assert {folder[3:-8] for folder in folders} == launched
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("explicit", "xpbd"), SOLVERS))
 def test_binding_reads_no_elements_back(name, device, monkeypatch):
     """Stencils, stiffness and rest states stay on the host until they are final, in an order of the model's own too.
 

@@ -8,6 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.numerics.hierarchy import levels
 from warpcloth.scenes import chain
 
@@ -102,7 +103,7 @@ def test_levels_of_any_mesh(name):
         there = kept
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", slow_but(["float32"], ["float32", "float64"]))
 @pytest.mark.parametrize("name", SCENES)
 def test_steps_on_any_mesh_and_copies(name, dtype, device):
     """Of a cloth stretched by a tenth: finite, no more stretched after; pins stay, and copies have the bits of one alone."""

@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.numerics.integrators import INTEGRATORS
 
 EPS = np.finfo(np.float64).eps
@@ -24,7 +25,7 @@ SOLVERS = {
     "xpbd": wc.XPBD(substeps=1, iterations=120),
     "xpbd scalar": wc.XPBD(substeps=1, iterations=120, form="scalar"),
 }
-each_solver = pytest.mark.parametrize("name", SOLVERS)
+each_solver = pytest.mark.parametrize("name", slow_but(("newton", "projective dynamics", "xpbd"), SOLVERS))
 each_integrator = pytest.mark.parametrize("integrator", INTEGRATORS)
 
 

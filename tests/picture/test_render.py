@@ -221,6 +221,7 @@ def test_strings_and_bars_of_a_scene_are_drawn():
     assert len(lines) == 2 and all(shape.count == len(scene.mesh.points) for shape in subject.shapes)
 
 
+@pytest.mark.slow
 def test_colliders_of_a_run_are_drawn_as_those_of_its_stage(tmp_path):
     ball = wc.Sphere(radius=0.2, position=[[0.5, -0.3, 0.5], [0.6, -0.3, 0.5]], name="ball")
     mesh = wc.MeshCollider([[0.0, -1.0, 0.0], [0.0, -1.0, 1.0], [1.0, -1.0, 0.0]], [[0, 1, 2]], name="sheet")

@@ -9,6 +9,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.meshes import PAIR
+from support.rows import slow_but
 from support.scenes import LIVELY, QUICK, noisy
 from warpcloth.cli import main
 from warpcloth.core.energy import Energy
@@ -75,7 +76,7 @@ def test_the_command_line_says_so_and_keeps_the_good_frames(tmp_path, capsys, mo
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("solver", QUICK)
+@pytest.mark.parametrize("solver", slow_but(("explicit", "newton", "pbd", "xpbd", "admm"), QUICK))
 @pytest.mark.parametrize("name", LIVELY)
 def test_energy_of_the_start_is_a_source(name, solver, device):
     """Springs that start long, an attachment far away: sweeps that close their gaps in a step throw more than ½kx²."""

@@ -8,6 +8,7 @@ import pytest
 import scipy.sparse
 
 import warpcloth as wc
+from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.core.status import digits
 from warpcloth.lab.elastica import aspect
@@ -44,8 +45,13 @@ def test_table_of_the_elastica(gamma):
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("bending", ["quadratic", "dihedral"])
-@pytest.mark.parametrize("gamma", GAMMAS)
+@pytest.mark.parametrize(
+    ("gamma", "bending"),
+    slow_but(
+        [(1.0, "dihedral"), (10.0, "quadratic")],
+        [(gamma, bending) for gamma in GAMMAS for bending in ("quadratic", "dihedral")],
+    ),
+)
 def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
     """One row of triangles bends with 8/9 of D: H/W at 9Γ/8 to 0.2 %, at second order in the mesh size."""
     errors = []
@@ -61,7 +67,7 @@ def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("gamma", "bending"), list(zip(GAMMAS, 3 * ["quadratic", "dihedral"], strict=True)))
+@pytest.mark.parametrize(("gamma", "bending"), [(0.1, "quadratic"), (1.0, "dihedral"), (5.0, "quadratic"), (50.0, "dihedral")])
 def test_a_wide_sheet_is_the_elastica(gamma, bending, device):
     """As wide as long and nearly inextensible its edges stay flat: H/W at Γ to 1.5 %.
 
@@ -176,7 +182,7 @@ def test_a_sheet_too_stiff_to_move_is_no_rest_shape(device):
         assert rest.status.residual > 1.0 - 1e-6  # and what lengths are rounded by times the stiffness, which is 0 on the CPU
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", slow_but(["float64"], ["float32", "float64"]))
 def test_what_is_at_rest_without_weight_is_settled(dtype, device):
     """The forces at the start are rounding, and those that are left are as large: nothing that a rest shape could hide."""
     for seed in range(4):
@@ -195,7 +201,7 @@ def test_a_saddle_that_is_not_left_is_reported(device, monkeypatch):
     assert rest.status.result.name == "SADDLE"
 
 
-@pytest.mark.parametrize("stretch", [1.01, 1.02, 1.05, 1.1, 1.2, 1.3])
+@pytest.mark.parametrize("stretch", slow_but([1.01, 1.2], [1.01, 1.02, 1.05, 1.1, 1.2, 1.3]))
 def test_a_circle_of_minima_is_no_saddle(stretch, device):
     """A chain of two links too long for its span may buckle any way round: a zero eigenvalue is not a negative one."""
     mesh = wc.Mesh([[0, 0, 0], [1, 1, 0], [2, 2, 0]], edges=[[0, 1], [1, 2]])

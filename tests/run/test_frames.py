@@ -158,7 +158,13 @@ def test_a_run_that_diverges_ends_as_without(solver, output, tmp_path, device, m
     assert len(other.timings["frames"]) == one.status.frame + 1
 
 
-@pytest.mark.parametrize("scene", [flag.scene(nx=6, ny=4), ring.scene(elements=12)], ids=["moving pins", "moving colliders"])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param(flag.scene(nx=6, ny=4), id="moving pins"),
+        pytest.param(ring.scene(elements=12), id="moving colliders", marks=pytest.mark.slow),
+    ],
+)
 def test_nothing_reads_a_device_beside_the_frames(scene, device, monkeypatch):
     """Warp changes the stream of a device while it reads an array: two threads that read at once may leave a wrong stream."""
     read, apart = wp.array.numpy, []

@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 import warpcloth as wc
 from support import setups
+from support.rows import slow_but
 from support.setups import square
 from support.usd_validation import validate
 from warpcloth.run.history import Evaluation
@@ -96,7 +97,7 @@ def test_rollers_bear_along_the_axes_that_they_hold(device):
 ORDERS = {"explicit": 2, "newton": 2, "newton midpoint": 4, "newton bdf2": 4, "xpbd": 2, "constrained dynamics": 2}
 
 
-@pytest.mark.parametrize("name", ORDERS)
+@pytest.mark.parametrize("name", slow_but(("newton midpoint", "xpbd"), ORDERS))
 @pytest.mark.parametrize("driven", ["pins", "loads"])
 def test_energies_and_works_balance_to_the_order_of_the_scheme(name, driven, device):
     """Moved pins, or a pressure and a force that change; the motion is the same to the bit as without a history."""
@@ -304,7 +305,7 @@ def test_books_follow_the_order_of_the_vertices(device):
     assert np.abs(found[0][0]).max() > 1.0 and found[0][1][-1] != 0.0
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("newton", "xpbd", "projective dynamics"), SOLVERS))
 def test_books_leave_the_motion_as_it_is(name, device):
     """In float32, and without them nothing is launched for them."""
     cloth = square(solver=SOLVERS[name], pins="corners")

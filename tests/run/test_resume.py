@@ -11,7 +11,8 @@ import pytest
 
 import warpcloth as wc
 from support.command_line import refused, run
-from support.setups import SOLVERS
+from support.rows import slow_but
+from support.setups import RUNS, SOLVERS
 from warpcloth.cli import main
 from warpcloth.run import recorders
 from warpcloth.scenes import hanging
@@ -56,10 +57,19 @@ def same(one, other):
     return True
 
 
-CASES = [(name, 0.0, dtype) for name in SOLVERS for dtype in ("float32", "float64")]
+CASES = [("explicit", 300.0, "float32"), *((name, 0.0, dtype) for name, dtype in RUNS)]
 
 
-@pytest.mark.parametrize(("name", "offset", "dtype"), [*CASES, ("explicit", 300.0, "float32")])
+@pytest.mark.parametrize(
+    ("name", "offset", "dtype"),
+    slow_but(
+        [
+            ("explicit", 300.0, "float32"),
+            *((name, 0.0, "float32") for name in ("newton", "pbd", "projective dynamics", "admm")),
+        ],
+        CASES,
+    ),
+)
 def test_a_resumed_run_is_the_same_to_the_bit(name, offset, dtype, tmp_path, device, monkeypatch):
     """In the file, and in the precision of the run, which the file has not."""
     scene, solver, kept = moved(offset), SOLVERS[name], []

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.base.digest import scene_digest
 
 # Explicit steps and sweeps take no number from another cloth. Newton's method has products and a tolerance over all vertices:
@@ -54,7 +55,7 @@ def locked():
     return found | {"heavy": replace(found["heavy"], free_axes=axes)}
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("newton", "xpbd"), SOLVERS))
 def test_each_moves_as_alone(name, device):
     """Bit for bit on the CPU, where each cloth has the kernels that it has alone."""
     solver, tolerance = SOLVERS[name]

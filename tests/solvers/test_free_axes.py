@@ -7,7 +7,8 @@ import pytest
 
 import warpcloth as wc
 from support import setups
-from support.setups import square
+from support.rows import slow_but
+from support.setups import MAIN, square
 from support.steps import after_one_step, newton_step, swinging
 
 # Eight substeps, for Explicit is not stable with fewer.
@@ -57,7 +58,7 @@ ENDED = {
 del ENDED["xpbd"], ENDED["xpbd averaged by constraint"]
 
 
-@pytest.mark.parametrize("name", ENDED)
+@pytest.mark.parametrize("name", slow_but(("explicit", "newton", "admm"), ENDED))
 def test_half_a_sheet_moves_as_the_whole(name, device):
     """To 1e-9 m, within which steps end; without the lock the half moves by centimetres from there."""
     whole, kept, half = halves()
@@ -106,8 +107,13 @@ def membrane():
     return wc.Scene(mesh, density=0.1, terms=terms, pins=[0], velocities=velocities)
 
 
-@pytest.mark.parametrize("scene", ["springs", "membrane"])
-@pytest.mark.parametrize("name", MINIMISE)
+@pytest.mark.parametrize(
+    ("name", "scene"),
+    slow_but(
+        [("newton", "springs"), ("projective dynamics", "membrane"), ("constrained dynamics", "springs"), ("admm", "springs")],
+        [(name, scene) for name in MINIMISE for scene in ("springs", "membrane")],
+    ),
+)
 def test_all_meet(name, scene, device):
     """At the minimum over the coordinates that are free, where the gradient along them is 0.
 
@@ -142,7 +148,7 @@ def test_a_hard_spring_holds_a_bead_on_its_rail(name, device):
     np.testing.assert_allclose(x[1], [0.6, -0.8, 0.0], rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(MAIN, SOLVERS))
 def test_vertices_without_a_free_axis_are_pins(name, device):
     """To the bit, and to every solver."""
     declared = square(solver=SOLVERS[name])
@@ -153,7 +159,7 @@ def test_vertices_without_a_free_axis_are_pins(name, device):
     assert (runs[0] == runs[1]).all()
 
 
-@pytest.mark.parametrize("name", LOCKING)
+@pytest.mark.parametrize("name", slow_but(MAIN, LOCKING))
 def test_locked_coordinates_stay_to_the_bit(name, device):
     """In float32, in a batch, in another order, along gravity and after a reset to other positions, with a velocity of 0."""
     declared = replace(rails(square(solver=SOLVERS[name], pins=[0])), velocities=np.ones((36, 3)))
@@ -191,7 +197,7 @@ def rollers(solver=None, frames=9, **given):
     return replace(declared, pins=wc.Pins(vertices, keyframes, axes=["xyz", "x", "zy", "z"]))
 
 
-@pytest.mark.parametrize("name", LOCKING)
+@pytest.mark.parametrize("name", slow_but(("explicit", "newton", "newton midpoint", "xpbd"), LOCKING))
 def test_pins_hold_their_axes(name, device):
     """Along them they are where the keyframes say and as fast, and along the others the cloth takes them where it goes."""
     declared, solver = rollers(LOCKING[name]), LOCKING[name]
@@ -205,7 +211,9 @@ def test_pins_hold_their_axes(name, device):
     assert np.abs(run.points[6, vertices] - keyframes[6])[~held].min() > 1e-4
 
 
-@pytest.mark.parametrize("name", ["explicit", "newton", "newton midpoint", "newton bdf2", "xpbd", "admm"])
+@pytest.mark.parametrize(
+    "name", slow_but(("newton", "xpbd"), ["explicit", "newton", "newton midpoint", "newton bdf2", "xpbd", "admm"])
+)
 def test_pins_that_hold_axes_are_rails_and_moved_pins(name, device):
     """Standing ones are free_axes; one whose other axes are locked is a pin that holds all of them."""
     declared = square(solver=LOCKING[name], damping=1e-3)
@@ -281,7 +289,7 @@ def test_a_bead_on_a_rail_comes_to_rest(device):
         assert rest.stable
 
 
-@pytest.mark.parametrize("name", LOCKING)
+@pytest.mark.parametrize("name", slow_but(MAIN, LOCKING))
 def test_without_locks_nothing_is_there(name, device):
     """No bytes, kernels or launches more where every axis is free."""
     reports, launches = [], []

@@ -11,7 +11,8 @@ import warp as wp
 import warpcloth as wc
 from support.meshes import PAIR
 from support.nets import net
-from support.setups import SOLVERS, allocations, square
+from support.rows import slow_but
+from support.setups import MAIN, RUNS, SOLVERS, allocations, square
 from warpcloth.core.capture import Segment, on_host
 from warpcloth.core.hessian import Hessian
 from warpcloth.core.status import Result
@@ -90,8 +91,7 @@ def test_oscillator_keeps_its_invariant(method, omega_h, device):
     assert np.allclose(energies, expected, rtol=40 * 20 * EPS, atol=40 * 20 * EPS * omega**2)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float64") for name in MAIN], RUNS))
 def test_free_fall(name, dtype, device):
     """y_n = −g h² n(n+1)/2 for every method of first order, −½g(nh)² for those of second, and no strain."""
     scene = square(solver=SOLVERS[name], fps=600.0)
@@ -109,7 +109,9 @@ def test_free_fall(name, dtype, device):
 
 
 # Averaging by vertex keeps neither; Jacobi steps of one matrix keep momentum in the end, not on the way.
-@pytest.mark.parametrize("name", [name for name in SOLVERS if "vertex" not in name and "matrix-free" not in name])
+@pytest.mark.parametrize(
+    "name", slow_but(MAIN, [name for name in SOLVERS if "vertex" not in name and "matrix-free" not in name])
+)
 def test_momentum_is_conserved(name, device):
     """Inner forces cancel: P is kept; symplectic Euler and midpoint keep L too, the others lose it in x_new − x_old."""
     angular, implicit = name in ("explicit", "newton midpoint"), name.startswith("newton")
@@ -183,8 +185,7 @@ def test_steps_above_gershgorins_bound_warn(device):
         wc.Explicit(substeps=1).bind(scene.build(device=device))
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.host)])
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in MAIN], RUNS))
 def test_a_sheet_at_rest_stays_there(name, dtype, device):
     """Its rest shape, one pinned vertex, no gravity: it moves by no more than rounding, and does not spin about the pin."""
     pin, solver, steps = 14, SOLVERS[name], 200
@@ -336,7 +337,7 @@ def test_a_frame_is_a_whole_number_of_steps(device):
         wc.Newton(dt=0.01).bind(square().build(device=device))
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(MAIN, SOLVERS))
 def test_a_step_allocates_nothing(name, device):
     """Of arrays of Warp; what scipy allocates to factorise on the host is outside the tracker's sight."""
     solver = SOLVERS[name]
@@ -347,8 +348,7 @@ def test_a_step_allocates_nothing(name, device):
         assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in MAIN], RUNS))
 def test_the_same_run_gives_the_same_bits(name, dtype, device):
     def run():
         scene = square(solver=SOLVERS[name], damping=0.01, fps=600.0, pins="corners")
@@ -357,8 +357,13 @@ def test_the_same_run_gives_the_same_bits(name, dtype, device):
     assert np.array_equal(run(), run())
 
 
-@pytest.mark.parametrize("unlike", UNLIKE)
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize(
+    ("name", "unlike"),
+    slow_but(
+        [(name, "masses and start") for name in MAIN],
+        [(name, unlike) for name in SOLVERS for unlike in UNLIKE if name in MAIN or unlike == "density, bending and damping"],
+    ),
+)
 def test_copies_run_as_if_alone(name, unlike, device):
     """Every reduction is per copy: copies that differ do not notice one another."""
     vary, solver = UNLIKE[unlike], SOLVERS[name]
@@ -396,7 +401,7 @@ def stepped(stepper, steps):
     return np.array(states)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("explicit", "newton bdf2", "xpbd", "projective dynamics"), SOLVERS))
 def test_a_copy_put_back_starts_again(name, device):
     """To the bit, though it has become NaN, and the other copies notice neither; keyframes start again as well."""
     states = stepped(led(SOLVERS[name], device=device), 10)

@@ -31,6 +31,19 @@ SOLVERS = {
     "constrained dynamics once": wc.ConstrainedDynamics(substeps=1, iterations=1, stabilisation="none"),
     "admm": wc.ADMM(substeps=1, iterations=4),
 }
+# One of each solver, for what does not depend on how it sweeps, accelerates or solves its systems.
+MAIN = (
+    "explicit",
+    "newton",
+    "pbd",
+    "hierarchical pbd",
+    "xpbd",
+    "projective dynamics",
+    "constrained dynamics",
+    "admm",
+)
+# What runs of each is tested in float32, which users have; in float64 the kernels are the same.
+RUNS = [(name, "float32") for name in SOLVERS] + [(name, "float64") for name in MAIN]
 
 
 def square(n=6, solver=None, damping=None, **scene):

@@ -1,0 +1,11 @@
+"""Rows of tables of tests, of which some run always and the others only with `-m slow`."""
+
+import pytest
+
+
+def slow_but(kept, rows):
+    """Marks rows as slow, but for those in ``kept``. A row is a value, or a tuple of several."""
+    return [
+        row if row in kept else pytest.param(*(row if isinstance(row, tuple) else (row,)), marks=pytest.mark.slow)
+        for row in rows
+    ]
