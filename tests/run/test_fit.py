@@ -1,9 +1,13 @@
 """Fitting parameters to motions: what comes back, how uncertain it is said to be, what cannot be told."""
 
+import json
+
 import numpy as np
 import pytest
 
 import warpcloth as wc
+from warpcloth.cli import main
+from warpcloth.scenes.hanging import scene as hanging
 
 SOLVER = wc.Newton(substeps=4, integrator="midpoint", tolerance=1e-10)
 FRAMES, MASS, STIFFNESS, NOISE = 30, 0.5, 40.0, 1e-3
@@ -72,6 +76,26 @@ def test_what_the_motion_does_not_tell_has_no_error():
     found = wc.fit(scene, SOLVER, {"one.stiffness": 10.0, "other.stiffness": 25.0}, motion(weight(STIFFNESS))[:, 1:], [1])
     assert sum(found.parameters.values()) == pytest.approx(STIFFNESS, rel=1e-5)
     assert all(error == np.inf for error in found.errors.values()) and np.isnan(found.correlation).all()
+
+
+def test_the_command_reads_a_file_by_its_times(tmp_path, capsys):
+    """It uses the frames of the file at the times of frames of the scene, here the even ones, and no others."""
+    scene = hanging(n=4)
+    points = wc.simulate(scene, SOLVER, frames=6, dtype="float64").points
+    times = np.array([0, 2, 3.5, 4, 6]) / scene.fps
+    shown = [points[0], points[2], points[0], points[4], points[6]]
+    np.savez(tmp_path / "seen.npz", points=shown, triangles=scene.mesh.triangles, times=times)
+    words = ["fit", "hanging", str(tmp_path / "seen.npz"), "-p", "n=4", "--start", "Spring.stiffness=700"]
+    words += ["-s", "substeps=4", "integrator=midpoint", "tolerance=1e-10", "--plot", str(tmp_path / "residuals.png")]
+    assert main([*words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["parameters"]["Spring.stiffness"] == pytest.approx(1000.0, rel=1e-6)
+    assert [value == "nan" for value in found["residuals"]] == [True, False, True, False, True, False]
+    assert (tmp_path / "residuals.png").stat().st_size
+    assert main([*words, "--frames", "1"]) == 2
+    assert "none at the time of a frame of the scene" in capsys.readouterr().err
+    assert main([*words, "--vertices", "x < 0.5"]) == 2
+    assert "seen.npz: has 16 vertices; it must have 8, one for each of 'vertices'" in capsys.readouterr().err
 
 
 SEEN = np.zeros((3, 2, 3))

@@ -143,7 +143,7 @@ def compare(
             where = name if sequence.path is None else sequence.path
             raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
     up_axes = up_axis_of("up_axis_a", one, up_axis_a or up_axis), up_axis_of("up_axis_b", other, up_axis_b or up_axis)
-    other = _turned(other, *up_axes)
+    other = turned(other, *up_axes)
     pairs = _matching(one, other)
     unmatched = tuple(np.setdiff1d(np.arange(len(s)), partners) for s, partners in zip((one, other), pairs.T, strict=True))
     pairs = pairs if frames is None else pairs[: frames + 1]
@@ -188,8 +188,8 @@ def up_axis_of(name, sequence, given):
     return given or sequence.up_axis
 
 
-def _turned(b, axis_a, axis_b):
-    """Rotates the frames of b to the up axis of a, without rounding; returns b if the axes agree or one is unknown."""
+def turned(b: Sequence, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Sequence:
+    """Returns b with its frames rotated to the up axis of a, without rounding; b itself if the axes agree or one is unknown."""
     if axis_a is None or axis_b is None or axis_a == axis_b:
         return b
     columns, signs = ([0, 2, 1], [1.0, 1.0, -1.0]) if axis_a == "Y" else ([0, 2, 1], [1.0, -1.0, 1.0])

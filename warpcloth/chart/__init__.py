@@ -5,5 +5,6 @@ from ..picture.picture import draw
 from ..picture.view import View
 from .distances import plot_distances
 from .percentiles import plot_percentiles
+from .residuals import plot_residuals
 
-__all__ = ["Scale", "View", "draw", "plot_distances", "plot_percentiles", "range_over"]
+__all__ = ["Scale", "View", "draw", "plot_distances", "plot_percentiles", "plot_residuals", "range_over"]

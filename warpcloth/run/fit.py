@@ -2,13 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from os import PathLike
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..analysis.compare import turned
 from ..base.checks import numeric, shown
-from ..base.types import Precision
+from ..base.types import FilePath, Precision
 from ..mesh.selection import distinct_vertices
+from ..mesh.sequences import Sequence, open_sequence
 from ..scene.scene import Scene
 from ..solvers.step import Step
 from .simulate import simulate
@@ -16,6 +19,7 @@ from .simulate import simulate
 _DIFFERENCE = 1e-3  # of the logarithm of a parameter, to both sides
 _TOLERANCE = 1e-8  # of the relative change of parameters and residuals
 _UNDETERMINED = 1e-5  # smallest ratio of a singular value of the Jacobian to the largest
+_SAME_TIME = 1e-6  # largest distance of a measured frame from a frame of the scene, in frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +31,7 @@ class Fit:
         errors: Their standard errors relative to the estimates, by name; infinite if the motion does not determine them.
         correlation: Correlation of the logarithms of the parameters, (P, P); NaN where the motion does not determine them.
         residual: RMS distance along an axis between the measured and the fitted positions [m].
+        residuals: The same in each of the frames 1 … F, (F,) [m]; NaN in frames without a measured position.
         runs: Number of batches that were run.
         message: How the fit ended.
     """
@@ -35,6 +40,7 @@ class Fit:
     errors: dict[str, float]
     correlation: np.ndarray
     residual: float
+    residuals: np.ndarray
     runs: int
     message: str
 
@@ -53,7 +59,7 @@ def fit(
     scene: Scene,
     solver: Step,
     start: Mapping[str, float],
-    measured: ArrayLike,
+    measured: ArrayLike | FilePath | Sequence,
     vertices: str | ArrayLike = "all",
     device: str = "cpu",
     dtype: Precision = "float64",
@@ -69,8 +75,10 @@ def fit(
         scene: The :class:`warpcloth.Scene`.
         solver: Its solver, with steps so small that their error is below that of the measurement.
         start: Parameters by their name in ``vary``, such as ``"Spring.stiffness"``, and values to start from, above 0.
-        measured: Positions at frames 1 … F of the scene, (F, v, 3) [m]; NaN where there is none.
-        vertices: The v vertices that were measured, indices or a selection.
+        measured: Positions at frames 1 … F of the scene, (F, v, 3) [m]; NaN where there is none. Or an animation of v vertices:
+            a path or a sequence that `open_sequence` takes or returns, with times from the start of the scene on. Its frames at
+            the times of frames of the scene are used. It is turned to the up axis of the mesh of the scene.
+        vertices: The v vertices that were measured, indices or a selection, in their order in ``measured``.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
 
@@ -78,7 +86,8 @@ def fit(
         :class:`Fit`.
 
     Raises:
-        ValueError: If an argument is not allowed, or a run with parameters on the way fails.
+        ValueError: If an argument is not allowed, if no frame of an animation is at the time of a frame of the scene, or if a
+            run with parameters on the way fails.
 
     Examples:
         >>> import numpy as np, warpcloth as wc
@@ -93,6 +102,8 @@ def fit(
 
     names = _checked_names(start)
     chosen = distinct_vertices("vertices", vertices, scene.mesh)
+    if isinstance(measured, (str, PathLike, Sequence)):
+        measured = _positions(scene, measured, len(chosen))
     seen = numeric("measured", measured, f"have shape (F, {len(chosen)}, 3)")
     if seen.ndim != 3 or seen.shape[1:] != (len(chosen), 3) or not 0 < len(seen) <= scene.frames:
         raise ValueError(
@@ -136,6 +147,7 @@ def fit(
         errors=dict(zip(names, errors.tolist(), strict=True)),
         correlation=correlation,
         residual=float(np.sqrt(np.mean(residuals**2))),
+        residuals=_of_frames(residuals, known),
         runs=len(runs),
         message=found.message,
     )
@@ -149,6 +161,36 @@ def _checked_names(start):
         if not (np.ndim(value) == 0 and np.isreal(value) and 0.0 < value < np.inf):
             raise ValueError(f"start[{name!r}] is {shown(value)}; it must be a finite number above 0")
     return list(start)
+
+
+def _positions(scene, measured, count):
+    """Returns the positions (F, count, 3) [m] of an animation at frames 1 … F of a scene, NaN where it has no such frame."""
+    sequence = measured if isinstance(measured, Sequence) else open_sequence(measured)
+    where = "measured" if sequence.path is None else sequence.path
+    if len(sequence.mesh.points) != count:
+        raise ValueError(f"{where}: has {len(sequence.mesh.points)} vertices; it must have {count}, one for each of 'vertices'")
+    if sequence.times is None:
+        raise ValueError(f"{where}: has no times; it must have them, or give fps (--fps)")
+    sequence = turned(sequence, scene.mesh.up_axis, sequence.up_axis)
+    wanted = np.asarray(sequence.times) * scene.fps
+    frames = np.rint(wanted).astype(int)
+    used = np.flatnonzero((np.abs(wanted - frames) <= _SAME_TIME) & (frames >= 1) & (frames <= scene.frames))
+    if not len(used):
+        raise ValueError(
+            f"{where}: has {len(wanted)} frames from {sequence.times[0]:g} to {sequence.times[-1]:g} s, none at the time of a "
+            f"frame of the scene; it must have one at a multiple of 1/{scene.fps:g} s, up to {scene.frames / scene.fps:g} s"
+        )
+    positions = np.full((frames[used].max(), count, 3), np.nan)
+    for index in used:
+        positions[frames[index] - 1] = sequence[index]
+    return positions
+
+
+def _of_frames(residuals, known):
+    """Returns the RMS of the residuals (m,) of each frame, (F,), NaN without any; ``known`` (F, v, 3) says of which numbers."""
+    squares, counts = np.zeros(known.shape), known.sum(axis=(1, 2))
+    squares[known] = residuals**2
+    return np.sqrt(np.divide(squares.sum(axis=(1, 2)), counts, out=np.full(len(known), np.nan), where=counts > 0))
 
 
 def _errors(jacobian, residuals):
