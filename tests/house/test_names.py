@@ -12,6 +12,7 @@ ROOMS = ("warpcloth", "kernels", "scenes")
 MODULES = {
     "compare": "the command of warpcloth.analysis.compare",
     "deform": "the command of warpcloth.deformation.deform",
+    "fit": "the command of warpcloth.run.fit",
     "render": "the command of warpcloth.picture.render",
     "stability": "the command of warpcloth.lab.stability",
     "distances": "the pictures of warpcloth.analysis.distances",
@@ -25,7 +26,7 @@ MODULES = {
 # Classes and functions that mean one thing in several modules, and why.
 NAMES = {
     "add_arguments": "each command declares its own",
-    "analyze compare deform choose render": "the command and what it calls",
+    "analyze compare deform choose fit render": "the command and what it calls",
     "measure tasks": "each file of the laboratory has its measurement and the list of them; a term has its rest measure",
     "write_csv": "each table has one",
     "run": "runs what it is given",

@@ -143,7 +143,7 @@ def compare(
             where = name if sequence.path is None else sequence.path
             raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
     up_axes = up_axis_of("up_axis_a", one, up_axis_a or up_axis), up_axis_of("up_axis_b", other, up_axis_b or up_axis)
-    other = turned(other, *up_axes)
+    other = to_up_axis(other, *up_axes)
     pairs = _matching(one, other)
     unmatched = tuple(np.setdiff1d(np.arange(len(s)), partners) for s, partners in zip((one, other), pairs.T, strict=True))
     pairs = pairs if frames is None else pairs[: frames + 1]
@@ -188,7 +188,7 @@ def up_axis_of(name, sequence, given):
     return given or sequence.up_axis
 
 
-def turned(b: Sequence, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Sequence:
+def to_up_axis(b: Sequence, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Sequence:
     """Returns b with its frames rotated to the up axis of a, without rounding; b itself if the axes agree or one is unknown."""
     if axis_a is None or axis_b is None or axis_a == axis_b:
         return b

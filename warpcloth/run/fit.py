@@ -7,7 +7,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..analysis.compare import turned
+from ..analysis.compare import to_up_axis
 from ..base.checks import numeric, shown
 from ..base.types import FilePath, Precision
 from ..mesh.selection import distinct_vertices
@@ -171,7 +171,7 @@ def _positions(scene, measured, count):
         raise ValueError(f"{where}: has {len(sequence.mesh.points)} vertices; it must have {count}, one for each of 'vertices'")
     if sequence.times is None:
         raise ValueError(f"{where}: has no times; it must have them, or give fps (--fps)")
-    sequence = turned(sequence, scene.mesh.up_axis, sequence.up_axis)
+    sequence = to_up_axis(sequence, scene.mesh.up_axis, sequence.up_axis)
     wanted = np.asarray(sequence.times) * scene.fps
     frames = np.rint(wanted).astype(int)
     used = np.flatnonzero((np.abs(wanted - frames) <= _SAME_TIME) & (frames >= 1) & (frames <= scene.frames))
