@@ -147,8 +147,8 @@ def _parser():
     choose.add_arguments(chooses)
     benches = add("bench", bench.bench, "Measure the time and memory of frames, or compare two results.", epilog=bench.EPILOG)
     bench.add_arguments(benches)
-    fits = add("fit", fit.fit, "Find parameters with which a scene moves as measured.", epilog=fit.EPILOG)
-    fit.add_arguments(fits)
+    fitted = add("fit", fit.fit, "Find parameters with which a scene moves as measured.", epilog=fit.EPILOG)
+    fit.add_arguments(fitted)
     for sub in (runs, infos):
         options.add_scene(sub)
         of_info = "also show the step and the kernels of this solver (default: none, or newton if -s or --advise is given)"
@@ -183,14 +183,14 @@ def _parser():
     runs.add_argument(
         "--frames", type=int, metavar="N", help="number of frames after the start (default: those of the scene's duration)"
     )
-    for sub in (runs, infos, deforms, analyzes, compares, checks, renders, chooses, benches, fits):
+    for sub in (runs, infos, deforms, analyzes, compares, checks, renders, chooses, benches, fitted):
         if sub is not checks:
             sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
     for sub in (runs, benches):
         sub.add_argument("--threads", type=int, default=1, metavar="N", help="number of CPU threads (default: 1)")
-    for sub in (runs, infos, deforms, analyzes, chooses, benches, fits):
-        default = "float64" if sub in (deforms, analyzes, fits) else "float32"
+    for sub in (runs, infos, deforms, analyzes, chooses, benches, fitted):
+        default = "float64" if sub in (deforms, analyzes, fitted) else "float32"
         sub.add_argument("--dtype", choices=DTYPES, default=default, help=f"precision (default: {default})")
     for sub in (runs, deforms):
         text = "the .usd, .usda, .usdc or .usdz file to write"
