@@ -1,17 +1,14 @@
-"""Factories of kernels for the forces of multipliers and for the work of pins, loads and colliders."""
+"""Factories of kernels for the forces of multipliers and for the work of pins and loads."""
 
 from functools import cache
 
 import warp as wp
 
-from .contact.colliders import of_pose, pose_types, step_poses
 from .local import local_coordinate
 from .project import multiplier_type
 from .term import Term
 from .transpose import LocalSource, gather, scatter
 from .vectors import types
-
-UNCUT, NOW = wp.constant(0), wp.constant(2)  # the filter shortened no move of a vertex, or one in this step (1: in the last)
 
 
 @cache
@@ -164,134 +161,6 @@ def add_work(dtype):
 
 
 @cache
-def half_way(dtype):
-    """Kernel over vertices: out = ½(a + b)."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
-    def half_way_between(
-        # state in
-        a: wp.array(dtype=vec3),
-        b: wp.array(dtype=vec3),
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        out[i] = dtype(0.5) * (a[i] + b[i])
-
-    return half_way_between
-
-
-@cache
-def collider_pulls(dtype):
-    """Struct of ∂U/∂x of contact and friction with a collider, of friction alone, and of the moves of the collider, or None."""
-    vec3, _ = types(dtype)
-
-    @wp.struct
-    class Pulls:
-        all: wp.array(dtype=vec3)
-        friction: wp.array(dtype=vec3)
-        move: wp.array(dtype=vec3)
-
-    return Pulls
-
-
-@cache
-def rigid_moves(dtype):
-    """Kernel over vertices: displacement in a step of the material point of a collider at x, from its ``poses``."""
-    vec3, _ = types(dtype)
-    pose_type, _anchor = pose_types(dtype)
-    to_local, to_space = of_pose(dtype)
-
-    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
-    def moves(
-        # state in
-        x: wp.array(dtype=vec3),
-        poses: wp.array2d(dtype=pose_type),
-        step: step_poses(dtype),
-        # parameters
-        collider: int,
-        per_copy: int,
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        copy = i // per_copy
-        X = to_local(poses[copy, collider], x[i])
-        out[i] = to_space(step.after[copy, collider], X) - to_space(step.before[copy, collider], X)
-
-    return moves
-
-
-@cache
-def add_collider_work(dtype):
-    """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
-
-    ∇U is that of contact and friction, ∇H that of friction alone. δ is the displacement of the collider's material at the
-    vertex. Both gradients are evaluated where the step takes its forces, ``now``. With ``before``, the trapezoidal rule takes
-    the mean of the products there and at the start of the step; ∇U and ∇H are then stored for the next step.
-
-    Contact acts within ``distance``. If the gap changes by more in a step, the two are in contact for only a part of it, in
-    which they move together. The work of contact is then that of the part of Δx that δ shares.
-
-    If the filter shortened the move, Δx is the unshortened move, to ``uncut``, and only the forces of ``now`` count, in this
-    step and in the next. Δx then does not change the energy of contact by ∇U·(Δx − δ); the filter did, so of_filter −= that.
-    """
-    vec3, _ = types(dtype)
-    product = wide_dot(dtype)
-
-    @wp.func
-    def work_on(pulls: collider_pulls(dtype), i: int, moved: vec3, distance: dtype):
-        """∇U·δ."""
-        contact = pulls.all[i]
-        rubbed = wp.float64(0.0)
-        if pulls.friction.shape[0] > 0:
-            contact = contact - pulls.friction[i]
-            rubbed = product(pulls.friction[i], pulls.move[i])
-        work = product(contact, pulls.move[i])
-        shared = product(contact, moved)
-        if wp.abs(work - shared) > wp.float64(wp.length(contact) * distance):
-            work = wp.clamp(shared, wp.min(work, wp.float64(0.0)), wp.max(work, wp.float64(0.0)))
-        return work + rubbed
-
-    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
-    def add(
-        # state in
-        x_before: wp.array(dtype=vec3),
-        uncut: wp.array(dtype=vec3),
-        cuts: wp.array(dtype=wp.int32),
-        now: collider_pulls(dtype),
-        # parameters
-        distance: dtype,
-        # in and out
-        before: collider_pulls(dtype),
-        of_collider: wp.array(dtype=wp.float64),
-        against_friction: wp.array(dtype=wp.float64),
-        of_filter: wp.array(dtype=wp.float64),
-    ):
-        i = wp.tid()
-        moved = uncut[i] - x_before[i]
-        work = work_on(now, i, moved, distance)
-        rubbed = wp.float64(0.0)
-        if now.friction.shape[0] > 0:
-            rubbed = product(now.friction[i], moved - now.move[i])
-        if cuts[i] == NOW:
-            of_filter[i] = of_filter[i] + work + rubbed - product(now.all[i], moved)
-        if before.all.shape[0] > 0:
-            if cuts[i] == UNCUT:
-                work = wp.float64(0.5) * (work + work_on(before, i, moved, distance))
-                if now.friction.shape[0] > 0:
-                    rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], moved - before.move[i]))
-            before.all[i] = now.all[i]
-            if now.friction.shape[0] > 0:
-                before.friction[i] = now.friction[i]
-        of_collider[i] = of_collider[i] - work
-        against_friction[i] = against_friction[i] + rubbed
-
-    return add
-
-
-@cache
 def add_rubbing_work(dtype):
     """Kernel over vertices, after a step: work against friction += ∇H·Δx, with ∇H where the step evaluates its forces."""
     vec3, _ = types(dtype)
@@ -310,96 +179,3 @@ def add_rubbing_work(dtype):
         against_friction[i] = against_friction[i] + product(gradient[i], x[i] - x_before[i])
 
     return add_each_rubbing
-
-
-@cache
-def add_filter_work(dtype):
-    """Kernel over vertices, after a step: work of the filter += ½m(v² − v₋²) − (m g + f)·(x − x₋), x₋ and v₋ without it.
-
-    Sets ``uncut`` to x₋, updates ``cuts``, and resets the notes of the filter to 0.
-    """
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
-    def add(
-        # elements
-        mass: wp.array(dtype=dtype),
-        gravity: wp.array(dtype=vec3),
-        per_copy: int,
-        # state in
-        x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        force: wp.array(dtype=vec3),
-        # in and out
-        pushed: wp.array(dtype=wp.vec3d),
-        kicked: wp.array(dtype=wp.vec3d),
-        uncut: wp.array(dtype=vec3),
-        cuts: wp.array(dtype=wp.int32),
-        of_filter: wp.array(dtype=wp.float64),
-    ):
-        i = wp.tid()
-        push = pushed[i]
-        kick = kicked[i]
-        uncut[i] = x[i]
-        cuts[i] = cuts[i] // 2
-        if wp.dot(push, push) + wp.dot(kick, kick) > wp.float64(0.0):
-            uncut[i] = x[i] - vec3(dtype(push[0]), dtype(push[1]), dtype(push[2]))
-            cuts[i] = NOW
-            m = wp.float64(mass[i])
-            g = gravity[i // per_copy]
-            pull = m * wp.vec3d(wp.float64(g[0]), wp.float64(g[1]), wp.float64(g[2]))
-            if force.shape[0] > 0:
-                pull += wp.vec3d(wp.float64(force[i][0]), wp.float64(force[i][1]), wp.float64(force[i][2]))
-            mean = wp.vec3d(wp.float64(v[i][0]), wp.float64(v[i][1]), wp.float64(v[i][2])) - wp.float64(0.5) * kick
-            of_filter[i] = of_filter[i] + m * wp.dot(mean, kick) - wp.dot(pull, push)
-            pushed[i] = wp.vec3d()
-            kicked[i] = wp.vec3d()
-
-    return add
-
-
-@wp.kernel(module="warpcloth.work.colliders", enable_backward=False)
-def add_stored(
-    # elements
-    stencil: wp.array2d(dtype=wp.int32),
-    # state in
-    energies: wp.array(dtype=wp.float64),
-    cuts: wp.array(dtype=wp.int32),
-    # in and out
-    before: wp.array(dtype=wp.float64),
-    of_filter: wp.array(dtype=wp.float64),
-):
-    """Kernel over elements of contact: work of the filter += the change of their energies in a step that it shortened."""
-    e = wp.tid()
-    i = stencil[e, 0]
-    if cuts[i] == NOW:
-        of_filter[i] = of_filter[i] + energies[e] - before[e]
-    before[e] = energies[e]
-
-
-@cache
-def limit_pulls(dtype):
-    """Kernel over vertices: scales ∇U of a collider by ‖f‖/‖∇U‖ if that is below ½, with the ∇U of all colliders.
-
-    f is the contact force that the step gave the vertex. If the step converged, f = −∇U. Else the vertex may be deep in a
-    collider, with a ∇U that is millions of times larger.
-    """
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
-    def limit(
-        # state in
-        given: wp.array(dtype=vec3),
-        taken: wp.array(dtype=vec3),
-        # in and out
-        pulls: collider_pulls(dtype),
-    ):
-        i = wp.tid()
-        most = wp.length(given[i])
-        size = wp.length(taken[i])
-        if size > dtype(2.0) * most:
-            pulls.all[i] = (most / size) * pulls.all[i]
-            if pulls.friction.shape[0] > 0:
-                pulls.friction[i] = (most / size) * pulls.friction[i]
-
-    return limit

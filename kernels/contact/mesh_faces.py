@@ -2,7 +2,7 @@
 
 Two triangles that do not cross have a plane between them, normal to the shortest vector between the two. As long as the
 vertices of each stay on their side of a plane, the triangles do not cross. This covers vertices of the mesh against triangles
-of the cloth, and edges against edges; the filter of :mod:`.mesh_colliders` has only vertices of the cloth.
+of the cloth, and edges against edges; the filter of :mod:`.mesh_filter` has only vertices of the cloth.
 
 All is in the frame of the collider, in float64, where x₀ is where the step began and x its end. Vertices of both sides move
 linearly. A *face* is a triangle of the cloth, or an edge of no triangle, whose last vertex is then there twice.
@@ -14,9 +14,10 @@ import warp as wp
 
 from ..terms.contact import turned
 from ..vectors import types
-from .colliders import FilterNotes, pose_types
-from .mesh_colliders import meshes as meshes_of
-from .mesh_colliders import motions
+from .collider_filter import FilterNotes
+from .colliders import pose_types
+from .mesh_geometry import meshes as meshes_of
+from .mesh_geometry import motions
 from .self_gaps import ONE, ZERO, nearest, vertex_of
 
 turned_by = turned

@@ -8,7 +8,8 @@ from functools import cache
 
 import warp as wp
 
-from ..contact.colliders import FilterNotes, local_gap_of, of_pose, outside, pose_types, shapes, step_poses, turned_by
+from ..contact.collider_filter import FilterNotes, outside
+from ..contact.colliders import local_gap_of, of_pose, pose_types, shapes, step_poses, turned_by
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..rotation import epsilon
@@ -80,7 +81,8 @@ def in_ball(dtype, moving: bool):
 def touching_step(dtype, symplectic: bool):
     """Device function (guard, i, w, x, v, a, h) → x, v of vertex i after a step, with a = g − ∇U/m without contact.
 
-    It computes the same as :func:`..contact.colliders.anchor_vertices` (``bounded``) and :func:`..contact.colliders.outside`.
+    It computes the same as :func:`..contact.anchors.anchor_vertices` (``bounded``) and
+    :func:`..contact.collider_filter.outside`.
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)

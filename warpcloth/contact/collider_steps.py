@@ -8,7 +8,9 @@ import numpy as np
 import warp as wp
 
 from ..kernels.contact import colliders as kernels
-from ..kernels.contact import mesh_colliders as mesh_kernels
+from ..kernels.contact.anchors import anchor_vertices
+from ..kernels.contact.collider_filter import FIRST, FilterNotes, filter_step, hold_locked
+from ..kernels.contact.mesh_filter import filter_meshes
 from ..kernels.fast.clear_elements import find_clear
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
@@ -50,7 +52,7 @@ class ColliderSteps:
         least: The smallest distance from a collider at which a vertex may end a step [m].
         faces: :class:`warpcloth.contact.mesh_faces.MeshFaces` that keeps triangles from crossing meshes, or None.
         steps_per_frame: As given.
-        notes: :class:`warpcloth.kernels.contact.colliders.FilterNotes`.
+        notes: :class:`warpcloth.kernels.contact.collider_filter.FilterNotes`.
         steps: The number of steps so far, (B,) int32.
         correction: x − x̃ of steps with contact (N,) [m], or None for explicit steps. ``he`` is their effective step [s].
         pushed, kicked: Sums of what the filter changed in positions [m] and velocities [m/s] since they were last set to 0,
@@ -70,7 +72,7 @@ class ColliderSteps:
             setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
         self.x_before = model.vectors()
         self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device))
-        self.notes = kernels.FilterNotes()
+        self.notes = FilterNotes()
         self.notes.steps = self.steps
         self.notes.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
         self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
@@ -90,9 +92,9 @@ class ColliderSteps:
             self.meshes = MeshSteps(model, self.poses, self.bounded, resting, **given)
             if model.scene.contact.elements == "triangles" and not resting:
                 self.faces = MeshFaces(model, self.meshes, h)
-        self._filter = model.kernel(kernels.filter_step if self.meshes is None else mesh_kernels.filter_meshes, model.dtype)
+        self._filter = model.kernel(filter_step if self.meshes is None else filter_meshes, model.dtype)
         if model.mobility is not None:
-            self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(kernels.hold_locked, model.dtype)
+            self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(hold_locked, model.dtype)
             self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
         self._finds_clear = model.device.is_cpu and not (self.bounded or resting)
         self.terms = []
@@ -113,7 +115,7 @@ class ColliderSteps:
                 of_mesh = self.meshes.contact(elements)
             launch = partial(self._on_mesh, of_mesh, state.v)
         elif elements.term is FRICTION:
-            kernel = model.kernel(kernels.anchor_vertices, model.dtype, self.bounded)
+            kernel = model.kernel(anchor_vertices, model.dtype, self.bounded)
             launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
         elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
             launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype), c, state.v)
@@ -226,7 +228,7 @@ class ColliderSteps:
     def end_again(self):
         """Prepares :meth:`launch_out` and :meth:`launch_inside`. From now on the latter counts the step."""
         device, model = self.model.device, self.model
-        self._again, self._unread = True, kernels.FilterNotes()
+        self._again, self._unread = True, FilterNotes()
         self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
         self._unread.steps, self._unread.cut = self.steps, wp.zeros(model.copies, dtype=wp.int64, device=device)
         self._unread.inside = wp.zeros(self._dim, dtype=wp.int64, device=device)
@@ -255,7 +257,7 @@ class ColliderSteps:
         free = self.model.inverse_mass.numpy() > 0.0 if self._again else np.zeros(self.model.count, dtype=bool)
         for (copy, c), value in np.ndenumerate(self.notes.inside.numpy()):
             if value:
-                rest, other = divmod(int(kernels.FIRST) - int(value), colliders + 1)
+                rest, other = divmod(int(FIRST) - int(value), colliders + 1)
                 step, vertex = divmod(rest, n)
                 held = CLOTH if free[copy * n + vertex] else None
                 found.append((copy, c, step, vertex, other if other < colliders else held))

@@ -5,10 +5,10 @@ import warp as wp
 from ..core.energy import Energy
 from ..core.gradient import Gradient
 from ..core.sums import Sums
-from ..kernels import work as kernels
-from ..kernels.contact.mesh_colliders import surface_moves
+from ..kernels.contact import collider_work as kernels
 from ..kernels.project import add_momentum
 from ..kernels.terms.friction import FRICTION
+from ..kernels.work import add_scaled
 from .present import ColliderPulls, PresentContact
 
 
@@ -31,7 +31,7 @@ class ColliderWork:
         self._before, self._x_step = [], self._x if self._at_end else colliders.x_before
         others, self._limit = [elements for elements in terms if elements.collider is None], None
         if colliders.correction is not None and model.mobility is None and not any(elements.hard for elements in others):
-            self._limit = [model.kernel(each, model.dtype) for each in (add_momentum, kernels.add_scaled, kernels.limit_pulls)]
+            self._limit = [model.kernel(each, model.dtype) for each in (add_momentum, add_scaled, kernels.limit_pulls)]
             self._elastic, self._given, self._taken = Gradient(model, terms=others), model.vectors(), model.vectors()
         for now in self.pulls.found:
             before = kernels.collider_pulls(model.dtype)()
@@ -46,7 +46,7 @@ class ColliderWork:
         self._add = model.kernel(kernels.add_collider_work, model.dtype)
         self._rigid, meshes = model.kernel(kernels.rigid_moves, model.dtype), model.colliders.meshes
         self._deform = [] if meshes is None else meshes.deform
-        self._surface = model.kernel(surface_moves, model.dtype) if self._deform else None
+        self._surface = model.kernel(kernels.surface_moves, model.dtype) if self._deform else None
 
     def begin(self, found, vertices):
         """Sets the state before the first step from the pulls ``found``, of which it takes the slice ``vertices``."""
@@ -104,7 +104,8 @@ class FilterWork:
 
     Attributes:
         uncut: Positions (N,) [m] after the last step without the filter.
-        cuts: Whether the filter shortened the move of each vertex, (N,) int32, see :mod:`warpcloth.kernels.work`.
+        cuts: Whether the filter shortened the move of each vertex, (N,) int32, see
+            :mod:`warpcloth.kernels.contact.collider_work`.
     """
 
     def __init__(self, stepper, of_filter):

@@ -3,7 +3,10 @@
 import numpy as np
 import warp as wp
 
-from ..kernels.contact import mesh_colliders as kernels
+from ..kernels.contact import mesh_facets
+from ..kernels.contact.anchors import anchor_on_mesh
+from ..kernels.contact.mesh_geometry import motions
+from ..kernels.contact.mesh_queries import LISTED, bound_triangles, near_lists
 from ..kernels.terms.contact import AREA
 
 
@@ -15,26 +18,26 @@ class MeshSteps:
         poses: Poses of the step, a :func:`warpcloth.kernels.contact.colliders.step_poses`.
         bounded: Whether the method is explicit.
         resting: Whether the solver finds an equilibrium, where vertices may move any distance.
-        **given: The numbers and ``steps`` of :func:`warpcloth.kernels.contact.mesh_colliders.motions`.
+        **given: The numbers and ``steps`` of :func:`warpcloth.kernels.contact.mesh_geometry.motions`.
 
     Attributes:
         geometry: See :class:`warpcloth.model.device_meshes.DeviceMeshes`.
-        motion: Struct :func:`warpcloth.kernels.contact.mesh_colliders.motions`.
+        motion: Struct :func:`warpcloth.kernels.contact.mesh_geometry.motions`.
         given: The numbers and ``steps``, by name.
     """
 
     def __init__(self, model, poses, bounded, resting=False, **given):
         self.model, self._bounded, self._resting, self._facets = model, bounded, resting, {}
         self._meshes = model.colliders.meshes.own(model)
-        self.geometry, self.motion = self._meshes.geometry, kernels.motions(model.dtype)()
+        self.geometry, self.motion = self._meshes.geometry, motions(model.dtype)()
         self.given = given
         for name, value in (given | {name: getattr(poses, name) for name in ("before", "at", "after")}).items():
             setattr(self.motion, name, value)
-        self.lists = kernels.near_lists(model.dtype)()
+        self.lists = near_lists(model.dtype)()
         if self.motion.ahead == 0:
             self._set_lists()
         if self._meshes.deform:
-            self._bound = model.kernel(kernels.bound_triangles, model.dtype)
+            self._bound = model.kernel(bound_triangles, model.dtype)
 
     def _set_lists(self):
         """Allocates lists of the triangles near vertices, for explicit steps, in which vertices move little."""
@@ -51,7 +54,7 @@ class MeshSteps:
             "ball": model.array(balls, wp.types.vector(4, model.dtype)),
             "built": wp.zeros(dim, dtype=wp.int32, device=model.device),
             "count": wp.zeros(dim, dtype=wp.int32, device=model.device),
-            "triangles": wp.zeros((*dim, kernels.LISTED), dtype=wp.int32, device=model.device),
+            "triangles": wp.zeros((*dim, LISTED), dtype=wp.int32, device=model.device),
         }
         for name, value in self._kept.items():
             setattr(self.lists, name, value)
@@ -71,13 +74,13 @@ class MeshSteps:
             elements: The contact elements of the model, in the order of their facets.
         """
         model, c = self.model, elements.collider
-        pose = model.kernel(kernels.pose_facets, model.dtype)
+        pose = model.kernel(mesh_facets.pose_facets, model.dtype)
         areas = model.array(elements.rest.numpy()[:, AREA], model.dtype)
         if elements.facet == 0:
             most = 1 + max(each.facet for each in model.terms if each.collider == c)
-            facet_type = kernels.facet_type(model.dtype)
+            facet_type = mesh_facets.facet_type(model.dtype)
             self._facets[c] = wp.zeros((model.count, most), dtype=facet_type, device=model.device)
-            find = model.kernel(kernels.find_facets, model.dtype, self.motion.ahead == 0, self._resting)
+            find = model.kernel(mesh_facets.find_facets, model.dtype, self.motion.ahead == 0, self._resting)
         facets = self._facets[c]
 
         def launch(elements, x, v):
@@ -97,7 +100,7 @@ class MeshSteps:
             anchors: The array of anchors (N,).
         """
         model, c = self.model, elements.collider
-        anchor = model.kernel(kernels.anchor_on_mesh, model.dtype, self._bounded)
+        anchor = model.kernel(anchor_on_mesh, model.dtype, self._bounded)
         most = self._facets[c].shape[1]
 
         def launch(elements, x, _v):

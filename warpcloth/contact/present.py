@@ -8,8 +8,9 @@ import warp as wp
 
 from ..core.gradient import Gradient
 from ..kernels.contact import colliders as kernels
+from ..kernels.contact.anchors import anchor_vertices
+from ..kernels.contact.collider_work import collider_pulls
 from ..kernels.terms.friction import FRICTION
-from ..kernels.work import collider_pulls
 from .mesh_steps import MeshSteps
 
 
@@ -62,7 +63,7 @@ class PresentContact:
                 on_mesh = self._meshes.contact(elements)
             self._launches.append(partial(on_mesh, own))
         elif elements.term is FRICTION:
-            kernel = model.kernel(kernels.anchor_vertices, model.dtype, steps.bounded)
+            kernel = model.kernel(anchor_vertices, model.dtype, steps.bounded)
             self._launches.append(partial(self._anchor, kernel, own, anchors))
         elif model.colliders.moves[c]:
             self._launches.append(partial(self._pose, model.kernel(kernels.pose_collider, model.dtype), own))
@@ -106,7 +107,7 @@ class ColliderPulls:
             multipliers; or None.
 
     Attributes:
-        found: A :func:`warpcloth.kernels.work.collider_pulls` for each collider.
+        found: A :func:`warpcloth.kernels.contact.collider_work.collider_pulls` for each collider.
         hard: Whether contact is hard.
     """
 

@@ -7,6 +7,7 @@ from ..base.limits import refuse_memory
 from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.scan import Scan
+from ..kernels.contact import piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 
 BYTES_OF_A_PAIR = 56
@@ -48,7 +49,7 @@ class Proximity:
             "rest": model.array(points, model.vec3),
             "piece": wp.array(piece, dtype=wp.int32, device=device),
         }
-        self._surface = kernels.surfaces(model.dtype)()
+        self._surface = proximity_grid.surfaces(model.dtype)()
         far = 2.0 * (distance + mesh.edge_lengths.max())
         for name, value in ({"vertices": n, "distance": distance, "skin": skin, "far": far} | self._kept).items():
             setattr(self._surface, name, value)
@@ -61,12 +62,9 @@ class Proximity:
         self._rows = Scan(model, model.count + self._edges)
         self._pairs_of = {each: model.kernel(kernels.find_pairs, model.dtype, each) for each in (False, True)}
         self._launch = model.launcher(
-            (
-                (kernels.count_items, kernels.fill_buckets, kernels.fill_rows, kernels.write_pairs),
-                model.dtype,
-            ),
-            ((kernels.begin_boxes, kernels.extend_boxes, kernels.find_motion, kernels.compare_motions), model.dtype),
-            ((kernels.take_moved,), model.dtype),
+            ((proximity_grid.count_items, proximity_grid.fill_buckets, kernels.fill_rows, kernels.write_pairs), model.dtype),
+            ((piece_motion.begin_boxes, piece_motion.extend_boxes), model.dtype),
+            ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.take_moved), model.dtype),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
@@ -112,7 +110,7 @@ class Proximity:
             for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("motion", model.dtype)):
                 self._piece_arrays[name] = wp.zeros(model.copies * len(used), dtype=kind, device=model.device)
         self.centre = self._piece_arrays["centre"]
-        self._pieces = kernels.pieces(model.dtype)()
+        self._pieces = piece_motion.pieces(model.dtype)()
         for name, value in ({"per_copy": len(used)} | self._piece_arrays).items():
             setattr(self._pieces, name, value)
 
@@ -125,7 +123,7 @@ class Proximity:
         self._grid_arrays = {k: wp.zeros(size, dtype=wp.int32, device=model.device) for k, size in count.items()}
         for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("entries", wp.vec4i)):
             self._grid_arrays[name] = wp.zeros(items, dtype=kind, device=model.device)
-        self._grid = kernels.grids(model.dtype)()
+        self._grid = proximity_grid.grids(model.dtype)()
         for name, value in ({"size": size} | self._grid_arrays).items():
             setattr(self._grid, name, value)
         self._buckets = Scan(model, buckets)
@@ -165,7 +163,7 @@ class Proximity:
 
         So the pairs of a copy do not depend on other copies.
         """
-        self._launch(kernels.take_moved, self.model.count, [x, self.copies, self.model.per_copy], [self.found])
+        self._launch(piece_motion.take_moved, self.model.count, [x, self.copies, self.model.per_copy], [self.found])
         self.launch(self.found)
 
     def launch(self, x):
@@ -179,9 +177,9 @@ class Proximity:
             self._launch_boxes(x)
         self.counts.zero_()
         self._grid_arrays["levels"].zero_()
-        self._launch(kernels.count_items, items, [surface, x], [grid])
+        self._launch(proximity_grid.count_items, items, [surface, x], [grid])
         self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
-        self._launch(kernels.fill_buckets, items, [surface, x], [grid])
+        self._launch(proximity_grid.fill_buckets, items, [surface, x], [grid])
         for of_edges, count in ((False, N if self._triangles else 0), (True, self._edges)):
             if count:
                 self.model.launch(self._pairs_of[of_edges], count, [surface, x, grid, self._triangles], [pairs])
@@ -190,8 +188,8 @@ class Proximity:
         self._launch(kernels.write_pairs, N + self._edges, [surface, N, self._triangles], [pairs])
 
     def _launch_boxes(self, x):
-        self._launch(kernels.begin_boxes, len(self._pieces.centre), [x], [self._pieces])
-        self._launch(kernels.extend_boxes, self.model.count, [x], [self._pieces])
+        self._launch(piece_motion.begin_boxes, len(self._pieces.centre), [x], [self._pieces])
+        self._launch(piece_motion.extend_boxes, self.model.count, [x], [self._pieces])
 
     def launch_kept(self, x, part, launch):
         """Calls ``launch`` at x if :meth:`moved` sets the flag, else at ``found`` if the list is not that of ``found``.
@@ -226,11 +224,11 @@ class Proximity:
         if several:
             self._pieces.motion.zero_()
         given = [x, self.found, self.listed, active, part * self.skin]
-        self._launch(kernels.find_motion, self.model.count, given, [self._pieces, self.copies, self.flag, self._stale])
+        self._launch(piece_motion.find_motion, self.model.count, given, [self._pieces, self.copies, self.flag, self._stale])
         if several:
             wp.capture_if(self._stale, lambda: self._launch_boxes(self.found))
             given = [x, self.found, self._pieces, active, self.distance + self.skin, 2.0 * part * self.skin]
-            self._launch(kernels.compare_motions, len(self._pieces.centre), given, [self.copies, self.flag])
+            self._launch(piece_motion.compare_motions, len(self._pieces.centre), given, [self.copies, self.flag])
         return self.flag
 
     @property

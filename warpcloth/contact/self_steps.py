@@ -11,7 +11,7 @@ from ..core.scan import Scan
 from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels.contact import gap_notes, self_pairs
-from ..kernels.contact.proximity import take_moved
+from ..kernels.contact.piece_motion import take_moved
 from ..kernels.contact.self_filter import HeldPins
 from .proximity import Proximity
 from .self_filter import WAY, SelfFilter

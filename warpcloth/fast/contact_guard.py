@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..contact.collider_steps import LANDING
-from ..kernels.contact.colliders import note_fixed
+from ..kernels.contact.collider_filter import note_fixed
 from ..kernels.copy import copy_chosen
 from ..kernels.fast import contact_guard as kernels
 from ..model.host_values import host_values

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..kernels.contact import mesh_colliders as kernels
+from ..kernels.contact import mesh_geometry as kernels
 
 # Rounding of bounds in float32, relative to the largest coordinate.
 _ROUNDING = 1e-6
@@ -15,7 +15,7 @@ class DeviceMeshes(NamedTuple):
     """The meshes of the colliders of a scene, which all copies share.
 
     Attributes:
-        geometry: The struct :func:`warpcloth.kernels.contact.mesh_colliders.meshes`.
+        geometry: The struct :func:`warpcloth.kernels.contact.mesh_geometry.meshes`.
         trees: A `wp.Bvh` of each collider at its start, or None if it is not a mesh.
         deform: Indices of the colliders that deform.
     """

@@ -76,7 +76,7 @@ def equilibrium(
     among them, so colliders and self-contact with friction are refused: run such a scene with damping until it rests.
 
     A mesh collider is approximated near each vertex by half-spaces that touch it, see
-    :mod:`warpcloth.kernels.contact.mesh_colliders`. They are updated after the cloth has settled, and it settles again, until
+    :mod:`warpcloth.kernels.contact.mesh_facets`. They are updated after the cloth has settled, and it settles again, until
     they no longer change the balance. No vertex crosses a triangle on the straight line between two of these rounds.
 
     With self-contact, no iterate crosses itself, pins included: pins with keyframes move as far as cloth lets them, and if they

@@ -12,7 +12,7 @@ from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..base.types import Converted, default
 from ..kernels import nearest
-from ..kernels.contact.mesh_colliders import FACETS, FAR
+from ..kernels.contact.mesh_facets import FACETS, FAR
 from ..mesh.mesh import Mesh
 from .colliders import Collider, from_y, turned
 

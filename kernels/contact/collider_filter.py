@@ -1,0 +1,337 @@
+"""Factories of the kernels of the filter of convex colliders, which ends a step, and of its notes."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from ..rotation import epsilon
+from ..terms.contact import local_gap, turned
+from ..vectors import types
+from .colliders import kept_part, of_pose, shapes, step_poses, surely_apart
+
+local_gap_of, turned_by = local_gap, turned
+ROUNDS = wp.constant(6)  # maximum number of tests of a vertex that colliders stop
+SLIDING = wp.constant(2)  # in so many of these it slides; then its move is only shortened, which terminates
+FIRST = wp.constant(wp.int64(2**62))
+
+
+@wp.struct
+class FilterNotes:
+    """Notes of the filter after ``steps`` steps: the number of cuts (copies,), and the first vertex inside (copies, colliders).
+
+    ``inside`` is 0 if no vertex is inside. Else it is FIRST − ((step·n + vertex)(C + 1) + other) with n vertices and C
+    colliders. other is the last collider that held the vertex back, or C for a vertex that is not free.
+
+    ``pushed`` and ``kicked``, (N,) or None, are the changes of the positions and velocities of vertices by cuts; entries of
+    other vertices are not written.
+    """
+
+    steps: wp.array(dtype=wp.int32)
+    cut: wp.array(dtype=wp.int64)
+    inside: wp.array2d(dtype=wp.int64)
+    pushed: wp.array(dtype=wp.vec3d)
+    kicked: wp.array(dtype=wp.vec3d)
+
+
+@wp.func
+def note_cut(notes: FilterNotes, copy: int, i: int, pushed: Any, kicked: Any):
+    """Notes that the move of vertex i of a copy was cut, with the changes of its position and velocity."""
+    wp.atomic_add(notes.cut, copy, wp.int64(1))
+    if notes.pushed.shape[0] > 0:
+        notes.pushed[i] = wp.vec3d(wp.float64(pushed[0]), wp.float64(pushed[1]), wp.float64(pushed[2]))
+        notes.kicked[i] = wp.vec3d(wp.float64(kicked[0]), wp.float64(kicked[1]), wp.float64(kicked[2]))
+
+
+@wp.func
+def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex: int, per_copy: int, other: int):
+    """Notes that a vertex of a copy is inside a collider; the first in time, then by index, remains."""
+    count = wp.int64(notes.inside.shape[1])
+    key = wp.int64(step) * wp.int64(per_copy) + wp.int64(vertex)
+    wp.atomic_max(notes.inside, copy, collider, FIRST - (key * (count + wp.int64(1)) + wp.int64(other)))
+
+
+@cache
+def sliding(dtype):
+    """Device functions for a vertex that a surface stops: ``along`` and ``velocity``."""
+    vec3, _ = types(dtype)
+    zero = dtype(0.0)
+
+    @wp.func
+    def along(move: vec3, n: vec3, friction: dtype):
+        """The part of a move along a surface with the normal n, and the push, which removes the part into it.
+
+        Friction reduces the first by up to μ times the push (Coulomb).
+        """
+        push = wp.max(-wp.dot(move, n), zero) * n
+        left = move + push
+        l, most = wp.length(left), friction * wp.length(push)
+        if most > zero:
+            left *= wp.max(l - most, zero) / wp.max(l, most)
+        return left, push
+
+    @wp.func
+    def velocity(v: vec3, move: vec3, change: vec3, push: vec3, h: dtype):
+        """The velocity after a step whose ``move`` was changed by a push and friction.
+
+        Along the push it is that of the move. For Euler it is v + change/h. For midpoint, v is twice the mean velocity of the
+        step minus that at its start, so v + change/h would throw the vertex back.
+        """
+        size = wp.dot(push, push)
+        found = v + (change - push) / h
+        if size > zero:
+            found += wp.dot((move + change) / h - v, push) / size * push
+        return found
+
+    return along, velocity
+
+
+@cache
+def stopped_by_shape(dtype):
+    """Device function (X, move, …) → the end of a move from X in the frame of a convex collider, its change, push, and stop.
+
+    A move that would come nearer than ``least`` stops before, at a distance of at most ``landing`` more. With ``slides``, it
+    continues along the plane through that point, which has the whole collider behind it, raised to twice ``least`` so that
+    rounding does not stop it. The fourth value is whether the move was stopped.
+    """
+    vec3, _ = types(dtype)
+    kept = kept_part(dtype)
+    along, _velocity = sliding(dtype)
+
+    @wp.func
+    def stopped(
+        X: vec3,
+        move: vec3,
+        core: vec3,
+        radius: dtype,
+        friction: dtype,
+        least: dtype,
+        landing: dtype,
+        slides: bool,
+    ):
+        end = X + move
+        change = vec3()
+        push = vec3()
+        hit = kept(X, move, core, radius, least) < dtype(1.0)
+        if hit:
+            t = kept(X, move, core, radius, least + landing)
+            end = X + t * move
+            change = (t - dtype(1.0)) * move
+            push = change
+            if slides:
+                d, n = local_gap_of(end, core, radius)
+                left, push = along(-change, n, friction)
+                end += left + wp.max(dtype(2.0) * least - d, dtype(0.0)) * n
+                change += left
+        return end, change, push, hit
+
+    return stopped
+
+
+@cache
+def outside(dtype):
+    """Device function (x, end, v, …) → final position and velocity of a free vertex that moves from x to ``end``.
+
+    In the frame of a collider it moves along a segment, or, if that comes too near, as in :func:`stopped_by_shape`. The third
+    value is whether a collider stopped it. ``notes`` counts stops, and notes the vertex if colliders leave no way out.
+    """
+    vec3, _ = types(dtype)
+    to_local, to_space = of_pose(dtype)
+    stopped, surely_out = stopped_by_shape(dtype), surely_apart(dtype)
+    _along, velocity = sliding(dtype)
+
+    @wp.func
+    def end_outside(
+        x: vec3,
+        end: vec3,
+        v: vec3,
+        h: dtype,
+        i: int,
+        step: int,
+        shape: shapes(dtype),
+        poses: step_poses(dtype),
+        per_copy: int,
+        least: dtype,
+        landing: dtype,
+        notes: FilterNotes,
+    ):
+        copy = i // per_copy
+        move = end - x
+        rounded = least + dtype(8.0) * epsilon(least) * wp.max(wp.abs(end))
+        change = vec3()
+        push = vec3()
+        cuts = wp.int32(0)
+        last = wp.int32(0)
+        rounds = wp.int32(0)
+        while rounds <= cuts and rounds < ROUNDS:  # another round after each cut
+            rounds += 1
+            for c in range(shape.radius.shape[0]):
+                pose = poses.after[copy, c]
+                began = poses.before[copy, c]
+                # For a collider at rest, the relative move is the move.
+                margin = wp.length(end - x) + rounded
+                if not (began == pose and surely_out(pose, shape.core[c], shape.radius[c], margin, x)):
+                    X = to_local(began, x)
+                    X, less, by, hit = stopped(
+                        X,
+                        to_local(pose, end) - X,
+                        shape.core[c],
+                        shape.radius[c],
+                        shape.friction[c],
+                        rounded,
+                        landing,
+                        rounds <= SLIDING,
+                    )
+                    if hit:
+                        end = to_space(pose, X)
+                        change += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], less)
+                        push += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], by)
+                        cuts = rounds
+                        last = c
+        if cuts > 0:
+            after = velocity(v, move, change, push, h)
+            note_cut(notes, copy, i, end - x - move, after - v)
+            v = after
+        if cuts == ROUNDS:
+            for c in range(shape.radius.shape[0]):
+                d, _n = local_gap_of(to_local(poses.after[copy, c], end), shape.core[c], shape.radius[c])
+                if d <= dtype(0.0):
+                    note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, last)
+        return end, v, cuts > 0
+
+    return end_outside
+
+
+@cache
+def entry(dtype):
+    """Device function (x, end, …) that notes a vertex that is not free if it enters a collider between x and ``end``."""
+    vec3, _ = types(dtype)
+    to_local, _to_space = of_pose(dtype)
+    kept = kept_part(dtype)
+
+    @wp.func
+    def note_entry(
+        x: vec3,
+        end: vec3,
+        i: int,
+        step: int,
+        shape: shapes(dtype),
+        poses: step_poses(dtype),
+        per_copy: int,
+        least: dtype,
+        notes: FilterNotes,
+    ):
+        copy = i // per_copy
+        rounding = dtype(8.0) * epsilon(least)
+        for c in range(shape.radius.shape[0]):
+            X = to_local(poses.before[copy, c], x)
+            way = to_local(poses.after[copy, c], end) - X
+            d, _n = local_gap_of(X, shape.core[c], shape.radius[c])
+            deep = -rounding * wp.max(wp.max(wp.abs(end)), wp.max(wp.abs(X)))  # a vertex that moves along may touch
+            if d > deep and kept(X, way, shape.core[c], shape.radius[c], deep) < dtype(1.0):
+                note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, shape.radius.shape[0])
+
+    return note_entry
+
+
+@cache
+def filter_step(dtype):
+    """Kernel over vertices at the end of a step: keeps free vertices outside colliders, also on their way.
+
+    Free vertices, and their ``move``, which may be None, end as in :func:`outside`. :func:`entry` notes others.
+    """
+    vec3, _ = types(dtype)
+    end_outside, note_entry = outside(dtype), entry(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def filter_vertices(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        shape: shapes(dtype),
+        # state in
+        x_before: wp.array(dtype=vec3),
+        poses: step_poses(dtype),
+        # parameters
+        per_copy: int,
+        least: dtype,
+        landing: dtype,
+        h: dtype,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        notes: FilterNotes,
+    ):
+        i = wp.tid()
+        now = notes.steps[i // per_copy]
+        if inverse_mass[i] > dtype(0.0):
+            end, after, short = end_outside(x_before[i], x[i], v[i], h, i, now, shape, poses, per_copy, least, landing, notes)
+            if short:
+                if move:
+                    move[i] = move[i] + (end - x[i])
+                x[i] = end
+                v[i] = after
+        else:
+            note_entry(x_before[i], x[i], i, now, shape, poses, per_copy, least, notes)
+
+    return filter_vertices
+
+
+@cache
+def hold_locked(dtype):
+    """Kernel over vertices: undoes the filter along locked axes."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def hold(
+        # elements
+        mobility: wp.array(dtype=vec3),
+        # state in
+        x_before: wp.array(dtype=vec3),
+        v_before: wp.array(dtype=vec3),
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        notes: FilterNotes,
+    ):
+        i = wp.tid()
+        for axis in range(3):
+            if mobility[i][axis] == dtype(0.0):
+                if notes.pushed.shape[0] > 0:
+                    notes.pushed[i][axis] = wp.float64(0.0)
+                    notes.kicked[i][axis] = wp.float64(0.0)
+                if move:
+                    move[i][axis] = move[i][axis] + x_before[i][axis] - x[i][axis]
+                x[i][axis] = x_before[i][axis]
+                v[i][axis] = v_before[i][axis]
+
+    return hold
+
+
+@cache
+def note_fixed(dtype):
+    """Kernel over the vertices of all copies that are not free: :func:`entry`, from the start of the step."""
+    vec3, _ = types(dtype)
+    note_entry = entry(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def note(
+        # elements
+        fixed: wp.array(dtype=wp.int32),
+        shape: shapes(dtype),
+        # state in
+        x_before: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        poses: step_poses(dtype),
+        # parameters
+        per_copy: int,
+        least: dtype,
+        # in and out
+        notes: FilterNotes,
+    ):
+        p = wp.tid()
+        i = fixed[p]
+        note_entry(x_before[p], x[i], i, notes.steps[i // per_copy], shape, poses, per_copy, least, notes)
+
+    return note

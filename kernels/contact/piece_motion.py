@@ -1,0 +1,179 @@
+"""Factories of the kernels that decide whether pairs must be found again, by the motion of the connected pieces of a cloth."""
+
+from functools import cache
+
+import warp as wp
+
+from ..vectors import types
+from .proximity_grid import MODULE
+
+
+@cache
+def pieces(dtype):
+    """Struct of the connected pieces of all copies: the piece of each vertex, or −1, and the middle vertex of each piece.
+
+    If a copy has more than one piece (``per_copy``), each also has a box, and the largest motion of its vertices relative to
+    the middle vertex [m].
+    """
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Pieces:
+        piece: wp.array(dtype=wp.int32)
+        centre: wp.array(dtype=wp.int32)
+        per_copy: wp.int32
+        lower: wp.array(dtype=vec3)
+        upper: wp.array(dtype=vec3)
+        motion: wp.array(dtype=dtype)
+
+    return Pieces
+
+
+@cache
+def begin_boxes(dtype):
+    """Kernel over pieces: sets the box to the middle vertex."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def begin_each_box(
+        # state in
+        x: wp.array(dtype=vec3),
+        # in and out
+        pieces: pieces(dtype),
+    ):
+        p = wp.tid()
+        pieces.lower[p] = x[pieces.centre[p]]
+        pieces.upper[p] = x[pieces.centre[p]]
+
+    return begin_each_box
+
+
+@cache
+def extend_boxes(dtype):
+    """Kernel over vertices: extends the boxes of their pieces."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def extend_each_box(
+        # state in
+        x: wp.array(dtype=vec3),
+        # in and out
+        pieces: pieces(dtype),
+    ):
+        i = wp.tid()
+        p = pieces.piece[i]
+        if p >= 0:
+            if wp.max(wp.max(pieces.lower[p] - x[i], x[i] - pieces.upper[p])) > dtype(0.0):  # few are
+                wp.atomic_min(pieces.lower, p, x[i])
+                wp.atomic_max(pieces.upper, p, x[i])
+
+    return extend_each_box
+
+
+@wp.func
+def note_moved(active: wp.array(dtype=wp.int32), copy: int, moved: wp.array(dtype=wp.int32), some: wp.array(dtype=wp.int32)):
+    found = wp.bool(True)
+    if active:
+        found = active[copy] != 0
+    if found:
+        moved[copy] = 1
+        some[0] = 1
+
+
+@cache
+def take_moved(dtype):
+    """Kernel over vertices: out = x in copies that have ``moved``."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def take_each_moved(
+        # state in
+        x: wp.array(dtype=vec3),
+        moved: wp.array(dtype=wp.int32),
+        # parameters
+        per_copy: int,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if moved[i // per_copy] != 0:
+            out[i] = x[i]
+
+    return take_each_moved
+
+
+@cache
+def find_motion(dtype):
+    """Kernel over vertices: finds copies in which a vertex has moved by more than ``most`` since ``found``.
+
+    The motion is relative to the middle vertex of the piece. moved = 1 for such copies, among the ``active`` ones if given;
+    some = 1 if there is one; stale = 1 if the pairs were not listed at ``found``.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def find_each_motion(
+        # state in
+        x: wp.array(dtype=vec3),
+        found: wp.array(dtype=vec3),
+        listed: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        most: dtype,
+        # in and out
+        pieces: pieces(dtype),
+        # out
+        moved: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
+        stale: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        if not (wp.length_sq(found[i] - listed[i]) <= dtype(0.0)):
+            stale[0] = 1
+        p = pieces.piece[i]
+        if p >= 0:
+            c = pieces.centre[p]
+            own = wp.length((x[i] - found[i]) - (x[c] - found[c]))
+            if not (own <= most):
+                note_moved(active, p // pieces.per_copy, moved, some)
+            if pieces.per_copy > 1:
+                if own > pieces.motion[p]:
+                    wp.atomic_max(pieces.motion, p, own)
+
+    return find_each_motion
+
+
+@cache
+def compare_motions(dtype):
+    """Kernel over pieces: moved and some as in :func:`find_motion`, if the piece and a later one of its copy may be too near.
+
+    That is, if their approach may exceed ``most`` plus the excess of the distance of their boxes over ``radius``, up to which
+    pairs are listed.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def compare_each_motion(
+        # state in
+        x: wp.array(dtype=vec3),
+        found: wp.array(dtype=vec3),
+        pieces: pieces(dtype),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        radius: dtype,
+        most: dtype,
+        # out
+        moved: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
+    ):
+        p = wp.tid()
+        c = pieces.centre[p]
+        for q in range(p + 1, (p // pieces.per_copy + 1) * pieces.per_copy):
+            a = pieces.centre[q]
+            nearer = wp.length((x[a] - found[a]) - (x[c] - found[c])) + pieces.motion[p] + pieces.motion[q]
+            gap = wp.max(pieces.lower[p] - pieces.upper[q], pieces.lower[q] - pieces.upper[p])
+            gap = wp.max(gap, vec3())
+            if not (nearer <= most + wp.max(wp.length(gap) - radius, dtype(0.0))):
+                note_moved(active, p // pieces.per_copy, moved, some)
+
+    return compare_each_motion

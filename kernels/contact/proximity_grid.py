@@ -1,0 +1,194 @@
+"""Factories of the hashed grid that finds near pairs, and of the structs of cloths and pairs.
+
+The *items* are the triangles and then the edges of all copies. Their bounding boxes are sorted by centre into the cells of a
+hierarchical grid (count, scan, fill). Level l has boxes with half sizes up to ``size``·2ˡ, so a box meets only boxes whose
+centres are at most this far from it, in its own level and those above. Cells are hashed to buckets such that a row along x is a
+sequence of buckets. So cells are a quarter as long as wide (measured on waves: 0.75 of the time with cubes).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ..rotation import epsilon
+from ..vectors import types
+
+LEVELS = wp.constant(30)  # levels of the grid; the last has one cell
+FARTHEST = 1e9  # largest cell coordinate; the outermost cells contain everything beyond
+MODULE = "warpcloth.proximity"
+
+
+@cache
+def surfaces(dtype):
+    """Struct of the cloths: the vertices of each item (the last vertex of an edge twice), with 2·copy + kind.
+
+    A copy has n ``vertices``. ``rest`` is the rest position of each [m], and ``piece`` its connected piece, −1 without an
+    element. ``distance`` is the contact distance and ``skin`` the skin [m]. Elements whose first vertices are more than ``far``
+    apart at rest are surely at least twice the contact distance apart [m].
+    """
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Surface:
+        items: wp.array(dtype=wp.vec4i)
+        vertices: wp.int32
+        rest: wp.array(dtype=vec3)
+        piece: wp.array(dtype=wp.int32)
+        distance: dtype
+        skin: dtype
+        far: dtype
+
+    return Surface
+
+
+@cache
+def grids(dtype):
+    """Struct of the grid: ``size``, the half size of the largest boxes of level 0 [m], and 2ᵏ buckets of entries.
+
+    Bucket b has the entries first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell; the
+    code combines kind, copy and level. ``counts`` and ``keys`` are scratch. ``levels`` has a bit for each level with triangles,
+    and one for each level with edges.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class Grid:
+        size: dtype
+        levels: wp.array(dtype=wp.int32)
+        counts: wp.array(dtype=wp.int32)
+        keys: wp.array(dtype=wp.int32)
+        first: wp.array(dtype=wp.int32)
+        entries: wp.array(dtype=wp.vec4i)
+        lower: wp.array(dtype=vec3)
+        upper: wp.array(dtype=vec3)
+
+    return Grid
+
+
+@cache
+def boxes(dtype):
+    """Device functions on boxes: ``box_of``, ``level_of``, ``cell_at``, ``cells_about``."""
+    vec3, _ = types(dtype)
+    half, farthest = dtype(0.5), dtype(FARTHEST)
+
+    @wp.func
+    def box_of(surface: surfaces(dtype), a: vec3, b: vec3, c: vec3):
+        """The box of three points, enlarged by half of the contact distance and the skin, and by a margin for rounding."""
+        low = wp.min(wp.min(a, b), c)
+        high = wp.max(wp.max(a, b), c)
+        more = half * (surface.distance + surface.skin)
+        more += dtype(4.0) * epsilon(more) * wp.max(wp.max(wp.abs(low)), wp.max(wp.abs(high)))
+        # min and max ignore NaN; these products do not.
+        more += wp.dot(a, vec3()) + wp.dot(b, vec3()) + wp.dot(c, vec3())
+        edge = vec3(more, more, more)
+        return low - edge, high + edge
+
+    @wp.func
+    def level_of(size: dtype, low: vec3, high: vec3):
+        """The level of a box; −1 if the box is not finite."""
+        own = half * wp.max(high - low)
+        level = wp.int32(-1)
+        if own < dtype(wp.inf):
+            level = wp.int32(0)
+            while level < LEVELS and own > size:
+                own *= half
+                level += 1
+        return level
+
+    @wp.func
+    def cell_of(size: dtype, p: vec3):
+        q = vec3(dtype(2.0) * p[0], half * p[1], half * p[2]) / size
+        cell = wp.vec3i()
+        for i in range(3):
+            cell[i] = wp.int32(wp.floor(wp.clamp(q[i], -farthest, farthest)))
+        return cell
+
+    @wp.func
+    def cell_at(size: dtype, low: vec3, high: vec3, level: int):
+        """The cell of the centre of a box."""
+        found = wp.vec3i()
+        if level < LEVELS:
+            found = cell_of(size * dtype(1 << level), half * (low + high))
+        return found
+
+    @wp.func
+    def cells_about(size: dtype, low: vec3, high: vec3, level: int):
+        """The first and last cells of a level that can contain the centres of boxes that meet a box."""
+        first = wp.vec3i()
+        last = wp.vec3i()
+        if level < LEVELS:
+            most = size * dtype(1 << level)
+            edge = vec3(most, most, most)
+            first = cell_of(most, low - edge)
+            last = cell_of(most, high + edge)
+        return first, last
+
+    return box_of, level_of, cell_at, cells_about
+
+
+@wp.func
+def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
+    key = wp.uint32(x) + wp.uint32(y) * wp.uint32(73856093) + wp.uint32(z) * wp.uint32(19349663)
+    return wp.int32((key + wp.uint32(code) * wp.uint32(83492791)) & wp.uint32(buckets - 1))
+
+
+@cache
+def count_items(dtype):
+    """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist."""
+    vec3, _ = types(dtype)
+    box_of, level_of, cell_at, _about = boxes(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def count_each_item(
+        # elements
+        surface: surfaces(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        # in and out
+        grid: grids(dtype),
+    ):
+        item = wp.tid()
+        v = surface.items[item]
+        low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
+        level = level_of(grid.size, low, high)
+        key = wp.int32(-1)
+        if level >= 0:
+            if (grid.levels[v[3] & 1] & (1 << level)) == 0:
+                wp.atomic_or(grid.levels, v[3] & 1, 1 << level)
+            cell = cell_at(grid.size, low, high, level)
+            key = bucket_of(cell[0], cell[1], cell[2], v[3] * 32 + level, grid.counts.shape[0])
+            wp.atomic_add(grid.counts, key, 1)
+        grid.keys[item] = key
+
+    return count_each_item
+
+
+@cache
+def fill_buckets(dtype):
+    """Kernel over items: the entries of the buckets; counts ``counts`` down to 0."""
+    vec3, _ = types(dtype)
+    box_of, level_of, cell_at, _about = boxes(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def fill_each_bucket(
+        # elements
+        surface: surfaces(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        # in and out
+        grid: grids(dtype),
+    ):
+        item = wp.tid()
+        key = grid.keys[item]
+        if key < 0:
+            return
+        v = surface.items[item]
+        low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
+        level = level_of(grid.size, low, high)
+        cell = cell_at(grid.size, low, high, level)
+        slot = grid.first[key] + wp.atomic_sub(grid.counts, key, 1) - 1
+        grid.entries[slot] = wp.vec4i(item, cell[1], cell[2], v[3] * 32 + level)
+        grid.lower[slot] = low
+        grid.upper[slot] = high
+
+    return fill_each_bucket
