@@ -10,12 +10,13 @@ from .vectors import types
 
 
 @cache
-def set_damped_rest(term: Term, dtype, bdf2: bool, midpoint: bool):
+def set_damped_rest(term: Term, dtype, parts: int, both: bool):
     """Kernel over elements: out[e] = the rest state of damping for s̃ = s(x) plus a change, see :class:`.term.Dissipation`.
 
-    With d = scale·move, the change is 0 for Euler, where move may be None. For BDF2, with the last move d, it is
-    (s(x) − s(x − d))/3. For midpoint, with d = hₑ v, it is s(x) − ½(s(x + d) + s(x − d)) ≈ −½ddᵀ∂²s. Without it, s at the mean
-    of two states would stand for the mean of s. That is of first order, and damps rotations.
+    With d = scale·move, the change is (s(x) − s(x − d))/parts, or, with ``both``, (2s(x) − s(x + d) − s(x − d))/parts. With 0
+    parts it is 0, and move may be None, as for Euler. For BDF2 d is the last move, with 3 parts. For midpoint d is hₑ v, with
+    both and 2 parts: the change is about −½ddᵀ∂²s. Without it, s at the mean of two states would stand for the mean of s. That
+    is of first order, and damps rotations.
     """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
@@ -39,12 +40,12 @@ def set_damped_rest(term: Term, dtype, bdf2: bool, midpoint: bool):
         e = wp.tid()
         y = y_of(stencil, e, rest[e], x, x)
         change = change_of(y, y, rest[e])
-        if wp.static(bdf2):
+        if wp.static(parts > 0):
             d = scale * y_of(stencil, e, rest[e], move, move)
-            change = -change_of(y, y - d, rest[e]) / dtype(3.0)
-        if wp.static(midpoint):
-            d = scale * y_of(stencil, e, rest[e], move, move)
-            change = -dtype(0.5) * (change_of(y, y + d, rest[e]) + change_of(y, y - d, rest[e]))
+            change = change_of(y, y - d, rest[e])
+            if wp.static(both):
+                change = change_of(y, y + d, rest[e]) + change
+            change = -change / dtype(parts)
         out[e] = rest_of(y, change, rest[e], share[e])
 
     return set_rest

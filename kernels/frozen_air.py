@@ -9,11 +9,11 @@ from .vectors import types
 
 
 @cache
-def set_air(dtype, moved: bool, explicit: bool):
+def set_air(dtype, parts: int, explicit: bool):
     """Kernel over triangles: a, n, κ_n and κ_t of rest, from x, v and the wind.
 
-    a is the centre after hₑ with the wind; the step begins at x, or where ``moved`` at x + move/3, from which BDF2 takes
-    velocities. Where ``explicit``, y stays at x while the force is taken, and a is that much farther back. A triangle without
+    a is the centre after hₑ with the wind; the step takes velocities from x, or, with ``parts``, from x + move/parts, as
+    BDF2 with 3. Where ``explicit``, y stays at x while the force is taken, and a is that much farther back. A triangle without
     an area has no force. Wind is that of the rest state or, if there are keyframes (F,), theirs ``ahead`` of the step.
     """
     vec3, _ = types(dtype)
@@ -62,8 +62,8 @@ def set_air(dtype, moved: bool, explicit: bool):
             n = both / double_area
         normal = wp.dot(n, away)
         across = away - normal * n
-        if wp.static(moved):
-            centre += third * third * (move[i] + move[j] + move[k])
+        if wp.static(parts > 0):
+            centre += dtype(1.0) / dtype(parts) * third * (move[i] + move[j] + move[k])
         way = he * wind
         if wp.static(explicit):
             way = he * away

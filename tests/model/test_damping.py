@@ -127,10 +127,10 @@ def test_the_rate_has_the_order_of_the_integrator(name, integrator, order, devic
         if integrator == "euler":
             x, rate, D = at(h), v + h * a, Dissipation(scene, h, device)
         elif integrator == "bdf2":
-            x, rate, D = at(h), v + h * a, Dissipation(scene, 2.0 * h / 3.0, device, at(0.0) - at(-h), integrator="bdf2")
+            x, rate, D = at(h), v + h * a, Dissipation(scene, 2.0 * h / 3.0, device, at(0.0) - at(-h), parts=3)
         else:
             x, rate = 0.5 * (at(0.0) + at(h)), v + 0.5 * h * a
-            D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, integrator="midpoint")
+            D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, parts=2, both=True)
         exact = viscous(name, x, rate, device)
         errors.append(np.linalg.norm(D.gradient(x) - exact) / np.linalg.norm(exact))
     if name == "Attachment" and errors[-1] < 1e-9:  # s is linear, and so exact: BDF2 of this motion and midpoint
@@ -147,7 +147,7 @@ def test_midpoint_brakes_a_turning_body_by_the_cube_of_the_step(name, device):
         h, turn = angle, [rotation((1.0, 2.0, 3.0), part * angle) for part in (0.0, 1.0)]
         x0, x1 = (scene.positions @ R.T for R in turn)
         v = np.cross(np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0), x0)
-        D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, integrator="midpoint")
+        D = Dissipation(scene, 0.5 * h, device, v, scale=0.5 * h, parts=2, both=True)
         forces.append(np.abs(D.gradient(0.5 * (x0 + x1))).max())
     assert forces[0] > 1e6 * EPS
     assert np.log2(forces[0] / forces[1]) == pytest.approx(3.0, abs=0.2)
@@ -200,10 +200,10 @@ def test_lengths_to_come_are_none_below_nought(device):
     """A spring that shrank to less than a quarter in the last step of BDF2 has s̃ = (4s₀ − s₋₁)/3 < 0, which no length is."""
     scene, rests = crumpled("Spring"), []
     for scale in (-1.0, -4.0):  # x₀ − x₋₁ = scale·x₀: from 2 and from 5 times the size
-        D = Dissipation(scene, 0.1, device, scale * scene.positions, integrator="bdf2")
+        D = Dissipation(scene, 0.1, device, scale * scene.positions, parts=3)
         (elements,) = dissipations(D.model, 0.1)
         move = D.model.array(scale * scene.positions, D.model.vec3)
-        D.model.refresh(STEP, Moment(D.model.positions, integrator="bdf2", move=move), [elements])
+        D.model.refresh(STEP, Moment(D.model.positions, move=move, parts=3), [elements])
         rests.append(elements.rest.numpy()[:, 0])
     y = np.diff(scene.positions[scene.terms[0].stencil(scene.mesh)], axis=1)[:, 0]
     assert np.abs(rests[0] - (4.0 - 2.0) / 3.0 * np.linalg.norm(y, axis=1)).max() < 100 * EPS
@@ -226,7 +226,7 @@ def test_a_hinge_is_damped_through_folded_flat(integrator, device):
             before, now, after = (at(sign * (first + part * turn)) for part in (-1.0, 0.0, 1.0))
             terms = [wc.DihedralBending(stiffness=0.0, damping=beta)]
             scene = wc.Scene(mesh, masses=np.ones(4), positions=now, terms=terms, gravity=(0.0, 0.0, 0.0))
-            knows = {} if integrator == "euler" else {"integrator": integrator}
+            knows = {"euler": {}, "midpoint": {"parts": 2, "both": True}, "bdf2": {"parts": 3}}[integrator]
             D = Dissipation(scene, he, device, now - before if knows else None, **knows)
             found.append(D.energy(after))
     assert found == pytest.approx([found[0]] * len(found), rel=1e-9)

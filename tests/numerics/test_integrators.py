@@ -255,6 +255,28 @@ def test_sweeps_of_xpbd_give_nothing_to_midpoint(sweep, iterations, device):
     assert strain() < 3.0 * start  # of all modes together at once, had they all the same phase
 
 
+@pytest.mark.parametrize("integrator", ["midpoint", "bdf2"])
+def test_no_code_outside_the_class_knows_its_name(integrator, device, monkeypatch):
+    """The class of another integrator in the place of Euler takes its steps, with damping, air, pins and contact."""
+    mesh, k = wc.Mesh.grid(4, 4, size=0.3), np.arange(4)[:, None]
+    path = mesh.points[[0, 3]] + 0.01 * k[:, :, None] * [1.0, 0.0, 1.0]
+    scene = wc.Scene(
+        mesh,
+        density=0.2,
+        terms=[wc.Spring(stiffness=100.0, damping=0.1)],
+        pins=wc.Pins([0, 3], keyframes=path),
+        air=wc.Air(keyframes=np.hstack([2.0 * k, 0.0 * k, -1.0 * k])),
+        colliders=[wc.Sphere(radius=0.1, position=(0.15, -0.1005, 0.15), friction=0.5)],
+    )
+
+    def run(name):
+        return wc.simulate(scene, wc.Newton(substeps=2, integrator=name), device=device, frames=3).points
+
+    expected, euler = run(integrator), run("euler")
+    monkeypatch.setitem(INTEGRATORS, "euler", INTEGRATORS[integrator])
+    assert np.array_equal(run("euler"), expected) and not np.array_equal(euler, expected)
+
+
 def test_midpoint_refuses_an_odd_number_of_sweeps():
     with pytest.raises(ValueError, match="sweeps go forward and backward in turn, so that it must be even"):
         wc.XPBD(substeps=1, iterations=5, integrator="midpoint")

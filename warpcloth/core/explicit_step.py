@@ -67,7 +67,7 @@ class ExplicitStep:
         """Launches this number of steps, and calls ``move_pins(pins, keyframes, count, x, v)`` after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
-            model.refresh(STEP, Moment(x, integrator="explicit", v=v, **self._time))
+            model.refresh(STEP, Moment(x, v=v, explicit=True, **self._time))
             model.refresh(STEP, Moment(x), self._damped)
             self._elastic.add(x, self.gradient, self.residual)
             if self._damped:

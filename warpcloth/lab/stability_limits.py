@@ -50,7 +50,7 @@ class _Cell:
     def __init__(self, scene, record, steps):
         self.scene, self.record, self.steps = scene, record, steps
         self.h = 1.0 / (scene.fps * record.per_frame(scene.fps))
-        self.he = _integrator(record).part * self.h
+        self.he = _integrator(record).share * self.h
         self.damped = any(getattr(term, "damping", None) is not None for term in scene.terms)
         self.springs = not self.damped and all(isinstance(term, Spring) for term in scene.terms)
 

@@ -50,8 +50,8 @@ def _dissipation(model, elements, he, stiffness):
 
 def _set_rest(damped, model, elements, moment):
     """Sets the rest states of dissipation at the start of a step, from those of the term that is ``damped``."""
-    rule = moment.integrator
-    kernel = model.kernel(kernels.set_damped_rest, damped, model.dtype, rule == "bdf2", rule == "midpoint")
+    parts = 0 if moment.move is None else moment.parts
+    kernel = model.kernel(kernels.set_damped_rest, damped, model.dtype, parts, moment.both)
     rest, share = elements.refresh.arrays
     given = [elements.stencil, rest, share, moment.x, moment.move, moment.scale]
     model.launch(kernel, elements.count, given, [elements.rest])

@@ -24,8 +24,9 @@ class Euler:
 
     Attributes:
         he: hₑ [s].
-        part: hₑ/h.
-        pin_parts: Number of parts in which pins move during a step.
+        share: hₑ/h.
+        move: x₀ − x₋₁ (N,) [m], which filters change with x; None for methods that do not look back.
+        parts: Number of equal parts of a step, in which pins move. Forces are those at the end of the first.
         hard: Whether it takes constraints of infinite stiffness.
         damps: Whether it damps frequencies that its steps do not resolve.
         to_and_fro: Whether Gauss–Seidel sweeps must alternate in direction, because the error of one order is not damped.
@@ -34,13 +35,14 @@ class Euler:
         least_factor: The smallest real q for which no |z| of `growth` is above 1.
     """
 
-    part: ClassVar[float] = 1.0
-    pin_parts: ClassVar[int] = 1
+    share: ClassVar[float] = 1.0
+    parts: ClassVar[int] = 1
     hard: ClassVar[bool] = True
     damps: ClassVar[bool] = True
     to_and_fro: ClassVar[bool] = False
     least_weight: ClassVar[float] = 2.0
     least_factor: ClassVar[float] = -1.0 / 3.0
+    move = None
 
     @staticmethod
     def growth(q):
@@ -48,7 +50,7 @@ class Euler:
         return _roots(q, q)
 
     def __init__(self, stepper):
-        self.stepper, self.he = stepper, self.part * stepper.h
+        self.stepper, self.he = stepper, self.share * stepper.h
 
     def start(self):
         """Prepares the past state before the first step, for methods that need one."""
@@ -56,17 +58,18 @@ class Euler:
     @property
     def moment(self):
         """The :class:`warpcloth.terms.refresh.Moment` at the start of a step; (s − s̃)/hₑ is then the rate of a damped s."""
-        return Moment(self.stepper.state.x, **self._time(parts=1))
+        return Moment(self.stepper.state.x, **self._time)
 
-    def _time(self, parts):
+    @property
+    def _time(self):
         """Fields of a Moment for loads with keyframes: one keyframe step ahead, of which a step has ``parts``."""
-        given = {"steps": self.stepper.count, "per_frame": parts * self.stepper.steps_per_frame, "ahead": 1}
+        given = {"steps": self.stepper.count, "per_frame": self.parts * self.stepper.steps_per_frame, "ahead": 1}
         return {**given, "v": self.stepper.state.v, "he": self.he}
 
     def launch_prediction(self):
         """Launches x = x̃, v = (x̃ − x₀)/hₑ, and the move of pins by a part of the step."""
         self._launch(kernels.predict, [*self.stepper.model.free_gravity, self.he], list(self.stepper.state))
-        self.stepper.launch_pins(self.pin_parts)
+        self.stepper.launch_pins(self.parts)
 
     def launch_finish(self, correction):
         """Launches the state at the end of the step, from the ``correction`` d of the minimiser (N,) [m]."""
@@ -80,7 +83,7 @@ class Euler:
 class Midpoint(Euler):
     """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Second order. xₘ has the pins at t + h/2."""
 
-    part, pin_parts, hard, damps, to_and_fro, least_weight, least_factor = 0.5, 2, False, False, True, 20.0, 0.0
+    share, parts, hard, damps, to_and_fro, least_weight, least_factor = 0.5, 2, False, False, True, 20.0, 0.0
 
     @staticmethod
     def growth(q):
@@ -90,13 +93,13 @@ class Midpoint(Euler):
     @property
     def moment(self):
         x, v = self.stepper.state
-        return Moment(x, integrator="midpoint", move=v, scale=self.he, **self._time(parts=2))
+        return Moment(x, move=v, scale=self.he, parts=2, both=True, **self._time)
 
     def launch_finish(self, correction):
         gravity, each = self.stepper.model.free_gravity
         given = [gravity, correction, each, self.he]
         self._launch(kernels.finish_midpoint, given, list(self.stepper.state))
-        self.stepper.launch_pins(self.pin_parts)
+        self.stepper.launch_pins(self.parts)
 
 
 class BDF2(Euler):
@@ -112,11 +115,10 @@ class BDF2(Euler):
     jump: the damping force is then too large by half of the jump, which is exactly what (v₀ − v₋₁)/3 lacks.
 
     Attributes:
-        move: x₀ − x₋₁ (N,) [m].
         v_before: v₋₁ (N,) [m/s]; not used for pins.
     """
 
-    part, hard, least_weight, least_factor = 2.0 / 3.0, False, 4.0, -9.0 / 55.0
+    share, hard, least_weight, least_factor = 2.0 / 3.0, False, 4.0, -9.0 / 55.0
 
     @staticmethod
     def growth(q):
@@ -155,7 +157,7 @@ class BDF2(Euler):
 
     @property
     def moment(self):
-        return Moment(self.stepper.state.x, integrator="bdf2", move=self.move, **self._time(parts=1))
+        return Moment(self.stepper.state.x, move=self.move, parts=3, **self._time)
 
     def launch_prediction(self):
         given = [*self.stepper.model.free_gravity, self.he]

@@ -142,7 +142,7 @@ class Evaluation:
         if self._elastic:
             self._elastic.add(x, self.gradient)
         if self._of_air is not None:
-            moment = Moment(x, v=v, he=self._h, integrator="explicit", **self._time)
+            moment = Moment(x, v=v, he=self._h, explicit=True, **self._time)
             model.refresh(STEP, moment, self._blown)
             self._of_air.add(x, self.gradient)
         if self._damped:

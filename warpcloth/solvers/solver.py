@@ -66,7 +66,7 @@ class Stepper:
         self.integrator, self.he = None, self.h
         self.colliders = None
         if model.colliders is not None:
-            part = 0.0 if integrator is None else 0.5 if integrator == "midpoint" else 1.0
+            part = 0.0 if integrator is None else 1.0 / INTEGRATORS[integrator].parts
             self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
             self.model = model = model.with_terms(self.colliders.terms)
         self.pairs, self._kept = None, None
@@ -164,7 +164,7 @@ class Stepper:
     @property
     def loads_at_end(self):
         """Whether steps evaluate loads at their end, not in the middle or at the start."""
-        return self.integrator is not None and self.integrator.part != 0.5
+        return self.integrator is not None and self.integrator.parts == 1
 
     @property
     def shares(self):
@@ -208,9 +208,9 @@ class Stepper:
         self.integrator.launch_finish(correction)
         if self.colliders is not None:
             self.colliders.correction, self.colliders.he = correction, self.he
-            self.colliders.launch_end(*self.state, self.state.arrays.get("move before"))
+            self.colliders.launch_end(*self.state, self.integrator.move)
         if self.pairs is not None:
-            self.pairs.filter.launch_end(*self.state, self.state.arrays.get("move before"))
+            self.pairs.filter.launch_end(*self.state, self.integrator.move)
 
     def launch_end_of(self, pins, keyframes, count, x, v):
         """Launches the end of an explicit step in x and v (N,): the move of pins, and the filters of contact."""

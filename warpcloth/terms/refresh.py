@@ -20,26 +20,32 @@ class Moment(NamedTuple):
     Attributes:
         x: Positions (N,) vectors [m].
         correction: d (N,) [m] for an evaluation at x + d; None for one at x.
-        integrator: Integrator of the step that begins: ``"euler"``, ``"midpoint"``, ``"bdf2"`` or ``"explicit"``.
-        move: Array (N,) such that scale·move is the last displacement of BDF2, or hₑ v of midpoint [m]; None for Euler.
+        move: Array (N,) such that d = scale·move is a displacement [m], for integrators that take rates from x − d too; None
+            for those that take them from x alone.
         scale: 1 if ``move`` is in metres, or a time [s] if it is a velocity.
+        parts: n of the s̃ from which an integrator with a ``move`` takes the rate (s − s̃)/hₑ of any s: s̃ is s(x) less the mean
+            of n changes of s, the first of which is s(x − d) − s(x), and the others 0.
+        both: Whether the second is s(x + d) − s(x).
         steps: Number of keyframe steps that each copy has made, (B,) int32; None if nothing follows keyframes.
         per_frame: Keyframe steps per frame.
         ahead: Keyframe steps from the start of the step to the time at which it takes forces.
         v: Velocities (N,) [m/s] at the start of a step; None where nothing has a velocity yet.
-        he: hₑ [s], over which velocities are taken; for ``"explicit"``, whose forces are those at x, the step.
+        he: hₑ [s], over which velocities are taken; the step, where ``explicit``.
+        explicit: Whether forces are those at x.
     """
 
     x: wp.array
     correction: wp.array | None = None
-    integrator: str = "euler"
     move: wp.array | None = None
     scale: float = 1.0
+    parts: int = 1
+    both: bool = False
     steps: wp.array | None = None
     per_frame: int = 1
     ahead: int = 0
     v: wp.array | None = None
     he: float = 0.0
+    explicit: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,8 +60,8 @@ class _Freeze:
             held = self._held[key]
         if moment.v is None:  # of what has no velocity yet
             return
-        moved, explicit = moment.integrator == "bdf2", moment.integrator == "explicit"
-        kernel = model.kernel(set_air, model.dtype, moved, explicit)
-        given = [elements.stencil, held, moment.x, moment.v, moment.move if moved else None, moment.steps]
+        parts = 0 if moment.move is None or moment.both else moment.parts  # with both, the changes of a position cancel
+        kernel = model.kernel(set_air, model.dtype, parts, moment.explicit)
+        given = [elements.stencil, held, moment.x, moment.v, moment.move if parts else None, moment.steps]
         given += [moment.he, moment.ahead, moment.per_frame, model.per_copy]
         model.launch(kernel, elements.count, given, [elements.rest])
