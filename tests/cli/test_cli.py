@@ -661,9 +661,9 @@ sys.meta_path.insert(0, Finder())
 @pytest.mark.parametrize(
     ("module", "how", "name", "more"),
     [
-        ("warpcloth.numerics.rotation", ["-m", "warpcloth"], "SIGINT", ""),
-        ("warpcloth.numerics.rotation", ["-m", "warpcloth.cli"], "SIGTERM", ""),
-        ("warpcloth.numerics.rotation", ["warpcloth"], "SIGINT", ""),
+        pytest.param("warpcloth.numerics.rotation", ["-m", "warpcloth"], "SIGINT", "", marks=pytest.mark.slow),
+        pytest.param("warpcloth.numerics.rotation", ["-m", "warpcloth.cli"], "SIGTERM", "", marks=pytest.mark.slow),
+        pytest.param("warpcloth.numerics.rotation", ["warpcloth"], "SIGINT", "", marks=pytest.mark.slow),
         ("warpcloth.numerics.rotation", ["warpcloth"], "SIGTERM", ""),
         ("pxr.UsdGeom", ["-m", "warpcloth"], "SIGINT", " before the first frame; nothing was saved"),
     ],

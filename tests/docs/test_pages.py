@@ -221,7 +221,8 @@ def test_the_rotations(tmp_path, monkeypatch):
 MODULES = {"libigl": "igl", "pillow": "PIL"}
 # Runs the blocks of a page one after the other, commands by the function behind them. Packages that the page does not say to
 # install are not found. Other commands are left out: .ci/run runs those of the README, a cluster needs several machines, and
-# bench compiles again what it measures, as test_bench.py has it do.
+# bench compiles again what it measures, as test_bench.py has it do. What commands measure in two processes is measured here in
+# a thread; test_work_precision.py, test_extending.py and test_chart_failures.py have them start processes.
 RUN = """
 import json, shlex, sys
 from importlib.machinery import PathFinder
@@ -230,8 +231,12 @@ blocks, absent, check = json.load(sys.stdin)
 find = PathFinder.find_spec
 PathFinder.find_spec = lambda name, *more: None if name.partition(".")[0] in absent else find(name, *more)
 
-from warpcloth.cli import main
+from concurrent.futures import ThreadPoolExecutor
 
+from warpcloth.cli import main
+from warpcloth.lab import campaign
+
+campaign._processes = lambda workers: ThreadPoolExecutor(1)
 names = {"__name__": "page"}
 for language, text in blocks:
     if language == "python":

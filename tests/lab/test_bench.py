@@ -11,6 +11,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.cli import main
 from warpcloth.cli.bench import _contact
 from warpcloth.core.capture import Segment
@@ -66,7 +67,7 @@ def test_launches_of_loops_on_the_device_count_each_time(device):
     assert launches_of(lambda: (segment(), segment())) == 2 * 2 + 3
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", slow_but(("explicit", "newton", "xpbd"), SOLVERS))
 def test_counting_takes_the_same_steps(solver, device):
     """To the bit; of explicit they are no more than a launch for each term and one for all vertices."""
     record = SOLVERS[solver](substeps=20 if solver == "explicit" else 4)
@@ -128,6 +129,7 @@ def test_what_contact_costs(scene, device):
     assert said.startswith(f"{row['ms'] / row['ms_without']:.2f} of the time without") and _contact({"ms": 1.0}) == ""
 
 
+@pytest.mark.slow
 def test_what_self_contact_costs(device):
     """As above, and what its filter did: sheets in a stack are listed as near to one another, and stay apart."""
     scene = SceneRef("stack", {"sheets": 2, "n": 4})

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import pytest
 
 from warpcloth.cli import main
 from warpcloth.cli.choose import command_line
-from warpcloth.lab import trajectory
+from warpcloth.lab import campaign, trajectory
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.choosing import Measured, choose, climb, ladders, pick
 from warpcloth.lab.measurements import SceneRef, Setup
@@ -91,6 +92,13 @@ def test_a_ladder_ends_where_finer_steps_are_no_help(reason):
     assert len(found) == (1 if reason == "slow" else 3)
 
 
+@pytest.fixture
+def in_a_thread(monkeypatch):
+    """Measures in a thread of this process; test_extending.py has the command start one."""
+    monkeypatch.setattr(campaign, "_processes", lambda workers: ThreadPoolExecutor(1))
+
+
+@pytest.mark.usefixtures("in_a_thread")
 def test_refused_methods_are_asked_once(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
     hard = SceneRef("chain", {"links": 3, "stiffness": "inf"})
@@ -131,13 +139,14 @@ def test_ladders_are_of_one_method_each_and_go_on():
 
 
 SCENES = [
-    ("hanging", {"n": 6}, 12),
+    pytest.param("hanging", {"n": 6}, 12, marks=pytest.mark.slow),
     ("chain", {"links": 5}, 12),
     pytest.param("cantilever", {"elements": 6}, 10, marks=pytest.mark.slow),  # with all solvers
 ]
 
 
 @pytest.mark.parametrize(("scene", "parameters", "frames"), SCENES)
+@pytest.mark.usefixtures("in_a_thread")
 def test_the_choice_meets_the_tolerance_when_it_is_run_afresh(scene, parameters, frames, tmp_path, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
     solvers = ["explicit", "xpbd", "newton"] if frames == 12 else None
@@ -150,6 +159,7 @@ def test_the_choice_meets_the_tolerance_when_it_is_run_afresh(scene, parameters,
     assert not any(each.error is not None and each.error + exact.error <= 0.01 for each in cheaper)
 
 
+@pytest.mark.usefixtures("in_a_thread")
 def test_the_command(tmp_path, monkeypatch, capsys):
     """It prints the command to use, which works; the second time nothing is measured; run takes the choice."""
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
@@ -171,6 +181,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert "warpcloth: chosen: " in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("in_a_thread")
 def test_the_command_takes_hard_constraints(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
     words = "choose chain -p links=3 stiffness=inf --frames 4 --tolerance 5% --solvers pbd hierarchical-pbd"

@@ -130,6 +130,7 @@ def test_errors_fall_with_the_order_of_the_method(scene, method, shared):
     assert np.abs(np.log2(found[0] / found[1]) - order).max() < 0.15
 
 
+@pytest.mark.slow
 def test_contact_has_a_reference(shared):
     """A sheet that slides, once its anchors are stretched, by g(sin 30° − 0.3 cos 30°); others meet it, by first order."""
     scene = SceneRef("incline", {"n": 3})

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.chart.maps import _PLAIN, plot_maps, write_csv
 from warpcloth.cli import _parser, main
 from warpcloth.cli.stability import _survey
@@ -82,7 +83,9 @@ def test_explicit_diverges_above_its_limit(kind, device):
 JACOBI = [("pbd", "jacobi"), ("pbd", "vertex-averaged"), ("pbd", "constraint-averaged"), ("xpbd", "constraint-averaged")]
 
 
-@pytest.mark.parametrize(("kind", "iterations"), [("structural", 1), ("structural", 20), ("shear", 1), ("shear", 4)])
+@pytest.mark.parametrize(
+    ("kind", "iterations"), slow_but([("shear", 4)], [("structural", 1), ("structural", 20), ("shear", 1), ("shear", 4)])
+)
 @pytest.mark.parametrize(("solver", "sweep"), JACOBI)
 def test_jacobi_diverges_above_its_limit(kind, solver, sweep, iterations, device):
     """ω λ_max = 2 to 1 % of an even number of sweeps; of an odd number n, 1 + 3^(−1/n), for steps have velocities."""
@@ -133,7 +136,7 @@ SOFT_JACOBI = [
 ]
 
 
-@pytest.mark.parametrize("iterations", [1, 4, 5])
+@pytest.mark.parametrize("iterations", slow_but([4], [1, 4, 5]))
 @pytest.mark.parametrize(("solver", "options"), SOFT_JACOBI)
 def test_limits_of_jacobi_with_compliance(solver, options, iterations, device):
     """α̃ = 1/(khₑ²) of XPBD counts twice, in D + α̃ and with λ, each integrator has its least q; "per-step" spreads it."""
@@ -160,7 +163,7 @@ ORDERED = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "solver", "options", "iterations", "stiffness"), ORDERED)
+@pytest.mark.parametrize(("kind", "solver", "options", "iterations", "stiffness"), slow_but(ORDERED[::3], ORDERED))
 def test_limits_of_gauss_seidel_in_its_order(kind, solver, options, iterations, stiffness, device):
     """The eigenvalues of sweeps in the order in which they go, soft and stiff (kh² of 1 and 1e4 times the mass)."""
     fixed, setup, scene = {"dt": 1.0, "iterations": iterations}, Setup(solver, options), net(kind, 8, stiffness)
@@ -356,6 +359,7 @@ def test_the_cost_of_a_cell_is_bounded(dt, steps, run, reference, device, monkey
 # --- Failures as maps show them; docs/stability.md says which.
 
 
+@pytest.mark.slow
 def test_02_a_raw_hessian_stalls_in_compression(device):
     """Newton with the raw Hessian, factorised, stalls beyond h² = m/(k(L/l − 1)) and nowhere before; clamped it never does."""
     soft = SceneRef("hanging", {"n": 5, "stiffness": 10.0})
@@ -368,6 +372,7 @@ def test_02_a_raw_hessian_stalls_in_compression(device):
     assert "stalled" not in {cell["verdict"] for cell in clamped}
 
 
+@pytest.mark.slow
 def test_03_stiffness_of_pbd_depends_on_iterations(device):
     """A soft mass on a spring: each sweep adds to the stiffness of PBD, 1 to 64 of them; XPBD keeps that of the material."""
     spring = SceneRef("chain", {"links": 1, "stiffness": 1.0, "mass": 0.01})
@@ -388,6 +393,7 @@ def test_03_stiffness_of_pbd_depends_on_iterations(device):
     assert np.ptp(xpbd, axis=0).max() < 1e-6 and verdicts(cells[1]) == [["stable"] * 2] * 3
 
 
+@pytest.mark.slow
 def test_06_and_08_few_iterations_fall_behind_as_stiffness_grows(device):
     """Of 8 iterations projective dynamics, plain and accelerated, stays behind by far where Σk h²/m is above them; so ADMM."""
     plain = Setup("projective-dynamics", {"acceleration": "none"})
@@ -401,6 +407,7 @@ def test_06_and_08_few_iterations_fall_behind_as_stiffness_grows(device):
     assert all(a["rules"][name] < b["rules"][name] for a, b in zip(cells[1][0], cells[0][0], strict=True))
 
 
+@pytest.mark.slow
 def test_07_weights_of_admm(device):
     """The error has its minimum between a weight that is too small and one that stalls, within the grid's factor at the line.
 
@@ -417,7 +424,7 @@ def test_07_weights_of_admm(device):
     assert "r = 1/(2hω)" not in limit_ratios(HANGING.load(), wc.ADMM(dt=1 / 60), 10), "which auto is on by itself"
 
 
-@pytest.mark.parametrize("solver", ["pbd", "xpbd"])
+@pytest.mark.parametrize("solver", slow_but(["pbd"], ["pbd", "xpbd"]))
 def test_14_information_moves_a_ring_an_iteration(solver, device):
     """A chain from the pin down: at fixed sweeps the error grows with its links, at fixed links it falls with sweeps."""
     setup = Setup(solver, {"sweep": "sequential"})
@@ -443,6 +450,7 @@ def test_each_failure_is_in_a_chart():
 # --- What a map is made of.
 
 
+@pytest.mark.slow
 def test_rows_are_copies_and_either_axis_can_be_a_row(device):
     """A cell in a row is the cell by itself, and a map turned over is the same map."""
     setups = [Setup("newton"), Setup("explicit")]
@@ -459,7 +467,7 @@ def test_rows_are_copies_and_either_axis_can_be_a_row(device):
         assert alone["growth"] == pytest.approx(within["growth"], rel=1e-9)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("explicit", "newton", "xpbd"), SOLVERS))
 def test_a_row_of_copies_is_its_cells(name, device):
     """Of each method, though some copies diverge or take many more iterations than others."""
     setup, factors = [asdict(Setup(name))], [1e-2, 1.0, 1e4]

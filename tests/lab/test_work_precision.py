@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.base.digest import scene_digest
 from warpcloth.chart import pareto
 from warpcloth.cli import main
@@ -102,7 +103,9 @@ def test_all_that_minimise_close_the_gap(setup, device):
         assert all(later <= before + found["floor"] for before, later in pairwise(gaps))
 
 
-@pytest.mark.parametrize(("solver", "which"), [("newton", 0), ("projective-dynamics", -1), ("xpbd", 0)])
+@pytest.mark.parametrize(
+    ("solver", "which"), slow_but([("newton", 0)], [("newton", 0), ("projective-dynamics", -1), ("xpbd", 0)])
+)
 def test_the_gap_closes_in_contact(solver, which, device):
     """Also where friction and contact are most of what is to be minimised."""
     found = measure(setups_of_steps([solver])[which], device, TOUCHING)
@@ -169,7 +172,13 @@ def test_errors_of_projective_dynamics_end_at_the_floor(device):
 
 
 @pytest.mark.parametrize(
-    ("scene", "substeps"), [(SMALL, 4), (SMALL, 16), pytest.param(TOUCHING, 4, id="touching-4")], ids=lambda value: str(value)
+    ("scene", "substeps"),
+    [
+        (SMALL, 4),
+        pytest.param(SMALL, 16, marks=pytest.mark.slow),
+        pytest.param(TOUCHING, 4, id="touching-4", marks=pytest.mark.slow),
+    ],
+    ids=lambda value: str(value),
 )
 def test_projective_dynamics_converges_as_its_spectrum_says(scene, substeps, device):
     """Terms of second order in the error are neglected: from 1e-2 on the prediction is off by less than 1e-2 of itself, and
@@ -407,6 +416,7 @@ def test_time_diagram(device, tmp_path, drawn):
         ]
 
 
+@pytest.mark.slow
 def test_time_diagram_of_contact(device):
     """A sheet that slides on a slope; PBD takes no friction."""
     with ThreadPoolExecutor(1) as executor:
@@ -426,6 +436,7 @@ def test_a_chart_of_errors_needs_motion(tmp_path):
         time_diagram(SceneRef(str(tmp_path / "still.py")), frames=2, executor=Nobody())
 
 
+@pytest.mark.slow
 def test_the_physics_diagram(tmp_path):
     """The catenary is met with order 2, a chain to rounding; the picture and the table have all of it."""
     found = work_precision.physics_diagram(SceneRef("catenary"), store=Store(), executor=ThreadPoolExecutor(1))

@@ -9,6 +9,7 @@ import warp as wp
 import warpcloth as wc
 from support.energies import damping_forces
 from support.nets import net
+from support.rows import slow_but
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import Sums
@@ -268,7 +269,7 @@ SOLVERS["pbd per step"] = wc.PBD(substeps=1, iterations=7, correction="per-step"
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("newton bdf2", "xpbd midpoint", "explicit", "pbd per step"), SOLVERS))
 def test_a_damped_oscillator(name, device):
     """u = e^{−βt/2}(u₀ cos + (v₀ + βu₀/2)/ω' sin), approached with the order of the method. BDF2 needs two states for ds/dt."""
     beta, omega, end, errors = 1.5, 2.0, 1.0, []
@@ -325,7 +326,13 @@ def test_limit_where_one_part_is_stiff_and_another_damped(device):
         assert motion == pytest.approx((4.0 / (beta + np.sqrt(beta**2 + 4.0 * k))).min(), rel=1e-9)
 
 
-@pytest.mark.parametrize("solver", [wc.Explicit(substeps=1), wc.Newton(substeps=1, tolerance=1e-12, integrator="midpoint")])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        wc.Explicit(substeps=1),
+        pytest.param(wc.Newton(substeps=1, tolerance=1e-12, integrator="midpoint"), marks=pytest.mark.slow),
+    ],
+)
 @each_inner
 def test_momentum_is_kept(name, solver, device):
     """Damping forces are inner ones along ∂s: linear and angular momentum stay, as they do without."""
@@ -405,7 +412,7 @@ def test_it_calms_a_cloth(solver, device):
     assert ends[1] < 0.5 * ends[0]
 
 
-@pytest.mark.parametrize("integrator", ["euler", "midpoint", "bdf2"])
+@pytest.mark.parametrize("integrator", slow_but(["midpoint"], ["euler", "midpoint", "bdf2"]))
 def test_damped_steps_meet_at_one_minimiser(integrator, device):
     """Newton, projective dynamics, ADMM and XPBD on springs, quadratic bending and attachments, all damped: 1e-8 m.
 

@@ -282,7 +282,7 @@ REFUSED[("mobile", "admm")] = "bars, whose bodies are no elements by themselves"
 # Frames of the larger of them on the CPU; the others have 30.
 FRAMES = {"usd_cloth": 3, "bunny": 2, "bar_twist": 15, "mobile": 15, "cards": 5, "loop": 15, "stack": 5}
 
-# Ways of solvers that self-contact does not know of.
+# Ways of a solver that do not touch self-contact are not run with it.
 UNFOLDED = [name for name in SMALL if name not in FOLDING]
 VARIANTS = ("pbd plain", "projective dynamics plain", "constrained dynamics searching")
 

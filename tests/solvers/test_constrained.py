@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.rows import slow_but
 from support.scenes import scene
 from support.steps import HANGING_PAIR, hanging_mass, swinging
 from warpcloth.core.gradient import Gradient
@@ -17,7 +18,7 @@ from warpcloth.terms import TERMS
 
 EPS = np.finfo(np.float64).eps
 SAFEGUARDS = ("geometric-stiffness", "line-search")
-each_linear = pytest.mark.parametrize("linear", ["cg", "factorised"])
+each_linear = pytest.mark.parametrize("linear", slow_but(["cg"], ["cg", "factorised"]))
 
 
 def constrained(**options):
@@ -123,7 +124,7 @@ def test_unsafe_iterations_do_not_converge_and_safe_ones_do(device):
         assert stepper.results == [Result.CONVERGED] and stepper.iterations < 60
 
 
-@pytest.mark.parametrize("stabilisation", SAFEGUARDS)
+@pytest.mark.parametrize("stabilisation", slow_but(SAFEGUARDS[:1], SAFEGUARDS))
 @pytest.mark.parametrize(
     "term",
     [

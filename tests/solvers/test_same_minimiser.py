@@ -42,7 +42,14 @@ ON_8 = {
     "xpbd sequential": wc.XPBD(substeps=1, iterations=30_000, sweep="sequential"),
     "xpbd jacobi": wc.XPBD(substeps=1, iterations=200_000, sweep="constraint-averaged"),
 }
-SLOW = ("xpbd jacobi",)
+QUICK = (
+    "newton adaptive cg",
+    "newton clamp factorised",
+    "constrained dynamics cg",
+    "projective dynamics l-bfgs",
+    "admm",
+    "xpbd coloured",
+)
 DO_NOT = {
     wc.Explicit: "takes the forces of where the step begins and minimises nothing",
     wc.PBD: "projects onto constraints whose stiffness depends on iterations and step",
@@ -58,7 +65,10 @@ SHORT = (
 )
 each_solver = pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=slow if name in SLOW else () if name in SHORT else pytest.mark.host) for name in ON_16 | ON_8],
+    [
+        pytest.param(name, marks=[*[slow] * (name not in QUICK), *[pytest.mark.host] * (name not in SHORT)])
+        for name in ON_16 | ON_8
+    ],
 )
 
 

@@ -6,6 +6,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.outside import Plane
+from support.rows import slow_but
 from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import Sums
@@ -21,7 +22,7 @@ def eps(dtype):
     return float(np.finfo(dtype).eps)
 
 
-every_dtype = pytest.mark.parametrize("dtype", DTYPES)
+every_dtype = pytest.mark.parametrize("dtype", slow_but(["float64"], DTYPES))
 # What a material of the tests has beside its stiffness, for the rest state.
 MATERIALS = {
     "StVKMembrane": {"poisson_ratio": 0.3},

@@ -10,6 +10,7 @@ from pxr import Usd, UsdGeom
 
 import warpcloth as wc
 from support.energies import energy_and_gradient
+from support.rows import slow_but
 from support.setups import allocations
 from support.usd_validation import validate
 from warpcloth.core.status import Result
@@ -238,7 +239,7 @@ def jelly(**scene):
     return wc.Scene(mesh, density=1.0, terms=terms, velocities=velocities, pins=[0], **scene)
 
 
-@pytest.mark.parametrize("integrator", ["euler", "midpoint", "bdf2"])
+@pytest.mark.parametrize("integrator", slow_but(["bdf2"], ["euler", "midpoint", "bdf2"]))
 def test_soft_bodies_meet_at_one_minimiser(integrator, device):
     """After three steps all who minimise are where Newton is, to 1e-8 m; vector XPBD as its fixed point is implicit Euler."""
     ends = {}

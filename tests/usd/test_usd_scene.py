@@ -14,6 +14,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 import warpcloth as wc
 from support.energies import DECLARED
 from support.outside import Plane
+from support.rows import slow_but
 from support.usd_validation import validate
 from warpcloth.terms import TERMS
 from warpcloth.terms.loads import LOADS
@@ -267,7 +268,7 @@ def assert_same_scene(read, scene):
             assert_same(value, getattr(other, field.name), f"{type(one).__name__}.{field.name}")
 
 
-@pytest.mark.parametrize("ending", ["usda", "usdc", "usd"])
+@pytest.mark.parametrize("ending", slow_but(["usda"], ["usda", "usdc", "usd"]))
 @pytest.mark.parametrize("make", SCENES, ids=lambda make: make.__name__)
 def test_a_scene_comes_back(tmp_path, make, ending):
     scene = make()
