@@ -21,6 +21,7 @@ from warpcloth.kernels.term import HessianPolicy
 from warpcloth.kernels.terms.contact import CONTACT
 from warpcloth.lab.counts import launches_of
 from warpcloth.scenes import drape
+from warpcloth.solvers.clear_steps import ClearSteps
 from warpcloth.solvers.solver import Stepper
 
 R = 1e-3
@@ -442,6 +443,24 @@ def test_a_step_with_nothing_near_has_few_launches_more(name):
     steppers = [SOLVERS[name].bind(each.build()) for each in (scene, replace(scene, colliders=(), contact=None))]
     with_contact, without = (launches_of(stepper.step) for stepper in steppers)
     assert without < with_contact <= without + 6
+
+
+@pytest.mark.parametrize("name", ("pbd", "xpbd"))
+def test_a_frame_with_one_test_has_the_bits_of_its_steps(name, device, monkeypatch):
+    """A sheet falls onto a ball: frames in which nothing is near, one in which contact begins, and frames with contact."""
+    scene = drape.scene(n=6, friction=0.0 if name == "pbd" else 0.3)
+    scene = replace(scene, positions=scene.positions + np.array([0.0, 0.1, 0.0]))
+    model = scene.build(device=device)
+    monkeypatch.setattr(ClearSteps, "several", lambda clear, steps, size: True)  # as on CUDA
+    one, other = (replace(SOLVERS[name], dt=None, substeps=4).bind(model) for _ in range(2))
+    near = []
+    for _ in range(16):
+        one.frame()
+        for _ in range(4):
+            other.step()
+        near.append(int(one.clear_steps.near.numpy()[0]))
+        assert (one.state.x.numpy() == other.state.x.numpy()).all() and near[-1] == other.clear_steps.near.numpy()[0]
+    assert near[0] == 0 and near[-1] == 1 and one.colliders.steps.numpy() == other.colliders.steps.numpy() == [64]
 
 
 @pytest.mark.filterwarnings("ignore:threads is . on . cores")

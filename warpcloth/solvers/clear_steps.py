@@ -86,6 +86,10 @@ class TwinSteps:
         self._launch_restore()
         self._launch_parts(touching)
 
+    def several(self, steps, size):
+        """Returns whether :meth:`launch_several` can take this number of steps of ``size`` launches with one test."""
+        return False
+
     def _launch_restore(self):
         for name, array in self.twin.state.arrays.items():
             wp.copy(array, self._kept[name])
@@ -116,6 +120,9 @@ class ClearSteps(TwinSteps):
 
     _launch_count = None  # the test after the step counts it
 
+    # Largest number of launches of a graph of several steps, because to capture one takes 100 µs.
+    LAUNCHES = 1024
+
     def __init__(self, stepper, twin):
         super().__init__(stepper, twin)
         model, colliders, self._followed = stepper.model, stepper.colliders, False
@@ -138,7 +145,7 @@ class ClearSteps(TwinSteps):
             max_length = STRETCHED / np.sqrt(3.0) * float(model.scene.mesh.edge_lengths.max())
             bounding = np.array(bounding) + [max_length if collider.facets else 0.0 for collider in model.scene.colliders]
         self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
-        self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy, stepper.h]]
+        self._given = [[self._bounds, *model.free_gravity], [colliders.poses, colliders.steps, model.per_copy]]
         self._out = [clear, self.near]
         self._finds = [model.kernel(kernels.near_colliders, model.dtype, ended) for ended in (False, True)]
         self._contact = [elements for elements in model.terms if elements.collider is not None]
@@ -148,8 +155,32 @@ class ClearSteps(TwinSteps):
         self._followed = True
         self.stepper.colliders.follow()
 
-    def _launch_look(self):
-        """Launches the test before a step, and saves the state."""
+    def several(self, steps, size):
+        standing = not (self._moving or self._followed)
+        return self.stepper.model.device.is_cuda and standing and steps > 1 and steps * size <= self.LAUNCHES
+
+    def launch_several(self, touching, steps):
+        """Launches several steps. If no vertex comes near in any of them, they have two conditions together.
+
+        The test before the steps assumes that a vertex moves by twice its prediction over all of them. That after each step
+        compares its end with the positions before the first one: the ball of a vertex is convex, so that it contains the motion
+        if it contains the ends of all steps. If one fails, all steps are taken again, each with its own tests.
+        """
+        self._launch_look(steps)
+        wp.capture_if(self.near, None, partial(self._launch_all_clear, steps))
+        wp.capture_if(self.near, partial(self._launch_all_again, touching, steps))
+
+    def _launch_all_clear(self, steps):
+        for _ in range(steps):
+            self._launch_clear()
+
+    def _launch_all_again(self, touching, steps):
+        self._launch_restore()
+        for _ in range(steps):
+            self._launch_step(touching)
+
+    def _launch_look(self, steps=1):
+        """Launches the test before a number of steps, and saves the state."""
         stepper = self.stepper
         if self._moving:
             stepper.colliders.launch_move()
@@ -159,7 +190,7 @@ class ClearSteps(TwinSteps):
                 stepper.model.refresh(STEP, stepper.integrator.moment, self._contact)
         for name in self._others:
             wp.copy(self._kept[name], self.twin.state.arrays[name])
-        self._launch(0, *stepper.state, None)
+        self._launch(0, *stepper.state, None, steps)
 
     def _launch_check(self):
         """Launches the test after a step, clears the friction anchors of earlier steps, and counts the step."""
@@ -172,6 +203,6 @@ class ClearSteps(TwinSteps):
         super()._launch_restore()
         wp.copy(self.stepper.colliders.steps, self._steps_kept)
 
-    def _launch(self, find, x, v, end):
-        (elements, others), model = self._given, self.stepper.model
-        model.launch(self._finds[find], model.count, [*elements, x, v, end, *others], self._out)
+    def _launch(self, find, x, v, end, steps=1):
+        (elements, others), model, h = self._given, self.stepper.model, steps * self.stepper.h
+        model.launch(self._finds[find], model.count, [*elements, x, v, end, *others, h], self._out)

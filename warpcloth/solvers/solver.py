@@ -342,6 +342,8 @@ class LaunchedStepper(Stepper):
     def _record_frame(self):
         """Captures the segments of a frame, on first use, and returns them with the number of replays of each."""
         steps = self.steps_per_frame
+        if self.clear_steps is not None and self.clear_steps.several(steps, self._size):
+            return [(self._segments(lambda: self.clear_steps.launch_several(self.parts, steps)), 1)]
         chunk = min(steps, LAUNCHES // max(self._size, 1))
         if chunk < 2:
             return self._step * steps
