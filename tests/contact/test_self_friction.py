@@ -317,18 +317,17 @@ def test_cards(name, friction, device):
 
 
 @SLOW  # 1440 frames of two cards
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_cards_stand_for_a_minute(dtype, device):
-    """From 30 s on they move by less than 1e-7 m, some last places of float32 coordinates, and in float64 not at all."""
-    stepper = SOLVERS["xpbd"].bind(cards.scene().build(device=device, dtype=dtype))
+def test_cards_stand_for_a_minute(device):
+    """From 30 s on they move by less than 1e-7 m, some last places of coordinates."""
+    stepper = SOLVERS["xpbd"].bind(cards.scene().build(device=device, dtype="float32"))
     found = []
     for frame in range(1440):
         stepper.frame()
         if frame >= 720:
             found.append(np.array(stepper.state.x.numpy()))
     moved = np.ptp(found, axis=0).max()
-    print(dtype, moved)
-    assert moved < (1e-7 if dtype == "float32" else 1e-12)
+    print(moved)
+    assert moved < 1e-7
 
 
 @pytest.mark.parametrize("solver", [wc.PBD(substeps=4), wc.HierarchicalPBD(substeps=4)])

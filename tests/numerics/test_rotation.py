@@ -8,7 +8,7 @@ import warpcloth as wc
 from support import matrices
 from support.matrices import CLASSES, angle, determinant, orthogonality, reconstruction, reference, samples, times
 
-COUNT = 25_000
+COUNT = 10_000
 # 17 ε and 45 ε. Ten to twenty operations, each rounded by ε/2, lie between a matrix and a number of the result.
 BOUND = {np.float32: 2e-6, np.float64: 1e-14}
 PRECISIONS = pytest.mark.parametrize("dtype", BOUND, ids=["float32", "float64"])

@@ -102,7 +102,8 @@ def test_all_meet(name, device):
     print(name, "from Newton", np.abs(x - newton).max(), "unbalanced", residual, "of rounding", noise)
     assert np.abs(x - newton).max() < 1e-8
     assert residual < 10.0 * noise
-    x, _ = after_one_step(declared, solver, device, "float32")
+    fewer = replace(solver, iterations=solver.iterations // 4) if name in ON_8 else solver
+    x, _ = after_one_step(declared, fewer, device, "float32")
     assert np.abs(x - newton).max() < 1e-4
     if not isinstance(solver, (wc.Newton, wc.ConstrainedDynamics)):  # which need fewer
         few, _ = after_one_step(declared, replace(solver, iterations=50), device)

@@ -347,13 +347,13 @@ for run in itertools.count():
     ids=["chunks", "layer", "one-file", "package"],
 )
 def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, ending, with_source, single_file):
-    """Three kills of each kind. The victim writes one result over the other for ever, so each kill meets it at work."""
+    """Two kills of each kind. The victim writes one result over the other for ever, so each kill meets it at work."""
     mesh = Mesh.grid(40, 40)
     source = artist_stage(tmp_path / "artist.usda", mesh) if with_source else ""
     mesh = read_mesh(source) if source else mesh
     script = VICTIM.format(path=[str(Path(__file__).parents[1]), *sys.path])
     moments = random.Random(f"{ending} {with_source} {single_file}")
-    for trial in range(3):
+    for trial in (0, 2):
         output, log = tmp_path / f"{trial}.{ending}", tmp_path / f"{trial}.log"
         arguments = [str(output), source, "yes" if single_file else "", str(log)]
         victim = subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE, text=True)
