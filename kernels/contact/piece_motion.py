@@ -7,20 +7,24 @@ import warp as wp
 from ..vectors import types
 from .proximity_grid import MODULE
 
+SAMPLES = wp.constant(9)  # vertices whose median motion is that of a piece
+
 
 @cache
 def pieces(dtype):
-    """Struct of the connected pieces of all copies: the piece of each vertex, or −1, and the middle vertex of each piece.
+    """Struct of the connected pieces of all copies: the piece of each vertex, or −1, and the drift of each piece [m].
 
-    If a copy has more than one piece (``per_copy``), each also has a box, and the largest motion of its vertices relative to
-    the middle vertex [m].
+    The drift is its motion: along each axis the median of that of SAMPLES of its vertices, ``samples`` (pieces·SAMPLES,). A
+    part that moves alone, such as a fold that rolls, hardly changes it. If a copy has more than one piece (``per_copy``), each
+    also has a box, and the largest motion of its vertices relative to the drift [m].
     """
     vec3, _ = types(dtype)
 
     @wp.struct
     class Pieces:
         piece: wp.array(dtype=wp.int32)
-        centre: wp.array(dtype=wp.int32)
+        samples: wp.array(dtype=wp.int32)
+        drift: wp.array(dtype=vec3)
         per_copy: wp.int32
         lower: wp.array(dtype=vec3)
         upper: wp.array(dtype=vec3)
@@ -31,7 +35,7 @@ def pieces(dtype):
 
 @cache
 def begin_boxes(dtype):
-    """Kernel over pieces: sets the box to the middle vertex."""
+    """Kernel over pieces: sets the box to a vertex."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -42,8 +46,8 @@ def begin_boxes(dtype):
         pieces: pieces(dtype),
     ):
         p = wp.tid()
-        pieces.lower[p] = x[pieces.centre[p]]
-        pieces.upper[p] = x[pieces.centre[p]]
+        pieces.lower[p] = x[pieces.samples[p * SAMPLES]]
+        pieces.upper[p] = x[pieces.samples[p * SAMPLES]]
 
     return begin_each_box
 
@@ -103,10 +107,46 @@ def take_moved(dtype):
 
 
 @cache
+def find_drift(dtype):
+    """Kernel over pieces: their drift from ``found`` to x; 0 if it is not finite."""
+    vec3, _ = types(dtype)
+    numbers = wp.types.vector(SAMPLES, dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def find_each_drift(
+        # state in
+        x: wp.array(dtype=vec3),
+        found: wp.array(dtype=vec3),
+        # in and out
+        pieces: pieces(dtype),
+    ):
+        p = wp.tid()
+        drift = vec3()
+        for axis in range(3):
+            sorted = numbers()
+            for k in range(SAMPLES):
+                i = pieces.samples[p * SAMPLES + k]
+                own = x[i][axis] - found[i][axis]
+                at = k
+                while at > 0:
+                    if sorted[at - 1] <= own:
+                        break
+                    sorted[at] = sorted[at - 1]
+                    at -= 1
+                sorted[at] = own
+            drift[axis] = sorted[SAMPLES // 2]
+        if not wp.length_sq(drift) < dtype(wp.inf):
+            drift = vec3()
+        pieces.drift[p] = drift
+
+    return find_each_drift
+
+
+@cache
 def find_motion(dtype):
     """Kernel over vertices: finds copies in which a vertex has moved by more than ``most`` since ``found``.
 
-    The motion is relative to the middle vertex of the piece. moved = 1 for such copies, among the ``active`` ones if given;
+    The motion is relative to the drift of the piece. moved = 1 for such copies, among the ``active`` ones if given;
     some = 1 if there is one; stale = 1 if the pairs were not listed at ``found``.
     """
     vec3, _ = types(dtype)
@@ -132,8 +172,7 @@ def find_motion(dtype):
             stale[0] = 1
         p = pieces.piece[i]
         if p >= 0:
-            c = pieces.centre[p]
-            own = wp.length((x[i] - found[i]) - (x[c] - found[c]))
+            own = wp.length((x[i] - found[i]) - pieces.drift[p])
             if not (own <= most):
                 note_moved(active, p // pieces.per_copy, moved, some)
             if pieces.per_copy > 1:
@@ -155,8 +194,6 @@ def compare_motions(dtype):
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def compare_each_motion(
         # state in
-        x: wp.array(dtype=vec3),
-        found: wp.array(dtype=vec3),
         pieces: pieces(dtype),
         # parameters
         active: wp.array(dtype=wp.int32),
@@ -167,10 +204,8 @@ def compare_motions(dtype):
         some: wp.array(dtype=wp.int32),
     ):
         p = wp.tid()
-        c = pieces.centre[p]
         for q in range(p + 1, (p // pieces.per_copy + 1) * pieces.per_copy):
-            a = pieces.centre[q]
-            nearer = wp.length((x[a] - found[a]) - (x[c] - found[c])) + pieces.motion[p] + pieces.motion[q]
+            nearer = wp.length(pieces.drift[q] - pieces.drift[p]) + pieces.motion[p] + pieces.motion[q]
             gap = wp.max(pieces.lower[p] - pieces.upper[q], pieces.lower[q] - pieces.upper[p])
             gap = wp.max(gap, vec3())
             if not (nearer <= most + wp.max(wp.length(gap) - radius, dtype(0.0))):

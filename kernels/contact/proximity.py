@@ -7,7 +7,7 @@ import warp as wp
 from ..memory import load
 from ..vectors import types
 from .mesh_geometry import geometry
-from .proximity_grid import MODULE, boxes, bucket_of, grids, surfaces
+from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, grids, moved_parts, surfaces
 
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 
@@ -103,10 +103,15 @@ def find_pairs(dtype, of_edges: bool):
     """Kernel over vertices, or edges: pairs with triangles, or with edges, of the same level and those above.
 
     Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices.
+
+    If parts have ``moved``, only pairs with one of them are found: those of vertices that have moved, those of other vertices
+    with triangles that have, and those of edges that have, on all levels. The distance of two edges is always computed in
+    the order of their indices.
     """
     vec3, _ = types(dtype)
     box_of, level_of, cell_at, cells_about = boxes(dtype)
     number, corner, four = load(wp.int32), load(vec3), load(wp.vec4i)
+    meet = boxes_meet(dtype)
     closest, cutoff = closest_points(dtype, of_edges), cutoffs(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
@@ -120,10 +125,18 @@ def find_pairs(dtype, of_edges: bool):
         grid: grids(dtype),
         # parameters
         triangles: int,
+        moved: moved_parts(dtype),
         # out
         pairs: pair_lists(dtype),
     ):
         i = wp.tid()
+        few = wp.bool(False)
+        if moved.items:
+            if wp.static(of_edges):
+                if moved.items[triangles + i] == 0:
+                    return
+            else:
+                few = moved.vertices[i] == 0
         if wp.static(of_edges):
             own = surface.items[triangles + i]
             copy = own[3] >> 1
@@ -138,10 +151,17 @@ def find_pairs(dtype, of_edges: bool):
         level = level_of(grid.size, low, high)
         if level < 0:
             return
+        if few:
+            if not meet(low, high, moved.region[0], moved.region[1]):
+                return
         lowest = level
         layer = cell_at(grid.size, low, high, level)[2]
         buckets = grid.counts.shape[0]
         radius = surface.distance + surface.skin
+        if wp.static(of_edges):
+            if moved.items:
+                level = 0
+                lowest = -1
         present = grid.levels[KIND] >> level
         while present != 0:
             if (present & 1) != 0:
@@ -159,18 +179,12 @@ def find_pairs(dtype, of_edges: bool):
                         # A sequence beyond the last bucket continues at the first.
                         for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
                             slot = wp.where(at < end, at, at - end)
-                            l = corner(grid.lower, slot)
-                            u = corner(grid.upper, slot)
-                            if (
-                                l[0] > high[0]
-                                or u[0] < low[0]
-                                or l[1] > high[1]
-                                or u[1] < low[1]
-                                or l[2] > high[2]
-                                or u[2] < low[2]
-                            ):
+                            if not meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
                                 continue
                             entry = four(grid.entries, slot)
+                            if few:
+                                if moved.items[entry[0]] == 0:
+                                    continue
                             other = four(surface.items, entry[0])
                             if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
                                 continue
@@ -179,6 +193,11 @@ def find_pairs(dtype, of_edges: bool):
                             if wp.static(of_edges):
                                 if level == lowest and cz == layer and k <= i:
                                     continue
+                                if lowest < 0:  # the other finds this one too if it has moved
+                                    if k < i and moved.items[entry[0]] != 0:
+                                        continue
+                                if k < i:
+                                    s = wp.vec4i(other[0], other[1], own[0], own[1])
                             elif other[2] == own[0]:
                                 continue
                             else:

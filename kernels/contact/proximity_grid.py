@@ -66,6 +66,23 @@ def grids(dtype):
 
 
 @cache
+def moved_parts(dtype):
+    """Struct of what has moved since the last list: 1 for such ``vertices``, and for ``items`` with such a vertex, else 0.
+
+    ``region`` (2,) has the lowest and the highest corner of the boxes of these items. The arrays are empty for a new list.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class MovedParts:
+        vertices: wp.array(dtype=wp.int32)
+        items: wp.array(dtype=wp.int32)
+        region: wp.array(dtype=vec3)
+
+    return MovedParts
+
+
+@cache
 def boxes(dtype):
     """Device functions on boxes: ``box_of``, ``level_of``, ``cell_at``, ``cells_about``."""
     vec3, _ = types(dtype)
@@ -126,6 +143,18 @@ def boxes(dtype):
     return box_of, level_of, cell_at, cells_about
 
 
+@cache
+def boxes_meet(dtype):
+    """Device function (low, high, l, u) → whether two boxes meet."""
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def meet(low: vec3, high: vec3, l: vec3, u: vec3):
+        return not (l[0] > high[0] or u[0] < low[0] or l[1] > high[1] or u[1] < low[1] or l[2] > high[2] or u[2] < low[2])
+
+    return meet
+
+
 @wp.func
 def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
     key = wp.uint32(x) + wp.uint32(y) * wp.uint32(73856093) + wp.uint32(z) * wp.uint32(19349663)
@@ -134,9 +163,13 @@ def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
 
 @cache
 def count_items(dtype):
-    """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist."""
+    """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist.
+
+    If parts have ``moved``, only items whose box meets their region count.
+    """
     vec3, _ = types(dtype)
     box_of, level_of, cell_at, _about = boxes(dtype)
+    meet = boxes_meet(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def count_each_item(
@@ -144,6 +177,7 @@ def count_items(dtype):
         surface: surfaces(dtype),
         # state in
         x: wp.array(dtype=vec3),
+        moved: moved_parts(dtype),
         # in and out
         grid: grids(dtype),
     ):
@@ -151,6 +185,9 @@ def count_items(dtype):
         v = surface.items[item]
         low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
         level = level_of(grid.size, low, high)
+        if moved.items:
+            if not meet(low, high, moved.region[0], moved.region[1]):
+                level = -1
         key = wp.int32(-1)
         if level >= 0:
             if (grid.levels[v[3] & 1] & (1 << level)) == 0:

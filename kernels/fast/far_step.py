@@ -29,7 +29,7 @@ def find_near(dtype):
     """Kernel over copies and ranges of ``size`` vertices at the start of a step: near = 1 if contact is possible; stores x, v.
 
     That is the case if the list is not that of ``found``; if a vertex has moved by more than ``way`` since then, relative to
-    the ``centre`` vertex of its copy; or if h v is longer than ``most``, relative to the first vertex of the copy if all move
+    the ``drift`` of its copy; or if h v is longer than ``most``, relative to the first vertex of the copy if all move
     ``together``. A range is a loop without branches, for the CPU.
     """
     vec3, _ = types(dtype)
@@ -37,9 +37,8 @@ def find_near(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_near_vertices(
-        # elements
-        centre: wp.array(dtype=wp.int32),
         # state in
+        drift: wp.array(dtype=vec3),
         found: wp.array(dtype=vec3),
         listed: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
@@ -53,8 +52,7 @@ def find_near(dtype):
     ):
         copy, part = wp.tid()
         first = copy * limits.per_copy
-        c = centre[copy]
-        common = x[c] - found[c]
+        common = drift[copy]
         own_move = vec3()
         if limits.together:
             own_move = limits.h * v[first]

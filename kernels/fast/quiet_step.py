@@ -13,7 +13,7 @@ def find_unquiet(dtype):
     """Kernel over copies and ranges of ``size`` vertices: again = 1 if a step from ``x_before`` to x may have needed contact.
 
     That is the case if the list is not that of ``found``; if a vertex had moved by more than ``way`` since then, relative to
-    the ``centre`` vertex of its copy; or if one moved by more than ``most``, relative to the first vertex of the copy if all
+    the ``drift`` of its copy; or if one moved by more than ``most``, relative to the first vertex of the copy if all
     move ``together``. A range is a loop without branches, for the CPU.
     """
     vec3, _ = types(dtype)
@@ -21,9 +21,8 @@ def find_unquiet(dtype):
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_unquiet_vertices(
-        # elements
-        centre: wp.array(dtype=wp.int32),
         # state in
+        drift: wp.array(dtype=vec3),
         x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         found: wp.array(dtype=vec3),
@@ -39,8 +38,7 @@ def find_unquiet(dtype):
     ):
         copy, part = wp.tid()
         first = copy * per_copy
-        c = centre[copy]
-        common = x_before[c] - found[c]
+        common = drift[copy]
         own_move = vec3()
         if together:
             own_move = x[first] - x_before[first]

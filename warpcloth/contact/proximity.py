@@ -7,10 +7,10 @@ from ..base.limits import refuse_memory
 from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.scan import Scan
-from ..kernels.contact import piece_motion, proximity_grid
+from ..kernels.contact import list_again, piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 
-BYTES_OF_A_PAIR = 56
+BYTES_OF_A_PAIR, BYTES_BEFORE = 56, 24  # the latter of the list before, on the CPU
 
 
 class Proximity:
@@ -35,7 +35,7 @@ class Proximity:
         found: Positions of the last list, (N,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
         flag, copies: (1,) and (B,) int32, see :meth:`moved`.
         listed: Positions (N,) [m] of the list that is in the arrays.
-        centre: The vertex in the middle of each connected piece of all copies.
+        drift: Motion of each connected piece of all copies since ``found`` [m], see :meth:`launch_drift`.
     """
 
     @in_turn
@@ -54,17 +54,28 @@ class Proximity:
         for name, value in ({"vertices": n, "distance": distance, "skin": skin, "far": far} | self._kept).items():
             setattr(self._surface, name, value)
         self._allocate_grid()
-        self._set_pieces(piece, points)
+        self._set_pieces(piece)
+        self._all, self._moved = (proximity_grid.moved_parts(model.dtype)() for _ in range(2))
+        # Lists of one piece on the CPU are made anew where it has moved. On CUDA a list of all is as quick.
+        self._by_parts = model.device.is_cpu and self._pieces.per_copy == 1
+        if self._by_parts:
+            sizes = {"vertices": model.count, "items": self._triangles + self._edges}
+            self._moved_arrays = {k: wp.zeros(size, dtype=wp.int32, device=device) for k, size in sizes.items()}
+            self._moved_arrays["region"] = wp.zeros(2, dtype=model.vec3, device=device)
+            for name, value in self._moved_arrays.items():
+                setattr(self._moved, name, value)
         self.found = model.vectors()  # all 0, so that the first call makes a list
         self.listed = model.vectors()
         self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.copies = model.scalars(wp.int32)
         self._rows = Scan(model, model.count + self._edges)
         self._pairs_of = {each: model.kernel(kernels.find_pairs, model.dtype, each) for each in (False, True)}
+        by_parts = list_again.take_parts, list_again.mark_items, list_again.merge_pairs
         self._launch = model.launcher(
             ((proximity_grid.count_items, proximity_grid.fill_buckets, kernels.fill_rows, kernels.write_pairs), model.dtype),
-            ((piece_motion.begin_boxes, piece_motion.extend_boxes), model.dtype),
+            ((piece_motion.begin_boxes, piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.take_moved), model.dtype),
+            *([(by_parts, model.dtype)] if self._by_parts else []),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
@@ -92,24 +103,28 @@ class Proximity:
         middle = np.stack([np.bincount(piece, axis, count) for axis in points.T], axis=1) / sizes[:, None]
         return np.where(sizes[piece] > 1, piece, -1).astype(np.int32), points - middle[piece]
 
-    def _set_pieces(self, piece, points):
-        """Numbers the pieces of all copies, and finds the vertex nearest to the middle of each."""
+    def _set_pieces(self, piece):
+        """Numbers the pieces of all copies, and takes vertices of each for its drift, by multiples of the golden ratio."""
         model = self.model
         used, numbers = np.unique(piece[piece >= 0], return_inverse=True)
         number = np.full(model.per_copy, -1)
         number[piece >= 0] = numbers
-        by_distance = np.lexsort((np.linalg.norm(points, axis=1), number))
-        centre = by_distance[np.searchsorted(number[by_distance], np.arange(len(used)))]
+        members = np.argsort(number, kind="stable")
+        ends = np.searchsorted(number[members], np.arange(len(used) + 1))
+        part = (np.arange(piece_motion.SAMPLES) + 0.5) * 0.6180339887 % 1.0
+        samples = members[(ends[:-1, None] + np.diff(ends)[:, None] * part).astype(int)].ravel()
         copy = np.arange(model.copies)[:, None]
         arrays = {
             "piece": np.where(number < 0, -1, number + copy * len(used)),
-            "centre": centre + copy * model.per_copy,
+            "samples": samples + copy * model.per_copy,
         }
         self._piece_arrays = {k: wp.array(v.ravel(), dtype=wp.int32, device=model.device) for k, v in arrays.items()}
+        kinds = {"drift": model.vec3}
         if len(used) > 1:
-            for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("motion", model.dtype)):
-                self._piece_arrays[name] = wp.zeros(model.copies * len(used), dtype=kind, device=model.device)
-        self.centre = self._piece_arrays["centre"]
+            kinds |= {"lower": model.vec3, "upper": model.vec3, "motion": model.dtype}
+        for name, kind in kinds.items():
+            self._piece_arrays[name] = wp.zeros(model.copies * len(used), dtype=kind, device=model.device)
+        self.drift = self._piece_arrays["drift"]
         self._pieces = piece_motion.pieces(model.dtype)()
         for name, value in ({"per_copy": len(used)} | self._piece_arrays).items():
             setattr(self._pieces, name, value)
@@ -131,7 +146,8 @@ class Proximity:
     def _allocate(self, capacity):
         model = self.model
         rows = model.count + self._edges
-        refuse_memory(f"the cloth has {capacity} pairs that are near one another", BYTES_OF_A_PAIR * capacity)
+        each = BYTES_OF_A_PAIR + BYTES_BEFORE * self._by_parts
+        refuse_memory(f"the cloth has {capacity} pairs that are near one another", each * capacity)
 
         def zeros(count, dtype=wp.int32):
             return wp.zeros(count, dtype=dtype, device=model.device)
@@ -152,6 +168,13 @@ class Proximity:
         self._pairs = kernels.pair_lists(model.dtype)()
         for name, value in self._arrays.items():
             setattr(self._pairs, name, value)
+        if self._by_parts:
+            room = {"first": rows + 1, "row_counts": rows, "items": capacity}
+            self._before_arrays = {k: zeros(size) for k, size in room.items()}
+            self._before_arrays |= {"stencils": zeros(capacity, wp.vec4i), "distances": zeros(capacity, model.dtype)}
+            self._before = kernels.pair_lists(model.dtype)()
+            for name, value in self._before_arrays.items():
+                setattr(self._before, name, value)
 
     def set_skin(self, skin):
         """Sets another skin [m]; the next :meth:`launch_kept` makes a new list."""
@@ -161,34 +184,55 @@ class Proximity:
     def launch_moved(self, x):
         """Launches the detection at x (N,) in ``copies``, and at the previous positions in the others.
 
-        So the pairs of a copy do not depend on other copies.
+        So the pairs of a copy do not depend on other copies. On the CPU the list of a single piece is made anew where vertices
+        have moved, see :mod:`warpcloth.kernels.contact.list_again`. Follows :meth:`moved`.
         """
+        if self._by_parts:
+            wp.capture_if(self._stale, self._launch_all_moved, self._launch_parts, x=x)
+        else:
+            self._launch_all_moved(x)
+
+    def _launch_all_moved(self, x):
         self._launch(piece_motion.take_moved, self.model.count, [x, self.copies, self.model.per_copy], [self.found])
         self.launch(self.found)
 
+    def _launch_parts(self, x):
+        model, moved, N = self.model, self._moved, self.model.count
+        given = [x, self.copies, self._pieces, model.per_copy, list_again.PART * self.skin]
+        self._launch(list_again.take_parts, model.copies, given, [self.found, moved])
+        self._launch(list_again.mark_items, self._triangles + self._edges, [self._surface, self.found], [moved])
+        wp.copy(self.listed, self.found)
+        self._launch_search(self.found, moved)
+        given = [self._surface, moved, N, self._triangles]
+        self._launch(list_again.merge_pairs, 1, given, [self._before, self._pairs])
+
     def launch(self, x):
         """Launches the detection at positions x (N,)."""
-        surface, grid, pairs, N = self._surface, self._grid, self._pairs, self.model.count
-        items, own = self._triangles + self._edges, self._arrays
+        pairs, N, own = self._pairs, self.model.count, self._arrays
         if x is not self.found:
             wp.copy(self.found, x)
         wp.copy(self.listed, x)
         if self._pieces.per_copy > 1:
             self._launch_boxes(x)
-        self.counts.zero_()
-        self._grid_arrays["levels"].zero_()
-        self._launch(proximity_grid.count_items, items, [surface, x], [grid])
-        self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
-        self._launch(proximity_grid.fill_buckets, items, [surface, x], [grid])
-        for of_edges, count in ((False, N if self._triangles else 0), (True, self._edges)):
-            if count:
-                self.model.launch(self._pairs_of[of_edges], count, [surface, x, grid, self._triangles], [pairs])
+        self._launch_search(x, self._all)
         self._rows.launch(own["row_counts"], own["first"])
         self._launch(kernels.fill_rows, self.capacity, [], [pairs])
-        self._launch(kernels.write_pairs, N + self._edges, [surface, N, self._triangles], [pairs])
+        self._launch(kernels.write_pairs, N + self._edges, [self._surface, N, self._triangles], [pairs])
+
+    def _launch_search(self, x, moved):
+        """Finds the pairs, or those with parts that have moved."""
+        surface, grid, items = self._surface, self._grid, self._triangles + self._edges
+        self.counts.zero_()
+        self._grid_arrays["levels"].zero_()
+        self._launch(proximity_grid.count_items, items, [surface, x, moved], [grid])
+        self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
+        self._launch(proximity_grid.fill_buckets, items, [surface, x], [grid])
+        for of_edges, count in ((False, self.model.count if self._triangles else 0), (True, self._edges)):
+            if count:
+                self.model.launch(self._pairs_of[of_edges], count, [surface, x, grid, self._triangles, moved], [self._pairs])
 
     def _launch_boxes(self, x):
-        self._launch(piece_motion.begin_boxes, len(self._pieces.centre), [x], [self._pieces])
+        self._launch(piece_motion.begin_boxes, len(self.drift), [x], [self._pieces])
         self._launch(piece_motion.extend_boxes, self.model.count, [x], [self._pieces])
 
     def launch_kept(self, x, part, launch):
@@ -199,15 +243,19 @@ class Proximity:
         flag = self.moved(x, part)
         wp.capture_if(flag, launch, lambda x: wp.capture_if(self._stale, lambda: launch(self.found)), x=x)
 
+    def launch_drift(self, x):
+        """Finds the drift of each piece from ``found`` to x (N,)."""
+        self._launch(piece_motion.find_drift, len(self.drift), [x, self.found], [self._pieces])
+
     def moved(self, x, part=0.5, active=None):
         """Launches flag = 1 if pairs may be missing at x (N,), else 0, and returns it, for :func:`warp.capture_if`.
 
         ``copies`` is 1 for copies in which pairs may be missing.
 
         The flag is 0 while each vertex has moved by at most the fraction ``part`` of the skin since the last detection,
-        relative to the vertex in the middle of its connected piece. Two pieces may also have approached one another by twice
-        that, plus the excess of the distance of their boxes over the contact distance and the skin. So sheets that fall
-        together, or far apart, need no detection.
+        relative to the drift of its connected piece, the median motion of some of its vertices. Two pieces may also have
+        approached one another by twice that, plus the excess of the distance of their boxes over the contact distance and the
+        skin. So sheets that fall together, or far apart, need no detection.
 
         Args:
             x: Positions (N,) [m].
@@ -223,12 +271,13 @@ class Proximity:
         several = self._pieces.per_copy > 1
         if several:
             self._pieces.motion.zero_()
+        self.launch_drift(x)
         given = [x, self.found, self.listed, active, part * self.skin]
         self._launch(piece_motion.find_motion, self.model.count, given, [self._pieces, self.copies, self.flag, self._stale])
         if several:
             wp.capture_if(self._stale, lambda: self._launch_boxes(self.found))
-            given = [x, self.found, self._pieces, active, self.distance + self.skin, 2.0 * part * self.skin]
-            self._launch(piece_motion.compare_motions, len(self._pieces.centre), given, [self.copies, self.flag])
+            given = [self._pieces, active, self.distance + self.skin, 2.0 * part * self.skin]
+            self._launch(piece_motion.compare_motions, len(self.drift), given, [self.copies, self.flag])
         return self.flag
 
     @property

@@ -11,9 +11,9 @@ from ..kernels.step import count_step
 class QuietSteps:
     """Takes plain steps while no pair is listed, and repeats a step with contact and filter if the test requires it.
 
-    The test is that of the list, by motion relative to the middle vertex: while the list is valid, no pair can have a force.
-    Also, no vertex may move by more than the filter allows in a round. The steps of both kinds are then bitwise equal. With
-    several pieces, colliders, moving pins, loads, or a start with intersections, all steps have contact.
+    The test is that of the list, by motion relative to the drift of the piece. While the list is valid, no pair can have a
+    force. Also, no vertex may move by more than the filter allows in a round. The steps of both kinds are then bitwise equal.
+    With several pieces, colliders, moving pins, loads, or a start with intersections, all steps have contact.
 
     Args:
         steps: The plain steps, with a ``gradient`` to which contact adds before a step.
@@ -28,7 +28,7 @@ class QuietSteps:
 
     def __init__(self, steps, pairs, count):
         self._plain, self._pairs, self.record, model = steps, pairs, steps.record, pairs.model
-        one = len(pairs.proximity.centre) == model.copies
+        one = len(pairs.proximity.drift) == model.copies
         self._quiet = one and count is None and not model.scene.colliders and pairs.tangles is None
         self._v_before = model.vectors()
         self._left, self._again = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
@@ -70,7 +70,8 @@ class QuietSteps:
         self._plain.launch(1, lambda *moved: None)
         self._again.zero_()
         near = pairs.proximity
-        given = [near.centre, pairs.x_before, x, near.found, near.listed, *self._given]
+        near.launch_drift(pairs.x_before)
+        given = [near.drift, pairs.x_before, x, near.found, near.listed, *self._given]
         model.launch(self._test, self._dim, given, [self._again])
         wp.capture_if(self._again, self._launch_again, self._launch_count, end=end)
 

@@ -153,7 +153,8 @@ def _self_contact(stepper):
     gap = float(pairs.least_gap.min())
     values = pairs.most, lists / steps, 1.0 - float(pairs.share.mean()), gap if np.isfinite(gap) else None
     vertices, x = stepper.model.count, stepper.state.x
-    times = [1e9 * _seconds(Segment(x.device, partial(each, x))) / vertices for each in (pairs.launch_list, pairs.launch_areas)]
+    timed = pairs.proximity.launch, pairs.launch_areas
+    times = [1e9 * _seconds(Segment(x.device, partial(each, x))) / vertices for each in timed]
     return dict(zip(OF_SELF_CONTACT, (*values, *times), strict=True))
 
 

@@ -32,7 +32,7 @@ class FarSteps(TwinSteps):
     def serve(stepper):
         """Returns whether a stepper can use it: each copy is one piece, starts without crossings, and nothing else moves it."""
         pairs, model = stepper.pairs, stepper.model
-        one = len(pairs.proximity.centre) == model.copies
+        one = len(pairs.proximity.drift) == model.copies
         return one and stepper.count is None and model.colliders is None and pairs.tangles is None
 
     def _launch_look(self):
@@ -42,7 +42,8 @@ class FarSteps(TwinSteps):
         wp.copy(self.near, pairs.listed)
         for name in self._others:
             wp.copy(kept[name], self.twin.state.arrays[name])
-        given = [near.centre, near.found, near.listed, x, v, self._limits]
+        near.launch_drift(x)
+        given = [near.drift, near.found, near.listed, x, v, self._limits]
         stepper.model.launch(self._find_near, self._dim, given, [kept["x"], kept["v"], self.near])
 
     def _launch_check(self):
