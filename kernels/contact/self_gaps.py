@@ -9,6 +9,7 @@ from functools import cache
 
 import warp as wp
 
+from ..memory import load
 from ..vectors import types
 
 # Constants for all kernels of pairs.
@@ -163,6 +164,7 @@ def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3
 def vertex_of(dtype):
     """Device functions (x, correction, i) → xᵢ or xᵢ + dᵢ in float64, and (v) → v in float64."""
     vec3, _ = types(dtype)
+    vector = load(vec3)
 
     @wp.func
     def exact(v: vec3):
@@ -170,9 +172,9 @@ def vertex_of(dtype):
 
     @wp.func
     def at(x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3), i: int):
-        found = exact(x[i])
+        found = exact(vector(x, i))
         if correction:
-            found += exact(correction[i])
+            found += exact(vector(correction, i))
         return found
 
     return at, exact

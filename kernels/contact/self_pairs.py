@@ -7,6 +7,7 @@ from functools import cache
 
 import warp as wp
 
+from ..memory import load
 from ..vectors import types
 from .proximity import sort
 from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
@@ -116,6 +117,7 @@ def set_areas(dtype):
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
+    number, value, normal_at, stencil = load(wp.int32), load(wp.float64), load(wp.vec3d), load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def set_each_area(
@@ -133,37 +135,40 @@ def set_areas(dtype):
         triangles = pairs.counts[0]
         if e >= triangles + pairs.counts[1]:
             return
-        s = pairs.stencils[e]
+        s = stencil(pairs.stencils, e)
         r = wp.float64(pairs.distances[e])
-        n = step.normal[e]
-        gap = step.gap[e]
+        n = normal_at(step.normal, e)
+        gap = value(step.gap, e)
         area = ZERO
         if e < triangles:
-            first = pairs.rows[s[0]]
-            end = pairs.rows[s[0] + 1]
+            first = number(pairs.rows, s[0])
+            end = number(pairs.rows, s[0] + 1)
             least = gap
             for other in range(first, end):
-                if step.gap[other] < least:
-                    if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
-                        least = step.gap[other]
+                if value(step.gap, other) < least:
+                    if share_a_vertex(s, stencil(pairs.stencils, other)) and wp.dot(n, normal_at(step.normal, other)) > ZERO:
+                        least = value(step.gap, other)
             own = part_of_area(gap, least, r)
             if own > ZERO:
                 total = ZERO
                 for other in range(first, end):
-                    part = part_of_area(step.gap[other], least, r)
+                    part = part_of_area(value(step.gap, other), least, r)
                     if part > ZERO:
-                        if share_a_vertex(s, pairs.stencils[other]) and wp.dot(n, step.normal[other]) > ZERO:
+                        if (
+                            share_a_vertex(s, stencil(pairs.stencils, other))
+                            and wp.dot(n, normal_at(step.normal, other)) > ZERO
+                        ):
                             total += part
                 area = SIDE * areas[s[0]] * own / total
         else:
             least = wp.float64(wp.inf)
             for i in range(4):
                 sign = wp.where(i < 2, ONE, -ONE)
-                for other in range(pairs.rows[s[i]], pairs.rows[s[i] + 1]):
+                for other in range(number(pairs.rows, s[i]), number(pairs.rows, s[i] + 1)):
                     if least <= gap and least < wp.float64(wp.inf):
                         break  # most pairs end here
-                    if step.gap[other] < least and sign * wp.dot(n, step.normal[other]) > SIDE:
-                        least = step.gap[other]
+                    if value(step.gap, other) < least and sign * wp.dot(n, normal_at(step.normal, other)) > SIDE:
+                        least = value(step.gap, other)
             nearer = ONE
             if least < wp.float64(wp.inf):
                 nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)

@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from ..memory import load
 from ..vectors import types
 from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
 from .self_pairs import module_of, near_pairs
@@ -124,6 +125,7 @@ def cut_by_planes(dtype):
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
     wanted = wanted_move(dtype)
+    value, stencil, way_of = load(wp.float64), load(wp.vec4i), load(wp.vec2d)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def cut_by_each_plane(
@@ -147,13 +149,13 @@ def cut_by_planes(dtype):
         e = wp.tid()
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
-        s = pairs.stencils[e]
+        s = stencil(pairs.stencils, e)
         of_vertex = e < pairs.counts[0]
         sides = wp.where(of_vertex, 1, 2)
         way = wp.vec2d()
         far = ZERO
         for i in range(4):
-            each = ways[s[i]]
+            each = way_of(ways, s[i])
             far = wp.max(far, each[1])
             if i < sides:
                 way[0] = wp.max(way[0], each[0])
@@ -162,7 +164,7 @@ def cut_by_planes(dtype):
         margin = margin_of(least, far)
         if gap:
             # For any division of the gap, approaches with at most this sum are not shortened.
-            if way[0] + way[1] <= WIDE * gap[e] - KEPT / CLAMPED * margin:
+            if way[0] + way[1] <= WIDE * value(gap, e) - KEPT / CLAMPED * margin:
                 return
         if open:
             if open[e] != 0:

@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from ..memory import load
 from ..terms import contact
 from ..vectors import types
 from .self_contact import PairForces
@@ -81,6 +82,7 @@ def sweep_pairs(dtype, axes: bool):
     vec3, _ = types(dtype)
     at, exact = vertex_of(dtype)
     moved = free_move(dtype, axes)
+    number, value, stencil, normal, vector = (load(each) for each in (wp.int32, wp.float64, wp.vec4i, wp.vec3d, vec3))
 
     @wp.kernel(module="unique", enable_backward=False)
     def sweep_each_pair(
@@ -101,20 +103,23 @@ def sweep_pairs(dtype, axes: bool):
         correction: wp.array(dtype=vec3),
     ):
         count = pairs.number[0]
-        for turn in range(count):
+        vertex_pairs = pairs.counts[0]
+        turn = wp.int32(0)
+        while turn < count:
             own = wp.where(backward, count - 1 - turn, turn)
-            e = pairs.acting[own]
-            s = pairs.stencils[e]
-            of_vertex = e < pairs.counts[0]
+            turn += 1
+            e = number(pairs.acting, own)
+            s = stencil(pairs.stencils, e)
+            of_vertex = e < vertex_pairs
             before = ZERO
             if multipliers:
-                before = multipliers[e]
+                before = value(multipliers, e)
             if before == ZERO:
-                p0 = exact(correction[s[0]])
-                p1 = exact(correction[s[1]])
-                p2 = exact(correction[s[2]])
-                p3 = exact(correction[s[3]])
-                if clearance[own] + gap_along(of_vertex, step.normal[e], p0, p1, p2, p3) > ZERO:
+                p0 = exact(vector(correction, s[0]))
+                p1 = exact(vector(correction, s[1]))
+                p2 = exact(vector(correction, s[2]))
+                p3 = exact(vector(correction, s[3]))
+                if value(clearance, own) + gap_along(of_vertex, normal(step.normal, e), p0, p1, p2, p3) > ZERO:
                     continue
             k = step.stiffness[e]
             r = wp.float64(pairs.distances[e])
