@@ -13,7 +13,7 @@ from ..vectors import types
 from .self_friction import RubbedPairs, friction_module, stretch_of
 from .self_gaps import ONE, ZERO
 from .self_pairs import near_pairs
-from .self_sweeps import free_move
+from .self_sweeps import free_move, greatest_mobility
 
 
 @wp.func
@@ -26,19 +26,6 @@ def multiplier_after(u: wp.vec3d, D: wp.float64, k: wp.float64, limit: wp.float6
         most = wp.min(k * h * h * l / (ONE + c), limit * h * h)
         found = -most / l * u
     return found
-
-
-@cache
-def greatest_mobility(dtype, axes: bool):
-    """Device function (inverse masses, i) → the largest 1/m of the axes of vertex i."""
-    moved = free_move(dtype, axes)
-    kind, _ = types(dtype)
-
-    @wp.func
-    def greatest(inverse_mass: wp.array(dtype=kind if axes else dtype), i: int):
-        return wp.max(moved(inverse_mass, i, wp.vec3d(ONE, ONE, ONE)))
-
-    return greatest
 
 
 @cache

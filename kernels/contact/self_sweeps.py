@@ -8,10 +8,13 @@ from ..memory import load
 from ..terms import contact
 from ..vectors import types
 from .self_contact import PairForces
-from .self_gaps import ZERO, gap_along, nearest, signed_gap, vertex_of
+from .self_gaps import ONE, ZERO, gap_along, nearest, signed_gap, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
 
 gap_after = contact.gap_after
+# Smallest W of a hard pair, over its W with all axes free. If n is at an angle ε to the free axes, the vertices of the pair
+# would move by (r − d)/sin ε. This bounds their moves by (r − d)/√LOCKED, and takes them to 0 where sin ε does.
+LOCKED = wp.constant(wp.float64(0.01))
 
 
 @wp.struct
@@ -40,6 +43,19 @@ def free_move(dtype, axes: bool):
         return wp.cw_mul(exact(inverse_mass[i]), v)
 
     return by_axis if axes else alike
+
+
+@cache
+def greatest_mobility(dtype, axes: bool):
+    """Device function (inverse masses, i) → the largest 1/m of the axes of vertex i."""
+    moved = free_move(dtype, axes)
+    kind, _ = types(dtype)
+
+    @wp.func
+    def greatest(inverse_mass: wp.array(dtype=kind if axes else dtype), i: int):
+        return wp.max(moved(inverse_mass, i, wp.vec3d(ONE, ONE, ONE)))
+
+    return greatest
 
 
 @cache
@@ -81,7 +97,7 @@ def sweep_pairs(dtype, axes: bool):
     """
     vec3, _ = types(dtype)
     at, exact = vertex_of(dtype)
-    moved = free_move(dtype, axes)
+    moved, greatest = free_move(dtype, axes), greatest_mobility(dtype, axes)
     number, value, stencil, normal, vector = (load(each) for each in (wp.int32, wp.float64, wp.vec4i, wp.vec3d, vec3))
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -132,16 +148,20 @@ def sweep_pairs(dtype, axes: bool):
                 gap, n = signed_gap(y, step.normal[e], inside)
                 if before != ZERO or gap < r:
                     W = ZERO
+                    least = ZERO
                     left = gap
                     for i in range(4):
                         push = w[i] * moved(inverse_mass, s[i], n)
                         W += w[i] * wp.dot(n, push)
+                        least += LOCKED * w[i] * w[i] * greatest(inverse_mass, s[i])
                         if before != ZERO:
                             left -= forces.weights[e][i] * before * wp.dot(push, forces.normal[e])
                     after = ZERO
                     if W > ZERO and left < r:
                         compliance = wp.float64(wp.inf)
-                        if not hard:
+                        if hard:
+                            W = wp.max(W, least)
+                        else:
                             compliance = W * k * h * h
                         after = (gap_after(left, r, compliance) - left) / W
                     for i in range(4):
@@ -232,7 +252,7 @@ def press_pairs(dtype, axes: bool):
 
     D ⪰ J W Jᵀ, so the sum of the moves does not overshoot. The fixed point is that of :func:`sweep_pairs`.
     """
-    moved = free_move(dtype, axes)
+    moved, greatest = free_move(dtype, axes), greatest_mobility(dtype, axes)
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -260,16 +280,20 @@ def press_pairs(dtype, axes: bool):
         r = wp.float64(pairs.distances[e])
         n = swept.normal[e]
         D = ZERO
+        least = ZERO
         for i in range(4):
             w = swept.weights[e][i]
             D += touching[s[i]] * w * w * wp.dot(n, moved(inverse_mass, s[i], n))
+            least += LOCKED * touching[s[i]] * w * w * greatest(inverse_mass, s[i])
         left = swept.gap[e]
         if multipliers:
             left -= D * multipliers[e]
         after = ZERO
         if D > ZERO and left < r:
             compliance = wp.float64(wp.inf)
-            if not hard:
+            if hard:
+                D = wp.max(D, least)
+            else:
                 compliance = D * step.stiffness[e] * h * h
             after = (gap_after(left, r, compliance) - left) / D
         swept.multiplier[e] = after
