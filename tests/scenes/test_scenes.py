@@ -308,9 +308,7 @@ def test_every_solver_runs_every_scene(name, solver, device):
     assert status.ok, status.message
 
 
-@pytest.mark.parametrize(
-    "name", slow_but(("hanging", "mobile", "usd_cloth"), ["hanging", "chain", "usd_cloth", "bunny", "mobile", "stack"])
-)
+@pytest.mark.parametrize("name", slow_but(("hanging", "mobile", "usd_cloth"), SMALL))
 def test_a_file_has_the_frames_that_are_kept_in_memory(name, device, tmp_path):
     """Of any solver: what is written are the positions and velocities of its state."""
     declared, method = scene(name, **SMALL[name]), QUICK["xpbd" if name == "mobile" else "newton"]

@@ -14,8 +14,10 @@ from ..kernels.contact.mesh_filter import filter_meshes
 from ..kernels.fast.clear_elements import find_clear
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
+from ..kernels.terms.face_friction import FRICTIONS
 from ..kernels.terms.friction import FRICTION
 from ..terms.refresh import STEP, Refresh
+from .face_steps import FaceSteps
 from .mesh_faces import MeshFaces
 from .mesh_steps import MeshSteps
 
@@ -51,6 +53,8 @@ class ColliderSteps:
         anchors: The anchors of friction, by the index of each collider with friction. They are rows of ``anchor_rows`` (C, N).
         least: The smallest distance from a collider at which a vertex may end a step [m].
         faces: :class:`warpcloth.contact.mesh_faces.MeshFaces` that keeps triangles from crossing meshes, or None.
+        face_steps: :class:`warpcloth.contact.face_steps.FaceSteps` of the pairs of triangles and meshes, or None.
+        face_anchors: Anchors of the friction of triangles on each mesh that has it, (B, E) by its index.
         steps_per_frame: As given.
         notes: :class:`warpcloth.kernels.contact.collider_filter.FilterNotes`.
         steps: The number of steps so far, (B,) int32.
@@ -85,13 +89,16 @@ class ColliderSteps:
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
         self.bounded = part == 0.0
         self._move, self._count = model.kernel(kernels.move_colliders, model.dtype), model.kernel(count_step)
-        self.meshes = self.faces = None
+        self.meshes = self.faces = self.face_steps = None
+        self.face_anchors = {}
         if declared.meshes is not None:
             given = {"steps": self.steps, "per_frame": 2 * steps_per_frame, "ahead": self._given[-1], "h": h}
             given |= {"r": declared.distance, "least": self.least, "landing": LANDING * declared.distance}
             self.meshes = MeshSteps(model, self.poses, self.bounded, resting, **given)
             if model.scene.contact.elements == "triangles" and not resting:
                 self.faces = MeshFaces(model, self.meshes, h)
+                if any(elements.on_faces for elements in model.terms):
+                    self.face_steps = FaceSteps(model, self.meshes, self.bounded)
         self._filter = model.kernel(filter_step if self.meshes is None else filter_meshes, model.dtype)
         if model.mobility is not None:
             self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(hold_locked, model.dtype)
@@ -106,6 +113,9 @@ class ColliderSteps:
         """Returns the elements of contact or friction with collider c, with rest states of their own."""
         model, declared = self.model, self.model.colliders
         first = all(each.refresh is None or each.collider is None for each in self.terms)
+        term = elements.term.bounded if self.bounded else elements.term
+        if elements.on_faces:
+            return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=self._refresh_of_faces(elements, state))
         if elements.term is FRICTION:
             anchors = self.anchors[c] = state.add(f"anchors on collider {c}", self.anchor_rows[c])
         if declared.facets[c]:
@@ -121,12 +131,27 @@ class ColliderSteps:
             launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype), c, state.v)
         else:
             launch = None
-        term = elements.term.bounded if self.bounded else elements.term
         refresh = Refresh(STEP, partial(self._refresh, first, launch))
         clear = None
         if self._finds_clear:
             clear = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
         return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=refresh, clear=clear)
+
+    def _refresh_of_faces(self, elements, state):
+        """The refresh of contact or friction of triangles with a mesh; None for an equilibrium, which has neither."""
+        if self.face_steps is None:
+            return None
+        if elements.term in FRICTIONS:
+            c, steps = elements.collider, self.face_steps
+            anchors = self.face_anchors[c] = state.add(f"anchors of triangles on collider {c}", steps.anchors(elements))
+            launch = steps.friction(elements, float(self.model.colliders.friction[c]), anchors)
+        else:
+            launch = self.face_steps.contact(elements)
+
+        def launch_on_faces(_model, elements, _moment):
+            launch(elements, elements.refresh.arrays, self.x_before, state.v)
+
+        return Refresh(STEP, launch_on_faces, self.face_steps.arrays(elements))
 
     def _refresh(self, first, launch, model, elements, moment):
         """Launches what the start of a step needs. The first of the terms also moves the colliders, once for all terms."""
@@ -172,6 +197,8 @@ class ColliderSteps:
         """Launches the removal of all anchors, for a step without contact."""
         if self.anchors:
             self.anchor_rows.zero_()
+        for anchors in self.face_anchors.values():
+            anchors.zero_()
 
     def launch_move(self):
         """Launches the computation of the poses of colliders at the start of a step."""
@@ -236,6 +263,8 @@ class ColliderSteps:
     def launch_out(self, x, v):
         """Moves vertices in x and v as :meth:`launch_end` does, and notes nothing."""
         self._launch_filter(self.model.inverse_mass, x, v, None, self._unread)
+        if self.faces is not None and any(self.model.colliders.moves):
+            self.faces.launch_out(self.x_before, x)
 
     def launch_inside(self, x, v):
         """Notes vertices that are inside colliders at the end of the step, and counts the step. It does not move them."""
@@ -265,5 +294,5 @@ class ColliderSteps:
 
     def start_again(self):
         """Clears counts and anchors after the steps that an integrator makes to find its past state."""
-        for array in (self.steps, self.notes.cut, self.notes.inside, *self.anchors.values()):
+        for array in (self.steps, self.notes.cut, self.notes.inside, *self.anchors.values(), *self.face_anchors.values()):
             array.zero_()

@@ -54,13 +54,21 @@ class MeshFaces:
         """Moves vertices on, in x, v and ``move`` (N,), so that no triangle has crossed a mesh since ``x_before`` (N,)."""
         model = self.model
         wp.copy(self._target, x)
+        self._launch_rounds(x_before, x)
+        given = [x_before, self._target, x, model.per_copy, self._h]
+        self._launch(kernels.end_faces, model.count, given, [v, move, self._moved, notes])
+
+    def launch_out(self, x_before, x):
+        """Moves vertices in x on as :meth:`launch_end`."""
+        self._launch_rounds(x_before, x)
+        self._moved.zero_()
+
+    def _launch_rounds(self, x_before, x):
         self._round.zero_()
         self._latest.zero_()
         self._proceed.fill_(1)
         wp.capture_while(self._proceed, self._launch_round, x_before=x_before, x=x)
         wp.capture_if(self._unfinished, self._launch_shortened, x_before=x_before, x=x)
-        given = [x_before, self._target, x, model.per_copy, self._h]
-        self._launch(kernels.end_faces, model.count, given, [v, move, self._moved, notes])
 
     def _launch_round(self, x_before, x):
         """Moves x to the allowed sides of the planes of the triangles that are met first."""
@@ -79,9 +87,10 @@ class MeshFaces:
             self._launch_shares(c, x_before, x, self._latest, None)
 
     def launch_least(self, x, target, share):
-        """Lowers the ``share`` (N,) that vertices may go from x to their targets (N,) with meshes as at the end of the step."""
+        """Lowers the ``share`` (N,) that vertices may go from x to their targets (N,) by meshes that stand."""
         for c in self._colliders:
-            self._launch_shares(c, x, target, None, share)
+            if not self.model.colliders.moves[c]:
+                self._launch_shares(c, x, target, None, share)
 
     def _launch_shares(self, c, x, end, latest, least):
         model, motion = self.model, self._meshes.motion

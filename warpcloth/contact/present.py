@@ -10,7 +10,9 @@ from ..core.gradient import Gradient
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.collider_work import collider_pulls
+from ..kernels.terms.face_friction import FRICTIONS
 from ..kernels.terms.friction import FRICTION
+from .face_steps import FaceSteps
 from .mesh_steps import MeshSteps
 
 
@@ -42,17 +44,22 @@ class PresentContact:
         self._moved.after = after  # poses after the next step, which are not read
         self._given = [declared.keyframes, declared.firsts, self._steps, steps.steps_per_frame, 0]
         self._move, self._shapes, self._least = model.kernel(kernels.move_colliders, model.dtype), steps.shapes, steps.least
-        self._meshes = None
+        self._meshes = self._faces = None
         if steps.meshes is not None:
             given = steps.meshes.given | {"steps": self._steps, "ahead": 0}
             self._meshes = MeshSteps(model, self._poses, steps.bounded, **given)
             self._launches.append(lambda _x, _v: self._meshes.launch_trees())
+            self._faces = FaceSteps(model, self._meshes, steps.bounded) if steps.face_steps is not None else None
         self.terms = tuple(elements if elements.collider is None else self._own(elements, steps) for elements in model.terms)
 
     def _own(self, elements, steps):
         model, c = self.model, elements.collider
         term = elements.term.bounded if steps.bounded else elements.term
         own = replace(elements, term=term, rest=wp.clone(elements.rest))
+        if elements.on_faces:
+            if self._faces is not None:
+                self._launches.append(partial(self._launch_of_faces(elements), own, self._faces.arrays(elements)))
+            return own
         if elements.term is FRICTION:
             anchors = wp.zeros(model.count, dtype=self._anchor_type, device=model.device)
         if model.colliders.facets[c]:
@@ -68,6 +75,20 @@ class PresentContact:
         elif model.colliders.moves[c]:
             self._launches.append(partial(self._pose, model.kernel(kernels.pose_collider, model.dtype), own))
         return own
+
+    def _launch_of_faces(self, elements):
+        c = elements.collider
+        if elements.term not in FRICTIONS:
+            return self._faces.contact(elements)
+        anchors = self._faces.anchors(elements)
+        rest = self._faces.friction(elements, float(self.model.colliders.friction[c]), anchors)
+
+        def launch(*given):
+            for steps, first, end in self._parts:
+                wp.copy(anchors[first:end], steps.face_anchors[c])
+            rest(*given)
+
+        return launch
 
     def launch(self, x, v):
         """Launches the rest states at positions x (N,) [m] and velocities v (N,) [m/s]."""
@@ -115,7 +136,7 @@ class ColliderPulls:
         self.found, self._adds, self.hard = [], [], any(each.hard for each in terms if each.collider is not None)
         for c in range(len(model.scene.colliders)):
             mine = [elements for elements in terms if elements.collider == c]
-            friction = tuple(elements for elements in mine if elements.term.name == FRICTION.name)
+            friction = tuple(elements for elements in mine if elements.term.name in [each.name for each in FRICTIONS])
             contact = tuple(elements for elements in mine if elements not in friction)
             found = collider_pulls(model.dtype)()
             found.all = model.vectors()

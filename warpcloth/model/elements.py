@@ -53,6 +53,11 @@ class DeviceElements:
         return [self.stencil, self.stiffness, self.rest]
 
     @property
+    def on_faces(self):
+        """Whether it is contact or friction of triangles with a mesh."""
+        return self.collider is not None and self.term.vertices == 3
+
+    @property
     def arrays(self):
         """All arrays of the term."""
         cells = self.cells.arrays if self.cells else []

@@ -4,8 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror, Segment
-from ..kernels.fast.clear_elements import add_hessian, add_secants
-from ..kernels.terms.contact import CONTACT
+from ..kernels.fast.clear_elements import add_hessian, find_hessians
 from ..model.host_values import host_values
 from .search import HALVINGS, Search
 
@@ -83,19 +82,53 @@ class CorrectedSystem:
         return np.divide(one, other, out=np.zeros(self.model.copies), where=where & (other > 0.0))
 
 
+class _FaceMatrix:
+    """Σ kA w wᵀ ⊗ ∂²u/∂y² of the contact or the friction of triangles with a mesh, y = Σ wᵢxᵢ.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        elements: The :class:`warpcloth.model.elements.DeviceElements` of the term.
+        free: Which coordinates move, (N, 3) booleans.
+    """
+
+    def __init__(self, model, elements, free):
+        self._model, self._elements, self._free = model, elements, free
+        self._kernel, self._stencil = model.kernel(find_hessians, elements.term, model.dtype), host_values(elements.stencil)
+        weights = wp.zeros(elements.count, dtype=model.vec3, device=model.device)
+        blocks = wp.zeros(elements.count, dtype=model.mat33, device=model.device)
+        self._weights, self._blocks = Mirror(weights), Mirror(blocks)
+
+    def launch(self, x, d):
+        """Launches the matrix at x + d."""
+        elements, out = self._elements, [self._weights.array, self._blocks.array]
+        self._model.launch(self._kernel, elements.count, [*elements.arguments, x, d], out)
+
+    def read(self):
+        """Reads the matrix, and returns whether it is not 0."""
+        blocks = self._blocks.read()
+        acting = np.flatnonzero(blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2])
+        self._now = self._stencil[acting], blocks[acting].astype(np.float64)
+        self._now += ((self._weights.read()[acting, :, None] * self._free[self._now[0]]).astype(np.float64),)
+        return len(acting) > 0
+
+    def add_product(self, p, q):
+        """Adds the product with p (N, 3) to q (N, 3)."""
+        stencil, blocks, weights = self._now
+        pressed = np.einsum("eij,ej->ei", blocks, (weights * p[stencil]).sum(axis=1))
+        np.add.at(q, stencil, weights * pressed[:, None])
+
+
 class ContactSystem(CorrectedSystem):
     """Solves (A + D) w = ∇φ, D the semi-definite Hessian of contact: accurately if φ rose or is near its minimum, else roughly.
 
     The curvature of contact has no bound, so no constant matrix is an upper bound of the Hessian. D is the sum of the blocks of
-    vertices near colliders and of the matrix of pairs of self-contact. A copy whose φ rose is ``careful`` in the next 4
-    iterations, after a second rise in 16, and so on: w is then also shortened until φ falls. In other copies the blocks of
-    contact are those of :func:`warpcloth.kernels.fast.clear_elements.add_secants`. Without :meth:`start`, all copies always
-    are careful.
+    vertices near colliders, of the matrix of pairs of triangles and meshes, and of that of pairs of self-contact. A copy where
+    φ rose is ``careful`` in the next 4 iterations, after a second rise in 16, and so on: w is then also shortened until φ
+    falls. Without :meth:`start`, all copies always are.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         x: x̃ (N,) [m].
-        gradient: ∇φ (N,) [N] at the d of :meth:`correct`; the caller's array, read only.
         linear: Solves with A, ``solve(b, x)``.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia [1/s²].
@@ -105,22 +138,24 @@ class ContactSystem(CorrectedSystem):
         careful: Which copies are careful, (B,) booleans.
     """
 
-    def __init__(self, model, x, gradient, linear, sums, s, pairs=None):
+    def __init__(self, model, x, linear, sums, s, pairs=None):
         super().__init__(model, linear)
         self.x, self._pairs = x, pairs
-        touching = [elements for elements in model.terms if elements.collider is not None]
-        self._touching = [(elements, self._kernel_of(elements.term)) for elements in touching]
-        self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
-        self._search = Search(model, x, sums, s, pairs)
         free = model.coordinate_mobility().reshape(-1, 3) > 0.0
+        self._touching = [
+            (elements, model.kernel(add_hessian, elements.term, model.dtype))
+            for elements in model.terms
+            if elements.collider is not None and not elements.on_faces
+        ]
+        self._faces = [_FaceMatrix(model, elements, free) for elements in model.terms if elements.on_faces]
+        self._search = Search(model, x, sums, s, pairs)
         self._held = np.flatnonzero(~free.all(axis=1))
         self._moves = (free[:, :, None] & free[:, None, :])[self._held]
         self._blocks = Mirror(wp.zeros(model.count, dtype=model.mat33, device=model.device))
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
         self._active = Mirror(model.scalars(wp.int32))
-        self.careful, self._marked = np.ones(model.copies, dtype=bool), np.zeros(model.copies, dtype=bool)
-        self._marks = Mirror(model.scalars(wp.int32))  # the careful copies on the device
         self.record()
+        self.careful = np.ones(model.copies, dtype=bool)
         self._left, self._more = (np.zeros(model.copies, dtype=int) for _ in range(2))
         self._start = np.zeros(model.copies)
 
@@ -131,17 +166,13 @@ class ContactSystem(CorrectedSystem):
         self._begin = Segment(device, search.launch_again)
         self._shorten = Segment(device, lambda: search.launch(self._active.array))
 
-    def _kernel_of(self, term):
-        """Returns the kernel that adds the blocks of a term."""
-        return self.model.kernel(*((add_secants,) if term is CONTACT else (add_hessian, term)), self.model.dtype)
-
     def _launch_assemble(self):
         self._blocks.array.zero_()
         for elements, kernel in self._touching:
             given = [*elements.arguments, elements.clear, self.x, self._search.correction]
-            if elements.term is CONTACT:
-                given += [self._gradient, self._inertia, self._marks.array, self.model.per_copy]
             self.model.launch(kernel, elements.count, given, [self._blocks.array])
+        for faces in self._faces:
+            faces.launch(self.x, self._search.correction)
         if self._pairs is not None:
             self._pairs.forces.launch_forces(self.x, self._search.correction)
 
@@ -155,19 +186,17 @@ class ContactSystem(CorrectedSystem):
         self._left = np.where(rose, self._more, self._left - 1)
         self.careful = self._left > 0
 
-    def correct(self, d, w, active):
+    def correct(self, d, gradient, w, active):
         """Replaces w = A⁻¹ ∇φ by (A + D)⁻¹ ∇φ at d, for careful copies times a step length."""
         wp.copy(self._search.correction, d)
-        if (self.careful != self._marked).any():
-            self._marked[:] = self.careful
-            self._marks.write(self.careful)
         self._assemble()
         blocks = self._blocks.read()
         blocks[self._held] = np.where(self._moves, blocks[self._held], 0.0)
         trace = blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2]
         touching = np.flatnonzero(trace != 0.0)  # a semi-definite block with trace 0 is 0
         J, D = (None, None) if self._pairs is None else self._pairs.forces.rows()
-        pressing = len(touching) or (J is not None and J.shape[0])
+        faces = [each for each in self._faces if each.read()]
+        pressing = len(touching) or faces or (J is not None and J.shape[0])
         if not (pressing or self.careful.any()):
             return
         found = w.numpy().astype(np.float64)
@@ -176,10 +205,12 @@ class ContactSystem(CorrectedSystem):
 
             def add_product(p, q):
                 q[touching] += np.einsum("nij,nj->ni", blocks, p[touching])
+                for each in faces:
+                    each.add_product(p, q)
                 if J is not None:
                     q += (J.T @ (D @ (J @ p.ravel()))).reshape(-1, 3)
 
-            b = self._gradient.numpy().astype(np.float64)
+            b = gradient.numpy().astype(np.float64)
             first = self._dot(b, found)
             self._start = np.maximum(self._start, first)
             found, _ = self._solve(add_product, b, found, active, self.careful | (first <= NEAR**2 * self._start))

@@ -18,7 +18,7 @@ from ..core.sums import Sums
 from ..fast.plan import plan
 from ..kernels import work as kernels
 from ..kernels.terms.air import AIR
-from ..kernels.terms.friction import FRICTION
+from ..kernels.terms.face_friction import FRICTIONS
 from ..model.damping import dissipations
 from ..scene.scene import Scene
 from ..terms.refresh import STEP, Moment
@@ -110,7 +110,7 @@ class Evaluation:
         self.names = energy_names(model.scene)
         self._term_names = _term_names(model.scene)
         self.names_of_friction = [
-            name for name, (_present, own) in zip(self._term_names, terms, strict=True) if own.term is FRICTION
+            name for name, (_present, own) in zip(self._term_names, terms, strict=True) if own.term in FRICTIONS
         ]
         if not forces:
             return

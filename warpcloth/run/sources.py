@@ -8,6 +8,7 @@ from functools import cached_property, singledispatch
 
 import numpy as np
 
+from ..contact.present import PresentContact
 from ..numerics.rotation import kabsch
 from ..scene.air import Air
 from ..scene.colliders import Collider
@@ -80,6 +81,15 @@ class Start(Source):
             energy, of_pairs = stepper.pairs.at_start()
             self._energy += energy
             gaps = gaps + stepper.options.closes * of_pairs
+        if any(elements.on_faces for elements in model.terms):  # whose pairs are found in steps, so that the model has none
+            present = PresentContact(model, [(each.colliders, first, end) for each, first, end in stepper.shares])
+            present.launch(model.positions, model.velocities)
+            faces = model.with_terms(each for each in present.terms if each.on_faces)
+            of_faces = type(elastic)(faces)
+            self._energy += of_faces.energy(model.positions)
+            gaps = gaps + len(faces.terms) * faces.terms[0].per_copy * of_faces.gaps(
+                model.positions, of_faces.hard + (of_faces.soft if stepper.options.closes else ())
+            )
         self._energy += 4.0 * balance.total * gaps / stepper.he**2
 
     def energy(self, frame, speed):

@@ -18,6 +18,7 @@ class Contact:
     """Contact of cloth with colliders: a pressure of k(r − d) at distances r/2 ≤ d < r, and of kr²/(4d) at d < r/2.
 
     The energy is U = Σ kA φ(d) over the vertices, where A is the area of a vertex; see :mod:`warpcloth.kernels.terms.contact`.
+    With ``elements="triangles"`` also over pairs of triangles with meshes, :mod:`warpcloth.kernels.contact.face_pairs`.
     A pressure p leaves a gap of r − p/k, or of kr²/(4p) if p is above kr/2. Friction also has the stiffness k: a vertex that
     sticks moves by up to μN/(kA) before it slides.
 
@@ -25,8 +26,8 @@ class Contact:
         distance: Contact distance r [m].
         stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default 10 w/r, where w is the weight of the
             cloth per area, so that one layer rests at a gap of 0.9 r.
-        elements: What the filter keeps from crossing meshes: ``"vertices"`` of the cloth, or also its ``"triangles"``, which
-            spikes and edges of a mesh can otherwise pierce between the vertices. No energy belongs to this.
+        elements: What touches meshes: ``"vertices"`` of the cloth, or also its ``"triangles"``, which spikes and edges of a
+            mesh can otherwise pierce between the vertices. On a plane of triangles both give the same pressure.
 
     Raises:
         ValueError: If a value is not allowed.

@@ -14,7 +14,7 @@ from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 from ..mesh.stage_mesh import StageMesh
 from ..model.model import Model
-from ..terms.contact import VertexContact, VertexFriction
+from ..terms.contact import PAIRS, FaceContact, FaceFriction, VertexContact, VertexFriction
 from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
 from ..terms.triangle_air import TriangleAir
@@ -299,8 +299,11 @@ class Scene:
         return float(self.vertex_masses[areas > 0.0].sum() / areas.sum())
 
     @property
-    def contact_terms(self) -> tuple[VertexContact, ...]:
-        """The terms of its colliders: contact of the free vertices with each collider, and friction if it has any."""
+    def contact_terms(self) -> tuple[VertexContact | FaceContact, ...]:
+        """The terms of its colliders: contact of the free vertices with each collider, and friction if it has any.
+
+        With ``Contact(elements="triangles")`` also those of the triangles with meshes.
+        """
         if not self.colliders or self.contact is None or self.contact.stiffness is None:
             return ()
         areas, mass = self._touching_areas, self._areal_mass
@@ -310,7 +313,7 @@ class Scene:
             raise ValueError("pins hold every vertex; colliders need one that is free")
         given = {"vertices": free, "areas": areas[free]}
         given |= {"stiffness": self.contact.stiffness, "distance": self.contact.distance}
-        found: list[VertexContact] = []
+        found: list[VertexContact | FaceContact] = []
         for c, collider in enumerate(self.colliders):
             core, radius = collider.core
             given |= {"collider": c, "pose": collider.poses[0], "core": core, "radius": radius}
@@ -321,7 +324,21 @@ class Scene:
                 found.append(VertexContact(name=f"contact with {collider.label}", facet=facet, **{**given, **shape}))
             if collider.friction:
                 found.append(VertexFriction(name=f"friction on {collider.label}", **given))
+            if self.contact.elements == "triangles" and isinstance(collider, MeshCollider):
+                found += self._face_terms(c, collider)
         return tuple(found)
+
+    def _face_terms(self, c, collider):
+        """The terms of the triangles that have a free vertex, with the mesh c."""
+        free = ~np.isin(self.mesh.triangles, self.fixed).all(axis=1)
+        if not free.any():
+            return []
+        given: dict[str, Any] = {"triangles": self.mesh.triangles[free], "collider": c}
+        given["areas"] = np.nan_to_num(self.mesh.triangle_areas[free])
+        given |= {"stiffness": self.contact.stiffness, "distance": self.contact.distance}
+        names = f"contact of triangles with {collider.label}", f"friction of triangles on {collider.label}"
+        found = [FaceContact(name=names[0], facet=pair, **given) for pair in range(PAIRS)]
+        return found + ([FaceFriction(name=names[1], **given)] if collider.friction else [])
 
     def _check_air(self):
         if not (self.air is None or isinstance(self.air, Air)):

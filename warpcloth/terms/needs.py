@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..kernels.terms.air import AIR
-from ..kernels.terms.friction import FRICTION
+from ..kernels.terms.face_friction import FRICTIONS
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ PROJECTION_OR_CONTACT = Need(
     lambda elements: elements.term.whole.project is not None or elements.term.bounded is not None, PROJECTION.lack
 )
 NORMAL_FORCE = Need(
-    lambda elements: elements.term is not FRICTION,
+    lambda elements: elements.term not in FRICTIONS,
     "{label}, whose normal force does not follow from positions",
     "leave friction at 0",
 )
