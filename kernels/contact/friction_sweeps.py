@@ -29,13 +29,40 @@ def multiplier_after(u: wp.vec3d, D: wp.float64, k: wp.float64, limit: wp.float6
 
 
 @cache
+def local_step(dtype):
+    """Device function (pairs, rubbed, start, x, correction, e, D, h, multipliers) → Δλ of the prox at the remaining u."""
+    vec3, _ = types(dtype)
+    stretch = stretch_of(dtype)
+
+    @wp.func
+    def step(
+        pairs: near_pairs(dtype),
+        rubbed: RubbedPairs,
+        start: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        e: int,
+        D: wp.float64,
+        h: wp.float64,
+        multipliers: wp.array(dtype=wp.vec3d),
+    ):
+        before = multipliers[e]
+        u = stretch(pairs.stencils[e], rubbed.weights[e], rubbed.normal[e], rubbed.stretch[e], start, x, correction)
+        after = multiplier_after(u - D * before, D, rubbed.stiffness[e], rubbed.limit[e], h)
+        multipliers[e] = after
+        return after - before
+
+    return step
+
+
+@cache
 def sweep_friction(dtype, axes: bool):
     """Kernel of one thread: for each acting pair in turn, removes its λ and adds that of the prox at the remaining u.
 
     M(x − x̃) = Σ wᵢλ always holds, and a fixed point minimises the objective of the step.
     """
     vec3, _ = types(dtype)
-    stretch, moved, greatest = stretch_of(dtype), free_move(dtype, axes), greatest_mobility(dtype, axes)
+    step, moved, greatest = local_step(dtype), free_move(dtype, axes), greatest_mobility(dtype, axes)
 
     @wp.kernel(module="unique", enable_backward=False)
     def sweep_friction_of_pairs(
@@ -56,19 +83,15 @@ def sweep_friction(dtype, axes: bool):
         count = pairs.number[0]
         for turn in range(count):
             e = pairs.acting[wp.where(backward, count - 1 - turn, turn)]
-            limit = rubbed.limit[e]
-            if limit > ZERO:
+            if rubbed.limit[e] > ZERO:
                 s = pairs.stencils[e]
                 w = rubbed.weights[e]
                 D = ZERO
                 for i in range(4):
                     D += w[i] * w[i] * greatest(inverse_mass, s[i])
-                before = multipliers[e]
-                u = stretch(s, w, rubbed.normal[e], rubbed.stretch[e], start, x, correction) - D * before
-                after = multiplier_after(u, D, rubbed.stiffness[e], limit, h)
-                multipliers[e] = after
+                change = step(pairs, rubbed, start, x, correction, e, D, h, multipliers)
                 for i in range(4):
-                    move = moved(inverse_mass, s[i], w[i] * (after - before))
+                    move = moved(inverse_mass, s[i], w[i] * change)
                     correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
 
     return sweep_friction_of_pairs
@@ -101,7 +124,7 @@ def count_rubbing(dtype):
 def rub_pairs(dtype, axes: bool):
     """Kernel over acting pairs of a Jacobi sweep: λ of the prox with D = Σ nᵢwᵢ²/mᵢ for W, nᵢ = ``rubbing`` of vertex i."""
     vec3, _ = types(dtype)
-    stretch, greatest = stretch_of(dtype), greatest_mobility(dtype, axes)
+    step, greatest = local_step(dtype), greatest_mobility(dtype, axes)
 
     @wp.kernel(module="unique", enable_backward=False)
     def rub_each_pair(
@@ -125,19 +148,14 @@ def rub_pairs(dtype, axes: bool):
         if turn >= pairs.number[0]:
             return
         e = pairs.acting[turn]
-        limit = rubbed.limit[e]
-        if limit == ZERO:
+        if rubbed.limit[e] == ZERO:
             return
         s = pairs.stencils[e]
         w = rubbed.weights[e]
         D = ZERO
         for i in range(4):
             D += rubbing[s[i]] * w[i] * w[i] * greatest(inverse_mass, s[i])
-        before = multipliers[e]
-        u = stretch(s, w, rubbed.normal[e], rubbed.stretch[e], start, x, correction) - D * before
-        after = multiplier_after(u, D, rubbed.stiffness[e], limit, h)
-        multipliers[e] = after
-        changes[e] = after - before
+        changes[e] = step(pairs, rubbed, start, x, correction, e, D, h, multipliers)
 
     return rub_each_pair
 

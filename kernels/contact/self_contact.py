@@ -13,15 +13,16 @@ import warp as wp
 
 from ..terms import contact
 from ..vectors import types
+from .pair_sums import PairSource
 from .self_gaps import SIDE, ZERO, gap_along, nearest, signed_gap, vertex_of
-from .self_pairs import StepPairs, module_of, near_pairs
+from .self_pairs import MODULE, StepPairs, module_of, near_pairs
 
 potential, slope, bend = contact.potential, contact.slope, contact.bend
 
 
 @wp.struct
 class PairForces:
-    """n, w, kAφ [J], kAφ′ [N] and kAφ″ [N/m] of each pair at some positions.
+    """n, w, kAφ [J], kAφ′ [N] and, in ``acting``, kAφ″ [N/m] of each pair at some positions.
 
     On the CPU ``pressing`` lists the ``count`` (1,) pairs with a force, in order.
     """
@@ -30,16 +31,52 @@ class PairForces:
     weights: wp.array(dtype=wp.vec4d)
     energy: wp.array(dtype=wp.float64)
     slope: wp.array(dtype=wp.float64)
-    bend: wp.array(dtype=wp.float64)
+    acting: wp.array(dtype=wp.float64)
     pressing: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
+
+
+@cache
+def gap_in_step(dtype):
+    """Device function (pairs, step, e, x, correction, always) → whether a pair touches, d, n and w at x, or x + correction.
+
+    The nearest points are found only if d can be below the contact distance, or ``always``; the pair then touches at any d.
+    """
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+
+    @wp.func
+    def gap_of(
+        pairs: near_pairs(dtype),
+        step: StepPairs,
+        e: int,
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        always: bool,
+    ):
+        s = pairs.stencils[e]
+        r = wp.float64(pairs.distances[e])
+        a = at(x, correction, s[0])
+        b = at(x, correction, s[1])
+        c = at(x, correction, s[2])
+        d = at(x, correction, s[3])
+        of_vertex = e < pairs.counts[0]
+        gap = r
+        n = wp.vec3d()
+        w = wp.vec4d()
+        if always or gap_along(of_vertex, step.normal[e], a, b, c, d) < r:
+            w, y, inside = nearest(of_vertex, a, b, c, d)
+            gap, n = signed_gap(y, step.normal[e], inside)
+        return always or gap < r, gap, n, w
+
+    return gap_of
 
 
 @cache
 def find_forces(dtype, bounded: bool):
     """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; φ = ½(r − d)² if ``bounded``."""
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
+    gap_of = gap_in_step(dtype)
 
     @wp.kernel(module=f"{module_of(dtype)}.{bounded}", enable_backward=False)
     def find_forces_of_pairs(
@@ -58,150 +95,63 @@ def find_forces(dtype, bounded: bool):
         e = pairs.acting[t]
         forces.energy[e] = ZERO
         forces.slope[e] = ZERO
-        forces.bend[e] = ZERO
-        k = step.stiffness[e]
-        r = wp.float64(pairs.distances[e])
-        s = pairs.stencils[e]
-        a = at(x, correction, s[0])
-        b = at(x, correction, s[1])
-        c = at(x, correction, s[2])
-        d = at(x, correction, s[3])
-        of_vertex = e < pairs.counts[0]
-        if gap_along(of_vertex, step.normal[e], a, b, c, d) >= r:
-            return
-        w, y, inside = nearest(of_vertex, a, b, c, d)
-        gap, n = signed_gap(y, step.normal[e], inside)
-        if gap < r:
+        forces.acting[e] = ZERO
+        touches, gap, n, w = gap_of(pairs, step, e, x, correction, False)
+        if touches:
+            k = step.stiffness[e]
+            r = wp.float64(pairs.distances[e])
             forces.normal[e] = n
             forces.weights[e] = w
             if wp.static(bounded):
                 forces.energy[e] = SIDE * k * (r - gap) * (r - gap)
                 forces.slope[e] = k * (gap - r)
-                forces.bend[e] = k
+                forces.acting[e] = k
             else:
                 forces.energy[e] = k * potential(gap, r)
                 forces.slope[e] = k * slope(gap, r)
-                forces.bend[e] = k * bend(gap, r)
+                forces.acting[e] = k * bend(gap, r)
             if forces.pressing:
                 forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
 
     return find_forces_of_pairs
 
 
-@cache
-def add_forces(dtype):
-    """Kernel over vertices: out += ∂U/∂x, in the order of the pairs."""
-    vec3, _ = types(dtype)
+@wp.struct
+class PressingPair:
+    """n, kAφ′ and kAφ″ of a pair."""
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def add_forces_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        forces: PairForces,
-        # in and out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        total = wp.vec3d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if forces.slope[e] != ZERO:
-                total += forces.weights[e][pairs.corners[k] - 4 * e] * forces.slope[e] * forces.normal[e]
-        out[i] = out[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
-
-    return add_forces_of_pairs
+    normal: wp.vec3d
+    slope: wp.float64
+    bend: wp.float64
 
 
-@cache
-def sum_energies(dtype):
-    """Kernel over vertices: sums of the energies [J] of the pairs whose first vertex it is."""
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def sum_energies_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        forces: PairForces,
-        # out
-        energies: wp.array(dtype=wp.float64),
-    ):
-        i = wp.tid()
-        total = ZERO
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            if pairs.corners[k] % 4 == 0:
-                total += forces.energy[pairs.corners[k] // 4]
-        energies[i] = total
-
-    return sum_energies_of_pairs
+@wp.func
+def _pair(found: PairForces, e: int):
+    own = PressingPair()
+    own.normal = found.normal[e]
+    own.slope = found.slope[e]
+    own.bend = found.acting[e]
+    return own
 
 
-@cache
-def add_diagonal(dtype):
-    """Kernel over vertices: adds Σ kAφ″ wᵢ²nnᵀ to the diagonal blocks of a Hessian, except those of pins."""
-    _, mat33 = types(dtype)
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def add_diagonal_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        inverse_mass: wp.array(dtype=dtype),
-        diagonal: wp.array(dtype=wp.int32),
-        # state in
-        forces: PairForces,
-        # in and out
-        values: wp.array(dtype=mat33),
-    ):
-        i = wp.tid()
-        if inverse_mass[i] == dtype(0.0):
-            return
-        total = wp.mat33d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if forces.bend[e] != ZERO:
-                w = forces.weights[e][pairs.corners[k] - 4 * e]
-                total += forces.bend[e] * w * w * wp.outer(forces.normal[e], forces.normal[e])
-        values[diagonal[i]] = values[diagonal[i]] + mat33(total)
-
-    return add_diagonal_of_pairs
+@wp.func
+def _force(own: PressingPair):
+    return own.slope * own.normal
 
 
-@cache
-def add_products(dtype):
-    """Kernel over vertices: q += Σ kAφ″ wᵢ n Σⱼ wⱼ nᵀpⱼ over the other vertices j of its pairs, in active copies."""
-    vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
+@wp.func
+def _curvature(own: PressingPair):
+    return own.bend * wp.outer(own.normal, own.normal)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def add_products_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        inverse_mass: wp.array(dtype=dtype),
-        # state in
-        forces: PairForces,
-        p: wp.array(dtype=vec3),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        # in and out
-        q: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        if inverse_mass[i] == dtype(0.0) or active[i // per_copy] == 0:
-            return
-        total = wp.vec3d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if forces.bend[e] != ZERO:
-                corner = pairs.corners[k] - 4 * e
-                s = pairs.stencils[e]
-                w = forces.weights[e]
-                n = forces.normal[e]
-                along = ZERO
-                for j in range(4):
-                    if j != corner and inverse_mass[s[j]] > dtype(0.0):
-                        along += w[j] * wp.dot(n, exact(p[s[j]]))
-                total += forces.bend[e] * w[corner] * along * n
-        q[i] = q[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
 
-    return add_products_of_pairs
+@wp.func
+def _part(own: PressingPair, w: wp.float64, p: wp.vec3d):
+    return w * wp.dot(own.normal, p)
+
+
+@wp.func
+def _product(own: PressingPair, w: wp.float64, along: wp.float64):
+    return own.bend * w * along * own.normal
+
+
+CONTACT_OF_PAIRS = PairSource("self-contact", MODULE, PairForces, _pair, _force, _curvature, _part, _product)

@@ -15,6 +15,7 @@ import warp as wp
 
 from ..terms import contact
 from ..vectors import types
+from .pair_sums import PairSource
 from .self_gaps import ONE, SIDE, ZERO, vertex_of
 from .self_pairs import StepPairs, near_pairs
 
@@ -35,8 +36,14 @@ class RubbedPairs:
 
 @wp.struct
 class RubForces:
-    """Values of pairs at given positions: kAH [J], ∂U/∂u [N], u/‖u‖, and the second derivatives along and across u [N/m]."""
+    """Values of pairs at given positions: kAH [J], ∂U/∂u [N], u/‖u‖, and the second derivatives along and across u [N/m].
 
+    The first three are n, w and μN of :class:`RubbedPairs`.
+    """
+
+    normal: wp.array(dtype=wp.vec3d)
+    weights: wp.array(dtype=wp.vec4d)
+    acting: wp.array(dtype=wp.float64)
     energy: wp.array(dtype=wp.float64)
     pull: wp.array(dtype=wp.vec3d)
     direction: wp.array(dtype=wp.vec3d)
@@ -44,9 +51,11 @@ class RubForces:
     across: wp.array(dtype=wp.float64)
 
 
-@cache
+MODULE = "warpcloth.self_friction"
+
+
 def friction_module(dtype):
-    return f"warpcloth.self_friction.{dtype.__name__}"
+    return f"{MODULE}.{dtype.__name__}"
 
 
 @wp.func
@@ -317,136 +326,6 @@ def find_friction(dtype):
 
 
 @cache
-def add_friction(dtype):
-    """Kernel over vertices: out += ∂U/∂x, in the order of the pairs."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module=friction_module(dtype), enable_backward=False)
-    def add_friction_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        rubbed: RubbedPairs,
-        forces: RubForces,
-        # in and out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        total = wp.vec3d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if rubbed.limit[e] > ZERO:
-                total += rubbed.weights[e][pairs.corners[k] - 4 * e] * forces.pull[e]
-        out[i] = out[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
-
-    return add_friction_of_pairs
-
-
-@cache
-def sum_friction(dtype):
-    """Kernel over vertices: adds the energies [J] of the pairs whose first vertex it is."""
-
-    @wp.kernel(module=friction_module(dtype), enable_backward=False)
-    def sum_friction_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        rubbed: RubbedPairs,
-        forces: RubForces,
-        # in and out
-        energies: wp.array(dtype=wp.float64),
-    ):
-        i = wp.tid()
-        total = ZERO
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if pairs.corners[k] == 4 * e and rubbed.limit[e] > ZERO:
-                total += forces.energy[e]
-        energies[i] = energies[i] + total
-
-    return sum_friction_of_pairs
-
-
-@cache
-def add_friction_diagonal(dtype):
-    """Kernel over vertices: adds Σ wᵢ²∂²U/∂u² to the diagonal blocks of a Hessian, except those of pins."""
-    _, mat33 = types(dtype)
-
-    @wp.kernel(module=friction_module(dtype), enable_backward=False)
-    def add_friction_to_diagonal(
-        # elements
-        pairs: near_pairs(dtype),
-        inverse_mass: wp.array(dtype=dtype),
-        diagonal: wp.array(dtype=wp.int32),
-        # state in
-        rubbed: RubbedPairs,
-        forces: RubForces,
-        # in and out
-        values: wp.array(dtype=mat33),
-    ):
-        i = wp.tid()
-        if inverse_mass[i] == dtype(0.0):
-            return
-        total = wp.mat33d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if rubbed.limit[e] > ZERO:
-                w = rubbed.weights[e][pairs.corners[k] - 4 * e]
-                n = rubbed.normal[e]
-                u = forces.direction[e]
-                flat = wp.identity(n=3, dtype=wp.float64) - wp.outer(n, n)
-                total += w * w * (forces.across[e] * flat + (forces.along[e] - forces.across[e]) * wp.outer(u, u))
-        values[diagonal[i]] = values[diagonal[i]] + mat33(total)
-
-    return add_friction_to_diagonal
-
-
-@cache
-def add_friction_products(dtype):
-    """Kernel over vertices: q += wᵢ ∂²U/∂u² Σⱼ wⱼpⱼ over the other vertices j of its pairs, in active copies."""
-    vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
-
-    @wp.kernel(module=friction_module(dtype), enable_backward=False)
-    def add_products_of_friction(
-        # elements
-        pairs: near_pairs(dtype),
-        inverse_mass: wp.array(dtype=dtype),
-        # state in
-        rubbed: RubbedPairs,
-        forces: RubForces,
-        p: wp.array(dtype=vec3),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        # in and out
-        q: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        if inverse_mass[i] == dtype(0.0) or active[i // per_copy] == 0:
-            return
-        total = wp.vec3d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if rubbed.limit[e] > ZERO:
-                corner = pairs.corners[k] - 4 * e
-                s = pairs.stencils[e]
-                w = rubbed.weights[e]
-                n = rubbed.normal[e]
-                u = forces.direction[e]
-                move = wp.vec3d()
-                for j in range(4):
-                    if j != corner and inverse_mass[s[j]] > dtype(0.0):
-                        move += w[j] * exact(p[s[j]])
-                change = forces.across[e] * (move - wp.dot(n, move) * n)
-                change += (forces.along[e] - forces.across[e]) * wp.dot(u, move) * u
-                total += w[corner] * change
-        q[i] = q[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
-
-    return add_products_of_friction
-
-
-@cache
 def end_friction(dtype):
     """Kernel over acting pairs at the end x of a step: values for the next step.
 
@@ -485,3 +364,52 @@ def end_friction(dtype):
         slips[e] = wp.vec4d(wp.dot(u, t), wp.dot(u, wp.cross(n, t)), rubbed.stiffness[e], rubbed.contact[e])
 
     return end_friction_of_pairs
+
+
+@wp.struct
+class RubbingPair:
+    """Those of :class:`RubForces` and n of a pair."""
+
+    normal: wp.vec3d
+    pull: wp.vec3d
+    direction: wp.vec3d
+    along: wp.float64
+    across: wp.float64
+
+
+@wp.func
+def _pair(found: RubForces, e: int):
+    own = RubbingPair()
+    own.normal = found.normal[e]
+    own.pull = found.pull[e]
+    own.direction = found.direction[e]
+    own.along = found.along[e]
+    own.across = found.across[e]
+    return own
+
+
+@wp.func
+def _force(own: RubbingPair):
+    return own.pull
+
+
+@wp.func
+def _curvature(own: RubbingPair):
+    n = own.normal
+    flat = wp.identity(n=3, dtype=wp.float64) - wp.outer(n, n)
+    return own.across * flat + (own.along - own.across) * wp.outer(own.direction, own.direction)
+
+
+@wp.func
+def _part(own: RubbingPair, w: wp.float64, p: wp.vec3d):
+    return w * p
+
+
+@wp.func
+def _product(own: RubbingPair, w: wp.float64, move: wp.vec3d):
+    change = own.across * (move - wp.dot(own.normal, move) * own.normal)
+    change += (own.along - own.across) * wp.dot(own.direction, move) * own.direction
+    return w * change
+
+
+FRICTION_OF_PAIRS = PairSource("self-friction", MODULE, RubForces, _pair, _force, _curvature, _part, _product)

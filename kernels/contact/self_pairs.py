@@ -56,9 +56,11 @@ class StepPairs:
     stiffness: wp.array(dtype=wp.float64)
 
 
-@cache
+MODULE = "warpcloth.self_contact"
+
+
 def module_of(dtype):
-    return f"warpcloth.self_contact.{dtype.__name__}"
+    return f"{MODULE}.{dtype.__name__}"
 
 
 @cache

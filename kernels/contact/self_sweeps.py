@@ -7,8 +7,8 @@ import warp as wp
 from ..memory import load
 from ..terms import contact
 from ..vectors import types
-from .self_contact import PairForces
-from .self_gaps import ONE, ZERO, gap_along, nearest, signed_gap, vertex_of
+from .self_contact import PairForces, gap_in_step
+from .self_gaps import ONE, ZERO, gap_along, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
 
 gap_after = contact.gap_after
@@ -43,6 +43,21 @@ def free_move(dtype, axes: bool):
         return wp.cw_mul(exact(inverse_mass[i]), v)
 
     return by_axis if axes else alike
+
+
+@wp.func
+def press(left: wp.float64, r: wp.float64, W: wp.float64, least: wp.float64, k: wp.float64, h: wp.float64, hard: bool):
+    """λ = (d* − d̂)/W of a pair with the gap d̂ = ``left`` without its force, W at least ``least`` if it is ``hard``."""
+    after = ZERO
+    if W > ZERO and left < r:
+        part = W
+        compliance = wp.float64(wp.inf)
+        if hard:
+            part = wp.max(W, least)
+        else:
+            compliance = W * k * h * h
+        after = (gap_after(left, r, compliance) - left) / part
+    return after
 
 
 @cache
@@ -96,8 +111,8 @@ def sweep_pairs(dtype, axes: bool):
     A pair is skipped quickly while corrections are smaller than its ``clearance``, see :func:`find_clearances`.
     """
     vec3, _ = types(dtype)
-    at, exact = vertex_of(dtype)
-    moved, greatest = free_move(dtype, axes), greatest_mobility(dtype, axes)
+    _at, exact = vertex_of(dtype)
+    gap_of, moved, greatest = gap_in_step(dtype), free_move(dtype, axes), greatest_mobility(dtype, axes)
     number, value, stencil, normal, vector = (load(each) for each in (wp.int32, wp.float64, wp.vec4i, wp.vec3d, vec3))
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -123,10 +138,8 @@ def sweep_pairs(dtype, axes: bool):
         turn = wp.int32(0)
         while turn < count:
             own = wp.where(backward, count - 1 - turn, turn)
-            turn += 1
             e = number(pairs.acting, own)
             s = stencil(pairs.stencils, e)
-            of_vertex = e < vertex_pairs
             before = ZERO
             if multipliers:
                 before = value(multipliers, e)
@@ -135,45 +148,30 @@ def sweep_pairs(dtype, axes: bool):
                 p1 = exact(vector(correction, s[1]))
                 p2 = exact(vector(correction, s[2]))
                 p3 = exact(vector(correction, s[3]))
-                if value(clearance, own) + gap_along(of_vertex, normal(step.normal, e), p0, p1, p2, p3) > ZERO:
+                if value(clearance, own) + gap_along(e < vertex_pairs, normal(step.normal, e), p0, p1, p2, p3) > ZERO:
                     continue
-            k = step.stiffness[e]
-            r = wp.float64(pairs.distances[e])
-            a = at(x, correction, s[0])
-            b = at(x, correction, s[1])
-            c = at(x, correction, s[2])
-            d = at(x, correction, s[3])
-            if before != ZERO or gap_along(of_vertex, step.normal[e], a, b, c, d) < r:
-                w, y, inside = nearest(of_vertex, a, b, c, d)
-                gap, n = signed_gap(y, step.normal[e], inside)
-                if before != ZERO or gap < r:
-                    W = ZERO
-                    least = ZERO
-                    left = gap
-                    for i in range(4):
-                        push = w[i] * moved(inverse_mass, s[i], n)
-                        W += w[i] * wp.dot(n, push)
-                        least += LOCKED * w[i] * w[i] * greatest(inverse_mass, s[i])
-                        if before != ZERO:
-                            left -= forces.weights[e][i] * before * wp.dot(push, forces.normal[e])
-                    after = ZERO
-                    if W > ZERO and left < r:
-                        compliance = wp.float64(wp.inf)
-                        if hard:
-                            W = wp.max(W, least)
-                        else:
-                            compliance = W * k * h * h
-                        after = (gap_after(left, r, compliance) - left) / W
-                    for i in range(4):
-                        move = w[i] * after * n
-                        if before != ZERO:
-                            move -= forces.weights[e][i] * before * forces.normal[e]
-                        move = moved(inverse_mass, s[i], move)
-                        correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
-                    if multipliers:
-                        multipliers[e] = after
-                        forces.weights[e] = w
-                        forces.normal[e] = n
+            touches, gap, n, w = gap_of(pairs, step, e, x, correction, before != ZERO)
+            if touches:
+                W = ZERO
+                least = ZERO
+                left = gap
+                for i in range(4):
+                    push = w[i] * moved(inverse_mass, s[i], n)
+                    W += w[i] * wp.dot(n, push)
+                    least += LOCKED * w[i] * w[i] * greatest(inverse_mass, s[i])
+                    if before != ZERO:
+                        left -= forces.weights[e][i] * before * wp.dot(push, forces.normal[e])
+                after = press(left, wp.float64(pairs.distances[e]), W, least, step.stiffness[e], h, hard)
+                for i in range(4):
+                    move = w[i] * after * n
+                    if before != ZERO:
+                        move -= forces.weights[e][i] * before * forces.normal[e]
+                    move = moved(inverse_mass, s[i], move)
+                    correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+                if multipliers:
+                    multipliers[e] = after
+                    forces.weights[e] = w
+                    forces.normal[e] = n
 
     return sweep_each_pair
 
@@ -182,7 +180,7 @@ def sweep_pairs(dtype, axes: bool):
 def touch_pairs(dtype):
     """Kernel over acting pairs of a Jacobi sweep: n, w and d of those that touch or have a force."""
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
+    gap_of = gap_in_step(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def touch_each_pair(
@@ -204,18 +202,8 @@ def touch_pairs(dtype):
         before = ZERO
         if multipliers:
             before = multipliers[e]
-        s = pairs.stencils[e]
-        r = wp.float64(pairs.distances[e])
-        a = at(x, correction, s[0])
-        b = at(x, correction, s[1])
-        c = at(x, correction, s[2])
-        d = at(x, correction, s[3])
-        of_vertex = e < pairs.counts[0]
-        if before == ZERO and gap_along(of_vertex, step.normal[e], a, b, c, d) >= r:
-            return
-        w, y, inside = nearest(of_vertex, a, b, c, d)
-        gap, n = signed_gap(y, step.normal[e], inside)
-        if before != ZERO or gap < r:
+        touches, gap, n, w = gap_of(pairs, step, e, x, correction, before != ZERO)
+        if touches:
             swept.touches[e] = 1
             swept.gap[e] = gap
             swept.weights[e] = w
@@ -277,7 +265,6 @@ def press_pairs(dtype, axes: bool):
         if swept.touches[e] == 0:
             return
         s = pairs.stencils[e]
-        r = wp.float64(pairs.distances[e])
         n = swept.normal[e]
         D = ZERO
         least = ZERO
@@ -288,15 +275,7 @@ def press_pairs(dtype, axes: bool):
         left = swept.gap[e]
         if multipliers:
             left -= D * multipliers[e]
-        after = ZERO
-        if D > ZERO and left < r:
-            compliance = wp.float64(wp.inf)
-            if hard:
-                D = wp.max(D, least)
-            else:
-                compliance = D * step.stiffness[e] * h * h
-            after = (gap_after(left, r, compliance) - left) / D
-        swept.multiplier[e] = after
+        swept.multiplier[e] = press(left, wp.float64(pairs.distances[e]), D, least, step.stiffness[e], h, hard)
 
     return press_each_pair
 

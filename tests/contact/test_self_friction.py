@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warpcloth as wc
 from support.rows import slow_but
+from warpcloth.contact.pair_sums import PairSums
 from warpcloth.contact.self_steps import SelfSteps
 from warpcloth.core.hessian import Hessian
 from warpcloth.core.sums import Sums
+from warpcloth.kernels.contact.self_contact import CONTACT_OF_PAIRS
 from warpcloth.scenes import cards
 
 SLOW = pytest.mark.slow
@@ -84,6 +87,32 @@ def rubbing(gap=2.2e-3, speed=0.05, friction=0.3, n=4, **fields):
         self_contact=wc.SelfContact(distance=5e-3, stiffness=1e3, friction=friction),
         **fields,
     )
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_contact_that_is_gathered_is_what_is_scattered(dtype, device):
+    """As on a GPU, which gathers: each of the four sums, up to the rounding of some ten terms."""
+    model = rubbing().build(device=device, dtype=dtype)
+    pairs = SelfSteps(model, wc.Newton(substeps=10).bind(model).state, 0.01, 1, False, None)
+    pairs.launch_begin(model.positions)
+    pairs.forces.launch_forces(model.positions)
+    p = model.array(np.random.default_rng(4).normal(size=(model.count, 3)), model.vec3)
+    diagonal, active = (wp.array(np.arange(each), dtype=wp.int32, device=device) for each in (model.count, 2))
+
+    def sums(scatters):
+        own = PairSums(model, CONTACT_OF_PAIRS, scatters)
+        own.pairs, own.found = pairs.forces.pairs, pairs.forces.found
+        found = [wp.zeros(model.count, dtype=kind, device=device) for kind in (model.vec3, wp.float64, model.mat33, model.vec3)]
+        own.add_gradient(found[0])
+        own.add_energies(found[1])
+        own.add_diagonal(diagonal, found[2])
+        own.add_products(p, found[3], active[1:])
+        return [array.numpy() for array in found]
+
+    for one, other in zip(sums(True), sums(False), strict=True):
+        size = np.abs(one).max()
+        assert size > 0.0 and np.abs(one - other).max() < 32.0 * np.finfo(model.numpy_dtype).eps * size
 
 
 @pytest.mark.parametrize("size", [1e-5, 1e-3], ids=["sticks", "slides"])

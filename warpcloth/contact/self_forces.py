@@ -4,10 +4,10 @@ import numpy as np
 import warp as wp
 
 from ..kernels.contact import self_contact, self_sweeps
-from ..kernels.fast import pair_scatter
+from .pair_sums import PairSums
 
 
-class SelfForces:
+class SelfForces(PairSums):
     """Energy, gradient, second derivatives and sweeps of the pairs of a :class:`warpcloth.contact.self_steps.SelfSteps`.
 
     They include friction.
@@ -22,13 +22,9 @@ class SelfForces:
     """
 
     def __init__(self, model, bounded):
-        self.model, self.friction, self._touching, self._clearance = model, None, None, None
+        super().__init__(model, self_contact.CONTACT_OF_PAIRS, scatters=model.device.is_cpu)
+        self.friction, self._touching, self._clearance, self._kernels = None, None, None, {}
         self.energies = wp.zeros(model.count, dtype=wp.float64, device=model.device)
-        made = self_contact.add_forces, self_contact.sum_energies, self_contact.add_diagonal, self_contact.add_products
-        if model.device.is_cpu:
-            made = pair_scatter.scatter_forces, pair_scatter.scatter_energies
-            made += pair_scatter.scatter_diagonal, pair_scatter.scatter_products
-        self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._find = model.kernel(self_contact.find_forces, model.dtype, bounded)
 
     def hold(self, pairs, begun):
@@ -43,11 +39,11 @@ class SelfForces:
         def room(dtype):
             return wp.zeros(len(pairs.stencils), dtype=dtype, device=device)
 
-        self._found = self_contact.PairForces()
-        self._found.normal, self._found.weights = room(wp.vec3d), room(wp.vec4d)
-        self._found.energy, self._found.slope, self._found.bend = (room(wp.float64) for _ in range(3))
+        self.found = self_contact.PairForces()
+        self.found.normal, self.found.weights = room(wp.vec3d), room(wp.vec4d)
+        self.found.energy, self.found.slope, self.found.acting = (room(wp.float64) for _ in range(3))
         if device.is_cpu:
-            self._found.pressing, self._found.count = room(wp.int32), wp.zeros(1, dtype=wp.int32, device=device)
+            self.found.pressing, self.found.count = room(wp.int32), wp.zeros(1, dtype=wp.int32, device=device)
         self.multipliers = room(wp.float64)
         if self._clearance is not None:
             self._clearance = room(wp.float64)
@@ -62,29 +58,20 @@ class SelfForces:
     def launch_forces(self, x, correction=None):
         """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""
         if self.model.device.is_cpu:
-            self._found.count.zero_()
-        self.model.launch(self._find, len(self.pairs.stencils), [self.pairs, self.begun, x, correction], [self._found])
+            self.found.count.zero_()
+        self.model.launch(self._find, len(self.pairs.stencils), [self.pairs, self.begun, x, correction], [self.found])
         if self.friction is not None:
             self.friction.launch_forces(x, correction)
 
-    def _sum(self, gather, scatter, inputs, outputs):
-        """Launches a sum over pairs: ``scatter`` in one thread on the CPU, ``gather`` over vertices on other devices."""
-        if self.model.device.is_cpu:
-            self._launch(scatter, 1, inputs, outputs)
-        else:
-            self._launch(gather, self.model.count, inputs, outputs)
-
     def add_gradient(self, out):
-        """out (N,) += ∂U/∂x."""
-        self._sum(self_contact.add_forces, pair_scatter.scatter_forces, [self.pairs, self._found], [out])
+        super().add_gradient(out)
         if self.friction is not None:
             self.friction.add_gradient(out)
 
     def add_energy(self, sums, out):
         """out (B,) += U."""
-        if self.model.device.is_cpu:
-            self.energies.zero_()
-        self._sum(self_contact.sum_energies, pair_scatter.scatter_energies, [self.pairs, self._found], [self.energies])
+        self.energies.zero_()
+        self.add_energies(self.energies)
         if self.friction is not None:
             self.friction.add_energies(self.energies)
         sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
@@ -97,16 +84,12 @@ class SelfForces:
             sums.sum(self.energies, self.model.per_copy, out, accumulate=1)
 
     def add_diagonal(self, diagonal, values):
-        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
-        given = [self.pairs, self.model.inverse_mass, diagonal, self._found]
-        self._sum(self_contact.add_diagonal, pair_scatter.scatter_diagonal, given, [values])
+        super().add_diagonal(diagonal, values)
         if self.friction is not None:
             self.friction.add_diagonal(diagonal, values)
 
     def add_products(self, p, q, active):
-        """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
-        given = [self.pairs, self.model.inverse_mass, self._found, p, active, self.model.per_copy]
-        self._sum(self_contact.add_products, pair_scatter.scatter_products, given, [q])
+        super().add_products(p, q, active)
         if self.friction is not None:
             self.friction.add_products(p, q, active)
         self.model.lock(q)
@@ -121,10 +104,10 @@ class SelfForces:
         """
         from scipy.sparse import csr_matrix, diags
 
-        model, bend = self.model, self._found.bend.numpy()
+        model, bend = self.model, self.found.acting.numpy()
         acting = np.sort(self.pairs.acting.numpy()[: self.pairs.number.numpy()[0]])
         press = acting[bend[acting] != 0.0]
-        found = [array.numpy()[press] for array in (self.pairs.stencils, self._found.weights, self._found.normal)]
+        found = [array.numpy()[press] for array in (self.pairs.stencils, self.found.weights, self.found.normal)]
         found.append(bend[press])
         if self.friction is not None:
             found = [np.concatenate(each) for each in zip(found, self.friction.rows(), strict=True)]
@@ -181,13 +164,13 @@ class SelfForces:
         model, mobility, multipliers = self.model, self.model.local_mobility, self.multipliers if adds else None
         if self._touching is None:
             given = [self.pairs, mobility, self.begun, self._clearance, x, h, not adds, backward]
-            model.launch(self._sweep, 1, given, [multipliers, self._found, correction])
+            model.launch(self._sweep, 1, given, [multipliers, self.found, correction])
             return
         count, N, swept = len(self.pairs.stencils), model.count, self._swept
         self._launch(self_sweeps.touch_pairs, count, [self.pairs, self.begun, multipliers, x, correction], [swept])
         self._launch(self_sweeps.count_touching, N, [self.pairs, swept], [self._touching])
         given = [self.pairs, mobility, self.begun, self._touching, multipliers, h, not adds]
         model.launch(self._press, count, given, [swept])
-        model.launch(self._move, N, [self.pairs, mobility, swept, multipliers, self._found], [correction])
+        model.launch(self._move, N, [self.pairs, mobility, swept, multipliers, self.found], [correction])
         if adds:
-            self._launch(self_sweeps.keep_pairs, count, [self.pairs, swept], [multipliers, self._found])
+            self._launch(self_sweeps.keep_pairs, count, [self.pairs, swept], [multipliers, self.found])

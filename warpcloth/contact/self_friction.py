@@ -7,6 +7,7 @@ from ..core.scan import Scan
 from ..kernels.contact import friction_sweeps
 from ..kernels.contact import self_friction as kernels
 from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
+from .pair_sums import PairSums
 
 # Rows of each array of a list, per pair of its capacity.
 ROWS = {"stencils": 1, "corners": 4, "slips": 1}
@@ -90,7 +91,7 @@ class Slips:
             array.assign(whole)
 
 
-class SelfFriction:
+class SelfFriction(PairSums):
     """Friction between parts of cloth in contact, and the stretch of its springs, in the steps of one solver.
 
     Args:
@@ -107,13 +108,13 @@ class SelfFriction:
     """
 
     def __init__(self, model, slips, steps, friction, bounded):
-        self.model, self._kept, self._steps, self._friction = model, slips, steps, friction
+        super().__init__(model, kernels.FRICTION_OF_PAIRS, scatters=False)
+        self._kept, self._steps, self._friction = slips, steps, friction
         self._bounded = bounded
         self.start, self._step, self._rubbing = model.vectors(), Slips(model, slips.room), None
         self._vertices = Scan(model, model.count)
-        made = kernels.set_stretch, kernels.find_friction, kernels.add_friction, kernels.sum_friction
+        made = kernels.set_stretch, kernels.find_friction, kernels.end_friction, kernels.set_contact
         made += fill_corners, sort_corners
-        made += kernels.add_friction_diagonal, kernels.add_friction_products, kernels.end_friction, kernels.set_contact
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._begin = model.kernel(kernels.begin_friction, model.dtype, bounded)
         self.hold(slips.room)
@@ -130,11 +131,13 @@ class SelfFriction:
         def zeros(dtype):
             return wp.zeros(room, dtype=dtype, device=self.model.device)
 
-        self.rubbed, self._forces = kernels.RubbedPairs(), kernels.RubForces()
+        self.rubbed, self.found = kernels.RubbedPairs(), kernels.RubForces()
         self.rubbed.normal, self.rubbed.weights, self.rubbed.stretch = zeros(wp.vec3d), zeros(wp.vec4d), zeros(wp.vec3d)
         self.rubbed.stiffness, self.rubbed.limit, self.rubbed.contact = (zeros(wp.float64) for _ in range(3))
-        self._forces.energy, self._forces.along, self._forces.across = (zeros(wp.float64) for _ in range(3))
-        self._forces.pull, self._forces.direction = zeros(wp.vec3d), zeros(wp.vec3d)
+        self.found.normal, self.found.weights = self.rubbed.normal, self.rubbed.weights
+        self.found.acting = self.rubbed.limit
+        self.found.energy, self.found.along, self.found.across = (zeros(wp.float64) for _ in range(3))
+        self.found.pull, self.found.direction = zeros(wp.vec3d), zeros(wp.vec3d)
         self.multipliers = zeros(wp.vec3d)
         if self._rubbing is not None:
             self._changes = zeros(wp.vec3d)
@@ -175,7 +178,7 @@ class SelfFriction:
     def launch_forces(self, x, correction):
         """Finds the forces of each pair at x, or at x + correction. The methods below add them up."""
         given = [self.pairs, self.rubbed, self.start, x, correction]
-        self._launch(kernels.find_friction, self._kept.room, given, [self._forces])
+        self._launch(kernels.find_friction, self._kept.room, given, [self.found])
 
     def launch_acting(self, x, out):
         """Sets out (N,) to ∂U/∂x where the step evaluated its forces: at its start if it is explicit, else at its end x."""
@@ -190,37 +193,17 @@ class SelfFriction:
         self._launch(kernels.end_friction, self._kept.room, given, [self._kept.slips])
         self._kept.launch_lists(self.pairs, LISTS)
 
-    def add_gradient(self, out):
-        """out (N,) += ∂U/∂x."""
-        self._launch(kernels.add_friction, self.model.count, [self.pairs, self.rubbed, self._forces], [out])
-
-    def add_energies(self, out):
-        """Adds the energies of the pairs to those of their first vertices, (N,) [J]."""
-        self._launch(kernels.sum_friction, self.model.count, [self.pairs, self.rubbed, self._forces], [out])
-
-    def add_diagonal(self, diagonal, values):
-        """Does the same for friction as :meth:`warpcloth.contact.self_forces.SelfForces.add_diagonal`.
-
-        ``add_products`` and ``rows`` also do what the methods of these names do there.
-        """
-        given = [self.pairs, self.model.inverse_mass, diagonal, self.rubbed, self._forces]
-        self._launch(kernels.add_friction_diagonal, self.model.count, given, [values])
-
-    def add_products(self, p, q, active):
-        given = [self.pairs, self.model.inverse_mass, self.rubbed, self._forces, p, active, self.model.per_copy]
-        self._launch(kernels.add_friction_products, self.model.count, given, [q])
-
     def rows(self):
         """Returns stencils, w, directions and second derivatives of the rows of all pairs with friction, two rows a pair."""
         count = min(int(self.pairs.counts.numpy().sum()), self._kept.room)
         rubs = np.flatnonzero(self.rubbed.limit.numpy()[:count])
-        found = self.pairs.stencils, self.rubbed.weights, self.rubbed.normal, self._forces.direction
+        found = self.pairs.stencils, self.rubbed.weights, self.rubbed.normal, self.found.direction
         stencils, w, n, u = (array.numpy()[rubs] for array in found)
         still = ~u.any(axis=1)  # without stretch, any direction in the plane will do
         axis = np.eye(3)[np.abs(n).argmin(axis=1)]
         u = np.where(still[:, None], np.cross(n, axis), u)
         u /= np.linalg.norm(u, axis=1)[:, None]
-        along, across = (array.numpy()[rubs] for array in (self._forces.along, self._forces.across))
+        along, across = (array.numpy()[rubs] for array in (self.found.along, self.found.across))
         return (
             np.concatenate([stencils, stencils]),
             np.concatenate([w, w]),
