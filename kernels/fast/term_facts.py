@@ -38,9 +38,12 @@ class TermFacts(NamedTuple):
 def local_gradient(part: TermFacts, dtype, corrected: bool = False):
     """Device function (k, β, rest, y, dy, h) → kA ∂u/∂y at y plus the force of damping at y + dy, (M, 3).
 
-    Without damping, ``corrected`` evaluates the first at y + dy.
+    Without damping, ``corrected`` evaluates the first at y + dy. A damped term has one dy, so it cannot be corrected too: no
+    explicit step with damping is compensated (:func:`warpcloth.fast.compensation.needs_compensation`), and in the gradients of
+    other solvers damping is an energy.
     """
     term = part.term
+    assert not (part.damped and corrected), f"{term.name} is damped, and evaluated with a position residual"
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     gradient, measure = term.gradient, term.measure
 
