@@ -16,6 +16,25 @@ local_gap_of, turned_by, slope_of = local_gap, turned, contact.slope
 
 
 @cache
+def slip_of(dtype):
+    """Device function (anchor, X, n) → the part of the way from an anchor to X along the surface, at most ε; 0 without ε."""
+    vec3, _ = types(dtype)
+    _pose, anchor_type = pose_types(dtype)
+
+    @wp.func
+    def slip(held: anchor_type, X: vec3, n: vec3):
+        found = vec3()
+        if held[3] > dtype(0.0):
+            u = X - vec3(held[0], held[1], held[2])
+            u = u - wp.dot(n, u) * n
+            l = wp.length(u)
+            found = wp.where(l > held[3], held[3] / wp.max(l, held[3]), dtype(1.0)) * u
+        return found
+
+    return slip
+
+
+@cache
 def anchor_vertices(dtype, bounded: bool):
     """Kernel over friction elements of one collider at the start of a step: anchors, and the rest states of the step.
 
@@ -26,7 +45,7 @@ def anchor_vertices(dtype, bounded: bool):
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
-    rest_type, surely_out = wp.types.vector(8, dtype), surely_apart(dtype)
+    rest_type, surely_out, slip = wp.types.vector(8, dtype), surely_apart(dtype), slip_of(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -59,15 +78,10 @@ def anchor_vertices(dtype, bounded: bool):
         depth = -slope_of(d, distance)
         if wp.static(bounded):
             depth = wp.max(distance - d, dtype(0.0))
-        held = anchors[i]
         r = rest[e]
         a = X
         if depth > dtype(0.0):
-            if held[3] > dtype(0.0):
-                u = X - vec3(held[0], held[1], held[2])
-                u = u - wp.dot(n, u) * n
-                l = wp.length(u)
-                a = X - wp.where(l > held[3], held[3] / wp.max(l, held[3]), dtype(1.0)) * u
+            a = X - slip(anchors[i], X, n)
             now = poses.at[copy, collider]
             target = to_space(now, a)
             normal = turned_by(vec3(now[3], now[4], now[5]), now[6], n)
@@ -93,8 +107,7 @@ def anchor_on_mesh(dtype, bounded: bool):
     to_local, to_space = of_pose(dtype)
     corners, _from, _carry = geometry(dtype)
     nearest_beyond, _sweep, has_list, is_alone, _listed = queries(dtype)
-    rest_type = wp.types.vector(8, dtype)
-    zero, one = dtype(0.0), dtype(1.0)
+    rest_type, slip, zero = wp.types.vector(8, dtype), slip_of(dtype), dtype(0.0)
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -150,17 +163,12 @@ def anchor_on_mesh(dtype, bounded: bool):
                 force = wp.max(distance - gaps[j], zero)
             depth += force / share
             push += force / share * normals[j]
-        held = anchors[i]
         r = rest[e]
         kept = vec3()
         if depth > zero:
             n = wp.normalize(push)
             a = p - wp.dot(normals[0], gaps[0] * n) * n
-            if held[3] > zero:
-                u = p - vec3(held[0], held[1], held[2])
-                u = u - wp.dot(n, u) * n
-                l = wp.length(u)
-                a = a - wp.where(l > held[3], held[3] / wp.max(l, held[3]), one) * u
+            a = a - slip(anchors[i], p, n)
             t = corners(mesh, collider, faces[0], before, per_frame)
             w = weights[0]
             foot = wp.transpose(t) * w

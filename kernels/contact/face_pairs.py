@@ -21,10 +21,10 @@ from ..terms.face_contact import PAIRS, PARAMETERS, WEIGHTS
 from ..terms.face_friction import PARAMETERS as OF_FRICTION
 from ..vectors import types
 from .colliders import half_space
-from .mesh_faces import corners_of, local_frames
+from .mesh_faces import local_frames
 from .mesh_facets import BEYOND, FAR
+from .mesh_geometry import corners_of, motions
 from .mesh_geometry import meshes as meshes_of
-from .mesh_geometry import motions
 from .self_gaps import ONE, ZERO, nearest, vertex_of
 from .self_pairs import PARALLEL
 
@@ -159,7 +159,7 @@ def pair_ahead(
 @cache
 def distance_of(dtype):
     """The device function (mesh, collider, halves, per_frame, p, most) → the distance of p from a mesh, at most ``most``."""
-    corners = corners_of(dtype)
+    corners = corners_of(dtype, wp.float64)
 
     @wp.func
     def distance(mesh: meshes_of(dtype), c: int, halves: int, per_frame: int, p: wp.vec3d, most: wp.float64):
@@ -185,7 +185,7 @@ def find_face_pairs(dtype, ahead: bool):
     the half-space of another counts only if it is at another part of the triangle.
     """
     vec3, _ = types(dtype)
-    corners, distance = corners_of(dtype), distance_of(dtype)
+    corners, distance = corners_of(dtype, wp.float64), distance_of(dtype)
     to_local, _to_space = local_frames(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -390,7 +390,7 @@ def anchor_face_pairs(dtype, bounded: bool):
     anchor is as far away.
     """
     vec3, _ = types(dtype)
-    corners = corners_of(dtype)
+    corners = corners_of(dtype, wp.float64)
     to_local, to_space = local_frames(dtype)
     _at, exact = vertex_of(dtype)
     kept_type, rest_type = anchor_type(dtype), wp.types.vector(OF_FRICTION, dtype)

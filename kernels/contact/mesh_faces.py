@@ -16,8 +16,8 @@ from ..terms.contact import turned
 from ..vectors import types
 from .collider_filter import FilterNotes
 from .colliders import pose_types
+from .mesh_geometry import corners_of, motions
 from .mesh_geometry import meshes as meshes_of
-from .mesh_geometry import motions
 from .self_gaps import ONE, ZERO, nearest, vertex_of
 
 turned_by = turned
@@ -180,30 +180,20 @@ def local_frames(dtype):
 
 
 @cache
-def corners_of(dtype):
-    """The device function that gives the corners of a triangle of a mesh, as rows, after half steps."""
-    _at, exact = vertex_of(dtype)
+def free_part(dtype):
+    """Device function (mobility, i, x, other) → x, along locked axes ``other``."""
+    vec3, _ = types(dtype)
 
     @wp.func
-    def corners(mesh: meshes_of(dtype), c: int, triangle: int, halves: int, per_frame: int):
-        v = mesh.triangles[mesh.first_triangle[c] + triangle]
-        first = mesh.first_point[c]
-        frames = mesh.frames[c]
-        size = mesh.size[c]
-        frame = wp.max(wp.min(halves // per_frame, frames - 1), 0)
-        after = wp.min(frame + 1, frames - 1)
-        part = wp.float64(wp.max(halves, 0) - frame * per_frame) / wp.float64(per_frame)
-        if after == frame:
-            part = ZERO
-        found = wp.mat33d()
-        for k in range(3):
-            a = exact(mesh.points[first + frame * size + v[k]])
-            found[k] = a
-            if part > ZERO:
-                found[k] = a + part * (exact(mesh.points[first + after * size + v[k]]) - a)
+    def where_free(mobility: wp.array(dtype=vec3), i: int, x: wp.vec3d, other: vec3):
+        found = vec3(dtype(x[0]), dtype(x[1]), dtype(x[2]))
+        if mobility:
+            for axis in range(3):
+                if mobility[i][axis] == dtype(0.0):
+                    found[axis] = other[axis]
         return found
 
-    return corners
+    return where_free
 
 
 @cache
@@ -247,7 +237,7 @@ def find_planes(dtype):
     step begins are left alone.
     """
     vec3, _ = types(dtype)
-    corners, way = corners_of(dtype), ways_of(dtype)
+    corners, way = corners_of(dtype, wp.float64), ways_of(dtype)
 
     @wp.kernel(module=f"warpcloth.mesh_faces.{dtype.__name__}", enable_backward=False)
     def find_each_plane(
@@ -314,7 +304,7 @@ def follow_planes(dtype):
     """Kernel over vertices: moves x to the allowed sides of the planes of the faces of each."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    to_local, to_space = local_frames(dtype)
+    (to_local, to_space), where_free = local_frames(dtype), free_part(dtype)
 
     @wp.kernel(module=f"warpcloth.mesh_faces.{dtype.__name__}", enable_backward=False)
     def follow_each_plane(
@@ -355,13 +345,7 @@ def follow_planes(dtype):
                     again = wp.bool(True)
                     changed = wp.bool(True)
         if changed:
-            position = to_space(pose, end)
-            at = vec3(dtype(position[0]), dtype(position[1]), dtype(position[2]))
-            if mobility:
-                for axis in range(3):
-                    if mobility[i][axis] == dtype(0.0):
-                        at[axis] = start[axis]
-            x[i] = at
+            x[i] = where_free(mobility, i, to_space(pose, end), start)
             moved[i] = round[0] + 1
 
     return follow_each_plane
@@ -400,7 +384,7 @@ def find_shares(dtype):
     whose rounds have ended before are left out; else the mesh is where the step ends.
     """
     vec3, _ = types(dtype)
-    corners, way = corners_of(dtype), ways_of(dtype)
+    corners, way = corners_of(dtype, wp.float64), ways_of(dtype)
 
     @wp.kernel(module=f"warpcloth.mesh_faces.{dtype.__name__}", enable_backward=False)
     def find_each_share(
@@ -459,7 +443,7 @@ def keep_shares(dtype):
     share of the faces of each."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    to_local, to_space = local_frames(dtype)
+    (to_local, to_space), where_free = local_frames(dtype), free_part(dtype)
 
     @wp.kernel(module=f"warpcloth.mesh_faces.{dtype.__name__}", enable_backward=False)
     def keep_each_share(
@@ -492,13 +476,7 @@ def keep_shares(dtype):
             copy = i // per_copy
             p = to_local(motion.before[copy, collider], exact(x[i]))
             p_end = to_local(motion.after[copy, collider], exact(end[i]))
-            position = to_space(motion.after[copy, collider], p + share * (p_end - p))
-            at = vec3(dtype(position[0]), dtype(position[1]), dtype(position[2]))
-            if mobility:
-                for axis in range(3):
-                    if mobility[i][axis] == dtype(0.0):
-                        at[axis] = end[i][axis]
-            end[i] = at
+            end[i] = where_free(mobility, i, to_space(motion.after[copy, collider], p + share * (p_end - p)), end[i])
             moved[i] = ROUNDS + 1
 
     return keep_each_share

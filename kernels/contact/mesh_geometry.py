@@ -63,32 +63,47 @@ def motions(dtype):
 
 
 @cache
-def geometry(dtype):
-    """Device functions on triangles: ``corners``, ``from_triangle``, ``carry``."""
-    vec3, mat33 = types(dtype)
-    zero, one = dtype(0.0), dtype(1.0)
+def corners_of(dtype, wide):
+    """Device function (mesh, c, triangle, halves, per_frame) → the corners of a triangle, as rows, in the precision ``wide``.
+
+    They are those after ``halves`` half steps; a frame has ``per_frame`` half steps.
+    """
+    vec3, mat33 = types(wide)
+
+    @wp.func
+    def point(mesh: meshes(dtype), i: int):
+        p = mesh.points[i]
+        return vec3(wide(p[0]), wide(p[1]), wide(p[2]))
 
     @wp.func
     def corners(mesh: meshes(dtype), c: int, triangle: int, halves: int, per_frame: int):
-        """The corners of a triangle after ``halves`` half steps, as rows; a frame has ``per_frame`` half steps."""
         v = mesh.triangles[mesh.first_triangle[c] + triangle]
         first = mesh.first_point[c]
         frames = mesh.frames[c]
         found = mat33()
         if frames == 1:
             for k in range(3):
-                found[k] = mesh.points[first + v[k]]
+                found[k] = point(mesh, first + v[k])
         else:
             size = mesh.size[c]
             frame = wp.max(wp.min(halves // per_frame, frames - 1), 0)
             after = wp.min(frame + 1, frames - 1)
-            part = dtype(wp.max(halves, 0) - frame * per_frame) / dtype(per_frame)
+            part = wide(wp.max(halves, 0) - frame * per_frame) / wide(per_frame)
             if after == frame:
-                part = zero
+                part = wide(0.0)
             for k in range(3):
-                a = mesh.points[first + frame * size + v[k]]
-                found[k] = a + part * (mesh.points[first + after * size + v[k]] - a)
+                a = point(mesh, first + frame * size + v[k])
+                found[k] = a + part * (point(mesh, first + after * size + v[k]) - a)
         return found
+
+    return corners
+
+
+@cache
+def geometry(dtype):
+    """Device functions on triangles: :func:`corners_of`, ``from_triangle``, ``carry``."""
+    vec3, mat33 = types(dtype)
+    corners, zero, one = corners_of(dtype, dtype), dtype(0.0), dtype(1.0)
 
     @wp.func
     def nearer_side(p: vec3, a: vec3, b: vec3, best: dtype):

@@ -8,6 +8,7 @@ from functools import cache
 
 import warp as wp
 
+from ..contact.anchors import slip_of
 from ..contact.collider_filter import FilterNotes, outside
 from ..contact.colliders import local_gap_of, of_pose, pose_types, shapes, step_poses, turned_by
 from ..explicit_step import kick_and_drift
@@ -88,7 +89,7 @@ def touching_step(dtype, symplectic: bool):
     _pose, anchor_type = pose_types(dtype)
     to_local, _to_space = of_pose(dtype)
     end_outside, step, ball_type = outside(dtype), kick_and_drift(dtype, symplectic), wp.types.vector(4, dtype)
-    put = store(ball_type)
+    put, slip_along = store(ball_type), slip_of(dtype)
 
     @wp.func
     def touch(guard: guard_struct(dtype), i: int, w: dtype, x: vec3, v: vec3, a: vec3, h: dtype):
@@ -106,12 +107,7 @@ def touching_step(dtype, symplectic: bool):
                 pull = depth * n
                 if most > dtype(0.0):
                     held = 1
-                    anchor = guard.anchors[c, i]
-                    if anchor[3] > dtype(0.0):
-                        slip = X - vec3(anchor[0], anchor[1], anchor[2])
-                        slip = slip - wp.dot(n, slip) * n
-                        l = wp.length(slip)
-                        slip = wp.where(l > anchor[3], anchor[3] / wp.max(l, anchor[3]), dtype(1.0)) * slip
+                    slip = slip_along(guard.anchors[c, i], X, n)
                     l = wp.length(slip)
                     pull -= wp.where(l > most, most / wp.max(l, most), dtype(1.0)) * slip
                 force += guard.stiffness[c, i] * turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], pull)
