@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from .fast.clear_elements import is_clear
+from .contact.clear_elements import is_clear
 from .local import local_coordinate
 from .memory import load, load_shared, store
 from .rotation import epsilon
@@ -152,7 +152,7 @@ def stiffness_scale(term: Term, dtype):
 def admm_elements(term: Term, dtype):
     """Struct of the elements of a term: ratio r, scale s, W² = r s k A, z, u, gap = W²(y − z), and the change of W²z [N].
 
-    ``clear`` is that of :mod:`.fast.clear_elements`, or empty.
+    ``clear`` is that of :mod:`.contact.clear_elements`, or empty.
     """
     y_type = wp.types.matrix((term.rows, 3), dtype)
 

@@ -15,12 +15,38 @@ from .vectors import types
 
 
 @cache
+def of_element(term: Term, dtype, corrected: bool):
+    """Device functions (stencil, stiffness, e, rest, x, d) → kₑ Aₑ u(yₑ) [J] in double precision, and kₑ Aₑ ∂u/∂y.
+
+    A third one, which also takes a Hessian policy, gives kₑ Aₑ ∂²u/∂y².
+    """
+    vec3, _ = types(dtype)
+    indices, numbers, vectors = wp.array2d(dtype=wp.int32), wp.array(dtype=dtype), wp.array(dtype=vec3)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, number, measure = local_coordinate(term, dtype, corrected), load_shared(dtype), term.measure
+    u, gradient, hessian = term.energy, term.gradient, term.hessian
+
+    @wp.func
+    def energy_of(stencil: indices, stiffness: numbers, e: int, r: rest_type, x: vectors, d: vectors):
+        return wp.float64(number(stiffness, e) * measure(r) * u(y_of(stencil, e, r, x, d), r))
+
+    @wp.func
+    def gradient_of(stencil: indices, stiffness: numbers, e: int, r: rest_type, x: vectors, d: vectors):
+        return (number(stiffness, e) * measure(r)) * gradient(y_of(stencil, e, r, x, d), r)
+
+    @wp.func
+    def hessian_of(stencil: indices, stiffness: numbers, e: int, r: rest_type, x: vectors, d: vectors, policy: int):
+        return (number(stiffness, e) * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, policy)
+
+    return energy_of, gradient_of, hessian_of
+
+
+@cache
 def energy(term: Term, dtype, corrected: bool = False):
     """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in double precision, to be summed."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
-    y_of, u, measure = local_coordinate(term, dtype, corrected), term.energy, term.measure
-    rest_of, number = load(rest_type), load_shared(dtype)
+    (energy_of, _gradient, _hessian), rest_of = of_element(term, dtype, corrected), load(rest_type)
 
     @wp.kernel(module="unique", enable_backward=False)
     def energy_of_elements(
@@ -35,8 +61,7 @@ def energy(term: Term, dtype, corrected: bool = False):
         out: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
-        r = rest_of(rest, e)
-        out[e] = wp.float64(number(stiffness, e) * measure(r) * u(y_of(stencil, e, r, x, d), r))
+        out[e] = energy_of(stencil, stiffness, e, rest_of(rest, e), x, d)
 
     return energy_of_elements
 
@@ -60,12 +85,11 @@ def elastic(term: Term, dtype):
 def forces(term: Term, dtype, corrected: bool = False):
     """The :class:`.transpose.LocalSource` of kₑ Aₑ ∂u/∂y."""
     data, rest_type = elastic(term, dtype), wp.types.vector(term.parameters, dtype)
-    y_of, gradient, measure = local_coordinate(term, dtype, corrected), term.gradient, term.measure
-    number = load_shared(dtype)
+    _energy, gradient_of, _hessian = of_element(term, dtype, corrected)
 
     @wp.func
     def force(data: data, e: int, r: rest_type):
-        return (number(data.stiffness, e) * measure(r)) * gradient(y_of(data.stencil, e, r, data.x, data.d), r)
+        return gradient_of(data.stencil, data.stiffness, e, r, data.x, data.d)
 
     return LocalSource(data, force)
 
@@ -86,7 +110,7 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
     vec3, mat33 = types(dtype)
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
-    y_of, weight, hessian, measure = local_coordinate(term, dtype, corrected), term.weight, term.hessian, term.measure
+    weight, (_energy, _gradient, hessian_of) = term.weight, of_element(term, dtype, corrected)
 
     @wp.kernel(module="unique", enable_backward=False)
     def blocks_of_elements(
@@ -106,7 +130,7 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
         e = wp.tid()
         r = rest[e]
         corners = out.shape[1] // K  # K, but not a constant: the compiler would take seconds to unroll the loops
-        h = (stiffness[e] * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, policy[e // elements_per_copy])
+        h = hessian_of(stencil, stiffness, e, r, x, d, policy[e // elements_per_copy])
         for i in range(corners):
             wi = weight(r, i)
             for j in range(corners):

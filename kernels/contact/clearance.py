@@ -35,8 +35,8 @@ def near_colliders(dtype, ended: bool):
     """Kernel over vertices: near = 1 if a vertex may come within the contact distance of a collider in a step.
 
     Before steps of duration h, together, a vertex is assumed to move by twice its prediction, 2‖h v + h² g‖, and x, v and
-    ``step`` are saved. After a step (``ended``), it moved from ``x`` to ``end``. The distance from x to the colliders decides. A
-    ball that contains the motion makes this distance unnecessary. When one vertex is near, the others are skipped.
+    ``step`` are saved. After a step (``ended``), it moved from ``x`` to ``end``. The distance from x to the colliders decides.
+    A ball that contains the motion makes this distance unnecessary. When one vertex is near, the others are skipped.
     """
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)

@@ -9,9 +9,9 @@ import warp as wp
 
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
+from ..kernels.contact.clear_elements import find_clear
 from ..kernels.contact.collider_filter import FIRST, FilterNotes, filter_step, hold_locked
 from ..kernels.contact.mesh_filter import filter_meshes
-from ..kernels.fast.clear_elements import find_clear
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..kernels.terms.face_friction import FRICTIONS

@@ -11,6 +11,7 @@ from ..core.scan import Scan
 from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels.contact import gap_notes, self_pairs
+from ..kernels.contact.far_step import far_limits
 from ..kernels.contact.piece_motion import take_moved
 from ..kernels.contact.self_filter import HeldPins
 from .proximity import Proximity
@@ -134,6 +135,15 @@ class SelfSteps:
             self.forces.friction = self.friction
         self.tangles = check_start(self, state)
         self.start_again()
+
+    def far_limits(self):
+        """Returns :func:`warpcloth.kernels.contact.far_step.far_limits` of a step, and the launch dimensions of its tests."""
+        model, limits = self.model, far_limits(self.model.dtype)()
+        limits.per_copy, limits.size = model.per_copy, model.per_copy if model.device.is_cpu else 1
+        # Both are below what the list and the filter allow, by more than rounding.
+        limits.h, limits.way, limits.together = self.h, (1.0 - 1e-4) * WAY * self.skin, self.filter.moves_together
+        limits.most = 0.49 * limits.way if limits.together else limits.way
+        return limits, (model.copies, -(-model.per_copy // limits.size))
 
     def refuse_reset(self, mask, x):
         """Refuses a reset of copies in ``mask`` (B,) to positions x (B·n, 3) at which cloth crosses or nearly touches cloth.

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..base.turns import in_turn
 from ..kernels import assemble
-from ..kernels.fast.clear_elements import add_energy
+from ..kernels.contact.clear_elements import add_energy
 from ..terms.refresh import EVALUATION, Moment
 
 

@@ -2,7 +2,7 @@
 
 from ..base.turns import in_turn
 from ..kernels import assemble
-from ..kernels.fast.clear_elements import add_gradient
+from ..kernels.contact.clear_elements import add_gradient
 from ..terms.refresh import EVALUATION, Moment
 from .transpose import Transpose
 

@@ -2,8 +2,7 @@
 
 import warp as wp
 
-from ..contact.self_filter import WAY
-from ..kernels.fast.quiet_step import find_unquiet
+from ..kernels.contact.far_step import find_far
 from ..kernels.loop import count_down
 from ..kernels.step import count_step
 
@@ -32,12 +31,8 @@ class QuietSteps:
         self._quiet = one and count is None and not model.scene.colliders and pairs.tangles is None
         self._v_before = model.vectors()
         self._left, self._again = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
-        self._test, size = model.kernel(find_unquiet, model.dtype), model.per_copy if model.device.is_cpu else 1
-        self._dim = model.copies, -(-model.per_copy // size)
-        # Below what the list and the filter allow, by more than rounding.
-        way = (1.0 - 1e-4) * WAY * pairs.skin
-        together = pairs.filter.moves_together
-        self._given = [model.per_copy, size, way, 0.49 * way if together else way, together]
+        self._test = model.kernel(find_far, model.dtype)
+        self._limits, self._dim = pairs.far_limits()
         self._count, self._count_down = model.kernel(count_step), model.kernel(count_down)
 
     def launch(self, steps, end):
@@ -71,7 +66,7 @@ class QuietSteps:
         self._again.zero_()
         near = pairs.proximity
         near.launch_drift(pairs.x_before)
-        given = [near.drift, pairs.x_before, x, near.found, near.listed, *self._given]
+        given = [near.drift, near.found, near.listed, pairs.x_before, x, self._limits]
         model.launch(self._test, self._dim, given, [self._again])
         wp.capture_if(self._again, self._launch_again, self._launch_count, end=end)
 

@@ -30,7 +30,7 @@ class DeviceElements:
         collider: For contact and friction, index of the collider in the scene; else None.
         facet: For contact with a mesh, index of the half-space.
         clear: How far each vertex may move from x̃ in a step before there is a force, (B·E,) [m], see
-            :mod:`warpcloth.kernels.fast.clear_elements`; None for elements that are always evaluated.
+            :mod:`warpcloth.kernels.contact.clear_elements`; None for elements that are always evaluated.
     """
 
     label: str

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror, Segment
-from ..kernels.fast.clear_elements import add_hessian, find_hessians
+from ..kernels.contact.clear_elements import add_hessian, find_hessians
 from ..model.host_values import host_values
 from .search import HALVINGS, Search
 

@@ -2,8 +2,7 @@
 
 import warp as wp
 
-from ..contact.self_filter import WAY
-from ..kernels.fast.far_step import far_limits, find_far, find_near
+from ..kernels.contact.far_step import find_far, find_near
 from ..kernels.step import count_step
 from .clear_steps import TwinSteps
 
@@ -19,12 +18,7 @@ class FarSteps(TwinSteps):
         super().__init__(stepper, twin)
         model, pairs = stepper.model, stepper.pairs
         self._others = [name for name in self._kept if name not in ("x", "v")]
-        limits = self._limits = far_limits(model.dtype)()
-        limits.per_copy, limits.size = model.per_copy, model.per_copy if model.device.is_cpu else 1
-        self._dim = model.copies, -(-model.per_copy // limits.size)
-        # Both are below what the list and the filter allow, by more than rounding.
-        limits.h, limits.way, limits.together = stepper.h, (1.0 - 1e-4) * WAY * pairs.skin, pairs.filter.moves_together
-        limits.most = 0.49 * limits.way if limits.together else limits.way
+        self._limits, self._dim = pairs.far_limits()
         self._find_near, self._find_far = (model.kernel(each, model.dtype) for each in (find_near, find_far))
         self._count = model.kernel(count_step)
 
@@ -48,7 +42,8 @@ class FarSteps(TwinSteps):
 
     def _launch_check(self):
         """Launches the test after a step."""
-        given = [self._kept["x"], self.stepper.state.x, self._limits]
+        near = self.stepper.pairs.proximity
+        given = [near.drift, near.found, near.listed, self._kept["x"], self.stepper.state.x, self._limits]
         self.stepper.model.launch(self._find_far, self._dim, given, [self.near])
 
     def _launch_count(self):

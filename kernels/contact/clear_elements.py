@@ -1,4 +1,4 @@
-"""Factories of CPU kernels over elements of one vertex, most of which have no force.
+"""Factories of CPU kernels over contact with colliders: elements of one vertex, most of which have no force.
 
 ``clear`` is the distance that the vertex of an element can move from x̃ without a force [m]. It is 0 or less where a force is
 possible at x̃. Elements with a shorter correction d are skipped before their rest state is read.
@@ -9,8 +9,9 @@ from typing import Any
 
 import warp as wp
 
+from ..assemble import of_element
 from ..local import local_coordinate
-from ..memory import load, load_shared
+from ..memory import load
 from ..term import HessianPolicy, Term
 from ..vectors import types
 
@@ -51,8 +52,8 @@ def find_clear(term: Term, dtype):
 def add_energy(term: Term, dtype):
     """Kernel of one thread: out[copy] += Σ kₑ Aₑ u(yₑ) [J], in double precision."""
     vec3, _ = types(dtype)
-    rest_type, u, measure = wp.types.vector(term.parameters, dtype), term.energy, term.measure
-    y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    (energy_of, _gradient, _hessian), rest_of = of_element(term, dtype, True), load(rest_type)
 
     @wp.kernel(module="unique", enable_backward=False)
     def add(
@@ -71,8 +72,7 @@ def add_energy(term: Term, dtype):
     ):
         for e in range(stencil.shape[0]):
             if not is_clear(clear[e], d[stencil[e, 0]]):
-                r = rest_of(rest, e)
-                value = wp.float64(number(stiffness, e) * measure(r) * u(y_of(stencil, e, r, x, d), r))
+                value = energy_of(stencil, stiffness, e, rest_of(rest, e), x, d)
                 out[e // per_copy] = out[e // per_copy] + value
 
     return add
@@ -82,8 +82,8 @@ def add_energy(term: Term, dtype):
 def add_gradient(term: Term, dtype):
     """Kernel of one thread: out[vertex] += kₑ Aₑ ∂u/∂y [N]."""
     vec3, _ = types(dtype)
-    rest_type, gradient, measure = wp.types.vector(term.parameters, dtype), term.gradient, term.measure
-    y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    (_energy, gradient_of, _hessian), rest_of = of_element(term, dtype, True), load(rest_type)
 
     @wp.kernel(module="unique", enable_backward=False)
     def add(
@@ -101,9 +101,7 @@ def add_gradient(term: Term, dtype):
         for e in range(stencil.shape[0]):
             i = stencil[e, 0]
             if not is_clear(clear[e], d[i]):
-                r = rest_of(rest, e)
-                g = gradient(y_of(stencil, e, r, x, d), r)
-                out[i] = out[i] + (number(stiffness, e) * measure(r)) * g[0]
+                out[i] = out[i] + gradient_of(stencil, stiffness, e, rest_of(rest, e), x, d)[0]
 
     return add
 
@@ -115,8 +113,8 @@ def add_hessian(term: Term, dtype):
     It works on any device, for no two elements share a vertex. ``clear`` may be None.
     """
     vec3, mat33 = types(dtype)
-    rest_type, hessian, measure = wp.types.vector(term.parameters, dtype), term.hessian, term.measure
-    y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    (_energy, _gradient, hessian_of), rest_of = of_element(term, dtype, True), load(rest_type)
 
     @wp.kernel(module="unique", enable_backward=False)
     def add(
@@ -136,8 +134,7 @@ def add_hessian(term: Term, dtype):
         if clear.shape[0] > 0:
             if is_clear(clear[e], d[i]):
                 return
-        r = rest_of(rest, e)
-        out[i] = out[i] + (number(stiffness, e) * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, CLAMP)
+        out[i] = out[i] + hessian_of(stencil, stiffness, e, rest_of(rest, e), x, d, CLAMP)
 
     return add
 
@@ -146,8 +143,8 @@ def add_hessian(term: Term, dtype):
 def find_hessians(term: Term, dtype):
     """Kernel over elements of three vertices, with one row: kₑ Aₑ ∂²u/∂y² [N/m], semi-definite, and the weights of y."""
     vec3, mat33 = types(dtype)
-    rest_type, weight, hessian, measure = wp.types.vector(term.parameters, dtype), term.weight, term.hessian, term.measure
-    y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
+    rest_type, weight = wp.types.vector(term.parameters, dtype), term.weight
+    (_energy, _gradient, hessian_of), rest_of = of_element(term, dtype, True), load(rest_type)
 
     @wp.kernel(module="unique", enable_backward=False)
     def find(
@@ -168,6 +165,6 @@ def find_hessians(term: Term, dtype):
         for i in range(3):
             w[i] = weight(r, i)[0]
         weights[e] = w
-        out[e] = (number(stiffness, e) * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, CLAMP)
+        out[e] = hessian_of(stencil, stiffness, e, r, x, d, CLAMP)
 
     return find
