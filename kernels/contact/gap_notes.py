@@ -15,6 +15,7 @@ from .self_planes import ULP
 
 nearest_points = self_gaps.nearest
 FOUR = wp.constant(wp.float64(4.0))
+MORE = wp.constant(wp.float32(0.75 * 2.0**-23))
 FIRST = wp.constant(wp.int64(2**62))
 
 
@@ -48,9 +49,11 @@ def stored_gap(dtype):
         far = ZERO
         for i in range(4):
             far = wp.max(far, wp.max(wp.abs(exact(x[s[i]]))))
-        fine = FOUR * ULP * far
+        # 0.75 to 1.5 units more, which is rounded to the next number.
+        next = wp.float32(far) + MORE * wp.float32(far)
+        fine = FOUR * wp.float64(next - wp.float32(far))
         found = d
-        if d < FOUR * fine:
+        if d < FOUR * FOUR * ULP * far:
             a = rounded(x[s[0]])
             _w, y, _inside = nearest_points(of_vertex, a, rounded(x[s[1]]), rounded(x[s[2]]), rounded(x[s[3]]))
             found = wp.length(y)

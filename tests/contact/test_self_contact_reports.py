@@ -90,14 +90,14 @@ def test_none_of_it_without_self_contact(device):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_frames_too_coarse_for_the_gap_are_named(dtype, device):
-    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 12.6 m this is less than 4 · 2⁻²³ x, from frame 3 on."""
+    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 16 m this is less than 4 · 2⁻¹⁹ m, from frame 4 on."""
     soft = wc.SelfContact(DISTANCE, 1e-6)  # which does not push them apart in the meantime
     scene = sheets(gap=6e-6, turn=0.0, self_contact=soft)
     scene = replace(scene, velocities=np.tile([100.0, 0.0, 0.0], (32, 1)))
-    near = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=2).self_contact
+    near = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=3).self_contact
     assert near.too_near is None and near.least_gap == pytest.approx(6e-6, rel=1e-3)
-    far = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=4).self_contact
-    assert far.too_near.startswith("in frame 3 first, at vertex ") and "the least gap is 6e-06 m" in far.too_near
+    far = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=5).self_contact
+    assert far.too_near.startswith("in frame 4 first, at vertex ") and "the least gap is 6e-06 m" in far.too_near
 
 
 @pytest.mark.parametrize("axes", ["xyz", "y"])
