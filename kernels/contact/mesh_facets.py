@@ -88,6 +88,11 @@ def find_facets(dtype, at_vertex: bool, anywhere: bool = False):
         radius = r
         farthest = r
         row = wp.int32(-1)
+        known = wp.bool(False)  # whether d, n, face and w are those of the nearest point already
+        d = zero
+        n = vec3()
+        face = wp.int32(-1)
+        w = vec3()
         if wp.static(anywhere):
             radius = dtype(2.0) * r
             farthest = dtype(FAR)
@@ -132,7 +137,8 @@ def find_facets(dtype, at_vertex: bool, anywhere: bool = False):
             if face_hit >= 0:
                 radius += wp.min(dtype(0.25) * wp.length(target - foot), dtype(32.0) * r)
                 d, n, face, w = nearest_beyond(mesh, collider, when, per_frame, p, radius, zero, 0, normals, gaps, lists, -1, i)
-                if d < zero or wp.dot(n, n_hit) < dtype(ALIKE):
+                known = wp.dot(n, n_hit) >= dtype(ALIKE)
+                if d < zero or not known:
                     normals[0] = n_hit
                     gaps[0] = wp.dot(n_hit, p - foot)
                     points[0] = foot
@@ -141,9 +147,11 @@ def find_facets(dtype, at_vertex: bool, anywhere: bool = False):
         if row >= 0:
             searching = lists.count[row, i] > 0
         while searching and count < most:
-            d, n, face, w = nearest_beyond(
-                mesh, collider, when, per_frame, p, radius, dtype(BEYOND) * r, count, normals, gaps, lists, row, i
-            )
+            if not known or count > 0:
+                d, n, face, w = nearest_beyond(
+                    mesh, collider, when, per_frame, p, radius, dtype(BEYOND) * r, count, normals, gaps, lists, row, i
+                )
+            known = wp.bool(False)
             searching = d > zero
             if searching:
                 t = corners(mesh, collider, face, when, per_frame)
