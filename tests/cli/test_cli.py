@@ -20,6 +20,7 @@ import warpcloth.cli.run
 import warpcloth.cli.scenes
 import warpcloth.usd
 from support.command_line import refused, run
+from support.rows import slow_but
 from warpcloth.base.outputs import Lock
 from warpcloth.base.texts import convert
 from warpcloth.cli import main
@@ -591,7 +592,11 @@ MOMENTS = {
 }
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["ctrl-c", "sigterm"])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    slow_but([(signal.SIGINT, 130)], [(signal.SIGINT, 130), (signal.SIGTERM, 143)]),
+    ids=["ctrl-c", "sigterm"],
+)
 @pytest.mark.parametrize("ending", ["usdc", "usdz"])
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_an_interrupt_finishes_the_file_and_says_what_is_in_it(moment, ending, number, code, tmp_path, capfd, monkeypatch):

@@ -136,7 +136,7 @@ def local_steps(
 
 
 @each_shape
-@pytest.mark.parametrize("compliance", (1e-3, 1.0, 1e3))
+@pytest.mark.parametrize("compliance", slow_but([1.0], [1e-3, 1.0, 1e3]))
 def test_prox_and_constraint_belong_to_the_energy(shape, compliance):
     """The prox is where (p − v)/c + ∂u/∂y is 0, from far inside too; u = ½C²."""
     model = touching(SHAPES[shape])
@@ -191,9 +191,9 @@ MOVING = {
 }
 
 
-# The filter is the same for all: explicit steps meet every kind, as do the two that enter most without the filter.
+# The filter is the same for all: explicit steps meet every kind, as does one that enters most without the filter.
 EVERY = [
-    *((name, what, "float32") for name in ("explicit", "projective dynamics", "admm") for what in MOVING),
+    *((name, what, "float32") for name in ("explicit", "projective dynamics") for what in MOVING),
     *((name, what, "float32") for name in SOLVERS for what in ("mesh", "spinning box", "balls that close")),
     *(("explicit", what, "float64") for what in MOVING),
     *(("projective dynamics", what, "float64") for what in ("mesh", "balls that close")),
@@ -203,7 +203,7 @@ EVERY = [
 @pytest.mark.parametrize(
     ("name", "what", "dtype"),
     slow_but(
-        [*(("explicit", what, "float32") for what in MOVING), *((name, "mesh", "float32") for name in SOLVERS)],
+        [("explicit", "spinning box", "float32"), *((name, "mesh", "float32") for name in ("explicit", "xpbd"))],
         list(dict.fromkeys(EVERY)),
     ),
 )
@@ -218,7 +218,7 @@ def test_no_vertex_is_inside(name, what, dtype, device):
                 assert collider.distances(points, frame).min() > 0.0, (speed, frame, collider.label)
 
 
-@pytest.mark.parametrize("solver", slow_but(("explicit", "midpoint"), ["explicit", "euler", "midpoint", "bdf2"]))
+@pytest.mark.parametrize("solver", slow_but(["midpoint"], ["explicit", "euler", "midpoint", "bdf2"]))
 @pytest.mark.parametrize("speed", slow_but([100.0], [10.0, 100.0]))
 def test_an_impact_without_friction_gains_no_energy(solver, speed, device):
     """Against a plane that is tilted, so that some vertices meet it long before others."""
@@ -247,7 +247,7 @@ SLIDING = {
 }
 
 
-@pytest.mark.parametrize("what", SLIDING)
+@pytest.mark.parametrize("what", slow_but(("groove", "torus"), SLIDING))
 @pytest.mark.parametrize("dtype", slow_but(["float32"], ["float32", "float64"]))
 def test_what_slides_stays_outside(what, dtype, device):
     """Points that go in all directions at 100 m/s, by 0.1 m a step, so that what slides along one surface meets another."""
@@ -274,7 +274,7 @@ def test_what_slides_stays_outside(what, dtype, device):
 @pytest.mark.parametrize(
     ("name", "open"),
     slow_but(
-        [(name, True) for name in ("explicit", "newton", "xpbd", "pbd")],
+        [(name, True) for name in ("newton", "xpbd", "pbd")],
         [*((name, True) for name in SOLVERS), ("newton", False)],
     ),
 )
@@ -329,7 +329,9 @@ PLAIN = {
 @pytest.mark.parametrize(
     ("name", "gravity", "friction", "mesh"),
     [
-        *((name, 981.0, 0.3, False) for name in EXACT),
+        *slow_but(
+            [(name, 981.0, 0.3, False) for name in ("newton clamp", "xpbd")], [(name, 981.0, 0.3, False) for name in EXACT]
+        ),
         *slow_but(
             [("newton clamp", 200.0, 0.3, True)],
             [(name, *load) for name in EXACT for load in [(300.0, 0.0, False), (200.0, 0.3, True)]],

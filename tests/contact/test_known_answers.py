@@ -208,11 +208,9 @@ def polygon(friction, turn, turns):
 
 @methods(
     "newton",
-    "projective_dynamics",
     "xpbd",
     explicit=wc.Explicit(substeps=600),
     newton=wc.Newton(substeps=1, linear="factorised"),
-    projective_dynamics=wc.ProjectiveDynamics(substeps=1, tolerance=1.0, iterations=300),
     xpbd=wc.XPBD(substeps=150, iterations=10),
 )
 def test_a_belt_slides_over_a_drum(solver, device, friction=0.3):
@@ -289,12 +287,10 @@ def critical(friction, radius, length=1.0):
 
 
 @methods(
-    "projective_dynamics",
     "explicit",
     "newton",
     explicit=wc.Explicit(substeps=200),
     newton=wc.Newton(substeps=2, tolerance=1e-4),
-    projective_dynamics=wc.ProjectiveDynamics(substeps=1, tolerance=1e-3, iterations=40),
     xpbd=wc.XPBD(substeps=20, iterations=10),
 )
 def test_an_overhang_slips_or_sticks(solver, device):

@@ -179,7 +179,7 @@ def test_minimiser_is_the_same(name, gap, device):
 @pytest.mark.parametrize(
     ("name", "layers", "error"),
     slow_but(
-        [(name, 1, 5e-3) for name in ("explicit", "newton", "constrained")] + [("xpbd", 2, 0.02)],
+        [("explicit", 1, 5e-3), ("newton", 1, 5e-3), ("xpbd", 2, 0.02)],
         [*((name, 1, 5e-3) for name in SOLVERS), ("newton", 2, 0.02), ("xpbd", 2, 0.02)],
     ),
 )
@@ -229,7 +229,7 @@ def test_sticks(name, dtype, device):
     assert creep < (least if dtype == "float64" else 24.0 * np.spacing(np.float32(0.5)) * 1.1)
 
 
-@pytest.mark.parametrize("name", slow_but(("admm", "xpbd_jacobi"), SOLVERS))
+@pytest.mark.parametrize("name", slow_but(["xpbd"], SOLVERS))
 def test_momentum_and_energy(name, device):
     """Sheets that press and rub: Σp stays, as exactly as linear systems are solved, and motion along them loses energy."""
     scene, left = rubbing(gap=4.5e-3), []

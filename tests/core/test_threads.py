@@ -148,6 +148,7 @@ def test_ranges_far_from_the_origin_move_as_the_whole(device):
 
 
 @pytest.mark.parametrize("name", DIVIDED)
+@pytest.mark.slow
 def test_threads_allocate_nothing(name, device):
     record, terms = DIVIDED[name]
     for copies in (1, 2):

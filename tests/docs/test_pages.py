@@ -222,7 +222,8 @@ MODULES = {"libigl": "igl", "pillow": "PIL"}
 # Runs the blocks of a page one after the other, commands by the function behind them. Packages that the page does not say to
 # install are not found. Other commands are left out: .ci/run runs those of the README, a cluster needs several machines, and
 # bench compiles again what it measures, as test_bench.py has it do. What commands measure in two processes is measured here in
-# a thread; test_work_precision.py, test_extending.py and test_chart_failures.py have them start processes.
+# a thread; test_work_precision.py, test_extending.py and test_chart_failures.py have them start processes. Runs of whole scenes
+# end after 12 frames.
 RUN = """
 import json, shlex, sys
 from importlib.machinery import PathFinder
@@ -244,7 +245,8 @@ for language, text in blocks:
     for line in text.splitlines() if language == "sh" else ():
         if line.startswith("warpcloth ") and not line.startswith("warpcloth bench "):
             print("+", line, flush=True)
-            code = main(shlex.split(line, comments=True)[1:])
+            words = shlex.split(line, comments=True)[1:]
+            code = main(words + ["--frames", "12"] * (words[0] == "run" and "--frames" not in words))
             assert code == 0, f"{line}: {code}"
 exec(check, names)
 """

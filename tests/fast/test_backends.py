@@ -330,7 +330,7 @@ PROJECTED["corotated"] = [wc.CorotatedMembrane(stiffness=100.0)]
 
 
 # What else sweeps do to corrections does not depend on the energy: all of it for some of each kind.
-WIDELY = (*FEW, "limits", "dihedral bending")
+WIDELY = ("springs", "several", "limits")
 
 
 @pytest.mark.parametrize(

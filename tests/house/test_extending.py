@@ -159,11 +159,11 @@ MEASURES = {
 }
 
 
-# `bench` compiles all kernels anew, which takes half a minute.
+# Each starts processes; `bench` compiles all kernels anew.
 SLOW = pytest.mark.slow
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW if name == "bench" else ()) for name in MEASURES])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "choose" else SLOW) for name in MEASURES])
 def test_processes_that_measure_load_them(name, outside, capfd, tmp_path):
     picture = ["-o", tmp_path / "chart.png"] if "chart" in MEASURES[name] else []
     code, out, err = run(capfd, *MEASURES[name], *IMPORTS, *picture, "--json")

@@ -61,14 +61,14 @@ def archive(tree, tmp_path_factory):
     return build(tree, "--sdist", tmp_path_factory.mktemp("sdist"))
 
 
-@pytest.fixture(scope="module", params=["from the tree", "from the source archive"])
-def wheel(request, tree, archive, tmp_path_factory):
-    if request.param == "from the source archive":
-        unpacked = tmp_path_factory.mktemp("unpacked")
-        with tarfile.open(archive) as packed:
-            packed.extractall(unpacked, filter="data")
-        (tree,) = unpacked.iterdir()
-    return build(tree, "--wheel", tmp_path_factory.mktemp("wheel"))
+@pytest.fixture(scope="module")
+def wheel(archive, tmp_path_factory):
+    """The wheel that is made from the source archive."""
+    unpacked = tmp_path_factory.mktemp("unpacked")
+    with tarfile.open(archive) as packed:
+        packed.extractall(unpacked, filter="data")
+    (source,) = unpacked.iterdir()
+    return build(source, "--wheel", tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +102,14 @@ def test_a_wheel_has_all_files_and_no_others(wheel):
     expected |= {"warpcloth/py.typed", "warpcloth/scenes/character.usda"}
     assert {name for name in names if ".dist-info/" not in name} == expected
     assert [name for name in names if name.endswith("/LICENSE")]
+
+
+def test_the_tree_and_its_archive_make_the_same_wheel(wheel, tree, tmp_path):
+    found = []
+    for path in (wheel, build(tree, "--wheel", tmp_path / "wheel")):
+        with zipfile.ZipFile(path) as packed:
+            found.append({name: packed.read(name) for name in packed.namelist()})
+    assert found[0] == found[1]
 
 
 def test_an_archive_has_its_tests_and_pictures(archive):

@@ -18,6 +18,7 @@ def by_name(found):
     return {trial.name: trial for trial in found.trials}
 
 
+@pytest.mark.slow
 def test_terms_that_do_nothing_do_not_matter_and_others_do():
     """Bending of 1e-9 N·m is next to none, an attachment to where a pin stands does nothing, springs hold the cloth."""
     scene = hanging.scene(n=6, bending=1e-9)

@@ -342,7 +342,6 @@ def test_refinement_does_not_cure_other_nets(pattern, angle, bending, near, devi
     [
         ("diagonal", 22.5, "quadratic", (12, 24)),
         ("alternating", 22.5, "dihedral", (12, 24)),
-        ("alternating", -15.0, "quadratic", (24, 32)),
     ],
 )
 def test_fine_meshes_of_other_nets_stay_wrong(pattern, angle, bending, resolutions, device):

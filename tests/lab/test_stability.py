@@ -704,6 +704,7 @@ def run(capfd, *words):
     return code, out, err
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, capfd, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
     given = ["hanging", "-p", "n=4", "--x", "dt", "--x-range", 1e-3, 1e-1, 3, "--y", "stiffness", "--y-range", 1, 100, 2]

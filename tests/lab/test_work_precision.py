@@ -487,6 +487,7 @@ def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
 # --- the command
 
 
+@pytest.mark.slow
 def test_command(tmp_path, monkeypatch, capsys):
     """Interrupted after two settings it says so and keeps them; the same command goes on."""
     monkeypatch.chdir(tmp_path)

@@ -854,7 +854,7 @@ def test_nothing_is_compiled_that_is_not_launched(probed):
     assert {folder[3:-8] for folder in folders} == launched
 
 
-@pytest.mark.parametrize("name", slow_but(("explicit", "xpbd"), SOLVERS))
+@pytest.mark.parametrize("name", slow_but(["xpbd"], SOLVERS))
 def test_binding_reads_no_elements_back(name, device, monkeypatch):
     """Stencils, stiffness and rest states stay on the host until they are final, in an order of the model's own too.
 

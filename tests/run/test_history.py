@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 import warpcloth as wc
 from support import setups
 from support.rows import slow_but
-from support.setups import square
+from support.setups import MAIN, square
 from support.usd_validation import validate
 from warpcloth.run.history import Evaluation
 from warpcloth.usd import read_scene, write_scene
@@ -305,7 +305,7 @@ def test_books_follow_the_order_of_the_vertices(device):
     assert np.abs(found[0][0]).max() > 1.0 and found[0][1][-1] != 0.0
 
 
-@pytest.mark.parametrize("name", slow_but(("newton", "xpbd", "projective dynamics"), SOLVERS))
+@pytest.mark.parametrize("name", slow_but(("newton", "xpbd", "projective dynamics"), [*MAIN, "newton midpoint", "newton bdf2"]))
 def test_books_leave_the_motion_as_it_is(name, device):
     """In float32, and without them nothing is launched for them."""
     cloth = square(solver=SOLVERS[name], pins="corners")

@@ -81,15 +81,12 @@ def test_half_a_sheet_hangs_as_the_whole(device):
 NEWTON, PD = wc.Newton(substeps=1, tolerance=1e-11), wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=5_000)
 MINIMISE = {
     "newton": NEWTON,
-    "newton absolute": replace(NEWTON, hessian="absolute"),
     "projective dynamics": PD,
-    "projective dynamics chebyshev": replace(PD, acceleration="chebyshev"),
     "projective dynamics matrix-free": replace(PD, acceleration="l-bfgs", linear="jacobi"),
     "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=5_000),
     "constrained dynamics": wc.ConstrainedDynamics(substeps=1, tolerance=1e-12, iterations=200),
     "constrained dynamics factorised": wc.ConstrainedDynamics(substeps=1, tolerance=1e-12, iterations=200, linear="factorised"),
     "xpbd": wc.XPBD(substeps=1, iterations=15_000),
-    "xpbd sequential": wc.XPBD(substeps=1, iterations=15_000, sweep="sequential"),
 }
 
 
@@ -148,7 +145,7 @@ def test_a_hard_spring_holds_a_bead_on_its_rail(name, device):
     np.testing.assert_allclose(x[1], [0.6, -0.8, 0.0], rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", MAIN)
+@pytest.mark.parametrize("name", slow_but(("newton", "xpbd"), MAIN))
 def test_vertices_without_a_free_axis_are_pins(name, device):
     """To the bit, and to every solver."""
     declared = square(solver=SOLVERS[name])
@@ -159,7 +156,7 @@ def test_vertices_without_a_free_axis_are_pins(name, device):
     assert (runs[0] == runs[1]).all()
 
 
-@pytest.mark.parametrize("name", slow_but(MAIN, LOCKING))
+@pytest.mark.parametrize("name", slow_but(("newton", "xpbd", "admm"), [name for name in LOCKING if "factorised" not in name]))
 def test_locked_coordinates_stay_to_the_bit(name, device):
     """In float32, in a batch, in another order, along gravity and after a reset to other positions, with a velocity of 0."""
     declared = replace(rails(square(solver=SOLVERS[name], pins=[0])), velocities=np.ones((36, 3)))
@@ -197,9 +194,7 @@ def rollers(solver=None, frames=9, **given):
     return replace(declared, pins=wc.Pins(vertices, keyframes, axes=["xyz", "x", "zy", "z"]))
 
 
-@pytest.mark.parametrize(
-    "name", slow_but(("explicit", "newton", "newton midpoint", "xpbd"), [*MAIN, "newton midpoint", "newton bdf2"])
-)
+@pytest.mark.parametrize("name", slow_but(("newton midpoint", "xpbd"), [*MAIN, "newton midpoint", "newton bdf2"]))
 def test_pins_hold_their_axes(name, device):
     """Along them they are where the keyframes say and as fast, and along the others the cloth takes them where it goes."""
     declared, solver = rollers(LOCKING[name]), LOCKING[name]

@@ -9,14 +9,15 @@ import warp as wp
 
 import warpcloth as wc
 from support import setups
-from support.setups import allocations, square
+from support.rows import slow_but
+from support.setups import MAIN, allocations, square
 from warpcloth.fast.plan import plan
 
 SOLVERS = {name: replace(solver, substeps=8) for name, solver in setups.SOLVERS.items()}
 NONE = (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("explicit", "newton midpoint", "xpbd"), [*MAIN, "newton midpoint", "newton bdf2"]))
 def test_forces_in_proportion_to_masses_are_gravity(name, device):
     """Of the same magnitude before and after, as residuals are relative to it; the rest is rounding."""
     down = square(solver=SOLVERS[name], pins="corners")

@@ -7,7 +7,8 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from support.setups import SOLVERS
+from support.rows import slow_but
+from support.setups import MAIN, SOLVERS
 from warpcloth.terms.refresh import EVALUATION, STEP, Refresh
 
 LIFT = 0.05
@@ -77,7 +78,9 @@ def state_after(steps, solver, scene, device):
     return stepper.state.x.numpy().copy(), stepper.state.v.numpy().copy()
 
 
-@pytest.mark.parametrize("name", [name for name in SOLVERS if "bdf2" not in name])  # which looks back beyond a restart
+@pytest.mark.parametrize(
+    "name", slow_but(("explicit", "newton midpoint", "xpbd"), [*MAIN, "newton midpoint"])
+)  # BDF2 looks back beyond a restart
 def test_a_step_begins_with_what_is_refreshed(name, device):
     """Three steps are those of three scenes whose spring was declared where each begins."""
     solver = SOLVERS[name]
@@ -92,7 +95,7 @@ def test_a_step_begins_with_what_is_refreshed(name, device):
     assert x[0, 1] > MESH.points[0, 1] + 0.03 * 0.1 + 1e-5, "the spring pulls"
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", slow_but(("explicit", "newton", "xpbd"), [*MAIN, "newton midpoint", "newton bdf2"]))
 def test_an_evaluation_has_what_is_refreshed(name, device):
     """A target that follows the vertex sideways pulls it down alone, as far as one that is where it must be from the first."""
     solver, h = SOLVERS[name], 0.01

@@ -91,7 +91,7 @@ def test_oscillator_keeps_its_invariant(method, omega_h, device):
     assert np.allclose(energies, expected, rtol=40 * 20 * EPS, atol=40 * 20 * EPS * omega**2)
 
 
-@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float64") for name in MAIN], RUNS))
+@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in MAIN], RUNS))
 def test_free_fall(name, dtype, device):
     """y_n = −g h² n(n+1)/2 for every method of first order, −½g(nh)² for those of second, and no strain."""
     scene = square(solver=SOLVERS[name], fps=600.0)
@@ -110,7 +110,8 @@ def test_free_fall(name, dtype, device):
 
 # Averaging by vertex keeps neither; Jacobi steps of one matrix keep momentum in the end, not on the way.
 @pytest.mark.parametrize(
-    "name", slow_but(MAIN, [name for name in SOLVERS if "vertex" not in name and "matrix-free" not in name])
+    "name",
+    slow_but(("explicit", "newton", "xpbd"), [name for name in SOLVERS if "vertex" not in name and "matrix-free" not in name]),
 )
 def test_momentum_is_conserved(name, device):
     """Inner forces cancel: P is kept; symplectic Euler and midpoint keep L too, the others lose it in x_new − x_old."""
@@ -337,7 +338,7 @@ def test_a_frame_is_a_whole_number_of_steps(device):
         wc.Newton(dt=0.01).bind(square().build(device=device))
 
 
-@pytest.mark.parametrize("name", slow_but(MAIN, SOLVERS))
+@pytest.mark.parametrize("name", slow_but(("explicit", "newton", "xpbd"), SOLVERS))
 def test_a_step_allocates_nothing(name, device):
     """Of arrays of Warp; what scipy allocates to factorise on the host is outside the tracker's sight."""
     solver = SOLVERS[name]
@@ -360,7 +361,7 @@ def test_the_same_run_gives_the_same_bits(name, dtype, device):
 @pytest.mark.parametrize(
     ("name", "unlike"),
     slow_but(
-        [(name, "masses and start") for name in MAIN],
+        [(name, "masses and start") for name in ("explicit", "newton", "xpbd")],
         [(name, unlike) for name in SOLVERS for unlike in UNLIKE if name in MAIN or unlike == "density, bending and damping"],
     ),
 )
