@@ -138,6 +138,7 @@ def sweep_pairs(dtype, axes: bool):
         turn = wp.int32(0)
         while turn < count:
             own = wp.where(backward, count - 1 - turn, turn)
+            turn += 1
             e = number(pairs.acting, own)
             s = stencil(pairs.stencils, e)
             before = ZERO
