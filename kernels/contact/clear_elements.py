@@ -11,8 +11,9 @@ import warp as wp
 
 from ..assemble import of_element
 from ..local import local_coordinate
-from ..memory import load
+from ..memory import load, load_shared
 from ..term import HessianPolicy, Term
+from ..terms import contact
 from ..vectors import types
 
 CLAMP = wp.constant(int(HessianPolicy.CLAMP))
@@ -102,6 +103,65 @@ def add_gradient(term: Term, dtype):
             i = stencil[e, 0]
             if not is_clear(clear[e], d[i]):
                 out[i] = out[i] + gradient_of(stencil, stiffness, e, rest_of(rest, e), x, d)[0]
+
+    return add
+
+
+# A secant of add_secants ends at LEAP d, or at LIFT r if that is more, at most.
+LEAP, LIFT = wp.constant(10.0), wp.constant(0.04)
+
+
+@cache
+def add_secants(dtype):
+    """Kernel over contact elements: out[vertex] += kA c nnᵀ [N/m], with c = φ″, or the slope of a secant of φ′ from d outwards.
+
+    For small d, φ″ is so large that Newton's method at most doubles d. The secant ends at the distance that the vertex would
+    have with its own ``inertia`` m/h² [N/m] and the present force of everything else, or before. At the minimum that distance
+    is d, and c is φ″. A secant is no upper bound, so ``careful`` copies have φ″. ``gradient`` is ∇φ of the whole objective
+    [N]. It works on any device, for no two elements share a vertex. ``clear`` may be None.
+    """
+    vec3, mat33 = types(dtype)
+    rest_type = wp.types.vector(contact.PARAMETERS, dtype)
+    y_of, rest_of, number = local_coordinate(contact.CONTACT, dtype, True), load(rest_type), load_shared(dtype)
+    measure, gap, slope = contact.measure, contact.gap, contact.slope
+    bend, mean_bend, gap_after = contact.bend, contact.mean_bend, contact.gap_after
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        clear: wp.array(dtype=dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        gradient: wp.array(dtype=vec3),
+        # parameters
+        inertia: wp.array(dtype=dtype),
+        careful: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # in and out
+        out: wp.array(dtype=mat33),
+    ):
+        e = wp.tid()
+        i = stencil[e, 0]
+        if clear.shape[0] > 0:
+            if is_clear(clear[e], d[i]):
+                return
+        r = rest_of(rest, e)
+        distance = r[11]
+        now, n = gap(y_of(stencil, e, r, x, d), r)
+        if now <= distance:
+            k = number(stiffness, e) * measure(r)
+            curvature = bend(now, distance)
+            if careful[i // per_copy] == 0 and inertia[i] > dtype(0.0):
+                others = wp.dot(gradient[i], n) - k * slope(now, distance)
+                after = gap_after(now - others / inertia[i], distance, k / inertia[i])
+                after = wp.min(after, wp.max(dtype(LEAP) * now, dtype(LIFT) * distance))
+                if after > dtype(1.001) * now:
+                    curvature = mean_bend(now, after, distance)
+            out[i] = out[i] + (k * curvature) * wp.outer(n, n)
 
     return add
 

@@ -159,6 +159,12 @@ def bend(d: Any, r: Any):
 
 
 @wp.func
+def mean_bend(d: Any, after: Any, r: Any):
+    """The slope of the secant of φ′ from d to a larger distance; at most φ″(d), for φ″ falls with d."""
+    return (slope(after, r) - slope(d, r)) / (after - d)
+
+
+@wp.func
 def beyond(x: Any, position: Any, u: Any, w: Any, half: Any, radius: Any, margin: Any):
     """Whether x is farther than ``margin`` from a half-space, or from a bounding ball; faster than the gap."""
     away = x - position

@@ -456,6 +456,29 @@ def test_admm_takes_a_crushed_membrane(dtype, device):
         assert 0.5 < np.median(lengths) < 1.5
 
 
+@pytest.mark.parametrize("speed", [0.06, 1.2], ids=lambda speed: f"{speed} m/s")
+def test_contact_pushes_out_at_once(speed, device):
+    """A sheet whose x̃ is inside the floor takes 3 iterations. Newton steps, which at most double a distance, take 11."""
+    sheet, h, r = wc.Mesh.grid(3, 3, size=0.1), 1.0 / 120.0, 1e-3
+    contact = wc.Contact(distance=r, stiffness=1e5)
+    scene = wc.Scene(
+        sheet,
+        density=0.15,
+        terms=[wc.Spring(stiffness=30.0)],
+        positions=sheet.points + np.array([0.0, r, 0.0]),
+        velocities=np.tile([0.0, -speed, 0.0], (9, 1)),
+        colliders=[wc.Plane(friction=0.3)],
+        contact=contact,
+    )
+    solver = wc.ProjectiveDynamics(substeps=2, tolerance=1e-6)
+    x, stepper = after_one_step(scene, solver, device)
+    assert stepper.results == [Result.CONVERGED] and stepper.iterations <= 4
+    # m/h² (d − d of x̃) = −kAφ′(d), with the same mass per area everywhere
+    gap, predicted = x[:, 1], r - speed * h - 9.81 * h**2
+    force = contact.stiffness * np.where(gap < 0.5 * r, 0.25 * r**2 / gap, r - gap)
+    np.testing.assert_allclose(0.15 / h**2 * (gap - predicted), force, rtol=1e-5)
+
+
 @pytest.mark.parametrize("solver", [wc.ProjectiveDynamics, wc.ADMM])
 def test_no_stiffness_and_no_terms(solver, device):
     """Then x̃ is the answer, in no iteration."""

@@ -4,7 +4,8 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror, Segment
-from ..kernels.contact.clear_elements import add_hessian, find_hessians
+from ..kernels.contact.clear_elements import add_hessian, add_secants, find_hessians
+from ..kernels.terms.contact import CONTACT
 from ..model.host_values import host_values
 from .search import HALVINGS, Search
 
@@ -124,11 +125,13 @@ class ContactSystem(CorrectedSystem):
     The curvature of contact has no bound, so no constant matrix is an upper bound of the Hessian. D is the sum of the blocks of
     vertices near colliders, of the matrix of pairs of triangles and meshes, and of that of pairs of self-contact. A copy where
     φ rose is ``careful`` in the next 4 iterations, after a second rise in 16, and so on: w is then also shortened until φ
-    falls. Without :meth:`start`, all copies always are.
+    falls. In other copies the blocks of contact are those of :func:`warpcloth.kernels.contact.clear_elements.add_secants`.
+    Without :meth:`start`, all copies always are careful.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         x: x̃ (N,) [m].
+        gradient: ∇φ (N,) [N] at the d of :meth:`correct`; the caller's array, read only.
         linear: Solves with A, ``solve(b, x)``.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia [1/s²].
@@ -138,24 +141,23 @@ class ContactSystem(CorrectedSystem):
         careful: Which copies are careful, (B,) booleans.
     """
 
-    def __init__(self, model, x, linear, sums, s, pairs=None):
+    def __init__(self, model, x, gradient, linear, sums, s, pairs=None):
         super().__init__(model, linear)
         self.x, self._pairs = x, pairs
         free = model.coordinate_mobility().reshape(-1, 3) > 0.0
-        self._touching = [
-            (elements, model.kernel(add_hessian, elements.term, model.dtype))
-            for elements in model.terms
-            if elements.collider is not None and not elements.on_faces
-        ]
+        touching = [elements for elements in model.terms if elements.collider is not None and not elements.on_faces]
+        self._touching = [(elements, self._kernel_of(elements.term)) for elements in touching]
         self._faces = [_FaceMatrix(model, elements, free) for elements in model.terms if elements.on_faces]
+        self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
         self._search = Search(model, x, sums, s, pairs)
         self._held = np.flatnonzero(~free.all(axis=1))
         self._moves = (free[:, :, None] & free[:, None, :])[self._held]
         self._blocks = Mirror(wp.zeros(model.count, dtype=model.mat33, device=model.device))
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
         self._active = Mirror(model.scalars(wp.int32))
+        self.careful, self._marked = np.ones(model.copies, dtype=bool), np.zeros(model.copies, dtype=bool)
+        self._marks = Mirror(model.scalars(wp.int32))  # the careful copies on the device
         self.record()
-        self.careful = np.ones(model.copies, dtype=bool)
         self._left, self._more = (np.zeros(model.copies, dtype=int) for _ in range(2))
         self._start = np.zeros(model.copies)
 
@@ -166,10 +168,16 @@ class ContactSystem(CorrectedSystem):
         self._begin = Segment(device, search.launch_again)
         self._shorten = Segment(device, lambda: search.launch(self._active.array))
 
+    def _kernel_of(self, term):
+        """Returns the kernel that adds the blocks of a term."""
+        return self.model.kernel(*((add_secants,) if term is CONTACT else (add_hessian, term)), self.model.dtype)
+
     def _launch_assemble(self):
         self._blocks.array.zero_()
         for elements, kernel in self._touching:
             given = [*elements.arguments, elements.clear, self.x, self._search.correction]
+            if elements.term is CONTACT:
+                given += [self._gradient, self._inertia, self._marks.array, self.model.per_copy]
             self.model.launch(kernel, elements.count, given, [self._blocks.array])
         for faces in self._faces:
             faces.launch(self.x, self._search.correction)
@@ -186,9 +194,12 @@ class ContactSystem(CorrectedSystem):
         self._left = np.where(rose, self._more, self._left - 1)
         self.careful = self._left > 0
 
-    def correct(self, d, gradient, w, active):
+    def correct(self, d, w, active):
         """Replaces w = A⁻¹ ∇φ by (A + D)⁻¹ ∇φ at d, for careful copies times a step length."""
         wp.copy(self._search.correction, d)
+        if (self.careful != self._marked).any():
+            self._marked[:] = self.careful
+            self._marks.write(self.careful)
         self._assemble()
         blocks = self._blocks.read()
         blocks[self._held] = np.where(self._moves, blocks[self._held], 0.0)
@@ -210,7 +221,7 @@ class ContactSystem(CorrectedSystem):
                 if J is not None:
                     q += (J.T @ (D @ (J @ p.ravel()))).reshape(-1, 3)
 
-            b = gradient.numpy().astype(np.float64)
+            b = self._gradient.numpy().astype(np.float64)
             first = self._dot(b, found)
             self._start = np.maximum(self._start, first)
             found, _ = self._solve(add_product, b, found, active, self.careful | (first <= NEAR**2 * self._start))

@@ -130,12 +130,12 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
             factorise_copies(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
         )
         self.factorise_seconds = self._linear.seconds
+        self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
         self._contact = None
         if model.colliders is not None or self.pairs is not None:
-            given = model, self.state.x, self._linear, self.sums, self.inertia.s, self.pairs
+            given = model, self.state.x, self.gradient, self._linear, self.sums, self.inertia.s, self.pairs
             self._contact = ContactSystem(*given)
         self._gradient_of = plan(model).gradient(corrected=True)
-        self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
         self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._gravity_scale = GravityScale(model)
@@ -170,7 +170,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         if self._contact:
             if self._accelerated:
                 self._contact.note(self._accelerated.stayed())
-            self._contact.correct(self.correction, self.gradient, self.w, active)
+            self._contact.correct(self.correction, self.w, active)
         if self._accelerated:
             self._accelerated.propose(active)
         self._move()
