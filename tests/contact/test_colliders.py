@@ -466,7 +466,7 @@ def test_a_frame_with_one_test_has_the_bits_of_its_steps(name, device, monkeypat
         for _ in range(4):
             other.step()
         near.append(int(one.clear_steps.near.numpy()[0]))
-        assert (one.state.x.numpy() == other.state.x.numpy()).all() and near[-1] == other.clear_steps.near.numpy()[0]
+        assert (one.state.x.numpy() == other.state.x.numpy()).all() and near[-1] >= other.clear_steps.near.numpy()[0]
     assert near[0] == 0 and near[-1] == 1 and one.colliders.steps.numpy() == other.colliders.steps.numpy() == [64]
 
 

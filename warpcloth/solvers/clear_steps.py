@@ -164,7 +164,7 @@ class ClearSteps(TwinSteps):
 
         The test before the steps assumes that a vertex moves by twice its prediction over all of them. That after each step
         compares its end with the positions before the first one: the ball of a vertex is convex, so that it contains the motion
-        if it contains the ends of all steps. If one fails, all steps are taken again, each with its own tests.
+        if it contains the ends of all steps. If one fails, all steps are taken again with contact.
         """
         self._launch_look(steps)
         wp.capture_if(self.near, None, partial(self._launch_all_clear, steps))
@@ -177,7 +177,7 @@ class ClearSteps(TwinSteps):
     def _launch_all_again(self, touching, steps):
         self._launch_restore()
         for _ in range(steps):
-            self._launch_step(touching)
+            self._launch_parts(touching)
 
     def _launch_look(self, steps=1):
         """Launches the test before a number of steps, and saves the state."""
