@@ -1,4 +1,4 @@
-"""Factories of CPU kernels over contact with colliders: elements of one vertex, most of which have no force.
+"""Factories of kernels over contact with colliders. On the CPU they skip elements of one vertex that have no force.
 
 ``clear`` is the distance that the vertex of an element can move from x̃ without a force [m]. It is 0 or less where a force is
 possible at x̃. Elements with a shorter correction d are skipped before their rest state is read.

@@ -245,9 +245,12 @@ def add_stored(
 ):
     """Kernel over elements of contact: work of the filter += the change of their energies in a step that it shortened."""
     e = wp.tid()
-    i = stencil[e, 0]
-    if cuts[i] == NOW:
-        of_filter[i] = of_filter[i] + energies[e] - before[e]
+    cut = wp.bool(False)
+    for k in range(stencil.shape[1]):
+        if cuts[stencil[e, k]] == NOW:
+            cut = True
+    if cut:
+        wp.atomic_add(of_filter, stencil[e, 0], energies[e] - before[e])
     before[e] = energies[e]
 
 

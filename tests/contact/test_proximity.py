@@ -179,18 +179,22 @@ def test_lists_of_what_has_moved_are_those_of_all(mesh, device):
     """To the bit, of copies in which few or all vertices move; of a list that has too little room the number is right."""
     rng, skin = np.random.default_rng(5), 0.03
     model, found = proximity(mesh, 0.02, skin, device, copies=2)
-    other = Proximity(model, 0.02, skin)
+    other, lost = (Proximity(model, 0.02, skin) for _ in range(2))
     lift = np.array([0.0, 1.0, 0.0])
     x = np.concatenate([folded(mesh, rng, 0.02) + each * lift for each in (0.0, 2.0)])
     detect(found, x)
+    detect(lost, x)
     for moving in (0.05, 0.1, 1.0, 0.0, 0.1):
         x += rng.uniform(-1.0, 1.0, 3) + 0.5 * skin * (rng.random((len(x), 1)) < moving) * rng.uniform(-1.0, 1.0, x.shape)
         positions = model.array(x, model.vec3)
-        found.moved(positions, 0.25)
-        found.launch_moved(positions)
-        if found.overflowed:
-            found.grow()
-            found.launch(found.found)
+        lost.listed.fill_(np.nan)  # as in a run that is resumed
+        for each in (found, lost):
+            each.moved(positions, 0.25)
+            each.launch_moved(positions)
+            if each.overflowed:
+                each.grow()
+                each.launch(each.found)
+        assert (found.found.numpy() == lost.found.numpy()).all()
         detect(other, found.found.numpy())
         count = other.counts.numpy().sum()
         for one, same in zip((found.counts, found.rows), (other.counts, other.rows), strict=True):

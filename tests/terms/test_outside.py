@@ -12,6 +12,7 @@ from support.outside import FILES, Plane
 from support.rows import slow_but
 from support.steps import after_one_step, newton_step
 from warpcloth import terms
+from warpcloth.base import extensions
 from warpcloth.solvers import SOLVERS
 from warpcloth.terms.declared import Declared, indices, quantity
 from warpcloth.usd import read_scene, write_scene
@@ -29,6 +30,13 @@ def scene(n: int = 6):
     return wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=50.0), plane], pins=[0], duration=0.1)
 """
 )
+
+
+@pytest.fixture(autouse=True)
+def forgotten(monkeypatch):
+    """What a test registers is no extension of later tests of the process."""
+    monkeypatch.setattr(extensions, "_names", set())
+    monkeypatch.setattr(extensions, "_files", set())
 
 
 @pytest.fixture

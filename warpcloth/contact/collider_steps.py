@@ -83,7 +83,7 @@ class ColliderSteps:
         self.correction, self.he = None, h
         self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
-        self._spare, self._reads, self._again = None, False, False
+        self._spare, self._face_spares, self._reads, self._again = None, {}, False, False
         self.least = FLOOR * declared.distance
         # Midpoint evaluates forces at the middle of a step, other integrators at its end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
@@ -116,6 +116,7 @@ class ColliderSteps:
         term = elements.term.bounded if self.bounded else elements.term
         if elements.on_faces:
             return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=self._refresh_of_faces(elements, state))
+        anchors = None
         if elements.term is FRICTION:
             anchors = self.anchors[c] = state.add(f"anchors on collider {c}", self.anchor_rows[c])
         if declared.facets[c]:
@@ -123,7 +124,7 @@ class ColliderSteps:
                 of_mesh = self.meshes.friction(elements, float(declared.friction[c]), anchors)
             else:
                 of_mesh = self.meshes.contact(elements)
-            launch = partial(self._on_mesh, of_mesh, state.v)
+            launch = partial(self._on_mesh, of_mesh, anchors, state.v)
         elif elements.term is FRICTION:
             kernel = model.kernel(anchor_vertices, model.dtype, self.bounded)
             launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
@@ -141,6 +142,7 @@ class ColliderSteps:
         """The refresh of contact or friction of triangles with a mesh; None for an equilibrium, which has neither."""
         if self.face_steps is None:
             return None
+        anchors = None
         if elements.term in FRICTIONS:
             c, steps = elements.collider, self.face_steps
             anchors = self.face_anchors[c] = state.add(f"anchors of triangles on collider {c}", steps.anchors(elements))
@@ -149,7 +151,8 @@ class ColliderSteps:
             launch = self.face_steps.contact(elements)
 
         def launch_on_faces(_model, elements, _moment):
-            launch(elements, elements.refresh.arrays, self.x_before, state.v)
+            with self._kept(anchors, self._face_spares.get(elements.collider)):
+                launch(elements, elements.refresh.arrays, self.x_before, state.v)
 
         return Refresh(STEP, launch_on_faces, self.face_steps.arrays(elements))
 
@@ -163,8 +166,9 @@ class ColliderSteps:
         if launch is not None:
             launch(model, elements)
 
-    def _on_mesh(self, launch, v, model, elements):
-        launch(elements, self.x_before, v)
+    def _on_mesh(self, launch, anchors, v, model, elements):
+        with self._kept(anchors, self._spare):
+            launch(elements, self.x_before, v)
 
     def _pose_elements(self, kernel, c, v, model, elements):
         given = [elements.stencil, self.shapes, *model.free_gravity, self.x_before, v, self.poses]
@@ -172,12 +176,20 @@ class ColliderSteps:
         model.launch(kernel, elements.count, given, [elements.rest])
 
     def _anchor(self, kernel, c, anchors, friction, model, elements):
-        if self._reads:
-            wp.copy(self._spare, anchors)
-            anchors = self._spare
         given = [elements.stencil, self.shapes, self.x_before, self.poses]
         given += [c, elements.per_copy, model.colliders.distance, friction]
-        model.launch(kernel, elements.count, given, [anchors, elements.rest])
+        with self._kept(anchors, self._spare):
+            model.launch(kernel, elements.count, given, [anchors, elements.rest])
+
+    @contextmanager
+    def _kept(self, anchors, spare):
+        """Sets anchors, or None, back at the end of this context if it is within :meth:`reading_anchors`."""
+        if anchors is None or not self._reads:
+            yield
+            return
+        wp.copy(spare, anchors)
+        yield
+        wp.copy(anchors, spare)
 
     @contextmanager
     def reading_anchors(self):
@@ -192,6 +204,7 @@ class ColliderSteps:
         """Allocates what :meth:`reading_anchors` needs."""
         if self._spare is None:
             self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
+            self._face_spares = {c: wp.zeros_like(anchors) for c, anchors in self.face_anchors.items()}
 
     def launch_release(self):
         """Launches the removal of all anchors, for a step without contact."""

@@ -187,19 +187,18 @@ class Proximity:
         So the pairs of a copy do not depend on other copies. On the CPU the list of a single piece is made anew where vertices
         have moved, see :mod:`warpcloth.kernels.contact.list_again`. Follows :meth:`moved`.
         """
+        model = self.model
         if self._by_parts:
-            wp.capture_if(self._stale, self._launch_all_moved, self._launch_parts, x=x)
+            given = [x, self.copies, self._pieces, model.per_copy, list_again.PART * self.skin]
+            self._launch(list_again.take_parts, model.copies, given, [self.found, self._moved])
+            # Both give the same list, so that it does not matter whether the last one was lost, as when a run is resumed.
+            wp.capture_if(self._stale, lambda: self.launch(self.found), self._launch_parts)
         else:
-            self._launch_all_moved(x)
+            self._launch(piece_motion.take_moved, model.count, [x, self.copies, model.per_copy], [self.found])
+            self.launch(self.found)
 
-    def _launch_all_moved(self, x):
-        self._launch(piece_motion.take_moved, self.model.count, [x, self.copies, self.model.per_copy], [self.found])
-        self.launch(self.found)
-
-    def _launch_parts(self, x):
-        model, moved, N = self.model, self._moved, self.model.count
-        given = [x, self.copies, self._pieces, model.per_copy, list_again.PART * self.skin]
-        self._launch(list_again.take_parts, model.copies, given, [self.found, moved])
+    def _launch_parts(self):
+        moved, N = self._moved, self.model.count
         self._launch(list_again.mark_items, self._triangles + self._edges, [self._surface, self.found], [moved])
         wp.copy(self.listed, self.found)
         self._launch_search(self.found, moved)

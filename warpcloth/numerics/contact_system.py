@@ -190,7 +190,7 @@ class ContactSystem(CorrectedSystem):
 
     def note(self, rose):
         """Notes in which copies φ rose in the last iteration, (B,) booleans."""
-        self._more = np.where(rose, 4 * self._more, self._more)
+        self._more = np.where(rose, np.minimum(4 * self._more, ITERATIONS), self._more)
         self._left = np.where(rose, self._more, self._left - 1)
         self.careful = self._left > 0
 

@@ -170,7 +170,7 @@ def _positions(scene, measured, count):
     if len(sequence.mesh.points) != count:
         raise ValueError(f"{where}: has {len(sequence.mesh.points)} vertices; it must have {count}, one for each of 'vertices'")
     if sequence.times is None:
-        raise ValueError(f"{where}: has no times; it must have them, or give fps (--fps)")
+        raise ValueError(f"{where}: has no times; open it with open_sequence(path, fps=…), or give --fps on the command line")
     sequence = to_up_axis(sequence, scene.mesh.up_axis, sequence.up_axis)
     wanted = np.asarray(sequence.times) * scene.fps
     frames = np.rint(wanted).astype(int)

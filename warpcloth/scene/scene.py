@@ -325,17 +325,17 @@ class Scene:
             if collider.friction:
                 found.append(VertexFriction(name=f"friction on {collider.label}", **given))
             if self.contact.elements == "triangles" and isinstance(collider, MeshCollider):
-                found += self._face_terms(c, collider)
+                found += self._face_terms(c, collider, self.contact)
         return tuple(found)
 
-    def _face_terms(self, c, collider):
+    def _face_terms(self, c: int, collider: MeshCollider, contact: Contact) -> list[FaceContact]:
         """The terms of the triangles that have a free vertex, with the mesh c."""
         free = ~np.isin(self.mesh.triangles, self.fixed).all(axis=1)
         if not free.any():
             return []
         given: dict[str, Any] = {"triangles": self.mesh.triangles[free], "collider": c}
         given["areas"] = np.nan_to_num(self.mesh.triangle_areas[free])
-        given |= {"stiffness": self.contact.stiffness, "distance": self.contact.distance}
+        given |= {"stiffness": contact.stiffness, "distance": contact.distance}
         names = f"contact of triangles with {collider.label}", f"friction of triangles on {collider.label}"
         found = [FaceContact(name=names[0], facet=pair, **given) for pair in range(PAIRS)]
         return found + ([FaceFriction(name=names[1], **given)] if collider.friction else [])
