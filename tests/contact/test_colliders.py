@@ -452,6 +452,27 @@ def test_a_step_with_nothing_near_has_few_launches_more(name):
     assert without < with_contact <= without + 6
 
 
+@pytest.mark.parametrize("elements", ("vertices", "triangles"))
+def test_a_record_does_not_change_friction_on_a_mesh(elements):
+    """A recorded run refreshes contact in every step, and no more than once where contact begins, on a mesh that deforms."""
+    corners = np.array([[-2.0, 0.0, -2.0], [2.0, 0.0, -2.0], [2.0, 0.0, 2.0], [-2.0, 0.0, 2.0]])
+    widening = [corners * [1.0 + 0.02 * frame, 1.0, 1.0] for frame in range(13)]
+    floor = wc.MeshCollider(widening, [[0, 2, 1], [0, 3, 2]], friction=0.5)
+    grid = wc.Mesh.grid(4, 4, size=0.3)
+    scene = wc.Scene(
+        grid,
+        density=0.15,
+        terms=[wc.Spring(stiffness=100.0)],
+        positions=grid.points + np.array([0.2, 0.03, 0.0]),
+        colliders=[floor],
+        contact=wc.Contact(distance=R, stiffness=1e5, elements=elements),
+        duration=0.2,
+    )
+    solver = wc.XPBD(substeps=4, iterations=5)
+    plain, recorded = (wc.simulate(scene, solver, dtype="float64", record=record) for record in ((), "energies"))
+    assert (plain.points == recorded.points).all() and plain.points[-1, :, 1].max() < 0.03
+
+
 @pytest.mark.parametrize("name", ("pbd", "xpbd"))
 def test_a_frame_with_one_test_has_the_bits_of_its_steps(name, device, monkeypatch):
     """A sheet falls onto a ball: frames in which nothing is near, one in which contact begins, and frames with contact."""

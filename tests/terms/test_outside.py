@@ -34,7 +34,7 @@ def scene(n: int = 6):
 
 @pytest.fixture(autouse=True)
 def forgotten(monkeypatch):
-    """What a test registers is no extension of later tests of the process."""
+    """Later tests of the process do not take for an extension what a test registers."""
     monkeypatch.setattr(extensions, "_names", set())
     monkeypatch.setattr(extensions, "_files", set())
 
