@@ -37,6 +37,8 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .run.equilibrium import equilibrium as equilibrium
     from .run.fit import Fit as Fit
     from .run.fit import fit as fit
+    from .run.readings import Markers as Markers
+    from .run.readings import Reading as Reading
     from .run.simulate import Animation as Animation
     from .run.simulate import simulate as simulate
     from .scene.air import Air as Air
@@ -82,6 +84,8 @@ _MODULES = {
     "equilibrium": "run.equilibrium",
     "Fit": "run.fit",
     "fit": "run.fit",
+    "Markers": "run.readings",
+    "Reading": "run.readings",
     "Animation": "run.simulate",
     "simulate": "run.simulate",
     "Air": "scene.air",

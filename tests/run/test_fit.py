@@ -1,12 +1,17 @@
-"""Fitting parameters to motions: what comes back, how uncertain it is said to be, what cannot be told."""
+"""Fitting parameters to motions and rest shapes: what comes back, how uncertain it is said to be, what cannot be told."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
+from scipy.stats import binomtest
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.cli import main
+from warpcloth.scenes import catenary, chain, loop
 from warpcloth.scenes.hanging import scene as hanging
 
 SOLVER = wc.Newton(substeps=4, integrator="midpoint", tolerance=1e-10)
@@ -98,12 +103,180 @@ def test_the_command_reads_a_file_by_its_times(tmp_path, capsys):
     assert "seen.npz: has 16 vertices; it must have 8, one for each of 'vertices'" in capsys.readouterr().err
 
 
-SEEN = np.zeros((3, 2, 3))
+@pytest.mark.slow
+@pytest.mark.host
+def test_intervals_contain_the_true_value_as_often_as_they_say():
+    """Of 50 noisy motions, by the binomial distribution; and errors are as large as they say, to 4/√100."""
+    scene = replace(weight(), duration=12 / 60)
+    solver = wc.Newton(substeps=1, integrator="midpoint", tolerance=1e-10)
+    true = replace(scene, terms=[wc.Spring(stiffness=STIFFNESS)])
+    seen = wc.simulate(true, solver, dtype="float64").points[1:, 1:] * [np.nan, 1.0, np.nan]  # 12 numbers
+    inside, errors = [], []
+    for seed in range(50):
+        noise = np.random.default_rng(seed).normal(scale=NOISE, size=seen.shape)
+        found = wc.fit(scene, solver, {"Spring.stiffness": 0.8 * STIFFNESS}, seen + noise, [1])
+        low, high = found.intervals["Spring.stiffness"]
+        inside.append(low < STIFFNESS < high)
+        errors.append(np.log(found.parameters["Spring.stiffness"] / STIFFNESS) / found.errors["Spring.stiffness"])
+    assert binomtest(sum(inside), 50, 0.95).pvalue > 0.01, sum(inside)
+    # The square of a variable of Student's t of ν degrees of freedom has the mean ν/(ν − 2).
+    assert np.mean(np.square(errors)) == pytest.approx(11 / 9, rel=4.0 / np.sqrt(100.0))
+
+
+def hung(k, links=20, weight=1.0, length=1.2):
+    """Sag of the scene `catenary` of few springs, by the horizontal tension T, of which the ends are 1 m apart.
+
+    Spring i from the middle on carries V = wh(i − ½), with h its length at rest, and has F = √(T² + V²) and the length h + F/k.
+    """
+    h = length / links
+    V = weight * h * (np.arange(links // 2) + 0.5)
+
+    def springs(T):
+        return h / np.hypot(T, V) + 1.0 / k
+
+    low, high = 1e-6, 1e3
+    for _ in range(200):
+        T = 0.5 * (low + high)
+        low, high = (T, high) if 2.0 * (springs(T) * T).sum() < 1.0 else (low, T)
+    return (springs(T) * V).sum(), T
+
+
+DEEP = wc.Reading(lambda rest: -rest.points[:, 1].min(), 0.0)
+PULL = wc.Reading(lambda rest: -rest.reactions[0, 0], 0.0)
+LONG = wc.Reading(lambda rest: -rest.points[-1, 1], 0.0)
+
+
+@pytest.mark.host
+@pytest.mark.parametrize(
+    ("scene", "reading", "of_stiffness", "k"),
+    [
+        (chain.scene(), LONG, lambda k: 1.0 + 0.01 * 9.81 / k * 20 * 21 / 2, 1e3),
+        (catenary.scene(links=20), DEEP, lambda k: hung(k)[0], 1e3),
+        (catenary.scene(links=20), PULL, lambda k: hung(k)[1], 1e3),
+    ],
+    ids=["chain", "catenary", "its tension"],
+)
+def test_one_reading_gives_a_stiffness(scene, reading, of_stiffness, k):
+    """At rest. The error is that of the reading over its derivative by ln k, in closed form."""
+    value, sigma = of_stiffness(k), 1e-6
+    slope = (of_stiffness(k * np.exp(1e-4)) - of_stiffness(k * np.exp(-1e-4))) / 2e-4
+    found = wc.fit(scene, None, {"Spring.stiffness": 0.7 * k}, replace(reading, value=value, sigma=sigma), record="reactions")
+    assert found.parameters["Spring.stiffness"] == pytest.approx(k, rel=1e-6)
+    assert found.errors["Spring.stiffness"] == pytest.approx(sigma / abs(slope), rel=1e-5)
+    low, high = found.intervals["Spring.stiffness"]
+    assert np.log(high / low) == pytest.approx(2.0 * 1.96 * found.errors["Spring.stiffness"], rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.host
+def test_the_depth_of_a_heart_loop_gives_its_bending_stiffness():
+    """That of the elastica for Γ = 100. The mesh of 128 edges hangs 0.27 % less deep, and D of that depth is 1.2 % less."""
+    true = 9 / 8 * 1e-6
+    depth = wc.Reading(lambda rest: -rest.points[:, 1].min(), 0.184043, 1e-4)
+    found = wc.fit(loop.scene(elements=128, length=1.0), None, {"QuadraticBending.stiffness": 0.7 * true}, depth)
+    assert found.parameters["QuadraticBending.stiffness"] == pytest.approx(true, rel=0.02)
+
+
+def disc(D=1e-6, rings=5):
+    """A disc of 30 cm of hexagonal rings over a support of 18 cm, which starts to fall in six folds."""
+    turns = [np.arange(6 * k) / (6 * max(k, 1)) for k in range(rings + 1)]
+    turns[0] = np.zeros(1)
+    r = np.repeat(np.arange(rings + 1) * 0.15 / rings, [len(each) for each in turns])
+    a = 2.0 * np.pi * np.concatenate(turns)
+    flat = np.stack([r * np.cos(a), 0.0 * r, r * np.sin(a)], axis=1)
+    mesh = wc.Mesh(flat, Delaunay(flat[:, [0, 2]]).simplices)
+    over = np.maximum(r - 0.091, 0.0)
+    start = flat + np.stack([-0.3 * over * np.cos(a), -over * (0.6 + 0.3 * np.cos(6 * a)), -0.3 * over * np.sin(a)], axis=1)
+    terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=D)]
+    return wc.Scene(mesh, density=0.1, positions=start, terms=terms, pins=np.flatnonzero(r < 0.091))
+
+
+def drape_coefficient(rest):
+    """The share of the ring beyond the support that the shadow of the edge encloses."""
+    x, z = rest.points[-30:, 0], rest.points[-30:, 2]
+    shadow = 0.5 * abs(np.dot(x, np.roll(z, -1)) - np.dot(z, np.roll(x, -1)))
+    return (shadow / np.pi - 0.09**2) / (0.15**2 - 0.09**2)
+
+
+@pytest.mark.host
+def test_a_drape_coefficient_gives_a_bending_stiffness():
+    """Of the many rest shapes of a drape, on the branch on which it starts."""
+    start = 3e-5
+    rest = wc.equilibrium(disc(2e-5), start=wc.equilibrium(disc(start)).points)
+    assert 0.5 < drape_coefficient(rest) < 0.72
+    reading = wc.Reading(drape_coefficient, drape_coefficient(rest), 0.01)
+    found = wc.fit(disc(), None, {"QuadraticBending.stiffness": start}, reading)
+    assert found.parameters["QuadraticBending.stiffness"] == pytest.approx(2e-5, rel=1e-4)
+    assert 0.01 < found.errors["QuadraticBending.stiffness"] < 0.2
+
+
+def markers(scene, points):
+    """Seven points of triangles of a scene, and their positions at points (F, n, 3)."""
+    random = np.random.default_rng(1)
+    triangles = random.choice(len(scene.mesh.triangles), 7, replace=False)
+    weights = random.dirichlet(np.ones(3), 7)
+    return triangles, weights, np.einsum("kc,fkci->fki", weights, points[:, scene.mesh.triangles[triangles]])
+
+
+@pytest.mark.parametrize("bound", slow_but([True, False], [True, False]))
+def test_markers_in_a_file_give_the_parameters(bound, tmp_path, capsys):
+    """Bound to triangles by where they are at the start; or free points, by their distances to the cloth."""
+    scene = hanging(n=4)
+    points = wc.simulate(scene, SOLVER, frames=8, dtype="float64").points
+    _, _, seen = markers(scene, points)
+    lines = ["time, id, x, y, z" if bound else "time, x, y, z"]
+    for frame, positions in enumerate(seen):
+        for k, at in enumerate(positions):
+            lines.append(", ".join(map(repr, [frame / scene.fps, *([f"m{k}"] if bound else []), *at.tolist()])))
+    path = tmp_path / "seen.csv"
+    path.write_text("\n".join(lines).replace("'", ""))
+    words = ["fit", "hanging", str(path), "-p", "n=4", "--start", "Spring.stiffness=800"]
+    words += ["-s", "substeps=4", "integrator=midpoint", "tolerance=1e-10", "--json"]
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["parameters"]["Spring.stiffness"] == pytest.approx(1000.0, rel=1e-5)
+    assert found["residual"] < 1e-8
+
+
+def test_markers_and_readings_together(device):
+    """Each is divided by its sigma, so a second one narrows the intervals."""
+    scene = sheet(400.0, 3e-4)
+    run = wc.simulate(scene, SOLVER, device=device, dtype="float64", record="energies")
+    triangles, weights, seen = markers(scene, run.points[1:])
+    data = [
+        wc.Markers(positions=seen, triangles=triangles, weights=weights, sigma=1e-3),
+        wc.Reading(lambda each: each.energies["Spring"][-1], run.energies["Spring"][-1], sigma=1e-4),
+    ]
+    found = wc.fit(sheet(1.0, 1.0), SOLVER, {**TRUE, "Spring.stiffness": 300.0}, data, device=device, record="energies")
+    assert found.parameters == pytest.approx(TRUE, rel=1e-6)
+    alone = wc.fit(sheet(1.0, 1.0), SOLVER, TRUE, data[:1], device=device)
+    assert all(found.errors[name] < alone.errors[name] for name in TRUE), "each datum narrows the interval"
+    assert len(found.residuals) == scene.frames and found.freedom == np.inf
+
+
+SEEN, K = np.zeros((3, 2, 3)), {"Spring.stiffness": 1.0}
+FILES = {
+    "empty.csv": "time,x,y,z\n",
+    "short.csv": "time,x,y,z\n0,1,2\n",
+    "words.csv": "time,x,y,z\n0,left,0,0\n",
+    "late.csv": "time,x,y,z\n0.001,0,0,0\n",
+}
 
 
 @pytest.mark.parametrize(
     ("start", "seen", "sentence"),
     [
+        (K, [wc.Markers(positions=SEEN, vertices="all"), LONG], r"measured\[1\] has no sigma; each of several data must have"),
+        (K, [wc.Markers(positions=SEEN)], r"measured\[0\]: the mesh has no triangles for markers"),
+        (
+            K,
+            replace(LONG, function=lambda run: run.points, sigma=1.0),
+            r"measured\[0\].function has shape \(31, 2, 3\); it must be",
+        ),
+        (K, "empty.csv", "empty.csv: has no rows"),
+        (K, "short.csv", "short.csv, line 2: has 3 values; it must have 4"),
+        (K, "words.csv", "words.csv, line 2: x is 'left'; it must be a number"),
+        (K, "late.csv", "late.csv: has no row at the time of a frame after the start"),
         ({}, SEEN, "start is {}; it must be a dict of parameters"),
         ({"Spring.stiffness": 0.0}, SEEN, r"start\['Spring.stiffness'\] is 0.0; it must be a finite number above 0"),
         ({"Spring.stiffness": 1.0}, SEEN[:, :1], r"measured has shape \(3, 1, 3\); it must be \(F, 2, 3\)"),
@@ -111,6 +284,9 @@ SEEN = np.zeros((3, 2, 3))
         ({"Spring.stifness": 1.0}, SEEN, r"vary\['Spring.stifness'\] names nothing in this scene"),
     ],
 )
-def test_refusals(start, seen, sentence):
+def test_refusals(start, seen, sentence, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=sentence):
         wc.fit(weight(), SOLVER, start, seen)

@@ -1,4 +1,4 @@
-"""The command ``fit``: finds parameters of a scene with which it moves as measured."""
+"""The command ``fit``: finds parameters of a scene with which it moves, or rests, as measured."""
 
 from dataclasses import asdict, replace
 
@@ -15,11 +15,13 @@ from .terminal import check_writable
 EPILOG = """\
 MEASURED is an animation of the scene's vertices, or of those of --vertices, in their order: a USD stage, a folder of .obj, .ply
 or .off files, a pattern such as "frames/*.obj", an .npz file. Its times count from the start of the scene, and its frames at
-the times of frames of the scene are used. Positions that are NaN count as not measured. --start names the parameters and the
-values to start from. Errors are one standard deviation, relative to the value; intervals contain the true value with a
-probability of 95 %.
+the times of frames of the scene are used. Positions that are NaN count as not measured. Or MEASURED is a .csv file of markers
+with the columns time, id, x, y, z [s, m]: rows at time 0 bind the markers to the nearest points of the cloth at its start.
+Without the column id, rows are free points on the cloth. --start names the parameters and the values to start from. Errors are
+one standard deviation, relative to the value; intervals contain the true value with a probability of 95 %.
 
   warpcloth fit hanging seen.usdc --start Spring.stiffness=300 QuadraticBending.stiffness=1e-4 --frames 30
+  warpcloth fit hanging markers.csv --start QuadraticBending.stiffness=1e-4 --at-rest
 """
 
 
@@ -37,6 +39,7 @@ def add_arguments(parser):
     )
     add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
+    parser.add_argument("--at-rest", action="store_true", help="fit the equilibrium; all rows after time 0 show it")
     parser.add_argument("--vertices", default="all", metavar="SELECTION", help="the vertices that were measured (default: all)")
     parser.add_argument("--prim", help="path or name of the prim of MEASURED, if it has several")
     parser.add_argument("--fps", type=float, help="frames per second of MEASURED; overrides its own")
@@ -48,6 +51,13 @@ def fit(arguments):
     from ..mesh.sequences import open_sequence
     from ..run.fit import fit
 
+    markers = arguments.measured.lower().endswith(".csv")
+    if markers and (arguments.prim or arguments.fps):
+        raise ValueError("--prim and --fps are for animations, and MEASURED is a file of markers; leave them out")
+    if arguments.at_rest and not markers:
+        raise ValueError("--at-rest is given, but MEASURED is an animation; it must be a .csv file of markers")
+    if arguments.at_rest and (arguments.solver or arguments.s or arguments.plot):
+        raise ValueError("--at-rest is given with --solver, -s or --plot, which are for motions; leave them out")
     if arguments.plot:
         check_path(arguments.plot, PICTURES)
     check_writable(arguments.plot)
@@ -58,15 +68,16 @@ def fit(arguments):
         whole("frames", arguments.frames, least=1)
         scene = replace(scene, duration=arguments.frames / scene.fps)
     device = find_device(arguments.device)
-    setup = solver_setup(arguments, scene, device)
-    sequence = open_sequence(measured, prim, arguments.fps)
-    found = fit(scene, setup.solver, start, sequence, arguments.vertices, device=device, dtype=arguments.dtype)
+    setup = None if arguments.at_rest else solver_setup(arguments, scene, device)
+    seen = measured if markers else open_sequence(measured, prim, arguments.fps)
+    found = fit(scene, setup and setup.solver, start, seen, arguments.vertices, device=device, dtype=arguments.dtype)
     if arguments.plot:
         from ..chart import plot_residuals
 
         plot_residuals(arguments.plot, found, scene.fps)
     facts = {"scene": arguments.scene, "measured": measured, "scene_parameters": values}
-    facts |= {"device": str(device), "dtype": arguments.dtype, **solver_facts(arguments, setup, scene.fps)}
+    facts |= {"device": str(device), "dtype": arguments.dtype}
+    facts |= solver_facts(arguments, setup, scene.fps) if setup else {"solver": None}
     facts |= {**asdict(found), "intervals": found.intervals}
     facts |= {name: np.asarray(facts[name]).tolist() for name in ("correlation", "residuals")}
     print(json_text(facts) if arguments.json else _summary(facts, found))
@@ -75,7 +86,7 @@ def fit(arguments):
 
 def _summary(facts, found):
     width = max(map(len, found.parameters))
-    lines = [f"{facts['scene']} fitted to {facts['measured']}, {solver_line(facts)}"]
+    lines = [f"{facts['scene']} fitted to {facts['measured']}, {solver_line(facts) if facts['solver'] else 'at rest'}"]
     for name, value in found.parameters.items():
         error, (low, high) = found.errors[name], found.intervals[name]
         certain = f"± {100.0 * error:.2g} %, from {low:.5g} to {high:.5g}" if np.isfinite(error) else "not determined"
@@ -85,5 +96,6 @@ def _summary(facts, found):
         if np.isfinite(found.correlation[i, j]):
             lines.append(f"  correlation of {names[i]} and {names[j]}: {found.correlation[i, j]:.2f}")
     frames = int(np.isfinite(found.residuals).sum())
-    lines.append(f"  residual {found.residual:.4g} m RMS along an axis, over {frames} frames; {found.runs} batches were run")
+    ran = f"{found.runs} {'batches were' if facts['solver'] else 'sets of equilibria were'} run"
+    lines.append(f"  residual {found.residual:.4g} m RMS along an axis, over {frames} frames; {ran}")
     return "\n".join(lines)

@@ -1,13 +1,14 @@
 """Static equilibria: minima of the energy of a scene and its weight, without inertia."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
-from ..base.checks import choice, number, whole
+from ..base.checks import array, choice, number, whole
 from ..base.limits import MOST_FRAMES
 from ..base.turns import in_turn
 from ..base.types import Precision
@@ -66,6 +67,8 @@ def equilibrium(
     dtype: Precision = "float64",
     linear: Literal["factorised", "cg"] = "factorised",
     record: str | Sequence[str] = (),
+    vary: Mapping[str, ArrayLike] | None = None,
+    start: ArrayLike | None = None,
 ) -> Equilibrium:
     """Finds the shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins in their final positions.
 
@@ -103,6 +106,8 @@ def equilibrium(
         dtype: ``"float32"`` or ``"float64"``.
         linear: ``"factorised"``, which stiff and slender cloth needs, or ``"cg"``.
         record: ``"energies"``, ``"reactions"`` or both, to be included in the result.
+        vary: Values in place of those of the scene, one each, as for one copy; see :class:`warpcloth.model.model.Model`.
+        start: Positions from which it descends, (n, 3) [m], in place of those of the scene, from which gravity still counts.
 
     Returns:
         :class:`Equilibrium`.
@@ -126,9 +131,11 @@ def equilibrium(
     choice("linear", linear, ("factorised", "cg"))
     record = checked_record(record)
     scene = _with_colliders_at_rest(scene)
-    model = scene.build(device=device, dtype=dtype)
+    model = scene.build(device=device, dtype=dtype, vary=vary)
     refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
     base = wp.clone(model.positions)
+    if start is not None:
+        base.assign(array("start", start, (model.count, 3)))
     contact = None
     if model.colliders is not None and model.colliders.meshes is not None:
         contact = ColliderSteps(model, State(base, model.vectors(), 1), 0.0, 1, 1.0, resting=True)

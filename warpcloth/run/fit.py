@@ -1,44 +1,52 @@
-"""Fits parameters of a scene to a measured motion, by least squares with differences from one batch."""
+"""Fits parameters of a scene to what was measured, by least squares with differences from one batch."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping
+from collections.abc import Sequence as List
 from dataclasses import dataclass
-from os import PathLike
+from os import PathLike, fspath
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..analysis.compare import to_up_axis
-from ..base.checks import numeric, shown
+from ..base.checks import shown
 from ..base.types import FilePath, Precision
 from ..mesh.selection import distinct_vertices
 from ..mesh.sequences import Sequence, open_sequence
 from ..scene.scene import Scene
 from ..solvers.step import Step
-from .simulate import simulate
+from .equilibrium import Equilibrium, equilibrium
+from .readings import Markers, Reading, frames_at
+from .simulate import Animation, simulate
 
 _DIFFERENCE = 1e-3  # of the logarithm of a parameter, to both sides
 _TOLERANCE = 1e-8  # of the relative change of parameters and residuals
 _UNDETERMINED = 1e-5  # smallest ratio of a singular value of the Jacobian to the largest
-_SAME_TIME = 1e-6  # largest distance of a measured frame from a frame of the scene, in frames
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Parameters that were fitted to a motion.
+    """Parameters that were fitted to what was measured.
 
     Attributes:
         parameters: Estimates by name.
-        errors: Their standard errors relative to the estimates, by name; infinite if the motion does not determine them.
-        correlation: Correlation of the logarithms of the parameters, (P, P); NaN where the motion does not determine them.
-        residual: RMS distance along an axis between the measured and the fitted positions [m].
-        residuals: The same in each of the frames 1 … F, (F,) [m]; NaN in frames without a measured position.
-        runs: Number of batches that were run.
+        errors: Their standard errors relative to the estimates, by name; infinite if the data do not determine them, NaN if
+            the noise is not known, because there is no sigma and no more numbers than parameters.
+        correlation: Correlation of the logarithms of the parameters, (P, P); NaN where the data do not determine them.
+        freedom: Degrees of freedom of the estimate of the noise; infinite if data have a sigma.
+        residual: RMS of the residuals: of positions along an axis [m], of free points to the cloth [m]; divided by sigma, where
+            it is given, so that it should be about 1.
+        residuals: The same in each of the frames 1 … F, (F,), over markers; NaN in frames without any.
+        runs: Number of batches that were run, or of sets of equilibria.
         message: How the fit ended.
     """
 
     parameters: dict[str, float]
     errors: dict[str, float]
     correlation: np.ndarray
+    freedom: float
     residual: float
     residuals: np.ndarray
     runs: int
@@ -47,7 +55,11 @@ class Fit:
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
         """Intervals that contain the true values with a probability of 95 %, if errors are independent and normal."""
-        limits = {name: 1.96 * self.errors[name] for name in self.parameters}
+        from scipy.stats import t
+
+        limits = {
+            name: (t.ppf(0.975, self.freedom) if self.freedom else np.nan) * self.errors[name] for name in self.parameters
+        }
         with np.errstate(over="ignore"):
             return {
                 name: (float(value * np.exp(-limits[name])), float(value * np.exp(limits[name])))
@@ -57,30 +69,36 @@ class Fit:
 
 def fit(
     scene: Scene,
-    solver: Step,
+    solver: Step | None,
     start: Mapping[str, float],
-    measured: ArrayLike | FilePath | Sequence,
+    measured: ArrayLike | FilePath | Sequence | Markers | Reading | List[Markers | Reading],
     vertices: str | ArrayLike = "all",
     device: str = "cpu",
     dtype: Precision = "float64",
+    record: str | List[str] = (),
 ) -> Fit:
-    """Finds the positive parameters with which the motion of a scene is nearest to a measured one.
+    """Finds the positive parameters with which a scene moves, or rests, most nearly as measured.
 
-    It minimises the sum of squared distances by ``scipy.optimize.least_squares`` over the logarithms of the parameters. One
+    It minimises the sum of squared residuals by ``scipy.optimize.least_squares`` over the logarithms of the parameters. One
     batch of 2P + 1 copies gives the motion and, by central differences of 0.1 %, its derivatives. Errors follow from the
-    Jacobian J at the minimum, whose covariance is s²(JᵀJ)⁻¹, s² the mean square of the residuals. Choose a motion that is not
-    chaotic: of a cloth that crumples, a short time.
+    Jacobian J at the minimum. The covariance is (JᵀJ)⁻¹ if residuals are divided by a sigma, else s²(JᵀJ)⁻¹ with s² = Σr²/(m −
+    P). Choose a motion that is not chaotic: of a cloth that crumples, a short time. Without a solver, the scene is fitted at
+    rest. Each shape is then found by :func:`warpcloth.equilibrium`, from the one before, so of several rest shapes it follows
+    that of ``start``.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
-        solver: Its solver, with steps so small that their error is below that of the measurement.
+        solver: Its solver, with steps so small that their error is below that of the measurement; None for the equilibrium.
         start: Parameters by their name in ``vary``, such as ``"Spring.stiffness"``, and values to start from, above 0.
-        measured: Positions at frames 1 … F of the scene, (F, v, 3) [m]; NaN where there is none. Or an animation of v vertices:
-            a path or a sequence that `open_sequence` takes or returns, with times from the start of the scene on. Its frames at
-            the times of frames of the scene are used. It is turned to the up axis of the mesh of the scene.
+        measured: :class:`warpcloth.Markers`, :class:`warpcloth.Reading`, or a list of these, each with a sigma. Or, in short
+            for the markers ``vertices``, their positions at frames 1 … F of the scene, (F, v, 3) [m], NaN where there is none;
+            or an animation of v vertices: a path or a sequence that `open_sequence` takes or returns, with times from the start
+            of the scene on. Its frames at the times of frames of the scene are used. It is turned to the up axis of the mesh of
+            the scene. Or the path of a .csv file, see :meth:`warpcloth.Markers.read`.
         vertices: The v vertices that were measured, indices or a selection, in their order in ``measured``.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
+        record: What runs record for readings, such as ``"reactions"``; see :func:`warpcloth.simulate`.
 
     Returns:
         :class:`Fit`.
@@ -97,37 +115,38 @@ def fit(
         >>> seen = wc.simulate(hanging(500.0), solver, frames=20, dtype="float64").points[1:]
         >>> round(wc.fit(hanging(1.0), solver, {"Spring.stiffness": 300.0}, seen).parameters["Spring.stiffness"], 2)
         500.0
+        >>> length = wc.Reading(lambda rest: -rest.points[1, 1], value=1.00981, sigma=1e-5)  # the weight over the stiffness
+        >>> found = wc.fit(hanging(1.0), None, {"Spring.stiffness": 300.0}, length)
+        >>> round(found.parameters["Spring.stiffness"]), round(found.errors["Spring.stiffness"], 4)
+        (1000, 0.001)
     """
     from scipy.optimize import least_squares
 
-    names = _checked_names(start)
-    chosen = distinct_vertices("vertices", vertices, scene.mesh)
-    if isinstance(measured, (str, PathLike, Sequence)):
-        measured = _positions(scene, measured, len(chosen))
-    seen = numeric("measured", measured, f"have shape (F, {len(chosen)}, 3)")
-    if seen.ndim != 3 or seen.shape[1:] != (len(chosen), 3) or not 0 < len(seen) <= scene.frames:
-        raise ValueError(
-            f"measured has shape {seen.shape}; it must be (F, {len(chosen)}, 3) with F from 1 to {scene.frames}, the frames of "
-            "the scene"
-        )
-    known = np.isfinite(seen)
-    if known.sum() < len(names):
-        raise ValueError(f"measured has {known.sum()} numbers; it must have at least {len(names)}, one for each parameter")
+    names, most = _checked_names(start), 1 if solver is None else scene.frames
+    data = _bound_data(scene, measured, vertices, most, solver is None)
+    frames = most if any(each.last is None for each in data) else max(each.last for each in data)
+    of_frames = np.concatenate([each.frames for each in data])
+    if len(of_frames) < len(names):
+        raise ValueError(f"measured has {len(of_frames)} numbers; it must have at least {len(names)}, one for each parameter")
+    known_noise = data[0].sigma is not None
+    scale = np.concatenate([np.broadcast_to(each.sigma if known_noise else 1.0, len(each.frames)) for each in data])
+    options = {"device": device, "dtype": dtype, "record": record}
     runs: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    rest = None
 
     def evaluated(logs):
         """Returns residuals (m,) and their derivatives (m, P) by the logarithms of the parameters."""
+        nonlocal rest
         key = logs.tobytes()
         if key not in runs:
             changes = _DIFFERENCE * np.eye(len(logs))
-            values = np.exp(np.vstack([logs, logs + changes, logs - changes]))
-            vary = {name: values[:, k] for k, name in enumerate(names)}
-            found = simulate(scene, solver, frames=len(seen), device=device, dtype=dtype, copies=len(values), vary=vary)
-            if not found.status.ok:
-                at = ", ".join(f"{name} {value:.6g}" for name, value in zip(names, values[0], strict=True))
-                raise ValueError(f"a run with {at} failed: {found.status.message}")
-            points = np.stack([np.asarray(found.points[frame]) for frame in range(1, len(seen) + 1)], axis=1)
-            residuals = (points[:, :, chosen] - seen)[:, known]
+            vary = dict(zip(names, np.exp(np.vstack([logs, logs + changes, logs - changes])).T, strict=True))
+            if solver is None:
+                found = _rests(scene, vary, rest, options)
+                rest = found[0].points
+            else:
+                found = _motions(scene, solver, vary, frames, options)
+            residuals = np.concatenate([each.residuals(found) for each in data], axis=1) / scale
             more, less = np.split(residuals[1:], 2)
             runs[key] = residuals[0], (more - less).T / (2.0 * _DIFFERENCE)
         return runs[key]
@@ -141,13 +160,17 @@ def fit(
         gtol=None,
     )
     residuals, jacobian = evaluated(found.x)
-    errors, correlation = _errors(jacobian, residuals)
+    freedom = np.inf if known_noise else float(len(residuals) - len(names))
+    with np.errstate(invalid="ignore"):
+        variance = 1.0 if known_noise else float(np.divide(residuals @ residuals, freedom)) if freedom else np.nan
+    errors, correlation = _errors(jacobian, variance)
     return Fit(
         parameters=dict(zip(names, np.exp(found.x).tolist(), strict=True)),
         errors=dict(zip(names, errors.tolist(), strict=True)),
         correlation=correlation,
+        freedom=freedom,
         residual=float(np.sqrt(np.mean(residuals**2))),
-        residuals=_of_frames(residuals, known),
+        residuals=_of_frames(residuals, of_frames, frames),
         runs=len(runs),
         message=found.message,
     )
@@ -163,6 +186,34 @@ def _checked_names(start):
     return list(start)
 
 
+def _bound_data(scene, measured, vertices, most, resting):
+    """Returns the residuals of each of the data on a scene of ``most`` frames, or at rest."""
+    if isinstance(measured, (Markers, Reading)):
+        measured = [measured]
+    if isinstance(measured, List) and measured and all(isinstance(each, (Markers, Reading)) for each in measured):
+        named = [(f"measured[{k}]", each) for k, each in enumerate(measured)]
+    else:
+        named = [("measured", _of_vertices(scene, measured, vertices, resting))]
+    data = [each.bind(name, scene, most) for name, each in named]
+    for (name, _), each in zip(named[1:], data[1:], strict=True):
+        if each.sigma is None or data[0].sigma is None:
+            lacking = name if each.sigma is None else named[0][0]
+            raise ValueError(f"{lacking} has no sigma; each of several data must have one")
+    return data
+
+
+def _of_vertices(scene, measured, vertices, resting):
+    """Returns the markers of positions, of an animation or of a file."""
+    if isinstance(measured, (str, PathLike)) and fspath(measured).lower().endswith(".csv"):
+        if not (isinstance(vertices, str) and vertices == "all"):
+            raise ValueError(f"vertices is {shown(vertices)} and measured is a file of markers; leave vertices out")
+        return Markers.read(measured, scene, resting=resting)
+    chosen = distinct_vertices("vertices", vertices, scene.mesh)
+    if isinstance(measured, (str, PathLike, Sequence)):
+        measured = _positions(scene, measured, len(chosen))
+    return Markers(positions=measured, vertices=chosen)
+
+
 def _positions(scene, measured, count):
     """Returns the positions (F, count, 3) [m] of an animation at frames 1 … F of a scene, NaN where it has no such frame."""
     sequence = measured if isinstance(measured, Sequence) else open_sequence(measured)
@@ -172,12 +223,11 @@ def _positions(scene, measured, count):
     if sequence.times is None:
         raise ValueError(f"{where}: has no times; open it with open_sequence(path, fps=…), or give --fps on the command line")
     sequence = to_up_axis(sequence, scene.mesh.up_axis, sequence.up_axis)
-    wanted = np.asarray(sequence.times) * scene.fps
-    frames = np.rint(wanted).astype(int)
-    used = np.flatnonzero((np.abs(wanted - frames) <= _SAME_TIME) & (frames >= 1) & (frames <= scene.frames))
+    frames, used = frames_at(sequence.times, scene)
+    used = np.flatnonzero(used & (frames >= 1))
     if not len(used):
         raise ValueError(
-            f"{where}: has {len(wanted)} frames from {sequence.times[0]:g} to {sequence.times[-1]:g} s, none at the time of a "
+            f"{where}: has {len(frames)} frames from {sequence.times[0]:g} to {sequence.times[-1]:g} s, none at the time of a "
             f"frame of the scene; it must have one at a multiple of 1/{scene.fps:g} s, up to {scene.frames / scene.fps:g} s"
         )
     positions = np.full((frames[used].max(), count, 3), np.nan)
@@ -186,20 +236,43 @@ def _positions(scene, measured, count):
     return positions
 
 
-def _of_frames(residuals, known):
-    """Returns the RMS of the residuals (m,) of each frame, (F,), NaN without any; ``known`` (F, v, 3) says of which numbers."""
-    squares, counts = np.zeros(known.shape), known.sum(axis=(1, 2))
-    squares[known] = residuals**2
-    return np.sqrt(np.divide(squares.sum(axis=(1, 2)), counts, out=np.full(len(known), np.nan), where=counts > 0))
+def _motions(scene, solver, vary, frames, options) -> list[Animation]:
+    """Runs a scene with each of the values (R,) of parameters, as one batch, and returns the animations."""
+    count = len(next(iter(vary.values())))
+    found = simulate(scene, solver, frames=frames, copies=count, vary=vary, **options)
+    if not found.status.ok:
+        raise ValueError(f"a run with {_listed(vary, 0)} failed: {found.status.message}")
+    return [found.of_copy(copy) for copy in range(count)]
 
 
-def _errors(jacobian, residuals):
+def _rests(scene, vary, rest, options) -> list[Equilibrium]:
+    """Finds the equilibrium with each of the values (R,) of parameters, each from the one before, the first from ``rest``."""
+    found = []
+    for k in range(len(next(iter(vary.values())))):
+        one = {name: values[k : k + 1] for name, values in vary.items()}
+        found.append(equilibrium(scene, vary=one, start=rest, **options))
+        if not found[-1].status.ok:
+            raise ValueError(f"the equilibrium with {_listed(vary, k)} failed: {found[-1].status.message}")
+        rest = found[0].points
+    return found
+
+
+def _listed(vary, k):
+    return ", ".join(f"{name} {values[k]:.6g}" for name, values in vary.items())
+
+
+def _of_frames(residuals, frames, count):
+    """Returns the RMS of the residuals (m,) in each of ``count`` frames, NaN without any; ``frames`` (m,), -1 of none."""
+    squares = np.bincount(frames[frames >= 0], residuals[frames >= 0] ** 2, count)
+    numbers = np.bincount(frames[frames >= 0], minlength=count)
+    return np.sqrt(np.divide(squares, numbers, out=np.full(count, np.nan), where=numbers > 0))
+
+
+def _errors(jacobian, variance):
     """Returns standard errors of the logarithms (P,), infinite where they are not determined, and their correlation (P, P)."""
-    m, P = jacobian.shape
     _, sizes, rows = np.linalg.svd(jacobian, full_matrices=False)
     kept = sizes > _UNDETERMINED * sizes[0] if sizes[0] > 0.0 else np.zeros(len(sizes), dtype=bool)
     lost = (np.abs(rows[~kept]) > 1e-3).any(axis=0)
-    variance = float(residuals @ residuals) / max(m - P, 1)
     inverse = rows[kept].T / sizes[kept]
     covariance = variance * inverse @ inverse.T
     covariance[lost], covariance[:, lost] = np.nan, np.nan

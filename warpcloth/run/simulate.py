@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -154,6 +154,29 @@ class Animation:
             raise ValueError(f"the scene has no cloth {name!r}; {known}")
         first, count, _ = parts[name]
         return np.asarray(self.points)[..., first : first + count, :]
+
+    def of_copy(self, copy: int) -> "Animation":
+        """Returns the animation of one of several copies, whose arrays have no axis of copies. The status is that of all.
+
+        Raises:
+            ValueError: There is no such copy.
+        """
+        if self.points.ndim == 3:
+            whole("copy", copy, 0, 0)
+            return self
+        whole("copy", copy, 0, self.points.shape[1] - 1)
+
+        def one(values):
+            return {name: each[:, copy] for name, each in values.items()} if isinstance(values, dict) else values[:, copy]
+
+        of_frames = ("points", "velocities", "energies", "reactions", "collider_forces", "friction_forces", "cuts", "pairs")
+        given = {name: one(getattr(self, name)) for name in of_frames if getattr(self, name) is not None}
+        given |= {name: np.asarray(getattr(self, name))[copy].item() for name in ("worst_strain", "cut", "crossings")}
+        summary = self.self_contact
+        if summary is not None:
+            summary = summary._replace(kept=float(summary.kept[copy]), least_gap=float(summary.least_gap[copy]))
+        inside = tuple(each for each in self.inside if each.copy == copy)
+        return replace(self, inside=inside, self_contact=summary, **given)
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape

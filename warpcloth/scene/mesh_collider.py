@@ -164,8 +164,7 @@ class MeshCollider(Collider):
         pose = self.poses[min(frame, len(self.poses) - 1)]
         local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
         vertices = self.frames[min(frame, len(self.frames) - 1)]
-        faces = nearest_faces(local, vertices, self.triangles)
-        weights = _nearest_weights(local, vertices[self.triangles[faces]])
+        faces, weights = nearest_points(local, vertices, self.triangles)
         return local - np.einsum("kc,kci->ki", weights, vertices[self.triangles[faces]]), vertices, faces, weights
 
     def planes(self, points: np.ndarray) -> np.ndarray:
@@ -207,9 +206,14 @@ def first_extended(points):
     return frames[np.argmax(np.ptp(frames, axis=1).any(axis=1))]
 
 
+def nearest_points(points, vertices, triangles):
+    """The triangle nearest to each of points (k, 3), to within float32, (k,), and the weights (k, 3) of its nearest point."""
+    faces = _nearest_faces(points, vertices, triangles)
+    return faces, _nearest_weights(points, vertices[triangles[faces]])
+
+
 @in_turn
-def nearest_faces(points, vertices, triangles):
-    """The triangle that is nearest to each of points (k, 3), to within float32, (k,)."""
+def _nearest_faces(points, vertices, triangles):
     centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     scale = 1.0 / max(np.abs(vertices - centre).max(), np.abs(points - centre).max(initial=0.0))
     with wp.ScopedDevice(find_device("cpu")):

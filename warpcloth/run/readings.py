@@ -1,0 +1,269 @@
+"""Measurements to which :func:`warpcloth.fit` fits parameters: points on the cloth, and numbers read from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.checks import array, number, numeric, refuse
+from ..base.tables import number_in, read_table
+from ..base.types import FilePath
+from ..mesh.selection import distinct_vertices
+from ..scene.mesh_collider import nearest_points
+from ..scene.scene import Scene
+
+_SAME_TIME = 1e-6  # largest distance of a measured time from a frame of the scene, in frames
+_BOUND = 1e-9  # largest distance of the sum of weights from 1
+
+
+def frames_at(times: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the nearest frames of a scene to times (m,) [s], (m,), and whether each is at the time of a frame."""
+    wanted = np.asarray(times) * scene.fps
+    frames = np.rint(wanted).astype(int)
+    return frames, (np.abs(wanted - frames) <= _SAME_TIME) & (frames >= 0) & (frames <= scene.frames)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Markers:
+    """Positions of k markers in frames of a scene, or at rest.
+
+    Markers are vertices, or points of triangles, Σ wᵢxᵢ over the corners. Without ``vertices`` and ``triangles`` they are free
+    points, as of a scanner: each residual is the distance to the nearest point of the cloth. The nearest points, and the
+    directions to them, are those of the parameters in question, and are held while these are varied. In the derivative of the
+    distance the motion of the nearest point along the cloth cancels.
+
+    Attributes:
+        positions: At frames 1 … F of the scene, (F, k, 3) [m], or of an equilibrium (k, 3); NaN where there is none.
+        vertices: The k vertices, indices or a selection.
+        triangles: The triangle of each marker, (k,).
+        weights: Its barycentric coordinates there, (k, 3), with the sum 1.
+        sigma: Standard deviation of the error along each axis [m]; of free points of the error along the normal. None if it is
+            not known.
+
+    Raises:
+        ValueError: A value is not allowed.
+    """
+
+    positions: ArrayLike
+    vertices: str | ArrayLike | None = None
+    triangles: ArrayLike | None = None
+    weights: ArrayLike | None = None
+    sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.triangles is None) != (self.weights is None):
+            raise ValueError("one of markers.triangles and markers.weights is given; both or none must be")
+        if self.vertices is not None and self.triangles is not None:
+            raise ValueError("markers.vertices and markers.triangles are given; at most one of the two may be")
+        if self.sigma is not None:
+            number("markers.sigma", self.sigma, above=0.0)
+
+    @staticmethod
+    def read(path: FilePath, scene: Scene, sigma: float | None = None, resting: bool = False) -> Markers:
+        """Reads markers from a CSV file with columns time [s], id, x, y, z [m], in any order; others are ignored.
+
+        A row gives the position of a marker at a time from the start of the scene on. A row at time 0 binds the marker to the
+        point of the cloth that is nearest to it at the start. Rows at times of frames of the scene are used. Without a column
+        id, rows are free points, and those at time 0 are left out.
+
+        Args:
+            path: The file.
+            scene: The scene that they are fitted to.
+            sigma: See :class:`Markers`.
+            resting: Whether all rows after time 0 show the cloth at rest.
+
+        Raises:
+            OSError: The file cannot be read.
+            ValueError: It has no such columns or rows, a marker is not bound or occurs twice at a time, or the mesh has no
+                triangles.
+        """
+        names, rows = read_table(path)
+        for name in ("time", "x", "y", "z"):
+            if name not in names:
+                raise ValueError(f"{path}: has no column {name!r}; it must have time, x, y and z, and id for bound markers")
+        found = np.array(
+            [[number_in(path, line, n, row[names.index(n)]) for n in ("time", "x", "y", "z")] for line, row in rows]
+        )
+        frames, used = frames_at(found[:, 0], scene)
+        if resting:
+            frames, used = (found[:, 0] != 0.0).astype(int), np.full(len(rows), True)
+        if not (used & (frames > 0)).any():
+            raise ValueError(
+                f"{path}: has no row at the time of a frame after the start; it must have one at a multiple of "
+                f"1/{scene.fps:g} s, up to {scene.frames / scene.fps:g} s"
+            )
+        _refuse_no_triangles(path, scene)
+        if "id" in names:
+            ids = [row[names.index("id")] for _line, row in rows]
+            starts = {ids[k]: found[k, 1:] for k in np.flatnonzero(used & (frames == 0))}
+            own = {name: k for k, name in enumerate(starts)}
+        else:  # a marker of its own for each row of a frame
+            ids, counts = [], {}
+            for frame in frames:
+                ids.append(counts.setdefault(frame, 0))
+                counts[frame] += 1
+            starts, own = {}, {k: k for k in range(max(counts.values()))}
+        positions = np.full((frames[used].max(), len(own), 3), np.nan)
+        for k in np.flatnonzero(used & (frames > 0)):
+            line = rows[k][0]
+            if ids[k] not in own:
+                raise ValueError(
+                    f"{path}, line {line}: marker {ids[k]!r} has no row at time 0; it must have one, which binds it"
+                )
+            if np.isfinite(positions[frames[k] - 1, own[ids[k]]]).any():
+                raise ValueError(f"{path}, line {line}: marker {ids[k]!r} has a row at this time before; it must have one only")
+            positions[frames[k] - 1, own[ids[k]]] = found[k, 1:]
+        bound = {}
+        if starts:
+            points = np.array(list(starts.values()))
+            refuse(f"{path}: positions at time 0", points, ~np.isfinite(points), "must be finite")
+            triangles, weights = nearest_points(points, scene.positions, scene.mesh.triangles)
+            bound = {"triangles": triangles, "weights": weights}
+        return Markers(positions=positions, sigma=sigma, **bound)
+
+    def bind(self, name: str, scene: Scene, most: int) -> _Seen:
+        """Returns the residuals of these markers on a scene, in at most ``most`` frames.
+
+        Raises:
+            ValueError: Something does not fit the scene. The message begins with ``name``.
+        """
+        chosen: Any = None
+        if self.vertices is not None:
+            chosen = distinct_vertices("vertices", self.vertices, scene.mesh)
+        elif self.triangles is not None:
+            _refuse_no_triangles(name, scene)
+            chosen = _bound(name, self.triangles, self.weights, scene.mesh.triangles)
+        else:
+            _refuse_no_triangles(name, scene)
+        count = "k" if chosen is None else len(chosen if self.vertices is not None else chosen[0])
+        seen = numeric(name, self.positions, f"have shape (F, {count}, 3)")
+        seen = seen[None] if seen.ndim == 2 and most == 1 else seen
+        if seen.ndim != 3 or seen.shape[2] != 3 or count not in ("k", seen.shape[1]) or not 0 < len(seen) <= most:
+            raise ValueError(
+                f"{name} has shape {seen.shape}; it must be (F, {count}, 3) with F from 1 to {most}, the frames of the scene"
+            )
+        return _Seen(seen, chosen, scene.mesh.triangles, self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """A number that was measured, or several, and the function that reads it from a run.
+
+    Attributes:
+        function: From an :class:`warpcloth.run.simulate.Animation` of one copy, or an
+            :class:`warpcloth.run.equilibrium.Equilibrium`, to a number, or to an array of the shape of ``value``. It must be
+            smooth in the parameters, because they are varied by 0.1 %.
+        value: Measured number, or an array; NaN where there is none.
+        sigma: Standard deviation of its error, a number or one for each value; None if it is not known.
+
+    Raises:
+        ValueError: A value is not allowed.
+    """
+
+    function: Callable[[Any], Any]
+    value: ArrayLike
+    sigma: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        if not callable(self.function):
+            raise ValueError(f"reading.function is {self.function!r}; it must be a function of an animation or an equilibrium")
+        value = numeric("reading.value", self.value, "be a number or an array of numbers")
+        if self.sigma is not None:
+            sigma = numeric("reading.sigma", self.sigma, "be a number, or one for each value")
+            if sigma.shape not in ((), value.shape):
+                raise ValueError(f"reading.sigma has shape {sigma.shape}; it must be one number, or have shape {value.shape}")
+            refuse("reading.sigma", sigma, ~((sigma > 0.0) & np.isfinite(sigma)), "must be a finite number above 0")
+
+    def bind(self, name: str, _scene: Scene, _most: int) -> _Read:
+        """Returns the residuals of this reading. Errors begin with ``name``."""
+        return _Read(name, self)
+
+
+class _Seen:
+    """Residuals of markers.
+
+    Attributes:
+        last: The last frame that is needed.
+        frames: The frame of each residual, counted from 0, (m,).
+        sigma: Standard deviation, or None.
+    """
+
+    def __init__(self, seen, chosen, triangles, sigma):
+        self._seen, self._chosen, self._triangles, self.sigma = seen, chosen, triangles, sigma
+        self._known = np.isfinite(seen) if chosen is not None else np.isfinite(seen).all(axis=2)
+        self.last, self.frames = len(seen), np.nonzero(self._known)[0]
+
+    def residuals(self, runs):
+        """Residuals in each of the runs, (R, m) [m]; the first run has the parameters, and the others vary them."""
+        points = [np.asarray(run.points, dtype=np.float64) for run in runs]
+        points = [each[None] if each.ndim == 2 else each[1 : self.last + 1] for each in points]
+        if self._chosen is None:
+            return self._distances(points)
+        return np.array([(_at(self._chosen, self._triangles, each) - self._seen)[self._known] for each in points])
+
+    def _distances(self, points):
+        found = []
+        for frame, known in enumerate(self._known):
+            if not known.any():
+                continue
+            seen, triangles = self._seen[frame][known], self._triangles
+            chosen = nearest_points(seen, points[0][frame], triangles)
+            away = seen - _at(chosen, triangles, points[0][frame])
+            size = np.linalg.norm(away, axis=1)
+            corners = points[0][frame][triangles[chosen[0]]]
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+            # On the cloth itself, or above it by rounding, the direction to it is the normal.
+            near = size <= 1e-12 * np.abs(corners).max()
+            direction = np.where(near[:, None], normal, away / np.where(near, 1.0, size)[:, None])
+            found.append([np.einsum("ki,ki->k", seen - _at(chosen, triangles, each[frame]), direction) for each in points])
+        return np.concatenate(found, axis=1)
+
+
+class _Read:
+    """Residuals of a reading; see :class:`_Seen`."""
+
+    last = None
+
+    def __init__(self, name, reading):
+        self._name, self._function = name, reading.function
+        self._value = numeric("value", reading.value, "be numbers")
+        self._known = np.isfinite(self._value)
+        self.frames = np.full(int(self._known.sum()), -1)  # of no frame
+        self.sigma = None if reading.sigma is None else np.broadcast_to(reading.sigma, self._value.shape)[self._known]
+
+    def residuals(self, runs):
+        return np.array(
+            [array(f"{self._name}.function", self._function(run), self._value.shape) - self._value for run in runs]
+        )[:, self._known]
+
+
+def _at(chosen, triangles, points):
+    """Positions of vertices (k,), or of points of triangles, (…, k, 3) [m], of points (…, n, 3) [m]."""
+    if isinstance(chosen, tuple):
+        return np.einsum("kc,...kci->...ki", chosen[1], points[..., triangles[chosen[0]], :])
+    return points[..., chosen, :]
+
+
+def _bound(name, triangles, weights, of_mesh):
+    """Checks indices (k,) of triangles and weights (k, 3), and returns them."""
+    given = numeric(f"{name}.triangles", triangles, "have shape (k,)")
+    refuse(
+        f"{name}.triangles",
+        given,
+        ~((given >= 0) & (given < len(of_mesh)) & (given == np.rint(given))),
+        f"must be a whole number from 0 to {len(of_mesh) - 1}, the last triangle",
+    )
+    weights = array(f"{name}.weights", weights, (len(np.atleast_1d(given)), 3))
+    sums = weights.sum(axis=1)
+    refuse(f"the sum of {name}.weights", sums, np.abs(sums - 1.0) > _BOUND, "must be 1")
+    return given.astype(int), weights
+
+
+def _refuse_no_triangles(name, scene):
+    if not len(scene.mesh.triangles):
+        raise ValueError(f"{name}: the mesh has no triangles for markers; give the vertices that were measured")
