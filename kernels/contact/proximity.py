@@ -102,6 +102,8 @@ def cutoffs(dtype, of_edges: bool):
 def find_pairs(dtype, of_edges: bool):
     """Kernel over vertices, or edges: pairs with triangles, or with edges, of the same level and those above.
 
+    The rows of cells near each vertex or edge are divided among ``shares`` threads, the second dimension of the launch.
+
     Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices.
 
     If parts have ``moved``, only pairs with one of them are found: those of vertices that have moved, those of other vertices
@@ -125,11 +127,12 @@ def find_pairs(dtype, of_edges: bool):
         grid: grids(dtype),
         # parameters
         triangles: int,
+        shares: int,
         moved: moved_parts(dtype),
         # out
         pairs: pair_lists(dtype),
     ):
-        i = wp.tid()
+        i, share = wp.tid()
         few = wp.bool(False)
         if moved.items:
             if wp.static(of_edges):
@@ -171,54 +174,56 @@ def find_pairs(dtype, of_edges: bool):
                     if level == lowest:
                         one[2] = layer
                 width = two[0] - one[0] + 1
-                for cz in range(one[2], two[2] + 1):
-                    for cy in range(one[1], two[1] + 1):
-                        run = bucket_of(one[0], cy, cz, code, buckets)
-                        begin = number(grid.first, run)
-                        end = number(grid.first, wp.min(run + width, buckets))
-                        # A sequence beyond the last bucket continues at the first.
-                        for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
-                            slot = wp.where(at < end, at, at - end)
-                            if not meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
+                height = two[1] - one[1] + 1
+                for line in range(share, height * (two[2] - one[2] + 1), shares):
+                    cz = one[2] + line // height
+                    cy = one[1] + line - height * (cz - one[2])
+                    run = bucket_of(one[0], cy, cz, code, buckets)
+                    begin = number(grid.first, run)
+                    end = number(grid.first, wp.min(run + width, buckets))
+                    # A sequence beyond the last bucket continues at the first.
+                    for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
+                        slot = wp.where(at < end, at, at - end)
+                        if not meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
+                            continue
+                        entry = four(grid.entries, slot)
+                        if few:
+                            if moved.items[entry[0]] == 0:
                                 continue
-                            entry = four(grid.entries, slot)
-                            if few:
-                                if moved.items[entry[0]] == 0:
+                        other = four(surface.items, entry[0])
+                        if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
+                            continue
+                        s = wp.vec4i(own[0], own[1], other[0], other[1])
+                        k = entry[0] - triangles
+                        if wp.static(of_edges):
+                            if level == lowest and cz == layer and k <= i:
+                                continue
+                            if lowest < 0:  # the other finds this one too if it has moved
+                                if k < i and moved.items[entry[0]] != 0:
                                     continue
-                            other = four(surface.items, entry[0])
-                            if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
-                                continue
-                            s = wp.vec4i(own[0], own[1], other[0], other[1])
-                            k = entry[0] - triangles
-                            if wp.static(of_edges):
-                                if level == lowest and cz == layer and k <= i:
-                                    continue
-                                if lowest < 0:  # the other finds this one too if it has moved
-                                    if k < i and moved.items[entry[0]] != 0:
-                                        continue
-                                if k < i:
-                                    s = wp.vec4i(other[0], other[1], own[0], own[1])
-                            elif other[2] == own[0]:
-                                continue
-                            else:
-                                s = wp.vec4i(own[0], other[0], other[1], other[2])
-                            if entry[1] != cy or entry[2] != cz or entry[3] != code:
-                                continue
-                            _w, y = closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
-                            d = wp.length(y)
-                            if d < radius:
-                                if d < surface.skin or d < surface.skin + cutoff(surface, s, copy * surface.vertices):
-                                    if pairs.counts[KIND] >= MOST:
-                                        return
-                                    slot = wp.atomic_add(pairs.counts, KIND, 1)
-                                    row = i
-                                    if wp.static(of_edges):
-                                        slot += pairs.counts[0]
-                                        row = wp.min(i, k) + x.shape[0]
-                                        k = wp.max(i, k)
-                                    if slot < pairs.found.shape[0]:
-                                        wp.atomic_add(pairs.row_counts, row, 1)
-                                        pairs.found[slot] = wp.vec2i(row, k + triangles)
+                            if k < i:
+                                s = wp.vec4i(other[0], other[1], own[0], own[1])
+                        elif other[2] == own[0]:
+                            continue
+                        else:
+                            s = wp.vec4i(own[0], other[0], other[1], other[2])
+                        if entry[1] != cy or entry[2] != cz or entry[3] != code:
+                            continue
+                        _w, y = closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
+                        d = wp.length(y)
+                        if d < radius:
+                            if d < surface.skin or d < surface.skin + cutoff(surface, s, copy * surface.vertices):
+                                if pairs.counts[KIND] >= MOST:
+                                    return
+                                slot = wp.atomic_add(pairs.counts, KIND, 1)
+                                row = i
+                                if wp.static(of_edges):
+                                    slot += pairs.counts[0]
+                                    row = wp.min(i, k) + x.shape[0]
+                                    k = wp.max(i, k)
+                                if slot < pairs.found.shape[0]:
+                                    wp.atomic_add(pairs.row_counts, row, 1)
+                                    pairs.found[slot] = wp.vec2i(row, k + triangles)
             present = present >> 1
             level += 1
 

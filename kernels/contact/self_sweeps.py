@@ -19,13 +19,19 @@ LOCKED = wp.constant(wp.float64(0.01))
 
 @wp.struct
 class SweptPairs:
-    """Values of each pair in a Jacobi sweep: whether it touches, n, w, d, and the new λ."""
+    """Values of each pair in a Jacobi sweep: whether it touches, n, w and d.
+
+    ``slots`` has the index in ``corners`` of each corner 4·pair + i, and ``moves`` the mΔx of each entry of ``corners`` [kg·m].
+    ``touching`` counts the pairs that touch at each vertex; it is 0 between sweeps.
+    """
 
     touches: wp.array(dtype=wp.int32)
     normal: wp.array(dtype=wp.vec3d)
     weights: wp.array(dtype=wp.vec4d)
     gap: wp.array(dtype=wp.float64)
-    multiplier: wp.array(dtype=wp.float64)
+    slots: wp.array(dtype=wp.int32)
+    moves: wp.array(dtype=wp.vec3d)
+    touching: wp.array(dtype=wp.int32)
 
 
 @cache
@@ -178,8 +184,26 @@ def sweep_pairs(dtype, axes: bool):
 
 
 @cache
+def number_corners(dtype):
+    """Kernel over entries of ``corners``: stores the index of each corner in ``slots``."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def number_each_corner(
+        # elements
+        pairs: near_pairs(dtype),
+        # out
+        slots: wp.array(dtype=wp.int32),
+    ):
+        k = wp.tid()
+        if k < pairs.first[pairs.first.shape[0] - 1]:
+            slots[pairs.corners[k]] = k
+
+    return number_each_corner
+
+
+@cache
 def touch_pairs(dtype):
-    """Kernel over acting pairs of a Jacobi sweep: n, w and d of those that touch or have a force."""
+    """Kernel over acting pairs of a Jacobi sweep: n, w and d of those that touch or have a force, counted at their vertices."""
     vec3, _ = types(dtype)
     gap_of = gap_in_step(dtype)
 
@@ -209,37 +233,19 @@ def touch_pairs(dtype):
             swept.gap[e] = gap
             swept.weights[e] = w
             swept.normal[e] = n
+            s = pairs.stencils[e]
+            for i in range(4):
+                wp.atomic_add(swept.touching, s[i], 1)
 
     return touch_each_pair
-
-
-@cache
-def count_touching(dtype):
-    """Kernel over vertices: number of its pairs that touch."""
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def count_touching_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        swept: SweptPairs,
-        # out
-        touching: wp.array(dtype=wp.float64),
-    ):
-        i = wp.tid()
-        total = ZERO
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            total += wp.float64(swept.touches[pairs.corners[k] // 4])
-        touching[i] = total
-
-    return count_touching_pairs
 
 
 @cache
 def press_pairs(dtype, axes: bool):
     """Kernel over acting pairs of a Jacobi sweep: λ of the prox, with D = Σ nᵢwᵢ²/mᵢ for W, nᵢ the touching pairs of vertex i.
 
-    D ⪰ J W Jᵀ, so the sum of the moves does not overshoot. The fixed point is that of :func:`sweep_pairs`.
+    D ⪰ J W Jᵀ, so the sum of the moves does not overshoot. The fixed point is that of :func:`sweep_pairs`. It stores
+    wᵢ(λn − λ'n') for each corner, λ'n' of the last sweep, and then λ, w and n for the next one.
     """
     moved, greatest = free_move(dtype, axes), greatest_mobility(dtype, axes)
     vec3, _ = types(dtype)
@@ -251,39 +257,53 @@ def press_pairs(dtype, axes: bool):
         inverse_mass: wp.array(dtype=vec3 if axes else dtype),
         # state in
         step: StepPairs,
-        touching: wp.array(dtype=wp.float64),
-        multipliers: wp.array(dtype=wp.float64),
         # parameters
         h: wp.float64,
         hard: bool,
         # in and out
         swept: SweptPairs,
+        multipliers: wp.array(dtype=wp.float64),
+        forces: PairForces,
     ):
         t = wp.tid()
         if t >= pairs.number[0]:
             return
         e = pairs.acting[t]
         if swept.touches[e] == 0:
+            for i in range(4):
+                swept.moves[swept.slots[4 * e + i]] = wp.vec3d()
             return
         s = pairs.stencils[e]
         n = swept.normal[e]
+        w = swept.weights[e]
         D = ZERO
         least = ZERO
         for i in range(4):
-            w = swept.weights[e][i]
-            D += touching[s[i]] * w * w * wp.dot(n, moved(inverse_mass, s[i], n))
-            least += LOCKED * touching[s[i]] * w * w * greatest(inverse_mass, s[i])
+            share = wp.float64(swept.touching[s[i]]) * w[i] * w[i]
+            D += share * wp.dot(n, moved(inverse_mass, s[i], n))
+            least += LOCKED * share * greatest(inverse_mass, s[i])
         left = swept.gap[e]
+        before = ZERO
         if multipliers:
-            left -= D * multipliers[e]
-        swept.multiplier[e] = press(left, wp.float64(pairs.distances[e]), D, least, step.stiffness[e], h, hard)
+            before = multipliers[e]
+            left -= D * before
+        after = press(left, wp.float64(pairs.distances[e]), D, least, step.stiffness[e], h, hard)
+        for i in range(4):
+            move = w[i] * after * n
+            if before != ZERO:
+                move -= forces.weights[e][i] * before * forces.normal[e]
+            swept.moves[swept.slots[4 * e + i]] = move
+        if multipliers:
+            multipliers[e] = after
+            forces.weights[e] = w
+            forces.normal[e] = n
 
     return press_each_pair
 
 
 @cache
 def move_by_pairs(dtype, axes: bool):
-    """Kernel over vertices of a Jacobi sweep: d += W Σ wᵢ(λn − λ'n') over the pairs that touch, λ'n' of the last sweep."""
+    """Kernel over vertices of a Jacobi sweep: d += W Σ of the ``moves`` of its corners, in order."""
     vec3, _ = types(dtype)
     moved = free_move(dtype, axes)
 
@@ -292,50 +312,18 @@ def move_by_pairs(dtype, axes: bool):
         # elements
         pairs: near_pairs(dtype),
         inverse_mass: wp.array(dtype=vec3 if axes else dtype),
-        # state in
-        swept: SweptPairs,
-        multipliers: wp.array(dtype=wp.float64),
-        forces: PairForces,
         # in and out
+        swept: SweptPairs,
         correction: wp.array(dtype=vec3),
     ):
         i = wp.tid()
+        if swept.touching[i] == 0:
+            return
+        swept.touching[i] = 0
         total = wp.vec3d()
         for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if swept.touches[e] == 1:
-                corner = pairs.corners[k] - 4 * e
-                total += swept.weights[e][corner] * swept.multiplier[e] * swept.normal[e]
-                if multipliers:
-                    if multipliers[e] != ZERO:
-                        total -= forces.weights[e][corner] * multipliers[e] * forces.normal[e]
+            total += swept.moves[k]
         move = moved(inverse_mass, i, total)
         correction[i] = correction[i] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
 
     return move_each_by_pairs
-
-
-@cache
-def keep_pairs(dtype):
-    """Kernel over acting pairs of a Jacobi sweep: stores λ, w and n for the next sweep."""
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def keep_each_pair(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        swept: SweptPairs,
-        # out
-        multipliers: wp.array(dtype=wp.float64),
-        forces: PairForces,
-    ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
-            return
-        e = pairs.acting[t]
-        if swept.touches[e] == 1:
-            multipliers[e] = swept.multiplier[e]
-            forces.weights[e] = swept.weights[e]
-            forces.normal[e] = swept.normal[e]
-
-    return keep_each_pair

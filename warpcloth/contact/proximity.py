@@ -58,6 +58,7 @@ class Proximity:
         self._all, self._moved = (proximity_grid.moved_parts(model.dtype)() for _ in range(2))
         # Lists of one piece on the CPU are made anew where it has moved. On CUDA a list of all is as quick.
         self._by_parts = model.device.is_cpu and self._pieces.per_copy == 1
+        self._shares = 8 if model.device.is_cuda else 1
         if self._by_parts:
             sizes = {"vertices": model.count, "items": self._triangles + self._edges}
             self._moved_arrays = {k: wp.zeros(size, dtype=wp.int32, device=device) for k, size in sizes.items()}
@@ -228,7 +229,8 @@ class Proximity:
         self._launch(proximity_grid.fill_buckets, items, [surface, x], [grid])
         for of_edges, count in ((False, self.model.count if self._triangles else 0), (True, self._edges)):
             if count:
-                self.model.launch(self._pairs_of[of_edges], count, [surface, x, grid, self._triangles, moved], [self._pairs])
+                given = [surface, x, grid, self._triangles, self._shares, moved]
+                self.model.launch(self._pairs_of[of_edges], (count, self._shares), given, [self._pairs])
 
     def _launch_boxes(self, x):
         self._launch(piece_motion.begin_boxes, len(self.drift), [x], [self._pieces])

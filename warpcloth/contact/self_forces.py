@@ -50,7 +50,10 @@ class SelfForces(PairSums):
         if self._touching is not None:
             self._swept = self_sweeps.SweptPairs()
             self._swept.touches, self._swept.normal, self._swept.weights = room(wp.int32), room(wp.vec3d), room(wp.vec4d)
-            self._swept.gap, self._swept.multiplier = room(wp.float64), room(wp.float64)
+            self._swept.gap, self._swept.touching = room(wp.float64), self._touching
+            corners = len(pairs.corners)
+            self._swept.slots = wp.zeros(corners, dtype=wp.int32, device=device)
+            self._swept.moves = wp.zeros(corners, dtype=wp.vec3d, device=device)
 
     def _launch(self, factory, dim, inputs, outputs):
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
@@ -128,11 +131,11 @@ class SelfForces(PairSums):
             self._kernels[self_sweeps.find_clearances] = model.kernel(self_sweeps.find_clearances, model.dtype)
             self._clearance = wp.zeros(len(self.pairs.stencils), dtype=wp.float64, device=model.device)
             return
-        self._touching = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self._touching = wp.zeros(model.count, dtype=wp.int32, device=model.device)
         self._press, self._move = (
             model.kernel(factory, *key) for factory in (self_sweeps.press_pairs, self_sweeps.move_by_pairs)
         )
-        for factory in (self_sweeps.touch_pairs, self_sweeps.count_touching, self_sweeps.keep_pairs):
+        for factory in (self_sweeps.number_corners, self_sweeps.touch_pairs):
             self._kernels[factory] = model.kernel(factory, model.dtype)
         self.hold(self.pairs, self.begun)
 
@@ -157,6 +160,8 @@ class SelfForces(PairSums):
         self.multipliers.zero_()
         if self._touching is None:
             self._launch(self_sweeps.find_clearances, len(self.pairs.stencils), [self.pairs, self.begun, x], [self._clearance])
+        else:
+            self._launch(self_sweeps.number_corners, len(self.pairs.corners), [self.pairs], [self._swept.slots])
         if self.friction is not None:
             self.friction.multipliers.zero_()
 
@@ -166,11 +171,8 @@ class SelfForces(PairSums):
             given = [self.pairs, mobility, self.begun, self._clearance, x, h, not adds, backward]
             model.launch(self._sweep, 1, given, [multipliers, self.found, correction])
             return
-        count, N, swept = len(self.pairs.stencils), model.count, self._swept
+        count, swept = len(self.pairs.stencils), self._swept
         self._launch(self_sweeps.touch_pairs, count, [self.pairs, self.begun, multipliers, x, correction], [swept])
-        self._launch(self_sweeps.count_touching, N, [self.pairs, swept], [self._touching])
-        given = [self.pairs, mobility, self.begun, self._touching, multipliers, h, not adds]
-        model.launch(self._press, count, given, [swept])
-        model.launch(self._move, N, [self.pairs, mobility, swept, multipliers, self.found], [correction])
-        if adds:
-            self._launch(self_sweeps.keep_pairs, count, [self.pairs, swept], [multipliers, self.found])
+        given = [self.pairs, mobility, self.begun, h, not adds]
+        model.launch(self._press, count, given, [swept, multipliers, self.found])
+        model.launch(self._move, model.count, [self.pairs, mobility], [swept, correction])

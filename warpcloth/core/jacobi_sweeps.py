@@ -43,8 +43,8 @@ class JacobiSweeps:
             if array is not None:
                 array.zero_()
 
-    def launch(self, sweeps=1):
-        """Launches this number of sweeps."""
+    def launch(self, sweeps=1, then=None):
+        """Launches this number of sweeps, and ``then(d)`` after each, which may add to d (N,) [m]."""
         model, d = self.model, self.correction
         for _ in range(sweeps):
             model.refresh(EVALUATION, Moment(self.x, d))
@@ -54,7 +54,9 @@ class JacobiSweeps:
                 transpose.add(data, self._total)
             model.lock(self._total)
             model.launch(self._move, model.count, [model.inverse_mass, self._scale], [self._total, d])
+            if then is not None:
+                then(d)
 
-    def parts(self, sweeps):
-        """Returns pairs (function that launches, number of calls) for this number of sweeps."""
-        return [(self.launch, sweeps)]
+    def parts(self, sweeps, then=None):
+        """Returns pairs (function that launches, number of calls) for this number of sweeps, with ``then(d)`` after each."""
+        return [(lambda: self.launch(1, then), sweeps)]

@@ -46,23 +46,26 @@ class GatherSweeps:
             if array is not None:
                 array.zero_()
 
-    def launch(self, sweeps=1):
-        """Launches a number of sweeps; after an odd number, the second arrays are copied back."""
+    def launch(self, sweeps=1, then=None):
+        """Launches a number of sweeps, and ``then(d)`` after each; after an odd number, the second arrays are copied back."""
         model = self.model
         for sweep in range(sweeps):
             (before, *_), (after, *_) = self._states[sweep % 2], self._states[1 - sweep % 2]
             model.refresh(EVALUATION, Moment(self.x, before))
             given = [self._chains[sweep % 2], self._scale, self._rows, before, *self._given]
             model.launch(self._kernel, model.count, given, [after], block_dim=128)
+            if then is not None:
+                then(after)
         if sweeps % 2:
             for array, last in zip(*self._states, strict=True):
                 if array is not None:
                     wp.copy(array, last)
 
-    def parts(self, sweeps):
-        """Returns pairs (launcher, number of calls) for a number of sweeps."""
+    def parts(self, sweeps, then=None):
+        """Returns pairs (launcher, number of calls) for a number of sweeps, with ``then(d)`` after each."""
         each = min(sweeps - sweeps % 2, RUN) or 1
-        return [(lambda: self.launch(each), sweeps // each), (lambda: self.launch(sweeps % each), int(sweeps % each > 0))]
+        left = sweeps % each
+        return [(lambda: self.launch(each, then), sweeps // each), (lambda: self.launch(left, then), int(left > 0))]
 
 
 def _chained(parts, found, before, after, dtype):

@@ -22,8 +22,8 @@ class ScatterSweeps(JacobiSweeps):
         self._apply, self._total = model.kernel(kernels.apply_correction, model.dtype), model.vectors()
         self._given, self._factors, self._scale = [h, spread or 1], factors, scale
 
-    def launch(self, sweeps=1):
-        """Launches so many sweeps."""
+    def launch(self, sweeps=1, then=None):
+        """Launches so many sweeps, and ``then(d)`` after each."""
         model, d = self.model, self.correction
         for _ in range(sweeps):
             model.refresh(EVALUATION, Moment(self.x, d))
@@ -32,3 +32,5 @@ class ScatterSweeps(JacobiSweeps):
                 given = [*elements.arguments, model.inverse_mass, factor, elements.clear, self.x, d, *self._given]
                 model.launch(kernel, threads, given, [lambdas, self._total])
             model.launch(self._apply, model.count, [self._scale], [self._total, d])
+            if then is not None:
+                then(d)

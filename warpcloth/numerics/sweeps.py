@@ -133,12 +133,14 @@ class JacobiSweep(_Sweep):
         self.pairs.forces.launch_sweep_start(self.x)
         self._elements.launch_start()
 
-    def _launch(self):
-        self._elements.launch(1)
-        self.pairs.forces.launch_sweep(self.x, self.correction, self.h, self._adds)
+    def _launch(self, sweeps=1):
+        self._elements.launch(sweeps, self._sweep_pairs)
 
     def _parts(self, sweeps):
-        return [(self._launch, sweeps)]
+        return self._elements.parts(sweeps, self._sweep_pairs)
+
+    def _sweep_pairs(self, correction):
+        self.pairs.forces.launch_sweep(self.x, correction, self.h, self._adds)
 
     def _weights(self, kind, alpha):
         """Returns the factors of elements and of vertices."""
