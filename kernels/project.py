@@ -12,7 +12,8 @@ or for a term with a prox, with s at least the largest eigenvalue of G W Gᵀ (e
 
     Δλ = (prox(y − s λ, s/α̃) − y)/s,   prox(v, c) = argmin u(y) + ‖y − v‖²/2c,
 
-or by ``prox_from`` instead of the prox, if the term has it.
+or by ``prox_from`` instead of the prox, if the term has it. For a term with none of these functions and a finite stiffness, one
+Newton step of :mod:`.local_minimiser` replaces the prox. Its fixed point is the same.
 
 XPBD accumulates Δλ in λ; for PBD λ is 0. With infinite stiffness α̃ = 0; for springs this is the projection of Müller et al.
 2006 (*Position based dynamics*). Δx is 0 if all vertices are pinned, or without stiffness. If so few vertices are free that the
@@ -31,11 +32,15 @@ from typing import Any
 import warp as wp
 
 from .local import local_coordinate
+from .local_minimiser import local_minimiser
 from .memory import load, load_shared, store
 from .rotation import epsilon
 from .term import Term
 from .transpose import to_corner
 from .vectors import types
+
+# Newton steps of a local problem. More do not save sweeps, because those to come solve it again.
+NEWTON_STEPS = wp.constant(1)
 
 
 def multiplier_type(term: Term, dtype, scalar: bool):
@@ -72,10 +77,10 @@ def spread_compliance(dtype):
 
 @cache
 def prox_step(term: Term, dtype):
-    """Device functions A (M, M) → s, the largest row sum and so a bound of the eigenvalues, and (y, rest, s, α̃, λ) → rows."""
+    """Device functions A (M, M) → s, the largest row sum, a bound of the eigenvalues, and (y, rest, s, α̃, λ, sweeps) → rows."""
     M, y_type = wp.constant(term.rows), wp.types.matrix((term.rows, 3), dtype)
     rest_type, square = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, term.rows), dtype)
-    prox, prox_from = term.prox, term.prox_from
+    prox, prox_from, minimise = term.prox, term.prox_from, local_minimiser(term, dtype)
 
     @wp.func
     def largest_sum(A: square):
@@ -88,11 +93,14 @@ def prox_step(term: Term, dtype):
         return largest
 
     @wp.func
-    def rows_of(y: y_type, r: rest_type, largest: dtype, compliance: dtype, before: y_type):
+    def rows_of(y: y_type, r: rest_type, largest: dtype, compliance: dtype, before: y_type, sweeps: int):
         rows = y_type()
         if wp.where(compliance < dtype(wp.inf), largest, dtype(0.0)) != dtype(0.0):
             v = y - largest * before
-            if wp.static(prox_from is None):
+            if wp.static(prox is None):
+                steps = sweeps - sweeps + NEWTON_STEPS  # unknown to the compiler, or it would unroll
+                rows = (minimise(v, y, r, compliance / largest, steps) - y) / largest
+            elif wp.static(prox_from is None):
                 rows = (prox(v, r, largest / compliance) - y) / largest
             else:
                 rows = (prox_from(y, v, r, largest / compliance) - y) / largest
@@ -167,12 +175,12 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
             system += w[i] * wp.outer(weight(r, i), weight(r, i))
         if wp.static(per_step):
             compliance = spread(wp.trace(system) * dtype(wp.static(1.0 / term.rows)), compliance, sweeps)
-        rows = rows_of(y, r, largest_sum(system), compliance, before)
+        rows = rows_of(y, r, largest_sum(system), compliance, before, sweeps)
         return rows, rows
 
     if scalar:
         return of_constraint
-    return of_projection if prox is None else of_prox
+    return of_projection if project is not None and prox is None else of_prox
 
 
 @cache
@@ -238,12 +246,12 @@ def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
             largest = wp.max(largest, largest_sum(system))
         if wp.static(per_step):
             compliance = spread(mean, compliance, sweeps)
-        rows = rows_of(y, r, largest, compliance, before)
+        rows = rows_of(y, r, largest, compliance, before, sweeps)
         return rows, rows
 
     if scalar:
         return of_constraint
-    return of_projection if prox is None else of_prox
+    return of_projection if project is not None and prox is None else of_prox
 
 
 @cache

@@ -131,7 +131,7 @@ class Term:
 
     @property
     def moves(self):
-        """Whether it has a local step: a projection, a scalar constraint or a prox; with sparse cells, a quadratic energy."""
+        """Whether it has a local step in closed form: a projection, a constraint or a prox; with cells, a quadratic energy."""
         if self.vertices == 0:
             return self.quadratic
         return any(function is not None for function in (self.project, self.constraint, self.prox))

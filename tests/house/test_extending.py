@@ -87,7 +87,7 @@ def test_both_run_in_python(scene, device):
 def test_refusals_follow(scene):
     declared, Descent = scene
     soft = replace(declared, terms=[wc.StVKMembrane(stiffness=10.0)]).build()
-    with pytest.raises(ValueError, match=r"Descent cannot take StVKMembrane, .*; Explicit, Newton or ADMM can"):
+    with pytest.raises(ValueError, match=r"Descent cannot take StVKMembrane, .*; Explicit, Newton, Pro.* can"):
         Descent(substeps=1).bind(soft)
     bodies = replace(declared, terms=[wc.RigidCluster(vertices="all", stiffness=10.0)]).build()
     with pytest.raises(ValueError, match=r"ADMM cannot take RigidCluster.* or Descent can"):

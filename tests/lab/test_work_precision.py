@@ -124,7 +124,7 @@ def test_float32_ends_where_its_rounding_is(device):
 def test_what_cannot_be_measured_says_why(device, monkeypatch, tmp_path):
     (tmp_path / "stiff.py").write_text(
         "import warpcloth as wc\n\ndef scene():\n    mesh = wc.Mesh.grid(3, 3)\n"
-        "    term = wc.StVKMembrane(stiffness=100.0, poisson_ratio=0.3)\n"
+        "    term = wc.StVKMembrane(stiffness=100.0, poisson_ratio=0.3, damping=1.0)\n"
         "    return wc.Scene(mesh, density=0.1, terms=[term], pins=[0])\n"
     )
     stiff = SceneRef(str(tmp_path / "stiff.py"))

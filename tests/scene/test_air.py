@@ -173,7 +173,7 @@ STRONG = wc.Air(wind=(100.0, 0.0, 0.0))
         (lambda: sheet(air=3), "air is 3; it must be an Air or None"),
         (lambda: sheet(air=wc.Air(wind=np.zeros((5, 3)))), r"air.wind has shape \(5, 3\); it must be \(3,\), or \(18, 3\)"),
         (lambda: wc.simulate(sheet(), wc.PBD(substeps=4)), "PBD cannot take Air, whose drag grows .*; Explicit, Newton"),
-        (lambda: wc.simulate(sheet(), wc.ProjectiveDynamics(substeps=4)), "cannot take Air, whose energy is no squared"),
+        (lambda: wc.simulate(sheet(), wc.ProjectiveDynamics(substeps=4)), "cannot take Air, whose curvature is not known"),
         (
             lambda: wc.simulate(sheet(air=STRONG), wc.Explicit(substeps=8)),
             "in this wind the forces of air need steps",

@@ -11,7 +11,6 @@ from support.scenes import scene
 from support.steps import after_one_step, hanging_mass, swinging
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
-from warpcloth.kernels.terms import SPRING
 from warpcloth.numerics.sweeps import GaussSeidelSweep, colours
 
 EPS = np.finfo(np.float64).eps
@@ -143,12 +142,3 @@ def test_residual_of_hard_constraints_is_the_last_move(device):
     chain = scene("chain", stiffness=np.inf)
     residuals = [after_one_step(chain, wc.XPBD(substeps=1, iterations=n), device)[1].residual[0] for n in (1, 10, 1000)]
     assert residuals[0] > residuals[1] > residuals[2] > 0.0
-
-
-@pytest.mark.parametrize("solver", [wc.PBD, wc.XPBD])
-def test_what_cannot_be_projected_is_refused(solver, device):
-    model = hanging_mass(1.0, 1.0, 0.0).build(device=device)
-    bare = replace(SPRING, project=None, constraint=None)
-    model.terms = tuple(replace(elements, term=bare) for elements in model.terms)
-    with pytest.raises(ValueError, match=f"{solver.__name__} cannot take Spring, .*; Explicit, Newton or ADMM can"):
-        solver(substeps=1).bind(model)

@@ -338,14 +338,6 @@ def test_status_of_a_run_that_used_up_its_iterations(device):
     assert status.result is Result.CONVERGED
 
 
-def test_what_is_no_squared_distance_is_refused(device):
-    mesh = wc.Mesh.grid(4, 4)
-    folded = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0), wc.DihedralBending(stiffness=1.0)])
-    message = "ProjectiveDynamics cannot take DihedralBending, whose .* distance to a set; Explicit, Newton, ADMM, PBD, "
-    with pytest.raises(ValueError, match=message):
-        wc.ProjectiveDynamics(substeps=1).bind(folded.build(device=device))
-
-
 @pytest.mark.parametrize("solver", [wc.ProjectiveDynamics(substeps=1), wc.ADMM(substeps=1)])
 def test_infinite_stiffness_is_refused(solver, device):
     hard = wc.Scene(wc.Mesh.grid(4, 4), density=0.1, terms=[wc.Spring(stiffness=np.inf)])

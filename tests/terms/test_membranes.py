@@ -319,10 +319,10 @@ def test_hard_limits_are_refused_where_forces_are_needed(kind, solver, device):
         solver.bind(flung("alternating", kind(most=1.1)).build(device=device))
 
 
-@pytest.mark.parametrize("name", ["StVKMembrane", "NeoHookeanMembrane"])
-def test_pbd_refuses_what_has_no_projection(name, device):
-    with pytest.raises(ValueError, match=f"PBD cannot take {name}, whose energy is no distance to a constraint"):
-        wc.PBD(substeps=1).bind(flung("alternating", membrane(name, 0.3)[0]).build(device=device))
+@pytest.mark.parametrize("solver", [wc.PBD(substeps=1), wc.XPBD(substeps=1)])
+def test_infinite_stiffness_is_refused_where_no_projection_is(solver, device):
+    with pytest.raises(ValueError, match="cannot take StVKMembrane with infinite stiffness, as its"):
+        solver.bind(flung("alternating", wc.StVKMembrane(stiffness=np.inf)).build(device=device))
 
 
 # --- moduli

@@ -16,9 +16,10 @@ class AcceleratedStep:
         stepper: The :class:`warpcloth.solvers.projective_dynamics.ProjectiveDynamicsStepper`.
         method: The acceleration, of :mod:`warpcloth.numerics.acceleration`.
         falls: Whether an iterate stays if φ rises with both steps; not needed if φ never rises with the plain step.
+        shortens: Whether both steps are halved after an iterate that stayed; needs ``falls``.
     """
 
-    def __init__(self, stepper, method, falls=False):
+    def __init__(self, stepper, method, falls=False, shortens=False):
         model = stepper.model
         self.stepper, self.method, B, device = stepper, method, model.copies, model.device
         m = method.window
@@ -31,6 +32,7 @@ class AcceleratedStep:
         self.plain_energy, self.energy = (Mirror(model.scalars()) for _ in range(2))
         self._lowest = model.scalars() if falls else None
         self._stayed = Mirror(model.scalars(wp.int32)) if falls else None
+        self._part = Mirror(wp.zeros((B, 1 + 2 * m), dtype=wp.float64, device=device)) if shortens else None
         # Relative rise of φ that counts as rounding, as in a line search.
         self._noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
         self.energy_of = Energy(model, stepper.sums, corrected=True)
@@ -43,6 +45,7 @@ class AcceleratedStep:
         """Clears the history, before the first iteration of a step."""
         self.method.start()
         self._iteration = 0
+        self._step = np.ones(self.stepper.model.copies)
 
     def propose(self, active):
         """Sets the coefficients of the accelerated step of the ``active`` copies (B,)."""
@@ -50,6 +53,12 @@ class AcceleratedStep:
         accepted = self.energy.read() <= self.plain_energy.read() if self._iteration else np.ones(len(active), dtype=bool)
         products = self.products.read().reshape(len(active), 4, -1)
         proposed = self.method.propose(self._iteration, products, accepted)
+        if self._part is not None:
+            self._step = np.where(self.stayed(), 0.5 * self._step, np.minimum(2.0 * self._step, 1.0))
+            proposed = self._step[:, None] * proposed
+            plain = np.zeros_like(proposed)
+            plain[:, 0] = np.where(active, self._step, 0.0)
+            self._part.write(plain)
         self.coefficients.write(np.where(active[:, None], proposed, 0.0))
         self._iteration += 1
 
@@ -76,7 +85,10 @@ class AcceleratedStep:
         """Launches d = the better of the plain and the accelerated step."""
         stepper, model = self.stepper, self.stepper.model
         N, n, d = model.count, model.per_copy, stepper.correction
-        stepper.launch_plain_step(self.plain)
+        if self._part is None:
+            stepper.launch_plain_step(self.plain)
+        else:
+            self._launch(kernels.combine, N, [d, stepper.w, self.s, self.z, self._part.array, n], [self.plain])
         given = [d, stepper.w, self.s, self.z, self.coefficients.array, n]
         self._launch(kernels.combine, N, given, [self.accelerated])
         self._launch_energy(self.plain, self.plain_energy.array)

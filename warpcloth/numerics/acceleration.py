@@ -7,6 +7,24 @@ changes yⱼ of ∇φ and zⱼ = A⁻¹yⱼ. All arrays here are on the host, in
 import numpy as np
 
 
+class Plain:
+    """No acceleration, d − w.
+
+    Args:
+        copies: B.
+    """
+
+    def __init__(self, copies):
+        self.window, self._copies = 1, copies
+
+    def start(self):
+        """Before the first iteration of a step."""
+
+    def propose(self, iteration, products, accepted):
+        """As :meth:`Chebyshev.propose`."""
+        return np.tile([1.0, 0.0, 0.0], (self._copies, 1))
+
+
 class Chebyshev:
     """The Chebyshev semi-iterative method (Wang 2015): d ← ω(d − w − d₋₁) + d₋₁ with ω → 2/(1 + √(1 − ρ²)).
 
@@ -133,7 +151,7 @@ class LBFGS(_History):
 
 
 def accelerated(name, model, window, slowest):
-    """Returns the acceleration of a name; None for ``"none"``.
+    """Returns the acceleration of a name.
 
     Args:
         name: ``"none"``, ``"chebyshev"``, ``"anderson"`` or ``"l-bfgs"``.
@@ -142,7 +160,7 @@ def accelerated(name, model, window, slowest):
         slowest: Function that returns ρ of Chebyshev, (B,).
     """
     if name == "none":
-        return None
+        return Plain(model.copies)
     if name == "chebyshev":
         return Chebyshev(model.copies, slowest())
     epsilon = 10.0 * float(np.finfo(model.numpy_dtype).eps)

@@ -1,4 +1,4 @@
-"""The weights of ADMM, r = W²/(s k A) of each element."""
+"""The curvature of energies at rest, and the weights of ADMM, r = W²/(s k A) of each element."""
 
 import numpy as np
 import warp as wp

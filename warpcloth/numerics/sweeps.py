@@ -74,7 +74,7 @@ class _Sweep:
         for elements in model.terms:
             term = elements.term.whole
             only = term.project is None and term.prox is None
-            self._keys.append((term, model.dtype, only or (scalar and term.constraint is not None)))
+            self._keys.append((term, model.dtype, term.constraint is not None and (only or scalar)))
         self.multipliers = [
             wp.zeros(elements.count, dtype=kernels.multiplier_type(*key), device=model.device) if multipliers else None
             for elements, key in zip(model.terms, self._keys, strict=True)

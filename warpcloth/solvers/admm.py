@@ -28,6 +28,9 @@ from .implicit import ImplicitStepper
 from .solver import Stepper
 from .step import ImplicitStep
 
+# Maximum number of Newton steps of a local problem.
+STEPS = 30
+
 
 @dataclass(frozen=True)
 class ADMM(ImplicitStep):
@@ -104,7 +107,7 @@ class ADMM(ImplicitStep):
     residual = Residual("largest primal or dual residual of a vertex (as an acceleration)", "m/s²")
     facts = Facts(
         method="implicit steps by the alternating direction method of multipliers",
-        suits="as projective dynamics, and for energies without a projection",
+        suits="as projective dynamics, also with strong damping of membranes",
         weakness='stalls with too large a weight, oscillates with too small a one; `weight="auto"` is near the best',
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64), cuda=(32, 64, 128, 256)),),
         runs=(
@@ -247,7 +250,7 @@ class ADMMStepper(ImplicitStepper):
             array.zero_()
         model.refresh(EVALUATION, Moment(self.state.x, self.correction), self._terms)
         for (elements, of, (_start, split)), transpose in zip(self._each(), self._sums_of, strict=True):
-            given = [elements.stencil, elements.rest, self.state.x, self.correction, kernels.STEPS]
+            given = [elements.stencil, elements.rest, self.state.x, self.correction, STEPS]
             model.launch(split, elements.count, given, [of])
             transpose.add(of, *sums)
         if self._gradient is not None:

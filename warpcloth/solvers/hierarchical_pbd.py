@@ -10,7 +10,7 @@ from ..kernels.hierarchy import follow
 from ..model.model import Model
 from ..numerics.hierarchy import levels, on_device
 from ..numerics.sweeps import GaussSeidelSweep
-from ..terms.needs import LOCAL_STEP, MERGED_DAMPING, NO_AIR, NORMAL_FORCE
+from ..terms.needs import CLOSED_STEP, LOCAL_STEP, MERGED_DAMPING, NO_AIR, NORMAL_FORCE
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
 from .step import Step
@@ -50,7 +50,7 @@ class HierarchicalPBD(Step):
     """
 
     name = "hierarchical-pbd"
-    needs, locks = (MERGED_DAMPING, LOCAL_STEP, NORMAL_FORCE, NO_AIR), True
+    needs, locks = (MERGED_DAMPING, LOCAL_STEP, CLOSED_STEP, NORMAL_FORCE, NO_AIR), True
     ordered = closes = touches_itself = True
     facts = Facts(
         method="PBD that also sweeps over coarser levels of the mesh, so that fine cloth stretches less",
@@ -82,7 +82,7 @@ class HierarchicalPBD(Step):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: A term has no projection, scalar constraint or ``prox``.
+            ValueError: A term has infinite stiffness and neither projection, scalar constraint nor ``prox``.
         """
         self.refuse(model)
         return self._on(HierarchicalPBDStepper, model)

@@ -7,7 +7,7 @@ from ..base.checks import number, whole
 from ..base.renamed import renamed
 from ..model.model import Model
 from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
-from ..terms.needs import LOCAL_STEP, MERGED_DAMPING, NO_AIR, NORMAL_FORCE
+from ..terms.needs import CLOSED_STEP, LOCAL_STEP, MERGED_DAMPING, NO_AIR, NORMAL_FORCE
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
 from .step import Step
@@ -54,7 +54,7 @@ class PBD(Step):
     """
 
     name = "pbd"
-    needs, locks = (MERGED_DAMPING, LOCAL_STEP, NORMAL_FORCE, NO_AIR), True
+    needs, locks = (MERGED_DAMPING, LOCAL_STEP, CLOSED_STEP, NORMAL_FORCE, NO_AIR), True
     touches_itself = True
     closes, multipliers = True, False  # λ does not add up over the sweeps of a step
     facts = Facts(
@@ -102,7 +102,7 @@ class PBD(Step):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: A term has no projection, scalar constraint or ``prox``.
+            ValueError: A term has infinite stiffness and neither projection, scalar constraint nor ``prox``.
         """
         self.refuse(model)
         return self._on(PBDStepper, model)

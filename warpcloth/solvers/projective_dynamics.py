@@ -20,7 +20,8 @@ from ..numerics.contact_system import ContactSystem
 from ..numerics.inertia import Inertia
 from ..numerics.iterate import GravityScale
 from ..numerics.linear import DiagonalScaling, factorise_copies
-from ..terms.needs import FINITE, MERGED_DAMPING, PROJECTION_OR_CONTACT
+from ..numerics.local_weights import curvatures
+from ..terms.needs import CONSTANT_MATRIX, FINITE
 from .facts import Benchmark, Facts, grid
 from .implicit import ImplicitStepper
 from .solver import Stepper
@@ -38,6 +39,10 @@ class ProjectiveDynamics(ImplicitStep):
     all steps, and is factorised once. As ∂u/∂y = y − p(y), one iteration is d ← d − S⁻¹∇φ(d) with d = x − x̃, so that later
     iterations correct the rounding of earlier ones. The objective φ never rises, and the fixed point is the x(t+h) of
     :class:`warpcloth.Newton`.
+
+    An energy without a projection has k A s GᵀG in S, with the curvature s = ‖∂²u/∂y²‖ at rest. The iteration is the same (Liu
+    et al. 2017), but a step may raise φ where the curvature is larger than at rest. If both the plain and the accelerated step
+    raise φ, the iterate stays, and the next steps are half as long.
 
     Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
     error perpendicular to it shrinks by the factor k(L/l)/(m/h² + k) in each iteration; the error along it is gone after one.
@@ -67,7 +72,7 @@ class ProjectiveDynamics(ImplicitStep):
     """
 
     name = "projective-dynamics"
-    needs, locks = (FINITE, MERGED_DAMPING, PROJECTION_OR_CONTACT), True
+    needs, locks = (FINITE, CONSTANT_MATRIX), True
     touches_itself = True
     residual = Residual(UNBALANCED, "times its value at the start of the step")
     facts = Facts(
@@ -104,7 +109,7 @@ class ProjectiveDynamics(ImplicitStep):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: A term has infinite stiffness, or an energy that is not a squared distance to a set.
+            ValueError: A term has infinite stiffness, or cells with an energy that is not quadratic.
         """
         self.refuse(model)
         return self._on(ProjectiveDynamicsStepper, model)
@@ -123,8 +128,14 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         super().__init__(options, model)
         model = self.model
         self.inertia, self.sums = Inertia(model, 1.0 / self.he**2), Sums(model)
-        projected = model.with_terms([elements for elements in model.terms if elements.collider is None])
-        matrices = constant_matrices(projected, self.inertia.s)
+        constant, bounded = [], True  # whether the matrix bounds the Hessian, so that φ never rises with a plain step
+        for elements in model.terms:
+            if elements.collider is not None:
+                continue
+            if elements.term.whole.project is None:
+                elements, bounded = elements.weighed(curvatures(model, elements)), False
+            constant.append(elements)
+        matrices = constant_matrices(model.with_terms(constant), self.inertia.s)
         self._sizes = np.stack([np.asarray(abs(matrix).sum(axis=1)).ravel() for matrix in matrices])
         self._linear = (
             factorise_copies(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
@@ -139,8 +150,11 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._gravity_scale = GravityScale(model)
-        method = accelerated(options.acceleration, model, options.window, self.slowest)
-        self._accelerated = method and AcceleratedStep(self, method, falls=self._contact is not None)
+        self._accelerated = None
+        if options.acceleration != "none" or not bounded:
+            method = accelerated(options.acceleration, model, options.window, self.slowest)
+            falls = self._contact is not None or not bounded
+            self._accelerated = AcceleratedStep(self, method, falls, shortens=not bounded)
         self._record()
         self.ready()
 

@@ -18,7 +18,7 @@ from ..model.model import Model
 from ..numerics.integrators import INTEGRATORS
 from ..numerics.iterate import GravityScale
 from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
-from ..terms.needs import LOCAL_STEP, MERGED_DAMPING
+from ..terms.needs import CLOSED_STEP, LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
 from .solver import LaunchedStepper, Stepper
 from .step import ImplicitStep
@@ -33,7 +33,8 @@ class XPBD(ImplicitStep):
     fixed point for finite stiffness is implicit Euler, the x(t+h) of :class:`warpcloth.Newton`. Form ``"scalar"`` is the
     published one on C = ‖y − p(y)‖ with its changing gradient, Δλ = −(C + α̃λ)/(Σw‖∇C‖² + α̃): its fixed point misses
     implicit Euler because ∇C changes within the step. Terms with only one of the two forms use that one: dihedral bending the
-    scalar form, quadratic bending and attachments the vector form.
+    scalar form, quadratic bending and attachments the vector form. Energies with neither, such as
+    :class:`warpcloth.OrthotropicMembrane`, take a step of Newton's method in each element, and share that fixed point.
 
     One hanging mass stretches by mg/k at rest, with any number of iterations and any step. With few iterations cloth is too
     soft, and finer cloth is softer; more substeps help more than more iterations (Macklin et al. 2019, *Small steps*):
@@ -71,7 +72,7 @@ class XPBD(ImplicitStep):
     """
 
     name = "xpbd"
-    needs, locks = (MERGED_DAMPING, LOCAL_STEP), True
+    needs, locks = (MERGED_DAMPING, LOCAL_STEP, CLOSED_STEP), True
     touches_itself = True
     residual, multipliers = Residual(UNBALANCED, "m/s²"), True  # λ adds up over the sweeps of a step
     facts = Facts(
@@ -124,8 +125,8 @@ class XPBD(ImplicitStep):
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
         Raises:
-            ValueError: A term has no projection, scalar constraint or ``prox``, or infinite stiffness with an integrator other
-                than Euler.
+            ValueError: A term has infinite stiffness, and neither projection, scalar constraint nor ``prox``, or an integrator
+                other than Euler.
         """
         self.refuse(model)
         self.refuse_hard(model)

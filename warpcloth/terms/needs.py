@@ -32,9 +32,14 @@ ELEMENTS = Need(
 PROJECTION = Need(
     lambda elements: elements.term.whole.project is not None, "{label}, whose energy is no squared distance to a set"
 )
-# A projection, or contact: its Hessian is added to the matrix of the projections.
-PROJECTION_OR_CONTACT = Need(
-    lambda elements: elements.term.whole.project is not None or elements.term.bounded is not None, PROJECTION.lack
+# A projection, contact, whose Hessian is added to the matrix, or a curvature at rest.
+CONSTANT_MATRIX = Need(
+    lambda elements: (
+        elements.term.whole.project is not None
+        or elements.term.bounded is not None
+        or (elements.term.whole.prox is None and elements.term.whole.vertices > 0)
+    ),
+    "{label}, whose curvature is not known in advance",
 )
 NORMAL_FORCE = Need(
     lambda elements: elements.term not in FRICTIONS,
@@ -45,8 +50,16 @@ NO_AIR = Need(
     lambda elements: elements.term is not AIR,
     "{label}, whose drag grows with the number of its sweeps",
 )
-# A projection, a scalar constraint or a prox.
-LOCAL_STEP = Need(lambda elements: elements.term.whole.moves, "{label}, whose energy is no distance to a constraint")
+LOCAL_STEP = Need(
+    lambda elements: elements.term.whole.moves or elements.term.whole.vertices > 0,
+    "{label}, whose cells have no local step",
+)
+# Newton's method finds the local step of other energies, if the stiffness is finite.
+CLOSED_STEP = Need(
+    lambda elements: elements.term.whole.moves or not elements.hard,
+    "{label} with infinite stiffness, as its energy is no distance to a constraint",
+    "give a finite stiffness",
+)
 ROWS = Need(
     lambda elements: elements.term.vertices > 0 and (elements.term.project is not None or elements.term.constraint is not None),
     "{label}, whose energy is no square of a constraint",
