@@ -16,6 +16,7 @@ from ..contact.collider_steps import ColliderSteps
 from ..contact.self_steps import SelfSteps
 from ..core.state import State
 from ..core.status import Residual, Result, Status, digits, sentence
+from ..kernels.terms.air import AIR
 from ..numerics.minimise import Minimiser
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
@@ -87,6 +88,10 @@ def equilibrium(
     again, until forces balance. ``stable`` and ``lowest_eigenvalue`` neglect the rotation of pairs. Layers without friction may
     slide off one another, so they often have no equilibrium.
 
+    Wind is that of the last keyframe, and its force follows the normals: cloth without mass moves in it until it rests.
+    ``stable`` and ``lowest_eigenvalue`` are those under the final forces, held constant. Flutter needs mass, so a shape that
+    rests here may flutter in a run.
+
     The method is Newton's with a line search, without inertia; gravity is applied in equal load steps. If the Hessian is
     singular, for example because a flat cloth without bending stiffness cannot carry its weight, a term s/2‖x − x_now‖²_M is
     added, and s is lowered from there. This is a proximal point method, in which the energy never rises. Cloth that nothing
@@ -145,20 +150,25 @@ def equilibrium(
         pairs = SelfSteps(model, State(base, model.vectors(), 1), h=0.0, steps_per_frame=1, bounded=False, colliders=None)
         pairs.filter.iterates()
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
-    descent = _Descent(minimiser, base, tolerance, iterations)
+    wind = _Wind(model, base) if scene.air_terms else None
+    descent = _Descent(minimiser, base, tolerance, iterations, wind)
     for part in range(1, load_steps + 1):
         result = _settle_on_meshes(model, base, descent, part / load_steps, contact)
     # Forces balance, but they do for a straight chain that stands on its pin too. A small perturbation tells them apart.
+    if wind is not None:
+        wind.hold()
     if result in SETTLED and minimiser.curves_down(tolerance):
         base.assign(base.numpy() + _nudge(model))
         # A small unbalanced force compresses the edges of a nearly straight chain by much more, and changes the eigenvalues.
         descent.tolerance *= 0.01
         if contact is not None:
             contact.launch_end(base, model.vectors())
-        if contact is None and pairs is None:
+        if contact is None and pairs is None and wind is None:
             result = descent.run(1.0, _frequency_scale(model))
         else:
             result = _settle_on_meshes(model, base, descent, 1.0, contact)
+        if wind is not None:
+            wind.hold()
         if result in SETTLED and minimiser.curves_down(tolerance):
             result = Result.SADDLE
     residual, began = descent.residual, result.value
@@ -192,11 +202,6 @@ def equilibrium(
 
 def _with_colliders_at_rest(scene):
     """Returns the scene with static colliders at their last keyframes; raises ValueError if there is friction."""
-    if scene.air is not None:
-        raise ValueError(
-            "the scene has air, whose forces follow from velocities and normals and from no energy; run it with damping until "
-            "it rests"
-        )
     for collider in scene.colliders:
         if collider.friction:
             raise ValueError(
@@ -219,8 +224,9 @@ def _with_colliders_at_rest(scene):
 class _Descent:
     """Repeated minimisations from the present positions, with a limit on the total number of iterations."""
 
-    def __init__(self, minimiser, base, tolerance, iterations):
+    def __init__(self, minimiser, base, tolerance, iterations, wind):
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
+        self.wind = wind
         self.used, self.moved, self.pairs = 0, 0.0, minimiser.pairs
         self._apart = wp.clone(base)  # the last positions without crossings
         self.scale = None  # from the first descent, because without gravity a later one would be scaled by its own rounding
@@ -254,7 +260,7 @@ class _Descent:
         update()
         self._begin()
         self.minimiser.clear()
-        found = float(self.minimiser.unbalanced()[0])
+        self.found = found = float(self.minimiser.unbalanced()[0])
         if found > max(self.tolerance * self.load, 2.0 * rounded):
             return False
         self.unbalanced = max(self.unbalanced, min(found, self.tolerance * self.load))
@@ -300,15 +306,52 @@ class _Descent:
         self.minimiser.record()
 
 
+class _Wind:
+    """The forces of wind on cloth at rest, which follow its normals and have no energy.
+
+    Cloth without mass moves in the wind until it rests, by implicit steps of the law of air from velocity 0. The force on a
+    shape that does not move is that at rest, whatever the step. Long steps overshoot where the force depends more on the
+    normals than the cloth resists. So a step is half as long as the one before if that raised the unbalanced force, else a
+    tenth longer.
+    """
+
+    def __init__(self, model, base):
+        self._model, self._base, self._still = model, base, model.vectors()
+        self._elements = [each for each in model.terms if each.term is AIR]
+        winds = [np.linalg.norm(each.rest.numpy()[:, 8:11], axis=1).max() for each in self._elements]
+        speed = max(model.scene.air.speed, *winds)
+        self._seconds = 0.1 * float(np.linalg.norm(np.ptp(base.numpy(), axis=0))) / (speed or 1.0)
+        self._residual = np.inf
+
+    def set(self):
+        """Takes the force of a step from the present positions."""
+        self._set(self._seconds)
+
+    def hold(self):
+        """Makes the force constant, so that the Hessian is that of the other energies."""
+        self._set(1e9 * self._seconds)
+
+    def adapt(self, residual):
+        """Chooses the length of the next step from the unbalanced force after the last."""
+        self._seconds *= 0.5 if residual > self._residual else 1.1
+        self._residual = residual
+
+    def _set(self, seconds):
+        moment = Moment(self._base, v=self._still, he=seconds, ahead=MOST_FRAMES)
+        self._model.refresh(STEP, moment, self._elements)
+
+
 def _settle_all(model, base, descent, part):
     """Settles under the fraction ``part`` of loads and keyframes until loads and areas that follow the cloth are constant.
 
     Pressures follow the cloth, and so do the areas of pairs of self-contact. Pins that cloth held back move on.
     """
-    pins, loads = model.scene.pins, model.loads
-    follows = descent.pairs is not None or (loads is not None and loads.follows)
+    pins, loads, wind = model.scene.pins, model.loads, descent.wind
+    follows = descent.pairs is not None or wind is not None or (loads is not None and loads.follows)
 
     def set_loads():
+        if wind is not None:
+            wind.set()
         if loads is not None:
             # The last keyframe.
             loads.set(model, Moment(base, ahead=MOST_FRAMES))
@@ -325,6 +368,8 @@ def _settle_all(model, base, descent, part):
             return result if arrived else Result.ITERATIONS_USED_UP
         if arrived and descent.balanced(set_loads):
             return result
+        if wind is not None:
+            wind.adapt(descent.found)
         descent.used += 1
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..base.checks import shown
+from ..base.limits import MOST_FRAMES
 from ..base.texts import numbered
 from ..base.turns import in_turn
 from ..contact.collider_work import ColliderWork, FilterWork
@@ -22,6 +23,7 @@ from ..kernels.terms.face_friction import FRICTIONS
 from ..model.damping import dissipations
 from ..scene.scene import Scene
 from ..terms.refresh import STEP, Moment
+from .air_work import AirWork
 
 RECORDS = ("energies", "reactions", "pairs")
 # Numbers that record="pairs" has for each frame.
@@ -61,6 +63,7 @@ def _other_names(scene):
     moved = any(collider.moves for collider in scene.colliders)
     others = ["self-contact"] * (scene.self_contact is not None) + ["kinetic", "gravity"]
     others += ["work of pins"] * scene.pins.moves + ["work of loads"] * bool(scene.loads)
+    others += ["work of air"] * bool(scene.air_terms)
     others += ["work of colliders"] * moved + ["work of the filter"] * bool(scene.colliders)
     of_cloth = scene.self_contact is not None and scene.self_contact.friction > 0.0
     return others + ["heat of friction"] * (of_cloth or bool(scene.rubbing))
@@ -121,8 +124,9 @@ class Evaluation:
             self.pulls = ColliderPulls(model, self._terms, stepper and stepper.constraint_forces)
         soft = tuple(elements for elements in self._terms if not elements.hard and elements.collider is None)
         self._elastic = plan(model).gradient(terms=soft) if soft else None
-        self._of_air = plan(model).gradient(terms=self._blown) if self._blown and h else None
-        self._time = {} if stepper is None else _time_of(stepper)
+        self._of_air = plan(model).gradient(terms=self._blown) if self._blown else None
+        self._time = {"ahead": MOST_FRAMES} if stepper is None else _time_of(stepper)
+        self._still = model.vectors() if self._blown and h is None else None
         self._damped = dissipations(model, h) if h else []
         if self._damped:
             self._dissipative = plan(model).gradient(corrected=True, terms=self._damped)
@@ -142,7 +146,8 @@ class Evaluation:
         if self._elastic:
             self._elastic.add(x, self.gradient)
         if self._of_air is not None:
-            moment = Moment(x, v=v, he=self._h, explicit=True, **self._time)
+            v_air, seconds = (v, self._h) if self._still is None else (self._still, 1.0)
+            moment = Moment(x, v=v_air, he=seconds, explicit=True, **self._time)
             model.refresh(STEP, moment, self._blown)
             self._of_air.add(x, self.gradient)
         if self._damped:
@@ -250,8 +255,8 @@ class History:
         forces: Total force and friction force on each collider in each kept frame, (F, B, C, 2, 3) [N].
         pairs: :data:`PAIRS` of each kept frame, (F, B, 5).
         cuts: Fraction of the moves in each kept frame that contact cut short, (F, B).
-        totals: Work of pins, without their kinetic energy, of loads, of colliders, against friction and of the filter, up to
-            the last kept frame, (5, B) [J].
+        totals: Work of pins, without their kinetic energy, of loads, of colliders, against friction, of the filter and of the
+            air, up to the last kept frame, (6, B) [J].
 
     Raises:
         ValueError: A term is hard and the solver has no multipliers.
@@ -269,7 +274,7 @@ class History:
         self._moving, self._driven, self._rubbed, self._touched = (
             asked and each for each in (scene.pins.moves, changing, rubbed, touched)
         )
-        self._filtered = asked and bool(scene.colliders)
+        self._filtered, self._blown = asked and bool(scene.colliders), asked and bool(scene.air_terms)
         forces = "reactions" in record or self._moving or self._touched
         self._evaluation = Evaluation(model, stepper.h, stepper, forces)
         self._found, self._frame = deque(), 0
@@ -278,14 +283,14 @@ class History:
         self._rows = {name: [] for name in (*record, *of_contact)}
         self.carried = (*self._rows, "totals")  # from frame to frame
         self.names = self._evaluation.names
-        self._total, self._each_step = np.zeros((5, model.copies)), None
+        self._total, self._each_step = np.zeros((6, model.copies)), None
         self._seen = self._counted()
         x, v = stepper.state
         self._pulls_itself = None
         if asked and stepper.pairs is not None and stepper.pairs.friction is not None:
             self._pulls_itself, self._rubbed = model.vectors(), True
             self._rub = model.kernel(kernels.add_rubbing_work, model.dtype)
-        if self._moving or self._driven or self._filtered or self._pulls_itself:
+        if self._moving or self._driven or self._filtered or self._blown or self._pulls_itself:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
             self._room = None if stepper.pairs is None else stepper.pairs.proximity.capacity
@@ -309,8 +314,11 @@ class History:
             if self._touched or not any(elements.hard and elements.collider is not None for elements in terms):
                 touches = ColliderWork(stepper.colliders, terms, cuts, *sums, stepper.constraint_forces)
             self._touches.append((cuts, touches, vertices))
+        self._of_air = [AirWork(stepper) for stepper, _first, _end in (self._stepper.shares if self._blown else ())]
 
         def launch():
+            for air in self._of_air:
+                air.launch()
             for cuts, touches, _vertices in self._touches:
                 cuts.launch()
                 if touches:
@@ -333,6 +341,8 @@ class History:
         if self._moving or self._touched:
             self._evaluation.launch(x, v)
             wp.copy(before.gradient, self._evaluation.gradient)
+        for air in self._of_air:
+            air.begin()
         for cuts, touches, vertices in self._touches:
             cuts.begin()
             if self._touched:
@@ -352,9 +362,11 @@ class History:
                 self._add_rubbing()
                 self._make_room()
                 self._each_step()
-            for total, work in zip(self._total, self._works, strict=True):
+            for total, work in zip(self._total, self._works, strict=False):
                 total += work.numpy().reshape(self.model.copies, -1).sum(axis=1)
                 work.zero_()
+            if self._of_air:
+                self._total[5] += np.concatenate([air.sums() for air in self._of_air])
             if self._touches:
                 self._total[4] += np.concatenate([cuts.elastic() for cuts, _touches, _vertices in self._touches])
         self._frame += 1
@@ -391,6 +403,7 @@ class History:
             if self._driven:
                 energies["work of loads"] = self._total[1].copy()
             energies["work of colliders"], energies["work of the filter"] = self._total[2].copy(), self._total[4].copy()
+            energies["work of air"] = self._total[5].copy()
             if self._rubbed:
                 stored = evaluation.stored + sum(energies[name] for name in evaluation.names_of_friction)
                 energies["heat of friction"] = self._total[3] - stored

@@ -100,8 +100,8 @@ class Animation:
         scene: The :class:`warpcloth.Scene` of the run, or None.
         energies: With ``record="energies"``, a dictionary of arrays (frames+1,) or (frames+1, B) [J]: each term under its
             label, ``"contact with Ball"`` and ``"friction on Ball"`` for a collider called Ball, ``"kinetic"``, ``"gravity"``
-            (0 at the start), and, if the scene has them, ``"work of pins"`` that move, ``"work of loads"``, ``"work of
-            colliders"`` that move, and ``"heat of friction"``. A copy that diverged is NaN from then on.
+            (0 at the start), and, if the scene has them, ``"work of pins"`` that move, ``"work of loads"``, ``"work of air"``,
+            ``"work of colliders"`` that move, and ``"heat of friction"``. A copy that diverged is NaN from then on.
         reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (frames+1, p,
             3) or (frames+1, B, p, 3) [N], in the order of ``scene.pins.vertices``.
         collider_forces: With ``record="reactions"``, a dictionary from the name of a collider to the force of the cloth on it,
