@@ -3,11 +3,17 @@
 The strip extends along x. With a width of 0 it is one row of triangles, which bends with 1 − ν² = 8/9 of D, because both
 bending energies have the Poisson's ratio ν = −1/3. Otherwise it has rows of edges across its width. L is measured from the
 middle of the pins, half an element from x = 0, to the free end (of a single row, its mean).
+
+With a fabric, it is the sample of a Shirley tester: a strip 25 mm wide, if no width is given, cut at an angle to the warp. L
+follows from Γ, with the fabric's own ρ and D; for Γ = 8, twice the bending length, the tip hangs 41.5° below the clamp. This
+clamp, from which L is measured, is 0.18 elements behind the second row of pins, as for every `PlateBending`.
 """
 
 import numpy as np
 
 import warpcloth as wc
+
+CLAMP = 0.18  # distance from the second row of pins back to where a plate is clamped, in elements
 
 
 def scene(
@@ -18,23 +24,33 @@ def scene(
     stretching: float = 1e7,
     length: float = 1.0,
     duration: float = 2.0,
+    fabric: str | None = None,
+    angle: float = 0.0,
 ):
-    """Γ, width [m], elements along, quadratic or dihedral, kL²/D for the spring stiffness k, L [m], duration [s]."""
+    """Γ, width [m], elements along, quadratic or dihedral, kL²/D of springs, L [m], duration [s]; fabric, its angle [°]."""
     wc.checks.number("width", width, least=0.0)
     wc.checks.choice("bending", bending, ("quadratic", "dihedral"))
-    spacing = length / (elements - (0.25 if width == 0.0 else 0.5))
-    if width == 0.0:
+    wc.checks.number("angle", angle)
+    spacing, stiffness = length / (elements - (0.25 if width == 0.0 else 0.5)), 1e-3  # D [N·m]
+    if fabric is not None:
+        cloth = wc.fabrics[fabric] if isinstance(fabric, str) else fabric
+        length = (gamma * cloth.bending_along(np.radians(angle)) / (9.81 * cloth.density)) ** (1 / 3)
+        spacing, width = length / (elements + CLAMP), width or 0.025
+        wc.checks.number("width", width, least=3.9 * spacing)
+        size = ((elements + 1) * spacing, width)
+        mesh = wc.Mesh.grid(elements + 2, round(width / spacing) + 1, size=size, pattern="alternating")
+    elif width == 0.0:
         mesh = wc.Mesh.grid(elements + 1, 2, size=spacing * elements, pattern="equilateral")
     else:
         across = max(round(width / spacing * np.sqrt(0.75)), 1)
         rows = wc.Mesh.grid(across + 1, elements + 1, size=across * spacing / np.sqrt(0.75), pattern="equilateral")
         mesh = wc.Mesh(rows.points[:, ::-1], rows.triangles[:, ::-1])  # x and z change places
-    stiffness = 1e-3  # D [N·m]
     bend = wc.QuadraticBending if bending == "quadratic" else wc.DihedralBending
+    springs = wc.Spring(pairs="edges", stiffness=stretching * stiffness / length**2)
     return wc.Scene(
         mesh,
-        density=gamma * stiffness / (9.81 * length**3),
-        terms=[wc.Spring(pairs="edges", stiffness=stretching * stiffness / length**2), bend(stiffness=stiffness)],
+        density=cloth.density if fabric else gamma * stiffness / (9.81 * length**3),
+        terms=cloth.terms(warp_angle=-np.radians(angle)) if fabric else [springs, bend(stiffness=stiffness)],
         pins=np.flatnonzero(mesh.points[:, 0] < 1.01 * spacing),
         duration=duration,
         name="cantilever",

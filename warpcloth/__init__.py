@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .deformation.arap import Arap as Arap
     from .deformation.deform import Deformation as Deformation
     from .deformation.deform import deform as deform
+    from .lab.laboratory import laboratory_readings as laboratory_readings
     from .mesh import ordering as ordering
     from .mesh.mesh import Mesh as Mesh
     from .mesh.sequences import Sequence as Sequence
@@ -71,6 +72,7 @@ _MODULES = {
     "Arap": "deformation.arap",
     "Deformation": "deformation.deform",
     "deform": "deformation.deform",
+    "laboratory_readings": "lab.laboratory",
     "ordering": "mesh",
     "Mesh": "mesh.mesh",
     "Sequence": "mesh.sequences",

@@ -30,6 +30,10 @@ def test_terms_have_the_moduli_of_the_record(name):
     assert all(0.01 < length < 0.05 for length in fabric.bending_lengths)
     for term in (membrane, bending):
         term.elements(MESH, MESH.points)
+    x, _, z = MESH.points.T
+    cylinder = bending.operator(MESH) @ (0.5 * (x * np.cos(0.5) + z * np.sin(0.5)) ** 2)  # at 0.5 + 0.3 rad to the warp
+    energy = bending.stiffness * (cylinder.reshape(-1, 3) ** 2).sum(axis=1)
+    assert energy == pytest.approx(np.full(len(energy), fabric.bending_along(0.8)))
 
 
 @pytest.mark.parametrize("name", needs_a_number)

@@ -274,6 +274,10 @@ REFUSED = {
     ("mobile", solver): "bars with infinite stiffness"
     for solver in ("newton", "explicit", "projective dynamics", "projective dynamics plain", "constrained dynamics searching")
 }
+REFUSED |= {
+    (name, "constrained dynamics"): "OrthotropicMembrane, whose energy is no square of a constraint"
+    for name in ("strip", "picture_frame", "cusick")
+}
 REFUSED[("mobile", "admm")] = "bars, whose bodies are no elements by themselves"
 # Frames of the larger of them on the CPU; the others have 30.
 FRAMES = {"usd_cloth": 3, "bunny": 2, "bar_twist": 15, "mobile": 15, "cards": 5, "loop": 15, "stack": 5}

@@ -62,6 +62,9 @@ SMALL = {
     "stack": {"sheets": 2, "n": 4},
     "mobile": {"n": 5},
     "net": {"n": 6},
+    "strip": {"elements": 4},
+    "picture_frame": {"n": 3},
+    "cusick": {"fabric": "silk", "rows": 4},
 }
 TOUCHING = {
     "incline": {"n": 4},

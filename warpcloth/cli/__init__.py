@@ -22,7 +22,7 @@ import numpy as np
 
 from ..base.interrupts import Interrupts
 from ..base.version import installed_version
-from . import analyze, bench, chart, check, choose, compare, deform, fabrics, fit, info, options, render, run, scenes
+from . import analyze, bench, chart, check, choose, compare, deform, fabrics, fit, info, measure, options, render, run, scenes
 from .terminal import DTYPES, Printable, say, show_warning
 
 
@@ -137,6 +137,9 @@ def _parser():
     analyze.add_arguments(analyzes)
     compares = add("compare", compare.compare, "Measure the distance between two animations.", epilog=compare.EPILOG)
     compare.add_arguments(compares)
+    measures = add("measure", measure.measure, "Read what a device of a textile laboratory measures.", epilog=measure.EPILOG)
+    options.add_scene(measures)
+    measure.add_arguments(measures)
     checks = add("check", check.check, "Find what intersects in an animation, exactly.", epilog=check.EPILOG)
     check.add_arguments(checks)
     renders = add("render", render.render, "Draw a picture or a film of an animation.", epilog=render.EPILOG)
@@ -183,7 +186,7 @@ def _parser():
     runs.add_argument(
         "--frames", type=int, metavar="N", help="number of frames after the start (default: those of the scene's duration)"
     )
-    for sub in (runs, infos, deforms, analyzes, compares, checks, renders, chooses, benches, fitted):
+    for sub in (runs, infos, deforms, analyzes, compares, measures, checks, renders, chooses, benches, fitted):
         if sub is not checks:
             sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")

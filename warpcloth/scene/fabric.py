@@ -92,6 +92,32 @@ class Fabric:
         """
         return [self.membrane(**given), self.bending(**given)]
 
+    def modulus_along(self, angle: float) -> float:
+        """Returns E(θ) [N/m] of a strip cut at ``angle`` θ [rad] to the warp, that shears and narrows freely.
+
+        1/E(θ) = c⁴/E₁ + s⁴/E₂ + (1/G − 2ν₁₂/E₁)s²c², with c and s the cosine and sine of θ.
+
+        Raises:
+            ValueError: A number that it needs is None.
+        """
+        E1, E2, G, ratio = self._known("a membrane", "warp", "weft", "shear", "poisson_ratio")
+        c, s = np.cos(angle), np.sin(angle)
+        return float(1.0 / (c**4 / E1 + s**4 / E2 + (1.0 / G - 2.0 * ratio / E1) * s**2 * c**2))
+
+    def bending_along(self, angle: float) -> float:
+        """Returns D(θ) [N·m] of a cylinder that is curved at ``angle`` θ [rad] to the warp, of :meth:`bending`.
+
+        D(θ) = D₁c⁴ + D₂s⁴ + 2(D₁₂ + 2D₆₆)s²c². A narrow strip is softer, because it curves across its width too.
+
+        Raises:
+            ValueError: A number that it needs is None.
+        """
+        plate, c, s = self.bending(), np.cos(angle), np.sin(angle)
+        root = plate.weft_ratio**0.5
+        twist = 0.5 * (1.0 - plate.poisson_ratio) * root if plate.twist_ratio is None else plate.twist_ratio
+        mixed = 2.0 * (plate.poisson_ratio * root + 2.0 * twist)
+        return float(plate.stiffness * (c**4 + plate.weft_ratio * s**4 + mixed * s**2 * c**2))
+
     @property
     def bending_lengths(self) -> tuple[float, float]:
         """(D/ρg)^⅓ [m] of strips cut along warp and weft; NaN where D is None."""

@@ -1,0 +1,141 @@
+"""What devices of textile laboratories read, against the moduli of the fabric and closed forms."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from support.command_line import run
+from support.rows import slow_but
+from support.scenes import scene
+from warpcloth.lab import elastica
+from warpcloth.lab.laboratory import drape_coefficient
+
+COTTON = wc.fabrics["cotton"]
+
+
+def read(declared, device, **options):
+    """Values by their names, at rest."""
+    rest = wc.equilibrium(declared, device=device, record="reactions", **options)
+    assert rest.status.ok and rest.stable, rest.status
+    return {quantity: value for quantity, (value, _unit) in wc.laboratory_readings(declared, rest).items()}
+
+
+@pytest.mark.parametrize("degrees", np.linspace(0.0, 90.0, 9))
+def test_a_strip_off_the_axes_has_its_modulus(degrees, device):
+    """To 1e-6 at a strain of 1e-7; the grips let it shear, so it is stretched uniformly."""
+    E1, E2, G, ratio = COTTON.warp, COTTON.weft, COTTON.shear, COTTON.poisson_ratio
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    expected = 1.0 / (c**4 / E1 + s**4 / E2 + (1.0 / G - 2.0 * ratio / E1) * s**2 * c**2)
+    found = read(scene("strip", angle=degrees, strain=1e-7, elements=4), device, tolerance=1e-10)
+    assert found["modulus"] == pytest.approx(expected, rel=1e-6)
+    assert COTTON.modulus_along(np.radians(degrees)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [1.0, 40.0])
+def test_a_picture_frame_reads_the_shear_modulus(degrees, device):
+    found = read(scene("picture_frame", angle=degrees, n=4), device, tolerance=1e-13)
+    g = np.radians(degrees)
+    expected = 0.2 * COTTON.shear * np.sin(g) * np.cos(g) / np.sin(np.pi / 4.0 - g / 2.0)
+    assert found["force along the diagonal"] == pytest.approx(expected, rel=1e-10)
+    assert found["shear modulus"] == pytest.approx(COTTON.shear, rel=1e-10)
+
+
+# Fabrics of which D(θ) is that of narrow strips too, as they do not curl across: ν = 0, or 0 in the axes at 45°.
+THICK = 3e-4
+ALIGNED = wc.Fabric(
+    name="aligned",
+    density=0.2,
+    warp=2e3,
+    weft=5e3,
+    shear=300.0,
+    poisson_ratio=0.0,
+    thickness=THICK,
+    bending_warp=15e-6,
+    bending_weft=40e-6,
+)
+ALIKE = replace(
+    ALIGNED, weft=2e3, shear=0.75 * 20e-6 * 12.0 / THICK**2, poisson_ratio=0.5, bending_warp=20e-6, bending_weft=20e-6
+)
+STRIPS = {"warp": (ALIGNED, 0.0, 15e-6), "weft": (ALIGNED, 90.0, 40e-6), "45°": (ALIKE, 45.0, 30e-6)}
+
+
+@pytest.mark.parametrize("strip", slow_but(["45°"], STRIPS))
+def test_a_shirley_tester_reads_twice_the_bending_length(strip, device):
+    """The overhang to 0.2 %; the exact elastica of L = 2c hangs at 41.49°."""
+    fabric, angle, D = STRIPS[strip]
+    c = (D / (fabric.density * 9.81)) ** (1 / 3)
+    found = read(scene("cantilever", gamma=8.0, fabric=fabric, angle=angle, elements=24, width=8.0 * c / 24), device)
+    assert found["overhang at 41.5°"] == pytest.approx(2e3 * c, rel=2e-3)
+    assert found["bending length"] == pytest.approx(1e3 * c, rel=2e-3)
+    assert found["D"] == pytest.approx(1e6 * D, rel=6e-3)
+    assert found["angle of the tip"] == pytest.approx(41.49, abs=0.1)
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("strip", slow_but(["warp"], STRIPS))
+def test_a_heart_loop_reads_the_bending_length(strip, device):
+    """To 1 %, a quarter of that with twice the elements: the depth of the loop changes by 0.2 % if D changes by 1 %."""
+    fabric, angle, D = STRIPS[strip]
+    c, elements = (D / (fabric.density * 9.81)) ** (1 / 3), 48
+    width = 4.0 * 100.0 ** (1 / 3) * c / elements
+    found = read(scene("loop", fabric=fabric, angle=angle, elements=elements, width=width), device)
+    assert found["bending length"] == pytest.approx(1e3 * c, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "gamma", "depth"),
+    [
+        ("pear", 0.0, 0.424308),
+        ("ring", 0.0, 0.318310),
+        ("heart", 0.0, 0.133860),
+        ("heart", 10.0, 0.139540),
+        ("heart", 100.0, 0.184043),
+    ],
+)
+def test_depths_of_loops(kind, gamma, depth):
+    assert elastica.loop_depth(kind, gamma) == pytest.approx(depth, rel=1e-5)
+
+
+@pytest.mark.parametrize("degrees", [60.0, 150.0])
+def test_the_shadow_of_a_cone(degrees):
+    """A ring turned down by α ends at R₁ + (R₂ − R₁) cos α; what is below the support has no shadow of its own."""
+    mesh = scene("cusick", rows=8).mesh
+    radius = np.hypot(*mesh.points[:, [0, 2]].T)
+    over = np.maximum(radius - 0.09, 0.0)
+    turned = np.minimum(radius, 0.09) + over * np.cos(np.radians(degrees))
+    cone = mesh.points * (turned / radius)[:, None] - np.outer(over * np.sin(np.radians(degrees)), [0.0, 1.0, 0.0])
+    outer = max(0.09 + 0.06 * np.cos(np.radians(degrees)), 0.09)
+    found = drape_coefficient(cone, mesh.points, mesh.triangles)
+    assert found == pytest.approx((outer**2 - 0.09**2) / (0.15**2 - 0.09**2), abs=1e-3)
+
+
+def test_what_has_no_reading_is_refused(device):
+    strip, hanging = scene("strip", elements=2), scene("cantilever", gamma=0.01, fabric=ALIGNED, elements=6, width=0.005)
+    for declared, sentence in (
+        (strip, "rest has no reactions, which the device measures"),
+        (scene("hanging", n=3), "scene.name is 'hanging'; it must be one of 'cantilever', 'loop'"),
+        (hanging, "the tip hangs .*° below the clamp; its Γ must be from 0.4 to 100, best 8"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            wc.laboratory_readings(declared, wc.equilibrium(declared, device=device))
+
+
+def test_the_command_prints_the_reading(capfd, tmp_path):
+    shape = tmp_path / "strip.npz"
+    code, out, _ = run(capfd, "measure", "strip", "-p", "angle=0", "elements=2", "strain=1e-6", "--json", "-o", str(shape))
+    found = json.loads(out)["readings"]["modulus"]
+    assert code == 0 and found["unit"] == "N/m" and found["value"] == pytest.approx(COTTON.warp, rel=1e-5)
+    assert len(wc.open_sequence(str(shape))) == 1
+    code, out, _ = run(capfd, "measure", "strip", "-p", "elements=2")
+    assert code == 0 and "modulus  " in out
+    for given, sentence in (
+        (["hanging"], "hanging is no test of a laboratory; it must be one of cantilever"),
+        (["strip", "-o", "strip.obj"], "--output is strip.obj; it must end with .npz"),
+        (["strip", "-p", "fabric=denim-wang"], "fabric 'denim-wang' has no poisson_ratio"),
+        (["cantilever", "-p", "fabric=silk", "width=1e-4"], "width is 0.0001; it must be a number of"),
+    ):
+        code, _, error = run(capfd, "measure", *given)
+        assert code == 2 and sentence in error

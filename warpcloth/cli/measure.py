@@ -1,0 +1,66 @@
+"""The command ``measure``: lets a sample of a textile laboratory come to rest, and prints what the device reads."""
+
+import time
+
+import numpy as np
+
+from ..base.outputs import check_apart
+from ..base.quiet import find_device
+from ..base.texts import json_text
+from .setup import named_scene
+from .terminal import aligned, check_writable, say
+
+EPILOG = """\
+SCENE is cantilever, loop, cusick, strip or picture_frame, most of them with -p fabric=NAME. The sample is at rest: there is no
+motion. With -o the shape is written as .npz, which 'warpcloth render' draws.
+
+  warpcloth measure cantilever -p fabric=denim gamma=8 angle=45
+  warpcloth measure cusick -p fabric=silk -o drape.npz
+"""
+
+
+def add_arguments(parser):
+    """Adds the arguments of this command, without those of all commands."""
+    parser.add_argument("-o", "--output", metavar="FILE", help="also write the shape, as .npz")
+
+
+def measure(arguments):
+    from ..lab.laboratory import DEVICES, laboratory_readings
+    from ..run.equilibrium import equilibrium
+
+    source, values, scene = named_scene(arguments)
+    if scene.name not in DEVICES:
+        raise ValueError(f"{arguments.scene} is no test of a laboratory; it must be one of {', '.join(DEVICES)}")
+    if arguments.output is not None and not arguments.output.endswith(".npz"):
+        raise ValueError(f"--output is {arguments.output}; it must end with .npz")
+    check_apart([arguments.output] if arguments.output else [], [str(source.path)])
+    check_writable(arguments.output)
+    device = find_device(arguments.device)
+    began = time.perf_counter()
+    rest = equilibrium(scene, device=device, record="reactions")
+    seconds = time.perf_counter() - began
+    if not rest.status.ok:
+        return say(f"{scene.name}: {rest.status.message}", 1)
+    readings = laboratory_readings(scene, rest)
+    if arguments.output:
+        np.savez(arguments.output, points=rest.points[None], triangles=scene.mesh.triangles, times=np.zeros(1))
+    facts = {
+        "scene": scene.name,
+        "source": str(source.path),
+        "parameters": values,
+        "message": rest.status.message,
+        "stable": rest.stable,
+        "readings": {quantity: {"value": value, "unit": unit} for quantity, (value, unit) in readings.items()},
+        "iterations": rest.iterations,
+        "seconds": seconds,
+        "device": str(device),
+        "file": arguments.output,
+    }
+    print(json_text(facts) if arguments.json else _summary(facts, readings))
+    return 0
+
+
+def _summary(facts, readings):
+    lines = aligned([(quantity, f"{value:.4g} {unit}".rstrip()) for quantity, (value, unit) in readings.items()])
+    taken = f"{facts['iterations']} iterations, {facts['seconds']:.3g} s"
+    return "\n".join([f"{facts['scene']}: {facts['message']}", *(f"  {line}" for line in lines), f"  {taken}"])

@@ -1,0 +1,186 @@
+"""The numbers that devices of textile laboratories read from a sample at rest.
+
+| Scene | Device | Reading |
+|---|---|---|
+| cantilever | Shirley tester | overhang at which the tip hangs 41.5° below the clamp, and the bending length (D/ρg)^⅓ |
+| loop | hanging heart loop, pear or ring | depth of the loop, and the bending length |
+| cusick | Cusick drapemeter | drape coefficient: how much of the ring outside the support has a shadow, seen from above |
+| strip | tensile tester | modulus of a strip, force per width over strain |
+| picture_frame | picture frame | force along the diagonal, and the shear modulus |
+
+Bending lengths follow from the elastica (:mod:`warpcloth.lab.elastica`), not from Peirce's formula.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..base.checks import choice
+from ..run.equilibrium import Equilibrium
+from ..scene.scene import Scene
+from ..scenes import cantilever, cusick
+from ..terms.plate_bending import PlateBending
+from . import elastica
+
+Readings = dict[str, tuple[float, str]]
+ANGLE = np.radians(41.5)  # of the Shirley tester
+_LINES = 600  # across the shadow of a drape
+
+
+def laboratory_readings(scene: Scene, rest: Equilibrium) -> Readings:
+    """Returns what the device of a scene reads from its sample at rest: (value, unit) by the name of the quantity.
+
+    Args:
+        scene: One of the included scenes cantilever, loop, cusick, strip and picture_frame, known by its name.
+        rest: Its equilibrium, for strip and picture_frame with ``record="reactions"``.
+
+    Raises:
+        ValueError: The scene is none of these, the reactions were not recorded, or the sample hangs too far or too little for
+            its device.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> from warpcloth.scenes import strip
+        >>> scene = strip.scene("cotton", angle=0.0)
+        >>> modulus, unit = wc.laboratory_readings(scene, wc.equilibrium(scene, record="reactions"))["modulus"]
+        >>> round(modulus / 2365.0, 2), unit
+        (1.0, 'N/m')
+    """
+    choice("scene.name", scene.name, tuple(DEVICES))
+    return DEVICES[scene.name](scene, rest)
+
+
+def drape_coefficient(points: np.ndarray, flat: np.ndarray, triangles: np.ndarray) -> float:
+    """Returns the area of the ring outside the support that has a shadow, over that of the flat sample.
+
+    Args:
+        points: Draped positions (n, 3) [m], with the axis of the support along y through the origin.
+        flat: Positions of the flat sample (n, 3) [m].
+        triangles: (T, 3).
+    """
+    support = np.pi * cusick.SUPPORT**2
+    return (_shadow(points, triangles) - support) / (_shadow(flat, triangles) - support)
+
+
+def _shadow(points, triangles):
+    """Returns the area [m²] of the union of triangles and the support, projected along y.
+
+    Lines along x cross them in intervals, whose unions are measured exactly; the area is their sum by the midpoint rule.
+    """
+    x, z = np.moveaxis(points[triangles][..., [0, 2]], 2, 0)
+    width = 2.0 * np.abs(z).max() / _LINES
+    area = 0.0
+    for line in width * (np.arange(_LINES) + 0.5 - 0.5 * _LINES):
+        crossed = (z.min(axis=1) < line) & (z.max(axis=1) > line)
+        a, low = x[crossed], z[crossed]
+        b, high = np.roll(a, -1, axis=1), np.roll(low, -1, axis=1)
+        between = (low < line) != (high < line)
+        at = a + (line - low) / np.where(between, high - low, 1.0) * (b - a)
+        half = np.sqrt(max(cusick.SUPPORT**2 - line**2, 0.0))
+        begin = np.append(np.where(between, at, np.inf).min(axis=1), -half)
+        end = np.append(np.where(between, at, -np.inf).max(axis=1), half)
+        order = np.argsort(begin)
+        covered = np.maximum.accumulate(end[order])
+        new = covered - np.maximum(begin[order], np.append(-np.inf, covered[:-1]))
+        area += width * np.maximum(new, 0.0).sum()
+    return float(area)
+
+
+def _clamps(scene):
+    """Returns the effective clamp at the low and at the high end of a strip along x [m]: the same if one end is free."""
+    held = scene.mesh.points[scene.pins.vertices, 0]
+    middle = scene.mesh.points[:, 0].mean()
+    found = []
+    for side in (held[held < middle], -held[held > middle]):
+        if len(side) and any(isinstance(term, PlateBending) for term in scene.terms):
+            outer, inner = np.unique(side.round(12))[[-2, -1]]
+            found.append(inner - cantilever.CLAMP * (inner - outer))
+        elif len(side):
+            found.append(0.5 * (side.min() + side.max()))
+    return found[0], -found[-1]
+
+
+def _bending(length, gamma, scene):
+    """Returns the bending length and D of a strip of a length [m] with Γ."""
+    bending_length = float(length * gamma ** (-1 / 3))
+    weight = scene.density * float(np.linalg.norm(scene.gravity))
+    return {"bending length": (1e3 * bending_length, "mm"), "D": (1e6 * weight * bending_length**3, "µN·m")}
+
+
+def _cantilever(scene, rest):
+    flat = scene.mesh.points[:, 0]
+    clamp, _ = _clamps(scene)
+    spacing = np.unique(flat.round(12))[1] - flat.min()
+    tip = flat > flat.max() - 1.5 * spacing if scene.mesh.grid_shape is None else flat > flat.max() - 0.5 * spacing
+    x, y, _ = rest.points[tip].mean(axis=0)
+    gamma = elastica.gamma_of(-y / (x - clamp), 1.0, 8.0)
+    if gamma is None:
+        raise ValueError(
+            f"the tip hangs {np.degrees(np.arctan2(-y, x - clamp)):.3g}° below the clamp; its Γ must be from 0.4 to 100, best 8"
+        )
+    length = flat[tip].mean() - clamp
+    device = elastica.gamma_of(np.tan(ANGLE), 1.0, 8.0)
+    return {
+        "angle of the tip": (float(np.degrees(np.arctan2(-y, x - clamp))), "°"),
+        "overhang at 41.5°": (float(1e3 * length * (device / gamma) ** (1 / 3)), "mm"),
+        **_bending(length, gamma, scene),
+    }
+
+
+def _loop(scene, rest):
+    low, high = _clamps(scene)
+    length, depth = high - low, -float(rest.points[:, 1].min())
+    first, second = rest.points[np.lexsort((scene.mesh.points[:, 0], scene.mesh.points[:, 2]))[:2]]  # ends point that way
+    kind = ("pear", "ring", "heart")[1 + round((second - first)[1] / np.linalg.norm(second - first))]
+    gamma = elastica.gamma_of_loop(kind, depth / length)
+    if gamma is None:
+        raise ValueError(f"the {kind} is {depth / length:.4g} of its length deep; its Γ must be from 0 to 200, best 50 to 150")
+    return {"depth of the loop": (1e3 * depth, "mm"), **_bending(length, gamma, scene)}
+
+
+def _cusick(scene, rest):
+    points, flat = rest.points, scene.mesh.points
+    radius = np.hypot(*flat[:, [0, 2]].T)
+    edge = np.flatnonzero(radius > radius.max() * (1.0 - 1e-9))
+    outline = np.hypot(*points[edge][:, [0, 2]].T)
+    outside = outline > outline.mean()
+    return {
+        "drape coefficient": (100.0 * drape_coefficient(points, flat, scene.mesh.triangles), "%"),
+        "folds": (float((outside & ~np.roll(outside, 1)).sum()), ""),
+    }
+
+
+def _strip(scene, rest):
+    x = scene.mesh.points[:, 0]
+    pulled = scene.mesh.points[scene.pins.vertices, 0] == x.max()
+    width, length = np.ptp(scene.mesh.points[:, 2]), np.ptp(x)
+    strain = np.ptp(rest.points[:, 0]) / length - 1.0
+    return {"modulus": (float(_reactions(rest)[pulled, 0].sum() / (width * strain)), "N/m")}
+
+
+def _picture_frame(scene, rest):
+    """By virtual work: the power of the reactions over the rate at which the diagonal becomes longer."""
+    flat, held = scene.mesh.points, scene.pins.vertices
+    along_x = rest.points[held][np.argmax(flat[held, 0] - flat[held, 2])]
+    side, half = np.ptp(flat[:, 0]), float(np.arctan2(along_x[2], along_x[0]))  # γ/2
+    c, s = 0.5 * np.cos(half), -0.5 * np.sin(half)
+    speed = flat[held] @ np.array([[s, 0.0, c], [0.0, 0.0, 0.0], [c, 0.0, s]])  # by γ
+    rate = side * np.sin(0.25 * np.pi - half)
+    force = float((_reactions(rest) * speed).sum() / rate)
+    modulus = force * rate / (side**2 * np.sin(2.0 * half) * np.cos(2.0 * half))
+    return {"force along the diagonal": (force, "N"), "shear modulus": (float(modulus), "N/m")}
+
+
+def _reactions(rest):
+    if rest.reactions is None:
+        raise ValueError('rest has no reactions, which the device measures; find it by equilibrium(scene, record="reactions")')
+    return rest.reactions
+
+
+DEVICES: dict[str, Callable[[Scene, Equilibrium], Readings]] = {
+    "cantilever": _cantilever,
+    "loop": _loop,
+    "cusick": _cusick,
+    "strip": _strip,
+    "picture_frame": _picture_frame,
+}
