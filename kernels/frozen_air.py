@@ -8,13 +8,20 @@ from .terms.air import AIR
 from .vectors import types
 
 
+@wp.func
+def calm(_position: wp.vec3, _time: wp.float32):
+    """No wind."""
+    return wp.vec3()
+
+
 @cache
-def set_air(dtype, parts: int, explicit: bool):
+def set_air(dtype, parts: int, explicit: bool, blow: wp.Function = calm):
     """Kernel over triangles: a, n, κ_n and κ_t of rest, from x, v and the wind.
 
     a is the centre after hₑ with the wind; the step takes velocities from x, or, with ``parts``, from x + move/parts, as
     BDF2 with 3. Where ``explicit``, y stays at x while the force is taken, and a is that much farther back. A triangle without
-    an area has no force. Wind is that of the rest state or, if there are keyframes (F,), theirs ``ahead`` of the step.
+    an area has no force. Wind is that of the rest state or, if there are keyframes (F,), theirs ``ahead`` of the step. A
+    function ``blow`` gives that at the centre; where it is faster than the wind of the rest state, it is slowed to that.
     """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(AIR.parameters, dtype)
@@ -33,6 +40,7 @@ def set_air(dtype, parts: int, explicit: bool):
         he: dtype,
         ahead: int,
         steps_per_frame: int,
+        frame_time: dtype,
         per_copy: int,
         # in and out
         rest: wp.array(dtype=rest_type),
@@ -44,16 +52,24 @@ def set_air(dtype, parts: int, explicit: bool):
         r = rest[e]
         third = dtype(1.0) / dtype(3.0)
         wind = vec3(r[8], r[9], r[10])
+        after = ahead
+        if step:
+            after = step[i // per_copy] + ahead
         if keyframes:
-            after = ahead
-            if step:
-                after = step[i // per_copy] + ahead
             frame = after // steps_per_frame
             part = dtype(after - frame * steps_per_frame) / dtype(steps_per_frame)
             last = keyframes.shape[0] - 1
             wind = (dtype(1.0) - part) * keyframes[wp.min(frame, last)] + part * keyframes[wp.min(frame + 1, last)]
         velocity = third * (v[i] + v[j] + v[k])
         centre = third * (x[i] + x[j] + x[k])
+        if wp.static(blow is not calm):
+            time = dtype(after) / dtype(steps_per_frame) * frame_time
+            blown = blow(wp.vec3(wp.float32(centre[0]), wp.float32(centre[1]), wp.float32(centre[2])), wp.float32(time))
+            most = wp.length(wind)
+            wind = vec3(dtype(blown[0]), dtype(blown[1]), dtype(blown[2]))
+            speed = wp.length(wind)
+            if speed > most:
+                wind *= most / speed
         away = wind - velocity
         both = wp.cross(x[j] - x[i], x[k] - x[i])
         double_area = wp.length(both)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warpcloth as wc
 from support.rows import slow_but
@@ -157,6 +158,51 @@ def test_wind_by_keyframes_and_by_triangles(device):
     assert 1e-4 < np.abs(ends[3] - ends[0]).max() < 0.1
 
 
+@wp.func
+def ramp(_position: wp.vec3, time: float):
+    """The wind of the keyframes (0, 0, 0), (1, 0.5, 0), …, one each 1/60 s."""
+    return 60.0 * time * wp.vec3(1.0, 0.5, 0.0)
+
+
+@wp.func
+def sheared(position: wp.vec3, _time: float):
+    """A wind that differs from triangle to triangle, in a bound of 8 m/s."""
+    return wp.vec3(4.0 * position[2], 30.0 * position[0], 0.0)
+
+
+@pytest.mark.parametrize("name", slow_but(("explicit", "midpoint"), SOLVERS))
+def test_a_function_gives_the_wind_at_each_position_and_time(name, device):
+    """As keyframes do that are the same, to float32 of the function; and as winds of triangles do that do not move."""
+    keyframes = np.arange(8)[:, None] * [1.0, 0.5, 0.0]
+    solver = replace(SOLVERS[name], substeps=16 if name == "explicit" else 2)
+    ends = [
+        wc.simulate(sheet(air=air, pins=[0], duration=0.1), solver, device=device, dtype="float64", record="reactions")
+        for air in (wc.Air(keyframes=keyframes), wc.Air(wind=ramp, max_speed=10.0))
+    ]
+    assert np.abs(ends[1].points - ends[0].points).max() < 1e-7
+    assert ends[1].reactions == pytest.approx(ends[0].reactions, abs=1e-6 * np.abs(ends[0].reactions).max())
+    still = {"pins": "all", "gravity": (0.0, 0.0, 0.0), "duration": 1 / 60}
+    centres = sheet().mesh.points[sheet().mesh.triangles].mean(axis=1)
+    winds = np.stack([4.0 * centres[:, 2], 30.0 * centres[:, 0], 0.0 * centres[:, 0]], axis=1)
+    speeds = np.linalg.norm(winds, axis=1)
+    winds *= np.minimum(1.0, 8.0 / speeds)[:, None]
+    assert (speeds > 8.0).any() and (speeds < 8.0).any()
+    held = [
+        wc.simulate(sheet(air=air, **still), solver, device=device, dtype="float64", record="reactions").reactions[-1]
+        for air in (wc.Air(wind=winds), wc.Air(wind=sheared, max_speed=8.0))
+    ]
+    assert held[1] == pytest.approx(held[0], abs=1e-6 * np.abs(held[0]).max())
+
+
+def test_equilibrium_takes_a_function_at_the_end_of_the_scene(device):
+    scene = replace(strip(1.0, 0.5), duration=1 / 60)
+    ends = [
+        wc.equilibrium(replace(scene, air=air), device=device)
+        for air in (wc.Air(wind=(1.0, 0.5, 0.0)), wc.Air(wind=ramp, max_speed=10.0))
+    ]
+    assert ends[0].status.ok and np.abs(ends[1].points - ends[0].points).max() < 1e-6
+
+
 def test_reactions_have_the_drag_of_pins(device):
     """Of a sheet whose vertices are all pinned, at right angles to the wind: ½ρA(C_n u²)."""
     mesh = wc.Mesh.grid(4, 4, size=0.3)
@@ -194,6 +240,8 @@ STRONG = wc.Air(wind=(100.0, 0.0, 0.0))
         (lambda: wc.Air(wind=(1.0, 0.0)), r"air.wind has shape \(2,\)"),
         (lambda: wc.Air(wind=(1.0, 0.0, np.nan)), r"air.wind\[2\] is nan; it must be finite"),
         (lambda: wc.Air(wind=(1, 0, 0), keyframes=[(1, 0, 0)]), "air.wind and air.keyframes are given"),
+        (lambda: wc.Air(wind=ramp), "one of a function as air.wind and air.max_speed is given"),
+        (lambda: write_scene(sheet(air=wc.Air(wind=ramp, max_speed=1.0)), "air.usda"), "a function, which a stage cannot hold"),
         (lambda: wc.Air(density=-1.0), "air.density is -1.0; it must be a number of 0 or more"),
         (lambda: sheet(air=3), "air is 3; it must be an Air or None"),
         (lambda: sheet(air=wc.Air(wind=np.zeros((5, 3)))), r"air.wind has shape \(5, 3\); it must be \(3,\), or \(18, 3\)"),

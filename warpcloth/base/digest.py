@@ -27,7 +27,7 @@ def scene_digest(scene):
 
 
 def digest_of(facts):
-    """Hashes numbers, strings, lists, arrays and dataclasses of these.
+    """Hashes numbers, strings, lists, arrays, Warp functions by their own source, and dataclasses of these.
 
     Raises:
         ValueError: A value is of another type.
@@ -50,6 +50,8 @@ def _add(digest, value):
         digest.update(f"list {len(value)};".encode())
         for part in value:
             _add(digest, part)
+    elif hasattr(value, "adj"):  # a Warp function
+        digest.update(f"function {value.adj.source};".encode())
     elif is_dataclass(value) and not isinstance(value, type):
         digest.update(f"{type(value).__name__};".encode())
         for field in fields(value):

@@ -133,6 +133,8 @@ class Model:
         self.colliders = colliders_on(self, scene)
         declared = (*scene.terms, *scene.contact_terms, *scene.air_terms)
         self.terms = tuple(elements_on(self, term, positions, vary) for term in declared)
+        if vary.has("Air.wind") and scene.air is not None and scene.air.changes:
+            raise ValueError("vary['Air.wind'] is given and the wind follows keyframes or a function, the same for all copies")
         self.refresh(STEP, Moment(self.positions), [each for each in self.terms if each.term is AIR])  # uploads keyframes
         vary.refuse_rest()
 
@@ -166,8 +168,7 @@ class Model:
     @property
     def timed(self):
         """Whether pins, loads or wind follow keyframes, so that steps are counted."""
-        air = self.scene.air
-        blown = air is not None and air.keyframes is not None
+        blown = self.scene.air is not None and self.scene.air.changes
         return self.pins is not None or blown or (self.loads is not None and self.loads.timed)
 
     @property

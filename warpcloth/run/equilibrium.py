@@ -21,7 +21,7 @@ from ..numerics.minimise import Minimiser
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
 from ..terms.refresh import STEP, Moment
-from .history import Evaluation, checked_record, collider_names
+from .history import Evaluation, checked_record, collider_names, last_frame
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
@@ -88,9 +88,9 @@ def equilibrium(
     again, until forces balance. ``stable`` and ``lowest_eigenvalue`` neglect the rotation of pairs. Layers without friction may
     slide off one another, so they often have no equilibrium.
 
-    Wind is that of the last keyframe, and its force follows the normals: cloth without mass moves in it until it rests.
-    ``stable`` and ``lowest_eigenvalue`` are those under the final forces, held constant. Flutter needs mass, so a shape that
-    rests here may flutter in a run.
+    Wind is that of the last keyframe, or of a function at the end of the scene. Its force follows the normals: cloth without
+    mass moves in it until it rests. ``stable`` and ``lowest_eigenvalue`` are those under the final forces, held constant.
+    Flutter needs mass, so a shape that rests here may flutter in a run.
 
     The method is Newton's with a line search, without inertia; gravity is applied in equal load steps. If the Hessian is
     singular, for example because a flat cloth without bending stiffness cannot carry its weight, a term s/2‖x − x_now‖²_M is
@@ -337,7 +337,7 @@ class _Wind:
         self._residual = residual
 
     def _set(self, seconds):
-        moment = Moment(self._base, v=self._still, he=seconds, ahead=MOST_FRAMES)
+        moment = Moment(self._base, v=self._still, he=seconds, ahead=last_frame(self._model.scene))
         self._model.refresh(STEP, moment, self._elements)
 
 

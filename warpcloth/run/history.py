@@ -125,7 +125,7 @@ class Evaluation:
         soft = tuple(elements for elements in self._terms if not elements.hard and elements.collider is None)
         self._elastic = plan(model).gradient(terms=soft) if soft else None
         self._of_air = plan(model).gradient(terms=self._blown) if self._blown else None
-        self._time = {"ahead": MOST_FRAMES} if stepper is None else _time_of(stepper)
+        self._time = {"ahead": last_frame(model.scene)} if stepper is None else _time_of(stepper)
         self._still = model.vectors() if self._blown and h is None else None
         self._damped = dissipations(model, h) if h else []
         if self._damped:
@@ -214,13 +214,18 @@ class Evaluation:
         return array.numpy().astype(np.float64).reshape(*self._mass.shape, 3)
 
 
+def last_frame(scene: Scene) -> int:
+    """Returns the frame of the wind at rest: that of the last keyframe, or the last frame of a scene with a function."""
+    return MOST_FRAMES if scene.air is not None and scene.air.keyframes is not None else scene.frames
+
+
 def _time_of(stepper):
     """When the wind is taken after a step, as of a :class:`warpcloth.terms.refresh.Moment`."""
     air = stepper.model.scene.air
-    if air is None or air.keyframes is None:
+    if air is None or not air.changes:
         return {}
     if len(stepper.shares) > 1:
-        raise ValueError("record has forces, and wind follows keyframes in a batch that threads share; take threads=1")
+        raise ValueError("record has forces, and wind changes in a batch that threads share; take threads=1")
     per_frame = stepper.steps_per_frame if stepper.integrator is None else stepper.integrator.moment.per_frame
     return {"steps": stepper.count, "per_frame": per_frame}
 

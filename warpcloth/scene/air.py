@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 
 from ..base.checks import array, number, numeric, refuse
 
@@ -17,12 +18,15 @@ class Air:
     velocity; implicit solvers take it with the velocity at the end of the step. In still air it never adds energy.
 
     Attributes:
-        wind: [m/s], (3,), or (T, 3) with one for each triangle.
+        wind: [m/s], (3,), or (T, 3) with one for each triangle. Or a Warp function of a position ``wp.vec3`` [m] and a time
+            ``float`` [s] from the start, both float32, that returns a ``wp.vec3``. Steps call it at the centres of the
+            triangles, at the time at which they take forces.
         keyframes: (F, 3) [m/s], in place of ``wind``: a wind that is the same everywhere, at frames 0 … F−1 of the scene;
             linear between them, and constant after the last.
         density: ρ [kg/m³].
         normal_drag: C_n, by default that of a flat plate across the wind.
         tangential_drag: C_t, friction along the surface.
+        max_speed: The largest speed of a function [m/s], from which limits of steps follow; faster wind is slowed to it.
 
     Raises:
         ValueError: If a value is not allowed.
@@ -32,15 +36,26 @@ class Air:
         >>> breeze = wc.Air(wind=(3.0, 0.0, 0.0))
         >>> wc.Scene(wc.Mesh.grid(3, 3), density=0.1, terms=[wc.Spring(stiffness=1e3)], pins=[0], air=breeze).air.density
         1.2
+        >>> import warp as wp
+        >>> @wp.func
+        ... def gusts(position: wp.vec3, time: float):
+        ...     return wp.vec3(3.0 + wp.sin(6.0 * time - 2.0 * position[0]), 0.0, 0.0)
+        >>> wc.Air(wind=gusts, max_speed=4.0).speed
+        4.0
     """
 
-    wind: Sequence[float] | np.ndarray | None = None
+    wind: Sequence[float] | np.ndarray | wp.Function | None = None
     keyframes: Sequence[Sequence[float]] | np.ndarray | None = None
     density: float = 1.2
     normal_drag: float = 1.2
     tangential_drag: float = 0.02
+    max_speed: float | None = None
 
     def __post_init__(self):
+        if (self.blow is None) != (self.max_speed is None):
+            raise ValueError("one of a function as air.wind and air.max_speed is given; both or none must be")
+        if self.max_speed is not None:
+            number("air.max_speed", self.max_speed, above=0.0)
         if self.wind is not None and self.keyframes is not None:
             raise ValueError("air.wind and air.keyframes are given; at most one of the two may be")
         for name in ("density", "normal_drag", "tangential_drag"):
@@ -57,8 +72,23 @@ class Air:
         )
 
     @property
+    def blow(self) -> wp.Function | None:
+        """The function that gives the wind, or None."""
+        return self.wind if isinstance(self.wind, wp.Function) else None
+
+    @property
+    def changes(self) -> bool:
+        """Whether the wind depends on the time."""
+        return self.keyframes is not None or self.blow is not None
+
+    @property
     def winds(self) -> np.ndarray:
-        """All winds that it has, (3,), (T, 3) or (F, 3) [m/s]; 0 if neither ``wind`` nor ``keyframes`` is given."""
+        """All winds that it has, (3,), (T, 3) or (F, 3) [m/s]; 0 if neither ``wind`` nor ``keyframes`` is given.
+
+        Of a function, a vector of its largest speed.
+        """
+        if self.max_speed is not None:
+            return np.array([self.max_speed, 0.0, 0.0])
         if self.keyframes is not None:
             return np.asarray(self.keyframes, dtype=np.float64)
         return np.zeros(3) if self.wind is None else numeric("air.wind", self.wind, "be a vector or an array of vectors")

@@ -356,7 +356,7 @@ class Scene:
         if air is None or not air.density:
             return ()
         given: dict[str, Any] = {"keyframes" if air.keyframes is not None else "wind": air.winds}
-        given |= {"normal_drag": air.normal_drag, "tangential_drag": air.tangential_drag}
+        given |= {"normal_drag": air.normal_drag, "tangential_drag": air.tangential_drag, "blow": air.blow}
         return (TriangleAir(name="Air", stiffness=air.density, **given),)
 
     @property

@@ -5,8 +5,9 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
+import warp as wp
 
-from ..kernels.frozen_air import set_air
+from ..kernels.frozen_air import calm, set_air
 from ..kernels.term import Term
 from ..kernels.terms.air import AIR
 from ..mesh.mesh import Mesh
@@ -22,6 +23,8 @@ class TriangleAir(Declared):
         stiffness: Density of the air [kg/m³].
         wind: [m/s], (3,) or (T, 3).
         keyframes: Of a wind that is the same everywhere, (F, 3) [m/s], in place of ``wind``; or None.
+        blow: Warp function of position [m] and time [s] that gives the wind [m/s], of which ``wind`` is then the largest; or
+            None.
         normal_drag, tangential_drag: C_n and C_t.
     """
 
@@ -31,6 +34,7 @@ class TriangleAir(Declared):
         default=(0.0, 0.0, 0.0), metadata=quantity("must be finite", np.isfinite, shape=(3,))
     )
     keyframes: np.ndarray | None = None
+    blow: wp.Function | None = None
     normal_drag: float = field(default=1.2, metadata=FINITE_FROM_0)
     tangential_drag: float = field(default=0.02, metadata=FINITE_FROM_0)
 
@@ -42,14 +46,14 @@ class TriangleAir(Declared):
         return self.term.rest_state(mesh.points, stencil, *given)
 
     def elements_on(self, mesh: Mesh, positions: np.ndarray) -> Elements:
-        return replace(super().elements_on(mesh, positions), refresh=Refresh(STEP, _Freeze(self.keyframes)))
+        return replace(super().elements_on(mesh, positions), refresh=Refresh(STEP, _Freeze(self.keyframes, self.blow or calm)))
 
 
 class _Freeze:
     """Launches the forces of a step. Keyframes are put on the device by the first call, which the model makes."""
 
-    def __init__(self, keyframes):
-        self._keyframes, self._held = keyframes, {}
+    def __init__(self, keyframes, blow):
+        self._keyframes, self._blow, self._held = keyframes, blow, {}
 
     def __call__(self, model, elements, moment):
         held = None
@@ -61,7 +65,7 @@ class _Freeze:
         if moment.v is None:  # of what has no velocity yet
             return
         parts = 0 if moment.move is None or moment.both else moment.parts  # with both, the changes of a position cancel
-        kernel = model.kernel(set_air, model.dtype, parts, moment.explicit)
+        kernel = model.kernel(set_air, model.dtype, parts, moment.explicit, self._blow)
         given = [elements.stencil, held, moment.x, moment.v, moment.move if parts else None, moment.steps]
-        given += [moment.he, moment.ahead, moment.per_frame, model.per_copy]
+        given += [moment.he, moment.ahead, moment.per_frame, 1.0 / model.scene.fps, model.per_copy]
         model.launch(kernel, elements.count, given, [elements.rest])

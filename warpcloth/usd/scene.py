@@ -466,7 +466,7 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     Raises:
         FileNotFoundError: The folder does not exist.
         ValueError: The path has another ending, or is the stage that the scene was read from. Or the scene has no terms, or one
-            that does not fit the mesh.
+            that does not fit the mesh, or a wind that is a function.
         OSError: The file could not be written.
     """
     path = Path(os.path.abspath(followed(path)))
@@ -478,6 +478,8 @@ def write_scene(scene: Scene, path: FilePath) -> str:
         raise ValueError(f"path is {path}, the stage that the scene was read from; it must be another file")
     if not scene.terms:
         raise ValueError("scene.terms is empty; a scene in a stage must have one or more")
+    if scene.air is not None and scene.air.blow is not None:
+        raise ValueError("air.wind is a function, which a stage cannot hold; it must be a vector, vectors or keyframes")
     for term in scene.terms:
         term.elements(scene.mesh, scene.positions)  # raises here what reading the file would raise
     up_axis = scene.stage.up_axis if scene.stage else scene.up_axis
