@@ -74,7 +74,11 @@ def gap_in_step(dtype):
 
 @cache
 def find_forces(dtype, bounded: bool):
-    """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; φ = ½(r − d)² if ``bounded``."""
+    """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; φ = ½(r − d)² if ``bounded``.
+
+    With ``apart`` no pair passes through, so that d is never negative: where cloth slides over an edge, y may turn far from its
+    normal at the start of the step.
+    """
     vec3, _ = types(dtype)
     gap_of = gap_in_step(dtype)
 
@@ -86,6 +90,8 @@ def find_forces(dtype, bounded: bool):
         step: StepPairs,
         x: wp.array(dtype=vec3),
         correction: wp.array(dtype=vec3),
+        # parameters
+        apart: bool,
         # out
         forces: PairForces,
     ):
@@ -98,6 +104,9 @@ def find_forces(dtype, bounded: bool):
         forces.acting[e] = ZERO
         touches, gap, n, w = gap_of(pairs, step, e, x, correction, False)
         if touches:
+            if apart and gap < ZERO:
+                gap = -gap
+                n = -n
             k = step.stiffness[e]
             r = wp.float64(pairs.distances[e])
             forces.normal[e] = n

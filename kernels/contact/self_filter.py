@@ -10,7 +10,8 @@ import warp as wp
 from ..vectors import types
 from .gap_notes import FIRST
 from .self_gaps import ONE, ZERO, vertex_of
-from .self_pairs import StepPairs, module_of, near_pairs
+from .self_pairs import STOPPED, StepPairs, module_of, near_pairs
+from .self_planes import WHOLE
 
 
 @wp.func
@@ -279,7 +280,10 @@ def shorten(dtype):
 
 @cache
 def limit_direction(dtype):
-    """Kernel over vertices: p ← u + t(p − u), with u and t as in :func:`keep_apart`."""
+    """Kernel over vertices: p ← u + t(p − u), with u and t as in :func:`keep_apart`.
+
+    If ``whole`` is given and is at least WHOLE in a copy, p ← ``whole``·p there instead.
+    """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -288,6 +292,7 @@ def limit_direction(dtype):
         # state in
         share: wp.array(dtype=wp.float64),
         common: wp.array(dtype=wp.vec3d),
+        whole: wp.array(dtype=wp.float64),
         # parameters
         per_copy: int,
         most: wp.float64,
@@ -298,6 +303,10 @@ def limit_direction(dtype):
         u = common[i // per_copy]
         move = exact(direction[i]) - u
         t = wp.min(bounded_share(move, most), share[i])
+        if whole:
+            if whole[i // per_copy] >= WHOLE:
+                t = whole[i // per_copy]
+                u = t * u
         if t < ONE:
             end = u + t * move
             direction[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
@@ -306,18 +315,26 @@ def limit_direction(dtype):
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def find_blocked(
-    # state in
-    share: wp.array(dtype=wp.float64),
+def count_stops(
     # parameters
     per_copy: int,
+    # in and out
+    stopping: wp.array(dtype=wp.int32),
+    stopped: wp.array(dtype=wp.int32),
     # out
     blocked: wp.array(dtype=wp.int32),
 ):
-    """Kernel over vertices: blocked = 1 in copies where planes allow some vertex less than half of its move."""
+    """Kernel over vertices: counts up to STOPPED the directions that stopped at a vertex; blocked = 1 where it gets there.
+
+    It sets ``stopping`` to 0.
+    """
     i = wp.tid()
-    if share[i] < wp.float64(0.5):
-        blocked[i // per_copy] = 1
+    if stopping[i] != 0:
+        stopping[i] = 0
+        if stopped[i] < STOPPED:
+            stopped[i] = stopped[i] + 1
+            if stopped[i] == STOPPED:
+                blocked[i // per_copy] = 1
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)

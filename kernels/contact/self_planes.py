@@ -16,6 +16,12 @@ CLAMPED = wp.constant(wp.float64(0.05))  # smallest distance of each side from t
 # least 0.9 of the gap apart, and the fraction KEPT of this may be closed.
 WIDE = wp.constant(wp.float64(0.75))
 ULP = wp.constant(wp.float64(1.1920929e-07))  # largest relative unit in the last place of float32
+# A search direction is shortened as a whole if pairs allow this fraction of it, else at each vertex. To shorten it at single
+# vertices stretches stiff cloth and tears apart what is pressed together, so that the line search makes hardly any step.
+WHOLE = wp.constant(wp.float64(0.1))
+# The advances of a pair along a direction end after this number, or when no more than NEAR of the way to its floor is left.
+ADVANCES = wp.constant(64)
+NEAR = wp.constant(wp.float64(0.05))
 
 
 @cache
@@ -111,6 +117,24 @@ def margin_of(least: wp.float64, far: wp.float64):
     return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
 
 
+_way_of = load(wp.vec2d)
+
+
+@wp.func
+def ways_of_sides(ways: wp.array(dtype=wp.vec2d), s: wp.vec4i, sides: int):
+    """The largest way of each side of a pair, whose first side has ``sides`` vertices, and its largest coordinate."""
+    way = wp.vec2d()
+    far = ZERO
+    for i in range(4):
+        each = _way_of(ways, s[i])
+        far = wp.max(far, each[1])
+        if i < sides:
+            way[0] = wp.max(way[0], each[0])
+        else:
+            way[1] = wp.max(way[1], each[0])
+    return way, far
+
+
 @cache
 def cut_by_planes(dtype):
     """Kernel over pairs: reduces the ``share`` of each vertex, the fraction of its wanted move from x that it may make.
@@ -125,7 +149,7 @@ def cut_by_planes(dtype):
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
     wanted = wanted_move(dtype)
-    value, stencil, way_of = load(wp.float64), load(wp.vec4i), load(wp.vec2d)
+    value, stencil = load(wp.float64), load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def cut_by_each_plane(
@@ -152,15 +176,7 @@ def cut_by_planes(dtype):
         s = stencil(pairs.stencils, e)
         of_vertex = e < pairs.counts[0]
         sides = wp.where(of_vertex, 1, 2)
-        way = wp.vec2d()
-        far = ZERO
-        for i in range(4):
-            each = way_of(ways, s[i])
-            far = wp.max(far, each[1])
-            if i < sides:
-                way[0] = wp.max(way[0], each[0])
-            else:
-                way[1] = wp.max(way[1], each[0])
+        way, far = ways_of_sides(ways, s, sides)
         margin = margin_of(least, far)
         if gap:
             # For any division of the gap, approaches with at most this sum are not shortened.
@@ -211,3 +227,98 @@ def cut_by_planes(dtype):
                 wp.atomic_max(least_share, s[i], ULP * far / wp.max(-approaches[i], wp.float64(1e-300)))
 
     return cut_by_each_plane
+
+
+@cache
+def cut_as_a_whole(dtype):
+    """Kernel over pairs: reduces the ``whole`` of each copy, the fraction of the ``direction`` that all vertices may move.
+
+    A pair keeps a tenth of its gap. Where all vertices move by the same fraction, a plane between the two sides may move with
+    them: the two sides stay apart along y while no vertex of one side comes near the height of one of the other. Where this
+    allows less than the direction, as for cloth that slides over an edge, the pair advances until its gap could be closed at
+    the relative speed of its sides, finds its gap there, and goes on (Li, Kaufman and Jiang 2021, additive continuous collision
+    detection).
+
+    A pair of edges that may move by less than WHOLE of the direction sets ``stopping`` to 1 at its vertices.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+    value, stencil = load(wp.float64), load(wp.vec4i)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def cut_each_as_a_whole(
+        # elements
+        pairs: near_pairs(dtype),
+        gap: wp.array(dtype=wp.float64),
+        open: wp.array(dtype=wp.int32),
+        # state in
+        x: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        ways: wp.array(dtype=wp.vec2d),
+        # parameters
+        per_copy: int,
+        least: wp.float64,
+        # in and out
+        whole: wp.array(dtype=wp.float64),
+        stopping: wp.array(dtype=wp.int32),
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        s = stencil(pairs.stencils, e)
+        of_vertex = e < pairs.counts[0]
+        sides = wp.where(of_vertex, 1, 2)
+        way, far = ways_of_sides(ways, s, sides)
+        margin = margin_of(least, far)
+        if gap:
+            if way[0] + way[1] <= WIDE * value(gap, e) - KEPT / CLAMPED * margin:
+                return
+        if open:
+            if open[e] != 0:
+                return
+        a = exact(x[s[0]])
+        b = exact(x[s[1]])
+        c = exact(x[s[2]])
+        d = exact(x[s[3]])
+        mean = SIDE * SIDE * (exact(direction[s[0]]) + exact(direction[s[1]]) + exact(direction[s[2]]) + exact(direction[s[3]]))
+        _w, y, _inside = nearest(of_vertex, a, b, c, d)
+        distance = wp.length(y)
+        n = y / wp.max(distance, wp.float64(1e-300))
+        floor = (ONE - KEPT) * wp.max(distance - wp.float64(2.0) * margin, ZERO) + wp.float64(2.0) * margin
+        t = ONE
+        first = ZERO
+        second = ZERO
+        for i in range(4):
+            size = wp.length(exact(direction[s[i]]) - mean)
+            if i < sides:
+                first = wp.max(first, size)
+            else:
+                second = wp.max(second, size)
+            for j in range(sides, 4):
+                approach = wp.dot(n, exact(direction[s[j]]) - exact(direction[s[i]]))
+                if i < sides and approach > ZERO:
+                    apart = wp.dot(n, exact(x[s[i]]) - exact(x[s[j]])) - floor
+                    t = wp.min(t, wp.max(apart, ZERO) / approach)
+        room = distance - floor
+        if t < ONE and room > ZERO:
+            advanced = ZERO
+            enough = NEAR * room
+            for _ in range(ADVANCES):
+                if room > enough:
+                    advanced = wp.min(advanced + KEPT * room / (first + second), ONE)
+                    _w, y, _inside = nearest(
+                        of_vertex,
+                        a + advanced * (exact(direction[s[0]]) - mean),
+                        b + advanced * (exact(direction[s[1]]) - mean),
+                        c + advanced * (exact(direction[s[2]]) - mean),
+                        d + advanced * (exact(direction[s[3]]) - mean),
+                    )
+                    room = wp.where(advanced < ONE, wp.length(y) - floor, ZERO)
+            t = wp.max(t, advanced)
+        if t < ONE:
+            wp.atomic_min(whole, s[0] // per_copy, t)
+            if t < WHOLE and not of_vertex:
+                for i in range(4):
+                    stopping[s[i]] = 1
+
+    return cut_each_as_a_whole

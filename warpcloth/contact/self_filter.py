@@ -12,7 +12,7 @@ SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
 # The longest move of a vertex in a round, relative to the common motion, over the skin. The vertex may have moved as far since
 # the list was made, and so may the other side of a pair: together they approach by at most the skin.
 WAY = 0.25
-# The areas of contact are found again at an iterate if planes left less than half of some move on the way to it, at most
+# The areas of contact are found again at an iterate if pairs of edges stopped the direction to it at further vertices, at most
 # RENEWALS times in a step. After that the energy no longer changes within the step.
 RENEWALS = 32
 # Vertices that cloth holds back in a collider are moved out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
@@ -28,6 +28,8 @@ class SelfFilter:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
+        stopped: How many directions pairs of edges have stopped at each vertex in this step, up to STOPPED, (N,) int32; None if
+            iterates need not stay apart.
         moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
             an axis and there are no colliders.
     """
@@ -35,6 +37,7 @@ class SelfFilter:
     def __init__(self, contact, colliders):
         self.model = model = contact.model
         self._contact, self._colliders, self._cut_before, self._iterates = contact, colliders, None, False
+        self.stopped = None
         device = model.device
         self._target, self._from, self._other = (model.vectors() for _ in range(3))
         self._ways = wp.zeros(model.count, dtype=wp.vec2d, device=device)
@@ -67,7 +70,9 @@ class SelfFilter:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self):
-        """Stores, at the start of a step, how many moves colliders have cut so far."""
+        """Stores, at the start of a step, how many moves colliders have cut so far; no vertex is stopped yet."""
+        if self.stopped is not None:
+            self.stopped.zero_()
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
@@ -183,6 +188,19 @@ class SelfFilter:
         if target is not None and self._colliders is not None and self._colliders.faces is not None:
             self._colliders.faces.launch_least(x, target, self._share)
 
+    def _launch_whole(self, direction):
+        """Finds and returns the fraction of a direction that all vertices of a copy may move (B,); call it after the planes."""
+        contact, gap, open = self._contact, self._contact.begun.gap, None
+        if contact.tangles is not None:
+            gap, open = None, self._open
+        self._whole.fill_(1.0)
+        given = [contact.pairs, gap, open, contact.x_before, direction, self._ways, self.model.per_copy]
+        given.append(FLOOR * contact.declared.distance)
+        self._launch(self_planes.cut_as_a_whole, len(contact.pairs.stencils), given, [self._whole, self._stopping])
+        noted = [self._stopping, self.stopped, self._blocked]
+        self.model.launch(self_filter.count_stops, self.model.count, [self.model.per_copy], noted)
+        return self._whole
+
     # For methods whose iterates base + d stay apart too.
 
     def launch_first(self, base, d):
@@ -195,8 +213,11 @@ class SelfFilter:
 
     def iterates(self):
         """Prepares the methods below for a solver whose iterates stay apart."""
-        self._iterates, model = True, self.model
+        self._iterates, self._contact.forces.apart, model = True, True, self.model
         self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)
+        self._kernels[self_planes.cut_as_a_whole] = model.kernel(self_planes.cut_as_a_whole, model.dtype)
+        self.stopped, self._stopping = (wp.zeros(model.count, dtype=wp.int32, device=model.device) for _ in range(2))
+        self._whole = model.scalars()
         self._longest, self._ones = model.scalars(), wp.ones(model.count, dtype=model.dtype, device=model.device)
         self._blocked, self._renewed = (model.scalars(wp.int32) for _ in range(2))
         self._renewing, self._renew = model.scalars(wp.int32), wp.zeros(1, dtype=wp.int32, device=model.device)
@@ -208,9 +229,10 @@ class SelfFilter:
     def launch_relist(self, base, d, active, launch):
         """Lists the pairs at base + d again, in copies that are ``active`` (B,), if vertices have moved far enough.
 
-        Otherwise, if planes have cut moves of the last direction, it finds the areas alone again. In layers that a step presses
-        flat, pairs of crossing edges have hardly any area; where the layers then bend, planes alone would keep these edges
-        apart. In both cases it calls ``launch``.
+        Otherwise, if pairs of edges stopped the last direction, it finds the areas alone again. In layers that a step presses
+        flat, pairs of crossing edges have hardly any area; where the layers then bend, the filter alone would keep these edges
+        apart. So for the rest of the step edges between vertices that have stopped often enough have their whole area. In both
+        cases it calls ``launch``.
         """
         model, x = self.model, self._contact.x_before
         self._add(base, d, 1.0, x, active)
@@ -235,8 +257,8 @@ class SelfFilter:
         """Shortens the direction from the positions of :meth:`launch_relist`, so that pairs stay apart all along it.
 
         A direction that is longer than the list of pairs allows is scaled as a whole: to cut it at each vertex would stretch
-        stiff cloth. In copies where the energy does not decrease along the result, the direction becomes P·right, with the
-        preconditioner P, shortened in the same way.
+        stiff cloth. So it is where pairs allow at least WHOLE of it. In copies where the energy does not decrease along the
+        result, the direction becomes P·right, with the preconditioner P, cut at each vertex.
         """
         model, N = self.model, self.model.count
         self._launch(self_filter.precondition, N, [preconditioner, right], [self._other])
@@ -244,9 +266,8 @@ class SelfFilter:
             sums.largest(self._ones, each, self._longest)
             self._launch(self_filter.shorten, N, [self._longest, model.per_copy, WAY * self._contact.skin], [each])
             self._launch_planes(self._contact.x_before, None, each)
-            if each is direction:
-                model.launch(self_filter.find_blocked, N, [self._share, model.per_copy], [self._blocked])
-            given = [self._share, self._common, model.per_copy, WAY * self._contact.skin]
+            whole = self._launch_whole(each) if each is direction else None
+            given = [self._share, self._common, whole, model.per_copy, WAY * self._contact.skin]
             self._launch(self_filter.limit_direction, N, given, [each])
         sums.dot(gradient, direction, self._slope)
         self._launch(self_filter.take_descent, N, [self._slope, self._other, model.per_copy], [direction])

@@ -340,7 +340,7 @@ class SelfSteps:
         if self.tangles is not None:
             self.tangles.launch_leave_out(self.pairs.stencils, self.pairs.counts, self.begun.gap)
         self.pairs.number.zero_()
-        given = [self.pairs, self._areas, self.begun_at, self.declared.stiffness]
+        given = [self.pairs, self._areas, self.begun_at, self.filter.stopped, self.declared.stiffness]
         self._launch(self_pairs.set_areas, count, given, [self.begun])
         if self._corners:
             self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
