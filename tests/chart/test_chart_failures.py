@@ -68,14 +68,17 @@ def test_irregular_nets_lose_curvature_where_theory_says(device):
 
 @pytest.mark.slow
 def test_a_cantilever_locks_apart_from_its_pattern(device):
-    """Jittered nets are stiffer than D while the membrane is soft, which refinement leaves; locking falls with it."""
+    """Jittered nets of hinges are stiffer than D while the membrane is soft, which refinement leaves; locking falls with it."""
     stiffness = {}
-    for pattern in ("equilateral", "jittered"):
+    for pattern, bending in (("equilateral", "dihedral"), ("jittered", "dihedral"), ("jittered", "plate")):
+        series = pattern if bending == "dihedral" else f"{pattern}, {bending}"
         for elements in (6, 12):
-            points = locking.cantilever(pattern, elements, device)
+            points = locking.cantilever(pattern, elements, device, bending)
             for name in ("1e4", "1e8"):
-                ((_, value),) = of(points, "refined", f"{pattern}, KL²/D = {name}").T
-                stiffness[pattern, elements, name] = value
+                ((_, value),) = of(points, "refined", f"{series}, KL²/D = {name}").T
+                stiffness[series, elements, name] = value
+    coarse, fine = (stiffness["jittered, plate", n, "1e4"] - 1.0 for n in (6, 12))
+    assert abs(fine) < abs(coarse) / 3.0 and abs(fine) < 0.06
     for elements in (6, 12):
         assert abs(stiffness["equilateral", elements, "1e4"] - 1.0) < 0.05 < 0.1 < stiffness["jittered", elements, "1e4"] - 1.0
     for pattern in ("equilateral", "jittered"):
@@ -159,10 +162,10 @@ def test_quadratic_bending_holds_on_isometries_of_flat_sheets(charts):
         curvature = np.maximum(np.abs(x), isometry.REST)
         assert (np.abs(value - expected) < (curvature * h) ** 2 / 6.0 * curvature**2).all()
     rows = charts["isometry"]["rows"]
-    at_rest = {
-        name: value for name in ("quadratic", "dihedral") for x, value in of(rows, "curved", name).T if x == isometry.REST
-    }
-    assert at_rest["quadratic"] == pytest.approx(0.5, rel=0.01) and abs(at_rest["dihedral"]) < EPS
+    at_rest = {name: value for name in physics.BENDING for x, value in of(rows, "curved", name).T if x == isometry.REST}
+    for name in ("quadratic", "plate"):
+        assert at_rest[name] == pytest.approx(0.5, rel=0.01), name
+    assert abs(at_rest["dihedral"]) < EPS
 
 
 def test_slivers_are_stiff_without_bound_down_to_the_guard(charts):

@@ -116,6 +116,24 @@ def test_colliders_and_friction_matter_where_cloth_slides():
     assert trials["without friction on slope"].change == pytest.approx(expected, rel=0.05)
 
 
+def test_air_and_anisotropy_matter_where_they_do_something():
+    """Wind of 5 m/s lifts a cloth that otherwise hangs; a stiffness of weft that nothing loads changes nothing."""
+    mesh = wc.Mesh.grid(4, 4, size=0.3, pattern="alternating")
+    # Pulled by its weight along z, the weft; without texture coordinates directions are given.
+    membrane = wc.OrthotropicMembrane(stiffness=100.0, weft_ratio=0.1, warp=(1.0, 0.0, 0.0))
+    plate = wc.PlateBending(stiffness=1e-6, weft_ratio=2.0, warp=(1.0, 0.0, 0.0))
+    hung = mesh.points[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
+    wind = wc.Air(wind=(0.0, 0.0, 5.0))
+    scene = wc.Scene(mesh, density=0.2, positions=hung, terms=[membrane, plate], pins="z == 0", air=wind, duration=0.2)
+    trials = by_name(advise(scene, wc.Newton(substeps=2), tolerance=1e-3))
+    assert trials["without the air"].matters and trials["without the air"].change > 0.05
+    assert trials["without the anisotropy of OrthotropicMembrane"].matters
+    assert trials["without the anisotropy of PlateBending"].matters is False
+    even = replace(scene, air=None, terms=[membrane.isotropic(), plate.isotropic()])
+    assert not any("air" in name or "anisotropy" in name for name in by_name(advise(even, wc.Newton(substeps=2), frames=2)))
+    assert membrane.isotropic().stiffness == pytest.approx(100.0 * np.sqrt(0.1))
+
+
 def test_frames_that_were_not_run_are_said():
     """A limit that the cloth meets after 10 frames does not matter before, and is not said to be needless for good."""
     scene = hanging.scene(n=5)

@@ -288,6 +288,12 @@ def test_a_cantilever_of_an_equilateral_net_converges(angle, bending, gamma, dev
     assert converges(cantilevers((6, 12, 24), device, angle, bending=bending, gamma=gamma), 1.4)
 
 
+def test_a_cantilever_of_plates_has_the_stiffness_of_the_plate_on_an_irregular_mesh(device):
+    """The error is of second order, where hinges keep a sixth; the clamp is that of hinges, which leaves a hundredth."""
+    coarse, fine = (measured("cantilever", n, "plate", "jittered", device=device)["stiffness"] - 1.0 for n in (6, 12))
+    assert abs(fine) < abs(coarse) / 3.0 and abs(fine) < 0.06, (coarse, fine)
+
+
 def least(pattern, angle):
     """Stiffness over D of a narrow strip of a net, curved along x, whose other curvatures are free: 1/(C⁻¹)₁₁.
 

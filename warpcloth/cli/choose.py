@@ -44,7 +44,8 @@ def choose(arguments):
 
     command = None if choice.chosen is None else command_line(arguments, values, choice.chosen.setup)
     facts = {"scene": arguments.scene, "parameters": values, **as_json(choice, found, exact), "command": command}
-    print(json_text(facts) if arguments.json else _text(facts, choice, found, exact))
+    advise = shlex.join(["warpcloth", "info", *_scene(arguments, values), "--advise"])
+    print(json_text(facts) if arguments.json else _text(facts, choice, found, exact, advise))
     return 0
 
 
@@ -97,17 +98,21 @@ def take_choice(arguments, device):
 
 def command_line(arguments, values, setup):
     """Returns the command line that runs a scene with a setup."""
-    words = ["warpcloth", "run", arguments.scene]
-    words += [word for module in arguments.imports for word in ("--import", module)]
-    given = [f"{name}={value}" for name, value in values.items() if name in assignments(arguments.p)]
-    words += ["-p", *given] if given else []
+    words = ["warpcloth", "run", *_scene(arguments, values)]
     words += ["--solver", setup.solver, "-s", *(f"{name}={value}" for name, value in setup.options.items())]
     words += [] if arguments.frames is None else ["--frames", str(arguments.frames)]
     words += [] if arguments.device == "cpu" else ["--device", arguments.device]
     return shlex.join([*words, "--dtype", arguments.dtype, "-o", "out.usdc"])
 
 
-def _text(facts, choice, found, exact):
+def _scene(arguments, values):
+    """Returns the words that name the scene on a command line."""
+    given = [f"{name}={value}" for name, value in values.items() if name in assignments(arguments.p)]
+    imports = [word for module in arguments.imports for word in ("--import", module)]
+    return [arguments.scene, *imports, *(["-p", *given] if given else [])]
+
+
+def _text(facts, choice, found, exact, advise):
     from ..lab.choosing import percent
 
     measured = f"{facts['scene']}: {len(found)} settings measured over {len(exact.points) - 1} frames"
@@ -124,4 +129,5 @@ def _text(facts, choice, found, exact):
             )
     lines += [f"  measured on {name}" for name in dict.fromkeys(each.machine for each in found)]
     lines.append(choice.certainty)
+    lines.append(f"errors are those on this mesh; whether a finer mesh, air or anisotropy matters: {advise}")
     return "\n".join([*lines, *([facts["command"]] if facts["command"] else [])])

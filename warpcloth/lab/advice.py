@@ -7,9 +7,10 @@ import numpy as np
 from ..analysis.distances import surface_distances
 from ..base.checks import number, whole
 from ..run.simulate import simulate
+from ..terms.woven import Woven
 
 # Kinds of trials that leave something out.
-_LEFT_OUT = ("term", "collider", "friction", "all")
+_LEFT_OUT = ("term", "collider", "friction", "air", "anisotropy", "all")
 # If the cost of the whole scene changed by more than this between its first and last run, costs are not compared.
 _STEADY = 0.25
 _FRAMES = 7  # at which surfaces of other resolutions are compared
@@ -20,8 +21,8 @@ class Trial:
     """A run of the scene with one change, compared with the unchanged scene.
 
     Attributes:
-        kind: Left out: a "term", a "collider", the "friction" of a collider, or "all" that do not matter alone; or changed:
-            "precision", "step" or "resolution".
+        kind: Left out: a "term", a "collider", the "friction" of a collider, the "air", the "anisotropy" of a term, or "all"
+            that do not matter alone; or changed: "precision", "step" or "resolution".
         name: The change, such as "without QuadraticBending", "without friction on ball" or "n=64".
         change: RMS distance of the results over vertices and frames, over the longest side of the cloth; for another
             resolution, the distance between the surfaces, both ways. NaN without a result.
@@ -77,8 +78,10 @@ class Advice:
                 else f"half the step: {step.reason}"
             )
         needless = [trial for trial in self.trials if trial.kind in _LEFT_OUT[:-1] and trial.matters is False]
-        left = {trial.name.partition("the collider ")[2] for trial in needless if trial.kind == "collider"}  # with its friction
-        needless = [trial for trial in needless if trial.name.partition("friction on ")[2] not in left - {""}]
+        # A collider is left out with its friction, and a term with its anisotropy.
+        inner = {trial.name.replace("the collider", "friction on") for trial in needless if trial.kind == "collider"}
+        inner |= {f"without {_anisotropy(trial.name.removeprefix('without '))}" for trial in needless if trial.kind == "term"}
+        needless = [trial for trial in needless if trial.name not in inner]
         together = next((trial for trial in self.trials if trial.kind == "all"), None)
         redundant = together is not None and together.matters is not False
         for trial in needless:
@@ -107,7 +110,8 @@ class Advice:
 
 
 def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device="cpu", dtype="float32", progress=None):
-    """Leaves out each term, each collider and its friction in turn, and changes precision, step and resolution.
+    """Leaves out each term, each collider and its friction, and the air in turn, makes terms of fabrics isotropic, and changes
+    precision, step and resolution.
 
     Each change is compared with the unchanged scene in a short run.
 
@@ -156,7 +160,8 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         if done == len(parts):
             # If two parts can replace one another, leaving out either alone changes nothing.
             needless = [part for part, trial in zip(parts, trials, strict=True) if trial.matters is False]
-            needless = [(kind, k) for kind, k in needless if kind != "friction" or ("collider", k) not in needless]
+            of_whole = {"friction": "collider", "anisotropy": "term"}
+            needless = [(kind, k) for kind, k in needless if (of_whole.get(kind), k) not in needless]
             if len(needless) > 1:
                 without = {"changed": _without(scene, needless)}
                 *most, last = (parts[part] for part in needless)
@@ -173,7 +178,16 @@ def _parts(scene):
         found["collider", k] = f"the collider {name}"
         if collider.friction:
             found["friction", k] = f"friction on {name}"
+    if scene.air is not None:
+        found["air", 0] = "the air"
+    for k, (term, name) in enumerate(zip(scene.terms, terms, strict=True)):
+        if isinstance(term, Woven) and term.anisotropic:
+            found["anisotropy", k] = _anisotropy(name)
     return found
+
+
+def _anisotropy(term):
+    return f"the anisotropy of {term}"
 
 
 def _names(declared):
@@ -185,13 +199,18 @@ def _names(declared):
 
 def _without(scene, parts):
     """Returns the scene without some parts, see :func:`_parts`."""
-    terms = [term for k, term in enumerate(scene.terms) if ("term", k) not in parts]
+    terms = [
+        term.isotropic() if ("anisotropy", k) in parts else term
+        for k, term in enumerate(scene.terms)
+        if ("term", k) not in parts
+    ]
     colliders = [
         replace(collider, friction=0.0) if ("friction", k) in parts else collider
         for k, collider in enumerate(scene.colliders)
         if ("collider", k) not in parts
     ]
-    return replace(scene, terms=terms, colliders=colliders, contact=scene.contact if colliders else None)
+    air = None if ("air", 0) in parts else scene.air
+    return replace(scene, terms=terms, colliders=colliders, contact=scene.contact if colliders else None, air=air)
 
 
 def _trial(kind, name, options, run, base, first, scene, size, tolerance, device):

@@ -2,7 +2,7 @@
 quadratic bending model for inextensible surfaces*; Grinspun et al. 2003, *Discrete shells*).
 
 Its energy per area is ½D‖Δx‖², with the Laplacian Δ of a flat rest shape: non-uniform stretch counts as bending, and any rest
-shape as flat. On isometries of a flat sheet, for which it is made, both agree.
+shape as flat. Plate bending does the same. On isometries of a flat sheet, for which they are made, all agree.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from .panels import Panel, point
 from .physics import BENDING, bending_density, rolled_up
 from .strips import strip
 
-TITLE = "10. Quadratic bending holds on isometries of sheets that are flat at rest"
+TITLE = "10. Quadratic and plate bending hold on isometries of sheets that are flat at rest"
 REST = 1.0  # κ̄ [1/m]
 _H = 0.1  # edge of the net [m]
 
@@ -26,15 +26,15 @@ PANELS = (
         "ε [1/m]",
         "bending energy an area, over D [1/m²]",
         laws={_STRETCHED: lambda e: 0.5 * (2.0 * e) ** 2, _NONE: lambda e: 0.0},
-        follows={"quadratic": _STRETCHED, "dihedral": _NONE},
+        follows={"quadratic": _STRETCHED, "plate": _STRETCHED, "dihedral": _NONE},
     ),
     Panel(
         "flat",
-        "A sheet flat at rest, rolled to a cylinder: both hold",
+        "A sheet flat at rest, rolled to a cylinder: all hold",
         "curvature κ [1/m]",
         "bending energy an area, over D [1/m²]",
         laws={_FLAT: lambda k: 0.5 * k**2},
-        follows={"quadratic": _FLAT, "dihedral": _FLAT},
+        follows=dict.fromkeys(BENDING, _FLAT),
     ),
     Panel(
         "curved",
@@ -42,7 +42,7 @@ PANELS = (
         "curvature κ [1/m]",
         "bending energy an area, over D [1/m²]",
         laws={_FLAT: lambda k: 0.5 * k**2, _CURVED: lambda k: 0.5 * (k - REST) ** 2},
-        follows={"quadratic": _FLAT, "dihedral": _CURVED},
+        follows={"quadratic": _FLAT, "plate": _FLAT, "dihedral": _CURVED},
         marks={REST: "rest shape"},
     ),
 )

@@ -5,9 +5,10 @@ if κ²h⁴K > 576D. A regular net with three edge lengths avoids it at no cost 
 of the strain, or loses curvature to wrinkles. Springs k on all edges act as a membrane of K = 2k/√3 on an equilateral net; the
 same is assumed for others.
 
-Apart from locking, each net has its own bending stiffness, an error of its pattern that refinement does not remove. A
+Apart from locking, each net of hinges has its own bending stiffness, an error of its pattern that refinement does not remove. A
 cantilever with a soft membrane shows it. The stiffness divided by that is due to locking, and falls with h⁴. Regular nets lock
-there too, though less, because their curvature varies and their sides curl.
+there too, though less, because their curvature varies and their sides curl. Plate bending locks as well, but its stiffness does
+not depend on the pattern.
 
 How well a net can avoid strain depends on the degrees of freedom that its stiff edges leave (:mod:`warpcloth.scene.freedom`).
 Rows and columns alone leave more than one per vertex. All edges of triangles leave 3 plus the number of boundary edges, at any
@@ -48,7 +49,8 @@ _LET_GO = (("equilateral", 0.0), ("jittered", 0.0), ("jittered", 20.0), ("jitter
 # KL²/D of membranes so soft that nothing locks, where a cantilever shows the pattern by itself, and of a stiff one.
 SOFT, STIFF = 1e4, 1e8
 _DECADES = {8: range(4, 11), 16: range(4, 10)}
-_CANTILEVERS = [(pattern, n) for pattern in ("equilateral", "jittered") for n in (6, 8, 12, 16, 24)] + [("alternating", 8)]
+_CANTILEVERS = [(pattern, n, "dihedral") for pattern in ("equilateral", "jittered") for n in (6, 8, 12, 16, 24)]
+_CANTILEVERS += [("alternating", 8, "dihedral"), *(("jittered", n, "plate") for n in (6, 8, 12, 16, 24))]
 # Nets of springs by the edges that hold; their freedom is counted, and they are rolled up while almost rigid, K/D = 1e9.
 _HOLDING = {"rows and columns": "diagonal", "edges": "equilateral", "edges, jittered": "jittered", "both diagonals": "diagonal"}
 _COUNTED = (5, 9, 17, 33, 65)  # vertices a side
@@ -150,7 +152,8 @@ def tasks(device):
     found += [task(let_go, pattern=pattern, degrees=turn, device=device) for pattern, turn in _LET_GO]
     found += [task(counted, holding=holding, n=n) for holding in _HOLDING for n in _COUNTED]
     found += [task(nearly_rigid, holding=holding, degrees=turn, device=device) for holding in _HOLDING for turn in _TURNED]
-    return found + [task(cantilever, pattern=pattern, elements=n, device=device) for pattern, n in _CANTILEVERS]
+    given = [{"pattern": pattern, "elements": n, "bending": bending} for pattern, n, bending in _CANTILEVERS]
+    return found + [task(cantilever, **each, device=device) for each in given]
 
 
 def imposed(device):
@@ -257,29 +260,30 @@ def let_go(pattern, degrees, device):
     return [point("time", series, run.times[frame], kept_angles(flat, start, run.points[frame])) for frame in frames]
 
 
-def cantilever(pattern, elements, device):
+def cantilever(pattern, elements, device, bending="dihedral"):
     """Returns the apparent bending stiffness of a cantilever over its membrane stiffness, also relative to a soft membrane."""
     angle, found, unlocked = np.radians(NETS[pattern]), [], None
+    of = pattern if bending == "dihedral" else f"{pattern}, {bending}"
     for stretching in [10.0**e for e in _DECADES[elements]] if elements in _DECADES else (SOFT, STIFF):
-        rest = physics.measure("cantilever", elements, "dihedral", pattern, angle, GAMMA, device, stretching=stretching)
+        rest = physics.measure("cantilever", elements, bending, pattern, angle, GAMMA, device, stretching=stretching)
         stiffness, h, reason = rest["stiffness"], rest["h"], rest["reason"]
         if stiffness is None and not reason:
             reason = "beyond 20 times D"
         if stretching == SOFT:
             unlocked = stiffness
         if elements == min(_DECADES):
-            found.append(point("apparent", pattern, stretching, stiffness, reason))
+            found.append(point("apparent", of, stretching, stiffness, reason))
         if elements in _DECADES:
             alone = stiffness / unlocked if stiffness and unlocked else None
-            series, at = f"{pattern}, h = L/{elements}", ratio(0.5 * GAMMA, h, stretching)
+            series, at = f"{of}, h = L/{elements}", ratio(0.5 * GAMMA, h, stretching)
             found.append(point("locking", series, at, alone, reason))
         if pattern != "alternating" and stretching in (SOFT, STIFF):
-            found.append(point("refined", f"{pattern}, KL²/D = 1e{np.log10(stretching):.0f}", h, stiffness, reason))
+            found.append(point("refined", f"{of}, KL²/D = 1e{np.log10(stretching):.0f}", h, stiffness, reason))
     if elements == min(_DECADES):
         # An upper bound: a sheet at rest finds a softer shape.
-        rolled = physics.measure("cylinder", elements, "dihedral", pattern, angle, device=device)["stiffness"]
+        rolled = physics.measure("cylinder", elements, bending, pattern, angle, device=device)["stiffness"]
         found += [
-            point("apparent", f"{pattern}, rolled up, without membrane", 10.0**end, rolled)
+            point("apparent", f"{of}, rolled up, without membrane", 10.0**end, rolled)
             for end in (_DECADES[elements][0], _DECADES[elements][-1])
         ]
     return found

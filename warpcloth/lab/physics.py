@@ -8,8 +8,9 @@
 | catenary | sag of the elastic catenary | 2 |
 | patch | x = Gx̄ inside a membrane whose boundary is moved to Gx̄ | none: exact |
 
-Bending is calibrated on equilateral nets. On others, refinement does not remove the error (:func:`strips.rolled`). A cantilever
-differs from the elastica in these ways:
+Hinges are calibrated on equilateral nets. On others, refinement does not remove their error (:func:`strips.rolled`). Plates,
+here with ν = 0, have no such error. A cantilever with hinges differs from the elastica in these ways. The last three are those
+of plates too, whose clamp was not calibrated:
 
 - One row of triangles, or any strip much narrower than long, bends with 1 − ν² = 8/9 of D, because the Poisson's ratio ν of
   both energies is −1/3 (:func:`strips.plate`): it is the elastica of 9Γ/8. This strip is twice as wide as it is long.
@@ -37,12 +38,12 @@ from ..core.sums import Sums
 from ..run.equilibrium import SETTLED, equilibrium
 from ..scene.scene import Scene
 from ..scenes import catenary, chain
-from ..terms import CorotatedMembrane, DihedralBending, NeoHookeanMembrane, QuadraticBending
+from ..terms import CorotatedMembrane, DihedralBending, NeoHookeanMembrane, PlateBending, QuadraticBending
 from . import elastica
 from .strips import PATTERNS, inner_shares, strip
 
 CASES = ("cylinder", "cantilever", "chain", "catenary", "patch")
-BENDING = {"dihedral": DihedralBending, "quadratic": QuadraticBending}
+BENDING = {"dihedral": DihedralBending, "quadratic": QuadraticBending, "plate": PlateBending}
 D = 1e-3  # [N·m]
 G = 9.81  # [m/s²]
 SEED = 0  # of the perturbations that give the accuracy of an equilibrium
@@ -70,7 +71,7 @@ def measure(
     Args:
         case: One of `CASES`.
         resolution: Number of elements along L, 1 m.
-        bending: "dihedral" or "quadratic".
+        bending: "dihedral", "quadratic" or "plate", the last with ν = 0.
         pattern: Pattern of the net, see :func:`strips.strip`; ignored for a chain and a catenary.
         angle: Rotation of the net [rad].
         gamma: Γ = ρgL³/D of the cantilever, up to 100.
@@ -183,8 +184,8 @@ def rolled_up(points, curvature):
 
 
 def bending_density(bending, mesh, positions, **options):
-    """Returns the bending energy per area over ½D [1/m²] of a mesh at ``positions``, over triangles with three hinges."""
-    shares, area = inner_shares(mesh)
+    """Returns the bending energy per area over ½D [1/m²] of a mesh at ``positions``; of hinges, over triangles with three."""
+    shares, area = (1.0, mesh.triangle_areas.sum()) if bending is PlateBending else inner_shares(mesh)
     scene = Scene(mesh, density=1.0, positions=positions, terms=[bending(stiffness=D * shares)])
     return float(energies(scene, **options)[0].sum() / (0.5 * D * area))
 
@@ -216,7 +217,7 @@ def _cantilever(settle, bending, net, gamma, stretching, width):
     return {
         "error": float(abs(found)),
         "stiffness": gamma / apparent if apparent else None,
-        "sides": side_loss(gamma, stretching, width),
+        "sides": 0.0 if bending is PlateBending else side_loss(gamma, stretching, width),
         "elements": len(cut.mesh.triangles),
         "h": float(1.0 / (resolution * L)),
     }

@@ -143,7 +143,7 @@ PHYSICS = {
             {"case": "cantilever", "bending": bending, "pattern": pattern, "angle": angle}
             for pattern in ("equilateral", "diagonal", "alternating", "jittered")
             for angle in (0.0, math.pi / 4)
-            for bending in ("quadratic", "dihedral")
+            for bending in physics.BENDING
         ],
         (8, 12, 16, 24),
     ),

@@ -1,7 +1,7 @@
 """The membrane of woven fabrics."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -50,6 +50,7 @@ class OrthotropicMembrane(Woven, Membrane):
     """
 
     term: ClassVar[Term] = ORTHOTROPIC_MEMBRANE
+    shearing: ClassVar[str] = "shear_ratio"
 
     poisson_ratio: float | Sequence[float] | np.ndarray = field(default=0.0, metadata=FINITE)
     shear_ratio: float | Sequence[float] | np.ndarray | None = field(default=None, metadata=ABOVE_0)
@@ -84,6 +85,11 @@ class OrthotropicMembrane(Woven, Membrane):
         E1, E2, G = (values[()] for values in found.values())
         ratios = {"weft_ratio": E2 / E1, "shear_ratio": G / E1}
         return cls(stiffness=E1, **ratios, poisson_ratio=poisson_ratio, warp=direction, **fields)
+
+    def isotropic(self: Own) -> Own:
+        """Returns the isotropic membrane with √(E₁E₂)t and Poisson's ratio √(ν₁₂ν₂₁)."""
+        ratio = self._numeric("poisson_ratio") * np.sqrt(self._numeric("weft_ratio"))
+        return replace(super().isotropic(), poisson_ratio=ratio[()])
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         T = len(stencil)

@@ -48,6 +48,7 @@ class PlateBending(Woven, Sparse):
     """
 
     term: ClassVar[Term] = PLATE_BENDING
+    shearing: ClassVar[str] = "twist_ratio"
 
     poisson_ratio: float | Sequence[float] | np.ndarray = field(
         default=0.0,
@@ -85,8 +86,7 @@ class PlateBending(Woven, Sparse):
         root[:, 0, 0], root[:, 0, 1] = 1.0, ratio * np.sqrt(weft)
         root[:, 1, 1], root[:, 2, 2] = np.sqrt(weft * (1.0 - ratio**2)), 2.0 * np.sqrt(twist)
         axes = side_axes(mesh.points, mesh.triangles)
-        isotropic = self.warp is None and self.twist_ratio is None and (weft == 1.0).all()
-        warp = axes[:, 0] if isotropic else self.warp_directions(mesh)
+        warp = axes[:, 0] if self.warp is None and not self.anisotropic else self.warp_directions(mesh)
         c, s = np.einsum("tai,ti->at", axes, warp)  # rotates κ from the axes of each triangle to warp and weft
         turn = np.stack([c * c, s * s, 2.0 * c * s, s * s, c * c, -2.0 * c * s, -c * s, c * s, c * c - s * s], axis=1)
         columns = np.broadcast_to(3 * np.arange(T)[:, None, None] + np.arange(3), root.shape)

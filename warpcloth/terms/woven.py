@@ -1,7 +1,8 @@
 """The base of energies of fabrics, which are stiffer along warp or weft."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from ..kernels.membrane import side_axes
 from ..mesh.mesh import Mesh
 from .declared import FINITE, Declared, quantity
 
+Own = TypeVar("Own", bound="Woven")
 ABOVE_0 = quantity("must be finite and above 0", lambda values: (values > 0.0) & np.isfinite(values))
 
 
@@ -24,11 +26,24 @@ class Woven(Declared):
             from the front, one or (T,).
     """
 
+    # The field with the stiffness of shear or twist over that along warp; None for that of an isotropic sheet.
+    shearing: ClassVar[str]
+
     weft_ratio: float | Sequence[float] | np.ndarray = field(default=1.0, metadata=ABOVE_0)
     warp: Sequence[float] | np.ndarray | None = field(
         default=None, metadata=quantity("must be finite", np.isfinite, shape=(3,))
     )
     warp_angle: float | Sequence[float] | np.ndarray = field(default=0.0, metadata=FINITE)
+
+    @property
+    def anisotropic(self) -> bool:
+        """Whether weft, or shear and twist, are not as stiff as in an isotropic sheet."""
+        return getattr(self, self.shearing) is not None or bool((self._numeric("weft_ratio") != 1.0).any())
+
+    def isotropic(self: Own) -> Own:
+        """Returns the isotropic energy whose stiffness is the geometric mean of those along warp and weft."""
+        mean = self._numeric("stiffness") * np.sqrt(self._numeric("weft_ratio"))
+        return replace(self, stiffness=mean[()], weft_ratio=1.0, **{self.shearing: None})
 
     def warp_directions(self, mesh: Mesh) -> np.ndarray:
         """Unit vectors along the warp in the plane of each triangle, (T, 3).
