@@ -49,6 +49,7 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .scene.colliders import Plane as Plane
     from .scene.colliders import Sphere as Sphere
     from .scene.fabric import Fabric as Fabric
+    from .scene.fabric_files import read_fabrics as read_fabrics
     from .scene.measured_fabrics import fabrics as fabrics
     from .scene.mesh_collider import MeshCollider as MeshCollider
     from .scene.scene import Pins as Pins
@@ -97,6 +98,7 @@ _MODULES = {
     "Plane": "scene.colliders",
     "Sphere": "scene.colliders",
     "Fabric": "scene.fabric",
+    "read_fabrics": "scene.fabric_files",
     "fabrics": "scene.measured_fabrics",
     "MeshCollider": "scene.mesh_collider",
     "Pins": "scene.scene",

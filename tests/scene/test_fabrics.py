@@ -125,6 +125,96 @@ def test_a_stage_names_one(tmp_path):
         read_scene(path)
 
 
+ARCSIM = """{ // a material
+    "density": 0.2, "stretching": [[50, 10, 100, 30], [1, 2, 3, 4]], "note": "http://x",
+    "bending": [[24e-6, 1], [1, 1], [16e-6, 1]]
+}"""
+KES = """name,W,T,B-1,B-2,G 1,G 2,EMT-1,WT-1,LT-1,EMT-2,LT-2,2HB-1
+wool,20,0.6,0.1,0.05,0.7,0.9,4,8,,4,0.8,0.03
+silk,8,,,,,,,,,,,
+"""
+FAST = """name,W,T2,C-warp,C-weft,EB5,E5-warp,E20-warp,E100-weft
+wool,200,0.5,20,18,2,0.5,1.25,2
+"""
+
+
+def listed(fabric):
+    names = ("density", "thickness", "warp", "weft", "shear", "poisson_ratio", "bending_warp", "bending_weft")
+    return [getattr(fabric, name) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "numbers"),
+    [
+        # k₁ = 100, k₁₂ = 20, k₂ = 200, 4Gt = 60 N/m: E = k − k₁₂²/k, ν₁₂ = k₁₂/k₂.
+        ("wool.json", ARCSIM, [0.2, None, 98.0, 196.0, 15.0, 0.1, 6e-6, 4e-6]),
+        # gf = 9.80665 mN, gf·cm = 98.0665 µN·m, G per degree, 2WT/EMT² with WT = 8 gf/cm, also from LT = 2WT/(EMT·500).
+        (
+            "lab.csv",
+            KES,
+            [0.2, 6e-4, *[2.0 * 8.0 * 0.980665 / 0.04**2] * 2, 0.8 * 0.980665 * 180.0 / np.pi, None, 9.80665e-6, 4.903325e-6],
+        ),
+        # 15 gf/cm over 0.75 %, 100 gf/cm over 2 %, 4.9 N/m over 4 times 2 %, W g c³.
+        (
+            "lab.csv",
+            FAST,
+            [0.2, 5e-4, 14.709975 / 0.0075, 98.0665 / 0.02, 4.903325 / 0.08, None, 1.962 * 8e-6, 1.962 * 5.832e-6],
+        ),
+    ],
+    ids=["ARCSim", "KES-F", "FAST"],
+)
+def test_files_give_fabrics_in_si_units(name, text, numbers, tmp_path, capfd):
+    """And what is not measured is missing, and refused by its name; what was derived is said."""
+    (tmp_path / name).write_text(text)
+    found = wc.read_fabrics(tmp_path / name)
+    assert listed(found["wool"]) == pytest.approx(numbers)
+    assert found["wool"].source == name and len(found["wool"].notes) > 100
+    if numbers[5] is None:
+        with pytest.raises(ValueError, match="fabric 'wool' has no poisson_ratio, which a membrane needs"):
+            wc.Scene(MESH, fabric=found["wool"])
+    else:
+        assert wc.Scene(MESH, fabric=found["wool"]).terms[0].stiffness == pytest.approx(98.0)
+    if "silk" in found:
+        assert listed(found["silk"]) == pytest.approx([0.08, *[None] * 7])
+    code, out, _ = run(capfd, "fabrics", str(tmp_path / name))
+    assert code == 0 and "wool" in out and "denim" not in out
+
+
+def test_a_material_of_the_published_code_is_its_record(tmp_path):
+    """The first entries of that of gray interlock, from the tables of Wang, O'Brien and Ramamoorthi."""
+    first = '{"density": 0.187, "stretching": [[16.59, -14.70, 34.48, 36.86]], "bending": [[23.2e-6], [24.7e-6], [14.3e-6]]}'
+    (tmp_path / "interlock.json").write_text(first)
+    found, record = wc.read_fabrics(tmp_path / "interlock.json")["interlock"], wc.fabrics["interlock-wang"]
+    known = [k for k, value in enumerate(listed(record)) if value is not None]
+    assert [listed(found)[k] for k in known] == pytest.approx([listed(record)[k] for k in known], rel=0.03)
+    assert found.poisson_ratio == 0.0  # as k₁₂ is below 0
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("a.json", "{", "a.json, line 1: Expecting property name"),
+        ("a.json", '{"density": 0.1, "stretching": [1, 2, 3, 4]}', "a.json: has no bending; a material of ARCSim must"),
+        ("a.json", ARCSIM.replace("100,", ""), r"a.json: stretching begins with \[50, 10, 30\]; it must be a row of 4 numbers"),
+        ("a.json", ARCSIM.replace("[1, 1], ", ""), "a.json: bending is .*; it must be rows of numbers"),
+        ("a.json", ARCSIM.replace("0.2", "-1"), "a.json: Fabric.density is -1"),
+        ("a.txt", "", "a.txt: is a .txt; it must be .json of ARCSim or .csv"),
+        ("a.csv", "name,W\nwool,1\n", "a.csv: has no columns of either KES-F"),
+        ("a.csv", "name,W,LT,E5\nwool,1,1,1\n", "a.csv: has columns of both KES-F"),
+        ("a.csv", "W,LT\n1,1\n", "a.csv: has no column 'name'"),
+        ("a.csv", "name,W,LT\nwool,1,1\nwool,1,1\n", "a.csv, line 3: name is 'wool', as before; each fabric must have its own"),
+        ("a.csv", "name,W,B1,B warp,LT\nwool,1,1,1,1\n", "a.csv: columns 'B1' and 'B warp' are the same number"),
+        ("a.csv", "name,W,LT\nwool,,1\n", "a.csv, line 2: fabric 'wool' has no W, the weight"),
+        ("a.csv", "name,W,LT\nwool,1,-1\n", "a.csv, line 2: LT is -1.0; it must be a finite number above 0"),
+        ("a.csv", "name,W,E5,E20\nwool,1,2,1\n", "a.csv, line 2: Fabric.warp is -"),
+    ],
+)
+def test_refusals_of_files(name, text, sentence, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=sentence):
+        wc.read_fabrics(tmp_path / name)
+
+
 def test_the_command_lists_them(capfd):
     code, out, _ = run(capfd, "fabrics")
     assert code == 0 and all(name in out for name in wc.fabrics) and "1673" in out and "Clyde" in out

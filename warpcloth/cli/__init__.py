@@ -213,7 +213,9 @@ def _parser():
     )
     for sub in (runs, deforms, analyzes, checks):
         sub.add_argument("--single-file", action="store_true", help="write one file instead of a file and a folder of frames")
-    add("fabrics", fabrics.fabrics, "List measured fabrics, their moduli, bending lengths and sources.")
+    lists = add("fabrics", fabrics.fabrics, "List measured fabrics, their moduli, bending lengths and sources.")
+    text = "list those of a file instead: .json of ARCSim, or a .csv table of KES-F or FAST measurements"
+    lists.add_argument("file", metavar="FILE", nargs="?", help=text)
     lists = add("scenes", scenes.scenes, "List scenes and their parameters.")
     lists.add_argument(
         "folder", metavar="FOLDER", nargs="?", help="a folder of scene files (default: ./scenes and the included scenes)"

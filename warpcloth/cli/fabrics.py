@@ -2,11 +2,15 @@
 
 
 def fabrics(arguments):
-    from ..scene.measured_fabrics import fabrics
+    if arguments.file:
+        from ..scene.fabric_files import read_fabrics
 
-    for line in table_lines(fabrics.values()):
+        listed = read_fabrics(arguments.file)
+    else:
+        from ..scene.measured_fabrics import fabrics as listed
+    for line in table_lines(listed.values()):
         print(line)
-    sources = list(dict.fromkeys((fabric.source, fabric.notes) for fabric in fabrics.values()))
+    sources = list(dict.fromkeys((fabric.source, fabric.notes) for fabric in listed.values()))
     for number, (source, notes) in enumerate(sources, start=1):
         print(f"\n[{number}] {source}. {notes}")
     return 0
