@@ -11,6 +11,7 @@ from warpcloth.usd import read_scene, write_scene
 
 MESH = wc.Mesh.grid(4, 4, pattern="alternating")
 WHOLE = [name for name, fabric in wc.fabrics.items() if fabric.poisson_ratio is not None and fabric.shear is not None]
+THIN = replace(wc.fabrics["denim-wang"], name="thin", poisson_ratio=0.2)
 needs_a_number = [name for name in wc.fabrics if name not in WHOLE]
 
 
@@ -60,6 +61,27 @@ def test_a_scene_takes_density_and_terms_from_it(device):
     assert wc.simulate(scene, wc.Newton(substeps=2), device=device).status.ok
 
 
+BALL = wc.Sphere(radius=0.1, position=(0.0, -1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("fabric", "given", "distances"),
+    [
+        ({"fabric": "denim"}, {}, (0.33e-3, 0.66e-3)),  # half of it between the middle of the cloth and a collider
+        ({"fabric": "denim"}, {"distance": 2e-3}, (2e-3, 2e-3)),
+        ({"density": 0.1, "terms": [wc.Spring(stiffness=1.0)]}, {}, (1e-3, 1e-3)),
+    ],
+    ids=["fabric", "given", "none"],
+)
+def test_a_fabric_gives_contact_its_thickness(fabric, given, distances):
+    """And the stiffness follows from it, 10 w/r."""
+    scene = wc.Scene(MESH, **fabric, contact=wc.Contact(**given), self_contact=wc.SelfContact(**given), colliders=[BALL])
+    for contact, distance in zip((scene.contact, scene.self_contact), distances, strict=True):
+        assert contact.distance == pytest.approx(distance)
+        assert contact.stiffness == pytest.approx(10.0 * scene.density * 9.81 / distance)
+    assert wc.Scene(MESH, **fabric, colliders=[BALL]).contact.distance == 1e-3  # contact that is not declared
+
+
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
@@ -68,6 +90,8 @@ def test_a_scene_takes_density_and_terms_from_it(device):
         ({"terms": [wc.Spring(stiffness=1.0)]}, "fabric and terms are given"),
         ({"fabric": "denin"}, "fabric is 'denin'; it must be one of cotton, wool"),
         ({"fabric": 3}, "fabric is 3; it must be a Fabric or its name"),
+        ({"fabric": THIN, "contact": wc.Contact()}, "fabric 'thin' has no thickness, which contact needs"),
+        ({"fabric": THIN, "self_contact": wc.SelfContact()}, "fabric 'thin' has no thickness, which self_contact needs"),
     ],
 )
 def test_refusals_of_scenes(given, sentence):

@@ -23,7 +23,8 @@ class Contact:
     sticks moves by up to μN/(kA) before it slides.
 
     Attributes:
-        distance: Contact distance r [m].
+        distance: Contact distance r [m]. None lets the scene set it: to half of the thickness of its fabric, or to 1 mm without
+            a fabric.
         stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default 10 w/r, where w is the weight of the
             cloth per area, so that one layer rests at a gap of 0.9 r.
         elements: What touches meshes: ``"vertices"`` of the cloth, or also its ``"triangles"``, which spikes and edges of a
@@ -33,13 +34,14 @@ class Contact:
         ValueError: If a value is not allowed.
     """
 
-    distance: float = 1e-3
+    distance: Converted[float | None, float] = default(None)
     stiffness: float | None = None
     elements: Literal["vertices", "triangles"] = "vertices"
 
     def __post_init__(self) -> None:
         choice("contact.elements", self.elements, ("vertices", "triangles"))
-        number("contact.distance", self.distance, above=0.0)
+        if self.distance is not None:
+            number("contact.distance", self.distance, above=0.0)
         if self.stiffness is not None and (np.ndim(self.stiffness) or self.stiffness != np.inf):
             number("contact.stiffness", self.stiffness, above=0.0)
 

@@ -28,6 +28,7 @@ from .self_contact import SelfContact
 
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
+DISTANCE = 1e-3  # of contact, where neither it nor a fabric has one [m]
 _MOST_FRAMES = 2**31 - 1  # frames are counted in int32 on the device
 
 
@@ -113,8 +114,8 @@ class Scene:
             is a pin that stands still. Values of pinned vertices are ignored.
         loads: Forces, tractions and pressures on the cloth: :class:`Force`, :class:`Traction`, :class:`Pressure`.
         colliders: The colliders, such as :class:`warpcloth.Sphere`. Pinned vertices do not collide.
-        contact: The :class:`warpcloth.Contact` with all colliders, by default ``Contact()``; its stiffness is then computed. It
-            has no effect without colliders.
+        contact: The :class:`warpcloth.Contact` with all colliders, by default ``Contact(distance=1e-3)``; its stiffness is then
+            computed. It has no effect without colliders.
         self_contact: The :class:`warpcloth.SelfContact` of the cloth with itself; its stiffness is then computed. None if cloth
             passes through cloth.
         air: The :class:`warpcloth.Air` around the cloth, with its wind; None for none.
@@ -227,6 +228,8 @@ class Scene:
             keep("masses", array("masses", self.masses, (n,)))
         self._check_masses()
         keep("colliders", checked_colliders(self.colliders))
+        keep("contact", _with_distance(self.contact, "contact", fabric, 0.5))
+        keep("self_contact", _with_distance(self.self_contact, "self_contact", fabric, 1.0))
         keep("contact", self._checked_contact())
         keep("self_contact", self._checked_self_contact())
         self._check_air()
@@ -255,7 +258,7 @@ class Scene:
             raise ValueError(f"contact is {shown(self.contact)}; it must be a Contact or None")
         if not self.colliders:
             return self.contact
-        contact = self.contact or Contact()
+        contact = self.contact or Contact(DISTANCE)
         for collider in (each for each in self.colliders if each.friction and np.isinf(contact.stiffness or 0.0)):
             raise ValueError(
                 f"{collider.label} has friction {collider.friction:g} and contact.stiffness is infinite, which leaves no gap "
@@ -289,7 +292,7 @@ class Scene:
         mesh = self.mesh
         if len(mesh.triangles):
             return mesh.vertex_areas
-        distance = Contact.distance if self.contact is None else self.contact.distance
+        distance = DISTANCE if self.contact is None else self.contact.distance
         return 2.0 * distance * mesh.vertex_lengths
 
     @property
@@ -467,6 +470,17 @@ class Scene:
         if self.air is not None:
             lines.append(f"  {_described(self.air)}")
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
+
+
+def _with_distance(contact, name, fabric, thicknesses):
+    """Returns contact with a distance: that number of thicknesses of the fabric, without a fabric `DISTANCE`."""
+    if not isinstance(contact, (Contact, SelfContact)) or contact.distance is not None:
+        return contact
+    if fabric is None:
+        return replace(contact, distance=DISTANCE)
+    if fabric.thickness is None:
+        raise ValueError(f"fabric {fabric.name!r} has no thickness, which {name} needs; give {name} a distance [m]")
+    return replace(contact, distance=thicknesses * fabric.thickness)
 
 
 def _checked_axes(free_axes, n):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ..base.checks import choice, number
+from ..base.types import Converted, default
 
 STARTS = ("refuse", "run")
 
@@ -18,7 +19,7 @@ class SelfContact:
     each step a filter shortens moves that would cross, so that cloth never passes through cloth.
 
     Attributes:
-        distance: Contact distance r [m].
+        distance: Contact distance r [m]. None lets the scene set it: to the thickness of its fabric, or to 1 mm without one.
         stiffness: k [Pa/m]. By default 10 w/r, where w is the weight of the cloth per area, so that one layer rests at a gap of
             0.9 r.
         friction: Coefficient μ of friction.
@@ -30,13 +31,14 @@ class SelfContact:
         ValueError: A value is not allowed.
     """
 
-    distance: float = 1e-3
+    distance: Converted[float | None, float] = default(None)
     stiffness: float | None = None
     friction: float = 0.0
     crossing_start: Literal["refuse", "run"] = "refuse"
 
     def __post_init__(self) -> None:
-        number("self_contact.distance", self.distance, above=0.0)
+        if self.distance is not None:
+            number("self_contact.distance", self.distance, above=0.0)
         if self.stiffness is not None:
             number("self_contact.stiffness", self.stiffness, above=0.0)
         number("self_contact.friction", self.friction, least=0.0)
