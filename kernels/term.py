@@ -82,6 +82,7 @@ class Term:
             rows hold p fixed in an iteration, so they use that point and s k instead; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices.
         quadratic: Whether p is 0 and the weights of an element add up to 0: U is then quadratic in the differences of vertices.
+        curvature: Of sparse cells that are not quadratic, the largest eigenvalue of ∂²u/∂y² at rest; or None.
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, like the next four fields.
         constraint_gradient: (y, rest) → ∂C/∂y (M, 3).
         constraint_hessian: (y, rest) → ∂²C/∂y² (3M, 3M).
@@ -116,6 +117,7 @@ class Term:
     secant: Any = None
     linear: bool = False
     quadratic: bool = False
+    curvature: float | None = None
     constraint: Any = None
     constraint_gradient: Any = None
     constraint_hessian: Any = None

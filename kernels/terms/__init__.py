@@ -8,6 +8,7 @@ from .orthotropic_membrane import ORTHOTROPIC_MEMBRANE as ORTHOTROPIC_MEMBRANE
 from .plate_bending import PLATE_BENDING as PLATE_BENDING
 from .quadratic_bending import QUADRATIC_BENDING as QUADRATIC_BENDING
 from .rigid_cluster import RIGID_CLUSTER as RIGID_CLUSTER
+from .shell_bending import SHELL_BENDING as SHELL_BENDING
 from .spring import SPRING as SPRING
 from .spring_limit import SPRING_LIMIT as SPRING_LIMIT
 from .strain_limit import STRAIN_LIMIT as STRAIN_LIMIT

@@ -71,6 +71,7 @@ DECLARED = {
     "StrainLimit": lambda mesh: wc.StrainLimit(stiffness=50.0, **MATERIALS["StrainLimit"]),
     "QuadraticBending": lambda mesh: wc.QuadraticBending(stiffness=0.5),
     "PlateBending": lambda mesh: wc.PlateBending(stiffness=0.5, poisson_ratio=0.3, weft_ratio=2.0, warp=(1.0, 0.0, 1.0)),
+    "ShellBending": lambda mesh: wc.ShellBending(stiffness=0.5, poisson_ratio=0.3),
     "DihedralBending": lambda mesh: wc.DihedralBending(stiffness=0.5),
     "Plane": lambda mesh: Plane(stiffness=5.0, **MATERIALS["Plane"]),
     "Attachment": lambda mesh: wc.Attachment(vertices=np.arange(len(mesh.points)), stiffness=5.0, targets=1.1 * mesh.points),

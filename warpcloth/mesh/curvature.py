@@ -14,7 +14,7 @@ the plane of T, so that a curved mesh counts by its edge lengths alone.
 
 import numpy as np
 
-from ..kernels.membrane import side_axes
+from ..kernels.membrane import inverse_edges, side_axes
 
 _RANK = 1e-2  # ratio of the smallest to the largest singular value below which vertices do not determine a quadratic function
 _RINGS = 4  # largest number of rings of triangles to fit to
@@ -62,6 +62,31 @@ def curvature_operator(mesh):
         return csr_array((entries.ravel(), columns.ravel(), np.arange(0, 9 * T + 1, 3)), shape=(3 * T, 3 * T))
 
     return summed(outward) @ across + summed(along) @ tangential
+
+
+def covariant_operator(mesh):
+    """Returns second and first covariant derivatives on a mesh that may be curved: matrices (3T, n) and (2T, n) [1/m², 1/m].
+
+    Rows 2t and 2t + 1 of the second matrix give the gradient on triangle t. The first one is :func:`curvature_operator` less
+    the combination of these rows with which the second derivatives of the points of the mesh are normal to the triangles.
+
+    Args:
+        mesh: As for :func:`curvature_operator`.
+    """
+    from scipy.sparse import csr_array
+
+    T, n = len(mesh.triangles), len(mesh.points)
+    r = inverse_edges(mesh.points, mesh.triangles)
+    weights = np.zeros((T, 2, 3))  # the first row of the gradient, then the second, at the three corners
+    weights[:, 0, 0], weights[:, 0, 1] = -r[:, 0], r[:, 0]
+    weights[:, 1] = np.stack([-r[:, 1] - r[:, 2], r[:, 1], r[:, 2]], axis=1)
+    columns = np.broadcast_to(mesh.triangles[:, None], weights.shape)
+    first = csr_array((weights.ravel(), columns.ravel(), np.arange(0, 6 * T + 1, 3)), shape=(2 * T, n))
+    second = curvature_operator(mesh)
+    along = np.einsum("tmi,tai->tma", (second @ mesh.points).reshape(T, 3, 3), (first @ mesh.points).reshape(T, 2, 3))
+    columns = np.broadcast_to(2 * np.arange(T)[:, None, None] + np.arange(2), along.shape)
+    tangential = csr_array((along.ravel(), columns.ravel(), np.arange(0, 6 * T + 1, 2)), shape=(3 * T, 2 * T))
+    return second - tangential @ first, first
 
 
 def _partners(mesh):

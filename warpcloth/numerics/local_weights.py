@@ -27,6 +27,8 @@ def curvatures(model, elements):
     """Returns s of each element (E,): 1 for a squared distance and for contact, else the curvature at rest."""
     if elements.term.project is not None or elements.term.bounded is not None:
         return np.ones(elements.count, dtype=model.numpy_dtype)
+    if elements.term.whole.curvature is not None:
+        return np.full(elements.count, elements.term.whole.curvature, dtype=model.numpy_dtype)
     scale = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
     rest_shape = model.array(np.tile(model.rest_points, (model.copies, 1)), model.vec3)
     kernel = model.kernel(stiffness_scale, elements.term, model.dtype)

@@ -73,7 +73,7 @@ class ConstrainedDynamics(ImplicitStep):
     needs, locks = (MERGED_DAMPING, ROWS, STEADY_ROWS), True
     touches_itself = True
     facts = Facts(
-        method="implicit steps with hard or compliant constraints, solved for positions and Lagrange multipliers",
+        method="implicit steps with hard or compliant constraints and Lagrange multipliers",
         suits="constraints of any stiffness, met at the point nearest to x̃; bodies that hang from one another",
         weakness="slow with thousands of constraints; one iteration overshoots",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 1}, cpu=(8, 16, 32), cuda=(16, 32, 64)),),

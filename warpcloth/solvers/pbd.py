@@ -58,7 +58,7 @@ class PBD(Step):
     touches_itself = True
     closes, multipliers = True, False  # λ does not add up over the sweeps of a step
     facts = Facts(
-        method="position based dynamics, by Gauss–Seidel or Jacobi sweeps over the constraints",
+        method="position based dynamics, by Gauss–Seidel or Jacobi sweeps",
         suits="cloth that only has to look plausible",
         weakness="its stiffness depends on the number of iterations and on the step",
         benchmarks=(

@@ -13,6 +13,7 @@ from .orthotropic_membrane import OrthotropicMembrane
 from .plate_bending import PlateBending
 from .quadratic_bending import QuadraticBending
 from .rigid_cluster import RigidCluster
+from .shell_bending import ShellBending
 from .spring import Spring
 from .spring_limit import SpringLimit
 from .strain_limit import StrainLimit
@@ -27,6 +28,7 @@ __all__ = [
     "PlateBending",
     "QuadraticBending",
     "RigidCluster",
+    "ShellBending",
     "Spring",
     "SpringLimit",
     "StVKMembrane",

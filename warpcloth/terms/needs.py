@@ -37,6 +37,7 @@ CONSTANT_MATRIX = Need(
     lambda elements: (
         elements.term.whole.project is not None
         or elements.term.bounded is not None
+        or elements.term.whole.curvature is not None
         or (elements.term.whole.prox is None and elements.term.whole.vertices > 0)
     ),
     "{label}, whose curvature is not known in advance",

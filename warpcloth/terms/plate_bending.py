@@ -75,6 +75,14 @@ class PlateBending(Woven, Sparse):
         return cls(stiffness=D1, **ratios, warp=direction, **fields)
 
     def operator(self, mesh: Mesh) -> Any:
+        return self.roots(mesh) @ curvature_operator(mesh)
+
+    def roots(self, mesh: Mesh) -> Any:
+        """Returns the square roots of C/D₁ of all triangles, as a block diagonal matrix (3T, 3T) for κ in their own axes.
+
+        Raises:
+            ValueError: The mesh has no hinges.
+        """
         from scipy.sparse import csr_array
 
         T = len(mesh.triangles)
@@ -91,7 +99,7 @@ class PlateBending(Woven, Sparse):
         turn = np.stack([c * c, s * s, 2.0 * c * s, s * s, c * c, -2.0 * c * s, -c * s, c * s, c * c - s * s], axis=1)
         columns = np.broadcast_to(3 * np.arange(T)[:, None, None] + np.arange(3), root.shape)
         entries = (root @ turn.reshape(-1, 3, 3)).ravel(), columns.ravel(), np.arange(0, 9 * T + 1, 3)
-        return csr_array(entries, shape=(3 * T, 3 * T)) @ curvature_operator(mesh)
+        return csr_array(entries, shape=(3 * T, 3 * T))
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         return mesh.triangle_areas[:, None]

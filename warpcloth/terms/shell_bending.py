@@ -1,0 +1,61 @@
+"""Bending of an isotropic or orthotropic shell, whose rest shape is curved, independent of the pattern of the mesh."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..kernels.term import Term
+from ..kernels.terms import SHELL_BENDING
+from ..mesh.curvature import covariant_operator
+from ..mesh.mesh import Mesh
+from .plate_bending import PlateBending
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShellBending(PlateBending):
+    """Shell bending, U = Σ ½AδᵀCδ.
+
+    δ = κ − κ̄n, and κᵀCκ is that of :class:`warpcloth.PlateBending`. κ̄ is the curvature of the rest shape along warp and weft,
+    and n the normal of a triangle. The rest shape has no energy, wherever it is and however it is turned. In motion without
+    stretch the energy is that of the change of curvature. Forces are not linear in x.
+
+    Attributes:
+        stiffness: D₁ [N·m], the bending stiffness along warp, one or (T,).
+        poisson_ratio: ν, above −1 and below 1, one or (T,).
+        weft_ratio: D₂/D₁, one or (T,).
+        twist_ratio: D₆₆/D₁, one or (T,); ½(1 − ν)√(D₂/D₁) if None.
+        warp: Vector along the warp, (3,) or (T,3), of which each triangle takes the component in its plane. By default the
+            direction in which the texture coordinate s grows and t is constant. Isotropic shells need neither.
+        warp_angle: Angle [rad] by which the warp is turned from there in the plane of the triangle, counter-clockwise if seen
+            from the front, one or (T,).
+        name: To tell two terms of one kind apart.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> wc.ShellBending(stiffness=1e-5, poisson_ratio=0.3).operator(wc.Mesh.grid(3, 3)).shape
+        (40, 9)
+    """
+
+    term: ClassVar[Term] = SHELL_BENDING
+
+    def operator(self, mesh: Mesh) -> Any:
+        from scipy.sparse import diags_array, vstack
+
+        bent, gradient, curvature = self._at_rest(mesh)
+        T = len(mesh.triangles)
+        order = np.concatenate([np.arange(3 * T).reshape(T, 3), 3 * T + np.arange(2 * T).reshape(T, 2)], axis=1)
+        size = diags_array(np.repeat(np.linalg.norm(curvature, axis=1), 2))
+        return vstack([bent, size @ gradient]).tocsr()[order.ravel()]
+
+    def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
+        curvature = self._at_rest(mesh)[2]
+        square = (curvature**2).sum(axis=1)[:, None]
+        return np.column_stack([mesh.triangle_areas, curvature / np.where(square > 0.0, square, 1.0)])
+
+    def _at_rest(self, mesh):
+        """Returns the matrices of κ (3T, n) and of f₁ and f₂ (2T, n), and κ̄ (T, 3) [1/m]."""
+        second, first = covariant_operator(mesh)
+        bent = self.roots(mesh) @ second
+        f = (first @ mesh.points).reshape(-1, 2, 3)
+        return bent, first, np.einsum("tmi,ti->tm", (bent @ mesh.points).reshape(-1, 3, 3), np.cross(f[:, 0], f[:, 1]))
