@@ -13,6 +13,9 @@ from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import STOPPED, StepPairs, module_of, near_pairs
 from .self_planes import WHOLE
 
+# Pins that move together, but turn, may seem to approach by this fraction of their gap in a step.
+TOGETHER = wp.constant(wp.float64(0.01))
+
 
 @wp.func
 def bounded_share(move: wp.vec3d, most: wp.float64):
@@ -111,6 +114,97 @@ class HeldPins:
     farthest: wp.array(dtype=wp.float64)
 
 
+@wp.func
+def note_held(held: HeldPins, steps: wp.array(dtype=wp.int32), per_copy: int, i: int, back: wp.float64):
+    """Notes that the pin i was held back by the distance ``back`` [m]."""
+    copy = i // per_copy
+    key = wp.int64(steps[copy]) * wp.int64(per_copy) + wp.int64(i - copy * per_copy)
+    wp.atomic_max(held.first, copy, FIRST - key)
+    wp.atomic_max(held.farthest, copy, back)
+
+
+@cache
+def share_of_pins(dtype):
+    """Kernel over pairs: reduces the ``share`` of each pin, the fraction of its move to x that other pins leave it.
+
+    It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If two pins would
+    pass one another along n, they stop at the contact distance or, if that is smaller, at their gap at the start of the step.
+    If pairs are ``hard``, so do pins that would come nearer than this by more than a hundredth of it.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_each_share_of_pins(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        step: StepPairs,
+        x_before: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # parameters
+        hard: bool,
+        # in and out
+        share: wp.array(dtype=wp.float64),
+    ):
+        e = wp.tid()
+        if e >= pairs.counts[0] + pairs.counts[1]:
+            return
+        s = pairs.stencils[e]
+        w = step.weights[e]
+        for i in range(4):
+            if w[i] == ZERO:
+                return
+        n = step.normal[e]
+        sides = wp.where(e < pairs.counts[0], 1, 2)
+        floor = wp.min(step.gap[e], wp.float64(pairs.distances[e]))
+        allowed = wp.where(hard, TOGETHER * floor, floor)
+        for i in range(sides):
+            for j in range(sides, 4):
+                if inverse_mass[s[i]] == dtype(0.0) and inverse_mass[s[j]] == dtype(0.0):
+                    apart = wp.dot(n, exact(x_before[s[i]]) - exact(x_before[s[j]]))
+                    approach = apart - wp.dot(n, exact(x[s[i]]) - exact(x[s[j]]))
+                    if approach > apart - floor + allowed:
+                        t = wp.max(apart - floor, ZERO) / approach
+                        wp.atomic_min(share, s[i], t)
+                        wp.atomic_min(share, s[j], t)
+
+    return find_each_share_of_pins
+
+
+@cache
+def hold_pins(dtype):
+    """Kernel over vertices: pins make the ``share`` of their moves from x_before in x, and v changes with them."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def hold_each_pin(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        share: wp.array(dtype=wp.float64),
+        x_before: wp.array(dtype=vec3),
+        steps: wp.array(dtype=wp.int32),
+        # parameters
+        per_copy: int,
+        # in and out
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        held: HeldPins,
+    ):
+        i = wp.tid()
+        if inverse_mass[i] == dtype(0.0) and share[i] < ONE:
+            move = exact(x[i]) - exact(x_before[i])
+            end = exact(x_before[i]) + share[i] * move
+            note_held(held, steps, per_copy, i, (ONE - share[i]) * wp.length(move))
+            x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
+            v[i] = dtype(share[i]) * v[i]
+
+    return hold_each_pin
+
+
 @cache
 def end_filter(dtype):
     """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and the change over h to v.
@@ -152,9 +246,7 @@ def end_filter(dtype):
                     if free:
                         pinned[axis] = ZERO
             if wp.length_sq(pinned) > ZERO:
-                key = wp.int64(steps[copy]) * wp.int64(per_copy) + wp.int64(i - copy * per_copy)
-                wp.atomic_max(held.first, copy, FIRST - key)
-                wp.atomic_max(held.farthest, copy, wp.length(pinned))
+                note_held(held, steps, per_copy, i, wp.length(pinned))
             v[i] = v[i] + change / h
             if move:
                 move[i] = move[i] + change

@@ -247,6 +247,31 @@ def test_pins_that_cloth_holds_back(device):
     assert rest.points[:16, 1].max() < 0.02
 
 
+@pytest.mark.parametrize(
+    ("name", "rise"),
+    slow_but([("xpbd", 0.06), ("pbd", 0.06), ("admm", 0.6)], [(name, rise) for name in SOLVERS for rise in (0.06, 0.6)]),
+)
+def test_pins_that_pinned_cloth_holds_back(name, rise, device):
+    """A border is to go through the pinned border of another sheet, at 0.24 or 2.4 m/s: it is held, and nothing is thrown.
+
+    Solvers used to draw cloth after the prescribed pins, and then threw it at up to 38 m/s.
+    """
+    two, border = (
+        layers(turn=17.0, gap=0.01, stiffness=1e4),
+        np.setdiff1d(np.arange(36), np.arange(36).reshape(6, 6)[1:-1, 1:-1]),
+    )
+    held = np.concatenate([border, 36 + border])
+    keyframes = np.tile(two.positions[held], (7, 1, 1))
+    keyframes[:, :20, 1] += np.linspace(0.0, rise, 7)[:, None]
+    scene = replace(two, pins=wc.Pins(held, keyframes))
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
+    for _ in range(6):
+        stepper.frame()
+        assert np.linalg.norm(stepper.state.v.numpy(), axis=1).max() < 1.0
+        assert crossed(stepper.state.x.numpy(), two.mesh.triangles) == 0
+    assert stepper.pairs.pins_held[0].farthest == pytest.approx(rise - 0.0075, abs=0.0026)
+
+
 def test_acting_pairs(device):
     """They are those of the list that have an area, and their corners are in order at each vertex."""
     pairs, model = steps_of(layers(3, turn=17.0, gap=2e-3), device)

@@ -51,6 +51,8 @@ class SelfFilter:
         made = self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move
         made += self_filter.keep_apart, self_filter.end_filter, self_filter.add_positions
         made += self_filter.limit_direction, self_filter.precondition, self_filter.take_descent
+        if model.keyframes is not None:
+            made += self_filter.share_of_pins, self_filter.hold_pins
         declared = model.colliders
         self._lets_out = colliders is not None and (declared.meshes is not None or any(declared.moves))
         if self._lets_out:
@@ -107,6 +109,18 @@ class SelfFilter:
             self._contact.friction.launch_end(x)
         if self._contact.tangles is not None:
             self._contact.tangles.launch_free(x)
+
+    def launch_hold(self, x, v, hard):
+        """Shortens moves of pins to x that other pins are in the way of, before a solver draws cloth after them; corrects v.
+
+        ``hard`` pairs keep the contact distance as a constraint.
+        """
+        model, contact = self.model, self._contact
+        self._share.fill_(1.0)
+        given = [contact.pairs, model.inverse_mass, contact.begun, contact.x_before, x, hard]
+        self._launch(self_filter.share_of_pins, len(contact.pairs.stencils), given, [self._share])
+        given = [model.inverse_mass, self._share, contact.x_before, contact.steps, model.per_copy]
+        self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
 
     def launch_fresh(self, x, launch, active=None):
         """Calls ``launch`` with x if the next round might miss a pair, as a vertex has moved far since the last list.

@@ -96,6 +96,8 @@ class HierarchicalPBDStepper(LaunchedStepper):
         sweep: The :class:`warpcloth.numerics.sweeps.GaussSeidelSweep` over all terms, with x − x̃ of the last step.
     """
 
+    hard_pairs = True
+
     def __init__(self, options, model):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations

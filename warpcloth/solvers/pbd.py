@@ -115,6 +115,8 @@ class PBDStepper(LaunchedStepper):
         sweep: The sweep of :mod:`warpcloth.numerics.sweeps`, with x − x̃ of the last step.
     """
 
+    hard_pairs = True
+
     def __init__(self, options, model):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations

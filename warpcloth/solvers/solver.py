@@ -43,6 +43,7 @@ class Stepper:
 
     factorise_seconds = 0.0
     iterations = 1
+    hard_pairs = False  # whether pairs of self-contact keep the contact distance as a constraint
     uniform = False  # whether all steps have the same number of iterations
     _motion = None  # x and v, if they are views of those of another stepper, see `part_of`
     lead = None  # for a twin without contact, the stepper whose state it shares, see `find_twin`
@@ -200,6 +201,8 @@ class Stepper:
         if self.pairs is not None:
             self.pairs.launch_begin(self.state.x)
         self.integrator.launch_prediction()
+        if self.pairs is not None and self.model.keyframes is not None:
+            self.pairs.filter.launch_hold(*self.state, self.hard_pairs)
         if self.colliders is not None:
             self.colliders.launch_clear(self.model.terms, self.state.x)
 
