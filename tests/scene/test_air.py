@@ -20,6 +20,7 @@ SOLVERS = {
     "bdf2": wc.Newton(substeps=32, tolerance=1e-8, integrator="bdf2"),
     "admm": wc.ADMM(substeps=16, tolerance=1e-6, iterations=200),
     "xpbd": wc.XPBD(substeps=16, iterations=10),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=16, tolerance=1e-8, iterations=200),
     "explicit": wc.Explicit(substeps=64),
 }
 each_solver = pytest.mark.parametrize("name", slow_but(("explicit", "newton"), SOLVERS))
@@ -128,6 +129,7 @@ def test_still_air_takes_energy(name, device):
 MEET = {
     "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=8000),
     "xpbd": wc.XPBD(substeps=1, iterations=4000),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-12, iterations=2000),
 }
 
 
@@ -246,7 +248,7 @@ STRONG = wc.Air(wind=(100.0, 0.0, 0.0))
         (lambda: sheet(air=3), "air is 3; it must be an Air or None"),
         (lambda: sheet(air=wc.Air(wind=np.zeros((5, 3)))), r"air.wind has shape \(5, 3\); it must be \(3,\), or \(18, 3\)"),
         (lambda: wc.simulate(sheet(), wc.PBD(substeps=4)), "PBD cannot take Air, whose drag grows .*; Explicit, Newton"),
-        (lambda: wc.simulate(sheet(), wc.ProjectiveDynamics(substeps=4)), "cannot take Air, whose curvature is not known"),
+        (lambda: wc.simulate(sheet(), wc.ConstrainedDynamics(substeps=4)), "cannot take Air, whose energy is no square of"),
         (
             lambda: wc.simulate(sheet(air=STRONG), wc.Explicit(substeps=8)),
             "in this wind the forces of air need steps",

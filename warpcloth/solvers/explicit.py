@@ -143,7 +143,7 @@ def _refuse_strong_air(model, h):
             fewest = int(most / model.scene.fps) + 1
             raise ValueError(
                 f"dt is {h:.6g} s; in this wind the forces of air need steps of at most {1.0 / most:.6g} s, that is {fewest} "
-                "substeps a frame; Newton, ADMM and XPBD take any"
+                "substeps a frame; the implicit solvers that take air take any"
             )
 
 

@@ -13,6 +13,7 @@ from ..core.status import UNBALANCED, Residual
 from ..core.sums import Sums
 from ..fast.plan import plan
 from ..kernels.accelerate import plain_step
+from ..kernels.terms.air import AIR
 from ..model.model import Model
 from ..numerics.accelerated_step import AcceleratedStep
 from ..numerics.acceleration import accelerated
@@ -42,7 +43,8 @@ class ProjectiveDynamics(ImplicitStep):
 
     An energy without a projection has k A s GᵀG in S, with the curvature s = ‖∂²u/∂y²‖ at rest. The iteration is the same (Liu
     et al. 2017), but a step may raise φ where the curvature is larger than at rest. If both the plain and the accelerated step
-    raise φ, the iterate stays, and the next steps are half as long.
+    raise φ, the iterate stays, and the next steps are half as long. Air has no part in S, because its curvature changes in each
+    step; where h·½ρC|u|/3m < 1, with the sum over the triangles of a vertex, the iteration converges without it.
 
     Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
     error perpendicular to it shrinks by the factor k(L/l)/(m/h² + k) in each iteration; the error along it is gone after one.
@@ -131,6 +133,9 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         constant, bounded = [], True  # whether the matrix bounds the Hessian, so that φ never rises with a plain step
         for elements in model.terms:
             if elements.collider is not None:
+                continue
+            if elements.term is AIR:
+                bounded = False
                 continue
             if elements.term.whole.project is None:
                 elements, bounded = elements.weighed(curvatures(model, elements)), False

@@ -32,12 +32,13 @@ ELEMENTS = Need(
 PROJECTION = Need(
     lambda elements: elements.term.whole.project is not None, "{label}, whose energy is no squared distance to a set"
 )
-# A projection, contact, whose Hessian is added to the matrix, or a curvature at rest.
+# A projection, contact, whose Hessian is added to the matrix, a curvature at rest, or air, whose curvature is small.
 CONSTANT_MATRIX = Need(
     lambda elements: (
         elements.term.whole.project is not None
         or elements.term.bounded is not None
         or elements.term.whole.curvature is not None
+        or elements.term is AIR
         or (elements.term.whole.prox is None and elements.term.whole.vertices > 0)
     ),
     "{label}, whose curvature is not known in advance",
