@@ -1,6 +1,7 @@
 """The constraint rows of a model and their Schur complement J W Jᵀ + α̃, the matrix of constrained dynamics.
 
-Each term has an object for its rows of J. Self-contact and rigid clusters have objects with the same methods.
+Each term has an object for its rows of J. Self-contact, rigid clusters and sparse cells have objects with the
+same methods.
 """
 
 from functools import cached_property
@@ -17,6 +18,7 @@ from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 from .cluster_rows import ClusterRows
 from .pair_rows import FrictionRows, PairRows
+from .sparse_rows import SparseRows
 
 
 class TermRows:
@@ -93,6 +95,13 @@ class TermRows:
         return blocks.read().ravel(), rows, columns
 
 
+def _rows_of(model, elements, curved):
+    """Returns the object for the rows of one term."""
+    if elements.term.cell:
+        return SparseRows(model, elements)
+    return ClusterRows(model, elements) if elements.cells else TermRows(model, elements, curved)
+
+
 class Constraints:
     """All constraint rows of a model, with the matrix A = J W Jᵀ + α̃, W the inverse masses.
 
@@ -112,10 +121,8 @@ class Constraints:
 
     def __init__(self, model, h, curved, pairs=None):
         self.model, self.h = model, h
-        self.parts = [
-            ClusterRows(model, elements) if elements.cells else TermRows(model, elements, curved) for elements in model.terms
-        ]
-        sizes = [elements.per_copy for elements in model.terms]
+        self.parts = [_rows_of(model, elements, curved) for elements in model.terms]
+        sizes = [elements.cells.per_copy if elements.term.cell else elements.per_copy for elements in model.terms]
         if pairs is not None:
             pairs.list_corners()
             self.parts.append(PairRows(model, pairs, curved))

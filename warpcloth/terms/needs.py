@@ -63,7 +63,11 @@ CLOSED_STEP = Need(
     "give a finite stiffness",
 )
 ROWS = Need(
-    lambda elements: elements.term.vertices > 0 and (elements.term.project is not None or elements.term.constraint is not None),
+    lambda elements: (
+        elements.term.whole.quadratic
+        if elements.term.whole.vertices == 0
+        else elements.term.project is not None or elements.term.constraint is not None
+    ),
     "{label}, whose energy is no square of a constraint",
 )
 # With a projection that changes between iterations, λ would keep components along earlier directions.
