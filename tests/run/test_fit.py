@@ -177,6 +177,27 @@ def test_the_depth_of_a_heart_loop_gives_its_bending_stiffness():
     assert found.parameters["QuadraticBending.stiffness"] == pytest.approx(true, rel=0.02)
 
 
+@pytest.mark.slow
+@pytest.mark.host
+def test_the_angle_of_a_strip_in_wind_gives_its_drag():
+    """sin φ = (√(1 + 4N²) − 1)/2N with N = ½ρC_n w²/(mg), at 1 m/s; the error is that of the angle over dφ/d ln C_n."""
+    mesh = wc.Mesh.grid(3, 5, size=(0.1, 0.2), pattern="alternating")
+    terms = [wc.StVKMembrane(stiffness=5e3), wc.QuadraticBending(stiffness=1e-4)]
+    down = mesh.points[:, [1, 2, 0]] * [1.0, -1.0, 1.0]
+
+    def angle(C):
+        N = 0.5 * 1.2 * C / (0.1 * 9.81)
+        return np.arcsin((np.sqrt(1.0 + 4.0 * N**2) - 1.0) / (2.0 * N))
+
+    air = wc.Air(wind=(1.0, 0.0, 0.0), tangential_drag=0.0)
+    scene = wc.Scene(mesh, density=0.1, positions=down, terms=terms, pins="z < 0.001", air=air)
+    reading = wc.Reading(lambda rest: np.arctan2(rest.points[-1, 0], -rest.points[-1, 1]), angle(1.2), 0.01)
+    found = wc.fit(scene, None, {"Air.normal_drag": 1.0}, reading)
+    assert found.parameters["Air.normal_drag"] == pytest.approx(1.2, rel=1e-3)
+    slope = (angle(1.2 * np.exp(1e-4)) - angle(1.2 * np.exp(-1e-4))) / 2e-4
+    assert found.errors["Air.normal_drag"] == pytest.approx(0.01 / slope, rel=1e-3)
+
+
 def disc(D=1e-6, rings=5):
     """A disc of 30 cm of hexagonal rings over a support of 18 cm, which starts to fall in six folds."""
     turns = [np.arange(6 * k) / (6 * max(k, 1)) for k in range(rings + 1)]

@@ -378,3 +378,23 @@ def test_wrong_records_and_hidden_forces_are_refused():
     body = wc.Scene(wc.Mesh.grid(2, 2), density=1.0, terms=[wc.RigidCluster(vertices=[[0, 1, 2, 3]])], pins=[0])
     with pytest.raises(ValueError, match=r"^XPBD has no multipliers of RigidCluster at pinned vertices"):
         wc.simulate(body, SOLVERS["xpbd"], record="reactions")
+
+
+def test_a_copy_of_a_batch_is_an_animation(device):
+    """Of its own numbers, of which those of one copy alone are the same to rounding; and there are no others."""
+    cloth = square(pins="corners", self_contact=wc.SelfContact(), colliders=[wc.Sphere(radius=0.1, position=(0.0, -3.0, 0.0))])
+    solver, run = wc.XPBD(substeps=2), {"device": device, "dtype": "float64", "frames": 2, "record": (*BOTH, "pairs")}
+    density = 2.0 * cloth.density
+    both = wc.simulate(cloth, solver, copies=2, vary={"density": np.array([cloth.density, density])}, **run)
+    one, alone = both.of_copy(1), wc.simulate(replace(cloth, density=density), solver, **run)
+    assert alone.of_copy(0) is alone
+    for name in ("points", "velocities", "reactions", "cuts"):
+        np.testing.assert_allclose(getattr(one, name), getattr(alone, name), rtol=1e-9, atol=1e-9)
+    for name in ("energies", "pairs", "collider_forces"):
+        assert getattr(one, name).keys() == getattr(alone, name).keys()
+        for key, values in getattr(one, name).items():
+            np.testing.assert_allclose(values, getattr(alone, name)[key], rtol=1e-9, atol=1e-9)
+    assert one.worst_strain == pytest.approx(alone.worst_strain) and one.cut == alone.cut and one.crossings == 0
+    assert one.self_contact.kept == alone.self_contact.kept
+    with pytest.raises(ValueError, match="copy is 2; it must be 1 or less"):
+        both.of_copy(2)
