@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import warpcloth as wc
 from warpcloth.cli.reports import write_report
 from warpcloth.lab import elastica
-from warpcloth.scenes import bar_twist, bunny, cantilever, character, hanging, mobile, tablecloth
+from warpcloth.scenes import bar_twist, bunny, cantilever, character, cusick, hanging, mobile, tablecloth
 
 DOCS = Path(__file__).parent
 GREY = "0.35"
@@ -97,6 +97,16 @@ def picture_mobile(moments=(0.0, 1.0, 2.0, 3.0)):
     wc.render(animation, DOCS / "mobile.png", size=(1430, 400), samples=16, azimuth=-30.0, elevation=14.0)
 
 
+def picture_drape():
+    """A drape of the cotton from above and from the side."""
+    scene = cusick.scene("cotton", rows=8)
+    rest = wc.equilibrium(scene)
+    assert rest.status.ok, rest.status
+    shape = wc.Mesh(rest.points, scene.mesh.triangles)
+    for name, elevation in (("drape-above.png", 90.0), ("drape-side.png", 14.0)):
+        wc.render(shape, DOCS / name, size=(480, 360), samples=16, elevation=elevation, ground=False)
+
+
 def picture_contact():
     """The tablecloth on its table, and the figure that walks in its skirt in real time, from the stages of their runs."""
     with tempfile.TemporaryDirectory() as folder:
@@ -120,5 +130,6 @@ if __name__ == "__main__":
     picture_hanging()
     picture_mobile()
     picture_contact()
+    picture_drape()
     picture_deformation()
     picture_cantilever()

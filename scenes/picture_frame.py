@@ -12,6 +12,8 @@ import warpcloth as wc
 def scene(fabric: str = "cotton", angle: float = 20.0, n: int = 9, side: float = 0.2, duration: float = 1.0):
     """One of 'warpcloth fabrics', γ [°], vertices per side, side [m], duration [s]."""
     wc.checks.number("angle", angle, above=0.0)
+    if angle >= 90.0:
+        raise ValueError(f"angle is {angle:g}; it must be below 90, at which the frame is shut")
     cloth = wc.fabrics[fabric] if isinstance(fabric, str) else fabric
     mesh = wc.Mesh.grid(n, n, size=side, pattern="alternating")
     half = 0.5 * np.radians(np.linspace(0.0, angle, 61))
