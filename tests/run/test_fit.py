@@ -9,7 +9,6 @@ from scipy.spatial import Delaunay
 from scipy.stats import binomtest
 
 import warpcloth as wc
-from support.rows import slow_but
 from warpcloth.cli import main
 from warpcloth.scenes import catenary, chain, loop
 from warpcloth.scenes.hanging import scene as hanging
@@ -239,24 +238,43 @@ def markers(scene, points):
     return triangles, weights, np.einsum("kc,fkci->fki", weights, points[:, scene.mesh.triangles[triangles]])
 
 
-@pytest.mark.parametrize("bound", slow_but([True, False], [True, False]))
-def test_markers_in_a_file_give_the_parameters(bound, tmp_path, capsys):
-    """Bound to triangles by where they are at the start; or free points, by their distances to the cloth."""
-    scene = hanging(n=4)
-    points = wc.simulate(scene, SOLVER, frames=8, dtype="float64").points
+def table(scene, points, bound):
+    """The rows of a .csv file of markers on a scene at points (F, n, 3) of its first frames."""
     _, _, seen = markers(scene, points)
     lines = ["time, id, x, y, z" if bound else "time, x, y, z"]
     for frame, positions in enumerate(seen):
         for k, at in enumerate(positions):
-            lines.append(", ".join(map(repr, [frame / scene.fps, *([f"m{k}"] if bound else []), *at.tolist()])))
-    path = tmp_path / "seen.csv"
-    path.write_text("\n".join(lines).replace("'", ""))
-    words = ["fit", "hanging", str(path), "-p", "n=4", "--start", "Spring.stiffness=800"]
-    words += ["-s", "substeps=4", "integrator=midpoint", "tolerance=1e-10", "--json"]
-    assert main(words) == 0
+            numbers = ", ".join(f"{value!r}" for value in at.tolist())
+            lines.append(f"{frame / scene.fps!r}, {f'm{k}, ' if bound else ''}{numbers}")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("bound", [True, False])
+@pytest.mark.parametrize("resting", [False, True])
+def test_markers_in_a_file_give_the_parameters(bound, resting, tmp_path, capsys):
+    """Bound to triangles by where they are at the start, or free points, by their distances; of a motion or at rest."""
+    scene, path = hanging(n=4), tmp_path / "seen.csv"
+    if resting:
+        soft = wc.equilibrium(scene, vary={"Spring.stiffness": [800.0]})  # two shapes rest; the fit follows that of its start
+        points = np.array([scene.positions, wc.equilibrium(scene, start=soft.points).points])
+        how = ["--at-rest"]
+    else:
+        points = wc.simulate(scene, SOLVER, frames=8, dtype="float64").points
+        how = ["-s", "substeps=4", "integrator=midpoint", "tolerance=1e-10"]
+    path.write_text(table(scene, points, bound))
+    words = ["fit", "hanging", str(path), "-p", "n=4", "--start", "Spring.stiffness=800", *how]
+    assert main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["parameters"]["Spring.stiffness"] == pytest.approx(1000.0, rel=1e-5)
     assert found["residual"] < 1e-8
+    if resting:
+        assert main(words) == 0 and "at rest" in capsys.readouterr().out
+        for wrong, sentence in (
+            (["--solver", "newton"], "--at-rest is given with --solver"),
+            (["--fps", "24"], "--prim and --fps are for animations"),
+            (["--vertices", "x < 1"], "measured is a file of markers; leave vertices out"),
+        ):
+            assert main([*words, *wrong]) == 2 and sentence in capsys.readouterr().err
 
 
 def test_markers_and_readings_together(device):
