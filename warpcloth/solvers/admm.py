@@ -44,10 +44,10 @@ class ADMM(ImplicitStep):
     - u += Dx − z.
     - (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once.
 
-    Sparse quadratic energies, such as :class:`warpcloth.PlateBending`, are not split: their matrix is added to that of the last
-    step. The energy of self-contact is not split either: it makes the last step one of Newton's method. The fixed point is that
-    of :class:`warpcloth.ProjectiveDynamics`, and the x(t+h) of :class:`warpcloth.Newton`. Only the product WD matters: if D is
-    scaled and W inversely, the iterates stay the same.
+    Sparse energies, such as :class:`warpcloth.PlateBending`, are not split: their matrix, or a bound of it at rest, is added to
+    that of the last step. The energy of self-contact is not split either: it makes the last step one of Newton's method. The
+    fixed point is that of :class:`warpcloth.ProjectiveDynamics`, and the x(t+h) of :class:`warpcloth.Newton`. Only the product
+    WD matters: if D is scaled and W inversely, the iterates stay the same.
 
     With too large a weight the iteration stalls, with too small a one it oscillates. An iteration multiplies the error of a
     mode with s = h²ω² by (1 + r²s)/((1 + rs)(1 + r)), which is smallest for r = 1/√s. So ``"auto"`` is r = 1/(2hₑω) for each
@@ -161,7 +161,11 @@ class ADMMStepper(ImplicitStepper):
         factors = [scale * ratio for scale, ratio in zip(scales, ratios, strict=True)]
         self._inertia, self._sums = Inertia(model, 1.0 / self.he**2), Sums(model)
         weighed = [elements.weighed(factor) for elements, factor in zip(self._terms, factors, strict=True)]
-        self._factors = factorise_copies(model, constant_matrices(model.with_terms(weighed + self._whole), self._inertia.s))
+        whole = [
+            elements if elements.term.whole.quadratic else elements.weighed(curvatures(model, elements))
+            for elements in self._whole
+        ]
+        self._factors = factorise_copies(model, constant_matrices(model.with_terms(weighed + whole), self._inertia.s))
         self._gradient = Gradient(model, corrected=True, terms=self._whole) if self._whole else None
         self.factorise_seconds = self._factors.seconds
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))

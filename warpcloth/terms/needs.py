@@ -26,7 +26,7 @@ class Need:
 
 FINITE = Need(lambda elements: not elements.hard, "{label} with infinite stiffness", "give a finite stiffness")
 ELEMENTS = Need(
-    lambda elements: not elements.term.cells or elements.term.whole.quadratic,
+    lambda elements: not elements.term.cells or elements.term.whole.quadratic or elements.term.whole.curvature is not None,
     "{label}, whose bodies are no elements by themselves",
 )
 PROJECTION = Need(

@@ -14,8 +14,8 @@ class Sparse(Declared):
     """An energy U = Σ_c k A u(y_c) of cells with any number of vertices, y = Dx linear in all of them.
 
     A subclass defines ``operator`` and ``rest``, and no ``stencil``. Its ``term`` has ``vertices`` 0 and ``weight`` None.
-    Explicit and Newton take it, and ProjectiveDynamics if its ``term`` has a ``curvature``. All solvers take a quadratic
-    energy, whose ``term`` sets ``cells``, ``project``, ``linear`` and ``quadratic``.
+    Explicit and Newton take it, and ProjectiveDynamics and ADMM if its ``term`` has a ``curvature``. All solvers take a
+    quadratic energy, whose ``term`` sets ``cells``, ``project``, ``linear`` and ``quadratic``.
     """
 
     def operator(self, mesh):
