@@ -691,19 +691,23 @@ def test_far_steps_are_those_with_contact(name, speed, device, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "distance"),
+    ("name", "distance", "count"),
     slow_but(
-        [("explicit", 5e-3), ("newton", 5e-3), ("xpbd", 0.15)],
-        [*((name, 5e-3) for name in SOLVERS), *((name, 0.15) for name in FEW)],
+        [("explicit", 5e-3, 2), ("newton", 5e-3, 2), ("xpbd", 0.15, 2)],
+        [
+            *((name, 5e-3, 2) for name in SOLVERS),
+            *((name, 0.15, 2) for name in FEW),
+            *(("constrained_dynamics", 5e-3, count) for count in (3, 4)),
+        ],
     ),
 )
-def test_copies(name, distance, device):
+def test_copies(name, distance, count, device):
     """Each of two copies, at speeds of their own, moves as one alone, to the bit, and again after it was put back.
 
     Of these the filter cuts one and not the other, and lists are made anew at other times; of thick sheets the areas are of
     pairs that are farther apart than the skin.
     """
-    scene = layers(turn=17.0, speed=1.0, n=5, distance=distance, stiffness=1e5 if distance < 0.1 else 100.0)
+    scene = layers(count, turn=17.0, speed=1.0, n=5, distance=distance, stiffness=1e5 if distance < 0.1 else 100.0)
     velocities = np.stack([3.0 * scene.velocities, 0.1 * scene.velocities])
     steppers = [SOLVERS[name].bind(scene.build(device=device, copies=copies)) for copies in (1, 1, 2)]
     for stepper, given in zip(steppers, (velocities[:1], velocities[1:], velocities), strict=True):
@@ -718,6 +722,7 @@ def test_copies(name, distance, device):
                 stepper.frame()
         for found, stepper in zip(both.state.x.numpy().reshape(2, -1, 3), steppers, strict=True):
             assert (found == stepper.state.x.numpy()).all()
+            assert crossed(found, scene.mesh.triangles) == 0
 
 
 @pytest.mark.parametrize("length", [0.1, 1.0, 14.0])

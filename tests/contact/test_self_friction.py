@@ -251,7 +251,8 @@ def test_energy_becomes_heat(name, device):
     """What a sheet that slides down a slope loses is μ mg cos θ times its way, and it never gains: to 4 % of the heat.
 
     As much is what contact gains and loses by areas that change, 2.5 %, and what implicit steps damp, 1.6 %. The record has
-    this heat too.
+    this heat too. Explicit steps damp nothing: the sheet bounces, so that N is not its weight, but the heat is all that it
+    loses, to 0.0016 in these steps and half of that in steps of half the length.
     """
     scene = slope(0.6, duration=0.25)
     mass = scene.vertex_masses[4:, None]
@@ -265,6 +266,8 @@ def test_energy_becomes_heat(name, device):
     assert recorded[-1] == pytest.approx(heat[-1], rel=0.04)
     assert (np.diff(total) < 0.0).all()
     assert total[0] - total[-1] == pytest.approx(heat[-1], rel=0.04)
+    if name == "explicit":
+        assert total[0] - total[-1] == pytest.approx(recorded[-1], rel=0.003)
 
 
 @some_solvers
