@@ -112,6 +112,30 @@ def test_the_shadow_of_a_cone(degrees):
     assert found == pytest.approx((outer**2 - 0.09**2) / (0.15**2 - 0.09**2), abs=1e-3)
 
 
+def test_a_stiff_disc_sinks_like_a_plate(device):
+    """An annular plate with a clamped inner and a free outer circle: w = A + B ln r + C r² + E r² ln r + qr⁴/64D to 1 %.
+
+    The clamp is 0.18 rows inside the second row of pins, as for a strip.
+    """
+    rows, D, ratio, outer = 8, 1.0, 0.3, 0.15
+    modulus = {"warp": 2e3, "weft": 2e3, "shear": 1e3 / (1.0 + ratio), "poisson_ratio": ratio}
+    stiff = wc.Fabric(name="stiff", density=0.2, **modulus, bending_warp=D, bending_weft=D)
+    rest = wc.equilibrium(scene("cusick", fabric=stiff, rows=rows), device=device)
+    assert rest.status.ok and rest.stable, rest.status
+    inner = 0.09 * (1.0 - 0.18 * (1.0 - (0.09 / 0.15) ** (1.0 / rows)))
+    q, log = 0.2 * 9.81 / D, np.log(outer)
+    equations = [
+        [1.0, np.log(inner), inner**2, inner**2 * np.log(inner)],  # w = 0
+        [0.0, 1.0 / inner, 2.0 * inner, inner * (2.0 * np.log(inner) + 1.0)],  # w′ = 0
+        [0.0, (ratio - 1.0) / outer**2, 2.0 + 2.0 * ratio, 2.0 * log + 3.0 + ratio * (2.0 * log + 1.0)],  # w″ + νw′/r = 0
+        [0.0, 0.0, 0.0, 4.0 / outer],  # (Δw)′ = 0
+    ]
+    loads = [q * inner**4 / 64, q * inner**3 / 16, q * outer**2 * (3.0 + ratio) / 16, q * outer / 2]
+    constants = np.linalg.solve(equations, -np.array(loads))
+    expected = constants @ [1.0, log, outer**2, outer**2 * log] + q * outer**4 / 64
+    assert -rest.points[:, 1].min() == pytest.approx(expected, rel=1e-2)
+
+
 def test_what_has_no_reading_is_refused(device):
     strip, hanging = scene("strip", elements=2), scene("cantilever", gamma=0.01, fabric=ALIGNED, elements=6, width=0.005)
     for declared, sentence in (
