@@ -28,7 +28,10 @@ def scene(
     angle: float = 0.0,
 ):
     """Γ, width [m], elements along, quadratic or dihedral, kL²/D of springs, L [m], duration [s]; fabric, its angle [°]."""
+    wc.checks.number("gamma", gamma, above=0.0)
     wc.checks.number("width", width, least=0.0)
+    wc.checks.whole("elements", elements, 2)
+    wc.checks.number("length", length, above=0.0)
     wc.checks.choice("bending", bending, ("quadratic", "dihedral"))
     wc.checks.number("angle", angle)
     spacing, stiffness = length / (elements - (0.25 if width == 0.0 else 0.5)), 1e-3  # D [N·m]
@@ -36,7 +39,8 @@ def scene(
         cloth = wc.fabrics[fabric] if isinstance(fabric, str) else fabric
         length = (gamma * cloth.bending_along(np.radians(angle)) / (9.81 * cloth.density)) ** (1 / 3)
         spacing, width = length / (elements + CLAMP), width or 0.025
-        wc.checks.number("width", width, least=3.9 * spacing)
+        if width < 3.9 * spacing:
+            raise ValueError(f"width is {width:g} m, below 4 elements of {spacing:.3g} m; take more elements or a wider strip")
         size = ((elements + 1) * spacing, width)
         mesh = wc.Mesh.grid(elements + 2, round(width / spacing) + 1, size=size, pattern="alternating")
     elif width == 0.0:

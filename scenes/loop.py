@@ -33,6 +33,8 @@ def scene(
     wc.checks.number("gamma", gamma, least=0.0)
     wc.checks.whole("elements", elements, 8)
     wc.checks.number("length", length, above=0.0)
+    wc.checks.number("angle", angle)
+    wc.checks.number("width", width, above=0.0)
     (turns, closing, aside), edge, bending = KINDS[kind], length / elements, 1e-6
     if fabric is None:
         s = edge * (np.arange(2 * elements + 3) - 1) / 2.0  # a row of triangles, half an edge beyond L at each end
@@ -49,7 +51,8 @@ def scene(
         length = (max(gamma, 1.0) * cloth.bending_along(np.radians(angle)) / (9.81 * density)) ** (1 / 3)
         edge = length / (elements + 2 * CLAMP)
         free, s = CLAMP * edge, edge * (CLAMP - 1.0 + np.arange(elements + 3))
-        wc.checks.number("width", width, least=3.9 * edge)
+        if width < 3.9 * edge:
+            raise ValueError(f"width is {width:g} m, below 4 edges of {edge:.3g} m; take more elements or a wider strip")
         size = ((elements + 2) * edge, width)
         mesh = wc.Mesh.grid(elements + 3, round(width / edge) + 1, size=size, pattern="alternating")
     u = np.clip((s[1:] + s[:-1] - length) / (length - 2.0 * free), -1.0, 1.0)  # clamps are straight

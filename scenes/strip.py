@@ -21,6 +21,7 @@ def scene(
     """One of 'warpcloth fabrics', angle to the warp [°], strain, elements along, length and width [m], duration [s]."""
     wc.checks.number("angle", angle)
     wc.checks.number("strain", strain, above=0.0)
+    wc.checks.number("length", length, above=0.0)
     wc.checks.number("width", width, above=0.0)
     wc.checks.whole("elements", elements, 1)
     cloth = wc.fabrics[fabric] if isinstance(fabric, str) else fabric

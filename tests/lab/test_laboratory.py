@@ -11,7 +11,7 @@ from support.command_line import run
 from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.lab import elastica
-from warpcloth.lab.laboratory import drape_coefficient
+from warpcloth.lab.laboratory import check_sample, drape_coefficient
 
 COTTON = wc.fabrics["cotton"]
 
@@ -138,13 +138,31 @@ def test_a_stiff_disc_sinks_like_a_plate(device):
 
 def test_what_has_no_reading_is_refused(device):
     strip, hanging = scene("strip", elements=2), scene("cantilever", gamma=0.01, fabric=ALIGNED, elements=6, width=0.005)
+    frame = scene("picture_frame", n=3)
+    for declared, record, sentence in (
+        (strip, (), "rest has no reactions, which the device measures"),
+        (hanging, (), "the tip hangs .*° below the clamp; its Γ must be from 0.4 to 100, best 8"),
+        (scene("loop", kind="pear", elements=8), (), "deep, and without weight it would be 0.4243; take more elements or a"),
+        (replace(frame, pins=frame.mesh.boundary), "reactions", "the shear modulus of the scene .* is .*; a reading must be"),
+    ):
+        rest = wc.equilibrium(declared, device=device, record=record)
+        with pytest.raises(ValueError, match=sentence):
+            wc.laboratory_readings(declared, rest)
+
+
+def test_what_is_no_sample_is_refused():
+    free = scene("hanging", n=4)
     for declared, sentence in (
-        (strip, "rest has no reactions, which the device measures"),
-        (scene("hanging", n=3), "scene.name is 'hanging'; it must be one of 'cantilever', 'loop'"),
-        (hanging, "the tip hangs .*° below the clamp; its Γ must be from 0.4 to 100, best 8"),
+        (free, "scene.name is 'hanging'; it must be one of 'cantilever', 'loop'"),
+        (replace(free, name="cantilever"), "'cantilever' is not the sample of its device; it must be a strip along x with"),
+        (replace(free, name="strip"), "'strip' is not the sample of its device; it must be a strip along x, pinned at its"),
+        (replace(free, name="loop", pins=[]), "'loop' is not the sample of its device"),
+        (scene("loop", gamma=0.0), "the scene 'loop' is not the sample of its device; it must be a strip along x with"),
+        (replace(free, name="picture_frame"), "'picture_frame' is not the sample of its device; it must be a square with a"),
+        (replace(free, name="cusick"), "'cusick' is not the sample of its device; it must be a disc of radius 0.15 m"),
     ):
         with pytest.raises(ValueError, match=sentence):
-            wc.laboratory_readings(declared, wc.equilibrium(declared, device=device))
+            check_sample(declared)
 
 
 def test_the_command_prints_the_reading(capfd, tmp_path):
@@ -160,7 +178,12 @@ def test_the_command_prints_the_reading(capfd, tmp_path):
         (["strip", "-o", "strip.obj"], "--output is strip.obj; it must end with .npz"),
         (["strip", "-p", "fabric=denim-wang"], "fabric 'denim-wang' has no poisson_ratio"),
         (["picture_frame", "-p", "angle=90"], "angle is 90; it must be below 90, at which the frame is shut"),
-        (["cantilever", "-p", "fabric=silk", "width=1e-4"], "width is 0.0001; it must be a number of"),
+        (["cantilever", "-p", "fabric=silk", "width=1e-4"], "width is 0.0001 m, below 4 elements of"),
+        (["loop", "-p", "fabric=silk", "width=1e-4"], "; take more elements or a wider strip"),
+        (["cantilever", "-p", "fabric=silk", "gamma=-1"], "gamma is -1.0; it must be a number above 0"),
+        (["cantilever", "-p", "elements=0"], "elements is 0; it must be a whole number of 2 or more"),
+        (["strip", "-p", "length=0"], "length is 0.0; it must be a number above 0"),
+        (["picture_frame", "-p", "angle=90"], "angle is 90; it must be below 90, at which the frame is shut"),
     ):
         code, _, error = run(capfd, "measure", *given)
         assert code == 2 and sentence in error

@@ -25,12 +25,13 @@ def add_arguments(parser):
 
 
 def measure(arguments):
-    from ..lab.laboratory import DEVICES, laboratory_readings
+    from ..lab.laboratory import DEVICES, check_sample, laboratory_readings
     from ..run.equilibrium import equilibrium
 
     source, values, scene = named_scene(arguments)
     if scene.name not in DEVICES:
         raise ValueError(f"{arguments.scene} is no test of a laboratory; it must be one of {', '.join(DEVICES)}")
+    check_sample(scene)
     if arguments.output is not None and not arguments.output.endswith(".npz"):
         raise ValueError(f"--output is {arguments.output}; it must end with .npz")
     check_apart([arguments.output] if arguments.output else [], [str(source.path)])

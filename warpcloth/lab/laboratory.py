@@ -35,8 +35,8 @@ def laboratory_readings(scene: Scene, rest: Equilibrium) -> Readings:
         rest: Its equilibrium, for strip and picture_frame with ``record="reactions"``.
 
     Raises:
-        ValueError: The scene is none of these, the reactions were not recorded, or the sample hangs too far or too little for
-            its device.
+        ValueError: The scene is none of these, its sample is not held as its device holds it, the reactions were not recorded,
+            or the sample hangs too far or too little.
 
     Examples:
         >>> import warpcloth as wc
@@ -46,8 +46,41 @@ def laboratory_readings(scene: Scene, rest: Equilibrium) -> Readings:
         >>> round(modulus / 2365.0, 2), unit
         (1.0, 'N/m')
     """
+    check_sample(scene)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        readings = DEVICES[scene.name](scene, rest)
+    for quantity, (value, _unit) in readings.items():
+        if not np.isfinite(value):
+            raise ValueError(f"the {quantity} of the scene {scene.name!r} is {value}; a reading must be finite")
+    return readings
+
+
+def check_sample(scene: Scene) -> None:
+    """Checks that a scene has the name of a test, and a sample that is cut and held as for its device.
+
+    Raises:
+        ValueError: It has not.
+    """
     choice("scene.name", scene.name, tuple(DEVICES))
-    return DEVICES[scene.name](scene, rest)
+    points, held = scene.mesh.points, np.isin(np.arange(len(scene.mesh.points)), scene.pins.vertices)
+    x, z, sheet = points[:, 0], points[:, 2], len(scene.mesh.triangles) > 0
+    low, high = held[x == x.min()].all(), held[x == x.max()].any()
+    if scene.name == "cusick":
+        rule = f"a disc of radius {cusick.RADIUS:g} m around the origin, whose boundary further in is pinned"
+        radius = np.hypot(x, z)
+        good = sheet and np.isclose(radius.max(), cusick.RADIUS)
+        good = good and held[scene.mesh.boundary][radius[scene.mesh.boundary] < radius.max() * (1.0 - 1e-9)].all()
+    elif scene.name == "picture_frame":
+        rule = "a square with a corner at the origin and sides along x and z, whose boundary is pinned"
+        good = sheet and held[scene.mesh.boundary].all() and np.isclose(np.ptp(x), np.ptp(z))
+        good = good and np.isclose(x.min(), 0.0) and np.isclose(z.min(), 0.0)
+    elif scene.name == "cantilever":
+        rule, good = "a strip along x with weight, pinned at its lowest x and free at its highest", sheet and low and not high
+    else:
+        weight = " with weight" if scene.name == "loop" else ""
+        rule, good = f"a strip along x{weight}, pinned at its lowest and at its highest x", sheet and low and high
+    if not good or ("weight" in rule and not scene.gravity.any()):
+        raise ValueError(f"the scene {scene.name!r} is not the sample of its device; it must be {rule}")
 
 
 def drape_coefficient(points: np.ndarray, flat: np.ndarray, triangles: np.ndarray) -> float:
@@ -93,7 +126,10 @@ def _clamps(scene):
     found = []
     for side in (held[held < middle], -held[held > middle]):
         if len(side) and any(isinstance(term, PlateBending) for term in scene.terms):
-            outer, inner = np.unique(side.round(12))[[-2, -1]]
+            rows = np.unique(side.round(12))
+            if len(rows) < 2:
+                raise ValueError(f"an end of the scene {scene.name!r} has one row of pins; a plate must have two to be clamped")
+            outer, inner = rows[-2:]
             found.append(inner - cantilever.CLAMP * (inner - outer))
         elif len(side):
             found.append(0.5 * (side.min() + side.max()))
@@ -134,7 +170,10 @@ def _loop(scene, rest):
     kind = ("pear", "ring", "heart")[1 + round((second - first)[1] / np.linalg.norm(second - first))]
     gamma = elastica.gamma_of_loop(kind, depth / length)
     if gamma is None:
-        raise ValueError(f"the {kind} is {depth / length:.4g} of its length deep; its Γ must be from 0 to 200, best 50 to 150")
+        weightless, deep = elastica.loop_depth(kind, 0.0), f"the {kind} is {depth / length:.4g} of its length deep"
+        if depth / length <= weightless:
+            raise ValueError(f"{deep}, and without weight it would be {weightless:.4g}; take more elements or a larger Γ")
+        raise ValueError(f"{deep}; its Γ must be 200 or less, best 50 to 150")
     return {"depth of the loop": (1e3 * depth, "mm"), **_bending(length, gamma, scene)}
 
 
@@ -163,7 +202,10 @@ def _picture_frame(scene, rest):
     flat, held = scene.mesh.points, scene.pins.vertices
     along_x = rest.points[held][np.argmax(flat[held, 0] - flat[held, 2])]
     side, half = np.ptp(flat[:, 0]), float(np.arctan2(along_x[2], along_x[0]))  # γ/2
-    c, s = 0.5 * np.cos(half), -0.5 * np.sin(half)
+    c, s = np.cos(half), np.sin(half)
+    if not np.allclose(rest.points[held], flat[held] @ [[c, 0.0, s], [0.0, 1.0, 0.0], [s, 0.0, c]], rtol=0.0, atol=1e-5 * side):
+        raise ValueError("the pins of the scene 'picture_frame' are not those of a hinged frame; it must turn its sides by γ/2")
+    c, s = 0.5 * c, -0.5 * s
     speed = flat[held] @ np.array([[s, 0.0, c], [0.0, 0.0, 0.0], [c, 0.0, s]])  # by γ
     rate = side * np.sin(0.25 * np.pi - half)
     force = float((_reactions(rest) * speed).sum() / rate)
