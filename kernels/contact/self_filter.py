@@ -209,7 +209,8 @@ def hold_pins(dtype):
 def end_filter(dtype):
     """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and the change over h to v.
 
-    ``cut`` counts the free vertices that the filter moved. ``held`` notes the pins that it held back.
+    ``cut`` counts the free vertices that the filter moved. ``held`` notes the pins that it held back. Pins have v of their last
+    move, which took ``pin_h``.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -226,6 +227,7 @@ def end_filter(dtype):
         # parameters
         per_copy: int,
         h: dtype,
+        pin_h: dtype,
         # in and out
         v: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
@@ -247,7 +249,7 @@ def end_filter(dtype):
                         pinned[axis] = ZERO
             if wp.length_sq(pinned) > ZERO:
                 note_held(held, steps, per_copy, i, wp.length(pinned))
-            v[i] = v[i] + change / h
+            v[i] = v[i] + change / wp.where(inverse_mass[i] > dtype(0.0), h, pin_h)
             if move:
                 move[i] = move[i] + change
 

@@ -249,7 +249,10 @@ def test_pins_that_cloth_holds_back(device):
 
 @pytest.mark.parametrize(
     ("name", "rise"),
-    slow_but([("xpbd", 0.06), ("pbd", 0.06), ("admm", 0.6)], [(name, rise) for name in SOLVERS for rise in (0.06, 0.6)]),
+    slow_but(
+        [("xpbd", 0.06), ("pbd", 0.06), ("admm", 0.6)],
+        [*((name, rise) for name in SOLVERS for rise in (0.06, 0.6)), ("midpoint", 0.06)],
+    ),
 )
 def test_pins_that_pinned_cloth_holds_back(name, rise, device):
     """A border is to go through the pinned border of another sheet, at 0.24 or 2.4 m/s: it is held, and nothing is thrown.
@@ -264,7 +267,8 @@ def test_pins_that_pinned_cloth_holds_back(name, rise, device):
     keyframes = np.tile(two.positions[held], (7, 1, 1))
     keyframes[:, :20, 1] += np.linspace(0.0, rise, 7)[:, None]
     scene = replace(two, pins=wc.Pins(held, keyframes))
-    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
+    solver = wc.Newton(substeps=2, integrator="midpoint") if name == "midpoint" else SOLVERS[name]
+    stepper = solver.bind(scene.build(device=device, dtype="float64"))
     for _ in range(6):
         stepper.frame()
         assert np.linalg.norm(stepper.state.v.numpy(), axis=1).max() < 1.0

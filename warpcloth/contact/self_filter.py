@@ -78,11 +78,13 @@ class SelfFilter:
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
-    def launch_end(self, x, v, move=None):
+    def launch_end(self, x, v, move=None, parts=1):
         """Moves the cloth from its start of the step towards x, as far as pairs stay apart; corrects x, v and ``move``, (N,).
 
         If the iterates of the solver stay apart, the move starts at the last iterate. But that may be inside a collider, out of
         which the filter of colliders has moved x. Then the move starts at the start of the step, which is outside.
+
+        Pins have moved in ``parts`` equal parts of the step.
         """
         model = self.model
         if self._contact.friction is not None and self._iterates:  # its areas may be those of a list made within the step
@@ -102,7 +104,8 @@ class SelfFilter:
             self._launch_held(x)
             wp.capture_while(self._within, self._launch_let_out, x=x)
             self._colliders.launch_inside(x, self._from)
-        given = [model.inverse_mass, model.mobility, self._target, x, self._contact.steps, model.per_copy, self._contact.h]
+        given = [model.inverse_mass, model.mobility, self._target, x, self._contact.steps, model.per_copy]
+        given += [self._contact.h, self._contact.h / parts]
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
         model.launch(self._count, model.copies, [], [self._contact.steps])
         if self._contact.friction is not None:

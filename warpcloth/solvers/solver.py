@@ -213,7 +213,7 @@ class Stepper:
             self.colliders.correction, self.colliders.he = correction, self.he
             self.colliders.launch_end(*self.state, self.integrator.move)
         if self.pairs is not None:
-            self.pairs.filter.launch_end(*self.state, self.integrator.move)
+            self.pairs.filter.launch_end(*self.state, self.integrator.move, self.integrator.parts)
 
     def launch_end_of(self, pins, keyframes, count, x, v):
         """Launches the end of an explicit step in x and v (N,): the move of pins, and the filters of contact."""
