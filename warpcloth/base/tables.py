@@ -7,7 +7,7 @@ from .types import FilePath
 
 
 def read_table(path: FilePath) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Returns the names of the columns of a CSV file, and its rows with the numbers of their lines; all without blanks about.
+    """Returns the names of the columns of a CSV file, and its rows with the numbers of their lines, all stripped.
 
     Empty lines are left out.
 

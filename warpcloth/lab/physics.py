@@ -9,8 +9,8 @@
 | patch | x = Gx̄ inside a membrane whose boundary is moved to Gx̄ | none: exact |
 
 Hinges are calibrated on equilateral nets. On others, refinement does not remove their error (:func:`strips.rolled`). Plates,
-here with ν = 0, have no such error. A cantilever with hinges differs from the elastica in these ways. The last three are those
-of plates too, whose clamp was not calibrated:
+here with ν = 0, have no such error. A cantilever with hinges differs from the elastica in these ways. The last three also
+apply to plates, for which the position of the clamp was not calibrated:
 
 - One row of triangles, or any strip much narrower than long, bends with 1 − ν² = 8/9 of D, because the Poisson's ratio ν of
   both energies is −1/3 (:func:`strips.plate`): it is the elastica of 9Γ/8. This strip is twice as wide as it is long.
