@@ -19,118 +19,127 @@ PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges belo
 
 
 @wp.func
-def nearest_on_segment(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """The t in [0, 1] of the point a + t(b − a) nearest to p."""
-    ab = b - a
+def nearest_on_segment(p: wp.vec3d, ab: wp.vec3d):
+    """The t in [0, 1] of the point t ab nearest to p, and the square of its distance."""
     square = wp.dot(ab, ab)
-    t = ZERO
-    if square > ZERO:
-        t = wp.clamp(wp.dot(p - a, ab) / square, ZERO, ONE)
-    return t
+    t = wp.clamp(wp.dot(p, ab) / wp.where(square > ZERO, square, ONE), ZERO, ONE)
+    away = p - t * ab
+    return t, wp.dot(away, away)
 
 
 @wp.func
-def vertex_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """w of p and the nearest point of a triangle, and whether that is in its interior (Ericson 2005, section 5.1.5)."""
+def in_plane(inside: bool, y: wp.vec3d, normal: wp.vec3d, a: wp.vec3d):
+    """y if it is not of points ``inside``, else −a along ``normal``.
+
+    For nearly parallel edges and thin triangles, y from the weights would have too few digits.
+    """
+    square = wp.dot(normal, normal)
+    along = -wp.dot(normal, a) / wp.where(square > ZERO, square, ONE)
+    normally = inside and square > ZERO
+    return wp.vec3d(
+        wp.where(normally, along * normal[0], y[0]),
+        wp.where(normally, along * normal[1], y[1]),
+        wp.where(normally, along * normal[2], y[2]),
+    )
+
+
+# The next two functions have no branches, so that the compiler vectorises loops of them.
+@wp.func
+def vertex_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """w and y of the vertex 0 and a triangle, and whether the nearest point is in its interior (Ericson 2005, 5.1.5)."""
     ab = b - a
     ac = c - a
-    ap = p - a
-    d1 = wp.dot(ab, ap)
-    d2 = wp.dot(ac, ap)
-    bp = p - b
-    d3 = wp.dot(ab, bp)
-    d4 = wp.dot(ac, bp)
-    cp = p - c
-    d5 = wp.dot(ab, cp)
-    d6 = wp.dot(ac, cp)
+    d1 = -wp.dot(ab, a)
+    d2 = -wp.dot(ac, a)
+    d3 = -wp.dot(ab, b)
+    d4 = -wp.dot(ac, b)
+    d5 = -wp.dot(ab, c)
+    d6 = -wp.dot(ac, c)
     va = d3 * d6 - d5 * d4
     vb = d5 * d2 - d1 * d6
     vc = d1 * d4 - d3 * d2
     total = va + vb + vc
-    w = wp.vec4d(ONE, -ONE, ZERO, ZERO)
-    inside = wp.int32(0)
-    if va > ZERO and vb > ZERO and vc > ZERO and total > ZERO:
-        w = wp.vec4d(ONE, -va / total, -vb / total, -vc / total)
-        inside = 1
-    else:  # the nearest of the nearest points of the edges
-        t = nearest_on_segment(p, a, b)
-        away = p - a - t * ab
-        least = wp.dot(away, away)
-        w = wp.vec4d(ONE, t - ONE, -t, ZERO)
-        t = nearest_on_segment(p, a, c)
-        away = p - a - t * ac
-        square = wp.dot(away, away)
-        if square < least:
-            least = square
-            w = wp.vec4d(ONE, t - ONE, ZERO, -t)
-        t = nearest_on_segment(p, b, c)
-        away = p - b - t * (c - b)
-        square = wp.dot(away, away)
-        if square < least:
-            w = wp.vec4d(ONE, ZERO, t - ONE, -t)
-    return w, inside
+    inside = va > ZERO and vb > ZERO and vc > ZERO and total > ZERO
+    # Else the nearest of the nearest points of the edges.
+    t, least = nearest_on_segment(-a, ab)
+    w1 = t - ONE
+    w2 = -t
+    w3 = ZERO
+    t, square = nearest_on_segment(-a, ac)
+    nearer = square < least
+    least = wp.where(nearer, square, least)
+    w1 = wp.where(nearer, t - ONE, w1)
+    w2 = wp.where(nearer, ZERO, w2)
+    w3 = wp.where(nearer, -t, w3)
+    t, square = nearest_on_segment(-b, c - b)
+    nearer = square < least
+    w1 = wp.where(nearer, ZERO, w1)
+    w2 = wp.where(nearer, t - ONE, w2)
+    w3 = wp.where(nearer, -t, w3)
+    total = wp.where(inside, total, ONE)
+    w1 = wp.where(inside, -va / total, w1)
+    w2 = wp.where(inside, -vb / total, w2)
+    w3 = wp.where(inside, -vc / total, w3)
+    y = w1 * a + w2 * b + w3 * c
+    return wp.vec4d(ONE, w1, w2, w3), in_plane(inside, y, wp.cross(ab, ac), b), wp.where(inside, 1, 0)
 
 
 @wp.func
-def edge_edge(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """w of the nearest points of two edges ab and cd, and whether both are in the interior of their edges."""
-    ab = b - a
+def edge_edge(b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """w and y of the edges 0b and cd, and whether both nearest points are in the interior of their edges."""
     cd = d - c
-    ca = a - c
-    # sin² from the cross product, because |ab|²|cd|² − (ab·cd)² cancels for nearly parallel edges.
-    normal = wp.cross(ab, cd)
+    # sin² from the cross product, because |b|²|cd|² − (b·cd)² cancels for nearly parallel edges.
+    normal = wp.cross(b, cd)
     determinant = wp.dot(normal, normal)
-    w = wp.vec4d(ONE, ZERO, -ONE, ZERO)
-    inside = wp.int32(0)
-    if determinant > PLANAR * wp.dot(ab, ab) * wp.dot(cd, cd):
-        s = wp.dot(wp.cross(cd, ca), normal) / determinant
-        t = wp.dot(wp.cross(ab, ca), normal) / determinant
-        if s > ZERO and s < ONE and t > ZERO and t < ONE:
-            w = wp.vec4d(ONE - s, s, t - ONE, -t)
-            inside = 1
-    if inside == 0:  # an end of one edge is nearest to the other
-        t = nearest_on_segment(a, c, d)
-        away = a - c - t * cd
-        least = wp.dot(away, away)
-        w = wp.vec4d(ONE, ZERO, t - ONE, -t)
-        t = nearest_on_segment(b, c, d)
-        away = b - c - t * cd
-        square = wp.dot(away, away)
-        if square < least:
-            least = square
-            w = wp.vec4d(ZERO, ONE, t - ONE, -t)
-        s = nearest_on_segment(c, a, b)
-        away = a + s * ab - c
-        square = wp.dot(away, away)
-        if square < least:
-            least = square
-            w = wp.vec4d(ONE - s, s, -ONE, ZERO)
-        s = nearest_on_segment(d, a, b)
-        away = a + s * ab - d
-        square = wp.dot(away, away)
-        if square < least:
-            w = wp.vec4d(ONE - s, s, ZERO, -ONE)
-    return w, inside
+    crossing = determinant > PLANAR * wp.dot(b, b) * wp.dot(cd, cd)
+    divisor = wp.where(crossing, determinant, ONE)
+    s = wp.dot(wp.cross(cd, -c), normal) / divisor
+    t = wp.dot(wp.cross(b, -c), normal) / divisor
+    inside = crossing and s > ZERO and s < ONE and t > ZERO and t < ONE
+    # Else an end of one edge is nearest to the other.
+    u, least = nearest_on_segment(-c, cd)
+    w0 = ONE
+    w1 = ZERO
+    w2 = u - ONE
+    w3 = -u
+    u, square = nearest_on_segment(b - c, cd)
+    nearer = square < least
+    least = wp.where(nearer, square, least)
+    w0 = wp.where(nearer, ZERO, w0)
+    w1 = wp.where(nearer, ONE, w1)
+    w2 = wp.where(nearer, u - ONE, w2)
+    w3 = wp.where(nearer, -u, w3)
+    u, square = nearest_on_segment(c, b)
+    nearer = square < least
+    least = wp.where(nearer, square, least)
+    w0 = wp.where(nearer, ONE - u, w0)
+    w1 = wp.where(nearer, u, w1)
+    w2 = wp.where(nearer, -ONE, w2)
+    w3 = wp.where(nearer, ZERO, w3)
+    u, square = nearest_on_segment(d, b)
+    nearer = square < least
+    w0 = wp.where(nearer, ONE - u, w0)
+    w1 = wp.where(nearer, u, w1)
+    w2 = wp.where(nearer, ZERO, w2)
+    w3 = wp.where(nearer, -ONE, w3)
+    w0 = wp.where(inside, ONE - s, w0)
+    w1 = wp.where(inside, s, w1)
+    w2 = wp.where(inside, t - ONE, w2)
+    w3 = wp.where(inside, -t, w3)
+    y = w1 * b + w2 * c + w3 * d
+    return wp.vec4d(w0, w1, w2, w3), in_plane(inside, y, normal, c), wp.where(inside, 1, 0)
 
 
 @wp.func
 def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """w, y and whether the nearest points are interior; computed relative to the first vertex, which keeps digits."""
-    zero = wp.vec3d()
     w = wp.vec4d()
+    y = wp.vec3d()
     inside = wp.int32(0)
     if of_vertex:
-        w, inside = vertex_triangle(zero, b - a, c - a, d - a)
+        w, y, inside = vertex_triangle(b - a, c - a, d - a)
     else:
-        w, inside = edge_edge(zero, b - a, c - a, d - a)
-    y = w[1] * (b - a) + w[2] * (c - a) + w[3] * (d - a)
-    if inside == 1:  # for nearly parallel edges and thin triangles, y from the weights would have too few digits
-        normal = wp.cross(b - a, d - c)
-        if of_vertex:
-            normal = wp.cross(c - b, d - b)
-        square = wp.dot(normal, normal)
-        if square > ZERO:
-            y = wp.dot(normal, a - c) / square * normal
+        w, y, inside = edge_edge(b - a, c - a, d - a)
     return w, y, inside
 
 

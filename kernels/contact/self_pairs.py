@@ -51,12 +51,16 @@ def near_pairs(dtype):
 
 @wp.struct
 class StepPairs:
-    """Normal n, gap d [m], weights w and stiffness kA [N/m] of each pair at the start of a step."""
+    """Normal n, gap d [m], weights w and stiffness kA [N/m] of each pair at the start of a step.
+
+    ``nearest`` is the vertex–triangle pair of each vertex with the smallest gap, or −1.
+    """
 
     normal: wp.array(dtype=wp.vec3d)
     gap: wp.array(dtype=wp.float64)
     weights: wp.array(dtype=wp.vec4d)
     stiffness: wp.array(dtype=wp.float64)
+    nearest: wp.array(dtype=wp.int32)
 
 
 MODULE = "warpcloth.self_contact"
@@ -111,6 +115,30 @@ def part_of_area(gap: wp.float64, least: wp.float64, r: wp.float64):
 
 
 @cache
+def find_nearest(dtype):
+    """Kernel over vertices: the nearest of the vertex–triangle pairs of a vertex, −1 if no gap is finite."""
+    value = load(wp.float64)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_each_nearest(
+        # elements
+        pairs: near_pairs(dtype),
+        # in and out
+        step: StepPairs,
+    ):
+        i = wp.tid()
+        found = wp.int32(-1)
+        least = wp.float64(wp.inf)
+        for e in range(pairs.rows[i], pairs.rows[i + 1]):
+            if value(step.gap, e) < least:
+                least = value(step.gap, e)
+                found = e
+        step.nearest[i] = found
+
+    return find_each_nearest
+
+
+@cache
 def set_areas(dtype):
     """Kernel over pairs, at the start of a step: kA, and the list of acting pairs.
 
@@ -151,10 +179,20 @@ def set_areas(dtype):
             first = number(pairs.rows, s[0])
             end = number(pairs.rows, s[0] + 1)
             least = gap
-            for other in range(first, end):
-                if value(step.gap, other) < least:
-                    if share_a_vertex(s, stencil(pairs.stencils, other)) and wp.dot(n, normal_at(step.normal, other)) > ZERO:
-                        least = value(step.gap, other)
+            near = number(step.nearest, s[0])
+            found = near == e
+            if near >= 0 and not found:  # mostly it is the least of those that share a vertex
+                if share_a_vertex(s, stencil(pairs.stencils, near)) and wp.dot(n, normal_at(step.normal, near)) > ZERO:
+                    least = value(step.gap, near)
+                    found = True
+            if not found:
+                for other in range(first, end):
+                    if value(step.gap, other) < least:
+                        if (
+                            share_a_vertex(s, stencil(pairs.stencils, other))
+                            and wp.dot(n, normal_at(step.normal, other)) > ZERO
+                        ):
+                            least = value(step.gap, other)
             own = part_of_area(gap, least, r)
             if own > ZERO:
                 total = ZERO
@@ -168,17 +206,24 @@ def set_areas(dtype):
                             total += part
                 area = SIDE * areas[s[0]] * own / total
         else:
-            least = wp.float64(wp.inf)
-            for i in range(4):
-                sign = wp.where(i < 2, ONE, -ONE)
-                for other in range(number(pairs.rows, s[i]), number(pairs.rows, s[i] + 1)):
-                    if least <= gap and least < wp.float64(wp.inf):
-                        break  # most pairs end here
-                    if value(step.gap, other) < least and sign * wp.dot(n, normal_at(step.normal, other)) > SIDE:
-                        least = value(step.gap, other)
             nearer = ONE
-            if least < wp.float64(wp.inf):
-                nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)
+            corner = wp.int32(0)
+            while corner < 4 and nearer > ZERO:  # most pairs of edges are as near as one of their vertices
+                near = number(step.nearest, s[corner])
+                if near >= 0:
+                    sign = wp.where(corner < 2, ONE, -ONE)
+                    if value(step.gap, near) <= gap and sign * wp.dot(n, normal_at(step.normal, near)) > SIDE:
+                        nearer = ZERO
+                corner += 1
+            if nearer > ZERO:
+                least = wp.float64(wp.inf)
+                for i in range(4):
+                    sign = wp.where(i < 2, ONE, -ONE)
+                    for other in range(number(pairs.rows, s[i]), number(pairs.rows, s[i] + 1)):
+                        if value(step.gap, other) < least and sign * wp.dot(n, normal_at(step.normal, other)) > SIDE:
+                            least = value(step.gap, other)
+                if least < wp.float64(wp.inf):
+                    nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)
             if stopped:
                 if wp.min(wp.min(stopped[s[0]], stopped[s[1]]), wp.min(stopped[s[2]], stopped[s[3]])) == STOPPED:
                     nearer = ONE

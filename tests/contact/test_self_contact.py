@@ -13,7 +13,9 @@ from warpcloth.contact.self_start import crossings
 from warpcloth.contact.self_steps import SelfSteps
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
+from warpcloth.kernels.contact.pair_blocks import BLOCK
 from warpcloth.kernels.contact.self_gaps import nearest
+from warpcloth.kernels.contact.self_pairs import begin_pairs
 from warpcloth.solvers.solver import Stepper
 
 SLOW = pytest.mark.slow
@@ -291,6 +293,42 @@ def test_acting_pairs(device):
         vertices = pairs.pairs.stencils.numpy().reshape(-1)[corners]
         assert (vertices == np.repeat(np.arange(model.count), np.diff(first))).all()
         assert (np.diff(corners)[np.diff(vertices) == 0] > 0).all()
+
+
+def test_which_pairs_have_an_area(device):
+    """In layers that are not flat, by the rule that is written with :func:`set_areas`, with all near pairs compared."""
+    pairs, model = steps_of(layers(2, turn=17.0, gap=2e-3), device)
+    x = model.positions.numpy() + 3e-4 * np.random.default_rng(0).normal(size=(model.count, 3))
+    pairs.launch_begin(model.array(x, model.vec3))
+    triangles, count = np.cumsum(pairs.proximity.counts.numpy())
+    arrays = pairs.pairs.stencils, pairs.begun.gap, pairs.begun.normal, pairs.pairs.distances, pairs.begun.stiffness
+    s, gap, n, r, stiffness = (array.numpy()[:count] for array in arrays)
+    for e in range(count):
+        least = gap[e] if e < triangles else np.inf
+        for corner, sign in enumerate((1.0,) if e < triangles else (1.0, 1.0, -1.0, -1.0)):
+            others = np.flatnonzero(s[:triangles, 0] == s[e, corner])
+            along = sign * n[others] @ n[e]
+            alike = along > 0.5
+            if e < triangles:
+                alike = (along > 0.0) & np.isin(s[others, 1:], s[e, 1:]).any(axis=1)
+            least = gap[others][alike].min(initial=least)
+        assert (stiffness[e] > 0.0) == (gap[e] < least + 0.25 * r[e] if e < triangles else gap[e] < least), e
+    assert (stiffness[triangles:] > 0.0).any() and (stiffness[triangles:] == 0.0).any() and (stiffness[:triangles] == 0.0).any()
+
+
+def test_gaps_by_blocks(device):
+    """They are those of the kernel that takes pairs one by one, to the bit, in full blocks and in others."""
+    pairs, model = steps_of(layers(3, turn=17.0, gap=2e-3, n=10), device)
+    pairs.launch_begin(model.positions)
+    count = pairs.proximity.counts.numpy()
+    assert (count > BLOCK).all() and (count % BLOCK > 0).any()
+    arrays = pairs.begun.gap, pairs.begun.normal, pairs.begun.weights
+    found = [array.numpy()[: count.sum()].copy() for array in arrays]
+    for array in arrays:
+        array.zero_()
+    model.launch(model.kernel(begin_pairs, model.dtype), count.sum(), [pairs.pairs, model.positions], [pairs.begun])
+    for array, before in zip(arrays, found, strict=True):
+        assert (array.numpy()[: count.sum()] == before).all()
 
 
 @pytest.mark.parametrize(

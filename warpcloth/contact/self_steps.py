@@ -10,7 +10,7 @@ from ..core.capture import Mirror
 from ..core.scan import Scan
 from ..core.status import Stopped
 from ..core.sums import Sums
-from ..kernels.contact import gap_notes, self_pairs
+from ..kernels.contact import gap_notes, pair_blocks, self_pairs
 from ..kernels.contact.far_step import far_limits
 from ..kernels.contact.piece_motion import take_moved
 from ..kernels.contact.self_filter import HeldPins
@@ -113,7 +113,8 @@ class SelfSteps:
         self.held.first = state.add("first pin held back", model.scalars(wp.int64))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
         made = (
-            self_pairs.begin_pairs,
+            pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs,
+            self_pairs.find_nearest,
             self_pairs.set_areas,
             self_pairs.fill_corners,
             self_pairs.sort_corners,
@@ -122,6 +123,8 @@ class SelfSteps:
         )
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._vertices, self._counted = Scan(model, model.count), None
+        size = pair_blocks.NUMBERS * pair_blocks.BLOCK
+        self._block = wp.zeros(size, dtype=wp.float64, device=device) if device.is_cpu else None
         self._corners = model.device.is_cuda or declared.friction > 0.0
         self.forces, self.filter = SelfForces(model, bounded), SelfFilter(self, colliders)
         self.friction, self.tangles, self.stale = None, None, False
@@ -198,6 +201,7 @@ class SelfSteps:
         self.begun = self_pairs.StepPairs()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
         self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
+        self.begun.nearest = wp.zeros(self.model.count, dtype=wp.int32, device=device)
         self.forces.hold(self.pairs, self.begun)
         self.filter.hold(capacity)
 
@@ -339,6 +343,7 @@ class SelfSteps:
         self.launch_sides(x, copies)
         if self.tangles is not None:
             self.tangles.launch_leave_out(self.pairs.stencils, self.pairs.counts, self.begun.gap)
+        self._launch(self_pairs.find_nearest, self.model.count, [self.pairs], [self.begun])
         self.pairs.number.zero_()
         given = [self.pairs, self._areas, self.begun_at, self.filter.stopped, self.declared.stiffness]
         self._launch(self_pairs.set_areas, count, given, [self.begun])
@@ -353,7 +358,11 @@ class SelfSteps:
             wp.copy(self.begun_at, x)
         else:
             self._launch(take_moved, self.model.count, [x, copies, self.model.per_copy], [self.begun_at])
-        self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), [self.pairs, self.begun_at], [self.begun])
+        given = [self.pairs, self.begun_at]
+        if self._block is None:
+            self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), given, [self.begun])
+        else:
+            self._launch(pair_blocks.begin_blocks, 1, given, [self._block, self.begun])
 
     def relist(self, x):
         """Lists the pairs again at x, in copies that have moved, and computes their sides and gaps, but no areas."""
