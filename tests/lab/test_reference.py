@@ -367,6 +367,24 @@ def test_terms_of_the_same_numbers_have_keys_of_their_own():
     assert scene_digest(scenes[0]) != scene_digest(scenes[1])
 
 
+def blowing(speed):
+    @wp.func
+    def called(position: wp.vec3):
+        return wp.vec3(speed, position[0], 0.0)
+
+    @wp.func
+    def blow(position: wp.vec3, _time: float):
+        return called(position)
+
+    return wc.Scene(wc.Mesh.grid(3, 3), density=0.1, air=wc.Air(wind=blow, max_speed=4.0))
+
+
+def test_winds_of_the_same_source_have_keys_of_their_own():
+    """A function calls another, which has a value from outside."""
+    keys = [scene_digest(blowing(speed)) for speed in (1.0, 1.0, 3.0)]
+    assert keys[0] == keys[1] != keys[2]
+
+
 def test_a_key_is_of_data():
     term = wc.Spring(pairs="structural", stiffness=10.0)
     object.__setattr__(term, "stiffness", object())

@@ -311,3 +311,48 @@ def test_pins_end_at_their_last_keyframe(load_steps, device):
     assert one.status.result in SETTLED and other.status.result in SETTLED
     assert np.array_equal(one.points[started.pins.vertices], away[-1])
     assert np.abs(one.points - other.points).max() < 1e-6
+
+
+def over(**fields):
+    """A sheet that hangs by an edge, with a copy of it 0.1 m higher."""
+    grid = wc.Mesh.grid(4, 4, size=0.3)
+    points = np.concatenate([grid.points, grid.points + np.array([0.0, 0.1, 0.0])])
+    mesh = wc.Mesh(points, np.concatenate([grid.triangles, grid.triangles + 16]))
+    terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-3)]
+    return wc.Scene(mesh, density=0.1, terms=terms, pins=[0, 1, 2, 3, 16, 17, 18, 19], **fields)
+
+
+BALL = wc.Sphere(position=(0.15, -0.4, 0.15), radius=0.1)
+BAD_STARTS = {
+    "crosses itself": ({"self_contact": wc.SelfContact(distance=5e-3)}, slice(20, None), [0.02, -0.15, 0.01], " cross at the "),
+    "inside": ({"colliders": [BALL]}, [5], [0.05, -0.4, 0.05], r"vertex 5 starts .* the collider .* in start"),
+}
+
+
+@pytest.mark.parametrize(("fields", "vertices", "move", "message"), BAD_STARTS.values(), ids=BAD_STARTS)
+def test_a_start_is_checked_as_that_of_a_scene(fields, vertices, move, message):
+    """As Scene.positions are, and at the same shape."""
+    cloth = over(**fields)
+    start = cloth.positions.copy()
+    start[vertices] += move
+    with pytest.raises(ValueError, match=message):
+        wc.equilibrium(cloth, start=start)
+    with pytest.raises(ValueError, match=message.removesuffix(" in start")):
+        wc.equilibrium(replace(cloth, positions=start))
+
+
+def test_a_start_moves_no_pins_and_no_locked_axes(device):
+    """From a start 0.3 m away: pins and the locked z stay, those with keyframes end at the last; the rest shape is the same."""
+    axes = np.ones((32, 3), dtype=bool)
+    axes[8:16, 2] = False
+    cloth = over(free_axes=axes)
+    last, away = cloth.positions[cloth.pins.vertices] + [0.0, 0.02, 0.0], np.array([0.3, 0.0, 0.1])
+    for pins in (cloth.pins, wc.Pins(cloth.pins.vertices, [last - [0.0, 0.02, 0.0], last])):
+        scene = replace(cloth, pins=pins)
+        rest = wc.equilibrium(scene, device=device)
+        moved = wc.equilibrium(scene, device=device, start=rest.points + away)
+        assert moved.status.ok
+        held = cloth.positions[cloth.pins.vertices] if pins.keyframes is None else last
+        assert np.array_equal(moved.points[cloth.pins.vertices], held)
+        assert np.array_equal(moved.points[8:16, 2], cloth.positions[8:16, 2])
+        assert np.abs(moved.points - rest.points).max() < 1e-6

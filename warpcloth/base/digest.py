@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 
 from .extensions import extensions
 
@@ -27,7 +28,7 @@ def scene_digest(scene):
 
 
 def digest_of(facts):
-    """Hashes numbers, strings, lists, arrays, Warp functions by their own source, and dataclasses of these.
+    """Hashes numbers, strings, lists, arrays, Warp functions with all that their code depends on, and dataclasses of these.
 
     Raises:
         ValueError: A value is of another type.
@@ -51,7 +52,8 @@ def _add(digest, value):
         for part in value:
             _add(digest, part)
     elif hasattr(value, "adj"):  # a Warp function
-        digest.update(f"function {value.adj.source};".encode())
+        # Warp's own hash has the source, the values that it refers to, and the functions that it calls.
+        digest.update(b"function" + wp._src.context.ModuleHasher([], {}).hash_function(value) + b";")
     elif is_dataclass(value) and not isinstance(value, type):
         digest.update(f"{type(value).__name__};".encode())
         for field in fields(value):

@@ -15,7 +15,7 @@ def check_start(contact, state):
 
     Args:
         contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
-        state: The :class:`warpcloth.core.state.State` of the solver, to which tangles add their own arrays.
+        state: The :class:`warpcloth.core.state.State` of the solver, with the positions; tangles add their own arrays to it.
 
     Returns:
         With ``crossing_start="run"``, the :class:`warpcloth.contact.tangles.Tangles` of such a start; else None.
@@ -23,7 +23,7 @@ def check_start(contact, state):
     Raises:
         ValueError: Such a pair exists, without ``crossing_start="run"``. The message names the first.
     """
-    near, split, gap, through, least = _too_near(contact, contact.model.positions)
+    near, split, gap, through, least = _too_near(contact, state.x)
     if not len(near) and not through:
         return None
     crossing = [np.array([each[k] for each in through], dtype=np.int64).reshape(-1, 2 + k) for k in (0, 1)]

@@ -113,6 +113,8 @@ def equilibrium(
         record: ``"energies"``, ``"reactions"`` or both, to be included in the result.
         vary: Values in place of those of the scene, one each, as for one copy; see :class:`warpcloth.model.model.Model`.
         start: Positions from which it descends, (n, 3) [m], in place of those of the scene, from which gravity still counts.
+            Pins without keyframes and locked coordinates stay where the scene has them. Cloth must not cross itself there, and
+            free vertices must be outside colliders, as in a scene.
 
     Returns:
         :class:`Equilibrium`.
@@ -140,7 +142,7 @@ def equilibrium(
     refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
     base = wp.clone(model.positions)
     if start is not None:
-        base.assign(array("start", start, (model.count, 3)))
+        base.assign(_with_held(scene, model, array("start", start, (model.count, 3))))
     contact = None
     if model.colliders is not None and model.colliders.meshes is not None:
         contact = ColliderSteps(model, State(base, model.vectors(), 1), 0.0, 1, 1.0, resting=True)
@@ -395,6 +397,20 @@ def _settle_on_meshes(model, base, descent, part, contact):
         if not contact.notes.cut.numpy().any() and (result not in SETTLED or descent.balanced(find_facets)):
             return result
         descent.used += 1
+
+
+def _with_held(scene, model, start):
+    """Returns a start (n, 3) [m] with the coordinates that nothing moves where the model has them.
+
+    Raises:
+        ValueError: A free vertex is inside a collider.
+    """
+    held = model.coordinate_mobility().reshape(-1, 3) == 0.0
+    if scene.pins.keyframes is not None:  # these are set in each load step
+        held[scene.pins.vertices] &= ~scene.pins.held
+    points = np.where(held, model.positions.numpy(), start)
+    scene.refuse_inside(points, " in start")
+    return points
 
 
 def _halved(found, least):
