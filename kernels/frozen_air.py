@@ -26,6 +26,10 @@ def set_air(dtype, parts: int, explicit: bool, blow: wp.Function = calm):
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(AIR.parameters, dtype)
 
+    @wp.func
+    def wind_at(position: wp.vec3, time: wp.float32) -> wp.vec3:
+        return blow(position, time)
+
     @wp.kernel(module="unique", enable_backward=False)
     def set_each(
         # elements
@@ -64,7 +68,7 @@ def set_air(dtype, parts: int, explicit: bool, blow: wp.Function = calm):
         centre = third * (x[i] + x[j] + x[k])
         if wp.static(blow is not calm):
             time = dtype(after) / dtype(steps_per_frame) * frame_time
-            blown = blow(wp.vec3(wp.float32(centre[0]), wp.float32(centre[1]), wp.float32(centre[2])), wp.float32(time))
+            blown = wind_at(wp.vec3(wp.float32(centre[0]), wp.float32(centre[1]), wp.float32(centre[2])), wp.float32(time))
             most = wp.length(wind)
             wind = vec3(dtype(blown[0]), dtype(blown[1]), dtype(blown[2]))
             speed = wp.length(wind)

@@ -233,6 +233,25 @@ def test_stages_keep_it(air, tmp_path):
     assert (found.density, found.normal_drag, found.tangential_drag) == (1.2, air.normal_drag, 0.02)
 
 
+@wp.func
+def of_position(position: wp.vec3):
+    return position
+
+
+@wp.func
+def of_float64(position: wp.vec3d, time: wp.float64):
+    return position * time
+
+
+@wp.func
+def number(position: wp.vec3, time: float):
+    return time
+
+
+def blown(wind):
+    return sheet(air=wc.Air(wind=wind, max_speed=1.0))
+
+
 STRONG = wc.Air(wind=(100.0, 0.0, 0.0))
 
 
@@ -243,6 +262,17 @@ STRONG = wc.Air(wind=(100.0, 0.0, 0.0))
         (lambda: wc.Air(wind=(1.0, 0.0, np.nan)), r"air.wind\[2\] is nan; it must be finite"),
         (lambda: wc.Air(wind=(1, 0, 0), keyframes=[(1, 0, 0)]), "air.wind and air.keyframes are given"),
         (lambda: wc.Air(wind=ramp), "one of a function as air.wind and air.max_speed is given"),
+        (
+            lambda: blown(lambda position, time: position),
+            r"<lambda> .*, which is not a Warp function; decorate it with @wp.func",
+        ),
+        (lambda: blown(of_position), "its arguments must be a position wp.vec3 and a time float"),
+        (lambda: blown(of_float64), "its arguments must be a position wp.vec3 and a time float"),
+        (lambda: blown(wp.sin), "its arguments must be a position wp.vec3 and a time float"),
+        (
+            lambda: wc.simulate(blown(number), wc.Newton(substeps=1), frames=1),
+            "air.wind is the function 'number', which Warp cannot compile as a wind: .* returns a value of type `float32`",
+        ),
         (lambda: write_scene(sheet(air=wc.Air(wind=ramp, max_speed=1.0)), "air.usda"), "a function, which a stage cannot hold"),
         (lambda: wc.Air(density=-1.0), "air.density is -1.0; it must be a number of 0 or more"),
         (lambda: sheet(air=3), "air is 3; it must be an Air or None"),

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ..base.checks import array, number, numeric, refuse
+from ..base.checks import array, number, numeric, refuse, shown
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,6 +53,8 @@ class Air:
     max_speed: float | None = None
 
     def __post_init__(self):
+        if callable(self.wind):
+            _check_function(self.wind)
         if (self.blow is None) != (self.max_speed is None):
             raise ValueError("one of a function as air.wind and air.max_speed is given; both or none must be")
         if self.max_speed is not None:
@@ -97,3 +100,14 @@ class Air:
     def speed(self) -> float:
         """The largest wind [m/s]."""
         return float(np.linalg.norm(self.winds, axis=-1).max(initial=0.0))
+
+
+def _check_function(wind):
+    """Checks that a function is Warp's, and takes a position and a time. What it returns is checked when it is compiled."""
+    if not isinstance(wind, wp.Function):
+        raise ValueError(f"air.wind is {shown(wind)}, which is not a Warp function; decorate it with @wp.func")
+    for overload in (*getattr(wind, "user_templates", {}).values(), *getattr(wind, "user_overloads", {}).values()):
+        types = list(overload.input_types.values())
+        if len(types) == 2 and types[0] in (wp.vec3, Any) and types[1] in (float, wp.float32, Any):
+            return
+    raise ValueError(f"air.wind is {shown(wind)}; its arguments must be a position wp.vec3 and a time float")

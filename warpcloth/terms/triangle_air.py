@@ -68,4 +68,13 @@ class _Freeze:
         kernel = model.kernel(set_air, model.dtype, parts, moment.explicit, self._blow)
         given = [elements.stencil, held, moment.x, moment.v, moment.move if parts else None, moment.steps]
         given += [moment.he, moment.ahead, moment.per_frame, 1.0 / model.scene.fps, model.per_copy]
-        model.launch(kernel, elements.count, given, [elements.rest])
+        try:
+            model.launch(kernel, elements.count, given, [elements.rest])
+        except Exception as error:  # of generated code, Warp raises errors of several types
+            said = str(error.args[0] if error.args else error)
+            if self._blow is calm or "Error while parsing function" not in said:
+                raise
+            why = said.rpartition(";")[2].strip()
+            raise ValueError(
+                f"air.wind is the function {self._blow.key!r}, which Warp cannot compile as a wind: {why}"
+            ) from None
