@@ -271,6 +271,8 @@ def test_markers_in_a_file_give_the_parameters(bound, resting, tmp_path, capsys)
         assert main(words) == 0 and "at rest" in capsys.readouterr().out
         for wrong, sentence in (
             (["--solver", "newton"], "--at-rest is given with --solver"),
+            (["--frames", "3"], "--at-rest is given with --solver"),
+            (["--fps", "0"], "--prim and --fps are for animations"),
             (["--fps", "24"], "--prim and --fps are for animations"),
             (["--vertices", "x < 1"], "measured is a file of markers; leave vertices out"),
         ):
@@ -294,7 +296,12 @@ def test_markers_and_readings_together(device):
 
 
 SEEN, K = np.zeros((3, 2, 3)), {"Spring.stiffness": 1.0}
+ROWS, AFTER = "time,id,x,y,z\n0,a,0,0,0\n", "0.1,a,0,0,0\n"
 FILES = {
+    "twice.csv": ROWS + "0,a,0.1,0,0\n" + AFTER,
+    "far.csv": ROWS + "0,b,170,0,0\n" + AFTER,
+    "endless.csv": ROWS + AFTER + "nan,a,0,0,0\n",
+    "huge.csv": ROWS + AFTER + "0.2,a,0,1e308,0\n",
     "empty.csv": "time,x,y,z\n",
     "short.csv": "time,x,y,z\n0,1,2\n",
     "words.csv": "time,x,y,z\n0,left,0,0\n",
@@ -316,6 +323,15 @@ FILES = {
         (K, "short.csv", "short.csv, line 2: has 3 values; it must have 4"),
         (K, "words.csv", "words.csv, line 2: x is 'left'; it must be a number"),
         (K, "late.csv", "late.csv: has no row at the time of a frame after the start"),
+        (
+            K,
+            replace(LONG, function=lambda run: 1.0, sigma=1.0),
+            "measured does not depend on Spring.stiffness near its start, 1;",
+        ),
+        (K, wc.Markers(positions=SEEN[:, :1], vertices=[99]), r"measured\[0\].vertices\[0\] is 99; it must lie in 0 … 1"),
+        (K, replace(PULL, sigma=1.0), r"measured\[0\].function reads what a run has not .*; give record, such as"),
+        (K, [wc.Markers(positions=SEEN * np.nan, vertices="all", sigma=1.0)], r"measured\[0\] has 0 numbers; it must have at"),
+        (K, SEEN + 1e308, r"measured: a residual is 1e\+308 at the start; its square must be finite"),
         ({}, SEEN, "start is {}; it must be a dict of parameters"),
         ({"Spring.stiffness": 0.0}, SEEN, r"start\['Spring.stiffness'\] is 0.0; it must be a finite number above 0"),
         ({"Spring.stiffness": 1.0}, SEEN[:, :1], r"measured has shape \(3, 1, 3\); it must be \(F, 2, 3\)"),
@@ -329,3 +345,28 @@ def test_refusals(start, seen, sentence, tmp_path, monkeypatch):
         (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=sentence):
         wc.fit(weight(), SOLVER, start, seen)
+
+
+@pytest.mark.parametrize(
+    ("seen", "vertices", "sentence"),
+    [
+        ("twice.csv", "all", "twice.csv, line 3: marker 'a' has a row at time 0 before; it must have one only"),
+        ("far.csv", "all", "far.csv, line 3: marker 'b' is 16.* m from the cloth at time 0; it must be at most 0.471 m, the"),
+        ("endless.csv", "all", "endless.csv, line 4: time is nan; it must be finite"),
+        ("huge.csv", "all", r"huge.csv, line 4: y is 1e\+308; it must be at most 1e\+18 m, or NaN"),
+        (
+            wc.Markers(positions=SEEN, triangles=0, weights=[[1, 0, 0]]),
+            "all",
+            r"\[0\].triangles has shape \(\); it must be \(k,\)",
+        ),
+        (wc.Markers(positions=SEEN, triangles=[[0]], weights=[[1, 0, 0]]), "all", r"triangles has shape \(1, 1\); it must be"),
+        (wc.Markers(positions=SEEN), [3], r"vertices is \[3\], but Markers have vertices of their own; leave it out"),
+    ],
+    ids=range(7),
+)
+def test_markers_that_are_refused(seen, vertices, sentence, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=sentence):
+        wc.fit(hanging(n=4), SOLVER, K, seen, vertices)

@@ -39,7 +39,7 @@ def add_arguments(parser):
     )
     add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
-    parser.add_argument("--at-rest", action="store_true", help="fit the equilibrium; all rows after time 0 show it")
+    parser.add_argument("--at-rest", action="store_true", help="fit the equilibrium; rows after time 0, one a marker, show it")
     parser.add_argument("--vertices", default="all", metavar="SELECTION", help="the vertices that were measured (default: all)")
     parser.add_argument("--prim", help="path or name of the prim of MEASURED, if it has several")
     parser.add_argument("--fps", type=float, help="frames per second of MEASURED; overrides its own")
@@ -52,12 +52,12 @@ def fit(arguments):
     from ..run.fit import fit
 
     markers = arguments.measured.lower().endswith(".csv")
-    if markers and (arguments.prim or arguments.fps):
+    if markers and (arguments.prim or arguments.fps is not None):
         raise ValueError("--prim and --fps are for animations, and MEASURED is a file of markers; leave them out")
     if arguments.at_rest and not markers:
         raise ValueError("--at-rest is given, but MEASURED is an animation; it must be a .csv file of markers")
-    if arguments.at_rest and (arguments.solver or arguments.s or arguments.plot):
-        raise ValueError("--at-rest is given with --solver, -s or --plot, which are for motions; leave them out")
+    if arguments.at_rest and (arguments.solver or arguments.s or arguments.plot or arguments.frames is not None):
+        raise ValueError("--at-rest is given with --solver, -s, --plot or --frames, which are for motions; leave them out")
     if arguments.plot:
         check_path(arguments.plot, PICTURES)
     check_writable(arguments.plot)
@@ -96,6 +96,7 @@ def _summary(facts, found):
         if np.isfinite(found.correlation[i, j]):
             lines.append(f"  correlation of {names[i]} and {names[j]}: {found.correlation[i, j]:.2f}")
     frames = int(np.isfinite(found.residuals).sum())
+    over = f", over {frames} frame{'s' * (frames != 1)}" if facts["solver"] else ""
     ran = f"{found.runs} {'batches were' if facts['solver'] else 'sets of equilibria were'} run"
-    lines.append(f"  residual {found.residual:.4g} m RMS along an axis, over {frames} frames; {ran}")
+    lines.append(f"  residual {found.residual:.4g} m RMS{over}; {ran}")
     return "\n".join(lines)

@@ -104,8 +104,8 @@ def fit(
         :class:`Fit`.
 
     Raises:
-        ValueError: If an argument is not allowed, if no frame of an animation is at the time of a frame of the scene, or if a
-            run with parameters on the way fails.
+        ValueError: If an argument is not allowed, if no frame of an animation is at the time of a frame of the scene, if
+            nothing measured depends on a parameter at the start, or if a run with parameters on the way fails.
 
     Examples:
         >>> import numpy as np, warpcloth as wc
@@ -151,9 +151,16 @@ def fit(
             runs[key] = residuals[0], (more - less).T / (2.0 * _DIFFERENCE)
         return runs[key]
 
+    logs = np.log([start[name] for name in names])
+    residuals, jacobian = evaluated(logs)
+    with np.errstate(over="ignore"):
+        if not np.isfinite(residuals @ residuals):
+            raise ValueError(f"measured: a residual is {np.abs(residuals).max():.3g} at the start; its square must be finite")
+    for name in [name for name, slope in zip(names, jacobian.T, strict=True) if not slope.any()]:
+        raise ValueError(f"measured does not depend on {name} near its start, {start[name]:g}; leave it out, or measure more")
     found = least_squares(
         lambda logs: evaluated(logs)[0],
-        np.log([start[name] for name in names]),
+        logs,
         jac=lambda logs: evaluated(logs)[1],
         xtol=_TOLERANCE,
         ftol=_TOLERANCE,
@@ -191,10 +198,15 @@ def _bound_data(scene, measured, vertices, most, resting):
     if isinstance(measured, (Markers, Reading)):
         measured = [measured]
     if isinstance(measured, List) and measured and all(isinstance(each, (Markers, Reading)) for each in measured):
+        if not (isinstance(vertices, str) and vertices == "all"):
+            raise ValueError(f"vertices is {shown(vertices)}, but Markers have vertices of their own; leave it out")
         named = [(f"measured[{k}]", each) for k, each in enumerate(measured)]
     else:
         named = [("measured", _of_vertices(scene, measured, vertices, resting))]
     data = [each.bind(name, scene, most) for name, each in named]
+    for (name, _), each in zip(named, data, strict=True):
+        if not len(each.frames):
+            raise ValueError(f"{name} has 0 numbers; it must have at least 1 that is finite")
     for (name, _), each in zip(named[1:], data[1:], strict=True):
         if each.sigma is None or data[0].sigma is None:
             lacking = name if each.sigma is None else named[0][0]

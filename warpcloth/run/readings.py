@@ -17,6 +17,7 @@ from ..scene.mesh_collider import nearest_points
 from ..scene.scene import Scene
 
 _SAME_TIME = 1e-6  # largest distance of a measured time from a frame of the scene, in frames
+_FAR = 1e18  # largest coordinate in a file [m]; squares of residuals stay finite
 _BOUND = 1e-9  # largest distance of the sum of weights from 1
 
 
@@ -68,18 +69,18 @@ class Markers:
 
         A row gives the position of a marker at a time from the start of the scene on. A row at time 0 binds the marker to the
         point of the cloth that is nearest to it at the start. Rows at times of frames of the scene are used. Without a column
-        id, rows are free points, and those at time 0 are left out.
+        id, rows are free points, and those at time 0 are left out. Coordinates that are NaN count as not measured.
 
         Args:
             path: The file.
             scene: The scene that they are fitted to.
             sigma: See :class:`Markers`.
-            resting: Whether all rows after time 0 show the cloth at rest.
+            resting: Whether rows after time 0, one of each marker, show the cloth at rest.
 
         Raises:
             OSError: The file cannot be read.
-            ValueError: It has no such columns or rows, a marker is not bound or occurs twice at a time, or the mesh has no
-                triangles.
+            ValueError: It has no such columns or rows, a number is not allowed, a marker is not bound, occurs twice at a time
+                or is farther from the cloth at time 0 than its longest edge, or the mesh has no triangles.
         """
         names, rows = read_table(path)
         for name in ("time", "x", "y", "z"):
@@ -88,9 +89,16 @@ class Markers:
         found = np.array(
             [[number_in(path, line, n, row[names.index(n)]) for n in ("time", "x", "y", "z")] for line, row in rows]
         )
-        frames, used = frames_at(found[:, 0], scene)
+        for (line, _row), numbers in zip(rows, found, strict=True):
+            if not np.isfinite(numbers[0]):
+                raise ValueError(f"{path}, line {line}: time is {numbers[0]}; it must be finite")
+            for name, value in zip("xyz", numbers[1:], strict=True):
+                if abs(value) > _FAR:
+                    raise ValueError(f"{path}, line {line}: {name} is {value}; it must be at most {_FAR:g} m, or NaN")
         if resting:
-            frames, used = (found[:, 0] != 0.0).astype(int), np.full(len(rows), True)
+            frames, used = (found[:, 0] > 0.0).astype(int), found[:, 0] >= 0.0
+        else:
+            frames, used = frames_at(found[:, 0], scene)
         if not (used & (frames > 0)).any():
             raise ValueError(
                 f"{path}: has no row at the time of a frame after the start; it must have one at a multiple of "
@@ -99,7 +107,7 @@ class Markers:
         _refuse_no_triangles(path, scene)
         if "id" in names:
             ids = [row[names.index("id")] for _line, row in rows]
-            starts = {ids[k]: found[k, 1:] for k in np.flatnonzero(used & (frames == 0))}
+            starts = _starts(path, scene, [(rows[k][0], ids[k], found[k, 1:]) for k in np.flatnonzero(used & (frames == 0))])
             own = {name: k for k, name in enumerate(starts)}
         else:  # a marker of its own for each row of a frame
             ids, counts = [], {}
@@ -119,9 +127,7 @@ class Markers:
             positions[frames[k] - 1, own[ids[k]]] = found[k, 1:]
         bound = {}
         if starts:
-            points = np.array(list(starts.values()))
-            refuse(f"{path}: positions at time 0", points, ~np.isfinite(points), "must be finite")
-            triangles, weights = nearest_points(points, scene.positions, scene.mesh.triangles)
+            triangles, weights = (np.array(each) for each in zip(*starts.values(), strict=True))
             bound = {"triangles": triangles, "weights": weights}
         return Markers(positions=positions, sigma=sigma, **bound)
 
@@ -133,7 +139,7 @@ class Markers:
         """
         chosen: Any = None
         if self.vertices is not None:
-            chosen = distinct_vertices("vertices", self.vertices, scene.mesh)
+            chosen = distinct_vertices(f"{name}.vertices", self.vertices, scene.mesh)
         elif self.triangles is not None:
             _refuse_no_triangles(name, scene)
             chosen = _bound(name, self.triangles, self.weights, scene.mesh.triangles)
@@ -237,9 +243,17 @@ class _Read:
         self.sigma = None if reading.sigma is None else np.broadcast_to(reading.sigma, self._value.shape)[self._known]
 
     def residuals(self, runs):
-        return np.array(
-            [array(f"{self._name}.function", self._function(run), self._value.shape) - self._value for run in runs]
-        )[:, self._known]
+        try:
+            read = [self._function(run) for run in runs]
+        except TypeError as error:
+            if "NoneType" not in str(error):
+                raise
+            raise ValueError(
+                f"{self._name}.function reads what a run has not ({error}); give record, such as record='reactions'"
+            ) from error
+        return np.array([array(f"{self._name}.function", each, self._value.shape) - self._value for each in read])[
+            :, self._known
+        ]
 
 
 def _at(chosen, triangles, points):
@@ -252,16 +266,42 @@ def _at(chosen, triangles, points):
 def _bound(name, triangles, weights, of_mesh):
     """Checks indices (k,) of triangles and weights (k, 3), and returns them."""
     given = numeric(f"{name}.triangles", triangles, "have shape (k,)")
+    if given.ndim != 1:
+        raise ValueError(f"{name}.triangles has shape {given.shape}; it must be (k,)")
     refuse(
         f"{name}.triangles",
         given,
         ~((given >= 0) & (given < len(of_mesh)) & (given == np.rint(given))),
         f"must be a whole number from 0 to {len(of_mesh) - 1}, the last triangle",
     )
-    weights = array(f"{name}.weights", weights, (len(np.atleast_1d(given)), 3))
+    weights = array(f"{name}.weights", weights, (len(given), 3))
     sums = weights.sum(axis=1)
     refuse(f"the sum of {name}.weights", sums, np.abs(sums - 1.0) > _BOUND, "must be 1")
     return given.astype(int), weights
+
+
+def _starts(path, scene, rows):
+    """Returns (triangle, weights (3,)) of the nearest point, by name, of rows (line, name, position (3,)) at time 0."""
+    if not rows:
+        return {}
+    lines, names, points = zip(*rows, strict=True)
+    points = np.array(points)
+    refuse(f"{path}: positions at time 0", points, ~np.isfinite(points), "must be finite")
+    triangles, weights = nearest_points(points, scene.positions, scene.mesh.triangles)
+    away = np.linalg.norm(_at((triangles, weights), scene.mesh.triangles, scene.positions) - points, axis=1)
+    corners = scene.positions[scene.mesh.triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    found: dict[str, tuple[Any, Any]] = {}
+    for line, name, distance, *nearest in zip(lines, names, away, triangles, weights, strict=True):
+        if name in found:
+            raise ValueError(f"{path}, line {line}: marker {name!r} has a row at time 0 before; it must have one only")
+        if distance > longest:
+            raise ValueError(
+                f"{path}, line {line}: marker {name!r} is {distance:.3g} m from the cloth at time 0; it must be at most "
+                f"{longest:.3g} m, the longest edge"
+            )
+        found[name] = nearest[0], nearest[1]
+    return found
 
 
 def _refuse_no_triangles(name, scene):
