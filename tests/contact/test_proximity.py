@@ -174,6 +174,21 @@ def test_lists_grow_and_repeat_their_bits(device):
     assert rows(full) <= rows(lists[0][1])
 
 
+def test_lists_do_not_depend_on_the_threads_of_an_element(device):
+    """To the bit with one, as on the CPU, and with eight, as on CUDA, of copies and of several pieces."""
+    lists, points = [], np.tile(folded(SHEETS, np.random.default_rng(3), 0.02), (2, 1))
+    for shares in (1, 8):
+        _, found = proximity(SHEETS, 0.02, 0.01, device, copies=2)
+        found._shares = shares
+        count = sum(map(len, detect(found, points)))
+        lists.append(
+            [found.counts.numpy(), found.rows.numpy(), found.stencils.numpy()[:count], found.distances.numpy()[:count]]
+        )
+    assert count > 80
+    for one, eight in zip(*lists, strict=True):
+        assert one.tobytes() == eight.tobytes()
+
+
 @pytest.mark.parametrize("mesh", [UNEVEN, wc.Mesh.chain(40)], ids=["triangles", "edges"])
 def test_lists_of_what_has_moved_are_those_of_all(mesh, device):
     """To the bit, of copies in which few or all vertices move; of a list that has too little room the number is right."""

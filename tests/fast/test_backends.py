@@ -321,10 +321,10 @@ SWEEPS = {
     "multipliers": {"kind": "constraint-averaged", "multipliers": True},
     "scalar constraints": {"kind": "constraint-averaged", "multipliers": True, "scalar": True},
 }
-PROJECTED = {
-    name: terms for name, terms in TERMS.items() if name not in ("St. Venant-Kirchhoff", "orthotropic", "plate bending")
-}
+PROJECTED = {name: terms for name, terms in TERMS.items() if name != "plate bending"}
 PROJECTED["corotated"] = [wc.CorotatedMembrane(stiffness=100.0)]
+PROJECTED["St. Venant-Kirchhoff"] = [wc.StVKMembrane(stiffness=100.0)]
+PROJECTED["orthotropic"] = [replace(TERMS["orthotropic"][0], damping=0.0)]
 
 
 # What else sweeps do to corrections does not depend on the energy: all of it for some of each kind.
