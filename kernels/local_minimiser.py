@@ -49,7 +49,8 @@ def local_minimiser(term: Term, dtype):
 
     A term with a prox uses it. A term with a projection p uses (p(v) + r v)/(1 + r). Other terms use Newton's method with their
     semi-definite Hessian and a line search. The result is NaN if a force or the energy is not finite: CUDA's fused products
-    overflow to infinity where others give NaN, and infinity could pass for a minimum.
+    overflow to infinity where others give NaN, and infinity could pass for a minimum. It is NaN too if r is so small that
+    rounding leaves the Hessian not definite.
     """
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     flat = wp.types.vector(3 * term.rows, dtype)
@@ -91,11 +92,11 @@ def local_minimiser(term: Term, dtype):
                 H[i, i] = H[i, i] + r
             p = solve_definite(H, right, n)
             slope = -wp.dot(right, p)
-            if not (wp.dot(p, p) > dtype(64.0) * epsilon(r) * epsilon(r) * wp.ddot(z, z)):
-                return z + (g - g) + (now - now) * z
             direction = y_type()
             for i in range(n):
                 direction[i // 3, i % 3] = p[i]
+            if not (wp.dot(p, p) > dtype(64.0) * epsilon(r) * epsilon(r) * wp.ddot(z, z)):
+                return z + (direction - direction) + (g - g) + (now - now) * z
             t = dtype(1.0)
             halvings = steps - steps  # 0, and no constant, so that it may change in the loop
             searching = halvings == 0

@@ -325,6 +325,14 @@ def test_infinite_stiffness_is_refused_where_no_projection_is(solver, device):
         solver.bind(flung("alternating", wc.StVKMembrane(stiffness=np.inf)).build(device=device))
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_stiffness_beyond_the_precision_ends_a_run(dtype, device):
+    """The part 1/k of the local Hessian that makes it definite is lost in float32; the element must not just stay as it is."""
+    sheet = wc.Scene(wc.Mesh.grid(8, 8), density=0.1, terms=[wc.StVKMembrane(stiffness=1e12)], pins=[0, 7])
+    run = wc.simulate(sheet, wc.XPBD(substeps=4, iterations=10), frames=1, dtype=dtype, device=device)
+    assert run.status.ok == (dtype == "float64")
+
+
 # --- moduli
 
 
