@@ -12,6 +12,7 @@ from .fabric import Fabric
 
 _GRAM_FORCE = 9.80665e-3  # [N], exactly
 _PER_CM = 100.0 * _GRAM_FORCE  # gf/cm [N/m]
+_ROUNDED = 0.1  # largest logarithm of the ratio of a linearity to that from EMT and WT; tables round them
 _ENDS = {"1": 1, "warp": 1, "2": 2, "weft": 2}
 
 _ARCSIM = (
@@ -59,7 +60,7 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: It is of another kind, a name occurs twice, or a number is not allowed.
+        ValueError: It is of another kind, a name occurs twice, a number is not allowed, or EMT, WT and LT contradict.
     """
     ending = Path(path).suffix.lower()
     if ending == ".json":
@@ -74,11 +75,13 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
 
 def _arcsim(path):
     """Returns the fabric of a material file, in which // begins a comment."""
-    text = Path(path).read_text(encoding="utf-8")
     try:
+        text = Path(path).read_text(encoding="utf-8")
         found = json.loads(re.sub(r'("(?:[^"\\]|\\.)*")|//[^\n]*', lambda match: match[1] or "", text))
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}; it must be JSON") from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is no text in UTF-8, {error}") from None
     if not isinstance(found, dict):
         raise ValueError(f"{path}: is {shown(found)}; it must be a JSON object")
     for name in ("density", "stretching", "bending"):
@@ -121,7 +124,10 @@ def _table(path):
         for key, value in values.items():
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{path}, line {line}: {names[keys[key]]} is {value}; it must be a finite number above 0")
-        given = convert(values)
+        try:
+            given = convert(values)
+        except ValueError as error:
+            raise ValueError(f"{path}, line {line}: {error}") from None
         if given["density"] is None:
             raise ValueError(f"{path}, line {line}: fabric {name!r} has no W, the weight; it must have one")
         found[name] = _fabric(f"{path}, line {line}", name, **given, source=Path(path).name, notes=notes)
@@ -173,6 +179,11 @@ def _of_kes(values):
         percent, work, linearity = (values.get((name, direction)) for name in ("EMT", "WT", "LT"))
         strain = None if percent is None else percent / 100.0
         work = None if work is None else work * _PER_CM  # gf·cm/cm² is gf/cm
+        derived = 2.0 * work / (force * strain) if work and strain else None
+        if derived and linearity and abs(math.log(derived / linearity)) > _ROUNDED:
+            raise ValueError(
+                f"LT of direction {direction} is {linearity:g}, but 2WT/(500 gf/cm·EMT) is {derived:.3g}; must agree to 10 %"
+            )
         if strain is None and work and linearity:
             strain = 2.0 * work / (linearity * force)
         if work is None and strain and linearity:
