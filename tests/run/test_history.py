@@ -396,5 +396,6 @@ def test_a_copy_of_a_batch_is_an_animation(device):
             np.testing.assert_allclose(values, getattr(alone, name)[key], rtol=1e-9, atol=1e-9)
     assert one.worst_strain == pytest.approx(alone.worst_strain) and one.cut == alone.cut and one.crossings == 0
     assert one.self_contact.kept == alone.self_contact.kept
+    assert (one.status.residual, one.status.frame, one.status.good.tolist()) == (alone.status.residual, 2, [2])
     with pytest.raises(ValueError, match="copy is 2; it must be 1 or less"):
         both.of_copy(2)

@@ -156,7 +156,10 @@ class Animation:
         return np.asarray(self.points)[..., first : first + count, :]
 
     def of_copy(self, copy: int) -> "Animation":
-        """Returns the animation of one of several copies, whose arrays have no axis of copies. The status is that of all.
+        """Returns the animation of one of several copies, whose arrays have no axis of copies.
+
+        The result and the message of the status, and of ``self_contact`` the pairs, the lists and the sentences, are those of
+        all copies.
 
         Raises:
             ValueError: There is no such copy.
@@ -176,7 +179,9 @@ class Animation:
         if summary is not None:
             summary = summary._replace(kept=float(summary.kept[copy]), least_gap=float(summary.least_gap[copy]))
         inside = tuple(each for each in self.inside if each.copy == copy)
-        return replace(self, inside=inside, self_contact=summary, **given)
+        status = self.status._replace(frame=int(self.status.good[copy]), good=self.status.good[copy : copy + 1])
+        status = status._replace(residual=float(np.broadcast_to(self.status.residual, len(self.status.good))[copy]))
+        return replace(self, inside=inside, self_contact=summary, status=status, **given)
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
