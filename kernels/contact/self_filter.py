@@ -129,7 +129,8 @@ def share_of_pins(dtype):
 
     It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If two pins would
     pass one another along n, they stop at the contact distance or, if that is smaller, at their gap at the start of the step.
-    If pairs are ``hard``, so do pins that would come nearer than this by more than a hundredth of it.
+    If pairs are ``hard``, so do pins that would come nearer than this by more than a hundredth of it. Pairs that are ``open``
+    do not hold pins.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -139,6 +140,7 @@ def share_of_pins(dtype):
         # elements
         pairs: near_pairs(dtype),
         inverse_mass: wp.array(dtype=dtype),
+        open: wp.array(dtype=wp.int32),
         # state in
         step: StepPairs,
         x_before: wp.array(dtype=vec3),
@@ -151,6 +153,9 @@ def share_of_pins(dtype):
         e = wp.tid()
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
+        if open:
+            if open[e] != 0:
+                return
         s = pairs.stencils[e]
         w = step.weights[e]
         for i in range(4):
@@ -158,7 +163,12 @@ def share_of_pins(dtype):
                 return
         n = step.normal[e]
         sides = wp.where(e < pairs.counts[0], 1, 2)
-        floor = wp.min(step.gap[e], wp.float64(pairs.distances[e]))
+        gap = step.gap[e]
+        if gap == wp.float64(wp.inf):  # left out of contact
+            gap = ZERO
+            for i in range(4):
+                gap += w[i] * wp.dot(n, exact(x_before[s[i]]))
+        floor = wp.min(gap, wp.float64(pairs.distances[e]))
         allowed = wp.where(hard, TOGETHER * floor, floor)
         for i in range(sides):
             for j in range(sides, 4):

@@ -989,3 +989,19 @@ def test_pairs_of_a_start_that_crosses(device):
     assert found.pairs.tangles.left().tolist() == [1, 1]
     animation = wc.simulate(scene, wc.XPBD(substeps=2), device=device, frames=1)
     assert animation.crossings == 1
+
+
+@few_solvers
+def test_pins_that_cross_at_the_start_are_free(name, device):
+    """Two triangles that cross, all of whose vertices are led apart: contact leaves out all their pairs, so no pin lags."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [0.2, -0.01, 0.2], [0.3, 0.01, 0.2], [0.2, 0.01, 0.4]])
+    keyframes = np.tile(points, (5, 1, 1))
+    keyframes[:, 3:, 1] += np.linspace(0.0, 0.12, 5)[:, None]
+    contact = wc.SelfContact(distance=5e-3, stiffness=1e4, crossing_start="run")
+    given = {"terms": [wc.Spring(stiffness=1.0)], "pins": wc.Pins("all", keyframes), "self_contact": contact}
+    mesh = wc.Mesh(points, [[0, 1, 2], [3, 4, 5]])
+    stepper = SOLVERS[name].bind(wc.Scene(mesh, density=0.1, fps=24.0, **given).build(device=device, dtype="float64"))
+    for frame in range(1, 5):
+        stepper.frame()
+        assert stepper.state.x.numpy() == pytest.approx(keyframes[frame], abs=1e-12)
+    assert not stepper.pairs.tangles.left().any()

@@ -118,9 +118,12 @@ class SelfFilter:
 
         ``hard`` pairs keep the contact distance as a constraint.
         """
-        model, contact = self.model, self._contact
+        model, contact, open = self.model, self._contact, None
+        if contact.tangles is not None:
+            open = self._open
+            contact.tangles.launch_open(contact.pairs.stencils, contact.pairs.counts, open)
         self._share.fill_(1.0)
-        given = [contact.pairs, model.inverse_mass, contact.begun, contact.x_before, x, hard]
+        given = [contact.pairs, model.inverse_mass, open, contact.begun, contact.x_before, x, hard]
         self._launch(self_filter.share_of_pins, len(contact.pairs.stencils), given, [self._share])
         given = [model.inverse_mass, self._share, contact.x_before, contact.steps, model.per_copy]
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
