@@ -36,7 +36,7 @@ def scene(
     wc.checks.number("angle", angle)
     spacing, stiffness = length / (elements - (0.25 if width == 0.0 else 0.5)), 1e-3  # D [N·m]
     if fabric is not None:
-        cloth = wc.fabrics[fabric] if isinstance(fabric, str) else fabric
+        cloth = wc.fabrics.find(fabric)
         length = (gamma * cloth.bending_along(np.radians(angle)) / (9.81 * cloth.density)) ** (1 / 3)
         spacing, width = length / (elements + CLAMP), width or 0.025
         if width < 3.9 * spacing:

@@ -10,12 +10,10 @@ clamps are 0.18 edges behind the second row of pins, see the scene `cantilever`.
 import numpy as np
 
 import warpcloth as wc
+from warpcloth.scenes.cantilever import CLAMP
 
 # Half turns of one half of the strip, coefficient that closes the initial loop, direction from the first end to the second.
 KINDS = {"pear": (0.5, 1.171066, [1, 0, 0]), "ring": (1.0, 0.0, [0, 1, 0]), "heart": (1.5, -0.670103, [1, 0, 0])}
-
-
-CLAMP = 0.18  # distance from the second row of pins back to where a plate is clamped, in edges
 
 
 def scene(
@@ -46,7 +44,7 @@ def scene(
         bend = wc.QuadraticBending(stiffness=9 / 8 * bending, damping=1e-2 * bending)
         terms = [wc.Spring(stiffness=2e6 * bending / length**2), bend]
     else:
-        cloth = wc.fabrics[fabric] if isinstance(fabric, str) else fabric
+        cloth = wc.fabrics.find(fabric)
         density, rows, terms = cloth.density, 2, cloth.terms(warp_angle=-np.radians(angle))
         length = (max(gamma, 1.0) * cloth.bending_along(np.radians(angle)) / (9.81 * density)) ** (1 / 3)
         edge = length / (elements + 2 * CLAMP)

@@ -24,7 +24,7 @@ def scene(
     wc.checks.number("length", length, above=0.0)
     wc.checks.number("width", width, above=0.0)
     wc.checks.whole("elements", elements, 1)
-    cloth = wc.fabrics[fabric] if isinstance(fabric, str) else fabric
+    cloth = wc.fabrics.find(fabric)
     across = max(round(width / length * elements), 1)
     mesh = wc.Mesh.grid(elements + 1, across + 1, size=(length, width), pattern="alternating")
     x, n = mesh.points[:, 0], across + 1

@@ -1,5 +1,6 @@
 """Measured fabrics, by name. Where papers differ, each has records of its own."""
 
+from ..base.checks import shown
 from .fabric import Fabric
 
 _CLYDE = "Clyde, Teran and Tamstorf 2017, Modeling and data-driven parameter estimation for woven fabrics"
@@ -28,6 +29,18 @@ class Fabrics(dict[str, Fabric]):
 
     def __missing__(self, name: str) -> Fabric:
         raise ValueError(f"fabric is {name!r}; it must be one of {', '.join(self)}")
+
+    def find(self, fabric: Fabric | str) -> Fabric:
+        """Returns a fabric by its name, or one that is given itself.
+
+        Raises:
+            ValueError: It is neither.
+        """
+        if isinstance(fabric, str):
+            return self[fabric]
+        if not isinstance(fabric, Fabric):
+            raise ValueError(f"fabric is {shown(fabric)}; it must be a Fabric or its name")
+        return fabric
 
 
 def _plate(name, density, millimetres, warp, weft, shear, ratio):

@@ -196,9 +196,7 @@ class Scene:
 
         if fabric is not None:
             self._refuse_with_fabric()
-            fabric = fabrics[fabric] if isinstance(fabric, str) else fabric
-            if not isinstance(fabric, Fabric):
-                raise ValueError(f"fabric is {shown(fabric)}; it must be a Fabric or its name")
+            fabric = fabrics.find(fabric)
             keep("density", fabric.density)
             keep("terms", fabric.terms())
         number("fps", self.fps, above=0.0)
