@@ -421,6 +421,7 @@ def limit_direction(dtype):
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
 def count_stops(
     # parameters
+    active: wp.array(dtype=wp.int32),
     per_copy: int,
     # in and out
     stopping: wp.array(dtype=wp.int32),
@@ -430,12 +431,12 @@ def count_stops(
 ):
     """Kernel over vertices: counts up to STOPPED the directions that stopped at a vertex; blocked = 1 where it gets there.
 
-    It sets ``stopping`` to 0.
+    It sets ``stopping`` to 0. Copies that are not ``active`` keep old directions, which do not count.
     """
     i = wp.tid()
     if stopping[i] != 0:
         stopping[i] = 0
-        if stopped[i] < STOPPED:
+        if active[i // per_copy] != 0 and stopped[i] < STOPPED:
             stopped[i] = stopped[i] + 1
             if stopped[i] == STOPPED:
                 blocked[i // per_copy] = 1

@@ -208,7 +208,7 @@ class SelfFilter:
         if target is not None and self._colliders is not None and self._colliders.faces is not None:
             self._colliders.faces.launch_least(x, target, self._share)
 
-    def _launch_whole(self, direction):
+    def _launch_whole(self, direction, active):
         """Finds and returns the fraction of a direction that all vertices of a copy may move (B,); call it after the planes."""
         contact, gap, open = self._contact, self._contact.begun.gap, None
         if contact.tangles is not None:
@@ -218,7 +218,7 @@ class SelfFilter:
         given.append(FLOOR * contact.declared.distance)
         self._launch(self_planes.cut_as_a_whole, len(contact.pairs.stencils), given, [self._whole, self._stopping])
         noted = [self._stopping, self.stopped, self._blocked]
-        self.model.launch(self_filter.count_stops, self.model.count, [self.model.per_copy], noted)
+        self.model.launch(self_filter.count_stops, self.model.count, [active, self.model.per_copy], noted)
         return self._whole
 
     # For methods whose iterates base + d stay apart too.
@@ -273,8 +273,10 @@ class SelfFilter:
         model.launch(self_filter.take_blocked, model.copies, [active, RENEWALS], noted)
         wp.capture_if(self._renew, renew, x=x)
 
-    def launch_limit(self, sums, gradient, preconditioner, right, direction):
+    def launch_limit(self, sums, gradient, preconditioner, right, direction, active):
         """Shortens the direction from the positions of :meth:`launch_relist`, so that pairs stay apart all along it.
+
+        Directions of copies that are not ``active`` (B,) do not count as stopped.
 
         A direction that is longer than the list of pairs allows is scaled as a whole: to cut it at each vertex would stretch
         stiff cloth. So it is where pairs allow at least WHOLE of it. In copies where the energy does not decrease along the
@@ -286,7 +288,7 @@ class SelfFilter:
             sums.largest(self._ones, each, self._longest)
             self._launch(self_filter.shorten, N, [self._longest, model.per_copy, WAY * self._contact.skin], [each])
             self._launch_planes(self._contact.x_before, None, each)
-            whole = self._launch_whole(each) if each is direction else None
+            whole = self._launch_whole(each, active) if each is direction else None
             given = [self._share, self._common, whole, model.per_copy, WAY * self._contact.skin]
             self._launch(self_filter.limit_direction, N, given, [each])
         sums.dot(gradient, direction, self._slope)

@@ -206,7 +206,7 @@ class Minimiser:
     def _launch_search(self):
         if self.pairs is not None:
             self.hessian.invert_diagonal(self.preconditioner)
-            given = self.search.gradient, self.preconditioner, self.right, self.search.direction
+            given = self.search.gradient, self.preconditioner, self.right, self.search.direction, self.active
             self.pairs.filter.launch_limit(self.sums, *given)
         self.search.launch(self.active)
         self._launch_norms()
