@@ -488,7 +488,7 @@ def test_the_command(tmp_path, capfd, monkeypatch):
     given = ["chart", "failure", "isometry", "--workers", "1"]
     assert main([*given, "-o", str(tmp_path / "i.png"), "--csv", str(tmp_path / "i.csv")]) == 0
     out = capfd.readouterr().out
-    assert out.startswith("10. Quadratic bending") and "off their law by" in out
+    assert out.startswith("10. Quadratic and plate bending") and "off their law by" in out
     assert (tmp_path / "i.png").stat().st_size > 1000 and (tmp_path / "i.csv").is_file()
     assert len((tmp_path / "cache" / "failures.jsonl").read_text().splitlines()) == 1
     assert main([*given, "--json"]) == 0
