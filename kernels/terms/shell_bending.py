@@ -6,8 +6,8 @@ not change. In motion without stretch κ = Ln with the curvature L, so that U is
 have such an energy of hinges.
 
 The stiffness is D₁ in N·m. The rows of y are κ, multiplied by a square root of C/D₁ as κ̄ is, and bf₁ and bf₂ with b = ‖κ̄‖. The
-rest state is A and κ̄/b². U is a polynomial. Of its Hessian JᵀJ + ∂²(g·n), g = −Σ κ̄(κ − κ̄n), only the second part can be
-negative, with the eigenvalues ±‖g‖. At rest JᵀJ is at most 3.
+rest state is A and κ̄/b², or 0 where b is 0. U is a polynomial. Of its Hessian JᵀJ + ∂²(g·n), g = −Σ κ̄(κ − κ̄n), only the
+second part can be negative, with the eigenvalues ±‖g‖. At rest JᵀJ is at most 3.
 """
 
 from typing import Any

@@ -11,6 +11,8 @@ from ..mesh.curvature import covariant_operator
 from ..mesh.mesh import Mesh
 from .plate_bending import PlateBending
 
+_FLAT = 1e-9  # κ̄ times the longest side of a triangle below which κ̄ is rounding of a flat mesh, and is set to 0
+
 
 @dataclass(frozen=True, kw_only=True)
 class ShellBending(PlateBending):
@@ -18,7 +20,8 @@ class ShellBending(PlateBending):
 
     δ = κ − κ̄n, and κᵀCκ is that of :class:`warpcloth.PlateBending`. κ̄ is the curvature of the rest shape along warp and weft,
     and n the normal of a triangle. The rest shape has no energy, wherever it is and however it is turned. In motion without
-    stretch the energy is that of the change of curvature. Forces are not linear in x.
+    stretch the energy is that of the change of curvature. Forces are not linear in x. Triangles with ‖κ̄‖ below 1e-9 over their
+    longest side are flat: κ̄ is 0.
 
     Attributes:
         stiffness: D₁ [N·m], the bending stiffness along warp, one or (T,).
@@ -58,4 +61,8 @@ class ShellBending(PlateBending):
         second, first = covariant_operator(mesh)
         bent = self.roots(mesh) @ second
         f = (first @ mesh.points).reshape(-1, 2, 3)
-        return bent, first, np.einsum("tmi,ti->tm", (bent @ mesh.points).reshape(-1, 3, 3), np.cross(f[:, 0], f[:, 1]))
+        curvature = np.einsum("tmi,ti->tm", (bent @ mesh.points).reshape(-1, 3, 3), np.cross(f[:, 0], f[:, 1]))
+        corners = mesh.points[mesh.triangles]
+        longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        curvature[np.linalg.norm(curvature, axis=1) * longest < _FLAT] = 0.0
+        return bent, first, curvature
