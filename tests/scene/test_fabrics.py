@@ -79,7 +79,29 @@ def test_a_fabric_gives_contact_its_thickness(fabric, given, distances):
     for contact, distance in zip((scene.contact, scene.self_contact), distances, strict=True):
         assert contact.distance == pytest.approx(distance)
         assert contact.stiffness == pytest.approx(10.0 * scene.density * 9.81 / distance)
-    assert wc.Scene(MESH, **fabric, colliders=[BALL]).contact.distance == 1e-3  # contact that is not declared
+    bare = wc.Scene(MESH, **fabric)
+    if given:
+        return
+    assert wc.Scene(MESH, **fabric, colliders=[BALL]).contact.distance == pytest.approx(distances[0])  # not declared
+    later = {"colliders": [BALL], "contact": wc.Contact(), "self_contact": wc.SelfContact()}
+    for late in (replace(bare, **later), wc.Scene.join({"a": bare, "b": bare}, **later)):
+        assert [late.contact.distance, late.self_contact.distance] == pytest.approx(distances)
+
+
+def test_a_thickness_that_is_not_known_or_not_the_same_gives_no_distance():
+    """Contact without a distance is refused where it acts, and colliders without contact have 1 mm."""
+    denim, thin, free = (wc.Scene(MESH, fabric=fabric) for fabric in ("denim", THIN, "silk"))
+    for unknown in (thin, wc.Scene.join({"a": denim, "b": free}), wc.Scene.join({"a": thin, "b": thin})):
+        assert replace(unknown, contact=wc.Contact()).contact.distance is None  # without colliders it has no effect
+        assert replace(unknown, colliders=[BALL]).contact.distance == 1e-3
+        assert replace(unknown, self_contact=wc.SelfContact(distance=2e-3)).self_contact.distance == 2e-3
+        assert replace(unknown, thickness=4e-4, self_contact=wc.SelfContact()).self_contact.distance == 4e-4
+        with pytest.raises(ValueError, match=r"^self_contact has no distance, and the thickness of the cloth is not known"):
+            replace(unknown, self_contact=wc.SelfContact())
+        with pytest.raises(ValueError, match=r"^contact has no distance, and the thickness of the cloth is not known"):
+            replace(unknown, contact=wc.Contact(), colliders=[BALL])
+    joined = wc.Scene.join({"a": denim, "b": free}, thickness=5e-4, self_contact=wc.SelfContact())
+    assert joined.self_contact.distance == 5e-4
 
 
 @pytest.mark.parametrize(
@@ -90,8 +112,8 @@ def test_a_fabric_gives_contact_its_thickness(fabric, given, distances):
         ({"terms": [wc.Spring(stiffness=1.0)]}, "fabric and terms are given"),
         ({"fabric": "denin"}, "fabric is 'denin'; it must be one of cotton, wool"),
         ({"fabric": 3}, "fabric is 3; it must be a Fabric or its name"),
-        ({"fabric": THIN, "contact": wc.Contact()}, "fabric 'thin' has no thickness, which contact needs"),
-        ({"fabric": THIN, "self_contact": wc.SelfContact()}, "fabric 'thin' has no thickness, which self_contact needs"),
+        ({"thickness": 1e-3}, "fabric and thickness are given"),
+        ({"fabric": None, "density": 0.1, "thickness": 0.0}, "thickness is 0.0; it must be"),
     ],
 )
 def test_refusals_of_scenes(given, sentence):
@@ -139,11 +161,14 @@ def test_a_stage_names_one(tmp_path):
     path = tmp_path / "silk.usda"
     path.write_text(STAGE.replace("DENSITY", ""))
     scene = read_scene(path)
-    assert scene.density == 0.083 and scene.terms[0].stiffness == 327.0
+    assert scene.density == 0.083 and scene.thickness == wc.fabrics["silk"].thickness and scene.terms[0].stiffness == 327.0
     assert np.allclose(scene.terms[0].warp_directions(scene.mesh), [0.0, 0.0, -1.0])
     write_scene(scene, tmp_path / "written.usda")
     again = read_scene(tmp_path / "written.usda")
+    assert again.thickness == scene.thickness
     assert again.density == 0.083 and [term.stiffness for term in again.terms] == [term.stiffness for term in scene.terms]
+    path.write_text(STAGE.replace("DENSITY", "double warpcloth:selfContact:friction = 0.2"))
+    assert read_scene(path).self_contact.distance == scene.thickness
     path.write_text(STAGE.replace("DENSITY", "double warpcloth:density = 0.1"))
     with pytest.raises(ValueError, match="fabric and density are given"):
         read_scene(path)

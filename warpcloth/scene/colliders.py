@@ -23,8 +23,7 @@ class Contact:
     sticks moves by up to μN/(kA) before it slides.
 
     Attributes:
-        distance: Contact distance r [m]. None lets the scene set it: to half of the thickness of its fabric, or to 1 mm without
-            a fabric.
+        distance: Contact distance r [m]. None lets the scene set it: to half of its thickness, or to 1 mm without one.
         stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default 10 w/r, where w is the weight of the
             cloth per area, so that one layer rests at a gap of 0.9 r.
         elements: What touches meshes: ``"vertices"`` of the cloth, or also its ``"triangles"``, which spikes and edges of a

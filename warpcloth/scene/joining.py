@@ -28,7 +28,7 @@ def fields_of_cloths(cloths, whole):
     """
     if not (isinstance(cloths, Mapping) and cloths and all(hasattr(cloth, "mesh") for cloth in cloths.values())):
         raise ValueError(f"cloths is {shown(cloths)}; it must be a mapping of names to scenes, with one cloth or more")
-    allowed = (*_COMMON, *_WHOLE, "terms", "name")
+    allowed = (*_COMMON, *_WHOLE, "terms", "name", "thickness")
     for name in whole:
         if name not in allowed:
             raise ValueError(f"{name} is given for the whole scene, which takes {', '.join(allowed)}; give it to each cloth")
@@ -38,7 +38,7 @@ def fields_of_cloths(cloths, whole):
                 raise ValueError(f"the cloth {name!r} has {field} of its own; give them to the scene of all cloths")
     mesh, each = Mesh.join({name: cloth.mesh for name, cloth in cloths.items()}), list(cloths.values())
     firsts = [part.first for part in (mesh.parts or {}).values()]
-    densities = {cloth.density for cloth in each}
+    densities, thicknesses = {cloth.density for cloth in each}, {cloth.thickness for cloth in each}
     found = {
         "mesh": mesh,
         "cloths": tuple(cloths),
@@ -46,6 +46,7 @@ def fields_of_cloths(cloths, whole):
         "velocities": np.concatenate([cloth.velocities for cloth in each]),
         "terms": [*_terms(cloths), *whole.get("terms", ())],
         "loads": [_moved(load, cloth, first) for cloth, first in zip(each, firsts, strict=True) for load in cloth.loads],
+        "thickness": each[0].thickness if len(thicknesses) == 1 else np.nan,
     }
     if len(densities) == 1 and None not in densities:
         found["density"] = each[0].density
@@ -53,7 +54,7 @@ def fields_of_cloths(cloths, whole):
         found["masses"] = np.concatenate([cloth.vertex_masses for cloth in each])
     if any(cloth.free_axes is not None for cloth in each):
         found["free_axes"] = np.concatenate([_free(cloth) for cloth in each])
-    return {**found, **_common(cloths, whole), **{key: whole[key] for key in (*_WHOLE, "name") if key in whole}}
+    return {**found, **_common(cloths, whole), **{key: whole[key] for key in (*_WHOLE, "name", "thickness") if key in whole}}
 
 
 def pins_of_cloths(cloths):

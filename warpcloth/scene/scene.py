@@ -114,14 +114,17 @@ class Scene:
             is a pin that stands still. Values of pinned vertices are ignored.
         loads: Forces, tractions and pressures on the cloth: :class:`Force`, :class:`Traction`, :class:`Pressure`.
         colliders: The colliders, such as :class:`warpcloth.Sphere`. Pinned vertices do not collide.
-        contact: The :class:`warpcloth.Contact` with all colliders, by default ``Contact(distance=1e-3)``; its stiffness is then
-            computed. It has no effect without colliders.
+        contact: The :class:`warpcloth.Contact` with all colliders, by default one with half of the thickness as its distance,
+            or 1 mm if that is not known; its stiffness is then computed. It has no effect without colliders.
         self_contact: The :class:`warpcloth.SelfContact` of the cloth with itself; its stiffness is then computed. None if cloth
             passes through cloth.
         air: The :class:`warpcloth.Air` around the cloth, with its wind; None for none.
         cloths: Names of the cloths of a scene that :meth:`join` made, the parts of the mesh; else empty. In files each is a
             prim of its own.
-        fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, in place of ``density`` and ``terms``, which it sets.
+        fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, in place of ``density``, ``terms`` and
+            ``thickness``, which it sets.
+        thickness: Thickness of the cloth [m], from which contact without a distance takes it; None for cloth without one. NaN
+            if it is not known, because the fabric has none or the cloths of a scene differ; such contact is then refused.
 
     Raises:
         ValueError: A value is not allowed. The message names it.
@@ -154,6 +157,7 @@ class Scene:
     air: Air | None = None
     cloths: tuple[str, ...] = ()
     fabric: InitVar[Fabric | str | None] = None
+    thickness: float | None = None
 
     @classmethod
     def join(cls, cloths: Mapping[str, "Scene"], **whole: Any) -> "Scene":
@@ -166,7 +170,8 @@ class Scene:
         Args:
             cloths: A scene for each name, which must be an identifier. Cloths must not have colliders or contact.
             **whole: Fields of the whole scene: gravity, duration and fps, by default those of the cloths if all have the same;
-                colliders, contact, self_contact, air and name; and further terms, such as seams, on the vertices of all cloths.
+                colliders, contact, self_contact, air and name; thickness, by default that of the cloths if all have the same,
+                else not known; and further terms, such as seams, on the vertices of all cloths.
 
         Raises:
             ValueError: There is no cloth, a name is not an identifier, meshes cannot be joined, or a field is not allowed.
@@ -199,6 +204,9 @@ class Scene:
             fabric = fabrics.find(fabric)
             keep("density", fabric.density)
             keep("terms", fabric.terms())
+            keep("thickness", np.nan if fabric.thickness is None else fabric.thickness)
+        elif self.thickness is not None and not _is_nan(self.thickness):
+            number("thickness", self.thickness, above=0.0)
         number("fps", self.fps, above=0.0)
         number("duration", self.duration, above=0.0)
         frames = float(self.duration) * float(self.fps)
@@ -226,15 +234,14 @@ class Scene:
             keep("masses", array("masses", self.masses, (n,)))
         self._check_masses()
         keep("colliders", checked_colliders(self.colliders))
-        keep("contact", _with_distance(self.contact, "contact", fabric, 0.5))
-        keep("self_contact", _with_distance(self.self_contact, "self_contact", fabric, 1.0))
         keep("contact", self._checked_contact())
         keep("self_contact", self._checked_self_contact())
         self._check_air()
         self.refuse_inside(self.positions)
 
     def _refuse_with_fabric(self):
-        for name, value in (("density", self.density), ("masses", self.masses), ("terms", self.terms)):
+        for name in ("density", "masses", "terms", "thickness"):
+            value = getattr(self, name)
             if not (value is None or (isinstance(value, Sequence) and not value)):
                 raise ValueError(f"fabric and {name} are given; a fabric has {name} of its own, so leave one of them out")
 
@@ -254,9 +261,12 @@ class Scene:
     def _checked_contact(self):
         if not (self.contact is None or isinstance(self.contact, Contact)):
             raise ValueError(f"contact is {shown(self.contact)}; it must be a Contact or None")
+        if not self.colliders and (self.contact is None or _is_nan(self.thickness)):
+            return self.contact  # it has no effect
+        contact = self.contact or Contact(DISTANCE if _is_nan(self.thickness) else None)
+        contact = self._with_distance(contact, "contact", 0.5)
         if not self.colliders:
-            return self.contact
-        contact = self.contact or Contact(DISTANCE)
+            return contact
         for collider in (each for each in self.colliders if each.friction and np.isinf(contact.stiffness or 0.0)):
             raise ValueError(
                 f"{collider.label} has friction {collider.friction:g} and contact.stiffness is infinite, which leaves no gap "
@@ -277,12 +287,24 @@ class Scene:
             raise ValueError(f"self_contact is {shown(declared)}; it must be a SelfContact or None")
         if not len(self.mesh.triangles):
             raise ValueError("self_contact is given for a mesh without triangles; it must be None")
+        declared = self._with_distance(declared, "self_contact", 1.0)
         if declared.stiffness is not None:
             return declared
         weight = self._areal_mass * float(np.linalg.norm(self.gravity))
         if not weight > 0.0:
             raise ValueError("self_contact.stiffness has no default without gravity; give one [Pa/m]")
         return replace(declared, stiffness=default_stiffness(weight, declared.distance))
+
+    def _with_distance(self, contact, name, thicknesses):
+        """Returns contact with a distance: its own, or that number of thicknesses, or `DISTANCE` for cloth without one."""
+        if contact.distance is not None:
+            return contact
+        if _is_nan(self.thickness):
+            raise ValueError(
+                f"{name} has no distance, and the thickness of the cloth is not known or not the same everywhere; "
+                f"give {name} a distance [m]"
+            )
+        return replace(contact, distance=DISTANCE if self.thickness is None else thicknesses * self.thickness)
 
     @property
     def _touching_areas(self):
@@ -470,15 +492,8 @@ class Scene:
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
 
 
-def _with_distance(contact, name, fabric, thicknesses):
-    """Returns contact with a distance: that number of thicknesses of the fabric, without a fabric `DISTANCE`."""
-    if not isinstance(contact, (Contact, SelfContact)) or contact.distance is not None:
-        return contact
-    if fabric is None:
-        return replace(contact, distance=DISTANCE)
-    if fabric.thickness is None:
-        raise ValueError(f"fabric {fabric.name!r} has no thickness, which {name} needs; give {name} a distance [m]")
-    return replace(contact, distance=thicknesses * fabric.thickness)
+def _is_nan(value):
+    return isinstance(value, float) and np.isnan(value)
 
 
 def _checked_axes(free_axes, n):

@@ -19,7 +19,7 @@ class SelfContact:
     each step a filter shortens moves that would cross, so that cloth never passes through cloth.
 
     Attributes:
-        distance: Contact distance r [m]. None lets the scene set it: to the thickness of its fabric, or to 1 mm without one.
+        distance: Contact distance r [m]. None lets the scene set it: to its thickness, or to 1 mm without one.
         stiffness: k [Pa/m]. By default 10 w/r, where w is the weight of the cloth per area, so that one layer rests at a gap of
             0.9 r.
         friction: Coefficient μ of friction.

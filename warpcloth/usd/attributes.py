@@ -72,7 +72,8 @@ ATTRIBUTES = (
     # Our own. Of several rows of one field, the first wins.
     Attribute("name", "warpcloth:name", "cloth", ("string",)),
     Attribute("density", "warpcloth:density", "cloth", ("double",)),
-    Attribute("fabric", "warpcloth:fabric", "cloth", ("token",)),  # in place of a density and terms
+    Attribute("fabric", "warpcloth:fabric", "cloth", ("token",)),  # in place of a density, terms and a thickness
+    Attribute("thickness", "warpcloth:thickness", "cloth", ("double",)),
     Attribute("masses", "warpcloth:masses", "cloth", ("double[]",)),
     Attribute("positions", "warpcloth:positions", "cloth", ("double3[]",)),
     Attribute("velocities", "warpcloth:velocities", "cloth", ("double3[]",)),

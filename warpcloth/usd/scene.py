@@ -54,8 +54,8 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
             without any the only mesh.
 
     Returns:
-        Scene: With `stage` set. A file of `write_scene` gives the written scene, except that pins are sorted, and that texture
-        coordinates are float32 and are lost for edge meshes.
+        Scene: With `stage` set. A file of `write_scene` gives the written scene, except that pins are sorted, that a
+        thickness that is NaN is None, and that texture coordinates are float32 and are lost for edge meshes.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -146,6 +146,7 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all):
         name=cloth.GetName() if name is None else name,
         stage=surroundings,
         fabric=fabric,
+        thickness=values.get("thickness"),
     )
     for term in scene.terms:
         term.elements(mesh, scene.positions)  # raises errors here, where the file is known
@@ -529,8 +530,10 @@ def _scene_values(scene):
     mesh = scene.mesh
     given = {"name": scene.name, "duration": scene.duration, "gravity": scene.gravity}
     given |= {"masses": scene.masses} if scene.density is None else {"density": scene.density}
+    if scene.thickness is not None and np.isfinite(scene.thickness):
+        given["thickness"] = scene.thickness
     for name, contact in (("contact", scene.contact), ("self_contact", scene.self_contact)):
-        if contact is not None:
+        if contact is not None and contact.distance is not None:
             given[f"{name}.distance"] = contact.distance
         if contact is not None and contact.stiffness is not None:
             given[f"{name}.stiffness"] = contact.stiffness
