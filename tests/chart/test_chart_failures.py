@@ -493,7 +493,7 @@ def test_the_command(tmp_path, capfd, monkeypatch):
     assert len((tmp_path / "cache" / "failures.jsonl").read_text().splitlines()) == 1
     assert main([*given, "--json"]) == 0
     facts = json.loads(capfd.readouterr().out)
-    assert len(facts["rows"]) == 78 and facts["machine"]["source"] and len(facts["panels"]) == 3
+    assert len(facts["rows"]) == 117 and facts["machine"]["source"] and len(facts["panels"]) == 3
 
 
 @pytest.mark.parametrize(
