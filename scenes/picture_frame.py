@@ -14,6 +14,7 @@ def scene(fabric: str = "cotton", angle: float = 20.0, n: int = 9, side: float =
     wc.checks.number("angle", angle, above=0.0)
     if angle >= 90.0:
         raise ValueError(f"angle is {angle:g}; it must be below 90, at which the frame is shut")
+    wc.checks.whole("n", n, 3)
     cloth = wc.fabrics.find(fabric)
     mesh = wc.Mesh.grid(n, n, size=side, pattern="alternating")
     half = 0.5 * np.radians(np.linspace(0.0, angle, 61))

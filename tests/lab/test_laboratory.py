@@ -156,10 +156,10 @@ def test_what_is_no_sample_is_refused():
     free = scene("hanging", n=4)
     for declared, sentence in (
         (free, "scene.name is 'hanging'; it must be one of 'cantilever', 'loop'"),
-        (replace(free, name="cantilever"), "'cantilever' is not the sample of its device; it must be a strip along x with"),
+        (replace(free, name="cantilever"), "'cantilever' is not the sample of its device; it must be a strip along x, pinned"),
         (replace(free, name="strip"), "'strip' is not the sample of its device; it must be a strip along x, pinned at its"),
         (replace(free, name="loop", pins=[]), "'loop' is not the sample of its device"),
-        (scene("loop", gamma=0.0), "the scene 'loop' is not the sample of its device; it must be a strip along x with"),
+        (scene("loop", gamma=0.0), "the scene 'loop' has no gravity, which its device needs; its gamma must be above 0"),
         (replace(free, name="picture_frame"), "'picture_frame' is not the sample of its device; it must be a square with a"),
         (replace(free, name="cusick"), "'cusick' is not the sample of its device; it must be a disc of radius 0.15 m"),
     ):
@@ -183,6 +183,7 @@ def test_the_command_prints_the_reading(capfd, tmp_path):
         (["cantilever", "-p", "fabric=silk", "width=1e-4"], "width is 0.0001 m, below 4 elements of"),
         (["loop", "-p", "fabric=silk", "width=1e-4"], "; take more elements or a wider strip"),
         (["cantilever", "-p", "fabric=silk", "gamma=-1"], "gamma is -1.0; it must be a number above 0"),
+        (["picture_frame", "-p", "n=2"], "n is 2; it must be a whole number of 3 or more"),
         (["cantilever", "-p", "elements=0"], "elements is 0; it must be a whole number of 2 or more"),
         (["strip", "-p", "length=0"], "length is 0.0; it must be a number above 0"),
         (["picture_frame", "-p", "angle=90"], "angle is 90; it must be below 90, at which the frame is shut"),

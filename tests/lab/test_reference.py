@@ -385,6 +385,13 @@ def test_winds_of_the_same_source_have_keys_of_their_own():
     assert keys[0] == keys[1] != keys[2]
 
 
+def test_a_key_says_that_warp_has_no_hash_of_functions(monkeypatch):
+    scene = blowing(1.0)
+    monkeypatch.delattr(wp._src.context, "ModuleHasher")
+    with pytest.raises(ValueError, match=r"this version of Warp, .* gives no hash of functions"):
+        scene_digest(scene)
+
+
 def test_a_key_is_of_data():
     term = wc.Spring(pairs="structural", stiffness=10.0)
     object.__setattr__(term, "stiffness", object())

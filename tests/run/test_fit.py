@@ -306,6 +306,7 @@ FILES = {
     "empty.csv": "time,x,y,z\n",
     "short.csv": "time,x,y,z\n0,1,2\n",
     "words.csv": "time,x,y,z\n0,left,0,0\n",
+    "early.csv": ROWS + AFTER + "-0.1,a,0,0,0\n",
     "late.csv": "time,x,y,z\n0.001,0,0,0\n",
 }
 
@@ -348,6 +349,13 @@ def test_refusals(start, seen, sentence, tmp_path, monkeypatch):
         wc.fit(weight(), SOLVER, start, seen)
 
 
+def test_an_error_of_a_reading_is_its_own():
+    """Where everything is recorded, None is not what a run lacks."""
+    wrong = wc.Reading(lambda run: None + run.points[-1, 1, 1], -1.0, sigma=1.0)
+    with pytest.raises(TypeError, match="NoneType"):
+        wc.fit(weight(), SOLVER, K, wrong, record=["energies", "reactions"])
+
+
 @pytest.mark.parametrize(
     ("seen", "vertices", "sentence"),
     [
@@ -361,9 +369,10 @@ def test_refusals(start, seen, sentence, tmp_path, monkeypatch):
             r"\[0\].triangles has shape \(\); it must be \(k,\)",
         ),
         (wc.Markers(positions=SEEN, triangles=[[0]], weights=[[1, 0, 0]]), "all", r"triangles has shape \(1, 1\); it must be"),
-        (wc.Markers(positions=SEEN), [3], r"vertices is \[3\], but Markers have vertices of their own; leave it out"),
+        (wc.Markers(positions=SEEN), [3], r"vertices is \[3\]; it is for animations and arrays; leave it out"),
+        ("early.csv", "all", "early.csv, line 4: time is -0.1 s; it must be 0, the start, or later"),
     ],
-    ids=range(7),
+    ids=range(8),
 )
 def test_markers_that_are_refused(seen, vertices, sentence, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

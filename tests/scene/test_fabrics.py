@@ -182,8 +182,9 @@ KES = """name,W,T,B-1,B-2,G 1,G 2,EMT-1,WT-1,LT-1,EMT-2,LT-2,2HB-1
 wool,20,0.6,0.1,0.05,0.7,0.9,4,8,,4,0.8,0.03
 silk,8,,,,,,,,,,,
 """
-FAST = """name,W,T2,C-warp,C-weft,EB5,E5-warp,E20-warp,E100-weft
-wool,200,0.5,20,18,2,0.5,1.25,2
+FAST = """name,W,T2,C-warp,C-weft,EB5,E5-warp,E20-warp,E100-weft,ST
+wool,200,0.5,20,18,2,0.5,1.25,2,0.1
+felt,200,,,,,,,,
 """
 
 
@@ -196,7 +197,7 @@ def listed(fabric):
     ("name", "text", "numbers"),
     [
         # k₁ = 100, k₁₂ = 20, k₂ = 200, 4Gt = 60 N/m: E = k − k₁₂²/k, ν₁₂ = k₁₂/k₂.
-        ("wool.json", ARCSIM, [0.2, None, 98.0, 196.0, 15.0, 0.1, 6e-6, 4e-6]),
+        ("wool.json", "\ufeff" + ARCSIM, [0.2, None, 98.0, 196.0, 15.0, 0.1, 6e-6, 4e-6]),
         # gf = 9.80665 mN, gf·cm = 98.0665 µN·m, G per degree, 2WT/EMT² with WT = 8 gf/cm, also from LT = 2WT/(EMT·500).
         (
             "lab.csv",
@@ -227,6 +228,11 @@ def test_files_give_fabrics_in_si_units(name, text, numbers, tmp_path, capfd):
         assert listed(found["silk"]) == pytest.approx([0.08, *[None] * 7])
     code, out, _ = run(capfd, "fabrics", str(tmp_path / name))
     assert code == 0 and "wool" in out and "denim" not in out
+    if text == FAST:
+        assert "[1] lab.csv" in out and "E₁t is from E20 − E5. E₂t is from E100. Columns that were ignored: ST." in out
+        assert found["felt"].warp is None and "E₁t" not in found["felt"].notes and "felt   " in out and " [2]\n" in out
+    else:
+        assert ("Columns that were ignored: 2HB-1." in out) == (text == KES)
 
 
 def test_a_material_of_the_published_code_is_its_record(tmp_path):
@@ -261,7 +267,11 @@ def test_a_material_of_the_published_code_is_its_record(tmp_path):
         ("a.csv", "name,W,B1,B warp,LT\nwool,1,1,1,1\n", "a.csv: columns 'B1' and 'B warp' are the same number"),
         ("a.csv", "name,W,LT\nwool,,1\n", "a.csv, line 2: fabric 'wool' has no W, the weight"),
         ("a.csv", "name,W,LT\nwool,1,-1\n", "a.csv, line 2: LT is -1.0; it must be a finite number above 0"),
-        ("a.csv", "name,W,E5,E20\nwool,1,2,1\n", "a.csv, line 2: Fabric.warp is -"),
+        ("a.csv", "name,W,E5,E20\nwool,1,2,1\n", "a.csv, line 2: E20 of direction 1 is 1, E5 is 2; E20 must be larger"),
+        ("a.csv", "name,W,E5,E20\nwool,1,2,2\n", "a.csv, line 2: E20 of direction 1 is 2, E5 is 2; E20 must be larger"),
+        ("a.json", ARCSIM.replace("10, 100", "80, 20"), r"begins with \[50, 80, 20, 30\], .*; k₁₂² must be below k₁k₂"),
+        ("a.json", ARCSIM.replace("100, 30", "100, 0"), "the fourth number must be above 0"),
+        ("a.json", ARCSIM.replace("24e-6", "-24e-6"), "bending begins with -2.4e-05 at 0° and 1.6e-05 at 90°; they must be"),
     ],
 )
 def test_refusals_of_files(name, text, sentence, tmp_path):

@@ -21,7 +21,7 @@ COLUMNS = ("fabric", "kg/m²", "t mm", "E₁t N/m", "E₂t N/m", "Gt N/m", "ν�
 
 def rows(fabrics):
     """The columns of :data:`COLUMNS` as texts, "–" where a number is not known; l are the bending lengths."""
-    sources = list(dict.fromkeys(fabric.source for fabric in fabrics))
+    sources = list(dict.fromkeys((fabric.source, fabric.notes) for fabric in fabrics))
     found = []
     for fabric in fabrics:
         values = [fabric.density, _times(1e3, fabric.thickness), fabric.warp, fabric.weft, fabric.shear, fabric.poisson_ratio]
@@ -29,7 +29,7 @@ def rows(fabrics):
         values += [_times(1e3, length) for length in fabric.bending_lengths]
         texts = ["–" if value is None or value != value else f"{value:.4g}" for value in values[:7]]
         texts += ["–" if value is None or value != value else f"{value:.3g}" for value in values[7:]]
-        found.append([fabric.name, *texts, f"[{sources.index(fabric.source) + 1}]"])
+        found.append([fabric.name, *texts, f"[{sources.index((fabric.source, fabric.notes)) + 1}]"])
     return found
 
 

@@ -39,7 +39,9 @@ def add_arguments(parser):
     )
     add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
-    parser.add_argument("--at-rest", action="store_true", help="fit the equilibrium; rows after time 0, one a marker, show it")
+    parser.add_argument(
+        "--at-rest", action="store_true", help="fit the equilibrium; after time 0 each marker has one row, its position at rest"
+    )
     parser.add_argument("--vertices", default="all", metavar="SELECTION", help="the vertices that were measured (default: all)")
     parser.add_argument("--prim", help="path or name of the prim of MEASURED, if it has several")
     parser.add_argument("--fps", type=float, help="frames per second of MEASURED; overrides its own")

@@ -112,7 +112,8 @@ def equilibrium(
         linear: ``"factorised"``, which stiff and slender cloth needs, or ``"cg"``.
         record: ``"energies"``, ``"reactions"`` or both, to be included in the result.
         vary: Values in place of those of the scene, one each, as for one copy; see :class:`warpcloth.model.model.Model`.
-        start: Positions from which it descends, (n, 3) [m], in place of those of the scene, from which gravity still counts.
+        start: Positions from which it descends, (n, 3) [m], instead of those of the scene; the energy of gravity is
+            still measured from the scene's.
             Pins without keyframes and locked coordinates stay where the scene has them. Cloth must not cross itself there, and
             free vertices must be outside colliders, as in a scene.
 

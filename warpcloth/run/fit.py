@@ -199,7 +199,7 @@ def _bound_data(scene, measured, vertices, most, resting):
         measured = [measured]
     if isinstance(measured, List) and measured and all(isinstance(each, (Markers, Reading)) for each in measured):
         if not (isinstance(vertices, str) and vertices == "all"):
-            raise ValueError(f"vertices is {shown(vertices)}, but Markers have vertices of their own; leave it out")
+            raise ValueError(f"vertices is {shown(vertices)}; it is for animations and arrays; leave it out")
         named = [(f"measured[{k}]", each) for k, each in enumerate(measured)]
     else:
         named = [("measured", _of_vertices(scene, measured, vertices, resting))]

@@ -92,11 +92,13 @@ class Markers:
         for (line, _row), numbers in zip(rows, found, strict=True):
             if not np.isfinite(numbers[0]):
                 raise ValueError(f"{path}, line {line}: time is {numbers[0]}; it must be finite")
+            if numbers[0] * scene.fps < -_SAME_TIME:
+                raise ValueError(f"{path}, line {line}: time is {numbers[0]} s; it must be 0, the start, or later")
             for name, value in zip("xyz", numbers[1:], strict=True):
                 if abs(value) > _FAR:
                     raise ValueError(f"{path}, line {line}: {name} is {value}; it must be at most {_FAR:g} m, or NaN")
         if resting:
-            frames, used = (found[:, 0] > 0.0).astype(int), found[:, 0] >= 0.0
+            frames, used = (found[:, 0] > 0.0).astype(int), np.ones(len(found), dtype=bool)
         else:
             frames, used = frames_at(found[:, 0], scene)
         if not (used & (frames > 0)).any():
@@ -246,7 +248,7 @@ class _Read:
         try:
             read = [self._function(run) for run in runs]
         except TypeError as error:
-            if "NoneType" not in str(error):
+            if "NoneType" not in str(error) or not any(run.energies is None or run.reactions is None for run in runs):
                 raise
             raise ValueError(
                 f"{self._name}.function reads what a run has not ({error}); give record, such as record='reactions'"

@@ -50,7 +50,7 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
     | G | gf/(cm·degree) | G, or EB5 | N/m, % |
     | EMT, WT, LT (two of these) | %, gf·cm/cm², 1 | E5 and E20, or E100 | % |
 
-    ``notes`` of each fabric says what was derived.
+    ``notes`` of each fabric says what was derived, and which columns were ignored.
 
     Args:
         path: The file, .json or .csv.
@@ -60,7 +60,8 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: It is of another kind, a name occurs twice, a number is not allowed, or EMT, WT and LT contradict.
+        ValueError: It is of another kind, a name occurs twice, a number is not allowed, EMT, WT and LT contradict, or E20 is
+            not above E5.
     """
     ending = Path(path).suffix.lower()
     if ending == ".json":
@@ -76,7 +77,7 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
 def _arcsim(path):
     """Returns the fabric of a material file, in which // begins a comment."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8-sig")
         found = json.loads(re.sub(r'("(?:[^"\\]|\\.)*")|//[^\n]*', lambda match: match[1] or "", text))
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}; it must be JSON") from None
@@ -97,8 +98,13 @@ def _arcsim(path):
     if not (isinstance(stretching, list) and len(stretching) == 4 and all(map(_is_number, stretching))):
         raise ValueError(f"{path}: stretching begins with {shown(stretching)}; it must be a row of 4 numbers [N/m]")
     k1, k12, k2, shear = (2.0 * max(value, 0.0) for value in stretching)
-    ratio = k12 / k2 if k2 else 0.0
-    given = {"warp": k1 - ratio * k12, "weft": k2 - ratio * k12 * (k2 / k1 if k1 else 0.0), "poisson_ratio": ratio}
+    if not (k1 * k2 > k12**2 and shear > 0.0):
+        rule = "the fourth number must be above 0" if k1 * k2 > k12**2 else "k₁₂² must be below k₁k₂"
+        raise ValueError(f"{path}: stretching begins with {shown(stretching)}, k₁, k₁₂, k₂ and the shear; {rule}")
+    if not (along[0] > 0.0 and along[2] > 0.0):
+        raise ValueError(f"{path}: bending begins with {along[0]:g} at 0° and {along[2]:g} at 90°; they must be above 0")
+    ratio = k12 / k2
+    given = {"warp": k1 - ratio * k12, "weft": k2 - ratio * k12 * (k2 / k1), "poisson_ratio": ratio}
     given |= {"shear": shear / 4.0, "bending_warp": along[0] / 4.0, "bending_weft": along[2] / 4.0}
     return _fabric(str(path), Path(path).stem, density=found["density"], **given, source=str(Path(path).name), notes=_ARCSIM)
 
@@ -111,8 +117,9 @@ def _table(path):
         raise ValueError(f"{path}: has {has} KES-F (EMT, WT, LT) and FAST (E5, E20, E100, EB5, C); it must have those of one")
     if "name" not in names:
         raise ValueError(f"{path}: has no column 'name'; it must name each fabric")
-    ((columns, convert, _own, notes),) = kinds.values()
+    ((columns, convert, _own),) = kinds.values()
     keys = _keys(path, names, columns)
+    ignored = [name for k, name in enumerate(names) if name != "name" and k not in keys.values()]
     found = {}
     for line, row in rows:
         name = row[names.index("name")]
@@ -130,7 +137,9 @@ def _table(path):
             raise ValueError(f"{path}, line {line}: {error}") from None
         if given["density"] is None:
             raise ValueError(f"{path}, line {line}: fabric {name!r} has no W, the weight; it must have one")
-        found[name] = _fabric(f"{path}, line {line}", name, **given, source=Path(path).name, notes=notes)
+        if ignored:
+            given["notes"] += f" Columns that were ignored: {', '.join(ignored)}."
+        found[name] = _fabric(f"{path}, line {line}", name, **given, source=Path(path).name)
     return found
 
 
@@ -198,18 +207,24 @@ def _of_kes(values):
         "shear": _times(_PER_CM * 180.0 / math.pi, shear),
         "bending_warp": _times(1e-2 * _GRAM_FORCE, values.get(("B", 1))),  # gf·cm²/cm is gf·cm
         "bending_weft": _times(1e-2 * _GRAM_FORCE, values.get(("B", 2))),
+        "notes": _KES,
     }
 
 
 def _of_fast(values):
     """Returns the fields of a fabric from FAST numbers by (name, direction)."""
-    density, moduli, bending = _times(1e-3, values.get(("W", 1))), [], []
+    density, moduli, bending, notes = _times(1e-3, values.get(("W", 1))), [], [], _FAST
     for direction in (1, 2):
         low, middle, high, D, length = (values.get((name, direction)) for name in ("E5", "E20", "E100", "B", "C"))
+        modulus = "E₁t" if direction == 1 else "E₂t"
         if low is not None and middle is not None:
-            moduli.append(15.0 * _PER_CM / ((middle - low) / 100.0) if middle != low else math.inf)
+            if not middle > low:
+                raise ValueError(f"E20 of direction {direction} is {middle:g}, E5 is {low:g}; E20 must be larger")
+            moduli.append(15.0 * _PER_CM / ((middle - low) / 100.0))
+            notes += f" {modulus} is from E20 − E5."
         else:
             moduli.append(None if high is None else 100.0 * _PER_CM / (high / 100.0))
+            notes += "" if high is None else f" {modulus} is from E100."
         if D is None and length is not None and density is not None:
             D = 1e6 * density * 9.81 * (1e-3 * length) ** 3
         bending.append(_times(1e-6, D))
@@ -217,7 +232,7 @@ def _of_fast(values):
     if shear is None and extension is not None:
         shear = 5.0 * _PER_CM / (4.0 * extension / 100.0)  # 123/EB5
     thickness = values.get(("T", 1), values.get(("T2", 1)))
-    given = {"density": density, "thickness": _times(1e-3, thickness), "shear": shear}
+    given = {"density": density, "thickness": _times(1e-3, thickness), "shear": shear, "notes": notes}
     return given | dict(zip(("warp", "weft", "bending_warp", "bending_weft"), (*moduli, *bending), strict=True))
 
 
@@ -230,13 +245,12 @@ def _times(factor, value):
     return None if value is None else factor * value
 
 
-# Names of columns, function that converts their numbers, names by which a table is recognised, and notes.
+# Names of columns, function that converts their numbers, and names by which a table is recognised.
 _COLUMNS = {
-    "KES-F": (("W", "T", "B", "G", "EMT", "WT", "LT"), _of_kes, ("EMT", "WT", "LT"), _KES),
+    "KES-F": (("W", "T", "B", "G", "EMT", "WT", "LT"), _of_kes, ("EMT", "WT", "LT")),
     "FAST": (
         ("W", "T", "T2", "B", "C", "G", "EB5", "E5", "E20", "E100"),
         _of_fast,
         ("E5", "E20", "E100", "EB5", "C"),
-        _FAST,
     ),
 }

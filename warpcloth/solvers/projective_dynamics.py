@@ -44,7 +44,7 @@ class ProjectiveDynamics(ImplicitStep):
     An energy without a projection has k A s GᵀG in S, with the curvature s = ‖∂²u/∂y²‖ at rest. The iteration is the same (Liu
     et al. 2017), but a step may raise φ where the curvature is larger than at rest. If both the plain and the accelerated step
     raise φ, the iterate is kept and the step length is halved. Air has no part in S, because its curvature changes in each
-    step; where h·½ρC|u|/3m < 1, with the sum over the triangles of a vertex, the iteration converges without it.
+    step; the iteration converges without it where hΣ½ρAC|u|/3m < 1, summed over the triangles of each vertex.
 
     Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
     error perpendicular to it shrinks by the factor k(L/l)/(m/h² + k) in each iteration; the error along it is gone after one.
