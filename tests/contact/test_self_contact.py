@@ -296,25 +296,31 @@ def test_acting_pairs(device):
         assert (np.diff(corners)[np.diff(vertices) == 0] > 0).all()
 
 
-def test_which_pairs_have_an_area(device):
-    """In layers that are not flat, by the rule that is written with :func:`set_areas`, with all near pairs compared."""
-    pairs, model = steps_of(layers(2, turn=17.0, gap=2e-3), device)
+def test_areas_of_pairs(device):
+    """In three layers that are not flat, those of the rule that is written with :func:`set_areas`, with all pairs compared."""
+    scene = layers(3, turn=17.0, gap=2e-3)
+    pairs, model = steps_of(scene, device)
     x = model.positions.numpy() + 3e-4 * np.random.default_rng(0).normal(size=(model.count, 3))
     pairs.launch_begin(model.array(x, model.vec3))
     triangles, count = np.cumsum(pairs.proximity.counts.numpy())
     arrays = pairs.pairs.stencils, pairs.begun.gap, pairs.begun.normal, pairs.pairs.distances, pairs.begun.stiffness
     s, gap, n, r, stiffness = (array.numpy()[:count] for array in arrays)
-    for e in range(count):
-        least = gap[e] if e < triangles else np.inf
-        for corner, sign in enumerate((1.0,) if e < triangles else (1.0, 1.0, -1.0, -1.0)):
-            others = np.flatnonzero(s[:triangles, 0] == s[e, corner])
-            along = sign * n[others] @ n[e]
-            alike = along > 0.5
-            if e < triangles:
-                alike = (along > 0.0) & np.isin(s[others, 1:], s[e, 1:]).any(axis=1)
-            least = gap[others][alike].min(initial=least)
-        assert (stiffness[e] > 0.0) == (gap[e] < least + 0.25 * r[e] if e < triangles else gap[e] < least), e
-    assert (stiffness[triangles:] > 0.0).any() and (stiffness[triangles:] == 0.0).any() and (stiffness[:triangles] == 0.0).any()
+    areas, expected = np.empty(model.count), np.zeros(count)
+    areas[model.in_model(np.arange(model.count))] = scene.mesh.vertex_areas
+    for e in range(triangles):
+        others = np.flatnonzero(s[:triangles, 0] == s[e, 0])
+        others = others[(n[others] @ n[e] > 0.0) & np.isin(s[others, 1:], s[e, 1:]).any(axis=1)]
+        parts = np.maximum(1.0 - (gap[np.append(others, e)] - gap[others].min()) / (0.25 * r[e]), 0.0)
+        expected[e] = 0.5 * areas[s[e, 0]] * parts[-1] / parts[:-1].sum()
+    for e in range(triangles, count):
+        alike = [(s[:triangles, 0] == s[e, i]) & (sign * n[:triangles] @ n[e] > 0.5) for i, sign in enumerate((1, 1, -1, -1))]
+        nearer = np.clip((gap[:triangles][np.any(alike, axis=0)].min(initial=np.inf) - gap[e]) / (0.25 * r[e]), 0.0, 1.0)
+        ab, cd = x[s[e, 1]] - x[s[e, 0]], x[s[e, 3]] - x[s[e, 2]]
+        z = min((np.cross(ab, cd) ** 2).sum() / (1e-3 * (ab @ ab) * (cd @ cd)), 1.0)
+        expected[e] = nearer * z * (2.0 - z) * areas[s[e]].sum() / 12.0
+    assert stiffness == pytest.approx(1e5 * expected, rel=1e-9, abs=1e-9 * stiffness.max())
+    for some in (stiffness[:triangles], stiffness[triangles:]):
+        assert (some > 0.0).any() and (some == 0.0).any()
 
 
 def test_stops_count_in_active_copies_alone(device):
@@ -328,6 +334,7 @@ def test_stops_count_in_active_copies_alone(device):
     assert not stopping.numpy().any()
 
 
+@pytest.mark.host
 def test_gaps_by_blocks(device):
     """They are those of the kernel that takes pairs one by one, to the bit, in full blocks and in others."""
     pairs, model = steps_of(layers(3, turn=17.0, gap=2e-3, n=10), device)
