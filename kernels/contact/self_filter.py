@@ -9,11 +9,11 @@ import warp as wp
 
 from ..vectors import types
 from .gap_notes import FIRST
-from .self_gaps import ONE, ZERO, vertex_of
+from .self_gaps import ONE, PLANAR, ZERO, vertex_of
 from .self_pairs import STOPPED, StepPairs, module_of, near_pairs
 from .self_planes import WHOLE
 
-# Pins that move together, but turn, may seem to approach by this fraction of their gap in a step.
+# Pins of hard pairs may approach by this fraction of their gap in a step.
 TOGETHER = wp.constant(wp.float64(0.01))
 
 
@@ -123,13 +123,33 @@ def note_held(held: HeldPins, steps: wp.array(dtype=wp.int32), per_copy: int, i:
     wp.atomic_max(held.farthest, copy, back)
 
 
+@wp.func
+def turned_gap(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """The gap of a pair at a, b, c and d along its common normal, which was n before it moved, and the sine of the turn of n.
+
+    The normal is that of the triangle bcd, or of both edges ab and cd. A pair that has none keeps n.
+    """
+    first = wp.where(of_vertex, c - b, b - a)
+    second = wp.where(of_vertex, d - b, d - c)
+    normal = wp.cross(first, second)
+    square = wp.dot(normal, normal)
+    if square <= PLANAR * wp.dot(first, first) * wp.dot(second, second):
+        return wp.dot(n, a - c), ZERO
+    normal = normal / wp.sqrt(square)
+    if wp.dot(normal, n) < ZERO:
+        normal = -normal
+    return wp.dot(normal, a - c), wp.length(wp.cross(n, normal))
+
+
 @cache
 def share_of_pins(dtype):
     """Kernel over pairs: reduces the ``share`` of each pin, the fraction of its move to x that other pins leave it.
 
-    It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If two pins would
-    pass one another along n, they stop at the contact distance or, if that is smaller, at their gap at the start of the step.
-    If pairs are ``hard``, so do pins that would come nearer than this by more than a hundredth of it. Pairs that are ``open``
+    It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If they would pass
+    through one another, pins stop at the contact distance or, if that is smaller, at the gap at the start of the step. If pairs
+    are ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER or, if it is larger, the
+    sine of the turn of their normal. Gaps are those of :func:`turned_gap`, which do not change if a pair turns as one body. On
+    the chords of a turn by θ between two keyframes they shrink, by up to tan θ/2 times this sine. Pairs that are ``open``
     do not hold pins.
     """
     vec3, _ = types(dtype)
@@ -169,14 +189,13 @@ def share_of_pins(dtype):
             for i in range(4):
                 gap += w[i] * wp.dot(n, exact(x_before[s[i]]))
         floor = wp.min(gap, wp.float64(pairs.distances[e]))
-        allowed = wp.where(hard, TOGETHER * floor, floor)
-        for i in range(sides):
-            for j in range(sides, 4):
-                if inverse_mass[s[i]] == dtype(0.0) and inverse_mass[s[j]] == dtype(0.0):
-                    apart = wp.dot(n, exact(x_before[s[i]]) - exact(x_before[s[j]]))
-                    approach = apart - wp.dot(n, exact(x[s[i]]) - exact(x[s[j]]))
-                    if approach > apart - floor + allowed:
-                        t = wp.max(apart - floor, ZERO) / approach
+        end, turned = turned_gap(e < pairs.counts[0], n, exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        lost = wp.where(hard, wp.max(TOGETHER, turned), ONE) * floor
+        if end < floor - lost:
+            t = wp.max(gap - floor, ZERO) / (gap - end)
+            for i in range(sides):
+                for j in range(sides, 4):
+                    if inverse_mass[s[i]] == dtype(0.0) and inverse_mass[s[j]] == dtype(0.0):
                         wp.atomic_min(share, s[i], t)
                         wp.atomic_min(share, s[j], t)
 

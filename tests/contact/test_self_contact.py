@@ -279,6 +279,24 @@ def test_pins_that_pinned_cloth_holds_back(name, rise, device):
     assert stepper.pairs.pins_held[0].farthest == pytest.approx(rise - 0.0075, abs=0.0026)
 
 
+@pytest.mark.parametrize("name", ["newton", "pbd"])
+@pytest.mark.parametrize("gap", [2e-3, 3e-3])
+def test_pins_that_turn_together(name, gap, device):
+    """Two pinned layers turn as one body, by 0.3 rad a frame, at the contact distance or above it: no pin is held back.
+
+    Corners of a pair move by more than its gap along its old normal.
+    """
+    two = layers(n=4, gap=gap, turn=17.0, distance=2e-3, size=0.15)
+    turns = [np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]) for a in (0.0, 0.3, 0.6, 0.9)]
+    keyframes = np.stack([two.positions @ turn.T for turn in turns])
+    scene = replace(two, pins=wc.Pins(np.arange(32), keyframes))
+    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
+    for frame in range(1, 4):
+        stepper.frame()
+        assert stepper.state.x.numpy() == pytest.approx(keyframes[frame], abs=1e-12)
+    assert stepper.pairs.pins_held == []
+
+
 def test_acting_pairs(device):
     """They are those of the list that have an area, and their corners are in order at each vertex."""
     pairs, model = steps_of(layers(3, turn=17.0, gap=2e-3), device)
