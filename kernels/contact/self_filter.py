@@ -13,8 +13,9 @@ from .self_gaps import ONE, PLANAR, ZERO, vertex_of
 from .self_pairs import STOPPED, StepPairs, module_of, near_pairs
 from .self_planes import WHOLE
 
-# Pins of hard pairs may approach by this fraction of their gap in a step.
-TOGETHER = wp.constant(wp.float64(0.01))
+# Pins of hard pairs may approach by this fraction of their gap in a step. The second is for pairs with a free vertex, which
+# lags behind pins that turn.
+TOGETHER, LAGGING = wp.constant(wp.float64(0.01)), wp.constant(wp.float64(0.5))
 
 
 @wp.func
@@ -147,10 +148,10 @@ def share_of_pins(dtype):
 
     It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If they would pass
     through one another, pins stop at the contact distance or, if that is smaller, at the gap at the start of the step. If pairs
-    are ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER or, if it is larger, the
-    sine of the turn of their normal. Gaps are those of :func:`turned_gap`, which do not change if a pair turns as one body. On
-    the chords of a turn by θ between two keyframes they shrink, by up to tan θ/2 times this sine. Pairs that are ``open``
-    do not hold pins.
+    are ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER, or LAGGING if a vertex is
+    free, or, if it is larger, the sine of the turn of their normal. Gaps are those of :func:`turned_gap`, which do not change
+    if a pair turns as one body. On the chords of a turn by θ between two keyframes they shrink, by up to tan θ/2 times this
+    sine. Pairs that are ``open`` do not hold pins.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -190,7 +191,11 @@ def share_of_pins(dtype):
                 gap += w[i] * wp.dot(n, exact(x_before[s[i]]))
         floor = wp.min(gap, wp.float64(pairs.distances[e]))
         end, turned = turned_gap(e < pairs.counts[0], n, exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
-        lost = wp.where(hard, wp.max(TOGETHER, turned), ONE) * floor
+        most = TOGETHER
+        for i in range(4):
+            if inverse_mass[s[i]] > dtype(0.0):
+                most = LAGGING
+        lost = wp.where(hard, wp.max(most, turned), ONE) * floor
         if end < floor - lost:
             t = wp.max(gap - floor, ZERO) / (gap - end)
             for i in range(sides):
