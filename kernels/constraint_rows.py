@@ -97,6 +97,47 @@ def lowest_compliance(alpha: Any, least: Any):
 
 
 @cache
+def set_projected_row(dtype):
+    """Device function that sets the three values from j on of a row c = y − p(y) of G, a vector, see :func:`linearise`.
+
+    ``total`` is the diagonal of G W Gᵀ, and ``most`` the largest |w|/m of its vertices. ``size`` bounds the summands of y.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def set_row(
+        j: int,
+        c: vec3,
+        total: dtype,
+        most: dtype,
+        size: dtype,
+        alpha: dtype,
+        least: dtype,
+        active: bool,
+        rows: row_values(dtype),
+    ):
+        excess = wp.max(lowest_compliance(alpha, least) * total - alpha, dtype(0.0))
+        diagonal = total + (alpha + excess)
+        inverted = wp.where(diagonal == dtype(0.0), dtype(0.0), dtype(1.0) / diagonal)
+        row = vec3()
+        force = vec3()
+        for a in range(3):
+            if not active:
+                rows.multipliers[j + a] = dtype(0.0)
+            force[a] = rows.multipliers[j + a]
+            row[a] = c[a] + (alpha + excess) * force[a]
+            rows.gap[j + a] = row[a]
+            rows.compliance[j + a] = alpha + excess
+            rows.inverse[j + a] = inverted
+        rows.carried[j] = wp.float64(most * excess * wp.length(force) * inverted)
+        rows.residual[j] = wp.float64(most * wp.length(row) * inverted)
+        lost = most * (size * inverted + wp.length(force))
+        rows.rounding[j] = wp.float64(dtype(ROUNDINGS) * epsilon(lost) * lost)
+
+    return set_row
+
+
+@cache
 def linearise(term: Term, dtype, scalar: bool, curved: bool):
     """Kernel over elements at x̃ + d: gap = C + α̃λ, the Jacobian, α̃ = 1/(kAh²), the inverse diagonal of J W Jᵀ + α̃.
 
@@ -113,6 +154,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
     y_of, weight, measure, dead_zone = local_coordinate(term, dtype, True), term.weight, term.measure, term.dead_zone
     gradient, constraint, constraint_gradient, secant = term.gradient, term.constraint, term.constraint_gradient, term.secant
     stiffening, share_of, row_of = term.stiffening, to_corner(term, dtype), covector_row(term, dtype, scalar, curved)
+    set_row = set_projected_row(dtype)
 
     @wp.func
     def size_of(stencil: wp.array2d(dtype=wp.int32), e: int, r: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
@@ -241,23 +283,6 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
                     w = wp.abs(weight(r, i)[m])
                     total += inverse_mass[stencil[e, i]] * w * w
                     most = wp.max(most, inverse_mass[stencil[e, i]] * w)
-            excess = wp.max(lowest_compliance(alpha, least) * total - alpha, dtype(0.0))
-            total += alpha + excess
-            inverted = wp.where(total == dtype(0.0), dtype(0.0), dtype(1.0) / total)
-            row = vec3()
-            force = vec3()
-            for a in range(3):
-                j = s + 3 * m + a
-                if not active:
-                    rows.multipliers[j] = dtype(0.0)
-                force[a] = rows.multipliers[j]
-                row[a] = c[m, a] + (alpha + excess) * force[a]
-                rows.gap[j] = row[a]
-                rows.compliance[j] = alpha + excess
-                rows.inverse[j] = inverted
-            rows.carried[s + 3 * m] = wp.float64(most * excess * wp.length(force) * inverted)
-            rows.residual[s + 3 * m] = wp.float64(most * wp.length(row) * inverted)
-            lost = most * (size * inverted + wp.length(force))
-            rows.rounding[s + 3 * m] = wp.float64(dtype(ROUNDINGS) * epsilon(lost) * lost)
+            set_row(s + 3 * m, c[m], total, most, size, alpha, least, active, rows)
 
     return linearise_constraints if scalar else linearise_projections

@@ -8,8 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from .constraint_rows import ROUNDINGS, RowLayout, first_row, lowest_compliance, row_values
-from .rotation import epsilon
+from .constraint_rows import RowLayout, first_row, row_values, set_projected_row
 from .term import Term
 from .vectors import types
 
@@ -20,7 +19,7 @@ def linearise_cells(term: Term, dtype):
     vec3, _ = types(dtype)
     M, weights_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
-    area, Q = term.measure, wp.constant(3 * term.rows)
+    area, Q, set_row = term.measure, wp.constant(3 * term.rows), set_projected_row(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def linearise(
@@ -65,24 +64,7 @@ def linearise_cells(term: Term, dtype):
                     w = wp.abs(weights[e][m])
                     total += inverse_mass[stencil[e, 0]] * w * w
                     most = wp.max(most, inverse_mass[stencil[e, 0]] * w)
-            excess = wp.max(lowest_compliance(alpha, least) * total - alpha, dtype(0.0))
-            total += alpha + excess
-            inverted = wp.where(total == dtype(0.0), dtype(0.0), dtype(1.0) / total)
-            row = vec3()
-            force = vec3()
-            for a in range(3):
-                j = s + 3 * m + a
-                if not active:
-                    rows.multipliers[j] = dtype(0.0)
-                force[a] = rows.multipliers[j]
-                row[a] = y[m, a] + (alpha + excess) * force[a]
-                rows.gap[j] = row[a]
-                rows.compliance[j] = alpha + excess
-                rows.inverse[j] = inverted
-            rows.carried[s + 3 * m] = wp.float64(most * excess * wp.length(force) * inverted)
-            rows.residual[s + 3 * m] = wp.float64(most * wp.length(row) * inverted)
-            lost = most * (size * inverted + wp.length(force))
-            rows.rounding[s + 3 * m] = wp.float64(dtype(ROUNDINGS) * epsilon(lost) * lost)
+            set_row(s + 3 * m, y[m], total, most, size, alpha, least, active, rows)
 
     return linearise
 

@@ -117,7 +117,7 @@ def margin_of(least: wp.float64, far: wp.float64):
     return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
 
 
-_way_of = load(wp.vec2d)
+_value, _way_of = load(wp.float64), load(wp.vec2d)
 
 
 @wp.func
@@ -135,6 +135,20 @@ def ways_of_sides(ways: wp.array(dtype=wp.vec2d), s: wp.vec4i, sides: int):
     return way, far
 
 
+@wp.func
+def needs_no_cut(e: int, way: wp.vec2d, margin: wp.float64, gap: wp.array(dtype=wp.float64), open: wp.array(dtype=wp.int32)):
+    """Whether pair e is ``open``, or its ``gap`` is too wide for moves of the length ``way`` of its sides to be shortened.
+
+    For any division of the gap, approaches with at most this sum are not shortened.
+    """
+    found = wp.bool(False)
+    if gap:
+        found = way[0] + way[1] <= WIDE * _value(gap, e) - KEPT / CLAMPED * margin
+    if open:
+        found = found or open[e] != 0
+    return found
+
+
 @cache
 def cut_by_planes(dtype):
     """Kernel over pairs: reduces the ``share`` of each vertex, the fraction of its wanted move from x that it may make.
@@ -149,7 +163,7 @@ def cut_by_planes(dtype):
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
     wanted = wanted_move(dtype)
-    value, stencil = load(wp.float64), load(wp.vec4i)
+    stencil = load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def cut_by_each_plane(
@@ -178,13 +192,8 @@ def cut_by_planes(dtype):
         sides = wp.where(of_vertex, 1, 2)
         way, far = ways_of_sides(ways, s, sides)
         margin = margin_of(least, far)
-        if gap:
-            # For any division of the gap, approaches with at most this sum are not shortened.
-            if way[0] + way[1] <= WIDE * value(gap, e) - KEPT / CLAMPED * margin:
-                return
-        if open:
-            if open[e] != 0:
-                return
+        if needs_no_cut(e, way, margin, gap, open):
+            return
         origin = exact(x[s[0]])
         _w, y, _inside = nearest(of_vertex, origin, exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
         n = y / wp.max(wp.length(y), wp.float64(1e-300))
@@ -243,7 +252,7 @@ def cut_as_a_whole(dtype):
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    value, stencil = load(wp.float64), load(wp.vec4i)
+    stencil = load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def cut_each_as_a_whole(
@@ -270,12 +279,8 @@ def cut_as_a_whole(dtype):
         sides = wp.where(of_vertex, 1, 2)
         way, far = ways_of_sides(ways, s, sides)
         margin = margin_of(least, far)
-        if gap:
-            if way[0] + way[1] <= WIDE * value(gap, e) - KEPT / CLAMPED * margin:
-                return
-        if open:
-            if open[e] != 0:
-                return
+        if needs_no_cut(e, way, margin, gap, open):
+            return
         a = exact(x[s[0]])
         b = exact(x[s[1]])
         c = exact(x[s[2]])

@@ -1,4 +1,4 @@
-"""What devices of textile laboratories read, against the moduli of the fabric and closed forms."""
+"""Readings of the devices of textile laboratories, against the moduli of the fabric and closed forms."""
 
 import json
 from dataclasses import replace
