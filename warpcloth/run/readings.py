@@ -108,13 +108,14 @@ class Markers:
             )
         _refuse_no_triangles(path, scene)
         if "id" in names:
-            ids = [row[names.index("id")] for _line, row in rows]
+            ids: list[Any] = [row[names.index("id")] for _line, row in rows]
             starts = _starts(path, scene, [(rows[k][0], ids[k], found[k, 1:]) for k in np.flatnonzero(used & (frames == 0))])
             own = {name: k for k, name in enumerate(starts)}
         else:  # a marker of its own for each row of a frame
-            ids, counts = [], {}
+            counts: dict[Any, int] = dict.fromkeys(frames, 0)
+            ids = []
             for frame in frames:
-                ids.append(counts.setdefault(frame, 0))
+                ids.append(counts[frame])
                 counts[frame] += 1
             starts, own = {}, {k: k for k in range(max(counts.values()))}
         positions = np.full((frames[used].max(), len(own), 3), np.nan)

@@ -177,10 +177,13 @@ class Animation:
         given |= {name: np.asarray(getattr(self, name))[copy].item() for name in ("worst_strain", "cut", "crossings")}
         summary = self.self_contact
         if summary is not None:
-            summary = summary._replace(kept=float(summary.kept[copy]), least_gap=float(summary.least_gap[copy]))
+            summary = summary._replace(
+                kept=float(np.asarray(summary.kept)[copy]), least_gap=float(np.asarray(summary.least_gap)[copy])
+            )
         inside = tuple(each for each in self.inside if each.copy == copy)
-        status = self.status._replace(frame=int(self.status.good[copy]), good=self.status.good[copy : copy + 1])
-        status = status._replace(residual=float(np.broadcast_to(self.status.residual, len(self.status.good))[copy]))
+        good = np.asarray(self.status.good)
+        status = self.status._replace(frame=int(good[copy]), good=good[copy : copy + 1])
+        status = status._replace(residual=float(np.broadcast_to(self.status.residual, len(good))[copy]))
         return replace(self, inside=inside, self_contact=summary, status=status, **given)
 
     def __repr__(self) -> str:

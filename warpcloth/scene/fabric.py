@@ -78,11 +78,16 @@ class Fabric:
         Raises:
             ValueError: A number that it needs is None.
         """
+        return PlateBending(**self._plate(), **given)
+
+    def _plate(self) -> dict[str, Any]:
+        """Returns the fields of :meth:`bending` that are known."""
         one, two = self._known("bending", "bending_warp", "bending_weft")
         E1, E2, ratio = self._known("bending", "warp", "weft", "poisson_ratio")
+        found = {"stiffness": one, "weft_ratio": two / one, "poisson_ratio": ratio * (E2 / E1) ** 0.5}
         if self.shear is not None and self.thickness is not None:
-            given["twist_ratio"] = self.shear * self.thickness**2 / 12.0 / one
-        return PlateBending(stiffness=one, weft_ratio=two / one, poisson_ratio=ratio * (E2 / E1) ** 0.5, **given)
+            found["twist_ratio"] = self.shear * self.thickness**2 / 12.0 / one
+        return found
 
     def terms(self, **given: Any) -> list[Declared]:
         """The energies of the fabric: :meth:`membrane` and :meth:`bending`.
@@ -112,11 +117,11 @@ class Fabric:
         Raises:
             ValueError: A number that it needs is None.
         """
-        plate, c, s = self.bending(), np.cos(angle), np.sin(angle)
-        root = plate.weft_ratio**0.5
-        twist = 0.5 * (1.0 - plate.poisson_ratio) * root if plate.twist_ratio is None else plate.twist_ratio
-        mixed = 2.0 * (plate.poisson_ratio * root + 2.0 * twist)
-        return float(plate.stiffness * (c**4 + plate.weft_ratio * s**4 + mixed * s**2 * c**2))
+        plate, c, s = self._plate(), np.cos(angle), np.sin(angle)
+        root, ratio = plate["weft_ratio"] ** 0.5, plate["poisson_ratio"]
+        twist = plate.get("twist_ratio", 0.5 * (1.0 - ratio) * root)
+        mixed = 2.0 * (ratio * root + 2.0 * twist)
+        return float(plate["stiffness"] * (c**4 + plate["weft_ratio"] * s**4 + mixed * s**2 * c**2))
 
     @property
     def bending_lengths(self) -> tuple[float, float]:

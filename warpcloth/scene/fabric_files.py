@@ -168,7 +168,7 @@ def _matched(text, names):
 
 def _keys(path, names, columns):
     """Returns the indices of columns by (name, direction); of both directions for a column that names none."""
-    found = {}
+    found: dict[tuple[str, int], int] = {}
     for k, text in enumerate(names):
         match = _matched(text, columns)
         if match is None:

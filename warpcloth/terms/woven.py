@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -43,7 +43,8 @@ class Woven(Declared):
     def isotropic(self: Own) -> Own:
         """Returns the isotropic energy whose stiffness is the geometric mean of those along warp and weft."""
         mean = self._numeric("stiffness") * np.sqrt(self._numeric("weft_ratio"))
-        return replace(self, stiffness=mean[()], weft_ratio=1.0, **{self.shearing: None})
+        unshearing: dict[str, Any] = {self.shearing: None}
+        return replace(self, stiffness=mean[()], weft_ratio=1.0, **unshearing)
 
     def warp_directions(self, mesh: Mesh) -> np.ndarray:
         """Unit vectors along the warp in the plane of each triangle, (T, 3).
