@@ -243,7 +243,7 @@ def _unknowns(dtype, numbers):
 
 @cache
 def start_iteration(dtype, numbers: bool = False):
-    """Kernel over unknowns: x = 0, r = b, z = P r, p = z."""
+    """Kernel over unknowns: x = 0, r = b, z = P r, p = z in the copies that are ``wanted``."""
     vector, block, module = _unknowns(dtype, numbers)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -251,6 +251,9 @@ def start_iteration(dtype, numbers: bool = False):
         # state in
         preconditioner: wp.array(dtype=block),
         b: wp.array(dtype=vector),
+        # parameters
+        wanted: wp.array(dtype=wp.int32),
+        per_copy: int,
         # out
         x: wp.array(dtype=vector),
         r: wp.array(dtype=vector),
@@ -258,6 +261,8 @@ def start_iteration(dtype, numbers: bool = False):
         p: wp.array(dtype=vector),
     ):
         i = wp.tid()
+        if wanted[i // per_copy] == 0:
+            return
         if wp.static(numbers):
             x[i] = dtype(0.0)
         else:

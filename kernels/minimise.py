@@ -4,13 +4,211 @@
 the start, s = 0 and load = 1.
 """
 
+from enum import IntEnum
 from functools import cache
 
 import warp as wp
 
+from .term import HessianPolicy
 from .vectors import types
 
 MODULE = "warpcloth.minimise"  # of the kernels over copies
+
+# Number of roundings in a force: of lengths, strain, products, and the sum over the elements of a vertex.
+ROUNDINGS = wp.constant(wp.float64(4.0))
+# Typical rounding of the energy relative to its worst case, because roundings add up like a random walk.
+TYPICAL = wp.constant(wp.float64(0.1))
+# Iterations after which the loop on the device returns to the host, which can then be interrupted.
+AT_ONCE = wp.constant(8)
+RAW, CLAMP = wp.constant(int(HessianPolicy.RAW)), wp.constant(int(HessianPolicy.CLAMP))
+
+
+class End(IntEnum):
+    """How the minimisation of a copy ended; each is the result of this name in :class:`warpcloth.core.status.Result`."""
+
+    ITERATIONS_USED_UP = 0
+    CONVERGED = 1
+    ROUNDED = 2
+    STALLED = 3
+    DIVERGED = 4
+
+
+USED_UP, CONVERGED, ROUNDED = (wp.constant(int(end)) for end in (End.ITERATIONS_USED_UP, End.CONVERGED, End.ROUNDED))
+STALLED, DIVERGED = wp.constant(int(End.STALLED)), wp.constant(int(End.DIVERGED))
+
+
+@wp.struct
+class DescentState:
+    """The minimisation of each copy, (B,) arrays, and flags of all, (1,).
+
+    ``residual`` is the largest unbalanced acceleration over ``scale`` [m/s²], ``first`` its first value, at least 1; ``energy``
+    is φ [J] and ``end`` an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also iterates before the host
+    looks.
+    """
+
+    active: wp.array(dtype=wp.int32)
+    end: wp.array(dtype=wp.int32)
+    iterations: wp.array(dtype=wp.int32)
+    residual: wp.array(dtype=wp.float64)
+    scale: wp.array(dtype=wp.float64)
+    first: wp.array(dtype=wp.float64)
+    energy: wp.array(dtype=wp.float64)
+    proceed: wp.array(dtype=wp.int32)
+    more: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Limits:
+    """The tolerance of the residual, the maximum number of iterations, (1,), and the given scale of each copy, or 0, (B,)."""
+
+    tolerance: wp.array(dtype=wp.float64)
+    iterations: wp.array(dtype=wp.int32)
+    scale: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def look(progress: DescentState, limits: Limits, copy: int, residual: wp.float64, end: int):
+    """Notes the residual of an active copy and whether it has ended; ``end`` holds if the residual is finite and too large."""
+    found = end
+    if not wp.isfinite(residual):
+        found = DIVERGED
+    elif residual <= limits.tolerance[0]:
+        found = CONVERGED
+    progress.residual[copy] = residual
+    progress.end[copy] = found
+    done = progress.iterations[copy]
+    if found != USED_UP or done >= limits.iterations[0]:
+        progress.active[copy] = 0
+    else:
+        progress.active[copy] = 1
+        progress.proceed[0] = 1
+        if (done + 1) % AT_ONCE != 0:
+            progress.more[0] = 1
+
+
+@cache
+def begin_descent():
+    """Kernel over copies: the state of :class:`DescentState` at d = 0; ``proceed`` and ``more`` are 0 before."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def begin(
+        # state in
+        acceleration: wp.array(dtype=wp.float64),
+        energy: wp.array(dtype=wp.float64),
+        # parameters
+        limits: Limits,
+        # out
+        progress: DescentState,
+    ):
+        copy = wp.tid()
+        scale = limits.scale[copy]
+        if scale == wp.float64(0.0):
+            scale = acceleration[copy]
+        if scale == wp.float64(0.0):
+            scale = wp.float64(1.0)
+        residual = acceleration[copy] / scale
+        progress.scale[copy] = scale
+        progress.first[copy] = wp.max(residual, wp.float64(1.0))
+        progress.energy[copy] = energy[copy]
+        progress.iterations[copy] = 0
+        look(progress, limits, copy, residual, USED_UP)
+
+    return begin
+
+
+@cache
+def begin_newton():
+    """Kernel over copies: sets the tolerance of the linear system, and the raw Hessian if ``adaptive`` is 1; flags become 0.
+
+    Linear systems are solved more accurately as the residual falls (Eisenstat and Walker 1996).
+    """
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def begin(
+        # parameters
+        adaptive: int,
+        # in and out
+        progress: DescentState,
+        # out
+        policy: wp.array(dtype=wp.int32),
+        tolerance: wp.array(dtype=wp.float64),
+        indefinite: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        progress.proceed[0] = 0
+        progress.more[0] = 0
+        indefinite[0] = 0
+        if adaptive == 1:
+            policy[copy] = RAW
+        forcing = progress.residual[copy] / progress.first[copy]
+        tolerance[copy] = wp.clamp(forcing, wp.float64(1.0e-12), wp.float64(0.1))
+
+    return begin
+
+
+@cache
+def find_indefinite():
+    """Kernel over copies: those with a negative curvature are to be assembled with ``CLAMP`` and solved ``again``."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def find(
+        # state in
+        negative: wp.array(dtype=wp.int32),
+        # out
+        policy: wp.array(dtype=wp.int32),
+        again: wp.array(dtype=wp.int32),
+        indefinite: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        again[copy] = negative[copy]
+        if negative[copy] == 1:
+            policy[copy] = CLAMP
+            indefinite[0] = 1
+
+    return find
+
+
+@cache
+def end_newton():
+    """Kernel over copies: finds whether an active copy has ended after an iteration.
+
+    Rounding allows no further progress if the gradient is within its rounding, and no step was found or φ fell by no more than
+    its rounding. A copy is stuck if no step was found or the direction does not descend.
+    """
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def end(
+        # state in
+        acceleration: wp.array(dtype=wp.float64),
+        energy: wp.array(dtype=wp.float64),
+        square: wp.array(dtype=wp.float64),
+        rounding: wp.array(dtype=wp.float64),
+        lost: wp.array(dtype=wp.float64),
+        step: wp.array(dtype=wp.float64),
+        slope: wp.array(dtype=wp.float64),
+        # parameters
+        resolution: wp.float64,
+        limits: Limits,
+        # in and out
+        progress: DescentState,
+    ):
+        copy = wp.tid()
+        if progress.active[copy] == 0:
+            return
+        progress.iterations[copy] = progress.iterations[copy] + 1
+        before = progress.energy[copy]
+        progress.energy[copy] = energy[copy]
+        noisy = square[copy] <= ROUNDINGS * ROUNDINGS * rounding[copy]
+        level = before - energy[copy] <= resolution * wp.abs(before) + TYPICAL * lost[copy]
+        stuck = step[copy] == wp.float64(0.0) or not (slope[copy] < wp.float64(0.0))
+        ended = USED_UP
+        if noisy and (stuck or level):
+            ended = ROUNDED
+        elif stuck and not noisy:
+            ended = STALLED
+        look(progress, limits, copy, acceleration[copy] / progress.scale[copy], ended)
+
+    return end
 
 
 @cache

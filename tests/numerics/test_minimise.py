@@ -74,3 +74,37 @@ def test_a_quadratic_energy_takes_one_whole_step(apart, device):
     found = (model.positions.numpy() + minimiser.correction.numpy()).reshape(copies, 2, 3)[:, 0]
     # Each of two forces of 100 N is rounded by ε of it.
     assert np.abs(found).max() < 2.0 * EPS
+
+
+@pytest.mark.parametrize("linear", ["cg", "factorised"])
+def test_each_copy_ends_by_itself(linear, device):
+    """Crumpled sheets of unlike stiffness beside one in balance and one that is not finite, to the bits of each alone.
+
+    The raw Hessian of the crumpled ones has negative curvatures, and they take more iterations than the loop on the device does
+    before the host looks.
+    """
+    grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
+    crumpled = 0.3 * grid.points + 0.05 * np.random.default_rng(0).normal(size=grid.points.shape)
+    start = np.stack([crumpled, grid.points, crumpled, crumpled])
+    terms = [wc.Spring(pairs=("structural", "shear"), stiffness=1e3)]
+    scene = wc.Scene(grid, density=0.1, terms=terms, pins=[0], gravity=(0.0, 0.0, 0.0))
+
+    def descend(copies, iterations):
+        vary = {"positions": start[copies], "Spring.stiffness": np.array([1e2, 1e2, 1e3, 1e2])[copies]}
+        model = scene.build(device=device, dtype="float64", copies=len(copies), vary=vary)
+        base = model.positions.numpy().reshape(len(copies), -1, 3)
+        base[[copy == 3 for copy in copies], 7] = np.nan
+        minimiser = Minimiser(model, model.array(base.reshape(-1, 3), model.vec3), "adaptive", linear, s=1e3)
+        results = minimiser.minimise(1e-8, iterations, np.full(len(copies), 9.81))
+        return results, minimiser.residual, minimiser.iterations, minimiser.correction.numpy().reshape(base.shape)
+
+    for iterations, crumpled_end in ((300, Result.CONVERGED), (2, Result.ITERATIONS_USED_UP)):
+        results, residual, most, d = descend([0, 1, 2, 3], iterations)
+        assert results == [crumpled_end, Result.CONVERGED, crumpled_end, Result.DIVERGED]
+        alone = [descend([copy], iterations) for copy in range(4)]
+        for copy, (result, own_residual, _, own_d) in enumerate(alone):
+            assert result[0] is results[copy]
+            np.testing.assert_array_equal(own_residual[0], residual[copy])
+            np.testing.assert_array_equal(own_d[0], d[copy])
+        counts = [each[2] for each in alone]
+        assert counts[1] == counts[3] == 0 and most == max(counts) and (most > 8 or iterations == 2)

@@ -126,7 +126,7 @@ def test_02_newton_loses_definiteness_in_compression(hessian, part, free, device
         )
         minimiser = stepper.minimiser
         minimiser.clear()
-        minimiser._assemble()
+        minimiser._launch_assemble()
         matrix = minimiser.hessian.matrix().toarray()
         least = np.linalg.eigvalsh(matrix if free else matrix[3:, 3:])[0]
         # Two free ends move together at no cost, which is the least where the spring itself adds something.
@@ -136,7 +136,7 @@ def test_02_newton_loses_definiteness_in_compression(hessian, part, free, device
         if hessian != "raw":
             assert stepper.residual <= 1e-10, "every semi-definite policy reaches the minimum"
         elif not definite:
-            assert minimiser.linear.negative.read()[0] == 1, "the pivots show the negative curvature"
+            assert minimiser.linear.negative.numpy()[0] == 1, "the pivots show the negative curvature"
 
 
 def test_02_a_line_search_keeps_newton_going_downhill(device):
@@ -152,7 +152,7 @@ def test_02_a_line_search_keeps_newton_going_downhill(device):
     for iterations in range(1, 12):
         minimiser.minimise(1e-15, iterations)
         points.append(base + minimiser.correction.numpy())
-        steps.append(minimiser._step.read()[0])
+        steps.append(minimiser.search.step.numpy()[0])
     values = np.array([objective(crumpled, x, device) for x in points])
     assert (np.diff(values) < 0.0).all()
     short = [i for i, step in enumerate(steps) if step < 1.0]

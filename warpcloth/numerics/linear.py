@@ -44,8 +44,8 @@ class ConjugateGradients:
         self.preconditioner = per_unknown(matrix.block)
 
         self.rz, self.new_rz, self.pq, self.first, self.ratio = (model.scalars() for _ in range(5))
-        self.active, self.negative = model.scalars(wp.int32), Mirror(model.scalars(wp.int32))
-        self.tolerance = Mirror(model.scalars())
+        self.active, self.negative = (model.scalars(wp.int32) for _ in range(2))
+        self.tolerance = model.scalars()
         self.proceed, self.iteration = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         of_unknowns = linear.start_iteration, linear.advance, linear.new_direction
         self._launch = model.launcher(
@@ -55,12 +55,12 @@ class ConjugateGradients:
         )
 
     def solve(self, b, x, wanted):
-        """Solves for x = A⁻¹ b to the relative ``tolerance`` (B,), for the copies that are ``wanted`` (B,); others get 0."""
-        N, B = self.matrix.count, self.model.copies
+        """Solves for x = A⁻¹ b to the relative ``tolerance`` (B,), for the copies that are ``wanted`` (B,); others keep x."""
+        N, B, n = self.matrix.count, self.model.copies, self.matrix.per_copy
         self.matrix.invert_diagonal(self.preconditioner)
-        self._launch(linear.start_iteration, N, [self.preconditioner, b], [x, self.r, self.z, self.p])
+        self._launch(linear.start_iteration, N, [self.preconditioner, b, wanted, n], [x, self.r, self.z, self.p])
         self.sums.dot(self.r, self.z, self.rz)
-        self.negative.array.zero_()
+        self.negative.zero_()
         self._launch(linear.start_copies, B, [self.rz, wanted], [self.first, self.active, self.iteration, self.proceed])
         wp.capture_while(self.proceed, self._iterate, x=x)
 
@@ -72,8 +72,8 @@ class ConjugateGradients:
         self._launch(linear.advance, N, [self.preconditioner, self.p, self.q, *scalars], [x, self.r, self.z])
         self.sums.dot(self.r, self.z, self.new_rz, self.active)
         self._launch(count_pass, 1, [], [self.iteration, self.proceed])
-        given = [self.new_rz, self.pq, self.first, self.tolerance.array]
-        changed = [self.rz, self.active, self.negative.array, self.ratio, self.proceed]
+        given = [self.new_rz, self.pq, self.first, self.tolerance]
+        changed = [self.rz, self.active, self.negative, self.ratio, self.proceed]
         self._launch(linear.check_copies, B, given, changed)
         self._launch(limit_passes, 1, [self.iteration, self.iterations], [self.proceed])
         self._launch(linear.new_direction, N, [self.z, self.ratio, self.active, n], [self.p])
@@ -97,22 +97,23 @@ class Factorised:
         self.matrices = hessian.matrices()
         self.starts = np.cumsum([0, *(len(matrix.data) for matrix in self.matrices)])
         self.values = Mirror(hessian.values)
-        self.negative = Mirror(model.scalars(wp.int32))
+        self.negative, self.tolerance = model.scalars(wp.int32), model.scalars()
         self._mirrors = {}
 
     def solve(self, b, x, wanted):
-        """Solves for x = A⁻¹ b in float64; 0 for copies that are not ``wanted``, or whose A is singular or not finite."""
+        """Solves for x = A⁻¹ b in float64; 0 if A is singular or not finite. Copies that are not ``wanted`` keep x."""
         right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
         sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
-        solution, negative = np.zeros_like(sides), np.zeros(self.model.copies, dtype=bool)
+        solution, negative = left.read().astype(np.float64).reshape(sides.shape), np.zeros(self.model.copies, dtype=bool)
         values, coupling = self.values.read(), self.hessian.coupling()
         for copy in np.flatnonzero(wanted.read()):
             factor = self._factor(copy, values, coupling)
             found = None if factor is None else factor.solve(sides[copy])
+            solution[copy] = 0.0
             if found is not None and np.isfinite(found).all():
                 solution[copy], negative[copy] = found, (factor.U.diagonal() < 0.0).any()
         left.write(solution.reshape(-1, 3))
-        self.negative.write(negative)
+        self._mirror(self.negative).write(negative)
 
     def curves_down(self, unresolved=0.0):
         """Returns whether a copy has an eigenvalue below −(1000 ε times its largest diagonal entry + ``unresolved`` [N/m])."""

@@ -1,5 +1,7 @@
 """Newton's method with a line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d, shared by motion and equilibrium."""
 
+from functools import partial
+
 import numpy as np
 import warp as wp
 
@@ -7,17 +9,13 @@ from ..core.capture import Mirror, Segment
 from ..core.hessian import Hessian
 from ..core.status import Result
 from ..core.sums import Sums
+from ..kernels import minimise as kernels
 from ..kernels.elementwise import negate
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
-from .iterate import GravityScale, iterate
+from .iterate import GravityScale
 from .linear import ConjugateGradients, Factorised
 from .search import Search
-
-# Number of roundings in a force: of lengths, strain, products, and the sum over the elements of a vertex.
-ROUNDINGS = 4.0
-# Typical rounding of the energy relative to its worst case, because roundings add up like a random walk.
-TYPICAL = 0.1
 
 POLICIES = {
     "adaptive": HessianPolicy.RAW,
@@ -43,7 +41,7 @@ class Minimiser:
     Attributes:
         correction: d (N,) [m].
         residual: The largest unbalanced acceleration of each copy divided by ``scale``, (B,), after :meth:`minimise`.
-        scale: The acceleration by which the residual of each copy is divided, (B,) [m/s²], after :meth:`minimise`.
+        gravity: Magnitude of gravity of each copy (B,) [m/s²].
         iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
 
@@ -65,26 +63,42 @@ class Minimiser:
         self.work, self.lost = (wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2))
 
         self.square, self.rounding, self.lost_energy, self.acceleration = (model.scalars() for _ in range(4))
-        self.active = model.scalars(wp.int32)
-        self._active, self._policy = Mirror(self.active), Mirror(self.hessian.policy)
-        search = self.search
-        read = (search.energy, self.square, self.rounding, self.lost_energy, search.step, search.slope)
-        self._energy, self._square, self._rounding, self._lost, self._step, self._slope = (Mirror(array) for array in read)
-        self._acceleration = Mirror(self.acceleration)
         self.edge = float(np.median(model.scene.mesh.edge_lengths))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
-        self._launch = model.launcher(((negate, rounding), model.dtype))
+        self._allocate_progress()
+        of_copies = kernels.begin_descent, kernels.begin_newton, kernels.find_indefinite, kernels.end_newton
+        self._launch = model.launcher(((negate, rounding), model.dtype), (of_copies,))
         self.record()
-        self.gravity_scale, self._given_scale = GravityScale(model), None
         self.residual, self.iterations = np.zeros(model.copies), 0
 
+    def _allocate_progress(self):
+        """Allocates what the kernels know of the descent, and what the host reads of it."""
+        model, flag = self.model, partial(wp.zeros, 1, dtype=wp.int32, device=self.model.device)
+        self._progress, self._limits = kernels.DescentState(), kernels.Limits()
+        for name in ("active", "end", "iterations"):
+            setattr(self._progress, name, model.scalars(wp.int32))
+        for name in ("residual", "scale", "first", "energy"):
+            setattr(self._progress, name, model.scalars())
+        self._progress.proceed, self._progress.more = flag(), flag()
+        self._limits.tolerance, self._limits.scale = wp.zeros(1, dtype=wp.float64, device=model.device), model.scalars()
+        self._limits.iterations = flag()
+        self.active, self._again, self._indefinite = self._progress.active, model.scalars(wp.int32), flag()
+        read = ("end", "iterations", "residual", "scale", "proceed")
+        self._read = {name: Mirror(getattr(self._progress, name)) for name in read}
+        self._given = {name: Mirror(getattr(self._limits, name)) for name in ("tolerance", "iterations", "scale")}
+        self._found = Mirror(self._indefinite)
+        self.gravity, self._present = GravityScale(model).gravity, None
+
     def record(self):
-        """Records what an iteration launches."""
+        """Captures what :meth:`minimise` launches."""
         device = self.model.device
-        self._clear = Segment(device, self._launch_clear)
-        self._assemble = Segment(device, self._launch_assemble)
-        self._solve = Segment(device, self._launch_solve) if self.linear.capturable else self._launch_solve
-        self._step_on = Segment(device, self._launch_search)
+        self._start = Segment(device, self._launch_start)
+        if self.linear.capturable:
+            self._go_on = Segment(device, self._launch_iterations)
+            return
+        launches = self._launch_begin, self._launch_assemble, self._launch_find, self._launch_end
+        self._begin, self._assemble, self._find, self._end = (Segment(device, launch) for launch in launches)
+        self._go_on = self._iterate
 
     def set_objective(self, s, load):
         """Sets s and load, and captures again the launches that have the old values."""
@@ -99,55 +113,39 @@ class Minimiser:
         4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) per vertex, and an iteration lowered φ by no more than rounding. The norm
         alone would not do, because the noise of stiff directions may hide the error of soft ones.
 
+        If the linear solver runs on the device, so does the loop: the host waits once in ``AT_ONCE`` iterations.
+
         Returns:
             A :class:`Result` for each copy.
         """
-        self._given_scale = scale
-        ended = iterate(self, tolerance, iterations)
-        self.residual, self.iterations = ended.residual, ended.iterations
-        return ended.results
+        self._set_limits(tolerance, iterations, self.gravity if scale is None else scale)
+        self._start()
+        self._go_on()
+        while self._read["proceed"].read()[0]:
+            self._go_on()
+        self.residual = self._read["residual"].read().copy()
+        self.iterations = int(self._read["iterations"].read().max())
+        return [Result[kernels.End(end).name] for end in self._read["end"].read()]
 
-    # The loop of `iterate`.
+    def _set_limits(self, tolerance, iterations, scale):
+        present = tolerance, iterations, scale.tobytes()
+        if present != self._present:
+            for name, value in (("tolerance", tolerance), ("iterations", iterations), ("scale", scale)):
+                self._given[name].write(value)
+            self._present = present
 
-    def start(self):
-        """Starts from d = 0."""
-        self.clear()
-        acceleration = self._acceleration.read()
-        self.scale = self.gravity_scale.or_else(acceleration) if self._given_scale is None else self._given_scale
-        # Linear systems are solved more accurately as the residual falls (Eisenstat and Walker 1996).
-        self._first = np.maximum(acceleration / self.scale, 1.0)
-        self._before = self._energy.read().copy()
-        self._ended = {}
-
-    def measure(self):
-        """Returns the residual of each copy (B,), and which copies end for another reason."""
-        self.residual = self._acceleration.read() / self.scale
-        return self.residual, self._ended
-
-    def iterate(self, active):
-        """Takes a line-searched step along the Newton direction."""
-        self._active.write(active)
-        if self.linear.capturable:
-            self.linear.tolerance.write(np.clip(self.residual / self._first, 1e-12, 0.1))
-        self._find_direction()
-        self._step_on()
-        noisy = self._square.read() <= ROUNDINGS**2 * self._rounding.read()
-        before, self._before = self._before, self._energy.read().copy()
-        with np.errstate(invalid="ignore"):  # a copy may be NaN or infinite
-            level = before - self._before <= self.resolution * np.abs(before) + TYPICAL * self._lost.read()
-        # A copy is stuck if the search found no step, or the direction does not descend.
-        stuck = (self._step.read() == 0.0) | ~(self._slope.read() < 0.0)
-        self._ended = {Result.ROUNDED: noisy & (stuck | level), Result.STALLED: stuck & ~noisy}
-
-    def _find_direction(self):
-        if self.adaptive:
-            self._policy.write(int(HessianPolicy.RAW))
-        self._assemble()
-        self._solve()
-        if self.adaptive and (negative := self.linear.negative.read()).any():
-            self._policy.write(negative * int(HessianPolicy.CLAMP))
+    def _iterate(self):
+        """Iterates with a linear solver of the host."""
+        while self._read["proceed"].read()[0]:
+            self._begin()
             self._assemble()
-            self._solve()
+            self._launch_solve(self.active)
+            if self.adaptive:
+                self._find()
+                if self._found.read()[0]:
+                    self._assemble()
+                    self._launch_solve(self._again)
+            self._end()
 
     def curves_down(self, tolerance):
         """Returns whether the raw Hessian at d = 0 of a copy has a negative eigenvalue that ``tolerance`` does not explain.
@@ -170,23 +168,67 @@ class Minimiser:
         gradient = self.search.gradient.numpy().astype(np.float64).reshape(self.model.copies, -1, 3)
         return np.linalg.norm(gradient, axis=2).sum(axis=1)
 
+    @property
+    def scale(self):
+        """The acceleration by which the residual of each copy is divided, (B,) [m/s²], after :meth:`minimise`."""
+        return self._read["scale"].read().copy()
+
     def _assemble_raw(self):
-        before = self._policy.read().copy()
+        policy, before = self.hessian.policy, self.hessian.policy.numpy()
         self.clear()
-        self._policy.write(int(HessianPolicy.RAW))
-        self._active.write(1)
-        self._assemble()
-        self._policy.write(before)
+        policy.fill_(int(HessianPolicy.RAW))
+        self.active.fill_(1)
+        self._launch_assemble()
+        policy.assign(before)
 
     def clear(self):
-        """Sets d = 0 and everything that depends on it."""
-        self._clear()
+        """Launches d = 0 and everything that depends on it."""
+        self.search.launch_start()
+        self._launch_norms()
 
     # What the segments record.
 
-    def _launch_clear(self):
-        self.search.launch_start()
-        self._launch_norms()
+    def _launch_start(self):
+        """Launches the start from d = 0."""
+        self.clear()
+        self._progress.proceed.zero_()
+        given = [self.acceleration, self.search.energy, self._limits]
+        self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
+
+    def _launch_iterations(self):
+        """Launches iterations until no copy is active, but at most ``AT_ONCE``."""
+        wp.copy(self._progress.more, self._progress.proceed)
+        wp.capture_while(self._progress.more, self._launch_iteration)
+
+    def _launch_iteration(self):
+        self._launch_begin()
+        self._launch_assemble()
+        self._launch_solve(self.active)
+        if self.adaptive:
+            self._launch_find()
+            wp.capture_if(self._indefinite, self._launch_again)
+        self._launch_end()
+
+    def _launch_again(self):
+        """Launches the assembly and the solution for the copies whose Hessian is now clamped."""
+        self._launch_assemble()
+        self._launch_solve(self._again)
+
+    def _launch_begin(self):
+        out = [self._progress, self.hessian.policy, self.linear.tolerance, self._indefinite]
+        self._launch(kernels.begin_newton, self.model.copies, [int(self.adaptive)], out)
+
+    def _launch_find(self):
+        out = [self.hessian.policy, self._again, self._indefinite]
+        self._launch(kernels.find_indefinite, self.model.copies, [self.linear.negative], out)
+
+    def _launch_end(self):
+        """Launches the line search, and finds the copies that have ended."""
+        self._launch_search()
+        search = self.search
+        given = [self.acceleration, search.energy, self.square, self.rounding, self.lost_energy, search.step, search.slope]
+        given += [self.resolution, self._limits]
+        self._launch(kernels.end_newton, self.model.copies, given, [self._progress])
 
     def _launch_assemble(self):
         if self.pairs is not None:
@@ -200,8 +242,8 @@ class Minimiser:
         for values, total in ((self.work, self.rounding), (self.lost, self.lost_energy)):
             self.sums.sum(values, model.per_copy, total)
 
-    def _launch_solve(self):
-        self.linear.solve(self.right, self.search.direction, self.active)
+    def _launch_solve(self, wanted):
+        self.linear.solve(self.right, self.search.direction, wanted)
 
     def _launch_search(self):
         if self.pairs is not None:

@@ -178,13 +178,13 @@ def equilibrium(
     if result is Result.ROUNDED and residual <= tolerance:
         result = Result.CONVERGED
     # A sheet that did not move has its whole weight unbalanced. Without gravity, a start at rest has only rounding unbalanced.
-    elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity_scale.gravity[0] > 0.0:
+    elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity[0] > 0.0:
         result, began = Result.STALLED, f"rounding hides the equilibrium in {dtype}"
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
     use = None if result in SETTLED else "not an equilibrium"
     if result is Result.SADDLE:
         use = f"not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
-    unit = RESIDUAL.unit if minimiser.gravity_scale.gravity[0] > 0.0 else RESIDUAL.weightless
+    unit = RESIDUAL.unit if minimiser.gravity[0] > 0.0 else RESIDUAL.weightless
     message = sentence(result, dtype, residual, RESIDUAL.measure, unit, tolerance, use=use)
     if result is Result.STALLED:
         message = message.replace(result.value, began)
@@ -234,9 +234,7 @@ class _Descent:
         self._apart = wp.clone(base)  # the last positions without crossings
         self.scale = None  # from the first descent, because without gravity a later one would be scaled by its own rounding
         model = minimiser.model
-        self.load = float(
-            minimiser.gravity_scale.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64)
-        )
+        self.load = float(minimiser.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64))
         self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
 
     def run(self, load, s):

@@ -149,6 +149,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._active, self._stepped = Mirror(model.scalars(wp.int32)), Mirror(self._step)
         if options.linear == "cg":
             self._linear = ConjugateGradients(self.constraints, self._row_sums, LINEAR_ITERATIONS)
+            self._tolerance = Mirror(self._linear.tolerance)
         else:
             self._linear = FactorisedRows(self.constraints, (self._right, self._change, self._active.array))
         self._unbalanced, self._open, self._rounding, self._carried = (Mirror(model.scalars()) for _ in range(4))
@@ -178,7 +179,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         if self._linear.capturable:  # to a tenth of the tolerance of the step
             least = 1e3 * float(np.finfo(self.model.numpy_dtype).eps)
             wanted = 0.1 * self.options.tolerance / np.where(active, self._residual, 1.0)
-            self._linear.tolerance.write(np.clip(wanted, least, 0.1))
+            self._tolerance.write(np.clip(wanted, least, 0.1))
         self._solve()
         self._move()
         self._stuck = self._stepped.read() == 0.0
@@ -234,6 +235,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._row_sums.largest(constraints.carried, self._carried.array)
 
     def _launch_solve(self):
+        self._change.zero_()
         self._linear.solve(self._right, self._change, self._active.array)
 
     def _launch_move(self):

@@ -11,7 +11,8 @@ class ImplicitStepper(Stepper):
     """A solver that iterates on the correction d = x − x̃ until its residual is below a tolerance.
 
     A subclass has ``correction`` (N,) [m] and the methods ``start``, ``measure`` and ``iterate`` of
-    :func:`warpcloth.numerics.iterate.iterate`; ``start`` includes the prediction. Its constructor ends with :meth:`ready`.
+    :func:`warpcloth.numerics.iterate.iterate`, where ``start`` includes the prediction, or its own :meth:`minimise`. Its
+    constructor ends with :meth:`ready`.
     """
 
     def __init__(self, options, model):
@@ -42,10 +43,14 @@ class ImplicitStepper(Stepper):
             self.clear_steps.step(lambda: self.take(self._iterate))
 
     def _iterate(self):
-        ended = iterate(self, self.options.tolerance, self.options.iterations)
+        ended = self.minimise()
         self.iterations = ended.iterations
         self._finish()
         self.note(ended.results, ended.residual)
+
+    def minimise(self):
+        """Predicts and iterates; returns :class:`warpcloth.numerics.iterate.Ended`."""
+        return iterate(self, self.options.tolerance, self.options.iterations)
 
     def note(self, results, residual):
         """Notes how a step ended, for each copy."""

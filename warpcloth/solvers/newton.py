@@ -7,6 +7,7 @@ from ..base.checks import number, whole
 from ..core.capture import Segment
 from ..core.status import UNBALANCED, Residual
 from ..model.model import Model
+from ..numerics.iterate import Ended
 from ..numerics.minimise import Minimiser
 from ..terms.needs import FINITE
 from .facts import Benchmark, Facts
@@ -108,12 +109,7 @@ class NewtonStepper(ImplicitStepper):
         self.minimiser.record()
         self._record_end()
 
-    def start(self):
+    def minimise(self):
         self._predict()
-        self.minimiser.start()
-
-    def measure(self):
-        return self.minimiser.measure()
-
-    def iterate(self, active):
-        self.minimiser.iterate(active)
+        results = self.minimiser.minimise(self.options.tolerance, self.options.iterations)
+        return Ended(results, self.minimiser.residual, self.minimiser.iterations)
