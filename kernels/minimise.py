@@ -18,6 +18,8 @@ MODULE = "warpcloth.minimise"  # of the kernels over copies
 ROUNDINGS = wp.constant(wp.float64(4.0))
 # Typical rounding of the energy relative to its worst case, because roundings add up like a random walk.
 TYPICAL = wp.constant(wp.float64(0.1))
+# Largest relative tolerance of a linear system; the smallest one over that by which the residual must still fall.
+LOOSEST, LEFT = wp.constant(wp.float64(0.03)), wp.constant(wp.float64(0.5))
 # Iterations after which the loop on the device returns to the host, which can then be interrupted.
 AT_ONCE = wp.constant(8)
 RAW, CLAMP = wp.constant(int(HessianPolicy.RAW)), wp.constant(int(HessianPolicy.CLAMP))
@@ -41,9 +43,9 @@ STALLED, DIVERGED = wp.constant(int(End.STALLED)), wp.constant(int(End.DIVERGED)
 class DescentState:
     """The minimisation of each copy, (B,) arrays, and flags of all, (1,).
 
-    ``residual`` is the largest unbalanced acceleration over ``scale`` [m/s²], ``first`` its first value, at least 1; ``energy``
-    is φ [J] and ``end`` an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also iterates before the host
-    looks.
+    ``residual`` is the largest unbalanced acceleration over ``scale`` [m/s²], ``previous`` its value an iteration before, or 0;
+    ``energy`` is φ [J] and ``end`` an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also iterates before
+    the host looks.
     """
 
     active: wp.array(dtype=wp.int32)
@@ -51,7 +53,7 @@ class DescentState:
     iterations: wp.array(dtype=wp.int32)
     residual: wp.array(dtype=wp.float64)
     scale: wp.array(dtype=wp.float64)
-    first: wp.array(dtype=wp.float64)
+    previous: wp.array(dtype=wp.float64)
     energy: wp.array(dtype=wp.float64)
     proceed: wp.array(dtype=wp.int32)
     more: wp.array(dtype=wp.int32)
@@ -108,7 +110,7 @@ def begin_descent():
             scale = wp.float64(1.0)
         residual = acceleration[copy] / scale
         progress.scale[copy] = scale
-        progress.first[copy] = wp.max(residual, wp.float64(1.0))
+        progress.previous[copy] = wp.float64(0.0)
         progress.energy[copy] = energy[copy]
         progress.iterations[copy] = 0
         look(progress, limits, copy, residual, USED_UP)
@@ -117,16 +119,40 @@ def begin_descent():
 
 
 @cache
+def begin_at_guess():
+    """Kernel over copies: the state of :class:`DescentState` where the descent begins, for copies that are active at d = 0."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def begin(
+        # state in
+        acceleration: wp.array(dtype=wp.float64),
+        energy: wp.array(dtype=wp.float64),
+        # parameters
+        limits: Limits,
+        # in and out
+        progress: DescentState,
+    ):
+        copy = wp.tid()
+        if progress.active[copy] == 1:
+            progress.energy[copy] = energy[copy]
+            look(progress, limits, copy, acceleration[copy] / progress.scale[copy], USED_UP)
+
+    return begin
+
+
+@cache
 def begin_newton():
     """Kernel over copies: sets the tolerance of the linear system, and the raw Hessian if ``adaptive`` is 1; flags become 0.
 
-    Linear systems are solved more accurately as the residual falls (Eisenstat and Walker 1996).
+    The tolerance is 0.9 (residual/previous)², choice 2 of Eisenstat and Walker (1996), at most LOOSEST. It is not below LEFT
+    times limit/residual, because a more accurate solution would not save an iteration.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def begin(
         # parameters
         adaptive: int,
+        limits: Limits,
         # in and out
         progress: DescentState,
         # out
@@ -140,8 +166,14 @@ def begin_newton():
         indefinite[0] = 0
         if adaptive == 1:
             policy[copy] = RAW
-        forcing = progress.residual[copy] / progress.first[copy]
-        tolerance[copy] = wp.clamp(forcing, wp.float64(1.0e-12), wp.float64(0.1))
+        if progress.active[copy] == 1:
+            residual = progress.residual[copy]
+            forcing = LOOSEST
+            if progress.previous[copy] > wp.float64(0.0):
+                ratio = residual / progress.previous[copy]
+                forcing = wp.max(wp.float64(0.9) * ratio * ratio, LEFT * limits.tolerance[0] / residual)
+            tolerance[copy] = wp.clamp(forcing, wp.float64(1.0e-12), LOOSEST)
+            progress.previous[copy] = residual
 
     return begin
 
@@ -291,6 +323,29 @@ def begin_search():
         proceed[0] = 1
 
     return begin
+
+
+@cache
+def check_guess():
+    """Kernel over copies: keeps the step to a guess if φ is lower there, else sets it to 0, and ``rejected`` to 1."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def check(
+        # state in
+        start: wp.array(dtype=wp.float64),
+        trial: wp.array(dtype=wp.float64),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        # out
+        step: wp.array(dtype=wp.float64),
+        rejected: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        if active[copy] == 1 and not (trial[copy] < start[copy]):
+            step[copy] = wp.float64(0.0)
+            rejected[0] = 1
+
+    return check
 
 
 @cache

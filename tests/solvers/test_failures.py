@@ -150,6 +150,7 @@ def test_02_a_line_search_keeps_newton_going_downhill(device):
     base, minimiser = stepper.state.x.numpy().copy(), stepper.minimiser
     points, steps = [base], []
     for iterations in range(1, 12):
+        minimiser.correction.zero_()
         minimiser.minimise(1e-15, iterations)
         points.append(base + minimiser.correction.numpy())
         steps.append(minimiser.search.step.numpy()[0])

@@ -152,6 +152,7 @@ def test_newton_converges_quadratically(linear, device):
     stepper._predict()
     residuals = []
     for iterations in range(9):
+        stepper.minimiser.correction.zero_()
         stepper.minimiser.minimise(1e-15, iterations)
         residuals.append(stepper.minimiser.residual[0])
     r = np.array(residuals) / residuals[0]

@@ -80,8 +80,9 @@ class OneStep:
 
     @in_turn
     def set_state(self, stepper):
-        """Sets a bound solver to the state."""
+        """Sets a bound solver to the state, as if it had not stepped before."""
         model = stepper.model
+        stepper.reset()
         for array, values in zip(stepper.state, self._start, strict=True):
             array.assign(model.array(values, model.vec3))
         if stepper.count is not None:

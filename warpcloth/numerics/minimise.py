@@ -26,7 +26,7 @@ POLICIES = {
 
 
 class Minimiser:
-    """Minimises φ(d) of each copy from d = 0; the docstring of the module has the equation.
+    """Minimises φ(d) of each copy; the docstring of the module has the equation.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -37,6 +37,8 @@ class Minimiser:
         s: Weight of the inertia, 1/h² [1/s²].
         linear_iterations: Maximum number of iterations of a conjugate gradient solve.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
+        last: The array for d (N,) [m], which holds that of the last step. Without pairs a descent starts there if φ is lower
+            than at d = 0. None: every descent starts from d = 0.
 
     Attributes:
         correction: d (N,) [m].
@@ -45,11 +47,12 @@ class Minimiser:
         iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
 
-    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None):
+    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, last=None):
         self.model, self.base, self.pairs = model, base, pairs
+        self.warm = last is not None and pairs is None
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
-        self.search = Search(model, base, self.sums, s, pairs)
+        self.search = Search(model, base, self.sums, s, pairs, last)
         self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True, pairs=pairs)
         if linear == "cg":
@@ -66,8 +69,8 @@ class Minimiser:
         self.edge = float(np.median(model.scene.mesh.edge_lengths))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
         self._allocate_progress()
-        of_copies = kernels.begin_descent, kernels.begin_newton, kernels.find_indefinite, kernels.end_newton
-        self._launch = model.launcher(((negate, rounding), model.dtype), (of_copies,))
+        of_copies = kernels.begin_descent, kernels.begin_at_guess, kernels.begin_newton, kernels.find_indefinite
+        self._launch = model.launcher(((negate, rounding), model.dtype), ((*of_copies, kernels.end_newton),))
         self.record()
         self.residual, self.iterations = np.zeros(model.copies), 0
 
@@ -77,7 +80,7 @@ class Minimiser:
         self._progress, self._limits = kernels.DescentState(), kernels.Limits()
         for name in ("active", "end", "iterations"):
             setattr(self._progress, name, model.scalars(wp.int32))
-        for name in ("residual", "scale", "first", "energy"):
+        for name in ("residual", "scale", "previous", "energy"):
             setattr(self._progress, name, model.scalars())
         self._progress.proceed, self._progress.more = flag(), flag()
         self._limits.tolerance, self._limits.scale = wp.zeros(1, dtype=wp.float64, device=model.device), model.scalars()
@@ -189,11 +192,18 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        """Launches the start from d = 0."""
+        """Launches the start from d = 0, or from the last d."""
+        if self.warm:
+            wp.copy(self.right, self.correction)
         self.clear()
         self._progress.proceed.zero_()
         given = [self.acceleration, self.search.energy, self._limits]
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
+        if self.warm:
+            self.search.launch_guess(self.right, self.active)
+            self._launch_norms()
+            self._progress.proceed.zero_()
+            self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
     def _launch_iterations(self):
         """Launches iterations until no copy is active, but at most ``AT_ONCE``."""
@@ -216,7 +226,7 @@ class Minimiser:
 
     def _launch_begin(self):
         out = [self._progress, self.hessian.policy, self.linear.tolerance, self._indefinite]
-        self._launch(kernels.begin_newton, self.model.copies, [int(self.adaptive)], out)
+        self._launch(kernels.begin_newton, self.model.copies, [int(self.adaptive), self._limits], out)
 
     def _launch_find(self):
         out = [self.hessian.policy, self._again, self._indefinite]

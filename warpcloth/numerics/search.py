@@ -23,6 +23,7 @@ class Search:
         sums: :class:`warpcloth.core.sums.Sums`.
         s: See :class:`warpcloth.numerics.inertia.Inertia`.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
+        correction: The array for d (N,) [m], by default its own.
 
     Attributes:
         correction: d (N,) [m].
@@ -31,18 +32,18 @@ class Search:
         energy, slope, step: φ [J], its slope along p [J], and the step of each copy, (B,); a step of 0 if none was found.
     """
 
-    def __init__(self, model, base, sums, s, pairs=None):
+    def __init__(self, model, base, sums, s, pairs=None, correction=None):
         self.model, self.base, self.sums, self.inertia = model, base, sums, Inertia(model, s)
         self.pairs = pairs
         self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), Energy(model, sums, corrected=True)
-        self.correction, self.trial, self.gradient, self.direction = (model.vectors() for _ in range(4))
-
+        self.trial, self.gradient, self.direction = (model.vectors() for _ in range(3))
+        self.correction = model.vectors() if correction is None else correction
         self.energy, self.trial_energy, self.slope, self.trial_slope, self.step = (model.scalars() for _ in range(5))
         self.searching = model.scalars(wp.int32)
         self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self._launch = model.launcher(
             ((kernels.set_trial,), model.dtype),
-            ((kernels.begin_search, kernels.check_trial),),
+            ((kernels.begin_search, kernels.check_guess, kernels.check_trial),),
             ((count_pass, limit_passes), kernels.MODULE),
         )
         # Relative increase of φ that the approximate Wolfe condition counts as rounding. The energy of a spring of strain e has
@@ -70,6 +71,22 @@ class Search:
         started = [self.step, self.searching, self.trials, self.proceed]
         self._launch(kernels.begin_search, self.model.copies, [active], started)
         wp.capture_while(self.proceed, self._try_step)
+        self._take_trial()
+
+    def launch_guess(self, guess, active):
+        """Launches d = ``guess`` (N,) [m] for the ``active`` copies (B,), from d = 0, where that lowers φ."""
+        wp.copy(self.direction, guess)
+        started = [self.step, self.searching, self.trials, self.proceed]
+        self._launch(kernels.begin_search, self.model.copies, [active], started)
+        self._launch_trial()
+        self.proceed.zero_()
+        self._launch(
+            kernels.check_guess, self.model.copies, [self.energy, self.trial_energy, active], [self.step, self.proceed]
+        )
+        wp.capture_if(self.proceed, self._launch_trial)
+        self._take_trial()
+
+    def _take_trial(self):
         wp.copy(self.correction, self.trial)
         wp.copy(self.energy, self.trial_energy)
 

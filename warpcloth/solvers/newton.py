@@ -22,6 +22,7 @@ class Newton(ImplicitStep):
 
     It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Each step
     multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved, angular momentum is not.
+    Without self-contact a step starts from the x − x̃ of the last one where this lowers the function, else from x̃.
 
     Attributes:
         dt, substeps, integrator: See :class:`ImplicitStep`.
@@ -99,10 +100,13 @@ class NewtonStepper(ImplicitStepper):
         model = self.model
         if self.pairs is not None:
             self.pairs.filter.iterates()
-        self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, s=1.0 / self.he**2, pairs=self.pairs)
+        last = self.state.add("correction", model.vectors())
+        given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "last": last}
+        self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, **given)
         self.correction = self.minimiser.correction
         self._predict = Segment(model.device, self.launch_prediction)
         self.ready()
+        self.correction.zero_()  # that of the first steps of BDF2
 
     def record_again(self):
         self._predict = Segment(self.model.device, self.launch_prediction)
