@@ -148,6 +148,39 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
 
 
 @cache
+def row_norms(dtype):
+    """Kernel over rows of blocks: out = Σ √(‖·‖₁‖·‖∞) of the blocks of the row, in double precision.
+
+    √(‖·‖₁‖·‖∞) is a cheap upper bound of the spectral norm, equal to it along the axes and diagonals of a grid.
+    """
+    _, mat33 = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def norms_of_rows(
+        # state in
+        blocks: wp.array2d(dtype=mat33),
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        total = wp.float64(0.0)
+        for j in range(blocks.shape[1]):
+            block = blocks[i, j]
+            row, column, sum = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+            for a in range(3):
+                of_row, of_column = wp.float64(0.0), wp.float64(0.0)
+                for b in range(3):
+                    of_row += wp.abs(wp.float64(block[a, b]))
+                    of_column += wp.abs(wp.float64(block[b, a]))
+                row, column, sum = wp.max(row, of_row), wp.max(column, of_column), sum + of_row
+            norm = wp.sqrt(row * column)
+            total += wp.where(wp.isnan(sum), sum, norm)  # a maximum may lose NaN
+        out[i] = total
+
+    return norms_of_rows
+
+
+@cache
 def constant_blocks(term: Term, dtype):
     """Kernel over elements: out[e, K·i + j] = kₑ Aₑ wᵢ·wⱼ [N/m], the blocks of kAGᵀG, in double precision.
 

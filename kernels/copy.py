@@ -1,4 +1,4 @@
-"""Copies between arrays: rows, to measure the memory bandwidth, and chosen vertices."""
+"""Copies between arrays: rows, to measure the memory bandwidth, chosen vertices, and indices of a copy for all copies."""
 
 from functools import cache
 
@@ -64,3 +64,23 @@ def copy_chosen(dtype):
         out[targets[k]] = source[sources[k]]
 
     return copy_each_chosen
+
+
+@cache
+def repeat_indices():
+    """Kernel over (copies · m): out = the indices of the first copy (m,), plus ``step`` for each copy before."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def repeat_each_index(
+        # elements
+        indices: wp.array(dtype=wp.int32),
+        # parameters
+        step: int,
+        # out
+        out: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        m = indices.shape[0]
+        out[i] = indices[i % m] + i // m * step
+
+    return repeat_each_index

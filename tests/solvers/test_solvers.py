@@ -233,7 +233,7 @@ VARIED = {
 
 @pytest.mark.parametrize("name", VARIED)
 def test_limits_of_copies_are_the_least_of_each(name, device, monkeypatch):
-    """Found once for those that are alike, whatever number of them there is; and the quick one by itself."""
+    """Found once for those that are alike, and the slow one only of those of which it may be the least; the quick one alone."""
     (copies, vary), built = VARIED[name], {"device": device, "dtype": "float64"}
     scene = square(pins="corners", damping=0.05)
     alone = np.array([step_limits(one_of(scene, vary, copy).build(**built)) for copy in range(copies)])
@@ -241,12 +241,13 @@ def test_limits_of_copies_are_the_least_of_each(name, device, monkeypatch):
     monkeypatch.setattr(explicit, "_at_rest", lambda *given, before=explicit._at_rest: searches.append(1) or before(*given))
     model = scene.build(copies=copies, vary=vary, **built)
     assert step_limits(model) == tuple(alone.min(axis=0))
-    assert len(searches) == len(np.unique(alone, axis=0))
+    near = np.unique(alone[0.98 * alone[:, 1] <= alone[:, 0].min()], axis=0)
+    assert len(searches) == len(near)
     assert limit_in_motion(model) == alone[:, 1].min()
     # Below the second a step is stable about the rest shape too: no need to look for the first.
     fps = 1.0 / (0.999 * alone[:, 1].min())
     wc.Explicit(substeps=1).bind(replace(scene, fps=fps, duration=1 / fps).build(copies=copies, vary=vary, **built))
-    assert len(searches) == len(np.unique(alone, axis=0)) and (alone[:, 1] <= alone[:, 0]).all()
+    assert len(searches) == len(near) and (alone[:, 1] <= alone[:, 0]).all()
 
 
 @pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1)])

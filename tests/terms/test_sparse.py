@@ -116,6 +116,15 @@ def test_gradient_and_hessian_are_differences(device):
     assert (H[~free][:, ~free] == np.eye((~free).sum())).all()
 
 
+def test_the_hessian_of_a_copy_is_that_of_its_own_model(device):
+    declared, stiffness = sheet(), [20.0, 30.0]
+    hessian = Hessian(declared.build(device=device, copies=2, vary={"Laplacian.stiffness": stiffness}))
+    hessian.assemble(hessian.model.positions, 1.0)
+    alone = Hessian(sheet([declared.terms[0], Laplacian(stiffness=stiffness[1])]).build(device=device))
+    alone.assemble(alone.model.positions, 1.0)
+    assert (hessian.matrices()[1] != alone.matrix()).nnz == 0
+
+
 def test_explicit_steps_end_where_newton_does(device):
     """Implicit and symplectic Euler are of first order: half the step, half of what they are apart."""
     apart = []

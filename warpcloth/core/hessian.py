@@ -6,6 +6,9 @@ import warp as wp
 from ..base.turns import in_turn
 from ..kernels import assemble, linear, sparse
 from ..model.host_values import host_values
+from .block_pattern import TermCorners, find_pattern
+
+CHUNK = 1 << 16  # number of elements whose blocks `norms` computes at once
 
 
 def _is_sparse(elements):
@@ -18,22 +21,16 @@ class _Blocks:
     def __init__(self, model, elements, corrected):
         self.model, self.elements, K = model, elements, elements.term.vertices
         self._kernel = model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected)
-        self.blocks = wp.zeros((elements.count, K * K), dtype=model.mat33, device=model.device)
+        self.blocks = wp.empty((elements.count, K * K), dtype=model.mat33, device=model.device)
 
-    def pairs(self):
-        """The row and the column of each block."""
-        stencil = host_values(self.elements.stencil).astype(np.int64)
-        K = stencil.shape[1]
-        return np.repeat(stencil, K, axis=1).ravel(), np.tile(stencil, K).ravel()
+    def corners(self):
+        """The :class:`warpcloth.core.block_pattern.TermCorners`."""
+        stencil = host_values(self.elements.stencil)[: self.elements.per_copy]
+        return TermCorners(self.model, stencil.ravel(), K=stencil.shape[1])
 
     def launch(self, x, correction, policy):
         arguments = [*self.elements.arguments, x, correction, self.elements.per_copy, policy]
         self.model.launch(self._kernel, self.elements.count, arguments, [self.blocks])
-
-    def add_norms(self, norms, rows):
-        """Adds the norms of the blocks to their rows."""
-        K = self.elements.term.vertices
-        np.add.at(rows, host_values(self.elements.stencil), norms.reshape(-1, K, K).sum(axis=2))
 
 
 class _SparseBlocks:
@@ -43,21 +40,19 @@ class _SparseBlocks:
         self.model, self.elements, cells = model, elements, elements.cells
         self._kernel = model.kernel(sparse.blocks, cells.term, model.dtype, corrected)
         self._starts, count = cells.blocks()
-        self.blocks = wp.zeros(count, dtype=model.mat33, device=model.device)
+        self.blocks = wp.empty(count, dtype=model.mat33, device=model.device)
 
-    def pairs(self):
-        """The row and the column of each block."""
-        return self.elements.cells.pairs(self.elements)
+    def corners(self):
+        """The :class:`warpcloth.core.block_pattern.TermCorners`."""
+        elements, cells = self.elements, self.elements.cells
+        vertices = host_values(elements.stencil)[: elements.per_copy, 0]
+        return TermCorners(self.model, vertices, sizes=cells.sizes[: cells.per_copy].astype(np.int64))
 
     def launch(self, x, correction, policy):
         cells, elements = self.elements.cells, self.elements
         given = [cells.offsets, self._starts, elements.stencil, cells.weights, elements.stiffness, cells.rest]
         given += [x, correction, cells.per_copy, policy]
         self.model.launch(self._kernel, cells.count, given, [self.blocks])
-
-    def add_norms(self, norms, rows):
-        """Adds the norms of the blocks to their rows."""
-        np.add.at(rows, self.pairs()[0], norms)
 
 
 class Hessian:
@@ -90,35 +85,14 @@ class Hessian:
         self._set_inertia = model.kernel(linear.set_inertia, model.dtype)
         self._add_blocks = model.kernel(linear.add_blocks, model.dtype)
         self._multiply = self._invert_diagonal = None
-        self._find_pattern()
-
-    def _find_pattern(self):
-        """Finds the blocks of the matrix and, for each, the element blocks of which it is the sum."""
-        model, n = self.model, self.model.count
-        fixed = model.inverse_mass.numpy() == 0.0
-        keys, sources = [np.arange(n, dtype=np.int64) * (n + 1)], []
-        for of_term in self._of_terms:
-            rows, columns = of_term.pairs()
-            source = np.flatnonzero(~(fixed[rows] | fixed[columns]))
-            keys.append(rows[source] * n + columns[source])
-            sources.append(source)
-        unique, index = np.unique(np.concatenate(keys), return_inverse=True)
-
-        def put(values):
-            return wp.array(values.astype(np.int32), dtype=wp.int32, device=model.device)
-
-        self.offsets = put(np.searchsorted(unique, np.arange(n + 1) * n))
-        self.columns = put(unique % n)
-        self.diagonal = put(index[:n])
-        self.values = wp.zeros(len(unique), dtype=model.mat33, device=model.device)
-        self._rows = None if model.mobility is None else put(unique // n)
-        self.gathers, start = [], n
-        for source in sources:
-            target = index[start : start + len(source)]
-            order = np.argsort(target, kind="stable")
-            offsets = np.searchsorted(target[order], np.arange(len(unique) + 1))
-            self.gathers.append((put(offsets), put(source[order])))
-            start += len(source)
+        found = find_pattern(
+            model,
+            [of_term.corners() for of_term in self._of_terms],
+            [blocks.size // model.copies for blocks in self.blocks],
+        )
+        self.offsets, self.columns, self.diagonal, self.gathers = found.offsets, found.columns, found.diagonal, found.sums
+        self._rows = None if model.mobility is None else found.rows
+        self.values = wp.empty(len(found.columns), dtype=model.mat33, device=device)
 
     def assemble(self, x, scale, correction=None):
         """Launches the assembly of ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal."""
@@ -134,15 +108,6 @@ class Hessian:
         if self._rows is not None:
             lock = model.kernel(linear.lock_blocks, model.dtype)
             model.launch(lock, len(self.values), [self._rows, self.columns, model.mobility], [self.values])
-
-    def norms(self):
-        """Returns Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ of each vertex i, summed over elements, (N,) [N/m], each norm bounded by √(‖·‖₁‖·‖∞)."""
-        rows = np.zeros(self.model.count)
-        for of_term in self._of_terms:
-            sizes = np.abs(of_term.blocks.numpy().astype(np.float64))
-            # A cheap upper bound of the spectral norm, equal to it along the axes and diagonals of a grid.
-            of_term.add_norms(np.sqrt(sizes.sum(axis=-1).max(axis=-1) * sizes.sum(axis=-2).max(axis=-1)), rows)
-        return rows
 
     def prepare(self):
         """Makes the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""
@@ -191,3 +156,34 @@ class Hessian:
         from scipy.sparse import block_diag
 
         return block_diag(self.matrices(), format="csr")
+
+
+def norms(model, terms, x):
+    """Returns Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ at x of each vertex i, summed over the elements of ``terms``, (N,) [N/m].
+
+    The norms are upper bounds, see :func:`warpcloth.kernels.assemble.row_norms`. Nothing is assembled.
+    """
+    rows, policy = np.zeros(model.count), wp.zeros(model.copies, dtype=wp.int32, device=model.device)
+    row_norms = model.kernel(assemble.row_norms, model.dtype)
+
+    def add(blocks, vertices):
+        found = wp.empty(len(blocks), dtype=wp.float64, device=model.device)
+        model.launch(row_norms, len(blocks), [blocks], [found])
+        np.add.at(rows, vertices, found.numpy())
+
+    for elements in terms:
+        if _is_sparse(elements):
+            of_term = _SparseBlocks(model, elements, corrected=False)
+            of_term.launch(x, None, policy)
+            add(of_term.blocks.reshape((-1, 1)), elements.cells.pairs(elements)[0])
+            continue
+        kernel, K = model.kernel(assemble.hessian_blocks, elements.term, model.dtype), elements.term.vertices
+        stencil = host_values(elements.stencil)
+        blocks = wp.empty((min(CHUNK, elements.count), K * K), dtype=model.mat33, device=model.device)
+        for first in range(0, elements.count, CHUNK):
+            some = slice(first, min(first + CHUNK, elements.count))
+            given = [*(array[some] for array in elements.arguments), x, None, elements.per_copy, policy]
+            own = blocks[: some.stop - first]
+            model.launch(kernel, len(own), given, [own])
+            add(own.reshape((-1, K)), stencil[some].ravel())
+    return rows

@@ -154,7 +154,7 @@ def incidences_of(vertices, count):
         (offsets (N+1,), codes (E·K,)): vertex i has codes offsets[i] to offsets[i+1] − 1, each K·element + corner, ascending.
     """
     codes = np.argsort(vertices, kind="stable")
-    return np.searchsorted(vertices[codes], np.arange(count + 1)), codes
+    return np.append(0, np.cumsum(np.bincount(vertices, minlength=count))), codes
 
 
 def elements_on(model, term, positions, vary):

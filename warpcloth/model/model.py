@@ -10,6 +10,7 @@ from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..kernels.contact.pair_sums import PairSource
+from ..kernels.copy import repeat_indices
 from ..kernels.step import lock
 from ..kernels.term import Term
 from ..kernels.terms.air import AIR
@@ -288,6 +289,27 @@ class Model:
         """
         kernels = {factory: self.kernel(factory, *key) for factories, *key in made for factory in factories}
         return lambda factory, dim, inputs, outputs: self.launch(kernels[factory], dim, inputs, outputs)
+
+    def of_copies(self, indices, step, start=None):
+        """Returns indices (m,) of the first copy, then for each other copy ``step`` more than for the one before.
+
+        Args:
+            indices: On the device, (m,) int32.
+            step: Such as n, for indices of vertices.
+            start: A number that comes before all others, such as the 0 of offsets; None for none.
+
+        Returns:
+            wp.array: (B·m,) int32 on the device, or (1 + B·m,) with ``start``.
+        """
+        if self.copies == 1 and start is None:
+            return indices
+        first = int(start is not None)
+        out = wp.empty(first + self.copies * len(indices), dtype=wp.int32, device=self.device)
+        if first:
+            out[:1].fill_(start)
+        if len(indices):
+            self.launch(self.kernel(repeat_indices), self.copies * len(indices), [indices, step], [out[first:]])
+        return out
 
     def constant(self, value, count):
         """Returns an array (count,) of one value, with stride 0."""

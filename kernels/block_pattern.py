@@ -1,0 +1,187 @@
+"""Kernels that find the pattern of a sparse matrix of blocks which is a sum of element matrices.
+
+A corner q is an index into the vertices of all elements, one element after another. In the matrix row of its vertex, it has one
+block for each vertex of its element. Elements have K vertices each, or are cells with different numbers of vertices. Rows and
+columns of fixed vertices have no such blocks. Each row has its diagonal block.
+"""
+
+from functools import cache
+
+import warp as wp
+
+MODULE = "warpcloth.block_pattern"
+
+
+@wp.struct
+class Corners:
+    """The corners of the elements of one term.
+
+    Attributes:
+        vertices: Vertices of all elements, in one row.
+        offsets, codes: The corners of each vertex, ascending.
+        K: Number of vertices of an element, or 0 for cells.
+        firsts: For cells, the first corner of the cell of each corner.
+        sizes: For cells, the number of vertices of that cell.
+        starts: For cells, the first block of each corner in the array of all blocks. For elements it is K·q.
+    """
+
+    vertices: wp.array(dtype=wp.int32)
+    offsets: wp.array(dtype=wp.int32)
+    codes: wp.array(dtype=wp.int32)
+    K: int
+    firsts: wp.array(dtype=wp.int32)
+    sizes: wp.array(dtype=wp.int32)
+    starts: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def element_of(corners: Corners, q: int):
+    """The first corner of the element of corner q, the number of its vertices, and the first block of q."""
+    size = int(corners.K)
+    if size > 0:
+        return q // size * size, size, size * q
+    return corners.firsts[q], corners.sizes[q], corners.starts[q]
+
+
+@wp.func
+def find_column(columns: wp.array(dtype=wp.int32), first: int, last: int, column: int):
+    """The index of the first of the ascending columns[first : last] that is not below ``column``."""
+    low, high = int(first), int(last)
+    while low < high:
+        middle = (low + high) // 2
+        if columns[middle] < column:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@cache
+def add_diagonal():
+    """Kernel over vertices: the first of the columns, from ``firsts`` on, is the vertex itself."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def add_each_diagonal(
+        # parameters
+        firsts: wp.array(dtype=wp.int32),
+        # out
+        columns: wp.array(dtype=wp.int32),
+        counts: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        columns[firsts[i]] = i
+        counts[i] = 1
+
+    return add_each_diagonal
+
+
+@cache
+def add_columns():
+    """Kernel over vertices: adds the columns of a term to its ascending ones, from ``firsts`` on; how many blocks they have."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def add_each_column(
+        # elements
+        fixed: wp.array(dtype=wp.int32),
+        corners: Corners,
+        # parameters
+        firsts: wp.array(dtype=wp.int32),
+        # in and out
+        columns: wp.array(dtype=wp.int32),
+        counts: wp.array(dtype=wp.int32),
+        # out
+        blocks: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        start, count, total = firsts[i], int(counts[i]), wp.int32(0)
+        if fixed[i] == 0:
+            for n in range(corners.offsets[i], corners.offsets[i + 1]):
+                first, size, _start = element_of(corners, corners.codes[n])
+                for k in range(first, first + size):
+                    j = corners.vertices[k]
+                    if fixed[j] == 0:
+                        total += 1
+                        index = find_column(columns, start, start + count, j)
+                        if index == start + count or columns[index] != j:
+                            for after in range(count + start - index):
+                                columns[start + count - after] = columns[start + count - after - 1]
+                            columns[index] = j
+                            count += 1
+        counts[i] = count
+        blocks[i] = total
+
+    return add_each_column
+
+
+@cache
+def pack_columns():
+    """Kernel over vertices: the columns from ``firsts`` on, without gaps between rows; their row; and the diagonal block."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def pack_each_column(
+        # elements
+        firsts: wp.array(dtype=wp.int32),
+        offsets: wp.array(dtype=wp.int32),
+        # state in
+        columns: wp.array(dtype=wp.int32),
+        # out
+        packed: wp.array(dtype=wp.int32),
+        rows: wp.array(dtype=wp.int32),
+        diagonal: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        for n in range(offsets[i + 1] - offsets[i]):
+            j = columns[firsts[i] + n]
+            packed[offsets[i] + n] = j
+            rows[offsets[i] + n] = i
+            if j == i:
+                diagonal[i] = offsets[i] + n
+
+    return pack_each_column
+
+
+@cache
+def list_blocks():
+    """Kernel over vertices: the blocks of a term, ascending, of which each block of the row is the sum, and where they end."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def list_each_block(
+        # elements
+        fixed: wp.array(dtype=wp.int32),
+        corners: Corners,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        # parameters
+        firsts: wp.array(dtype=wp.int32),
+        # out
+        ends: wp.array(dtype=wp.int32),
+        sources: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        first_block, last_block = offsets[i], offsets[i + 1]
+        for s in range(first_block, last_block):
+            ends[s] = 0
+        if fixed[i] == 0:
+            for n in range(corners.offsets[i], corners.offsets[i + 1]):
+                first, size, _start = element_of(corners, corners.codes[n])
+                for k in range(first, first + size):
+                    j = corners.vertices[k]
+                    if fixed[j] == 0:
+                        s = find_column(columns, first_block, last_block, j)
+                        ends[s] = ends[s] + 1
+        before = int(firsts[i])
+        for s in range(first_block, last_block):
+            count = ends[s]
+            ends[s] = before
+            before += count
+        if fixed[i] == 0:
+            for n in range(corners.offsets[i], corners.offsets[i + 1]):
+                first, size, start = element_of(corners, corners.codes[n])
+                for k in range(first, first + size):
+                    j = corners.vertices[k]
+                    if fixed[j] == 0:
+                        s = find_column(columns, first_block, last_block, j)
+                        sources[ends[s]] = start + k - first
+                        ends[s] = ends[s] + 1
+
+    return list_each_block
