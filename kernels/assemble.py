@@ -212,3 +212,50 @@ def constant_blocks(term: Term, dtype):
                 out[e, K * i + j] = scale * total
 
     return blocks_of_weights
+
+
+# Weights up to this fraction of the largest one of an element count as 0, such as cotangents that cancel in double precision.
+ZERO = 1e-12
+
+
+@cache
+def sum_entries():
+    """Kernel over (copies, entries of a matrix): sums of the entries of elements, and of the sizes of these.
+
+    They are those of :func:`constant_blocks`. Entries of weights that are 0 up to rounding, such as those of vertices on one
+    line, count as 0.
+    """
+    threshold = wp.constant(ZERO * ZERO)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sum_each_entry(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        sources: wp.array(dtype=wp.int32),
+        blocks: wp.array3d(dtype=wp.float64),
+        # parameters
+        K: int,
+        # out
+        numbers: wp.array2d(dtype=wp.float64),
+        sizes: wp.array2d(dtype=wp.float64),
+    ):
+        copy, s = wp.tid()
+        number, size = wp.float64(0.0), wp.float64(0.0)
+        for n in range(offsets[s], offsets[s + 1]):
+            e = sources[n] // (K * K)
+            entry = sources[n] - e * K * K
+            i = entry // K
+            j = entry - i * K
+            most = wp.float64(0.0)
+            for k in range(K):
+                most = wp.max(most, blocks[copy, e, k * (K + 1)])
+            least = wp.min(blocks[copy, e, i * (K + 1)], blocks[copy, e, j * (K + 1)])
+            value = blocks[copy, e, entry]
+            if least <= wp.float64(threshold) * most:
+                value = wp.float64(0.0)
+            number += value
+            size += wp.abs(value)
+        numbers[copy, s] = number
+        sizes[copy, s] = size
+
+    return sum_each_entry

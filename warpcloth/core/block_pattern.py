@@ -10,12 +10,12 @@ from ..model.elements import incidences_of
 
 
 class BlockPattern(NamedTuple):
-    """The pattern of all copies, all arrays int32 on the device.
+    """The pattern of one copy with n vertices, or of all copies, arrays of int32 on the device.
 
     Attributes:
-        offsets, columns: Block rows (N+1,) and the column of each block, ascending in a row.
+        offsets, columns: Block rows (n+1,) and the column of each block, ascending in a row.
         rows: The row of each block.
-        diagonal: Index of each diagonal block (N,).
+        diagonal: Index of each diagonal block (n,).
         sums: For each term, (offsets, sources): block s of the matrix is the sum of the blocks of the term from
             sources[offsets[s]] to sources[offsets[s+1] − 1], which ascend.
     """
@@ -25,6 +25,21 @@ class BlockPattern(NamedTuple):
     rows: wp.array
     diagonal: wp.array
     sums: list
+
+    def of_copies(self, model, blocks):
+        """Returns the pattern of all copies of a model from that of one; ``blocks`` has the number of blocks of each term."""
+        if model.copies == 1:
+            return self
+        n, count = model.per_copy, len(self.columns)
+
+        def offsets(array, step):
+            return model.of_copies(array[1:], step, start=0)
+
+        return BlockPattern(
+            offsets(self.offsets, count),
+            *(model.of_copies(array, step) for array, step in ((self.columns, n), (self.rows, n), (self.diagonal, count))),
+            [(offsets(one, len(s)), model.of_copies(s, each)) for (one, s), each in zip(self.sums, blocks, strict=True)],
+        )
 
 
 class TermCorners:
@@ -57,16 +72,13 @@ class TermCorners:
             setattr(self.data, name, array)
 
 
-def find_pattern(model, terms, blocks):
-    """Returns the :class:`BlockPattern` of a model.
-
-    Rows and columns of pinned vertices have no blocks but on the diagonal. Copies have the same pattern: that of the first is
-    found, and repeated.
+def find_pattern(model, terms, fixed):
+    """Returns the :class:`BlockPattern` of the first copy of a model.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         terms: The :class:`TermCorners` of each term.
-        blocks: The number of blocks of each term in one copy.
+        fixed: Vertices whose rows and columns have no blocks but on the diagonal, (n,) booleans.
     """
     n, device = model.per_copy, model.device
 
@@ -74,8 +86,7 @@ def find_pattern(model, terms, blocks):
         return wp.empty(count, dtype=wp.int32, device=device)
 
     launch = model.launcher(((kernels.add_diagonal, kernels.add_columns, kernels.pack_columns, kernels.list_blocks),))
-    fixed = _put(model, model.inverse_mass[:n].numpy() == 0.0)
-    starts = _before(1 + sum(term.most for term in terms))
+    fixed, starts = _put(model, fixed), _before(1 + sum(term.most for term in terms))
     firsts, found = _put(model, starts[:-1]), empty(int(starts[-1]))
     counts, of_terms = empty(n), [empty(n) for _ in terms]
     launch(kernels.add_diagonal, n, [firsts], [found, counts])
@@ -86,16 +97,14 @@ def find_pattern(model, terms, blocks):
     offsets, columns, rows, diagonal = _put(model, starts), empty(count), empty(count), empty(n)
     launch(kernels.pack_columns, n, [firsts, offsets, found], [columns, rows, diagonal])
     sums = []
-    for term, of_term, each in zip(terms, of_terms, blocks, strict=True):
+    for term, of_term in zip(terms, of_terms, strict=True):
         starts = _before(of_term.numpy())
-        ends, sources = empty(count), empty(int(starts[-1]))
-        launch(kernels.list_blocks, n, [fixed, term.data, offsets, columns, _put(model, starts[:-1])], [ends, sources])
-        sums.append((model.of_copies(ends, len(sources), start=0), model.of_copies(sources, each)))
-    return BlockPattern(
-        model.of_copies(offsets[1:], count, start=0),
-        *(model.of_copies(columns, n), model.of_copies(rows, n), model.of_copies(diagonal, count)),
-        sums,
-    )
+        ends, sources = empty(count + 1), empty(int(starts[-1]))
+        ends[:1].zero_()
+        given = [fixed, term.data, offsets, columns, _put(model, starts[:-1])]
+        launch(kernels.list_blocks, n, given, [ends[1:], sources])
+        sums.append((ends, sources))
+    return BlockPattern(offsets, columns, rows, diagonal, sums)
 
 
 def _put(model, values):

@@ -85,11 +85,9 @@ class Hessian:
         self._set_inertia = model.kernel(linear.set_inertia, model.dtype)
         self._add_blocks = model.kernel(linear.add_blocks, model.dtype)
         self._multiply = self._invert_diagonal = None
-        found = find_pattern(
-            model,
-            [of_term.corners() for of_term in self._of_terms],
-            [blocks.size // model.copies for blocks in self.blocks],
-        )
+        fixed = model.inverse_mass[: model.per_copy].numpy() == 0.0
+        one = find_pattern(model, [of_term.corners() for of_term in self._of_terms], fixed)
+        found = one.of_copies(model, [blocks.size // model.copies for blocks in self.blocks])
         self.offsets, self.columns, self.diagonal, self.gathers = found.offsets, found.columns, found.diagonal, found.sums
         self._rows = None if model.mobility is None else found.rows
         self.values = wp.empty(len(found.columns), dtype=model.mat33, device=device)

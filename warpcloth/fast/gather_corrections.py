@@ -21,7 +21,7 @@ class GatherSweeps:
         self.model, self.x, self.correction, self.multipliers = model, x, correction, multipliers
         more, count = any(array is not None for array in multipliers), model.count
         self._found = [  # the structs hold no references
-            gathered_in_rows(elements, count, pairs=not more, factor=factor)
+            gathered_in_rows(model, elements, pairs=not more, factor=factor)
             for elements, factor in zip(model.terms, factors, strict=True)
         ]
         parts = tuple(

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ..kernels.fast.gather_copies import codes_of_copies, values_of_copies
 from ..kernels.fast.gather_corrections import slot_rows
 from ..kernels.fast.term_facts import TermFacts
 from ..model.elements import incidences_of
@@ -30,37 +31,39 @@ def gathered(model, elements, damped=False, rows=True):
     arrays = {"stencil": elements.stencil, "stiffness": elements.stiffness, "rest": elements.rest}
     if damped:
         arrays["damping"] = elements.damping
-    if found := _pairs(elements, model.count):
+    copies = _Copies(model, elements)
+    if found := _pairs(elements, copies):
         slots, codes, source = found
-        codes = np.where(codes < 0, np.arange(model.count), codes)
-        others = {name: _of_incidences(array, source.ravel()) for name, array in arrays.items() if name != "stencil"}
+        others = {name: copies.values(array, source) for name, array in arrays.items() if name != "stencil"}
         own = None if damped or part.shared else elements.stiffness_of_copies(model)
         if own is not None:
             part = part._replace(shared=True)
             others["stiffness"] = model.array(np.repeat(own, model.per_copy), model.dtype)
-        return part._replace(pairs=slots), {**others, "codes": int32_array(codes.ravel(), elements.stencil.device)}
+        return part._replace(pairs=slots), {**others, "codes": copies.codes(codes, copies.n, own=True)}
     if rows and elements.term.quadratic and not (damped or elements.refresh) and (found := _of_matrix(model, elements)):
         slots, numbers = found
         return part._replace(rows=slots), numbers
-    return _by_element(elements, model.count, part, arrays)
+    return _by_element(elements, copies, part, arrays)
 
 
-def gathered_in_rows(elements, count, pairs, **others):
+def gathered_in_rows(model, elements, pairs, **others):
     """As :func:`gathered`, for Jacobi sweeps, with the incidences of pairs in rows.
 
     See :func:`warpcloth.kernels.fast.gather_corrections.slot_rows` for rows.
 
     Args:
+        model: The :class:`warpcloth.model.model.Model`.
         elements: :class:`warpcloth.model.elements.DeviceElements`.
-        count: Number of vertices N.
         pairs: Whether incidences may store the other vertex instead of the element.
         others: Further numbers (B·E,) of the elements, by name.
     """
     part = TermFacts(elements.term, shared=0 in elements.stiffness.strides)
     arrays = {"stiffness": elements.stiffness, "rest": elements.rest, **others}
-    if not pairs or not (found := _pairs(elements, count)):
-        return _by_element(elements, count, part, {"stencil": elements.stencil, **arrays})
+    copies, count = _Copies(model, elements), model.count
+    if not pairs or not (found := _pairs(elements, copies)):
+        return _by_element(elements, copies, part, {"stencil": elements.stencil, **arrays})
     slots, codes, source = found
+    codes, source = copies.on_host(codes, copies.n), np.maximum(copies.on_host(source, elements.per_copy), 0)
     rows, width = slot_rows(sum(slots))
     empty = ((0, rows * width - sum(slots)), (0, 0))
     codes, source = np.pad(codes, empty, constant_values=-1), np.pad(source, empty)
@@ -77,29 +80,89 @@ def gathered_in_rows(elements, count, pairs, **others):
     return part._replace(pairs=slots), found
 
 
-def _by_element(elements, count, part, arrays):
+class _Copies:
+    """Repeats the layout of the first of the copies of a model, if elements are in the order of copies; else that of all.
+
+    Attributes:
+        n, E, count: Vertices and elements of a copy, and the number of copies; or those of all, and 1.
+        stencil: That of the first copy, (E, K).
+    """
+
+    def __init__(self, model, elements):
+        self._model, stencil = model, host_values(elements.stencil)
+        self.n, self.E, self.count = model.per_copy, elements.per_copy, model.copies
+        if stencil[: self.E].max(initial=0) >= self.n:  # coloured elements of all copies are mixed
+            self.n, self.E, self.count = model.count, elements.count, 1
+        self.stencil = stencil[: self.E]
+
+    def codes(self, codes, step, own=False):
+        """Returns codes (slots, n), −1 for none, of all copies in one row, see :func:`.codes_of_copies`."""
+        out = wp.empty((len(codes), self.count, self.n), dtype=wp.int32, device=self._model.device)
+        if out.size:
+            self._model.launch(self._model.kernel(codes_of_copies), out.shape, [self._put(codes), step, int(own)], [out])
+        return out.flatten()
+
+    def values(self, array, sources, step=None):
+        """Returns the values of an array for ``sources`` (slots, n), of all copies in one row.
+
+        A source is ``step`` more for each copy, by default by the number of elements. An array that repeats one is returned.
+        """
+        if 0 in array.strides:
+            return array
+        model, width = self._model, getattr(array.dtype, "_length_", 1)
+        out = wp.empty(len(sources) * self.count * self.n, dtype=array.dtype, device=model.device)
+        if len(out):
+            numbers, of_slots = (
+                wp.array(ptr=each.ptr, shape=(*shape, width), dtype=model.dtype, device=model.device)
+                for each, shape in ((array, array.shape), (out, (len(sources), self.count, self.n)))
+            )
+            given = [numbers, self._put(sources), self.E if step is None else step]
+            model.launch(model.kernel(values_of_copies, model.dtype), of_slots.shape[:3], given, [of_slots])
+        return out
+
+    def offsets(self, offsets, step):
+        """Returns offsets (n+1,) of all copies."""
+        every = offsets[1:] + step * np.arange(self.count)[:, None]
+        return int32_array(np.append(0, every), self._model.device)
+
+    def on_host(self, codes, step):
+        """Returns codes (slots, n), −1 for none, of all copies, (slots, N), on the host."""
+        every = codes[:, None] + step * np.arange(self.count)[:, None]
+        return np.where(codes[:, None] < 0, -1, every).reshape(len(codes), -1)
+
+    def _put(self, values):
+        return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=self._model.device)
+
+
+def _by_element(elements, copies, part, arrays):
     """The part and the arrays of incidences that store elements."""
-    stencil = host_values(elements.stencil).ravel()
-    offsets, codes = incidences_of(stencil, count)
-    codes, padded = _slots(codes, stencil[codes], offsets, count)
-    arrays |= {"offsets": int32_array(offsets, elements.stencil.device), "codes": int32_array(codes, elements.stencil.device)}
-    return part._replace(padded=padded), arrays
+    stencil, device = copies.stencil.ravel(), elements.stencil.device
+    offsets, codes = incidences_of(stencil, copies.n)
+    arrays |= {"offsets": copies.offsets(offsets, stencil.size)}
+    slots = int(np.diff(offsets).max(initial=0))
+    if padded := slots * copies.n <= 2 * len(codes):
+        table = np.full((slots, copies.n), -1)
+        vertices = stencil[codes]
+        table[np.arange(len(codes)) - offsets[vertices], vertices] = codes
+        return part._replace(padded=padded), arrays | {"codes": copies.codes(table, stencil.size)}
+    every = codes + stencil.size * np.arange(copies.count)[:, None]
+    return part._replace(padded=padded), arrays | {"codes": int32_array(every.ravel(), device)}
 
 
-def _pairs(elements, count):
+def _pairs(elements, copies):
     """Numbers of slots of a vertex as first and as second of a pair; other vertex and element for each slot and vertex.
 
-    An empty slot has −1 and 0. The result is None if elements are not pairs, if their rest states change in each step, or if
-    there would be too many slots.
+    The latter are (slots, n), of the first copy. An empty slot has −1. The result is None if elements are not pairs, if their
+    rest states change in each step, or if there would be too many slots.
     """
-    stencil = host_values(elements.stencil)
+    stencil = copies.stencil
     if stencil.shape[1] != 2 or elements.refresh is not None:
         return None
-    columns = [incidences_of(stencil[:, corner], count) for corner in range(2)]
+    columns = [incidences_of(stencil[:, corner], copies.n) for corner in range(2)]
     slots = tuple(int(np.diff(offsets).max(initial=0)) for offsets, _codes in columns)
-    if sum(slots) > SLOTS or sum(slots) * count > 2 * stencil.size:
+    if sum(slots) > SLOTS or sum(slots) * copies.n > 2 * stencil.size:
         return None
-    codes, source = np.full((sum(slots), count), -1), np.zeros((sum(slots), count), dtype=np.int64)
+    codes, source = (np.full((sum(slots), copies.n), -1) for _ in range(2))
     for corner, (offsets, order) in enumerate(columns):
         vertices = stencil[order, corner]
         slot = corner * slots[0] + np.arange(len(order)) - offsets[vertices], vertices
@@ -107,42 +170,28 @@ def _pairs(elements, count):
     return slots, codes, source
 
 
-def _slots(values, vertices, offsets, count):
-    """Values of incidences, slot by slot if padding at most doubles their number, else by vertex; and which of the two."""
-    slots = int(np.diff(offsets).max(initial=0))
-    if slots * count > 2 * len(values):
-        return values, False
-    padded = np.full(slots * count, -1, dtype=values.dtype)
-    padded[(np.arange(len(values)) - offsets[vertices]) * count + vertices] = values
-    return padded, True
-
-
 def _of_matrix(model, elements):
     """The largest number of off-diagonal entries in a row of kAGᵀG, and its rows, padded with 0 for the vertex itself.
 
     None if padding more than doubles their number, or if there are none.
     """
-    n, count = model.per_copy, model.count
+    n = model.per_copy
     rows, columns, entries_of_copies = matrix_entries(model, elements)
     firsts = np.searchsorted(rows, np.arange(n + 1))
     slots = int(np.diff(firsts).max())
     if slots * n > 2 * len(rows) or not slots:
         return None
     slot = np.arange(len(rows)) - firsts[rows]
-    codes, numbers = np.tile(np.arange(count), (slots, 1)), np.zeros((slots, count))
-    for copy, own in enumerate(entries_of_copies):
-        codes[slot, copy * n + rows], numbers[slot, copy * n + rows] = copy * n + columns, own
-    return slots, {
-        "codes": int32_array(codes.ravel(), elements.stencil.device),
-        "stiffness": model.array(numbers.ravel(), model.dtype),
-    }
-
-
-def _of_incidences(array, source):
-    """The values of the elements ``source``, unless elements share one."""
-    if 0 in array.strides:
-        return array
-    return wp.array(host_values(array)[source], dtype=array.dtype, device=array.device)
+    codes = np.full((slots, n), -1)
+    codes[slot, rows] = columns
+    alike = 0 in entries_of_copies.strides or model.copies == 1
+    numbers = np.zeros((slots, 1 if alike else model.copies, n))
+    numbers[slot, :, rows] = entries_of_copies[: numbers.shape[1]].T
+    of_copies = _Copies(model, elements.by_copies(model))
+    stiffness = model.array(numbers.ravel(), model.dtype)
+    if alike:
+        stiffness = of_copies.values(stiffness, np.arange(slots * n).reshape(slots, n), step=0)
+    return slots, {"codes": of_copies.codes(codes, n, own=True), "stiffness": stiffness}
 
 
 def lanes_of(model):

@@ -5,65 +5,54 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from ..core.block_pattern import TermCorners, find_pattern
 from ..core.constant_matrix import constant_entries
-from ..kernels.assemble import constant_blocks
+from ..kernels.assemble import constant_blocks, sum_entries
 from ..kernels.fast.quadratic_pair import QUADRATIC_PAIR
 from ..model.host_values import host_values
 
-CHUNK = 1 << 18  # number of elements whose blocks are summed at once
+CHUNK = 1 << 18  # number of elements, if a copy has fewer, whose blocks are summed at once
 # Pairs are faster up to this number per element: a hinge takes 5 to 6 ns, a pair of vertices 1.2 ns (one core).
 PAIRS = 4
-# Weights up to this fraction of the largest one of an element count as 0, such as cotangents that cancel in double precision.
-ZERO = 1e-12
 
 
 def matrix_entries(model, elements):
     """The off-diagonal entries of Q, row by row; if the elements of a copy share one stiffness, without entries that cancel.
 
     Returns:
-        (rows (m,), columns (m,), numbers (B, m) [N/m]) for the vertices of one copy.
+        (rows (m,), columns (m,), numbers (B, m) [N/m]) for the vertices of one copy. Copies that are alike share the numbers.
     """
-    from scipy.sparse import coo_matrix
-
-    K, n = elements.term.vertices, model.per_copy
-    stencil = host_values(elements.stencil)
-
-    def off_diagonal(some):
-        """Rows and columns of the off-diagonal entries, and a mask of these in the blocks."""
-        rows, columns = np.repeat(some, K, axis=1), np.tile(some, K)
-        apart = rows != columns
-        return rows[apart], columns[apart], apart
-
-    # Colours put elements of all copies in one order; all vertices of an element are in one copy.
-    rows, columns, _apart = off_diagonal(stencil[stencil[:, 0] < n])
-    pattern = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(n, n)).tocsr()
-    rows, columns = np.repeat(np.arange(n, dtype=np.int64), np.diff(pattern.indptr)), pattern.indices.astype(np.int64)
-    keys = rows * n + columns
-    size, shape = min(CHUNK, elements.count), (model.copies, len(keys))
-    numbers, sizes = np.zeros(shape), np.zeros(shape)
-    blocks = wp.zeros((size, K * K), dtype=wp.float64, device=model.device)
-    kernel = model.kernel(constant_blocks, elements.term, model.dtype)
-    for first in range(0, elements.count, size):
-        some = slice(first, min(first + size, elements.count))
-        model.launch(kernel, some.stop - first, [array[some] for array in elements.arguments], [blocks])
-        own_rows, own_columns, apart = off_diagonal(stencil[some].astype(np.int64))
-        found = own_rows // n, np.searchsorted(keys, own_rows % n * n + own_columns % n)
-        own = _without_zeros(blocks.numpy()[: len(apart)], K)[apart]
-        np.add.at(numbers, found, own)
-        np.add.at(sizes, found, np.abs(own))
-    if elements.stiffness_of_copies(model) is None:
-        return rows, columns, numbers  # an entry that cancels in a copy need not in others, on which no copy may depend
-    # Entries of right angles cancel up to the rounding of their elements. An entry must not be compared with others at its
-    # vertices: a few large elements may be the only connection between two parts with small ones.
-    some = (np.abs(numbers) > 4.0 * np.finfo(model.numpy_dtype).eps * sizes).any(axis=0)
-    return rows[some], columns[some], numbers[:, some]
+    elements, n = elements.by_copies(model), model.per_copy
+    stencil = host_values(elements.stencil)[: elements.per_copy]
+    pattern = find_pattern(model, [TermCorners(model, stencil.ravel(), K=stencil.shape[1])], np.zeros(n, dtype=bool))
+    rows, columns = (array.numpy().astype(np.int64) for array in (pattern.rows, pattern.columns))
+    copies = 1 if elements.alike(model.copies) else model.copies
+    numbers, sizes = _summed(model, elements, pattern.sums[0], (copies, len(rows)))
+    some = rows != columns
+    if elements.stiffness_of_copies(model) is not None:
+        # Entries of right angles cancel up to the rounding of their elements. An entry must not be compared with others at its
+        # vertices: a few large elements may be the only connection between two parts with small ones. Where stiffnesses
+        # differ, an entry that cancels in a copy need not in others, on which no copy may depend.
+        some &= (np.abs(numbers) > 4.0 * np.finfo(model.numpy_dtype).eps * sizes).any(axis=0)
+    return rows[some], columns[some], np.broadcast_to(numbers[:, some], (model.copies, int(some.sum())))
 
 
-def _without_zeros(blocks, K):
-    """Blocks (E, K·K), set to 0 for weights that are 0 up to rounding, such as those of vertices on one line."""
-    squares = blocks[:, :: K + 1]
-    small = squares <= ZERO**2 * squares.max(axis=1, keepdims=True)
-    return np.where((small[:, :, None] | small[:, None]).reshape(blocks.shape), 0.0, blocks)
+def _summed(model, elements, sums, shape):
+    """The entries of Q, and the sums of the sizes of their parts, for the first copies, both of a ``shape`` (copies, m)."""
+    K, E = elements.term.vertices, elements.per_copy
+    copies, some = shape[0], max(1, CHUNK // E)
+    numbers, sizes = np.empty(shape), np.empty(shape)
+    kernels = model.kernel(constant_blocks, elements.term, model.dtype), model.kernel(sum_entries)
+    for first in range(0, copies, some):
+        count = min(some, copies - first)
+        blocks = wp.empty((count * E, K * K), dtype=wp.float64, device=model.device)
+        found = [wp.empty((count, shape[1]), dtype=wp.float64, device=model.device) for _ in range(2)]
+        chosen = slice(first * E, (first + count) * E)
+        model.launch(kernels[0], count * E, [array[chosen] for array in elements.arguments], [blocks])
+        model.launch(kernels[1], (count, shape[1]), [*sums, blocks.reshape((count, E, K * K)), K], found)
+        for array, values in zip((numbers, sizes), found, strict=True):
+            array[first : first + count] = values.numpy()
+    return numbers, sizes
 
 
 def _entries_of_cells(model, elements):

@@ -338,7 +338,7 @@ class Mesh:
             both_ways = both_ways[np.argsort(both_ways[:, 0], kind="stable")]
             valence = np.bincount(both_ways[:, 0], minlength=len(self.points))
             pairs = both_ways[valence[both_ways[:, 0]] == 2, 1].reshape(-1, 2)
-        return self._unique(pairs)
+        return self.distinct_pairs(pairs)
 
     @cached_property
     def hinges(self) -> np.ndarray:
@@ -426,9 +426,11 @@ class Mesh:
         """Packs each pair of (E, 2), smaller index first, into one int64, because these sort much faster than rows."""
         return pairs.min(axis=1).astype(np.int64) * len(self.points) + pairs.max(axis=1)
 
-    def _unique(self, pairs):
-        """Returns the distinct pairs of (E, 2), int32, the smaller index first, in lexicographic order."""
-        return np.stack(np.divmod(np.unique(self._keys(pairs)), len(self.points)), axis=1).astype(np.int32)
+    def distinct_pairs(self, pairs: np.ndarray) -> np.ndarray:
+        """Returns the distinct pairs of vertices (E, 2), int32, the smaller index first, in lexicographic order."""
+        keys = np.sort(self._keys(pairs))
+        keys = keys[np.append(True, keys[1:] != keys[:-1])[: len(keys)]]
+        return np.stack(np.divmod(keys, len(self.points)), axis=1).astype(np.int32)
 
     def _flat(self):
         """Whether the height of each triangle is at most FLATTEST times its longest side, or is not finite, (T,)."""

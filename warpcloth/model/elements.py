@@ -70,10 +70,20 @@ class DeviceElements:
 
     def stiffness_of_copies(self, model):
         """Returns the stiffness (B,) that all elements of each copy share, or None if the elements of a copy differ."""
-        # Coloured elements of all copies are mixed. All vertices of an element are in one copy.
-        by_copy = np.argsort(host_values(self.stencil)[:, 0] // model.per_copy, kind="stable")
-        values = host_values(self.stiffness)[by_copy].reshape(model.copies, -1)
+        if 0 in self.stiffness.strides:
+            return np.repeat(host_values(self.stiffness)[:1], model.copies)
+        values = host_values(self.by_copies(model).stiffness).reshape(model.copies, -1)
         return values[:, 0] if values.size and (values == values[:, :1]).all() else None
+
+    def by_copies(self, model):
+        """Returns the elements in the order of their copies, such as coloured ones, which stand in the order of colours."""
+        copies = host_values(self.stencil)[:, 0] // model.per_copy  # all vertices of an element are in one copy
+        return self.reordered(np.argsort(copies, kind="stable")) if (np.diff(copies) < 0).any() else self
+
+    def alike(self, copies):
+        """Whether all copies have the same numbers; the elements are in the order of copies."""
+        arrays = (host_values(array) for array in self.arguments[1:] if 0 not in array.strides)
+        return all((array.reshape(copies, -1) == array[: self.per_copy].ravel()).all() for array in arrays)
 
     def with_unit_stiffness(self):
         """Returns these elements with a stiffness of 1, of 1/A for contact, and of 0 where it is 0."""
@@ -171,7 +181,9 @@ def elements_on(model, term, positions, vary):
     vertices = model.in_model(one.stencil)
     if model.order is not None and vertices.shape[1] == 2:
         vertices = np.sort(vertices, axis=1)  # a pair has no direction, and sorted pairs are faster
-    stencil = vertices[None] + (np.arange(model.copies) * model.per_copy)[:, None, None]
+    stencil = (
+        vertices[None].astype(np.int32) + np.int32(model.per_copy) * np.arange(model.copies, dtype=np.int32)[:, None, None]
+    )
     cells, declared = None, one.term
     if one.cells is not None:
         if one.weights is None:
@@ -188,7 +200,7 @@ def elements_on(model, term, positions, vary):
         label=one.label,
         term=declared,
         per_copy=E,
-        stencil=keep(stencil.reshape(-1, stencil.shape[-1]).astype(np.int32), wp.int32, model.device),
+        stencil=keep(stencil.reshape(-1, stencil.shape[-1]), wp.int32, model.device),
         stiffness=_numbers(model, f"{one.label}.stiffness", stiffness, E),
         rest=rest,
         hard=bool(np.isinf(stiffness).any()),

@@ -2,6 +2,7 @@
 
 import inspect
 from copy import copy as shallow_copy
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -24,7 +25,7 @@ from .loads import loads_on
 from .precision import DTYPES, cast, refuse_coarse
 from .report import report
 from .threads import threads_on
-from .vary import Vary
+from .vary import Vary, unlike_copies
 
 
 class Model:
@@ -90,17 +91,20 @@ class Model:
 
         masses = vary.masses(scene)
         with np.errstate(over="ignore"):  # an infinite inverse is refused below
-            inverse = 1.0 / np.where(masses > 0.0, masses, np.inf)
+            inverse = 1.0 / np.where(unlike_copies(masses) > 0.0, unlike_copies(masses), np.inf)
         inverse[:, scene.fixed] = 0.0
+        inverse = np.broadcast_to(inverse, masses.shape)
         positions = vary.take("positions", scene.positions)
-        velocities = vary.take("velocities", scene.velocities)
+        of_copies = vary.take("velocities", scene.velocities)
+        velocities = unlike_copies(of_copies).copy()
         velocities[:, scene.fixed] = 0.0
         if scene.locked is not None:
             velocities[:, scene.locked] = 0.0
+        velocities = np.broadcast_to(velocities, of_copies.shape)
         if vary.has("positions"):
             for copy, start in enumerate(positions):
                 scene.pins.refuse_far(start, f" in copy {copy}")
-        refuse_coarse(scene.mesh, positions, self.numpy_dtype, lambda copy, i: self._label("vertex", copy, i))
+        refuse_coarse(scene.mesh, unlike_copies(positions), self.numpy_dtype, lambda copy, i: self._label("vertex", copy, i))
         self.positions = self._put("position", "m", positions, self.vec3)
         self.velocities = self._put("velocity", "m/s", velocities, self.vec3)
         self.mass = self._put("mass", "kg", masses, self.dtype)
@@ -250,7 +254,8 @@ class Model:
         return keep(held.reshape(-1, *held.shape[2:]), dtype, self.device)
 
     def _cast(self, name, unit, values, each, infinite=False):
-        return cast(name, unit, values, self.numpy_dtype, lambda copy, i: self._label(each, copy, i), infinite)
+        label = partial(self._label, each)
+        return np.broadcast_to(cast(name, unit, unlike_copies(values), self.numpy_dtype, label, infinite), values.shape)
 
     def _label(self, each, copy, i):
         """Returns words for error messages, such as "vertex 3 of copy 0"."""
@@ -301,8 +306,6 @@ class Model:
         Returns:
             wp.array: (B·m,) int32 on the device, or (1 + B·m,) with ``start``.
         """
-        if self.copies == 1 and start is None:
-            return indices
         first = int(start is not None)
         out = wp.empty(first + self.copies * len(indices), dtype=wp.int32, device=self.device)
         if first:

@@ -29,11 +29,14 @@ class Vary:
         return name in self.values
 
     def take(self, name, default):
-        """Returns ``values[name]``, (B, *shape of default), or the default B times."""
+        """Returns ``values[name]``, (B, *shape of default), or the default B times, with stride 0."""
         if name not in self.values:
-            return np.repeat(np.asarray(default, dtype=np.float64)[None], self.copies, axis=0)
+            return self._repeated(np.asarray(default, dtype=np.float64))
         self.taken.add(name)
         return array(f"vary[{name!r}]", self.values[name], (self.copies, *np.shape(default))).copy()
+
+    def _repeated(self, values):
+        return np.broadcast_to(values, (self.copies, *np.shape(values)))
 
     def masses(self, scene):
         """Returns the masses of all copies, (B, n) [kg], and checks them."""
@@ -47,8 +50,9 @@ class Vary:
             for copy in np.flatnonzero(~(density > 0.0)):
                 raise ValueError(f"vary['density'] is {density[copy]} in copy {copy}; it must be above 0")
             masses = masses * (density / scene.density)[:, None]
-        allowed = masses > 0.0
-        allowed[:, scene.fixed] |= masses[:, scene.fixed] == 0.0
+        given = unlike_copies(masses)
+        allowed = given > 0.0
+        allowed[:, scene.fixed] |= given[:, scene.fixed] == 0.0
         for copy, vertex in np.argwhere(~allowed)[:1]:
             raise ValueError(
                 f"vary['masses'] of vertex {vertex} is {masses[copy, vertex]} kg in copy {copy}; it must be above 0, "
@@ -74,7 +78,7 @@ class Vary:
         given = {name: values for name, values in given.items() if values is not None}
         found = [given.pop(name, None) for name in ("stiffness", "damping")]
         stiffness, damping = (
-            np.repeat(np.atleast_1d(default)[None], self.copies, axis=0) if values is None else values.reshape(self.copies, -1)
+            self._repeated(np.atleast_1d(default)) if values is None else values.reshape(self.copies, -1)
             for values, default in zip(found, (one.stiffness, one.damping), strict=True)
         )
         if damping.any() and one.term.dissipation is None:
@@ -82,7 +86,7 @@ class Vary:
         if damping.any() and one.refresh:  # damping would overwrite the rest states
             raise ValueError(f"{one.label} changes during a run and cannot be damped; leave its damping out")
         if not (given or self.has("positions")):
-            return one, np.repeat(one.rest[None], self.copies, axis=0), stiffness, damping
+            return one, self._repeated(one.rest), stiffness, damping
         found = []
         for copy in range(self.copies):
             try:
@@ -144,3 +148,8 @@ class Vary:
         if rest:
             allowed = ["gravity", "density or masses", "positions", "velocities", *dict.fromkeys(self.fields)]
             raise ValueError(f"vary[{rest[0]!r}] names nothing in this scene; allowed are {', '.join(allowed)}")
+
+
+def unlike_copies(values):
+    """Returns values (B, …), or the first of them, (1, …), if copies share them by a stride of 0."""
+    return values[:1] if values.strides[0] == 0 else values

@@ -61,5 +61,5 @@ def pairs_on(mesh, label, pairs):
     kinds = (pairs,) if isinstance(pairs, str) else pairs
     if isinstance(kinds, (tuple, list)) and kinds and all(isinstance(kind, str) for kind in kinds):
         found = [mesh.springs(kind) for kind in kinds]
-        return found[0] if len(found) == 1 else np.unique(np.concatenate(found), axis=0)
+        return found[0] if len(found) == 1 else mesh.distinct_pairs(np.concatenate(found))
     return own_stencil(label, "pairs", pairs, 2, len(mesh.points))
