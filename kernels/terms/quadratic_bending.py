@@ -14,20 +14,24 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..columns import columns_of, cross_length, dot
 from ..term import Dissipation, Term
 from . import spring
 
 
 def rest_state(points, stencil):
     """Returns 4 cotangent weights [1] and the measure 1/(A₁ + A₂) [1/m²] of the hinges ``stencil`` (E, 4), (E, 5)."""
-    x0, x1, x2, x3 = (points[stencil[:, i]] for i in range(4))
+    x0, x1, x2, x3 = columns_of(points, *stencil.T)
 
     def cotangent(apex, b, c):
-        return np.einsum("ij,ij->i", b - apex, c - apex) / np.linalg.norm(np.cross(b - apex, c - apex), axis=1)
+        """The cotangent, and twice the area."""
+        sides = b - apex, c - apex
+        double = cross_length(*sides)
+        return dot(*sides) / double, double
 
-    at0 = cotangent(x0, x1, x2), cotangent(x0, x1, x3)
-    at1 = cotangent(x1, x0, x2), cotangent(x1, x0, x3)
-    areas = 0.5 * (np.linalg.norm(np.cross(x1 - x0, x2 - x0), axis=1) + np.linalg.norm(np.cross(x1 - x0, x3 - x0), axis=1))
+    (at0, areas) = zip(cotangent(x0, x1, x2), cotangent(x0, x1, x3), strict=True)
+    at1 = cotangent(x1, x0, x2)[0], cotangent(x1, x0, x3)[0]
+    areas = 0.5 * (areas[0] + areas[1])
     return np.stack(
         [at1[0] + at1[1], at0[0] + at0[1], -at0[0] - at1[0], -at0[1] - at1[1], 1.0 / areas],
         axis=1,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..columns import columns_of, length
 from ..term import Dissipation, HessianPolicy, Term
 
 CLAMP = wp.constant(int(HessianPolicy.CLAMP))
@@ -19,7 +20,8 @@ ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
 
 def rest_state(points, stencil):
     """Rest lengths [m] of the pairs ``stencil`` (E, 2) as an array (E, 1)."""
-    return np.linalg.norm(points[stencil[:, 1]] - points[stencil[:, 0]], axis=1)[:, None]
+    x0, x1 = columns_of(points, *stencil.T)
+    return length(x1 - x0)[:, None]
 
 
 def max_lengths(points, stencil, rest):

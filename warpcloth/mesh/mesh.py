@@ -1,5 +1,6 @@
 """The mesh of a cloth: NumPy arrays, validated once, and the topology that energies and solvers read."""
 
+import itertools
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import choice, shown
 from ..base.limits import refuse_memory
 from ..base.types import Converted, FilePath, UpAxis, default
+from ..kernels.columns import columns_of, cross_length, dot, length
 from ..kernels.deformation import FLATTEST
 from .parts import Part, checked_parts, joined
 from .selection import select
@@ -360,11 +362,14 @@ class Mesh:
         shared = first[count == 2]
         one, two = order[shared], order[shared + 1]
         # Side k of triangle t, number 3t+k, runs from its corner k to corner k+1; corner k+2 is opposite.
-        sides, corners = np.stack([one, one, one, two], axis=1), [0, 1, 2, 2]
-        hinges = self.triangles[sides // 3, (sides + corners) % 3]
+        vertices, following = self.triangles.ravel(), np.arange(self.triangles.size)
+        following += np.tile([1, 1, -2], len(self.triangles))
+        after = following[one]
+        corners = one, after, following[after], following[following[two]]
+        hinges = np.stack([vertices[corner] for corner in corners], axis=1)
         folded = np.flatnonzero(hinges[:, 2] == hinges[:, 3])
         if len(folded):
-            pair = (sides[folded[0], [0, 3]] // 3).tolist()
+            pair = [int(side[folded[0]]) // 3 for side in (one, two)]
             raise ValueError(f"triangles: {pair} have the same three vertices, must be different triangles")
         return _read_only(hinges)
 
@@ -389,7 +394,8 @@ class Mesh:
     @cached_property
     def edge_lengths(self) -> np.ndarray:
         """Rest lengths (E,) [m]."""
-        return _read_only(np.linalg.norm(self.points[self.edges[:, 1]] - self.points[self.edges[:, 0]], axis=1))
+        x0, x1 = columns_of(self.points, *self.edges.T)
+        return _read_only(length(x1 - x0))
 
     @cached_property
     def triangle_areas(self) -> np.ndarray:
@@ -424,7 +430,8 @@ class Mesh:
 
     def _keys(self, pairs):
         """Packs each pair of (E, 2), smaller index first, into one int64, because these sort much faster than rows."""
-        return pairs.min(axis=1).astype(np.int64) * len(self.points) + pairs.max(axis=1)
+        one, other = pairs.T
+        return np.minimum(one, other).astype(np.int64) * len(self.points) + np.maximum(one, other)
 
     def distinct_pairs(self, pairs: np.ndarray) -> np.ndarray:
         """Returns the distinct pairs of vertices (E, 2), int32, the smaller index first, in lexicographic order."""
@@ -435,8 +442,8 @@ class Mesh:
     def _flat(self):
         """Whether the height of each triangle is at most FLATTEST times its longest side, or is not finite, (T,)."""
         with np.errstate(invalid="ignore", over="ignore"):
-            sides = self.points[self.triangles] - self.points[np.roll(self.triangles, 1, axis=1)]
-            longest_squared = np.einsum("tki,tki->tk", sides, sides).max(axis=1)
+            a, b, c = columns_of(self.points, *self.triangles.T)
+            longest_squared = np.max([dot(side, side) for side in (a - c, b - a, c - b)], axis=0)
             # 2·area/longest² is the height over the longest side, divided by that side.
             return ~(2 * self.triangle_areas > FLATTEST * longest_squared)
 
@@ -472,8 +479,8 @@ class Surface(Mesh):
 
 def areas_of(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Returns the areas (T,) [m²] of triangles (T, 3) with corners among the points x (n, 3) [m]."""
-    a, b, c = (x[corner] for corner in triangles.T)
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    a, b, c = columns_of(x, *triangles.T)
+    return 0.5 * cross_length(b - a, c - a)
 
 
 def same_topology(one: Mesh, other: Mesh) -> bool:
@@ -524,8 +531,8 @@ def _indices(name, value, width, n):
 
 def _repeated(rows):
     """Returns which rows of (count, width) have a number twice, (count,)."""
-    ordered = np.sort(rows, axis=1)
-    return (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+    columns = rows.T
+    return np.any([one == other for one, other in itertools.combinations(columns, 2)], axis=0)
 
 
 def _count(name, value):

@@ -54,7 +54,7 @@ def refuse_coarse(mesh, positions, dtype, label):
         ValueError: It does not. The message names the edge or the largest coordinate.
     """
     limits = np.finfo(dtype)
-    edges = np.linalg.norm(np.diff(mesh.points[mesh.edges], axis=1)[:, 0], axis=1)
+    edges = mesh.edge_lengths
     least, most = np.sqrt(limits.tiny), np.sqrt(limits.max)
     for edge in (edges.min(), edges.max()):
         if not least < edge < most:
