@@ -5,6 +5,11 @@ copies. ``active[copy]`` is 1 while that copy iterates.
 
 Kernels that always run together share a module, which compiles faster. Conjugate gradients take vector unknowns with 3×3
 preconditioner blocks, or with ``numbers`` scalar ones.
+
+An iteration of conjugate gradients has three launches over (copies, lanes). A lane takes every lanes-th unknown of its copy. On
+CUDA each unknown has a lane, up to a limit, and blocks of ``block`` threads store their part of a scalar product. The next
+launch adds the parts of a copy, in each of its blocks. The CPU has one lane, and ``block`` is 0. So sums have a fixed order.
+What a launch writes for a copy, no other thread of it reads; the next one finds it in ``next_active`` and ``next_rz``.
 """
 
 from functools import cache
@@ -241,160 +246,333 @@ def _unknowns(dtype, numbers):
     return (dtype, dtype, f"{name}.numbers") if numbers else (vec3, mat33, name)
 
 
+@wp.struct
+class Solves:
+    """The conjugate gradients of each copy, (B,) arrays, and of all, (1,).
+
+    ``rz`` is rᵀz, ``first`` its first value, ``pq`` pᵀAp; ``negative`` is 1 after a direction of negative curvature.
+    ``iteration`` counts iterations from 1; ``proceed`` is 1 if a copy is active.
+    """
+
+    active: wp.array(dtype=wp.int32)
+    next_active: wp.array(dtype=wp.int32)
+    negative: wp.array(dtype=wp.int32)
+    rz: wp.array(dtype=wp.float64)
+    next_rz: wp.array(dtype=wp.float64)
+    first: wp.array(dtype=wp.float64)
+    pq: wp.array(dtype=wp.float64)
+    tolerance: wp.array(dtype=wp.float64)
+    iteration: wp.array(dtype=wp.int32)
+    proceed: wp.array(dtype=wp.int32)
+
+
 @cache
-def start_iteration(dtype, numbers: bool = False):
-    """Kernel over unknowns: x = 0, r = b, z = P r, p = z in the copies that are ``wanted``."""
-    vector, block, module = _unknowns(dtype, numbers)
+def block_sums(block: int):
+    """The device functions (lane, value, parts, copy), which stores the part of a block, and (lane, parts, copy) → Σ."""
+    threads = max(block, 1)
+
+    @wp.func
+    def over_block(value: wp.float64):
+        return wp.tile_sum(wp.tile(value))[0]
+
+    @wp.func
+    def store(lane: int, value: wp.float64, parts: wp.array2d(dtype=wp.float64), copy: int):
+        if wp.static(block > 0):
+            total = over_block(value)
+            if lane % wp.static(threads) == 0:
+                parts[copy, lane // wp.static(threads)] = total
+        else:
+            parts[copy, 0] = value
+
+    @wp.func
+    def add_up(lane: int, parts: wp.array2d(dtype=wp.float64), copy: int):
+        total = wp.float64(0.0)
+        if wp.static(block > 0):
+            own = wp.float64(0.0)
+            for k in range(lane % wp.static(threads), parts.shape[1], wp.static(threads)):
+                own += parts[copy, k]
+            total = over_block(own)
+        else:
+            total = parts[copy, 0]
+        return total
+
+    return store, add_up
+
+
+@cache
+def scalar_product(numbers: bool):
+    """Device function (a, b) → a·b in float64 of vectors or ``numbers``."""
+
+    @wp.func
+    def multiplied(a: Any, b: Any):
+        if wp.static(numbers):
+            return wp.float64(a) * wp.float64(b)
+        else:
+            return wp.float64(wp.dot(a, b))
+
+    return multiplied
+
+
+@wp.func
+def begin_pass(solves: Solves, copy: int, lane: int):
+    """Takes over what the last pass wrote for the next, and returns whether the copy is active."""
+    if lane == 0:
+        solves.active[copy] = solves.next_active[copy]
+        solves.rz[copy] = solves.next_rz[copy]
+        if copy == 0:
+            solves.iteration[0] = solves.iteration[0] + 1
+            solves.proceed[0] = 0
+    return solves.next_active[copy] == 1
+
+
+@cache
+def start_iteration(dtype, numbers: bool, block: int):
+    """Kernel over (copies, lanes): x = 0, r = b, z = P r, p = z in the copies that are ``wanted``; the parts of rᵀz."""
+    vector, matrix, module = _unknowns(dtype, numbers)
+    store, _add_up = block_sums(block)
+    multiplied = scalar_product(numbers)
 
     @wp.kernel(module=module, enable_backward=False)
     def start(
         # state in
-        preconditioner: wp.array(dtype=block),
+        preconditioner: wp.array(dtype=matrix),
         b: wp.array(dtype=vector),
         # parameters
         wanted: wp.array(dtype=wp.int32),
         per_copy: int,
+        lanes: int,
         # out
         x: wp.array(dtype=vector),
         r: wp.array(dtype=vector),
         z: wp.array(dtype=vector),
         p: wp.array(dtype=vector),
+        parts: wp.array2d(dtype=wp.float64),
+        solves: Solves,
     ):
-        i = wp.tid()
-        if wanted[i // per_copy] == 0:
-            return
-        if wp.static(numbers):
-            x[i] = dtype(0.0)
-        else:
-            x[i] = vector()
-        r[i] = b[i]
-        z[i] = preconditioner[i] * b[i]
-        p[i] = z[i]
+        copy, lane = wp.tid()
+        total = wp.float64(0.0)
+        if wanted[copy] == 1:
+            for j in range(lane, per_copy, lanes):
+                i = copy * per_copy + j
+                if wp.static(numbers):
+                    x[i] = dtype(0.0)
+                else:
+                    x[i] = vector()
+                r[i] = b[i]
+                z[i] = preconditioner[i] * b[i]
+                p[i] = z[i]
+                total += multiplied(r[i], z[i])
+        store(lane, total, parts, copy)
+        if copy == 0 and lane == 0:
+            solves.iteration[0] = 0
+            solves.proceed[0] = 0
 
     return start
 
 
 @cache
-def start_copies():
-    """Kernel over copies: active = 1 for wanted copies with rᵀz > 0; stores their rᵀz; resets the iteration count."""
+def start_copies(block: int):
+    """Kernel over (copies, lanes of one block): activates wanted copies with rᵀz > 0, and stores their rᵀz."""
+    _store, add_up = block_sums(block)
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def start(
         # state in
-        rz: wp.array(dtype=wp.float64),
+        parts: wp.array2d(dtype=wp.float64),
         # parameters
         wanted: wp.array(dtype=wp.int32),
         # out
-        first: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        iteration: wp.array(dtype=wp.int32),
-        proceed: wp.array(dtype=wp.int32),
+        solves: Solves,
     ):
-        copy = wp.tid()
-        first[copy] = rz[copy]
-        active[copy] = wp.where(rz[copy] > wp.float64(0.0), wanted[copy], 0)
-        iteration[0] = 0
-        proceed[0] = 1
+        copy, lane = wp.tid()
+        rz = add_up(lane, parts, copy)
+        if lane == 0:
+            solves.first[copy] = rz
+            solves.next_rz[copy] = rz
+            solves.negative[copy] = 0
+            going = wp.where(rz > wp.float64(0.0), wanted[copy], 0)
+            solves.next_active[copy] = going
+            if going == 1:
+                solves.proceed[0] = 1
 
     return start
 
 
 @cache
-def advance(dtype, numbers: bool = False):
-    """Kernel over unknowns: x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy.
+def begin_multiplying():
+    """Kernel over copies: begins an iteration whose product is launched by itself."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def begin(
+        # in and out
+        solves: Solves,
+    ):
+        begin_pass(solves, wp.tid(), 0)
+
+    return begin
+
+
+@cache
+def dot_parts(dtype, numbers: bool, block: int):
+    """Kernel over (copies, lanes): the parts of aᵀb in active copies."""
+    vector, _matrix, module = _unknowns(dtype, numbers)
+    store, _add_up = block_sums(block)
+    multiplied = scalar_product(numbers)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def dot(
+        # state in
+        a: wp.array(dtype=vector),
+        b: wp.array(dtype=vector),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        lanes: int,
+        # out
+        parts: wp.array2d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        total = wp.float64(0.0)
+        if active[copy] == 1:
+            for j in range(lane, per_copy, lanes):
+                i = copy * per_copy + j
+                total += multiplied(a[i], b[i])
+        store(lane, total, parts, copy)
+
+    return dot
+
+
+@cache
+def multiply_parts(dtype, block: int):
+    """Kernel over (copies, lanes): begins an iteration; q = A p in active copies, and the parts of pᵀq."""
+    vec3, mat33 = types(dtype)
+    store, _add_up = block_sums(block)
+    multiplied = scalar_product(False)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def multiply_rows_and_dot(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        # state in
+        values: wp.array(dtype=mat33),
+        p: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # in and out
+        solves: Solves,
+        # out
+        q: wp.array(dtype=vec3),
+        parts: wp.array2d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        total = wp.float64(0.0)
+        if begin_pass(solves, copy, lane):
+            for j in range(lane, per_copy, lanes):
+                i = copy * per_copy + j
+                row = vec3()
+                for s in range(offsets[i], offsets[i + 1]):
+                    row += values[s] * p[columns[s]]
+                q[i] = row
+                total += multiplied(p[i], row)
+        store(lane, total, parts, copy)
+
+    return multiply_rows_and_dot
+
+
+@cache
+def advance(dtype, numbers: bool, block: int):
+    """Kernel over (copies, lanes): x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy; the parts of rᵀz.
 
     If pᵀq ≤ 0, the first step sets x = p, and a later step leaves x. Both give a descent direction (Steihaug 1983).
     """
-    vector, block, module = _unknowns(dtype, numbers)
+    vector, matrix, module = _unknowns(dtype, numbers)
+    store, add_up = block_sums(block)
+    multiplied = scalar_product(numbers)
 
     @wp.kernel(module=module, enable_backward=False)
     def advance_unknowns(
         # state in
-        preconditioner: wp.array(dtype=block),
+        preconditioner: wp.array(dtype=matrix),
         p: wp.array(dtype=vector),
         q: wp.array(dtype=vector),
-        rz: wp.array(dtype=wp.float64),
-        pq: wp.array(dtype=wp.float64),
+        pq_parts: wp.array2d(dtype=wp.float64),
         # parameters
-        active: wp.array(dtype=wp.int32),
-        iteration: wp.array(dtype=wp.int32),
         per_copy: int,
+        lanes: int,
         # in and out
+        solves: Solves,
         x: wp.array(dtype=vector),
         r: wp.array(dtype=vector),
         # out
         z: wp.array(dtype=vector),
+        parts: wp.array2d(dtype=wp.float64),
     ):
-        i = wp.tid()
-        copy = i // per_copy
-        if active[copy] == 1:
-            if pq[copy] <= wp.float64(0.0):
-                if iteration[0] == 0:
-                    x[i] = p[i]
+        copy, lane = wp.tid()
+        pq = add_up(lane, pq_parts, copy)
+        total = wp.float64(0.0)
+        if solves.active[copy] == 1:
+            if lane == 0:
+                solves.pq[copy] = pq
+            if pq <= wp.float64(0.0):
+                if solves.iteration[0] == 1:
+                    for j in range(lane, per_copy, lanes):
+                        i = copy * per_copy + j
+                        x[i] = p[i]
             else:
-                a = dtype(rz[copy] / pq[copy])
-                x[i] = x[i] + a * p[i]
-                r[i] = r[i] - a * q[i]
-                z[i] = preconditioner[i] * r[i]
+                a = dtype(solves.rz[copy] / pq)
+                for j in range(lane, per_copy, lanes):
+                    i = copy * per_copy + j
+                    x[i] = x[i] + a * p[i]
+                    r[i] = r[i] - a * q[i]
+                    z[i] = preconditioner[i] * r[i]
+                    total += multiplied(r[i], z[i])
+        store(lane, total, parts, copy)
 
     return advance_unknowns
 
 
 @cache
-def check_copies():
-    """Kernel over copies: deactivates those that are done; ratio = new rᵀz / old rᵀz; proceed = 1 if any is active."""
+def turn(dtype, numbers: bool, block: int):
+    """Kernel over (copies, lanes): ends the copies that are done, and p = z + (new rᵀz/old rᵀz) p in the others.
 
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def check(
-        # state in
-        new_rz: wp.array(dtype=wp.float64),
-        pq: wp.array(dtype=wp.float64),
-        first: wp.array(dtype=wp.float64),
-        # parameters
-        tolerance: wp.array(dtype=wp.float64),
-        # in and out
-        rz: wp.array(dtype=wp.float64),
-        active: wp.array(dtype=wp.int32),
-        negative: wp.array(dtype=wp.int32),
-        # out
-        ratio: wp.array(dtype=wp.float64),
-        proceed: wp.array(dtype=wp.int32),
-    ):
-        copy = wp.tid()
-        if active[copy] == 1:
-            ratio[copy] = new_rz[copy] / rz[copy]
-            rz[copy] = new_rz[copy]
-            if pq[copy] <= wp.float64(0.0):
-                negative[copy] = 1
-                active[copy] = 0
-            # NaN also ends the iteration; the caller finds it in the result.
-            if not (new_rz[copy] > tolerance[copy] * tolerance[copy] * first[copy]):
-                active[copy] = 0
-            if active[copy] == 1:
-                proceed[0] = 1
-
-    return check
-
-
-@cache
-def new_direction(dtype, numbers: bool = False):
-    """Kernel over unknowns: p = z + ratio p."""
-    vector, _block, module = _unknowns(dtype, numbers)
+    A copy is done if √(rᵀz) has fallen to its tolerance, after ``most`` iterations, or at pᵀq ≤ 0. NaN ends it too; the caller
+    finds it in the result.
+    """
+    vector, _matrix, module = _unknowns(dtype, numbers)
+    _store, add_up = block_sums(block)
 
     @wp.kernel(module=module, enable_backward=False)
-    def turn(
+    def turn_directions(
         # state in
         z: wp.array(dtype=vector),
-        ratio: wp.array(dtype=wp.float64),
+        parts: wp.array2d(dtype=wp.float64),
         # parameters
-        active: wp.array(dtype=wp.int32),
         per_copy: int,
+        lanes: int,
+        most: int,
         # in and out
+        solves: Solves,
         p: wp.array(dtype=vector),
     ):
-        i = wp.tid()
-        copy = i // per_copy
-        if active[copy] == 1:
-            p[i] = z[i] + dtype(ratio[copy]) * p[i]
+        copy, lane = wp.tid()
+        rz = add_up(lane, parts, copy)
+        if solves.active[copy] == 1:
+            curved = solves.pq[copy] <= wp.float64(0.0)
+            left = solves.tolerance[copy] * solves.tolerance[copy] * solves.first[copy]
+            going = rz > left and not curved and solves.iteration[0] < most
+            if going:
+                ratio = dtype(rz / solves.rz[copy])
+                for j in range(lane, per_copy, lanes):
+                    i = copy * per_copy + j
+                    p[i] = z[i] + ratio * p[i]
+            if lane == 0:
+                solves.next_active[copy] = wp.where(going, 1, 0)
+                solves.next_rz[copy] = rz
+                if curved:
+                    solves.negative[copy] = 1
+                if going:
+                    solves.proceed[0] = 1
 
-    return turn
+    return turn_directions

@@ -6,6 +6,7 @@ import pytest
 import warpcloth as wc
 from support.steps import swinging
 from warpcloth.core.status import Result
+from warpcloth.numerics import linear
 from warpcloth.numerics.minimise import Minimiser
 
 EPS = float(np.finfo(np.float32).eps)
@@ -77,8 +78,8 @@ def test_a_quadratic_energy_takes_one_whole_step(apart, device):
     assert np.abs(found).max() < 2.0 * EPS
 
 
-@pytest.mark.parametrize("linear", ["cg", "factorised"])
-def test_each_copy_ends_by_itself(linear, device):
+@pytest.mark.parametrize("method", ["cg", "factorised"])
+def test_each_copy_ends_by_itself(method, device):
     """Crumpled sheets of unlike stiffness beside one in balance and one that is not finite, to the bits of each alone.
 
     The raw Hessian of the crumpled ones has negative curvatures, and they take more iterations than the loop on the device does
@@ -95,7 +96,7 @@ def test_each_copy_ends_by_itself(linear, device):
         model = scene.build(device=device, dtype="float64", copies=len(copies), vary=vary)
         base = model.positions.numpy().reshape(len(copies), -1, 3)
         base[[copy == 3 for copy in copies], 7] = np.nan
-        minimiser = Minimiser(model, model.array(base.reshape(-1, 3), model.vec3), "adaptive", linear, s=1e3)
+        minimiser = Minimiser(model, model.array(base.reshape(-1, 3), model.vec3), "adaptive", method, s=1e3)
         results = minimiser.minimise(1e-8, iterations, np.full(len(copies), 9.81))
         return results, minimiser.residual, minimiser.iterations, minimiser.correction.numpy().reshape(base.shape)
 
@@ -135,3 +136,20 @@ def test_steps_start_from_the_last_correction(device):
         warm.step()
         ends.append(warm.state.x.numpy())
     np.testing.assert_array_equal(*ends)
+
+
+@pytest.mark.slow
+def test_scalar_products_are_shared_by_blocks(device, monkeypatch):
+    """Seven lanes of each copy end where one lane does, but for rounding, with rows of a Hessian and of constraints."""
+    solvers = wc.Newton(substeps=4, tolerance=1e-10), wc.ConstrainedDynamics(substeps=4, linear="cg", tolerance=1e-10)
+    model = swinging(8).build(device=device, dtype="float64", copies=2, vary={"Spring.stiffness": np.array([1e3, 3e3])})
+    ends = []
+    for blocks in (None, {"cuda": 32, "cpu": 1}):
+        if blocks:
+            monkeypatch.setattr(linear, "BLOCKS", blocks)
+            monkeypatch.setattr(linear, "MOST_BLOCKS", 7)
+        for solver in solvers:
+            stepper = solver.bind(model)
+            stepper.frame()
+            ends.append(stepper.state.x.numpy())
+    assert np.abs(ends[0] - ends[2]).max() < 1e-12 and np.abs(ends[1] - ends[3]).max() < 1e-12

@@ -114,6 +114,11 @@ class Hessian:
         contact = self.pairs is not None or any(elements.collider is not None for elements in self.terms)
         self._lost = 16.0 * float(np.finfo(self.model.numpy_dtype).eps) * contact
 
+    @property
+    def block_rows(self):
+        """The offsets, columns and values of the rows, without pairs; else None, because values are not all of the matrix."""
+        return None if self.pairs is not None else (self.offsets, self.columns, self.values)
+
     def multiply(self, p, q, active):
         """Launches q = A p for the copies that are ``active`` (B,)."""
         given = [self.offsets, self.columns, self.values, p, active, self.per_copy]

@@ -175,6 +175,8 @@ class Constraints:
 
     # The matrix A, for ConjugateGradients.
 
+    block_rows = None
+
     def prepare(self):
         """Does nothing."""
 

@@ -10,8 +10,9 @@ from ..base.interrupts import deferred
 from ..core.capture import Mirror, on_host
 from ..kernels import linear
 from ..kernels.elementwise import scale
-from ..kernels.loop import count_pass, limit_passes
 
+# Threads of a block that share a scalar product, and the most blocks of a copy, on a GPU; on the CPU one thread takes a copy.
+BLOCKS, MOST_BLOCKS = {"cuda": 256, "cpu": 0}, 1024
 # Largest number of unknowns for which all eigenvalues are computed.
 SMALL = 100
 
@@ -25,16 +26,16 @@ class ConjugateGradients:
 
     Args:
         matrix: A, an object with ``count``, ``per_copy``, ``vector``, ``block``, ``prepare``, ``multiply`` and
-            ``invert_diagonal``, such as :class:`warpcloth.core.hessian.Hessian`.
-        sums: :class:`warpcloth.core.sums.Sums` over its unknowns.
+            ``invert_diagonal``, such as :class:`warpcloth.core.hessian.Hessian`. ``block_rows`` has its offsets, columns and
+            values if these are all of it, else None.
         iterations: Maximum number of iterations of one solve.
     """
 
     capturable = True
 
-    def __init__(self, matrix, sums, iterations):
+    def __init__(self, matrix, iterations):
         model = self.model = matrix.model
-        self.matrix, self.sums, self.iterations = matrix, sums, iterations
+        self.matrix, self.iterations = matrix, iterations
         matrix.prepare()
 
         def per_unknown(dtype):
@@ -43,40 +44,54 @@ class ConjugateGradients:
         self.r, self.z, self.p, self.q = (per_unknown(matrix.vector) for _ in range(4))
         self.preconditioner = per_unknown(matrix.block)
 
-        self.rz, self.new_rz, self.pq, self.first, self.ratio = (model.scalars() for _ in range(5))
-        self.active, self.negative = (model.scalars(wp.int32) for _ in range(2))
-        self.tolerance = model.scalars()
-        self.proceed, self.iteration = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
-        of_unknowns = linear.start_iteration, linear.advance, linear.new_direction
+        self._solves = solves = linear.Solves()
+        for name in ("active", "next_active", "negative"):
+            setattr(solves, name, model.scalars(wp.int32))
+        for name in ("rz", "next_rz", "first", "pq", "tolerance"):
+            setattr(solves, name, model.scalars())
+        solves.iteration, solves.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        self.active, self.negative, self.tolerance = solves.active, solves.negative, solves.tolerance
+        self.iteration = solves.iteration
+
+        block = BLOCKS["cuda" if model.device.is_cuda else "cpu"]
+        blocks = min(max(-(-matrix.per_copy // block), 1), MOST_BLOCKS) if block else 1
+        self._lanes, self._of_block = blocks * max(block, 1), (model.copies, max(block, 1))
+        self._dim, parts = (model.copies, self._lanes), (model.copies, blocks)
+        self._parts, self._pq_parts = (wp.zeros(parts, dtype=wp.float64, device=model.device) for _ in range(2))
+        of_unknowns = linear.start_iteration, linear.dot_parts, linear.advance, linear.turn
         self._launch = model.launcher(
-            (of_unknowns, model.dtype, matrix.vector is model.dtype),
-            ((linear.start_copies, linear.check_copies),),
-            ((count_pass, limit_passes), linear.MODULE),
+            (of_unknowns, model.dtype, matrix.vector is model.dtype, block),
+            ((linear.multiply_parts,) if matrix.block_rows else (), model.dtype, block),
+            ((linear.start_copies,), block),
+            ((linear.begin_multiplying,),),
         )
 
     def solve(self, b, x, wanted):
         """Solves for x = A⁻¹ b to the relative ``tolerance`` (B,), for the copies that are ``wanted`` (B,); others keep x."""
-        N, B, n = self.matrix.count, self.model.copies, self.matrix.per_copy
         self.matrix.invert_diagonal(self.preconditioner)
-        self._launch(linear.start_iteration, N, [self.preconditioner, b, wanted, n], [x, self.r, self.z, self.p])
-        self.sums.dot(self.r, self.z, self.rz)
-        self.negative.zero_()
-        self._launch(linear.start_copies, B, [self.rz, wanted], [self.first, self.active, self.iteration, self.proceed])
-        wp.capture_while(self.proceed, self._iterate, x=x)
+        given = [self.preconditioner, b, wanted, self.matrix.per_copy, self._lanes]
+        out = [x, self.r, self.z, self.p, self._parts, self._solves]
+        self._launch(linear.start_iteration, self._dim, given, out)
+        self._launch(linear.start_copies, self._of_block, [self._parts, wanted], [self._solves])
+        wp.capture_while(self._solves.proceed, self._iterate, x=x)
 
     def _iterate(self, x):
-        N, B, n = self.matrix.count, self.model.copies, self.matrix.per_copy
-        self.matrix.multiply(self.p, self.q, self.active)
-        self.sums.dot(self.p, self.q, self.pq, self.active)
-        scalars = [self.rz, self.pq, self.active, self.iteration, n]
-        self._launch(linear.advance, N, [self.preconditioner, self.p, self.q, *scalars], [x, self.r, self.z])
-        self.sums.dot(self.r, self.z, self.new_rz, self.active)
-        self._launch(count_pass, 1, [], [self.iteration, self.proceed])
-        given = [self.new_rz, self.pq, self.first, self.tolerance]
-        changed = [self.rz, self.active, self.negative, self.ratio, self.proceed]
-        self._launch(linear.check_copies, B, given, changed)
-        self._launch(limit_passes, 1, [self.iteration, self.iterations], [self.proceed])
-        self._launch(linear.new_direction, N, [self.z, self.ratio, self.active, n], [self.p])
+        matrix, size = self.matrix, [self.matrix.per_copy, self._lanes]
+        if matrix.block_rows:
+            given = [*matrix.block_rows, self.p, *size]
+            self._launch(linear.multiply_parts, self._dim, given, [self._solves, self.q, self._pq_parts])
+        else:
+            self._launch(linear.begin_multiplying, self.model.copies, [], [self._solves])
+            matrix.multiply(self.p, self.q, self.active)
+            self._launch_dot(self.p, self.q, self.active, self._pq_parts)
+        given = [self.preconditioner, self.p, self.q, self._pq_parts, *size]
+        self._launch(linear.advance, self._dim, given, [self._solves, x, self.r, self.z, self._parts])
+        given = [self.z, self._parts, *size, self.iterations]
+        self._launch(linear.turn, self._dim, given, [self._solves, self.p])
+
+    def _launch_dot(self, a, b, active, parts):
+        """Launches the parts of aᵀb in the copies that are ``active`` (B,)."""
+        self._launch(linear.dot_parts, self._dim, [a, b, active, self.matrix.per_copy, self._lanes], [parts])
 
 
 class Factorised:

@@ -56,7 +56,7 @@ class Minimiser:
         self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True, pairs=pairs)
         if linear == "cg":
-            self.linear = ConjugateGradients(self.hessian, self.sums, linear_iterations)
+            self.linear = ConjugateGradients(self.hessian, linear_iterations)
         else:
             self.linear = Factorised(self.hessian)
         if pairs is not None:

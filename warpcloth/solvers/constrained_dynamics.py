@@ -148,7 +148,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
 
         self._active, self._stepped = Mirror(model.scalars(wp.int32)), Mirror(self._step)
         if options.linear == "cg":
-            self._linear = ConjugateGradients(self.constraints, self._row_sums, LINEAR_ITERATIONS)
+            self._linear = ConjugateGradients(self.constraints, LINEAR_ITERATIONS)
             self._tolerance = Mirror(self._linear.tolerance)
         else:
             self._linear = FactorisedRows(self.constraints, (self._right, self._change, self._active.array))
