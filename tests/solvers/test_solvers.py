@@ -259,8 +259,15 @@ def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: wc.Newton(), "exactly one of dt and substeps"),
-        (lambda: wc.Newton(dt=0.01, substeps=2), "exactly one of dt and substeps"),
+        (lambda: wc.Newton(), "exactly one of dt, substeps and error"),
+        (lambda: wc.Newton(dt=0.01, substeps=2), "exactly one of dt, substeps and error"),
+        (lambda: wc.PBD(), "exactly one of dt and substeps"),
+        (lambda: wc.Newton(error=1e-3, substeps=2), "exactly one of dt, substeps and error"),
+        (lambda: wc.Newton(error=0.0), "error is 0"),
+        (
+            lambda: wc.Newton(error=1e-3, integrator="bdf2"),
+            "error is given with integrator='bdf2', whose steps must all have one length; take 'euler' or 'midpoint'",
+        ),
         (lambda: wc.Newton(dt=-0.01), "dt is -0.01"),
         (lambda: wc.Newton(dt=float("nan")), "dt is nan"),
         (lambda: wc.Newton(substeps=0), "substeps is 0"),
@@ -284,7 +291,7 @@ def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
         (lambda: wc.XPBD(substeps=1, sweep="vertex-averaged"), "sweep is 'vertex-averaged'; it must be one of 'coloured'"),
         (lambda: wc.XPBD(substeps=1, form="row"), "form is 'row'"),
         (lambda: wc.XPBD(substeps=1, relaxation=-1.0), "relaxation is -1.0"),
-        (lambda: wc.ProjectiveDynamics(), "exactly one of dt and substeps"),
+        (lambda: wc.ProjectiveDynamics(), "exactly one of dt, substeps and error"),
         (lambda: wc.ProjectiveDynamics(substeps=1, iterations=0), "iterations is 0"),
         (lambda: wc.ProjectiveDynamics(substeps=1, tolerance=0.0), "tolerance is 0.0"),
         (lambda: wc.ProjectiveDynamics(substeps=1, acceleration="lbfgs"), "acceleration is 'lbfgs'; it must be one of 'none'"),

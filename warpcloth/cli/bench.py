@@ -14,8 +14,8 @@ EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
 scene net. The scene resting then shows what contact costs, for colliders of each shape, touched and far away, and for meshes of
 growing size. The scene folded_sheet shows what self-contact costs, for a sheet that falls flat and for one that is folded in
-two. All of it takes many minutes. Rows are measured one after another, each in its own process. If neither dt nor substeps is
-given, the step is chosen as by 'warpcloth run'.
+two. All of it takes many minutes. Rows are measured one after another, each in its own process. If no step is
+given, by dt, substeps or error, it is chosen as by 'warpcloth run'.
 
 Columns:
   ms a frame  time of a frame after warm-up, with its points copied to the host: median
@@ -119,7 +119,7 @@ def _benchmarks(arguments, device):
     parameters = {name: values[name] for name in assignments(arguments.p)}
     arguments.solver = arguments.solver or DEFAULT
     chosen = options(SOLVERS[arguments.solver], assignments(arguments.s))
-    step_given = {"dt", "substeps"} & set(chosen)
+    step_given = set(SOLVERS[arguments.solver].step_options) & set(chosen)
     if step_given or not SOLVERS[arguments.solver].limited:
         solver = solver_setup(arguments, scene, device).solver
         chosen |= {} if step_given else {"substeps": solver.substeps}

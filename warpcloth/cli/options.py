@@ -43,7 +43,10 @@ def _of_solver(name):
     name = name or DEFAULT
     record = SOLVERS[name]
     found = _listed(f"-s of {name}", record.__doc__, record, parameters_of(record))
-    return found | {"note": "give dt (the step [s]) or substeps (steps per frame), not both; without either a step is chosen"}
+    error = " or error (tolerance [m])" if "error" in record.step_options else ""
+    return found | {
+        "note": f"give dt (the step [s]) or substeps (steps per frame){error}, only one; without any a step is chosen"
+    }
 
 
 def _of_scene(name):

@@ -14,7 +14,7 @@ _STEPS_A_SECOND = 240
 _MANY_SUBSTEPS = 1000
 
 EPILOG = """\
-If neither dt nor substeps is given, the step is chosen: about 1/240 s for most solvers. Solvers with a stability limit, such as
+If no step is given, by dt, substeps or error, it is about 1/240 s for most solvers. Solvers with a stability limit, such as
 explicit, take the fewest substeps that respect two limits. The first, with a margin of 10 %, is for small motion about the
 rest shape. The second is for large motion. It is a strict bound for springs and quadratic bending, but only an estimate for
 dihedral bending and membranes, because it uses their stiffness at rest.
@@ -77,7 +77,7 @@ def solver_setup(arguments, scene, device, limits=False):
     arguments.solver = arguments.solver or DEFAULT
     record = SOLVERS[arguments.solver]
     given = options(record, assignments(arguments.s))
-    step_given = "dt" in given or "substeps" in given
+    step_given = not set(record.step_options).isdisjoint(given)
     solver = record(**given, **({} if step_given else {"substeps": 1}))  # checks options before anything is built
     if not record.limited:
         if step_given:
@@ -118,12 +118,12 @@ def hint_of(arguments, setup, scene):
 
 
 def solver_facts(arguments, setup, fps):
-    step = 1.0 / (fps * setup.solver.per_frame(fps))
+    by_error = getattr(setup.solver, "error", None) is not None
+    step = None if by_error else 1.0 / (fps * setup.solver.per_frame(fps))
     return {"solver": arguments.solver, "options": asdict(setup.solver), "step": step, "step_chosen": setup.chosen}
 
 
 def solver_line(facts):
     options = ", ".join(f"{name}={value}" for name, value in facts["options"].items() if value is not None)
-    return f"{facts['solver']}({options}), step 1/{1.0 / facts['step']:.6g} s" + (
-        f" ({facts['step_chosen']})" if facts["step_chosen"] else ""
-    )
+    step = "by error" if facts["step"] is None else f"1/{1.0 / facts['step']:.6g} s"
+    return f"{facts['solver']}({options}), step {step}" + (f" ({facts['step_chosen']})" if facts["step_chosen"] else "")

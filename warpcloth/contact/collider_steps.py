@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from ..core.state import Count
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.clear_elements import find_clear
@@ -75,11 +76,14 @@ class ColliderSteps:
         for name in ("before", "at", "after"):
             setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
         self.x_before = model.vectors()
-        self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device))
+        self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device), Count())
         self.notes = FilterNotes()
         self.notes.steps = self.steps
-        self.notes.cut = state.add("vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device))
-        self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device))
+        self.notes.cut = state.add(
+            "vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device), Count(sums=True)
+        )
+        of_note = Count(rest=model.per_copy * (self._dim[1] + 1))
+        self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device), of_note)
         self.correction, self.he = None, h
         self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)

@@ -8,6 +8,7 @@ import warp as wp
 
 from ..core.capture import Mirror
 from ..core.scan import Scan
+from ..core.state import Count
 from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels.contact import gap_notes, pair_blocks, self_pairs
@@ -101,8 +102,8 @@ class SelfSteps:
         areas[model.in_model(np.arange(model.per_copy))] = model.scene.mesh.vertex_areas
         areas = np.tile(areas, model.copies)
         self._areas = wp.array(areas, dtype=wp.float64, device=device)
-        self.cut = state.add("vertices kept apart", wp.zeros(model.copies, dtype=wp.int64, device=device))
-        self.steps = state.add("steps of self-contact", model.scalars(wp.int32))
+        self.cut = state.add("vertices kept apart", wp.zeros(model.copies, dtype=wp.int64, device=device), Count(sums=True))
+        self.steps = state.add("steps of self-contact", model.scalars(wp.int32), Count())
         self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
         self.listed, self._ends = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
@@ -110,7 +111,7 @@ class SelfSteps:
         self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
         self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
         self.held = HeldPins()
-        self.held.first = state.add("first pin held back", model.scalars(wp.int64))
+        self.held.first = state.add("first pin held back", model.scalars(wp.int64), Count(rest=model.per_copy))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
         made = (
             pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs,

@@ -1,9 +1,24 @@
 """The state of a bound solver as a value: everything that one step passes to the next."""
 
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
 from .status import Result
+
+
+class Count(NamedTuple):
+    """How the values of an array depend on the number of steps, for steps whose length changes.
+
+    Attributes:
+        sums: Whether each step adds a number to it, such as that of the moves that were cut short. Else it is the number of
+            steps, or the note of a step.
+        rest: Of a note FIRST − (step·rest + other), with 0 for none: the number of values of ``other``. Else 0.
+    """
+
+    sums: bool = False
+    rest: int = 0
 
 
 class State:
@@ -26,11 +41,12 @@ class State:
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).
         lent: Arrays of another state by name, which :meth:`add` uses in place of the given ones.
+        counts: Arrays that count steps, by name: a :class:`Count` of each.
     """
 
     def __init__(self, x, v, batch_size, shares=()):
         self.arrays, self.starts, self.shares, self.parts = {"x": x, "v": v}, {}, tuple(shares), {}
-        self.lent = {}
+        self.lent, self.counts = {}, {}
         self._results, self._residual = [Result.COMPLETED] * batch_size, np.zeros(batch_size)
 
     @property
@@ -65,10 +81,18 @@ class State:
         """x and v, for ``x, v = stepper.state``."""
         return iter((self.x, self.v))
 
-    def add(self, name, array):
-        """Registers an array that is 0 at the start, and returns it, or the array that is lent in its place; ignores None."""
+    def add(self, name, array, count=None):
+        """Registers an array that is 0 at the start, and returns it, or the array that is lent in its place; ignores None.
+
+        Args:
+            name: Its name.
+            array: The array, or None.
+            count: The :class:`Count` of an array whose values depend on the number of steps, or None.
+        """
         if array is not None:
             array = self.arrays[name] = self.lent.get(name, array)
+            if count is not None:
+                self.counts[name] = count
         return array
 
     def add_part(self, name, part):
@@ -86,6 +110,7 @@ class State:
         other.arrays |= {name: wp.clone(array) for name, array in self.arrays.items() if name not in other.arrays}
         other.parts = {name: part.copy() for name, part in self.parts.items()}
         other.starts, other.results, other.residual = self.starts, list(self.results), self.residual.copy()
+        other.counts = self.counts
         return other
 
     def assign(self, other):

@@ -13,6 +13,7 @@ class Result(Enum):
     CONVERGED = "converged"
     ROUNDED = "converged as far as rounding allows"
     ITERATIONS_USED_UP = "iterations used up"
+    INACCURATE = "error above its tolerance with the shortest step"
     STALLED = "no step lowers the energy"
     SADDLE = "in balance, but not where the energy is least"
     CONTRADICTED = "constraints contradict one another"

@@ -117,7 +117,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
 
     Args:
         scene: The :class:`warpcloth.Scene`.
-        solver: The record of a solver, with `substeps`.
+        solver: The record of a solver, with its step.
         tolerance: Change of the result below which something does not matter, as a fraction of the longest side of the cloth.
         frames: Number of frames; by default those of the scene, but at most 30.
         resolutions: The same scene with coarser or finer meshes by name, such as {"n=16": scene}; or None.
@@ -144,12 +144,17 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         raise ValueError(f"{scene.name} as it is: {base.status.message}; advice needs a run that does not diverge")
     size = float(np.ptp(scene.mesh.points, axis=0).max())
     other = "float64" if dtype == "float32" else "float32"
-    halved = replace(solver, dt=None, substeps=2 * solver.per_frame(scene.fps))
+    if getattr(solver, "error", None) is None:
+        finer = replace(solver, dt=None, substeps=2 * solver.per_frame(scene.fps))
+        step = f"substeps={finer.substeps}"
+    else:
+        finer = replace(solver, error=0.5 * solver.error)
+        step = f"error={finer.error:g}"
     parts = _parts(scene)
     plans = [
         *((kind, f"without {name}", {"changed": _without(scene, [(kind, k)])}) for (kind, k), name in parts.items()),
         ("precision", other, {"changed": scene, "dtype": other}),
-        ("step", f"substeps={halved.substeps}", {"changed": scene, "solver": halved}),
+        ("step", step, {"changed": scene, "solver": finer}),
         *(("resolution", name, {"changed": changed}) for name, changed in (resolutions or {}).items()),
     ]
     trials = []

@@ -250,8 +250,8 @@ class Survey:
         if self.x == self.y or {self.x, self.y} & set(self.fixed):
             raise ValueError(f"axes are {self.x}, {self.y} and at fixed values {', '.join(self.fixed)}; each must be another")
         for setup in self.setups:
-            if {"dt", "substeps"} & set(setup.options):
-                raise ValueError(f"{setup}: the map sets the step; leave dt and substeps out")
+            if {"dt", "substeps", "error"} & set(setup.options):
+                raise ValueError(f"{setup}: the map sets the step; leave dt, substeps and error out")
         if self.duration is None:
             object.__setattr__(self, "duration", 0.5 * self.scene.load().duration)
         number("duration", self.duration, above=0.0)

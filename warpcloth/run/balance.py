@@ -113,7 +113,7 @@ class Balance:
 
     def __init__(self, model, stepper):
         self.model = model
-        self._h = stepper.h
+        self._stepper, self._h = stepper, stepper.h
         self._staggered, self._damps = stepper.options.staggered, stepper.options.damps
         arrays = (model.positions, model.mass, model.inverse_mass)
         points, mass, inverse = (model.in_scene_order(array.numpy()).astype(np.float64) for array in arrays)
@@ -153,6 +153,7 @@ class Balance:
         with np.errstate(all="ignore"):
             points, velocities = points.astype(np.float64, copy=False), velocities.astype(np.float64, copy=False)
             kinetic, height = self.kinetic(velocities), self._height(points)
+            self._h = min(self._h, self._stepper.h)
             if self.free:
                 self._note_farthest(points)
             self.points = points

@@ -264,7 +264,8 @@ class History:
             air, up to the last kept frame, (6, B) [J].
 
     Raises:
-        ValueError: A term is hard and the solver has no multipliers.
+        ValueError: A term is hard and the solver has no multipliers; or steps differ in length, and the work of contact or air
+            is asked for.
     """
 
     energies, reactions, pairs, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
@@ -280,6 +281,11 @@ class History:
             asked and each for each in (scene.pins.moves, changing, rubbed, touched)
         )
         self._filtered, self._blown = asked and bool(scene.colliders), asked and bool(scene.air_terms)
+        if asked and not stepper.even and (scene.colliders or scene.air_terms or scene.self_contact is not None):
+            raise ValueError(
+                "record is 'energies' of a scene with contact or air, whose work is summed over steps of one length; give dt "
+                "or substeps in place of error"
+            )
         forces = "reactions" in record or self._moving or self._touched
         self._evaluation = Evaluation(model, stepper.h, stepper, forces)
         self._found, self._frame = deque(), 0
@@ -362,8 +368,7 @@ class History:
             self._stepper.frame()
         else:
             self._begin()
-            for _ in range(self._stepper.steps_per_frame):
-                self._stepper.step()
+            for _ in self._stepper.steps_of_frame():
                 self._add_rubbing()
                 self._make_room()
                 self._each_step()

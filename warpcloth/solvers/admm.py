@@ -86,7 +86,7 @@ class ADMM(ImplicitStep):
     unbalanced acceleration of the last step.
 
     Attributes:
-        dt, substeps, integrator: See :class:`ImplicitStep`.
+        dt, substeps, integrator, error: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of both residuals.
         weight: r = W²/(kA) > 0 for all elements, or ``"auto"``.

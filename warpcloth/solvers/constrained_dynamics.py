@@ -51,7 +51,7 @@ class ConstrainedDynamics(ImplicitStep):
     direction of 1/(2h²)‖x − x̃‖²_M + U.
 
     Attributes:
-        dt, substeps, integrator: See :class:`ImplicitStep`.
+        dt, substeps, integrator, error: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of the residual, the larger of two accelerations, relative to gravity (or without gravity to its
             value at the first iterate): the largest unbalanced one of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest one

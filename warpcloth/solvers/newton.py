@@ -25,7 +25,7 @@ class Newton(ImplicitStep):
     Without self-contact a step starts from the x − x̃ of the last one where this lowers the function, else from x̃.
 
     Attributes:
-        dt, substeps, integrator: See :class:`ImplicitStep`.
+        dt, substeps, integrator, error: See :class:`ImplicitStep`.
         tolerance: Tolerance of the residual, which is the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, divided by
             gravity (or without gravity by the largest at x̃). If rounding leaves a larger residual, as in stiff cloth in
             float32, a step ends when no progress is possible, and its result says so.

@@ -52,7 +52,7 @@ class ProjectiveDynamics(ImplicitStep):
     plain one is taken. Chebyshev needs a bound of that factor and takes 1 − min m/(h²D), D the row sums of |S|.
 
     Attributes:
-        dt, substeps, integrator: See :class:`ImplicitStep`.
+        dt, substeps, integrator, error: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of the residual, as for :class:`warpcloth.Newton`: the largest unbalanced acceleration of any
             vertex, divided by gravity (or without gravity by the largest of the first iterate).

@@ -10,7 +10,7 @@ from ..contact.collider_steps import ColliderSteps
 from ..contact.self_steps import SelfSteps
 from ..core.capture import Segment
 from ..core.reset import Reset
-from ..core.state import State
+from ..core.state import Count, State
 from ..core.thread_pool import ThreadPool
 from ..kernels import step as kernels
 from ..model.damping import damped_terms
@@ -38,12 +38,14 @@ class Stepper:
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 for methods that have none.
         iterations: Number of iterations or sweeps of the last step; 1 for methods that do not iterate.
+        even: Whether all steps have the same length.
         factorise_seconds: Time of the factorisation of constant matrices [s]; 0 for methods that have none.
     """
 
     factorise_seconds = 0.0
     iterations = 1
     hard_pairs = False  # whether pairs of self-contact keep the contact distance as a constraint
+    even = True
     uniform = False  # whether all steps have the same number of iterations
     _motion = None  # x and v, if they are views of those of another stepper, see `part_of`
     lead = None  # for a twin without contact, the stepper whose state it shares, see `find_twin`
@@ -62,7 +64,7 @@ class Stepper:
         self.state = State(*motion, model.copies)
         if self.lead is not None:
             self.state.lent = self.lead.state.arrays
-        self.count = self.state.add("steps of keyframes", model.scalars(wp.int32) if model.timed else None)
+        self.count = self.state.add("steps of keyframes", model.scalars(wp.int32) if model.timed else None, Count())
         self._reset = None
         self.integrator, self.he = None, self.h
         self.colliders = None
@@ -254,9 +256,15 @@ class Stepper:
 
     @in_turn
     def frame(self):
-        """Takes the steps of one frame, with the same bits as ``steps_per_frame`` calls of `step`."""
+        """Takes the steps of one frame, with the same bits as `steps_of_frame`."""
+        for _ in self.steps_of_frame():
+            pass
+
+    def steps_of_frame(self):
+        """Takes the steps of one frame one by one, and yields after each."""
         for _ in range(self.steps_per_frame):
             self.step()
+            yield
 
     @in_turn
     def reset(self, mask=None, positions=None, velocities=None):

@@ -14,6 +14,7 @@ from ..model.model import Model
 from ..numerics.integrators import INTEGRATORS
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, NORMAL_FORCE, Need, listed, refuse_unmet
+from .error_steps import SHORTEST, ErrorStepper
 from .facts import Facts
 from .solver import Stepper
 from .threaded import ThreadedStepper
@@ -63,6 +64,7 @@ class Step:
         touches_itself: Whether it supports self-contact.
         locks: Whether it supports locked coordinates, by ``free_axes`` or the axes of pins.
         limited: Whether it refuses steps above a stability limit, see :meth:`step_limits`.
+        step_options: Names of the options of which exactly one must be given.
 
     Raises:
         ValueError: Both or neither are given, or the given one is not above 0.
@@ -78,6 +80,7 @@ class Step:
     needs: ClassVar[tuple[Need, ...]] = ()
     facts: ClassVar[Facts] = Facts()
     limited: ClassVar[bool] = False
+    step_options: ClassVar[tuple[str, ...]] = ("dt", "substeps")
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -189,12 +192,13 @@ class Step:
         return stepper(self, model)
 
     def __post_init__(self):
-        if (self.dt is None) == (self.substeps is None):
-            raise ValueError("exactly one of dt and substeps must be given")
-        if self.dt is not None:
-            number("dt", self.dt, above=0.0)
-        else:
+        given = [name for name in self.step_options if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"exactly one of {', '.join(self.step_options[:-1])} and {self.step_options[-1]} must be given")
+        if "substeps" in given:
             whole("substeps", self.substeps, 1)
+        else:
+            number(*given, getattr(self, *given), above=0.0)
         for name, words in words_of(type(self)).items():
             choice(name, getattr(self, name), words)
 
@@ -218,6 +222,8 @@ class Step:
 class ImplicitStep(Step):
     """The step of a solver that minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x); ``integrator`` determines hₑ and x̃.
 
+    Exactly one of ``dt``, ``substeps`` and ``error`` must be given.
+
     On x″ = −ω²x implicit Euler, of first order, multiplies the energy by 1/(1 + ω²h²) in each step. Midpoint, of second order,
     conserves the energy, and does not damp the noise of stiff springs. BDF2, of second order, multiplies the energy by about
     1 − ω⁴h⁴/2 if ωh is small, and damps stiff modes almost at once. All three are stable for every h if the motion is linear
@@ -229,12 +235,39 @@ class ImplicitStep(Step):
     Attributes:
         dt, substeps: See :class:`Step`.
         integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, see :mod:`warpcloth.numerics.integrators`.
+        error: Tolerance [m] of the error that two steps together add to the position of any vertex of any copy. All copies then
+            take steps of h = frame/2^k, k from 1 to 10, by an estimate of that error, see
+            :class:`warpcloth.solvers.error_steps.ErrorStepper`. BDF2 does not take it.
 
     Raises:
         ValueError: If an option is not allowed.
     """
 
+    step_options: ClassVar[tuple[str, ...]] = ("dt", "substeps", "error")
+
     integrator: Literal["euler", "midpoint", "bdf2"] = "euler"
+    error: float | None = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.error is not None and not INTEGRATORS[self.integrator].one_step:
+            able = " or ".join(repr(name) for name, integrator in INTEGRATORS.items() if integrator.one_step)
+            raise ValueError(
+                f"error is given with integrator={self.integrator!r}, whose steps must all have one length; take {able}"
+            )
+
+    def per_frame(self, fps: float) -> int:
+        """Returns the number of steps per frame at ``fps``, with ``error`` the largest one.
+
+        Raises:
+            ValueError: See :meth:`Step.per_frame`.
+        """
+        return super().per_frame(fps) if self.error is None else 2**SHORTEST
+
+    def _on(self, stepper, model):
+        if self.error is None:
+            return super()._on(stepper, model)
+        return ErrorStepper(self, lambda record: record._on(stepper, model), model)
 
     @property
     def damps(self) -> bool:

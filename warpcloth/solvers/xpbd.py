@@ -50,7 +50,7 @@ class XPBD(ImplicitStep):
     last sweep, divided by h².
 
     Attributes:
-        dt, substeps, integrator: See :class:`ImplicitStep`.
+        dt, substeps, integrator, error: See :class:`ImplicitStep`.
         iterations: Sweeps a step; with midpoint an even number.
         sweep: Gauss–Seidel ``"coloured"``; Gauss–Seidel ``"sequential"``, which takes elements in the order of the scene, by
             one thread, and on a GPU suits small scenes only; or Jacobi ``"constraint-averaged"``, which divides each Δλ by the
