@@ -245,7 +245,7 @@ def end_newton():
 
 @cache
 def set_trial(dtype):
-    """Kernel over vertices: trial = d + step·p, with the step length of the copy; resets the gradient to 0."""
+    """Kernel over vertices: trial = d + step·p, with the step length of the copy; the gradient becomes 0; counts the trial."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -256,11 +256,17 @@ def set_trial(dtype):
         step: wp.array(dtype=wp.float64),
         # parameters
         per_copy: int,
+        # in and out
+        trials: wp.array(dtype=wp.int32),
         # out
+        proceed: wp.array(dtype=wp.int32),
         trial: wp.array(dtype=vec3),
         gradient: wp.array(dtype=vec3),
     ):
         i = wp.tid()
+        if i == 0:
+            trials[0] = trials[0] + 1
+            proceed[0] = 0
         trial[i] = correction[i] + dtype(step[i // per_copy]) * direction[i]
         gradient[i] = vec3()
 
@@ -350,7 +356,7 @@ def check_guess():
 
 @cache
 def check_trial():
-    """Kernel over copies: accepts a trial step or halves it; sets it to 0 after ``most`` trials.
+    """Kernel over copies: accepts a trial step or halves it; sets it to 0 after ``most`` trials, of which one more is the last.
 
     A step is accepted if φ(α) ≤ φ(0) + 1e-4 α φ'(0) (Armijo). It is also accepted if φ(α) ≤ φ(0) + noise and
     φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe, Hager and Zhang 2005). NaN is never
@@ -383,7 +389,8 @@ def check_trial():
                 searching[copy] = 0
             else:
                 step[copy] = wp.float64(0.5) * step[copy]
-                proceed[0] = 1
+                if trials[0] <= most:
+                    proceed[0] = 1
                 if trials[0] >= most:
                     step[copy] = wp.float64(0.0)
 

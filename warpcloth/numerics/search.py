@@ -6,7 +6,6 @@ import warp as wp
 from ..core.energy import Energy
 from ..fast.plan import plan
 from ..kernels import minimise as kernels
-from ..kernels.loop import count_pass, limit_passes
 from .inertia import Inertia
 
 # Halvings of a step before a copy counts as stuck, because 2⁻³⁰ of a Newton step moves nothing.
@@ -44,7 +43,6 @@ class Search:
         self._launch = model.launcher(
             ((kernels.set_trial,), model.dtype),
             ((kernels.begin_search, kernels.check_guess, kernels.check_trial),),
-            ((count_pass, limit_passes), kernels.MODULE),
         )
         # Relative increase of φ that the approximate Wolfe condition counts as rounding. The energy of a spring of strain e has
         # a relative error of 2ε/e, so that √ε covers strains down to √ε.
@@ -79,7 +77,6 @@ class Search:
         started = [self.step, self.searching, self.trials, self.proceed]
         self._launch(kernels.begin_search, self.model.copies, [active], started)
         self._launch_trial()
-        self.proceed.zero_()
         self._launch(
             kernels.check_guess, self.model.copies, [self.energy, self.trial_energy, active], [self.step, self.proceed]
         )
@@ -95,7 +92,7 @@ class Search:
         model = self.model
         N, n = model.count, model.per_copy
         given = [self.correction, self.direction, self.step, n]
-        self._launch(kernels.set_trial, N, given, [self.trial, self.gradient])
+        self._launch(kernels.set_trial, N, given, [self.trials, self.proceed, self.trial, self.gradient])
         self.gradient_of.add(self.base, self.gradient, self.trial)
         if self.pairs is not None:
             self.pairs.forces.launch_forces(self.base, self.trial)
@@ -109,8 +106,5 @@ class Search:
 
     def _try_step(self):
         self._launch_trial()
-        self._launch(count_pass, 1, [], [self.trials, self.proceed])
         given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
         self._launch(kernels.check_trial, self.model.copies, given, [self.step, self.searching, self.proceed])
-        # One more evaluation after the last halving.
-        self._launch(limit_passes, 1, [self.trials, HALVINGS + 1], [self.proceed])
