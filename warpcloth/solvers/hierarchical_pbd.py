@@ -25,8 +25,10 @@ class HierarchicalPBD(Step):
     follow by dᵢ = Σ (dⱼ/Lᵢⱼ) / Σ (1/Lᵢⱼ) over the vertices j of the level that they are linked to, d = x − x̃. The sweeps of
     PBD over all terms come last. Each level costs a quarter of the next finer one in a sheet, a half in a chain.
 
-    The constraints of a level are one-sided: ‖xᵢ − xⱼ‖ ≤ L with L the length of the shortest path over finer bounds. So cloth
-    that meets the finer bounds is not moved, and the levels do not resist folding, or shear of a net. Springs, limits with
+    The constraints of a level are one-sided: ‖xᵢ − xⱼ‖ ≤ L with L the length of a path at rest: the shortest over finer bounds,
+    or a shorter, straight one over triangles that keep their shape, where the rest shape is flat. These are the triangles of
+    membranes and ``StrainLimit``, and those of springs whose stiffnesses differ by a factor of 4 at most. So cloth that meets
+    its constraints is not moved, and the levels do not resist folding, or shear of a net. Springs, limits with
     σ_max and membranes give bounds; bending, attachments and damping take part in the last sweeps only. Without bounds the
     solver is PBD. The stiffness of a bound is that of its path in series, scaled so that a level keeps Σ kL² of the finer one;
     it is infinite if that of the cloth is. A vertex of a level has the mass of the vertices that follow it too, Mⱼ = mⱼ + Σ wᵢⱼ
