@@ -8,10 +8,12 @@ from functools import cache
 import warp as wp
 
 from .local import local_coordinate
-from .memory import load, load_shared
+from .memory import load, load_shared, prefetch
 from .term import Term
-from .transpose import LocalSource, gather, scatter
+from .transpose import LocalSource, add_outer, gather, scatter, to_block
 from .vectors import types
+
+AHEAD = wp.constant(4)  # elements for whose blocks memory is asked ahead
 
 
 @cache
@@ -108,9 +110,12 @@ def gather_gradient(term: Term, dtype, corrected: bool = False):
 def hessian_blocks(term: Term, dtype, corrected: bool = False):
     """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], with the Hessian policy of the element's copy."""
     vec3, mat33 = types(dtype)
-    K, M = wp.constant(term.vertices), wp.constant(term.rows)
-    rest_type = wp.types.vector(term.parameters, dtype)
-    weight, (_energy, _gradient, hessian_of) = term.weight, of_element(term, dtype, corrected)
+    K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
+    weight, block_of, (_energy, _gradient, hessian_of) = (
+        term.weight,
+        to_block(term.rows, dtype),
+        of_element(term, dtype, corrected),
+    )
 
     @wp.kernel(module="unique", enable_backward=False)
     def blocks_of_elements(
@@ -134,17 +139,57 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
         for i in range(corners):
             wi = weight(r, i)
             for j in range(corners):
-                wj = weight(r, j)
-                block = mat33()
-                for m in range(M):
-                    for n in range(M):
-                        w = wi[m] * wj[n]
-                        for row in range(3):
-                            for column in range(3):
-                                block[row, column] = block[row, column] + w * h[3 * m + row, 3 * n + column]
-                out[e, K * i + j] = block
+                out[e, K * i + j] = block_of(wi, weight(r, j), h)
 
     return blocks_of_elements
+
+
+@cache
+def scatter_hessian(term: Term, dtype, corrected: bool = False):
+    """Kernel over elements: adds block q = K·i + j of :func:`hessian_blocks` to values[slots[K²e + q]], if it is not below 0.
+
+    For the CPU, where one thread takes the elements in order: no addition is atomic. Block (j, i) is the transpose of (i, j).
+    """
+    vec3, mat33 = types(dtype)
+    K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
+    weight, put, (_energy, _gradient, hessian_of) = term.weight, add_outer(term.rows, dtype), of_element(term, dtype, corrected)
+    rest_of, slot, fetch, short = load(rest_type), load(wp.int32), prefetch(mat33), term.vertices <= 2
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter_blocks(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        slots: wp.array(dtype=wp.int32),
+        # state in
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # parameters
+        elements_per_copy: int,
+        policy: wp.array(dtype=wp.int32),
+        # in and out
+        values: wp.array(dtype=mat33),
+    ):
+        e = wp.tid()
+        fetch(values, slots, K * K * (e + AHEAD), K * K * (e + AHEAD + 1))
+        r = rest_of(rest, e)
+        h = hessian_of(stencil, stiffness, e, r, x, d, policy[e // elements_per_copy])
+        first = K * K * e
+        if wp.static(short):
+            for i in range(K):
+                for j in range(i, K):
+                    t = wp.where(i < j, slot(slots, first + K * j + i), -1)
+                    put(weight(r, i), weight(r, j), h, slot(slots, first + K * i + j), t, values)
+        else:
+            corners = stencil.shape[1]  # K, but not a constant: the compiler would take seconds to unroll the loops
+            for i in range(corners):
+                wi = weight(r, i)
+                for j in range(i, corners):
+                    t = wp.where(i < j, slot(slots, first + K * j + i), -1)
+                    put(wi, weight(r, j), h, slot(slots, first + K * i + j), t, values)
+
+    return scatter_blocks
 
 
 @cache

@@ -185,3 +185,22 @@ def list_blocks():
                         ends[s] = ends[s] + 1
 
     return list_each_block
+
+
+@cache
+def set_slots():
+    """Kernel over the blocks of the matrix: slots[q] = s for each block q of a term of which block s is the sum."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def set_each_slot(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        sources: wp.array(dtype=wp.int32),
+        # out
+        slots: wp.array(dtype=wp.int32),
+    ):
+        s = wp.tid()
+        for n in range(offsets[s], offsets[s + 1]):
+            slots[sources[n]] = s
+
+    return set_each_slot

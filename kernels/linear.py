@@ -17,32 +17,34 @@ from typing import Any
 
 import warp as wp
 
+from .memory import load
 from .vectors import types
 
 MODULE = "warpcloth.conjugate_gradients"  # of the kernels over copies
 
 
 @cache
-def set_inertia(dtype):
-    """Kernel over vertices: values[diagonal] = scale·m I, or I for a pinned vertex."""
+def add_masses(dtype):
+    """Kernel over vertices: values[diagonal] += scale·m I, or I for a pinned vertex."""
     _, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def set_diagonal(
+    def add_to_diagonal(
         # elements
         diagonal: wp.array(dtype=wp.int32),
         mass: wp.array(dtype=dtype),
         inverse_mass: wp.array(dtype=dtype),
         # parameters
         scale: dtype,
-        # out
+        # in and out
         values: wp.array(dtype=mat33),
     ):
         i = wp.tid()
         entry = wp.where(inverse_mass[i] > dtype(0.0), scale * mass[i], dtype(1.0))
-        values[diagonal[i]] = entry * wp.identity(n=3, dtype=dtype)
+        s = diagonal[i]
+        values[s] = values[s] + entry * wp.identity(n=3, dtype=dtype)
 
-    return set_diagonal
+    return add_to_diagonal
 
 
 @cache
@@ -163,6 +165,7 @@ def rounding(dtype):
     edge length stands for pinned neighbours, which are not in the matrix.
     """
     vec3, mat33 = types(dtype)
+    column, block_at, vector = load(wp.int32), load(mat33), load(vec3)
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def rounding_of_rows(
@@ -184,8 +187,8 @@ def rounding(dtype):
         i = wp.tid()
         total = dtype(0.0)
         for s in range(offsets[i], offsets[i + 1]):
-            j = columns[s]
-            total += wp.sqrt(wp.ddot(values[s], values[s])) * (wp.length(x[j] - x[i]) + wp.length(d[j]))
+            j, each = column(columns, s), block_at(values, s)
+            total += wp.sqrt(wp.ddot(each, each)) * (wp.length(vector(x, j) - x[i]) + wp.length(vector(d, j)))
         block = values[diagonal[i]]
         size = wp.sqrt(wp.ddot(block, block))
         rho = wp.float64(epsilon * (total + size * edge))

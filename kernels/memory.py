@@ -59,6 +59,39 @@ def store(dtype, stored=None):
 
 
 @cache
+def add_to(dtype, transposed=False):
+    """Device function (a, i, value) that adds a value, or a 3×3 matrix ``transposed``, to a[i] of contiguous memory."""
+    number, numbers, _kind, _copy = _copied(dtype)
+    order = [3 * (n % 3) + n // 3 for n in range(9)] if transposed else range(numbers)
+    sums = " ".join(f"to[{n}] += from[{m}];" for n, m in enumerate(order))
+
+    @wp.func_native(
+        f"{number}* to = ({number}*)a.data + {numbers} * size_t(i); const {number}* from = (const {number}*)&value; {sums}"
+    )
+    def add_to_element(a: wp.array(dtype=dtype), i: int, value: dtype): ...
+
+    return add_to_element
+
+
+@cache
+def prefetch(dtype):
+    """Device function (a, indices, first, last) that asks the memory of a CPU for a[indices[n]], first ≤ n < last.
+
+    Indices beyond the last are left out; those below 0 fetch something of no use.
+    """
+    number, numbers, _kind, _copy = _copied(dtype)
+
+    @wp.func_native(
+        f"for (int n = first; n < last && n < indices.shape[0]; ++n) {{ "
+        f"const {number}* at = (const {number}*)a.data + {numbers} * (long long)((const int*)indices.data)[n]; "
+        f"__builtin_prefetch(at, 1); __builtin_prefetch(at + {numbers - 1}, 1); }}"
+    )
+    def prefetch_entries(a: wp.array(dtype=dtype), indices: wp.array(dtype=wp.int32), first: int, last: int): ...
+
+    return prefetch_entries
+
+
+@cache
 def copy_range(dtype):
     """Device function (to, at, source, first, count) → to[at + k] = source[first + k] for each k < count, contiguous memory."""
     number, numbers, _kind, _copy = _copied(dtype)

@@ -12,6 +12,7 @@ import warp as wp
 from .project import nth_of_thread, spread_compliance, sweep_turn
 from .term import Term
 from .terms.attachment import weight
+from .transpose import add_outer, to_block
 from .vectors import types
 
 
@@ -114,15 +115,38 @@ def evaluate(term: Term, dtype, corrected: bool):
 
 
 @cache
+def _hessian_of_cell(term: Term, dtype, corrected: bool):
+    """Device function (c, first, last, stencil, weights, stiffness, rest, x, d, policy) → k A ∂²u/∂y² of cell c."""
+    vec3, _ = types(dtype)
+    weights_type, rest_type = wp.types.vector(term.rows, dtype), wp.types.vector(term.parameters, dtype)
+    y_of, hessian, area = cell_coordinate(term, dtype, corrected), term.hessian, term.measure
+
+    @wp.func
+    def hessian_of(
+        c: int,
+        first: int,
+        last: int,
+        stencil: wp.array2d(dtype=wp.int32),
+        weights: wp.array(dtype=weights_type),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        policy: int,
+    ):
+        r = rest[c]
+        y = y_of(first, last, stencil, weights, x, d)
+        return (stiffness[first] * area(r)) * hessian(y, r, policy)
+
+    return hessian_of
+
+
+@cache
 def blocks(term: Term, dtype, corrected: bool):
     """Kernel over cells: out[starts[c] + n·i + j] = k A ∂²u/∂xᵢ∂xⱼ [N/m] for n vertices, with the copy's Hessian policy."""
     vec3, mat33 = types(dtype)
-    M, weights_type, rest_type = (
-        wp.constant(term.rows),
-        wp.types.vector(term.rows, dtype),
-        wp.types.vector(term.parameters, dtype),
-    )
-    y_of, hessian, area = cell_coordinate(term, dtype, corrected), term.hessian, term.measure
+    weights_type, rest_type = wp.types.vector(term.rows, dtype), wp.types.vector(term.parameters, dtype)
+    hessian_of, block_of = _hessian_of_cell(term, dtype, corrected), to_block(term.rows, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def blocks_of_cells(
@@ -143,21 +167,51 @@ def blocks(term: Term, dtype, corrected: bool):
         out: wp.array(dtype=mat33),
     ):
         c = wp.tid()
-        first, last, r = offsets[c], offsets[c + 1], rest[c]
-        y = y_of(first, last, stencil, weights, x, d)
-        h = (stiffness[first] * area(r)) * hessian(y, r, policy[c // cells_per_copy])
+        first, last, start = offsets[c], offsets[c + 1], starts[c]
+        h = hessian_of(c, first, last, stencil, weights, stiffness, rest, x, d, policy[c // cells_per_copy])
         for i in range(first, last):
             for j in range(first, last):
-                block = mat33()
-                for m in range(M):
-                    for n in range(M):
-                        w = weights[i][m] * weights[j][n]
-                        for row in range(3):
-                            for column in range(3):
-                                block[row, column] = block[row, column] + w * h[3 * m + row, 3 * n + column]
-                out[starts[c] + (last - first) * (i - first) + j - first] = block
+                out[start + (last - first) * (i - first) + j - first] = block_of(weights[i], weights[j], h)
 
     return blocks_of_cells
+
+
+@cache
+def scatter_blocks(term: Term, dtype, corrected: bool):
+    """Kernel over cells: adds block q of :func:`blocks` to values[slots[q]], see :func:`.assemble.scatter_hessian`."""
+    vec3, mat33 = types(dtype)
+    weights_type, rest_type = wp.types.vector(term.rows, dtype), wp.types.vector(term.parameters, dtype)
+    hessian_of, put = _hessian_of_cell(term, dtype, corrected), add_outer(term.rows, dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter_cells(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int32),
+        stencil: wp.array2d(dtype=wp.int32),
+        weights: wp.array(dtype=weights_type),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        slots: wp.array(dtype=wp.int32),
+        # state in
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # parameters
+        cells_per_copy: int,
+        policy: wp.array(dtype=wp.int32),
+        # in and out
+        values: wp.array(dtype=mat33),
+    ):
+        c = wp.tid()
+        first, last, start = offsets[c], offsets[c + 1], starts[c]
+        h = hessian_of(c, first, last, stencil, weights, stiffness, rest, x, d, policy[c // cells_per_copy])
+        n = last - first
+        for i in range(n):
+            for j in range(i, n):
+                t = wp.where(i < j, slots[start + n * j + i], -1)
+                put(weights[first + i], weights[first + j], h, slots[start + n * i + j], t, values)
+
+    return scatter_cells
 
 
 @cache

@@ -80,7 +80,8 @@ class Term:
             for terms with ``idle``; or None.
         secant: (y, rest) → s, 0 to 1. If p moves with y, y − p is s times the distance to a point that moves less. Constraint
             rows hold p fixed in an iteration, so they use that point and s k instead; or None.
-        linear: Whether p does not depend on y, so that y − p is linear in the vertices.
+        linear: Whether p does not depend on y, so that y − p is linear in the vertices. The Hessian is then constant: it is
+            assembled once, unless the rest state changes during a run.
         quadratic: Whether p is 0 and the weights of an element add up to 0: U is then quadratic in the differences of vertices.
         curvature: Of sparse cells that are not quadratic, the largest eigenvalue of ∂²u/∂y² at rest; or None.
         constraint: (y, rest) → C, a scalar with u = ½C²; or None, like the next four fields.

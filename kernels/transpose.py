@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from .memory import load, store
+from .memory import add_to, load, store
 from .term import Term
 from .vectors import types
 
@@ -30,6 +30,46 @@ def to_corner(term: Term, dtype):
         return total
 
     return share_of
+
+
+@cache
+def to_block(rows: int, dtype):
+    """Device function (wᵢ, wⱼ, h) → Σₘₙ wᵢ[m] wⱼ[n] h[m, n], the block of vertices i and j of DᵀhD, h of 3×3 parts h[m, n]."""
+    M, weights_type = wp.constant(rows), wp.types.vector(rows, dtype)
+    mat33, h_type = types(dtype)[1], wp.types.matrix((3 * rows, 3 * rows), dtype)
+
+    @wp.func
+    def block_of(wi: weights_type, wj: weights_type, h: h_type):
+        block = mat33()
+        for m in range(M):
+            for n in range(M):
+                w = wi[m] * wj[n]
+                for row in range(3):
+                    for column in range(3):
+                        block[row, column] = block[row, column] + w * h[3 * m + row, 3 * n + column]
+        return block
+
+    return block_of
+
+
+@cache
+def add_outer(rows: int, dtype):
+    """Device function (wᵢ, wⱼ, h, s, t, values) that adds :func:`to_block` to values[s], and its transpose to values[t].
+
+    It adds no transpose if t is below 0, and nothing if s is below 0.
+    """
+    weights_type, h_type, mat33 = wp.types.vector(rows, dtype), wp.types.matrix((3 * rows, 3 * rows), dtype), types(dtype)[1]
+    block_of, put, put_transposed = to_block(rows, dtype), add_to(mat33), add_to(mat33, transposed=True)
+
+    @wp.func
+    def add_outer_of(wi: weights_type, wj: weights_type, h: h_type, s: int, t: int, values: wp.array(dtype=mat33)):
+        if s >= 0:
+            block = block_of(wi, wj, h)
+            put(values, s, block)
+            if t >= 0:
+                put_transposed(values, t, block)
+
+    return add_outer_of
 
 
 class LocalSource(NamedTuple):

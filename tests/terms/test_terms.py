@@ -30,6 +30,7 @@ from support.energies import (
 from support.outside import Plane
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
+from warpcloth.core.hessian import norms as block_norms
 from warpcloth.fast import quadratic_pairs as quadratic
 from warpcloth.fast.gather_layout import gathered
 from warpcloth.fast.structs import chained
@@ -1030,12 +1031,7 @@ def test_nan_is_never_swallowed(term, dtype, device):
 
 def row_sums(model):
     """Σ‖Hᵢⱼ‖ of every vertex, element by element, (N,): how much rounding of the places comes back as force."""
-    hessian, rows = Hessian(model), np.zeros(model.count)
-    hessian.assemble(model.positions, 0.0)
-    for elements, blocks in zip(model.terms, hessian.blocks, strict=True):
-        K = elements.term.vertices
-        np.add.at(rows, elements.stencil.numpy(), np.linalg.norm(blocks.numpy(), axis=(2, 3)).reshape(-1, K, K).sum(axis=2))
-    return rows
+    return block_norms(model, model.terms, model.positions)
 
 
 @pytest.mark.parametrize("term", **named(DECLARABLE))

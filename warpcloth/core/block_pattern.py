@@ -107,6 +107,17 @@ def find_pattern(model, terms, fixed):
     return BlockPattern(offsets, columns, rows, diagonal, sums)
 
 
+def slots_of(model, sums, count):
+    """Returns the index of the block of the matrix to which each of the ``count`` blocks of a term is added, or −1.
+
+    ``sums`` are those of the term, see :class:`BlockPattern`.
+    """
+    offsets, sources = sums
+    slots = wp.full(count, -1, dtype=wp.int32, device=model.device)
+    model.launch(model.kernel(kernels.set_slots), len(offsets) - 1, [offsets, sources], [slots])
+    return slots
+
+
 def _put(model, values):
     return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=model.device)
 

@@ -6,7 +6,7 @@ import warp as wp
 from ..base.turns import in_turn
 from ..kernels import assemble, linear, sparse
 from ..model.host_values import host_values
-from .block_pattern import TermCorners, find_pattern
+from .block_pattern import TermCorners, find_pattern, slots_of
 
 CHUNK = 1 << 16  # number of elements whose blocks `norms` computes at once
 
@@ -15,32 +15,40 @@ def _is_sparse(elements):
     return elements.cells is not None and elements.cells.weights is not None
 
 
-class _Blocks:
-    """The Hessian blocks of the elements of one term, (B·E, K²)."""
+class _Elements:
+    """The Hessian blocks of the elements of one term, (B·E·K²,)."""
 
-    def __init__(self, model, elements, corrected):
-        self.model, self.elements, K = model, elements, elements.term.vertices
-        self._kernel = model.kernel(assemble.hessian_blocks, elements.term, model.dtype, corrected)
-        self.blocks = wp.empty((elements.count, K * K), dtype=model.mat33, device=model.device)
+    factories = assemble.hessian_blocks, assemble.scatter_hessian
+
+    def __init__(self, model, elements):
+        self.model, self.elements, self.term = model, elements, elements.term
+        self.count, self.blocks = elements.count, elements.count * elements.term.vertices**2
+        self._given, self._per_copy = elements.arguments, elements.per_copy
 
     def corners(self):
         """The :class:`warpcloth.core.block_pattern.TermCorners`."""
         stencil = host_values(self.elements.stencil)[: self.elements.per_copy]
         return TermCorners(self.model, stencil.ravel(), K=stencil.shape[1])
 
-    def launch(self, x, correction, policy):
-        arguments = [*self.elements.arguments, x, correction, self.elements.per_copy, policy]
-        self.model.launch(self._kernel, self.elements.count, arguments, [self.blocks])
+    def array(self):
+        """A new array for the blocks, in the shape that the kernel takes."""
+        K = self.term.vertices
+        return wp.empty((self.count, K * K), dtype=self.model.mat33, device=self.model.device)
+
+    def launch(self, kernel, x, correction, policy, out, slots=()):
+        self.model.launch(kernel, self.count, [*self._given, *slots, x, correction, self._per_copy, policy], [out])
 
 
-class _SparseBlocks:
+class _Cells(_Elements):
     """The Hessian blocks of the cells of one term, cell by cell, see :mod:`warpcloth.kernels.sparse`."""
 
-    def __init__(self, model, elements, corrected):
+    factories = sparse.blocks, sparse.scatter_blocks
+
+    def __init__(self, model, elements):
         self.model, self.elements, cells = model, elements, elements.cells
-        self._kernel = model.kernel(sparse.blocks, cells.term, model.dtype, corrected)
-        self._starts, count = cells.blocks()
-        self.blocks = wp.empty(count, dtype=model.mat33, device=model.device)
+        starts, self.blocks = cells.blocks()
+        self.term, self.count, self._per_copy = cells.term, cells.count, cells.per_copy
+        self._given = [cells.offsets, starts, elements.stencil, cells.weights, elements.stiffness, cells.rest]
 
     def corners(self):
         """The :class:`warpcloth.core.block_pattern.TermCorners`."""
@@ -48,11 +56,46 @@ class _SparseBlocks:
         vertices = host_values(elements.stencil)[: elements.per_copy, 0]
         return TermCorners(self.model, vertices, sizes=cells.sizes[: cells.per_copy].astype(np.int64))
 
-    def launch(self, x, correction, policy):
-        cells, elements = self.elements.cells, self.elements
-        given = [cells.offsets, self._starts, elements.stencil, cells.weights, elements.stiffness, cells.rest]
-        given += [x, correction, cells.per_copy, policy]
-        self.model.launch(self._kernel, cells.count, given, [self.blocks])
+    def array(self):
+        """A new array for the blocks, in the shape that the kernel takes."""
+        return wp.empty(self.blocks, dtype=self.model.mat33, device=self.model.device)
+
+
+def _of(model, elements):
+    return (_Cells if _is_sparse(elements) else _Elements)(model, elements)
+
+
+class _Sum:
+    """Adds the blocks of a term to those of the matrix: scatters from elements on the CPU, gathers on CUDA, in a fixed order.
+
+    Args:
+        of_term: The blocks, :class:`_Elements` or :class:`_Cells`.
+        sums: What the blocks of the matrix are the sums of, see :class:`warpcloth.core.block_pattern.BlockPattern`.
+        corrected: Whether positions are x + correction.
+    """
+
+    def __init__(self, of_term, sums, corrected):
+        model = self.model = of_term.model
+        self._of_term, self._sums, cuda = of_term, sums, model.device.is_cuda
+        gather, scatter = of_term.factories
+        self._kernel = model.kernel(gather if cuda else scatter, of_term.term, model.dtype, corrected)
+        if cuda:
+            self._blocks, self._add_blocks = of_term.array(), model.kernel(linear.add_blocks, model.dtype)
+        else:
+            self._slots, self._sums = slots_of(model, sums, of_term.blocks), None
+
+    def add(self, x, correction, policy, values):
+        """Launches values += ∂²U/∂x² of the term."""
+        if self._sums is None:
+            self._of_term.launch(self._kernel, x, correction, policy, values, [self._slots])
+            return
+        self._of_term.launch(self._kernel, x, correction, policy, self._blocks)
+        self.model.launch(self._add_blocks, len(values), [*self._sums, self._blocks.flatten()], [values])
+
+
+def _is_constant(elements):
+    """Whether the Hessian of a term depends neither on positions nor on a rest state that changes in a run."""
+    return elements.term.whole.linear and (elements.refresh is None or _is_sparse(elements))  # that of cells has the forces
 
 
 class Hessian:
@@ -78,28 +121,36 @@ class Hessian:
         self.pairs = pairs
         self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
         self.model, self.terms = model, model.terms if terms is None else terms
-        device = model.device
-        self._of_terms = [(_SparseBlocks if _is_sparse(each) else _Blocks)(model, each, corrected) for each in self.terms]
-        self.blocks = [of_term.blocks for of_term in self._of_terms]
-        self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=device)
-        self._set_inertia = model.kernel(linear.set_inertia, model.dtype)
-        self._add_blocks = model.kernel(linear.add_blocks, model.dtype)
+        self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=model.device)
+        self._add_masses = model.kernel(linear.add_masses, model.dtype)
         self._multiply = self._invert_diagonal = None
-        fixed = model.inverse_mass[: model.per_copy].numpy() == 0.0
-        one = find_pattern(model, [of_term.corners() for of_term in self._of_terms], fixed)
-        found = one.of_copies(model, [blocks.size // model.copies for blocks in self.blocks])
-        self.offsets, self.columns, self.diagonal, self.gathers = found.offsets, found.columns, found.diagonal, found.sums
+        found = pattern_of(model, self.terms)
+        self.offsets, self.columns, self.diagonal = found.offsets, found.columns, found.diagonal
         self._rows = None if model.mobility is None else found.rows
-        self.values = wp.empty(len(found.columns), dtype=model.mat33, device=device)
+        self.values = wp.empty(len(found.columns), dtype=model.mat33, device=model.device)
+        self._varying, self._constant = [], None
+        for elements, sums in zip(self.terms, found.sums, strict=True):
+            one = _Sum(_of(model, elements), sums, corrected)
+            if not _is_constant(elements):
+                self._varying.append(one)
+                continue
+            if self._constant is None:
+                self._constant, zero = wp.zeros_like(self.values), model.vectors()
+            one.add(zero, zero, self.policy, self._constant)
 
     def assemble(self, x, scale, correction=None):
-        """Launches the assembly of ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal."""
+        """Launches the assembly of ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal.
+
+        The sum of the terms whose Hessian is constant is computed once, and copied.
+        """
         model = self.model
-        self.values.zero_()
-        model.launch(self._set_inertia, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values])
-        for of_term, gather in zip(self._of_terms, self.gathers, strict=True):
-            of_term.launch(x, correction, self.policy)
-            model.launch(self._add_blocks, len(self.values), [*gather, of_term.blocks.flatten()], [self.values])
+        if self._constant is None:
+            self.values.zero_()
+        else:
+            wp.copy(self.values, self._constant)
+        model.launch(self._add_masses, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values])
+        for one in self._varying:
+            one.add(x, correction, self.policy, self.values)
         if self.pairs is not None:
             self.pairs.forces.launch_forces(x, correction)
             self.pairs.forces.add_diagonal(self.diagonal, self.values)
@@ -161,6 +212,14 @@ class Hessian:
         return block_diag(self.matrices(), format="csr")
 
 
+def pattern_of(model, terms):
+    """Returns the :class:`warpcloth.core.block_pattern.BlockPattern` of the sum of ``terms`` in all copies."""
+    of_terms = [_of(model, each) for each in terms]
+    fixed = model.inverse_mass[: model.per_copy].numpy() == 0.0
+    one = find_pattern(model, [of_term.corners() for of_term in of_terms], fixed)
+    return one.of_copies(model, [of_term.blocks // model.copies for of_term in of_terms])
+
+
 def norms(model, terms, x):
     """Returns Σⱼ‖∂²uₑ/∂xᵢ∂xⱼ‖ at x of each vertex i, summed over the elements of ``terms``, (N,) [N/m].
 
@@ -176,9 +235,10 @@ def norms(model, terms, x):
 
     for elements in terms:
         if _is_sparse(elements):
-            of_term = _SparseBlocks(model, elements, corrected=False)
-            of_term.launch(x, None, policy)
-            add(of_term.blocks.reshape((-1, 1)), elements.cells.pairs(elements)[0])
+            of_term = _Cells(model, elements)
+            blocks = of_term.array()
+            of_term.launch(model.kernel(sparse.blocks, of_term.term, model.dtype, False), x, None, policy, blocks)
+            add(blocks.reshape((-1, 1)), elements.cells.pairs(elements)[0])
             continue
         kernel, K = model.kernel(assemble.hessian_blocks, elements.term, model.dtype), elements.term.vertices
         stencil = host_values(elements.stencil)
