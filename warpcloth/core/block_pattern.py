@@ -86,7 +86,7 @@ def find_pattern(model, terms, fixed):
         return wp.empty(count, dtype=wp.int32, device=device)
 
     launch = model.launcher(((kernels.add_diagonal, kernels.add_columns, kernels.pack_columns, kernels.list_blocks),))
-    fixed, starts = _put(model, fixed), _before(1 + sum(term.most for term in terms))
+    fixed, starts = _put(model, fixed), _before(sum((term.most for term in terms), start=np.ones(n, dtype=np.int64)))
     firsts, found = _put(model, starts[:-1]), empty(int(starts[-1]))
     counts, of_terms = empty(n), [empty(n) for _ in terms]
     launch(kernels.add_diagonal, n, [firsts], [found, counts])
