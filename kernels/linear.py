@@ -254,7 +254,7 @@ class Solves:
     """The conjugate gradients of each copy, (B,) arrays, and of all, (1,).
 
     ``rz`` is rᵀz, ``first`` its first value, ``pq`` pᵀAp; ``negative`` is 1 after a direction of negative curvature.
-    ``iteration`` counts iterations from 1; ``proceed`` is 1 if a copy is active.
+    ``iteration`` counts iterations from 1, up to ``most``; ``proceed`` is 1 if a copy is active.
     """
 
     active: wp.array(dtype=wp.int32)
@@ -266,6 +266,7 @@ class Solves:
     pq: wp.array(dtype=wp.float64)
     tolerance: wp.array(dtype=wp.float64)
     iteration: wp.array(dtype=wp.int32)
+    most: wp.array(dtype=wp.int32)
     proceed: wp.array(dtype=wp.int32)
 
 
@@ -554,7 +555,6 @@ def turn(dtype, numbers: bool, block: int):
         # parameters
         per_copy: int,
         lanes: int,
-        most: int,
         # in and out
         solves: Solves,
         p: wp.array(dtype=vector),
@@ -564,7 +564,7 @@ def turn(dtype, numbers: bool, block: int):
         if solves.active[copy] == 1:
             curved = solves.pq[copy] <= wp.float64(0.0)
             left = solves.tolerance[copy] * solves.tolerance[copy] * solves.first[copy]
-            going = rz > left and not curved and solves.iteration[0] < most
+            going = rz > left and not curved and solves.iteration[0] < solves.most[0]
             if going:
                 ratio = dtype(rz / solves.rz[copy])
                 for j in range(lane, per_copy, lanes):

@@ -18,8 +18,9 @@ SMALL = 100
 
 
 class ConjugateGradients:
-    """Solves A x = b for each copy by conjugate gradients with the inverse diagonal blocks as preconditioner.
+    """Solves A x = b for each copy by conjugate gradients.
 
+    The preconditioner P is the inverse diagonal blocks, or a cycle of ``multigrid`` where solves take less time with it.
     It runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) has fallen to its tolerance times the first
     value, or at a direction of negative curvature. In that case x is still a descent direction of ½xᵀAx − bᵀx, and ``negative``
     is 1 (Steihaug 1983).
@@ -29,20 +30,21 @@ class ConjugateGradients:
             ``invert_diagonal``, such as :class:`warpcloth.core.hessian.Hessian`. ``block_rows`` has its offsets, columns and
             values if these are all of it, else None.
         iterations: Maximum number of iterations of one solve.
+        multigrid: A :class:`warpcloth.numerics.multigrid.Multigrid` of the matrix, or None.
     """
 
     capturable = True
 
-    def __init__(self, matrix, iterations):
+    def __init__(self, matrix, iterations, multigrid=None):
         model = self.model = matrix.model
-        self.matrix, self.iterations = matrix, iterations
+        self.matrix, self.multigrid = matrix, multigrid
         matrix.prepare()
 
         def per_unknown(dtype):
             return wp.zeros(matrix.count, dtype=dtype, device=model.device)
 
         self.r, self.z, self.p, self.q = (per_unknown(matrix.vector) for _ in range(4))
-        self.preconditioner = per_unknown(matrix.block)
+        self.preconditioner = per_unknown(matrix.block) if multigrid is None else multigrid.sweep
 
         self._solves = solves = linear.Solves()
         for name in ("active", "next_active", "negative"):
@@ -50,6 +52,7 @@ class ConjugateGradients:
         for name in ("rz", "next_rz", "first", "pq", "tolerance"):
             setattr(solves, name, model.scalars())
         solves.iteration, solves.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        solves.most = wp.full(1, iterations, dtype=wp.int32, device=model.device)
         self.active, self.negative, self.tolerance = solves.active, solves.negative, solves.tolerance
         self.iteration = solves.iteration
 
@@ -68,12 +71,36 @@ class ConjugateGradients:
 
     def solve(self, b, x, wanted):
         """Solves for x = A⁻¹ b to the relative ``tolerance`` (B,), for the copies that are ``wanted`` (B,); others keep x."""
-        self.matrix.invert_diagonal(self.preconditioner)
+        if self.multigrid is None:
+            self._prepare_diagonal()
+        else:
+            wp.capture_if(self.multigrid.used, self.multigrid.update, self._prepare_diagonal)
         given = [self.preconditioner, b, wanted, self.matrix.per_copy, self._lanes]
         out = [x, self.r, self.z, self.p, self._parts, self._solves]
         self._launch(linear.start_iteration, self._dim, given, out)
+        if self.multigrid is not None:
+            wp.capture_if(self.multigrid.used, self._refine_first, wanted=wanted)
         self._launch(linear.start_copies, self._of_block, [self._parts, wanted], [self._solves])
         wp.capture_while(self._solves.proceed, self._iterate, x=x)
+        if self.multigrid is not None:
+            self.multigrid.choose(self._solves)
+
+    def outdate(self):
+        """Launches that the next solve with multigrid computes all of it again."""
+        if self.multigrid is not None:
+            self.multigrid.outdate()
+
+    def _prepare_diagonal(self):
+        self.matrix.invert_diagonal(self.preconditioner)
+
+    def _refine_first(self, wanted):
+        self._refine(wanted)
+        wp.copy(self.p, self.z)
+
+    def _refine(self, active):
+        """Launches z = P r by multigrid and the parts of rᵀz, after the sweep in which z = S r."""
+        self.multigrid.refine(self.r, self.z, active)
+        self._launch_dot(self.r, self.z, active, self._parts)
 
     def _iterate(self, x):
         matrix, size = self.matrix, [self.matrix.per_copy, self._lanes]
@@ -86,7 +113,9 @@ class ConjugateGradients:
             self._launch_dot(self.p, self.q, self.active, self._pq_parts)
         given = [self.preconditioner, self.p, self.q, self._pq_parts, *size]
         self._launch(linear.advance, self._dim, given, [self._solves, x, self.r, self.z, self._parts])
-        given = [self.z, self._parts, *size, self.iterations]
+        if self.multigrid is not None:
+            wp.capture_if(self.multigrid.used, self._refine, active=self.active)
+        given = [self.z, self._parts, *size]
         self._launch(linear.turn, self._dim, given, [self._solves, self.p])
 
     def _launch_dot(self, a, b, active, parts):

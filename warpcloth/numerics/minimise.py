@@ -15,6 +15,7 @@ from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
 from .iterate import GravityScale
 from .linear import ConjugateGradients, Factorised
+from .multigrid import LEAST, Multigrid
 from .search import Search
 
 POLICIES = {
@@ -56,7 +57,8 @@ class Minimiser:
         self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True, pairs=pairs)
         if linear == "cg":
-            self.linear = ConjugateGradients(self.hessian, linear_iterations)
+            multigrid = Multigrid(self.hessian, linear_iterations) if model.per_copy >= LEAST else None
+            self.linear = ConjugateGradients(self.hessian, linear_iterations, multigrid)
         else:
             self.linear = Factorised(self.hessian)
         if pairs is not None:

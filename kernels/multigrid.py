@@ -1,0 +1,401 @@
+"""Factories of the kernels of a multigrid cycle for a symmetric matrix of blocks, in every copy.
+
+A level has block compressed rows A, the diagonal blocks S of its Jacobi sweeps, and vectors r, x and d. P interpolates vectors
+of the next coarser level. It has one weight for all coordinates, and all copies have the same. ``active[copy]`` is 1 while a
+copy iterates. Blocks are 3×3, or with ``numbers`` numbers.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .linear import Solves
+from .vectors import types
+
+MODULE = "warpcloth.multigrid"
+# Weight of Jacobi sweeps. All below 2 converge, because S/ω is at most A⁻¹.
+OMEGA = 1.8
+# New coarse matrices cost about as much as so many iterations.
+SPARED = 2
+# An iteration with a cycle costs about as much as so many with diagonal blocks.
+CYCLE = 4
+# The other preconditioner is tried again after so many solves, times its disadvantage.
+AGED = 64
+
+
+def _kinds(dtype, numbers, products=False):
+    """Types of a vector and of a block, and the name of the module, which has one kernel of a name."""
+    vec3, mat33 = types(dtype)
+    name = f"{MODULE}.{dtype.__name__}" + ".numbers" * numbers + ".products" * products
+    return vec3, dtype if numbers else mat33, name
+
+
+@cache
+def multiply_by_transfers(dtype):
+    """Kernel over (copies, upper blocks): A_c = Σ weight·A, a block of PᵀAP, which is stored with its transpose."""
+    _, mat33 = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def multiply_blocks(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        sources: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=dtype),
+        blocks: wp.array(dtype=wp.vec2i),
+        # state in
+        values: wp.array(dtype=mat33),
+        # parameters
+        per_copy: int,
+        coarse_per_copy: int,
+        # out
+        coarse: wp.array(dtype=mat33),
+    ):
+        copy, t = wp.tid()
+        total = mat33()
+        for s in range(offsets[t], offsets[t + 1]):
+            total += weights[s] * values[copy * per_copy + sources[s]]
+        first = copy * coarse_per_copy
+        coarse[first + blocks[t][0]] = total
+        coarse[first + blocks[t][1]] = wp.transpose(total)
+
+    return multiply_blocks
+
+
+@cache
+def eliminate(dtype):
+    """Kernel over (copies, m, m) blocks: a step of the inversion of dense matrices by Gauss and Jordan, with pivot block p.
+
+    A pivot that is not positive definite is left out: its row and column of the inverse are 0. So the inverse is always
+    semi-definite.
+    """
+    _, mat33 = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def eliminate_pivot(
+        # state in
+        before: wp.array(dtype=mat33),
+        # parameters
+        p: int,
+        m: int,
+        # out
+        after: wp.array(dtype=mat33),
+    ):
+        copy, i, j = wp.tid()
+        first = copy * m * m
+        pivot = before[first + p * m + p]
+        minor = pivot[0, 0] * pivot[1, 1] - pivot[0, 1] * pivot[1, 0]
+        inverse = mat33()
+        if pivot[0, 0] > dtype(0.0) and minor > dtype(0.0) and wp.determinant(pivot) > dtype(0.0):
+            inverse = wp.inverse(pivot)
+        found = inverse
+        if i != p and j != p:
+            found = before[first + i * m + j] - before[first + i * m + p] * inverse * before[first + p * m + j]
+        elif i != p:
+            found = -before[first + i * m + p] * inverse
+        elif j != p:
+            found = inverse * before[first + p * m + j]
+        after[first + i * m + j] = found
+
+    return eliminate_pivot
+
+
+@cache
+def factorise_diagonal(dtype):
+    """Kernel over block rows: factor[i] = L⁻¹ with A[i, i] = LLᵀ, or I/√‖A[i, i]‖ if that block is indefinite, or 0 if it is 0.
+
+    The factors are computed in float64, because the blocks of vertices in contact have condition numbers of 1e5 and more.
+    """
+    _, mat33 = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def factorise(
+        # elements
+        diagonal: wp.array(dtype=wp.int32),
+        # state in
+        values: wp.array(dtype=mat33),
+        # out
+        factor: wp.array(dtype=mat33),
+    ):
+        i = wp.tid()
+        zero = wp.float64(0.0)
+        block = wp.mat33d(values[diagonal[i]])
+        size = wp.sqrt(wp.ddot(block, block))
+        found = wp.mat33d()
+        if not (size == zero):
+            found = wp.identity(n=3, dtype=wp.float64) / wp.sqrt(size)
+            if block[0, 0] > zero:
+                l00 = wp.sqrt(block[0, 0])
+                l10 = block[1, 0] / l00
+                l20 = block[2, 0] / l00
+                rest = block[1, 1] - l10 * l10
+                if rest > zero:
+                    l11 = wp.sqrt(rest)
+                    l21 = (block[2, 1] - l20 * l10) / l11
+                    rest = block[2, 2] - l20 * l20 - l21 * l21
+                    if rest > zero:
+                        m00 = wp.float64(1.0) / l00
+                        m11 = wp.float64(1.0) / l11
+                        m22 = wp.float64(1.0) / wp.sqrt(rest)
+                        m10 = -l10 * m00 * m11
+                        m21 = -l21 * m11 * m22
+                        m20 = -(l20 * m00 + l21 * m10) * m22
+                        found = wp.mat33d(m00, zero, zero, m10, m11, zero, m20, m21, m22)
+        factor[i] = mat33(found)
+
+    return factorise
+
+
+@cache
+def scale_sweeps(dtype):
+    """Kernel over block rows: S[i] = ω LᵀL/Σⱼ‖L[i] A[i, j] L[j]ᵀ‖, L the inverse factors of the diagonal blocks.
+
+    So no eigenvalue of S A is above ω, whatever A is: a symmetric matrix is at most the diagonal matrix of the sums of norms in
+    its block rows (Baker et al. 2011, *Multigrid smoothers for ultraparallel computing*, have numbers instead of blocks).
+    ``own`` bounds the norm of the diagonal block. Those of the others are bounded by √(‖·‖₁‖·‖∞) and by the Frobenius norm.
+    """
+    _, mat33 = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def scale(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        # state in
+        values: wp.array(dtype=mat33),
+        factor: wp.array(dtype=mat33),
+        # parameters
+        own: dtype,
+        # out
+        sweep: wp.array(dtype=mat33),
+    ):
+        i = wp.tid()
+        left = factor[i]
+        total = own
+        for s in range(offsets[i], offsets[i + 1]):
+            j = columns[s]
+            if j != i:
+                block = left * values[s] * wp.transpose(factor[j])
+                rows = dtype(0.0)
+                across = dtype(0.0)
+                for a in range(3):
+                    rows = wp.max(rows, wp.abs(block[a, 0]) + wp.abs(block[a, 1]) + wp.abs(block[a, 2]))
+                    across = wp.max(across, wp.abs(block[0, a]) + wp.abs(block[1, a]) + wp.abs(block[2, a]))
+                total += wp.sqrt(wp.min(rows * across, wp.ddot(block, block)))
+        sweep[i] = dtype(OMEGA) / total * (wp.transpose(left) * left)
+
+    return scale
+
+
+@wp.struct
+class PreconditionerChoice:
+    """Which preconditioner solves use, (1,) arrays; of ``rates`` and ``ages`` the first is that of diagonal blocks.
+
+    ``used`` is 1 for multigrid, ``outdated`` 1 if its coarse matrices must be computed again. ``fresh`` is the number of
+    iterations of the first solve with these, or −1 before it. ``rates`` are decades of √(rᵀPr) for the cost of an iteration
+    with diagonal blocks, (2,), 0 if unknown; ``ages`` the number of solves since, (2,).
+    """
+
+    used: wp.array(dtype=wp.int32)
+    outdated: wp.array(dtype=wp.int32)
+    fresh: wp.array(dtype=wp.int32)
+    progress: wp.array(dtype=wp.float64)
+    rates: wp.array(dtype=wp.float64)
+    ages: wp.array(dtype=wp.int32)
+
+
+@cache
+def measure_progress():
+    """Kernel over copies: progress = the largest fall of √(rᵀPr) in a solve, in decades."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def measure(
+        # state in
+        solves: Solves,
+        # in and out
+        choice: PreconditionerChoice,
+    ):
+        copy = wp.tid()
+        if solves.first[copy] > wp.float64(0.0) and solves.next_rz[copy] > wp.float64(0.0):
+            decades = wp.float64(0.5) * wp.log10(solves.first[copy] / solves.next_rz[copy])
+            wp.atomic_max(choice.progress, 0, decades)
+
+    return measure
+
+
+@cache
+def choose():
+    """Kernel over one thread: chooses the preconditioner of the next solve by the decades that each gained for its cost.
+
+    After the first solve, which is by multigrid, diagonal blocks are tried, with at most as many iterations as cost the same.
+    The better one stays. The other is tried again after ``AGED`` solves times its disadvantage, so that trials cost little. The
+    coarse matrices are outdated if a solve takes 3/2 times as many iterations as the first with them.
+    """
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def choose_next(
+        # parameters
+        most: int,
+        # in and out
+        solves: Solves,
+        choice: PreconditionerChoice,
+    ):
+        used = choice.used[0]
+        other = 1 - used
+        count = solves.iteration[0]
+        cost = count + 1
+        if used == 1:
+            cost = wp.static(CYCLE) * (count + wp.static(SPARED))
+            choice.outdated[0] = 0
+            if choice.fresh[0] < 0:
+                choice.fresh[0] = count
+            elif 2 * count > 3 * choice.fresh[0] + wp.static(2 * SPARED):
+                choice.outdated[0] = 1
+        if choice.progress[0] > wp.float64(0.0):
+            choice.rates[used] = choice.progress[0] / wp.float64(cost)
+            choice.ages[used] = 0
+        choice.progress[0] = wp.float64(0.0)
+        choice.ages[other] = choice.ages[other] + 1
+        solves.most[0] = most
+        aged = wp.float64(choice.ages[other]) * choice.rates[other] > wp.float64(wp.static(AGED)) * choice.rates[used]
+        if choice.rates[other] == wp.float64(0.0) or aged or choice.rates[other] > choice.rates[used]:
+            choice.used[0] = other
+            choice.outdated[0] = 1
+            if used == 1:
+                solves.most[0] = wp.min(most, cost)
+
+    return choose_next
+
+
+@cache
+def subtract_product(dtype, numbers: bool = False, products: bool = False):
+    """Kernel over block rows: out = r − A x, with ``products`` also minus a further product with x."""
+    vec3, block, module = _kinds(dtype, numbers, products)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def subtract_rows(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        # state in
+        values: wp.array(dtype=block),
+        x: wp.array(dtype=vec3),
+        further: wp.array(dtype=vec3),
+        r: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if active[i // per_copy] == 0:
+            return
+        total = r[i]
+        if wp.static(products):
+            total -= further[i]
+        for s in range(offsets[i], offsets[i + 1]):
+            total -= values[s] * x[columns[s]]
+        out[i] = total
+
+    return subtract_rows
+
+
+@cache
+def restrict(dtype, numbers: bool = False):
+    """Kernel over (copies, coarse rows): r_c = Pᵀr, x_c = S r_c."""
+    vec3, block, module = _kinds(dtype, numbers)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def restrict_rows(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        sources: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=dtype),
+        # state in
+        r: wp.array(dtype=vec3),
+        sweep: wp.array(dtype=block),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        coarse_per_copy: int,
+        # out
+        coarse_r: wp.array(dtype=vec3),
+        coarse_x: wp.array(dtype=vec3),
+    ):
+        copy, i = wp.tid()
+        if active[copy] == 0:
+            return
+        total = vec3()
+        for s in range(offsets[i], offsets[i + 1]):
+            total += weights[s] * r[copy * per_copy + sources[s]]
+        at = copy * coarse_per_copy + i
+        coarse_r[at] = total
+        coarse_x[at] = sweep[at] * total
+
+    return restrict_rows
+
+
+@cache
+def prolong(dtype, numbers: bool = False):
+    """Kernel over (copies, rows): d = P x_c."""
+    vec3, _, module = _kinds(dtype, numbers)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def prolong_rows(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        parents: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=dtype),
+        # state in
+        coarse_x: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        coarse_per_copy: int,
+        # out
+        d: wp.array(dtype=vec3),
+    ):
+        copy, i = wp.tid()
+        if active[copy] == 0:
+            return
+        total = vec3()
+        for s in range(offsets[i], offsets[i + 1]):
+            total += weights[s] * coarse_x[copy * coarse_per_copy + parents[s]]
+        d[copy * per_copy + i] = total
+
+    return prolong_rows
+
+
+@cache
+def sweep_after(dtype, numbers: bool = False, products: bool = False):
+    """Kernel over block rows: x += d + S(r − A d), with ``products`` minus a further product with d."""
+    vec3, block, module = _kinds(dtype, numbers, products)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def sweep_rows(
+        # elements
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        # state in
+        values: wp.array(dtype=block),
+        sweep: wp.array(dtype=block),
+        d: wp.array(dtype=vec3),
+        further: wp.array(dtype=vec3),
+        r: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        # in and out
+        x: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if active[i // per_copy] == 0:
+            return
+        total = r[i]
+        if wp.static(products):
+            total -= further[i]
+        for s in range(offsets[i], offsets[i + 1]):
+            total -= values[s] * d[columns[s]]
+        x[i] = x[i] + d[i] + sweep[i] * total
+
+    return sweep_rows

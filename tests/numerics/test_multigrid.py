@@ -1,0 +1,224 @@
+"""Multigrid as a preconditioner: its levels, its cycle against matrices on the host, and what Newton's method gains by it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpcloth as wc
+from support.continuum import flat, hill, jittered
+from support.scenes import scene
+from warpcloth.core.hessian import Hessian
+from warpcloth.kernels.multigrid import OMEGA
+from warpcloth.kernels.term import HessianPolicy
+from warpcloth.numerics import minimise
+from warpcloth.numerics.interpolation import interpolations, neighbours
+from warpcloth.numerics.linear import ConjugateGradients
+from warpcloth.numerics.multigrid import COARSEST, Multigrid
+
+FAN = wc.Mesh([[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, 1]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+MESHES = {
+    "grid": wc.Mesh.grid(12, 9, size=1.0, pattern="alternating"),
+    "jittered": flat(12),
+    "curved": jittered(12, lift=hill),
+    "chain": wc.Mesh.chain(60),
+    "pieces": wc.Mesh.join({"one": wc.Mesh.grid(6, 6, size=1.0), "other": flat(7)}),
+    "three triangles on an edge": FAN,
+}
+
+
+@pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
+def test_levels_interpolate_affine_functions(mesh):
+    """Weights sum to 1, kept vertices keep their values, and flat meshes interpolate positions but for the added moments, 1e-4.
+
+    A vertex of a curved mesh lies off the plane of its parents by about κL²/2.
+    """
+    free = np.ones(len(mesh.points), dtype=bool)
+    free[3] = False
+    found = interpolations(mesh.points, neighbours(mesh), free, 4)
+    assert len(found) >= (2 if len(mesh.points) > 5 else 0)
+    at = mesh.points
+    for k, P in enumerate(found):
+        moving = free if k == 0 else np.ones(P.shape[0], dtype=bool)
+        np.testing.assert_allclose(P.sum(axis=1), moving.astype(float), atol=1e-12)
+        kept = np.flatnonzero((np.diff(P.indptr) == 1) & moving)
+        owners = P.indices[P.indptr[kept]]
+        _, first = np.unique(owners, return_index=True)
+        assert len(first) == P.shape[1]  # each coarse vertex is a fine one
+        coarse = np.zeros((P.shape[1], 3))
+        for vertex, owner in zip(kept, owners, strict=True):
+            coarse[owner] = at[vertex]
+        if k == 0:
+            size = np.linalg.norm(np.ptp(mesh.points, axis=0))
+            error = np.linalg.norm(P @ coarse - at, axis=1)[moving].max() / size
+            assert error < (0.05 if mesh is MESHES["curved"] else 2e-3)
+        at = coarse
+
+
+def compressed(device, copies=2):
+    """A Hessian of springs in compression, of unlike copies; it is indefinite."""
+    mesh = flat(12)
+    declared = wc.Scene(
+        mesh,
+        density=0.1,
+        terms=[wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-4)],
+        positions=0.9 * mesh.points + 0.01 * np.random.default_rng(0).normal(size=mesh.points.shape),
+        pins=[0, 5],
+    )
+    model = declared.build(device=device, dtype="float64", copies=copies, vary={"Spring.stiffness": np.logspace(2, 4, copies)})
+    hessian = Hessian(model, HessianPolicy.RAW)
+    hessian.assemble(model.positions, 1e3)
+    return hessian
+
+
+def applied(multigrid, count, copies):
+    """The matrix of the cycle in each copy, (B, 3n, 3n)."""
+    model = multigrid.model
+    active, r, z = wp.ones(copies, dtype=wp.int32, device=model.device), model.vectors(), model.vectors()
+    sweeps = multigrid.sweep.numpy().reshape(copies, count, 3, 3)
+    found = np.zeros((copies, 3 * count, 3 * count))
+    for k in range(3 * count):
+        right = np.zeros((copies, 3 * count))
+        right[:, k] = 1.0
+        r.assign(right.reshape(-1, 3))
+        z.assign(np.einsum("bnij,bnj->bni", sweeps, right.reshape(copies, count, 3)).reshape(-1, 3))
+        multigrid.refine(r, z, active)
+        found[:, :, k] = z.numpy().reshape(copies, -1)
+    return found
+
+
+def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels(device):
+    """x ← x + S(b − Ax), coarse correction P(PᵀAP)⁻¹Pᵀ, sweep, by dense matrices; A has negative eigenvalues."""
+    hessian = compressed(device)
+    multigrid = Multigrid(hessian, 100)
+    multigrid.update()
+    B, n = 2, hessian.per_copy
+    cycles = applied(multigrid, n, B)
+    transfers = interpolations(
+        hessian.model.rest_points, neighbours(hessian.model.scene.mesh), hessian.model.inverse_mass.numpy()[:n] > 0.0, COARSEST
+    )
+    assert multigrid.sizes == [n, *(P.shape[1] for P in transfers)] and len(transfers) > 1
+    for copy, A in enumerate(hessian.matrices()):
+        A = A.toarray()
+        assert np.linalg.eigvalsh(A)[0] < 0.0
+        S = np.zeros_like(A)
+        for i, block in enumerate(multigrid.sweep.numpy()[copy * n : (copy + 1) * n]):
+            S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = block
+        # No eigenvalue of S A is above ω.
+        root = np.linalg.cholesky(S)
+        assert np.linalg.eigvalsh(root.T @ A @ root)[-1] <= OMEGA * (1.0 + 1e-9)
+        M = cycles[copy]
+        np.testing.assert_allclose(M, M.T, atol=1e-9 * np.abs(M).max())
+        assert np.linalg.eigvalsh(0.5 * (M + M.T))[0] > 0.0
+        # The coarse part C of M = 2S − SAS + (I − SA) P C Pᵀ (I − AS) is the cycle of PᵀAP.
+        rest = M - (2.0 * S - S @ A @ S)
+        P, E = np.kron(transfers[0].toarray(), np.eye(3)), np.eye(len(A)) - S @ A
+        C = np.linalg.pinv(E @ P) @ rest @ np.linalg.pinv(E @ P).T
+        np.testing.assert_allclose(E @ P @ C @ P.T @ E.T, rest, atol=1e-6 * np.abs(rest).max())
+
+
+def test_coarse_matrices_are_products_with_the_interpolation(device):
+    """PᵀAP of each copy, and on the coarsest level its inverse, in float64."""
+    hessian = compressed(device)
+    multigrid = Multigrid(hessian, 100)
+    multigrid.update()
+    found = interpolations(
+        hessian.model.rest_points,
+        neighbours(hessian.model.scene.mesh),
+        hessian.model.inverse_mass.numpy()[: hessian.per_copy] > 0.0,
+        COARSEST,
+    )
+    for copy, A in enumerate(hessian.matrices()):
+        A = A.toarray()
+        for k, P in enumerate(found):
+            P = np.kron(P.toarray(), np.eye(3))
+            A, level = P.T @ A @ P, multigrid._levels[k + 1]
+            n = level.n
+            offsets, columns, values = (each.numpy() for each in (level.offsets, level.columns, level.values))
+            dense = np.zeros((3 * n, 3 * n))
+            for i in range(n):
+                for s in range(offsets[copy * n + i], offsets[copy * n + i + 1]):
+                    j = columns[s] - copy * n
+                    dense[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = values[s]
+            if level is multigrid._levels[-1] and np.linalg.eigvalsh(A)[0] > 0.0:
+                np.testing.assert_allclose(dense @ A, np.eye(3 * n), atol=1e-8)
+            elif level is not multigrid._levels[-1]:
+                np.testing.assert_allclose(dense, A, atol=1e-10 * np.abs(A).max())
+
+
+def keep(multigrid, used):
+    """Lets all solves use multigrid, or diagonal blocks."""
+    multigrid._choice.rates.assign([1e-30, 1.0] if used else [1.0, 1e-30])
+    multigrid.used.fill_(int(used))
+
+
+def iterations(n, stiffness, device, used):
+    """Of conjugate gradients to 1e-3, for the weight, at the start of ``hanging``."""
+    declared = scene("hanging", n=n, stiffness=stiffness)
+    bent = declared.mesh.points + np.outer(np.sin(np.pi * declared.mesh.points[:, 0]), [0.0, 0.1, 0.0])
+    model = replace(declared, positions=bent).build(device=device, dtype="float64")
+    hessian = Hessian(model, HessianPolicy.CLAMP)
+    hessian.assemble(model.positions, 240.0**2)
+    solver = ConjugateGradients(hessian, 10_000, Multigrid(hessian, 10_000))
+    keep(solver.multigrid, used)
+    solver.tolerance.fill_(1e-3)
+    b, x = model.vectors(), model.vectors()
+    b.assign(model.mass.numpy()[:, None] * [0.0, -9.81, 0.0] * (model.inverse_mass.numpy() > 0.0)[:, None])
+    solver.solve(b, x, wp.ones(1, dtype=wp.int32, device=device))
+    return int(solver.iteration.numpy()[0])
+
+
+@pytest.mark.parametrize("stiffness, most", [(1e3, 40), (1e5, 120)])
+def test_iterations_hardly_depend_on_resolution(device, stiffness, most):
+    """With diagonal blocks they grow as the number of vertices per side until inertia limits them."""
+    fine = {used: iterations(48, stiffness, device, used) for used in (True, False)}
+    coarse = {used: iterations(16, stiffness, device, used) for used in (True, False)}
+    assert fine[True] <= most
+    assert fine[True] <= 1.5 * coarse[True] + 2
+    assert fine[False] >= 1.8 * coarse[False]
+    assert fine[True] <= fine[False] / 5
+
+
+def locked():
+    """``hanging`` with a line of vertices that slide along the vertical."""
+    declared = scene("hanging", n=15)
+    axes = np.ones((225, 3), dtype=bool)
+    axes[105:120, [0, 2]] = False
+    return replace(declared, free_axes=axes)
+
+
+SCENES = {
+    "hanging": (scene("hanging", n=16, stiffness=1e4), {}),
+    "copies": (scene("hanging", n=15), {"copies": 2, "vary": {"Spring.stiffness": [1e2, 1e5]}}),
+    "locked": (locked(), {}),
+    "layers in contact": (scene("folded_sheet", n=15, gap=2e-3, distance=1.9e-3), {}),
+    "colliders": (scene("drape", n=15), {}),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_minimiser_does_not_depend_on_the_preconditioner(device, name, monkeypatch):
+    """After three frames, to the tolerance of Newton's iteration."""
+    declared, build = SCENES[name]
+    found = {}
+    for used in (True, False):
+        monkeypatch.setattr(minimise, "LEAST", 200)
+        stepper = wc.Newton(substeps=2, tolerance=1e-9).bind(declared.build(device=device, dtype="float64", **build))
+        keep(stepper.minimiser.linear.multigrid, used)
+        for _ in range(3):
+            stepper.frame()
+        assert int(stepper.minimiser.linear.multigrid.used.numpy()[0]) == used
+        found[used] = stepper.state.x.numpy()
+    np.testing.assert_allclose(found[True], found[False], atol=1e-8)
+
+
+def test_solves_choose_what_costs_less(device):
+    """Soft cloth in short steps needs few iterations with diagonal blocks; stiff cloth in long steps needs many."""
+    for stiffness, substeps, used in ((1.0, 64, 0), (1e5, 1, 1)):
+        stepper = wc.Newton(substeps=substeps).bind(
+            scene("hanging", n=24, stiffness=stiffness).build(device=device, dtype="float64")
+        )
+        for _ in range(2):
+            stepper.frame()
+        assert int(stepper.minimiser.linear.multigrid.used.numpy()[0]) == used
