@@ -123,6 +123,19 @@ def test_frames_steps_resets_and_states_give_the_same_bits():
     assert frames.state == bound_after(scene, 1)
 
 
+def test_copies_of_threads_are_reset_as_those_of_one():
+    scene, found = named("hanging", n=6), []
+    for threads in (1, 2):
+        stepper = bound(scene, wc.XPBD(error=1e-3), copies=2, threads=threads)
+        start = stepper.state.x.numpy()[: stepper.model.per_copy].copy()
+        stepper.frame()
+        stepper.reset(np.array([True, False]))
+        assert (stepper.state.x.numpy()[: len(start)] == start).all()
+        stepper.frame()
+        found.append(stepper.state.x.numpy())
+    np.testing.assert_array_equal(*found)
+
+
 def bound_after(scene, frames):
     stepper = bound(scene, wc.Newton(error=1e-3))
     for _ in range(frames):

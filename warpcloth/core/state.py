@@ -1,5 +1,6 @@
 """The state of a bound solver as a value: everything that one step passes to the next."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -104,9 +105,13 @@ class State:
         """Makes the present values of these arrays their initial values."""
         self.starts |= {name: wp.clone(self.arrays[name]) for name in names}
 
-    def copy(self):
-        """Returns an equal state with arrays of its own."""
-        other = State(wp.clone(self.x), wp.clone(self.v), len(self.results), [share.copy() for share in self.shares])
+    def copy(self, motion=None):
+        """Returns an equal state with arrays of its own, or with ``motion`` for its x and v, which have the same values."""
+        x, v = motion or (wp.clone(self.x), wp.clone(self.v))
+        ends = np.cumsum([0, *(len(share.x) for share in self.shares)]).tolist()
+        parts = zip(self.shares, pairwise(ends), strict=True)
+        shares = [share.copy((x[first:end], v[first:end])) for share, (first, end) in parts]
+        other = State(x, v, len(self.results), shares)
         other.arrays |= {name: wp.clone(array) for name, array in self.arrays.items() if name not in other.arrays}
         other.parts = {name: part.copy() for name, part in self.parts.items()}
         other.starts, other.results, other.residual = self.starts, list(self.results), self.residual.copy()
