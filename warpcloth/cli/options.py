@@ -45,7 +45,7 @@ def _of_solver(name):
     found = _listed(f"-s of {name}", record.__doc__, record, parameters_of(record))
     error = " or error (tolerance [m])" if "error" in record.step_options else ""
     return found | {
-        "note": f"give dt (the step [s]) or substeps (steps per frame){error}, only one; without any a step is chosen"
+        "note": f"give dt (the step [s]) or substeps (steps per frame){error}, and no other; if none is given, a step is chosen"
     }
 
 

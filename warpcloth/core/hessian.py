@@ -95,7 +95,7 @@ class _Sum:
 
 def _is_constant(elements):
     """Whether the Hessian of a term depends neither on positions nor on a rest state that changes in a run."""
-    return elements.term.whole.linear and (elements.refresh is None or _is_sparse(elements))  # that of cells has the forces
+    return elements.term.whole.linear and (elements.refresh is None or _is_sparse(elements))  # that of cells stores forces
 
 
 class Hessian:

@@ -63,10 +63,10 @@ class ErrorStepper(Stepper):
 
         e = max ‖x(two steps) − x(one step)‖/(2^p − 1)    over the vertices of all copies [m]
 
-    They are taken if e ≤ ``error``. Else h is halved: the first step is then the one of 2h. Two steps of twice the length come
-    next if 2^(p+1) e ≤ 0.8 ``error``, where they fit into the frame. An equal error of all steps takes the fewest of them for
-    an error of the motion. Where the motion is smooth, h is proportional to ``error``^(1/(p+1)), and the error of the motion
-    to ``error``^(p/(p+1)): with Euler to its square root.
+    The two are taken if e ≤ ``error``. Else h is halved, and the first of the two is now the one step of 2h. Two steps of twice
+    the length come next if 2^(p+1) e ≤ 0.8 ``error``, where they fit into the frame. A motion of a given error has the fewest
+    steps if all have an equal error. Where the motion is smooth, h is proportional to ``error``^(1/(p+1)), and the error of
+    the motion to ``error``^(p/(p+1)): with Euler to its square root.
 
     Each length has a stepper of its own, which is a plain one with 2^k steps a frame. At most four are kept. Between steps the
     state is in ``state``, whose counts are in units of the shortest step; a stepper takes it over before a step, so that
@@ -225,7 +225,7 @@ class ErrorStepper(Stepper):
         length.k = k - 1 if k > LONGEST and aligned and self._error.max() * 2.0 ** (self.order + 1) <= SURE else k
 
     def step(self):
-        """Takes one step of h. It takes each step that errors allow again, so that contact and loads are those of this step."""
+        """Takes one step of h. Once h is found, the step is taken again, so that contact and loads are those of this step."""
         if not self._planned:
             self._find()
             self._planned = 2
@@ -332,8 +332,8 @@ class ErrorStepper(Stepper):
 
     def multiplier_forces(self, collider=None):
         raise ValueError(
-            "error is given, and the multipliers of steps of several lengths are not kept, so that the forces of terms with "
-            "infinite stiffness and the reactions of pins are not known; take dt or substeps, or a finite stiffness"
+            "error is given, with which neither the forces of terms with infinite stiffness nor the reactions of their pins "
+            "are known; take dt or substeps, or a finite stiffness"
         )
 
     def constraint_forces(self, collider=None):
