@@ -233,10 +233,11 @@ def test_sticks(name, dtype, device):
 def test_momentum_and_energy(name, device):
     """Sheets that press and rub: Σp stays, as exactly as linear systems are solved, and motion along them loses energy."""
     scene, left = rubbing(gap=4.5e-3), []
+    solver = replace(SOLVERS[name], tolerance=1e-9) if name == "newton" else SOLVERS[name]
     mass = scene.vertex_masses[:, None]
     for friction in (0.0, 0.3):
         declared = replace(scene, self_contact=replace(scene.self_contact, friction=friction))
-        stepper = SOLVERS[name].bind(declared.build(device=device, dtype="float64"))
+        stepper = solver.bind(declared.build(device=device, dtype="float64"))
         for _ in range(10):
             stepper.step()
         v = stepper.state.v.numpy()

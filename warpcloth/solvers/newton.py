@@ -22,7 +22,7 @@ class Newton(ImplicitStep):
 
     It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Each step
     multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved, angular momentum is not.
-    Without self-contact a step starts from the x − x̃ of the last one where this lowers the function, else from x̃.
+    Without contact and rigid clusters a step starts from the x − x̃ of the last one where this lowers the function, else from x̃.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
