@@ -1,8 +1,8 @@
-"""Factories of the kernels of a multigrid cycle for a symmetric matrix of blocks, in every copy.
+"""Factories of the kernels of a multigrid cycle for a symmetric matrix of 3×3 blocks, in every copy.
 
 A level has block compressed rows A, the diagonal blocks S of its Jacobi sweeps, and vectors r, x and d. P interpolates vectors
 of the next coarser level. It has one weight for all coordinates, and all copies have the same. ``active[copy]`` is 1 while a
-copy iterates. Blocks are 3×3, or with ``numbers`` numbers.
+copy iterates.
 """
 
 from functools import cache
@@ -23,11 +23,34 @@ CYCLE = 4
 AGED = 64
 
 
-def _kinds(dtype, numbers, products=False):
-    """Types of a vector and of a block, and the name of the module, which has one kernel of a name."""
+@cache
+def residual(dtype, products: bool):
+    """Device function (i, rows, x, r) → r[i] − (A x)[i], with ``products`` also minus a further product with x."""
     vec3, mat33 = types(dtype)
-    name = f"{MODULE}.{dtype.__name__}" + ".numbers" * numbers + ".products" * products
-    return vec3, dtype if numbers else mat33, name
+
+    @wp.func
+    def residual_of_row(
+        i: int,
+        offsets: wp.array(dtype=wp.int32),
+        columns: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=mat33),
+        x: wp.array(dtype=vec3),
+        further: wp.array(dtype=vec3),
+        r: wp.array(dtype=vec3),
+    ):
+        total = r[i]
+        if wp.static(products):
+            total -= further[i]
+        for s in range(offsets[i], offsets[i + 1]):
+            total -= values[s] * x[columns[s]]
+        return total
+
+    return residual_of_row
+
+
+def _module(dtype, products):
+    """The name of a module, in which no two kernels have one name."""
+    return f"{MODULE}.{dtype.__name__}" + ".products" * products
 
 
 @cache
@@ -35,7 +58,7 @@ def multiply_by_transfers(dtype):
     """Kernel over (copies, upper blocks): A_c = Σ weight·A, a block of PᵀAP, which is stored with its transpose."""
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=_module(dtype, False), enable_backward=False)
     def multiply_blocks(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -70,7 +93,7 @@ def eliminate(dtype):
     """
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=_module(dtype, False), enable_backward=False)
     def eliminate_pivot(
         # state in
         before: wp.array(dtype=mat33),
@@ -107,7 +130,7 @@ def factorise_diagonal(dtype):
     """
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=_module(dtype, False), enable_backward=False)
     def factorise(
         # elements
         diagonal: wp.array(dtype=wp.int32),
@@ -155,7 +178,7 @@ def scale_sweeps(dtype):
     """
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=_module(dtype, False), enable_backward=False)
     def scale(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -267,17 +290,18 @@ def choose():
 
 
 @cache
-def subtract_product(dtype, numbers: bool = False, products: bool = False):
+def subtract_product(dtype, products: bool = False):
     """Kernel over block rows: out = r − A x, with ``products`` also minus a further product with x."""
-    vec3, block, module = _kinds(dtype, numbers, products)
+    vec3, mat33 = types(dtype)
+    remaining = residual(dtype, products)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=_module(dtype, products), enable_backward=False)
     def subtract_rows(
         # elements
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         # state in
-        values: wp.array(dtype=block),
+        values: wp.array(dtype=mat33),
         x: wp.array(dtype=vec3),
         further: wp.array(dtype=vec3),
         r: wp.array(dtype=vec3),
@@ -290,22 +314,17 @@ def subtract_product(dtype, numbers: bool = False, products: bool = False):
         i = wp.tid()
         if active[i // per_copy] == 0:
             return
-        total = r[i]
-        if wp.static(products):
-            total -= further[i]
-        for s in range(offsets[i], offsets[i + 1]):
-            total -= values[s] * x[columns[s]]
-        out[i] = total
+        out[i] = remaining(i, offsets, columns, values, x, further, r)
 
     return subtract_rows
 
 
 @cache
-def restrict(dtype, numbers: bool = False):
+def restrict(dtype):
     """Kernel over (copies, coarse rows): r_c = Pᵀr, x_c = S r_c."""
-    vec3, block, module = _kinds(dtype, numbers)
+    vec3, mat33 = types(dtype)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=_module(dtype, False), enable_backward=False)
     def restrict_rows(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -313,7 +332,7 @@ def restrict(dtype, numbers: bool = False):
         weights: wp.array(dtype=dtype),
         # state in
         r: wp.array(dtype=vec3),
-        sweep: wp.array(dtype=block),
+        sweep: wp.array(dtype=mat33),
         # parameters
         active: wp.array(dtype=wp.int32),
         per_copy: int,
@@ -336,11 +355,11 @@ def restrict(dtype, numbers: bool = False):
 
 
 @cache
-def prolong(dtype, numbers: bool = False):
+def prolong(dtype):
     """Kernel over (copies, rows): d = P x_c."""
-    vec3, _, module = _kinds(dtype, numbers)
+    vec3, _ = types(dtype)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=_module(dtype, False), enable_backward=False)
     def prolong_rows(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -367,18 +386,19 @@ def prolong(dtype, numbers: bool = False):
 
 
 @cache
-def sweep_after(dtype, numbers: bool = False, products: bool = False):
+def sweep_after(dtype, products: bool = False):
     """Kernel over block rows: x += d + S(r − A d), with ``products`` minus a further product with d."""
-    vec3, block, module = _kinds(dtype, numbers, products)
+    vec3, mat33 = types(dtype)
+    remaining = residual(dtype, products)
 
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=_module(dtype, products), enable_backward=False)
     def sweep_rows(
         # elements
         offsets: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         # state in
-        values: wp.array(dtype=block),
-        sweep: wp.array(dtype=block),
+        values: wp.array(dtype=mat33),
+        sweep: wp.array(dtype=mat33),
         d: wp.array(dtype=vec3),
         further: wp.array(dtype=vec3),
         r: wp.array(dtype=vec3),
@@ -391,11 +411,6 @@ def sweep_after(dtype, numbers: bool = False, products: bool = False):
         i = wp.tid()
         if active[i // per_copy] == 0:
             return
-        total = r[i]
-        if wp.static(products):
-            total -= further[i]
-        for s in range(offsets[i], offsets[i + 1]):
-            total -= values[s] * d[columns[s]]
-        x[i] = x[i] + d[i] + sweep[i] * total
+        x[i] = x[i] + d[i] + sweep[i] * remaining(i, offsets, columns, values, d, further, r)
 
     return sweep_rows

@@ -190,7 +190,7 @@ class Multigrid:
         )
         self._launch_finest = self._launch
         if self._further is not None:
-            self._launch_finest = model.launcher((products, model.dtype, False, True))
+            self._launch_finest = model.launcher((products, model.dtype, True))
 
     def update(self):
         """Launches the sweeps of the finest level for the present A, and the coarse matrices if they are ``outdated``."""
