@@ -140,14 +140,13 @@ def test_steps_start_from_the_last_correction(device):
 
 @pytest.mark.slow
 def test_scalar_products_are_shared_by_blocks(device, monkeypatch):
-    """Seven lanes of each copy end where one lane does, but for rounding, with rows of a Hessian and of constraints."""
-    solvers = wc.Newton(substeps=4, tolerance=1e-10), wc.ConstrainedDynamics(substeps=4, linear="cg", tolerance=1e-10)
-    model = swinging(8).build(device=device, dtype="float64", copies=2, vary={"Spring.stiffness": np.array([1e3, 3e3])})
+    """Several blocks of each copy end where one block does, but for rounding, with rows of a Hessian and of constraints."""
+    solvers = wc.Newton(substeps=1, tolerance=1e-10), wc.ConstrainedDynamics(substeps=1, linear="cg", tolerance=1e-10)
+    model = swinging(17).build(device=device, dtype="float64", copies=2, vary={"Spring.stiffness": np.array([1e3, 3e3])})
     ends = []
-    for blocks in (None, {"cuda": 32, "cpu": 1}):
-        if blocks:
-            monkeypatch.setattr(linear, "BLOCKS", blocks)
-            monkeypatch.setattr(linear, "MOST_BLOCKS", 7)
+    for most, block_of_cpu in (1, 0), (7, 1):
+        monkeypatch.setattr(linear, "BLOCKS", {"cuda": 256, "cpu": block_of_cpu})
+        monkeypatch.setattr(linear, "MOST_BLOCKS", most)
         for solver in solvers:
             stepper = solver.bind(model)
             stepper.frame()
