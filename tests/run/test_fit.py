@@ -231,6 +231,29 @@ def test_a_drape_coefficient_gives_a_bending_stiffness():
     assert 0.01 < found.errors["QuadraticBending.stiffness"] < 0.2
 
 
+def test_readings_on_the_command_line(capsys):
+    """A modulus of 1500 N/m ± 10 is that of the membrane at a strain of 1e-6, and so is its relative error."""
+    words = ["fit", "strip", "-p", "angle=0", "elements=2", "strain=1e-6", "--start", "OrthotropicMembrane.stiffness=1000"]
+    assert main([*words, "--reading", "modulus=1500+-10", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["parameters"]["OrthotropicMembrane.stiffness"] == pytest.approx(1500.0, rel=1e-5)
+    assert found["errors"]["OrthotropicMembrane.stiffness"] == pytest.approx(10.0 / 1500.0, rel=1e-5)
+    assert main([*words, "--reading", "modulus=1500"]) == 0 and "its error is not known" in capsys.readouterr().out
+    cantilever = ["fit", "cantilever", "--reading", "D=800", "--start"]
+    for wrong, sentence in (
+        (words, "none of MEASURED and --reading is given; one of the two must be"),
+        ([*words, "seen.usdc", "--reading", "modulus=1"], "is not of the form name=value"),
+        (["fit", "strip", "seen.usdc", *cantilever[2:], "a=1"], "both of MEASURED and --reading is given"),
+        ([*words, "--reading", "module=1"], "--reading is 'module'; it must be one of 'modulus'"),
+        ([*words, "--reading", "modulus=1+-0"], "reading.sigma is 0.0; it must be a finite number above 0"),
+        ([*words, "--reading", "modulus=1", "--fps", "24"], "--prim and --fps are for animations, and --reading is given"),
+        ([*words, "--reading", "modulus=1", "--frames", "2"], "--reading is given with --solver, -s, --plot or --frames"),
+        ([*cantilever, "density=0.1"], "--reading has D, which the device computes from the density"),
+        (["fit", "hanging", *cantilever[2:], "Spring.stiffness=1"], "scene.name is 'hanging'; it must be one of 'cantilever'"),
+    ):
+        assert main(wrong) == 2 and sentence in capsys.readouterr().err, wrong
+
+
 def markers(scene, points):
     """Seven points of triangles of a scene, and their positions at points (F, n, 3)."""
     random = np.random.default_rng(1)

@@ -1,10 +1,11 @@
 """The command ``fit``: finds parameters of a scene with which it moves, or rests, as measured."""
 
 from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 
-from ..base.checks import whole
+from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, json_text
 from ..picture.figures import PICTURES, check_path
@@ -20,15 +21,27 @@ with the columns time, id, x, y, z [s, m]: rows at time 0 bind the markers to th
 Without the column id, rows are free points on the cloth. --start names the parameters and the values to start from. Errors are
 one standard deviation, relative to the value; intervals contain the true value with a probability of 95 %.
 
+--reading stands for MEASURED: numbers that the device of a laboratory reads from its sample at rest, in the units of 'warpcloth
+measure'. Each of several needs its standard deviation, NAME=VALUE+-DEVIATION; one without gives an estimate without an error.
+
   warpcloth fit hanging seen.usdc --start Spring.stiffness=300 QuadraticBending.stiffness=1e-4 --frames 30
   warpcloth fit hanging markers.csv --start QuadraticBending.stiffness=1e-4 --at-rest
+  warpcloth fit loop -p fabric=cotton --reading "depth of the loop=19+-0.2" --start PlateBending.stiffness=1e-5
 """
 
 
 def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
     add_scene(parser)
-    parser.add_argument("measured", metavar="MEASURED", help="the measured animation")
+    parser.add_argument("measured", nargs="?", metavar="MEASURED", help="the measured animation; without --reading")
+    parser.add_argument(
+        "--reading",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help='fit what a laboratory\'s device reads from SCENE at rest, such as "drape coefficient=52+-1"',
+    )
     parser.add_argument(
         "--start",
         nargs="+",
@@ -53,13 +66,7 @@ def fit(arguments):
     from ..mesh.sequences import open_sequence
     from ..run.fit import fit
 
-    markers = arguments.measured.lower().endswith(".csv")
-    if markers and (arguments.prim or arguments.fps is not None):
-        raise ValueError("--prim and --fps are for animations, and MEASURED is a file of markers; leave them out")
-    if arguments.at_rest and not markers:
-        raise ValueError("--at-rest is given, but MEASURED is an animation; it must be a .csv file of markers")
-    if arguments.at_rest and (arguments.solver or arguments.s or arguments.plot or arguments.frames is not None):
-        raise ValueError("--at-rest is given with --solver, -s, --plot or --frames, which are for motions; leave them out")
+    _check(arguments)
     if arguments.plot:
         check_path(arguments.plot, PICTURES)
     check_writable(arguments.plot)
@@ -69,15 +76,19 @@ def fit(arguments):
     if arguments.frames is not None:
         whole("frames", arguments.frames, least=1)
         scene = replace(scene, duration=arguments.frames / scene.fps)
-    device = find_device(arguments.device)
-    setup = None if arguments.at_rest else solver_setup(arguments, scene, device)
-    seen = measured if markers else open_sequence(measured, prim, arguments.fps)
-    found = fit(scene, setup and setup.solver, start, seen, arguments.vertices, device=device, dtype=arguments.dtype)
+    device, read = find_device(arguments.device), bool(arguments.reading)
+    setup = None if arguments.at_rest or read else solver_setup(arguments, scene, device)
+    if read:
+        seen = _readings(arguments.reading, start, scene)
+    else:
+        seen = measured if _is_table(measured) else open_sequence(measured, prim, arguments.fps)
+    options = {"device": device, "dtype": arguments.dtype, "record": ("reactions",) if read else ()}
+    found = fit(scene, setup and setup.solver, start, seen, arguments.vertices, **options)
     if arguments.plot:
         from ..chart import plot_residuals
 
         plot_residuals(arguments.plot, found, scene.fps)
-    facts = {"scene": arguments.scene, "measured": measured, "scene_parameters": values}
+    facts = {"scene": arguments.scene, "measured": measured, "readings": arguments.reading, "scene_parameters": values}
     facts |= {"device": str(device), "dtype": arguments.dtype}
     facts |= solver_facts(arguments, setup, scene.fps) if setup else {"solver": None}
     facts |= {**asdict(found), "intervals": found.intervals}
@@ -86,12 +97,60 @@ def fit(arguments):
     return 0
 
 
+def _check(arguments):
+    """Checks that options go together."""
+    measured, read = arguments.measured, arguments.reading
+    if bool(measured) == bool(read):
+        raise ValueError(f"{'both' if measured else 'none'} of MEASURED and --reading is given; one of the two must be")
+    kind = "--reading is given" if read else "MEASURED is a file of markers"
+    if (read or _is_table(measured)) and (arguments.prim or arguments.fps is not None):
+        raise ValueError(f"--prim and --fps are for animations, and {kind}; leave them out")
+    if arguments.at_rest and not read and not _is_table(measured):
+        raise ValueError("--at-rest is given, but MEASURED is an animation; it must be a .csv file of markers")
+    motion = arguments.solver or arguments.s or arguments.plot or arguments.frames is not None
+    if motion and (arguments.at_rest or read):
+        option = "--reading" if read else "--at-rest"
+        raise ValueError(f"{option} is given with --solver, -s, --plot or --frames, which are for motions; leave them out")
+
+
+def _is_table(measured):
+    """Returns whether MEASURED is a file of markers."""
+    return measured.lower().endswith(".csv")
+
+
+def _readings(texts, start, scene):
+    """Returns a :class:`warpcloth.Reading` for each of the texts of --reading."""
+    from ..lab.laboratory import DEVICES, check_sample
+    from ..run.readings import Reading
+
+    check_sample(scene)
+    found = []
+    for quantity, text in assignments(texts).items():
+        choice("--reading", quantity, tuple(DEVICES[scene.name][1]))
+        if quantity == "D" and "density" in start:
+            raise ValueError("--reading has D, which the device computes from the density, and --start has density")
+        value, sign, deviation = text.replace("±", "+-").partition("+-")
+        numbers = [convert(f"--reading {quantity}", each, (float,)) for each in ([value, deviation] if sign else [value])]
+        found.append(Reading(partial(_read, scene, quantity), *numbers))
+    return found
+
+
+def _read(scene, quantity, rest):
+    from ..lab.laboratory import laboratory_readings
+
+    return laboratory_readings(scene, rest)[quantity][0]
+
+
 def _summary(facts, found):
     width = max(map(len, found.parameters))
-    lines = [f"{facts['scene']} fitted to {facts['measured']}, {solver_line(facts) if facts['solver'] else 'at rest'}"]
+    measured = facts["measured"] or ", ".join(facts["readings"])
+    lines = [f"{facts['scene']} fitted to {measured}, {solver_line(facts) if facts['solver'] else 'at rest'}"]
     for name, value in found.parameters.items():
         error, (low, high) = found.errors[name], found.intervals[name]
-        certain = f"± {100.0 * error:.2g} %, from {low:.5g} to {high:.5g}" if np.isfinite(error) else "not determined"
+        if np.isnan(error):
+            certain = "its error is not known"
+        else:
+            certain = f"± {100.0 * error:.2g} %, from {low:.5g} to {high:.5g}" if np.isfinite(error) else "not determined"
         lines.append(f"  {name.ljust(width)}  {value:.6g}  {certain}")
     names = list(found.parameters)
     for i, j in zip(*np.triu_indices(len(names), 1), strict=True):
@@ -100,5 +159,9 @@ def _summary(facts, found):
     frames = int(np.isfinite(found.residuals).sum())
     over = f", over {frames} frame{'s' * (frames != 1)}" if facts["solver"] else ""
     ran = f"{found.runs} {'batches were' if facts['solver'] else 'sets of equilibria were'} run"
-    lines.append(f"  residual {found.residual:.4g} m RMS{over}; {ran}")
+    if facts["measured"]:
+        unit = " m"
+    else:
+        unit = " standard deviations" if np.isinf(found.freedom) else " in the unit of the reading,"
+    lines.append(f"  residual {found.residual:.4g}{unit} RMS{over}; {ran}")
     return "\n".join(lines)

@@ -11,7 +11,7 @@
 Bending lengths follow from the elastica (:mod:`warpcloth.lab.elastica`), not from Peirce's formula.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -47,12 +47,13 @@ def laboratory_readings(scene: Scene, rest: Equilibrium) -> Readings:
         (1.0, 'N/m')
     """
     check_sample(scene)
+    device, units = DEVICES[scene.name]
     with np.errstate(divide="ignore", invalid="ignore"):
-        readings = DEVICES[scene.name](scene, rest)
-    for quantity, (value, _unit) in readings.items():
+        values = dict(zip(units, map(float, device(scene, rest)), strict=True))
+    for quantity, value in values.items():
         if not np.isfinite(value):
             raise ValueError(f"the {quantity} of the scene {scene.name!r} is {value}; a reading must be finite")
-    return readings
+    return {quantity: (values[quantity], unit) for quantity, unit in units.items()}
 
 
 def check_sample(scene: Scene) -> None:
@@ -138,10 +139,9 @@ def _clamps(scene):
 
 
 def _bending(length, gamma, scene):
-    """Returns the bending length and D of a strip of a length [m] with Γ."""
-    bending_length = float(length * gamma ** (-1 / 3))
-    weight = scene.density * float(np.linalg.norm(scene.gravity))
-    return {"bending length": (1e3 * bending_length, "mm"), "D": (1e6 * weight * bending_length**3, "µN·m")}
+    """Returns the bending length [mm] and D [µN·m] of a strip of a length [m] with Γ."""
+    bending_length = length * gamma ** (-1 / 3)
+    return 1e3 * bending_length, 1e6 * scene.density * np.linalg.norm(scene.gravity) * bending_length**3
 
 
 def _cantilever(scene, rest):
@@ -157,11 +157,8 @@ def _cantilever(scene, rest):
         )
     length = flat[tip].mean() - clamp
     device = elastica.gamma_of(np.tan(ANGLE), 1.0, 8.0)
-    return {
-        "angle of the tip": (float(np.degrees(np.arctan2(-y, x - clamp))), "°"),
-        "overhang at 41.5°": (float(1e3 * length * (device / gamma) ** (1 / 3)), "mm"),
-        **_bending(length, gamma, scene),
-    }
+    overhang = 1e3 * length * (device / gamma) ** (1 / 3)
+    return np.degrees(np.arctan2(-y, x - clamp)), overhang, *_bending(length, gamma, scene)
 
 
 def _loop(scene, rest):
@@ -175,7 +172,7 @@ def _loop(scene, rest):
         if depth / length <= weightless:
             raise ValueError(f"{deep}, and without weight it would be {weightless:.4g}; take more elements or a larger Γ")
         raise ValueError(f"{deep}; its Γ must be 200 or less, best 50 to 150")
-    return {"depth of the loop": (1e3 * depth, "mm"), **_bending(length, gamma, scene)}
+    return 1e3 * depth, *_bending(length, gamma, scene)
 
 
 def _cusick(scene, rest):
@@ -184,10 +181,7 @@ def _cusick(scene, rest):
     edge = np.flatnonzero(radius > radius.max() * (1.0 - 1e-9))
     outline = np.hypot(*points[edge][:, [0, 2]].T)
     outside = outline > outline.mean()
-    return {
-        "drape coefficient": (100.0 * drape_coefficient(points, flat, scene.mesh.triangles), "%"),
-        "folds": (float((outside & ~np.roll(outside, 1)).sum()), ""),
-    }
+    return 100.0 * drape_coefficient(points, flat, scene.mesh.triangles), (outside & ~np.roll(outside, 1)).sum()
 
 
 def _strip(scene, rest):
@@ -195,7 +189,7 @@ def _strip(scene, rest):
     pulled = scene.mesh.points[scene.pins.vertices, 0] == x.max()
     width, length = np.ptp(scene.mesh.points[:, 2]), np.ptp(x)
     strain = np.ptp(rest.points[:, 0]) / length - 1.0
-    return {"modulus": (float(_reactions(rest)[pulled, 0].sum() / (width * strain)), "N/m")}
+    return (_reactions(rest)[pulled, 0].sum() / (width * strain),)
 
 
 def _picture_frame(scene, rest):
@@ -209,9 +203,8 @@ def _picture_frame(scene, rest):
     c, s = 0.5 * c, -0.5 * s
     speed = flat[held] @ np.array([[s, 0.0, c], [0.0, 0.0, 0.0], [c, 0.0, s]])  # by γ
     rate = side * np.sin(0.25 * np.pi - half)
-    force = float((_reactions(rest) * speed).sum() / rate)
-    modulus = force * rate / (side**2 * np.sin(2.0 * half) * np.cos(2.0 * half))
-    return {"force along the diagonal": (force, "N"), "shear modulus": (float(modulus), "N/m")}
+    force = (_reactions(rest) * speed).sum() / rate
+    return force, force * rate / (side**2 * np.sin(2.0 * half) * np.cos(2.0 * half))
 
 
 def _reactions(rest):
@@ -220,10 +213,12 @@ def _reactions(rest):
     return rest.reactions
 
 
-DEVICES: dict[str, Callable[[Scene, Equilibrium], Readings]] = {
-    "cantilever": _cantilever,
-    "loop": _loop,
-    "cusick": _cusick,
-    "strip": _strip,
-    "picture_frame": _picture_frame,
+# By the name of a scene: the function that returns the values of its device, and their units by the names of the quantities.
+_STRIP = {"bending length": "mm", "D": "µN·m"}
+DEVICES: dict[str, tuple[Callable[[Scene, Equilibrium], Sequence[float]], dict[str, str]]] = {
+    "cantilever": (_cantilever, {"angle of the tip": "°", "overhang at 41.5°": "mm", **_STRIP}),
+    "loop": (_loop, {"depth of the loop": "mm", **_STRIP}),
+    "cusick": (_cusick, {"drape coefficient": "%", "folds": ""}),
+    "strip": (_strip, {"modulus": "N/m"}),
+    "picture_frame": (_picture_frame, {"force along the diagonal": "N", "shear modulus": "N/m"}),
 }
