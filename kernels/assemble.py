@@ -9,6 +9,7 @@ import warp as wp
 
 from .local import local_coordinate
 from .memory import load, load_shared, prefetch
+from .reduce import block_sums
 from .term import Term
 from .transpose import LocalSource, add_outer, gather, scatter, to_block
 from .vectors import types
@@ -66,6 +67,39 @@ def energy(term: Term, dtype, corrected: bool = False):
         out[e] = energy_of(stencil, stiffness, e, rest_of(rest, e), x, d)
 
     return energy_of_elements
+
+
+@cache
+def energy_parts(term: Term, dtype, block: int):
+    """Kernel over (copies, lanes): the parts of Σ kₑ Aₑ u(yₑ) [J] at x + d, see :func:`.reduce.block_sums`."""
+    vec3, _ = types(dtype)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    (energy_of, _gradient, _hessian), rest_of = of_element(term, dtype, True), load(rest_type)
+    store_part, _add_up = block_sums(block)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def energy_of_lanes(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        stiffness: wp.array(dtype=dtype),
+        rest: wp.array(dtype=rest_type),
+        # state in
+        x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # out
+        parts: wp.array2d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        total = wp.float64(0.0)
+        for j in range(lane, per_copy, lanes):
+            e = copy * per_copy + j
+            total += energy_of(stencil, stiffness, e, rest_of(rest, e), x, d)
+        store_part(lane, total, parts, copy)
+
+    return energy_of_lanes
 
 
 @cache

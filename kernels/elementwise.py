@@ -12,16 +12,15 @@ from .vectors import types
 
 
 @cache
-def negate(dtype, numbers: bool = False):
-    """Kernel over entries: out = −a."""
-    value, module = (dtype, "constraint_step") if numbers else (types(dtype)[0], "minimise")
+def negate(dtype):
+    """Kernel over numbers: out = −a."""
 
-    @wp.kernel(module=f"warpcloth.{module}.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.constraint_step.{dtype.__name__}", enable_backward=False)
     def negate_entries(
         # state in
-        a: wp.array(dtype=value),
+        a: wp.array(dtype=dtype),
         # out
-        out: wp.array(dtype=value),
+        out: wp.array(dtype=dtype),
     ):
         i = wp.tid()
         out[i] = -a[i]

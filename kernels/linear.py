@@ -18,6 +18,8 @@ from typing import Any
 import warp as wp
 
 from .memory import load
+from .reduce import block_sums
+from .rotation import epsilon
 from .vectors import types
 
 MODULE = "warpcloth.conjugate_gradients"  # of the kernels over copies
@@ -158,14 +160,15 @@ def multiply(dtype):
 
 
 @cache
-def rounding(dtype):
-    """Kernel over block rows: estimates of the rounding errors of the force and of the energy.
+def rounding(dtype, block: int):
+    """Kernel over (copies, lanes): b = −∇φ, and the parts of estimates of the rounding errors of the force and of the energy.
 
-    ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖);  energy[i] = ½ρ²/‖A[i, i]‖ [J],  force[i] = (ρ + ε‖A[i, i]‖ edge)² [N²]. The typical
-    edge length stands for pinned neighbours, which are not in the matrix.
+    They are Σ(ρ + ε‖A[i, i]‖ edge)² [N²] and Σ½ρ²/‖A[i, i]‖ [J] with ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖). The typical edge
+    length stands for pinned neighbours, which are not in the matrix.
     """
     vec3, mat33 = types(dtype)
     column, block_at, vector = load(wp.int32), load(mat33), load(vec3)
+    store, _add_up = block_sums(block)
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def rounding_of_rows(
@@ -177,24 +180,32 @@ def rounding(dtype):
         values: wp.array(dtype=mat33),
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
+        gradient: wp.array(dtype=vec3),
         # parameters
-        epsilon: dtype,
         edge: dtype,
+        per_copy: int,
+        lanes: int,
         # out
-        force: wp.array(dtype=wp.float64),
-        energy: wp.array(dtype=wp.float64),
+        b: wp.array(dtype=vec3),
+        parts: wp.array3d(dtype=wp.float64),
     ):
-        i = wp.tid()
-        total = dtype(0.0)
-        for s in range(offsets[i], offsets[i + 1]):
-            j, each = column(columns, s), block_at(values, s)
-            total += wp.sqrt(wp.ddot(each, each)) * (wp.length(vector(x, j) - x[i]) + wp.length(vector(d, j)))
-        block = values[diagonal[i]]
-        size = wp.sqrt(wp.ddot(block, block))
-        rho = wp.float64(epsilon * (total + size * edge))
-        force[i] = rho * rho
-        rho = wp.float64(epsilon * total)
-        energy[i] = wp.float64(0.5) * rho * rho / wp.float64(size)
+        copy, lane = wp.tid()
+        force, energy = wp.float64(0.0), wp.float64(0.0)
+        for k in range(lane, per_copy, lanes):
+            i = copy * per_copy + k
+            b[i] = -gradient[i]
+            total = dtype(0.0)
+            for s in range(offsets[i], offsets[i + 1]):
+                j, each = column(columns, s), block_at(values, s)
+                total += wp.sqrt(wp.ddot(each, each)) * (wp.length(vector(x, j) - x[i]) + wp.length(vector(d, j)))
+            own = values[diagonal[i]]
+            size = wp.sqrt(wp.ddot(own, own))
+            rho = wp.float64(epsilon(edge) * (total + size * edge))
+            force += rho * rho
+            rho = wp.float64(epsilon(edge) * total)
+            energy += wp.float64(0.5) * rho * rho / wp.float64(size)
+        store(lane, force, parts[0], copy)
+        store(lane, energy, parts[1], copy)
 
     return rounding_of_rows
 
@@ -268,39 +279,6 @@ class Solves:
     iteration: wp.array(dtype=wp.int32)
     most: wp.array(dtype=wp.int32)
     proceed: wp.array(dtype=wp.int32)
-
-
-@cache
-def block_sums(block: int):
-    """The device functions (lane, value, parts, copy), which stores the part of a block, and (lane, parts, copy) → Σ."""
-    threads = max(block, 1)
-
-    @wp.func
-    def over_block(value: wp.float64):
-        return wp.tile_sum(wp.tile(value))[0]
-
-    @wp.func
-    def store(lane: int, value: wp.float64, parts: wp.array2d(dtype=wp.float64), copy: int):
-        if wp.static(block > 0):
-            total = over_block(value)
-            if lane % wp.static(threads) == 0:
-                parts[copy, lane // wp.static(threads)] = total
-        else:
-            parts[copy, 0] = value
-
-    @wp.func
-    def add_up(lane: int, parts: wp.array2d(dtype=wp.float64), copy: int):
-        total = wp.float64(0.0)
-        if wp.static(block > 0):
-            own = wp.float64(0.0)
-            for k in range(lane % wp.static(threads), parts.shape[1], wp.static(threads)):
-                own += parts[copy, k]
-            total = over_block(own)
-        else:
-            total = parts[copy, 0]
-        return total
-
-    return store, add_up
 
 
 @cache

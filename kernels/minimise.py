@@ -9,6 +9,8 @@ from functools import cache
 
 import warp as wp
 
+from .reduce import block_sums
+from .search import LineSearch
 from .term import HessianPolicy
 from .vectors import types
 
@@ -201,76 +203,46 @@ def find_indefinite():
 
 
 @cache
-def end_newton():
-    """Kernel over copies: finds whether an active copy has ended after an iteration.
+def end_newton(block: int):
+    """Kernel over (copies, lanes of one block): finds whether an active copy has ended after an iteration.
 
     Rounding allows no further progress if the gradient is within its rounding, and no step was found or φ fell by no more than
-    its rounding. A copy is stuck if no step was found or the direction does not descend.
+    its rounding. A copy is stuck if no step was found or the direction does not descend. ``roundings`` has the parts of
+    :func:`.linear.rounding`.
     """
+    _store, add_up = block_sums(block)
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def end(
         # state in
-        acceleration: wp.array(dtype=wp.float64),
-        energy: wp.array(dtype=wp.float64),
-        square: wp.array(dtype=wp.float64),
-        rounding: wp.array(dtype=wp.float64),
-        lost: wp.array(dtype=wp.float64),
-        step: wp.array(dtype=wp.float64),
-        slope: wp.array(dtype=wp.float64),
+        search: LineSearch,
+        roundings: wp.array3d(dtype=wp.float64),
         # parameters
         resolution: wp.float64,
         limits: Limits,
         # in and out
         progress: DescentState,
     ):
-        copy = wp.tid()
-        if progress.active[copy] == 0:
+        copy, lane = wp.tid()
+        rounding = add_up(lane, roundings[0], copy)
+        lost = add_up(lane, roundings[1], copy)
+        if lane > 0 or progress.active[copy] == 0:
             return
         progress.iterations[copy] = progress.iterations[copy] + 1
         before = progress.energy[copy]
-        progress.energy[copy] = energy[copy]
-        noisy = square[copy] <= ROUNDINGS * ROUNDINGS * rounding[copy]
-        level = before - energy[copy] <= resolution * wp.abs(before) + TYPICAL * lost[copy]
-        stuck = step[copy] == wp.float64(0.0) or not (slope[copy] < wp.float64(0.0))
+        energy = search.energy[copy]
+        progress.energy[copy] = energy
+        noisy = search.square[copy] <= ROUNDINGS * ROUNDINGS * rounding
+        level = before - energy <= resolution * wp.abs(before) + TYPICAL * lost
+        stuck = search.step[copy] == wp.float64(0.0) or not (search.slope[copy] < wp.float64(0.0))
         ended = USED_UP
         if noisy and (stuck or level):
             ended = ROUNDED
         elif stuck and not noisy:
             ended = STALLED
-        look(progress, limits, copy, acceleration[copy] / progress.scale[copy], ended)
+        look(progress, limits, copy, search.acceleration[copy] / progress.scale[copy], ended)
 
     return end
-
-
-@cache
-def set_trial(dtype):
-    """Kernel over vertices: trial = d + step·p, with the step length of the copy; the gradient becomes 0; counts the trial."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
-    def set_each_trial(
-        # state in
-        correction: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
-        step: wp.array(dtype=wp.float64),
-        # parameters
-        per_copy: int,
-        # in and out
-        trials: wp.array(dtype=wp.int32),
-        # out
-        proceed: wp.array(dtype=wp.int32),
-        trial: wp.array(dtype=vec3),
-        gradient: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        if i == 0:
-            trials[0] = trials[0] + 1
-            proceed[0] = 0
-        trial[i] = correction[i] + dtype(step[i // per_copy]) * direction[i]
-        gradient[i] = vec3()
-
-    return set_each_trial
 
 
 @cache
@@ -306,92 +278,3 @@ def add_inertia(dtype):
             work[i] = wp.float64(0.0)
 
     return add
-
-
-@cache
-def begin_search():
-    """Kernel over copies: step = 1 for active copies, 0 for the others; starts their line searches."""
-
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def begin(
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        # out
-        step: wp.array(dtype=wp.float64),
-        searching: wp.array(dtype=wp.int32),
-        trials: wp.array(dtype=wp.int32),
-        proceed: wp.array(dtype=wp.int32),
-    ):
-        copy = wp.tid()
-        step[copy] = wp.float64(active[copy])
-        searching[copy] = active[copy]
-        trials[0] = 0
-        proceed[0] = 1
-
-    return begin
-
-
-@cache
-def check_guess():
-    """Kernel over copies: keeps the step to a guess if φ is lower there, else sets it to 0, and ``rejected`` to 1."""
-
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def check(
-        # state in
-        start: wp.array(dtype=wp.float64),
-        trial: wp.array(dtype=wp.float64),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        # out
-        step: wp.array(dtype=wp.float64),
-        rejected: wp.array(dtype=wp.int32),
-    ):
-        copy = wp.tid()
-        if active[copy] == 1 and not (trial[copy] < start[copy]):
-            step[copy] = wp.float64(0.0)
-            rejected[0] = 1
-
-    return check
-
-
-@cache
-def check_trial():
-    """Kernel over copies: accepts a trial step or halves it; sets it to 0 after ``most`` trials, of which one more is the last.
-
-    A step is accepted if φ(α) ≤ φ(0) + 1e-4 α φ'(0) (Armijo). It is also accepted if φ(α) ≤ φ(0) + noise and
-    φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe, Hager and Zhang 2005). NaN is never
-    accepted.
-    """
-
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def check(
-        # state in
-        start: wp.array(dtype=wp.float64),
-        trial: wp.array(dtype=wp.float64),
-        slope: wp.array(dtype=wp.float64),
-        trial_slope: wp.array(dtype=wp.float64),
-        # parameters
-        noise: wp.float64,
-        trials: wp.array(dtype=wp.int32),
-        most: int,
-        # in and out
-        step: wp.array(dtype=wp.float64),
-        searching: wp.array(dtype=wp.int32),
-        # out
-        proceed: wp.array(dtype=wp.int32),
-    ):
-        copy = wp.tid()
-        if searching[copy] == 1:
-            decrease = trial[copy] <= start[copy] + wp.float64(1.0e-4) * step[copy] * slope[copy]
-            level = trial[copy] <= start[copy] + noise * wp.abs(start[copy])
-            flat = trial_slope[copy] <= -wp.float64(1.0 - 2.0e-4) * slope[copy]
-            if decrease or (level and flat):
-                searching[copy] = 0
-            else:
-                step[copy] = wp.float64(0.5) * step[copy]
-                if trials[0] <= most:
-                    proceed[0] = 1
-                if trials[0] >= most:
-                    step[copy] = wp.float64(0.0)
-
-    return check

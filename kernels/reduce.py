@@ -1,6 +1,8 @@
 """Sums and maxima per copy, in double precision and in a fixed order, so that results are bitwise reproducible.
 
-Two launches: (copies, chunks) threads sum every chunks-th entry of their copy, then one thread per copy adds the chunks.
+Two launches: (copies, chunks) threads sum every chunks-th entry of their copy, then one thread per copy adds the chunks. Or
+lanes: a kernel over (copies, lanes), whose blocks store parts of sums, and the next kernel that adds these up, see
+:func:`block_sums`.
 """
 
 from functools import cache
@@ -184,3 +186,69 @@ def keep_largest():
         out[copy] = larger(out[copy], values[copy])
 
     return keep
+
+
+@cache
+def block_sums(block: int):
+    """The device functions (lane, value, parts, copy), which stores the part of a block, and (lane, parts, copy) → Σ."""
+    threads = max(block, 1)
+
+    @wp.func
+    def over_block(value: wp.float64):
+        return wp.tile_sum(wp.tile(value))[0]
+
+    @wp.func
+    def store(lane: int, value: wp.float64, parts: wp.array2d(dtype=wp.float64), copy: int):
+        if wp.static(block > 0):
+            total = over_block(value)
+            if lane % wp.static(threads) == 0:
+                parts[copy, lane // wp.static(threads)] = total
+        else:
+            parts[copy, 0] = value
+
+    @wp.func
+    def add_up(lane: int, parts: wp.array2d(dtype=wp.float64), copy: int):
+        total = wp.float64(0.0)
+        if wp.static(block > 0):
+            own = wp.float64(0.0)
+            for k in range(lane % wp.static(threads), parts.shape[1], wp.static(threads)):
+                own += parts[copy, k]
+            total = over_block(own)
+        else:
+            total = parts[copy, 0]
+        return total
+
+    return store, add_up
+
+
+@cache
+def block_largest(block: int):
+    """The functions of :func:`block_sums` for the largest of numbers of 0 or more; NaN if one is NaN."""
+    threads = max(block, 1)
+
+    @wp.func
+    def over_block(value: wp.float64):
+        return wp.tile_reduce(larger, wp.tile(value))[0]
+
+    @wp.func
+    def store(lane: int, value: wp.float64, parts: wp.array2d(dtype=wp.float64), copy: int):
+        if wp.static(block > 0):
+            most = over_block(value)
+            if lane % wp.static(threads) == 0:
+                parts[copy, lane // wp.static(threads)] = most
+        else:
+            parts[copy, 0] = value
+
+    @wp.func
+    def find(lane: int, parts: wp.array2d(dtype=wp.float64), copy: int):
+        most = wp.float64(0.0)
+        if wp.static(block > 0):
+            own = wp.float64(0.0)
+            for k in range(lane % wp.static(threads), parts.shape[1], wp.static(threads)):
+                own = larger(own, parts[copy, k])
+            most = over_block(own)
+        else:
+            most = parts[copy, 0]
+        return most
+
+    return store, find

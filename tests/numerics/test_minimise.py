@@ -5,8 +5,8 @@ import pytest
 
 import warpcloth as wc
 from support.steps import swinging
+from warpcloth.core import sums
 from warpcloth.core.status import Result
-from warpcloth.numerics import linear
 from warpcloth.numerics.minimise import Minimiser
 
 EPS = float(np.finfo(np.float32).eps)
@@ -139,16 +139,22 @@ def test_steps_start_from_the_last_correction(device):
 
 
 @pytest.mark.slow
-def test_scalar_products_are_shared_by_blocks(device, monkeypatch):
+def test_sums_are_shared_by_blocks(device, monkeypatch):
     """Several blocks of each copy end where one block does, but for rounding, with rows of a Hessian and of constraints."""
     solvers = wc.Newton(substeps=1, tolerance=1e-10), wc.ConstrainedDynamics(substeps=1, linear="cg", tolerance=1e-10)
     model = swinging(17).build(device=device, dtype="float64", copies=2, vary={"Spring.stiffness": np.array([1e3, 3e3])})
-    ends = []
+    ends, found = [], []
     for most, block_of_cpu in (1, 0), (7, 1):
-        monkeypatch.setattr(linear, "BLOCKS", {"cuda": 256, "cpu": block_of_cpu})
-        monkeypatch.setattr(linear, "MOST_BLOCKS", most)
+        monkeypatch.setattr(sums, "BLOCKS", {"cuda": 256, "cpu": block_of_cpu})
+        monkeypatch.setattr(sums, "MOST_BLOCKS", most)
         for solver in solvers:
             stepper = solver.bind(model)
             stepper.frame()
             ends.append(stepper.state.x.numpy())
+            if isinstance(solver, wc.Newton):
+                stepper.correction.fill_(1e-3)
+                stepper.minimiser.search.launch_again()
+                state = stepper.minimiser.search.state
+                found.append([array.numpy() for array in (state.energy, state.square, state.acceleration)])
+    np.testing.assert_allclose(*found, rtol=1e-9)
     assert np.abs(ends[0] - ends[2]).max() < 1e-12 and np.abs(ends[1] - ends[3]).max() < 1e-12

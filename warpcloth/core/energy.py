@@ -33,3 +33,36 @@ class Energy:
                 continue
             self.model.launch(kernel, elements.count, [*elements.arguments, x, correction], [values])
             self.sums.sum(values, elements.per_copy, out, accumulate=1)
+
+
+class EnergyParts:
+    """The energy U of each copy at x + correction as parts of sums, one launch for each term.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        lanes: :class:`warpcloth.core.sums.Lanes`.
+
+    Attributes:
+        parts: (T, B, blocks) [J], those of each term that is not in ``other`` of :meth:`launch`.
+    """
+
+    @in_turn
+    def __init__(self, model, lanes):
+        self.model, self._lanes = model, lanes
+        clear = [elements for elements in model.terms if elements.clear is not None]
+        whole = [elements for elements in model.terms if elements.clear is None]
+        self._clear = [(elements, model.kernel(add_energy, elements.term, model.dtype)) for elements in clear]
+        key = model.dtype, lanes.block
+        self.parts = lanes.parts(len(whole))
+        kernels = [model.kernel(assemble.energy_parts, elements.term, *key) for elements in whole]
+        self._whole = [(*each, self.parts[k]) for k, each in enumerate(zip(whole, kernels, strict=True))]
+
+    def launch(self, x, correction, other):
+        """Launches the ``parts``, and other (B,) += the energy of elements of colliders [J]."""
+        model, lanes = self.model, self._lanes
+        model.refresh(EVALUATION, Moment(x, correction))
+        for elements, kernel, parts in self._whole:
+            given = [*elements.arguments, x, correction, elements.per_copy, lanes.count]
+            model.launch(kernel, lanes.dim, given, [parts])
+        for elements, kernel in self._clear:
+            model.launch(kernel, 1, [*elements.arguments, elements.clear, x, correction, elements.per_copy], [other])

@@ -1,4 +1,4 @@
-"""Sums and maxima of each copy, in two launches: over chunks, then over the results of the chunks."""
+"""Sums and maxima of each copy, in two launches: over chunks, then over the results of the chunks; and by lanes."""
 
 import warp as wp
 
@@ -7,6 +7,32 @@ from ..kernels import reduce
 
 # Chunks per copy on a GPU, enough to occupy it. The CPU has one.
 CHUNKS = 256
+# Threads of a block that share a sum, and the most blocks of a copy, on a GPU; on the CPU one thread takes a copy.
+BLOCKS, MOST_BLOCKS = {"cuda": 256, "cpu": 0}, 1024
+
+
+class Lanes:
+    """How threads share the sums of a kernel over (copies, lanes), see :func:`warpcloth.kernels.reduce.block_sums`.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        per_copy: Number of summands of a copy.
+
+    Attributes:
+        block: Threads of a block on CUDA, 0 on the CPU.
+        count: Lanes of a copy.
+        dim, of_block: Threads of a kernel over (copies, lanes), and over (copies, lanes of one block).
+    """
+
+    def __init__(self, model, per_copy):
+        self.model, self.block = model, BLOCKS["cuda" if model.device.is_cuda else "cpu"]
+        self._blocks = min(max(-(-per_copy // self.block), 1), MOST_BLOCKS) if self.block else 1
+        self.count = self._blocks * max(self.block, 1)
+        self.dim, self.of_block = (model.copies, self.count), (model.copies, max(self.block, 1))
+
+    def parts(self, *sums):
+        """Returns an array (…, B, blocks) for the parts of sums."""
+        return wp.zeros((*sums, self.model.copies, self._blocks), dtype=wp.float64, device=self.model.device)
 
 
 class Sums:

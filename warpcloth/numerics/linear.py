@@ -8,11 +8,10 @@ import warp as wp
 
 from ..base.interrupts import deferred
 from ..core.capture import Mirror, on_host
+from ..core.sums import Lanes
 from ..kernels import linear
 from ..kernels.elementwise import scale
 
-# Threads of a block that share a scalar product, and the most blocks of a copy, on a GPU; on the CPU one thread takes a copy.
-BLOCKS, MOST_BLOCKS = {"cuda": 256, "cpu": 0}, 1024
 # Largest number of unknowns for which all eigenvalues are computed.
 SMALL = 100
 
@@ -56,11 +55,9 @@ class ConjugateGradients:
         self.active, self.negative, self.tolerance = solves.active, solves.negative, solves.tolerance
         self.iteration = solves.iteration
 
-        block = BLOCKS["cuda" if model.device.is_cuda else "cpu"]
-        blocks = min(max(-(-matrix.per_copy // block), 1), MOST_BLOCKS) if block else 1
-        self._lanes, self._of_block = blocks * max(block, 1), (model.copies, max(block, 1))
-        self._dim, parts = (model.copies, self._lanes), (model.copies, blocks)
-        self._parts, self._pq_parts = (wp.zeros(parts, dtype=wp.float64, device=model.device) for _ in range(2))
+        lanes = Lanes(model, matrix.per_copy)
+        block, self._lanes, self._dim, self._of_block = lanes.block, lanes.count, lanes.dim, lanes.of_block
+        self._parts, self._pq_parts = lanes.parts(), lanes.parts()
         of_unknowns = linear.start_iteration, linear.dot_parts, linear.advance, linear.turn
         self._launch = model.launcher(
             (of_unknowns, model.dtype, matrix.vector is model.dtype, block),

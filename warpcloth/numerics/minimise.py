@@ -10,7 +10,6 @@ from ..core.hessian import Hessian
 from ..core.status import Result
 from ..core.sums import Sums
 from ..kernels import minimise as kernels
-from ..kernels.elementwise import negate
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
 from .iterate import GravityScale
@@ -75,14 +74,15 @@ class Minimiser:
             self.hessian.prepare()
             self.preconditioner = wp.zeros(model.count, dtype=model.mat33, device=model.device)
         self.right = model.vectors()
-        self.work, self.lost = (wp.zeros(model.count, dtype=wp.float64, device=model.device) for _ in range(2))
-
-        self.square, self.rounding, self.lost_energy, self.acceleration = (model.scalars() for _ in range(4))
+        lanes = self.search.lanes
+        self._roundings = lanes.parts(2)
         self.edge = float(np.median(model.scene.mesh.edge_lengths))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
         self._allocate_progress()
         of_copies = kernels.begin_descent, kernels.begin_at_guess, kernels.begin_newton, kernels.find_indefinite
-        self._launch = model.launcher(((negate, rounding), model.dtype), ((*of_copies, kernels.end_newton),))
+        self._launch = model.launcher(
+            ((rounding,), model.dtype, lanes.block), (of_copies,), ((kernels.end_newton,), lanes.block)
+        )
         self.record()
         self.residual, self.iterations = np.zeros(model.copies), 0
 
@@ -199,7 +199,6 @@ class Minimiser:
     def clear(self):
         """Launches d = 0 and everything that depends on it."""
         self.search.launch_start()
-        self._launch_norms()
 
     # What the segments record.
 
@@ -209,11 +208,10 @@ class Minimiser:
             wp.copy(self.right, self.correction)
         self.clear()
         self._progress.proceed.zero_()
-        given = [self.acceleration, self.search.energy, self._limits]
+        given = [self.search.acceleration, self.search.energy, self._limits]
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
         if self.warm:
             self.search.launch_guess(self.right, self.active)
-            self._launch_norms()
             self._progress.proceed.zero_()
             self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
@@ -247,22 +245,17 @@ class Minimiser:
     def _launch_end(self):
         """Launches the line search, and finds the copies that have ended."""
         self._launch_search()
-        search = self.search
-        given = [self.acceleration, search.energy, self.square, self.rounding, self.lost_energy, search.step, search.slope]
-        given += [self.resolution, self._limits]
-        self._launch(kernels.end_newton, self.model.copies, given, [self._progress])
+        given = [self.search.state, self._roundings, self.resolution, self._limits]
+        self._launch(kernels.end_newton, self.search.lanes.of_block, given, [self._progress])
 
     def _launch_assemble(self):
         if self.pairs is not None:
             self.pairs.filter.launch_relist(self.base, self.correction, self.active, self.search.launch_again)
         self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
-        hessian, model = self.hessian, self.model
-        self._launch(negate, model.count, [self.search.gradient], [self.right])
+        hessian, search, lanes = self.hessian, self.search, self.search.lanes
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
-        given += [np.finfo(model.numpy_dtype).eps, self.edge]
-        self._launch(rounding, model.count, given, [self.work, self.lost])
-        for values, total in ((self.work, self.rounding), (self.lost, self.lost_energy)):
-            self.sums.sum(values, model.per_copy, total)
+        given += [search.gradient, self.edge, self.model.per_copy, lanes.count]
+        self._launch(rounding, lanes.dim, given, [self.right, self._roundings])
 
     def _launch_solve(self, wanted):
         self.linear.solve(self.right, self.search.direction, wanted)
@@ -273,10 +266,3 @@ class Minimiser:
             given = self.search.gradient, self.preconditioner, self.right, self.search.direction, self.active
             self.pairs.filter.launch_limit(self.sums, *given)
         self.search.launch(self.active)
-        self._launch_norms()
-
-    def _launch_norms(self):
-        """Launches ‖∇φ‖² and the largest unbalanced acceleration at d."""
-        gradient = self.search.gradient
-        self.sums.dot(gradient, gradient, self.square)
-        self.sums.largest(self.model.inverse_mass, gradient, self.acceleration)

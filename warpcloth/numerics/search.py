@@ -3,10 +3,10 @@
 import numpy as np
 import warp as wp
 
-from ..core.energy import Energy
+from ..core.energy import EnergyParts
+from ..core.sums import Lanes
 from ..fast.plan import plan
-from ..kernels import minimise as kernels
-from .inertia import Inertia
+from ..kernels import search as kernels
 
 # Halvings of a step before a copy counts as stuck, because 2⁻³⁰ of a Newton step moves nothing.
 HALVINGS = 30
@@ -20,7 +20,7 @@ class Search:
         model: The :class:`warpcloth.model.model.Model`.
         base: The positions at d = 0, (N,) vectors [m]; the caller's array, read only.
         sums: :class:`warpcloth.core.sums.Sums`.
-        s: See :class:`warpcloth.numerics.inertia.Inertia`.
+        s: Weight of the inertia, 1/h² [1/s²].
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
         correction: The array for d (N,) [m], by default its own.
 
@@ -28,21 +28,36 @@ class Search:
         correction: d (N,) [m].
         direction: Search direction p (N,) [m], set by the caller.
         gradient: ∇φ at d (N,) [N].
+        inertia: The mass, gravity, s and load of φ, see :func:`warpcloth.kernels.search.inertia_struct`; load is 0 at first.
         energy, slope, step: φ [J], its slope along p [J], and the step of each copy, (B,); a step of 0 if none was found.
+        acceleration: The largest ‖∇φᵢ‖/mᵢ of each copy at d, (B,) [m/s²].
+        state: These and more, :class:`warpcloth.kernels.search.LineSearch`.
+        lanes: The :class:`warpcloth.core.sums.Lanes` of sums over vertices.
     """
 
     def __init__(self, model, base, sums, s, pairs=None, correction=None):
-        self.model, self.base, self.sums, self.inertia = model, base, sums, Inertia(model, s)
-        self.pairs = pairs
-        self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), Energy(model, sums, corrected=True)
+        self.model, self.base, self.sums, self.pairs = model, base, sums, pairs
+        self.lanes = lanes = Lanes(model, model.per_copy)
+        self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), EnergyParts(model, lanes)
+        self.inertia = kernels.inertia_struct(model.dtype)()
+        self.inertia.mass, self.inertia.inverse_mass = model.mass, model.inverse_mass
+        self.inertia.gravity, self.inertia.shared = model.free_gravity
+        if model.mobility is not None:
+            self.inertia.mobility = model.mobility
+        self.inertia.s, self.inertia.load = s, 0.0
         self.trial, self.gradient, self.direction = (model.vectors() for _ in range(3))
         self.correction = model.vectors() if correction is None else correction
-        self.energy, self.trial_energy, self.slope, self.trial_slope, self.step = (model.scalars() for _ in range(5))
-        self.searching = model.scalars(wp.int32)
-        self.trials, self.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        self.state = state = kernels.LineSearch()
+        for name in ("energy", "slope", "step", "trial_energy", "trial_slope", "square", "acceleration", "other"):
+            setattr(state, name, model.scalars())
+        state.searching = model.scalars(wp.int32)
+        state.trials, state.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        self.energy, self.slope, self.step, self.acceleration = state.energy, state.slope, state.step, state.acceleration
+        self._parts, self._slopes = lanes.parts(kernels.ROWS), lanes.parts()
         self._launch = model.launcher(
-            ((kernels.set_trial,), model.dtype),
-            ((kernels.begin_search, kernels.check_guess, kernels.check_trial),),
+            ((kernels.set_trial, kernels.take_trial), model.dtype),
+            ((kernels.begin_search, kernels.finish_gradient), model.dtype, lanes.block),
+            ((kernels.measure_start, kernels.check_guess, kernels.check_trial), lanes.block),
         )
         # Relative increase of φ that the approximate Wolfe condition counts as rounding. The energy of a spring of strain e has
         # a relative error of 2ε/e, so that √ε covers strains down to √ε.
@@ -60,51 +75,68 @@ class Search:
         """Launches φ and ∇φ at the present d."""
         self.direction.zero_()
         self.step.zero_()
+        self._set_trial()
         self._launch_trial()
-        wp.copy(self.energy, self.trial_energy)
+        self._launch_sums(kernels.measure_start)
 
     def launch(self, active):
-        """Launches d += step·p with the longest step of 1, ½, ¼ … that lowers φ, for the copies that are ``active`` (B,)."""
-        self.sums.dot(self.gradient, self.direction, self.slope)
-        started = [self.step, self.searching, self.trials, self.proceed]
-        self._launch(kernels.begin_search, self.model.copies, [active], started)
-        wp.capture_while(self.proceed, self._try_step)
+        """Launches d += step·p with the longest step of 1, ½, ¼ … that lowers φ, for the copies that are ``active`` (B,).
+
+        The first trial has launches of its own, because further ones, which a conditional loop repeats, are rare.
+        """
+        self._begin(active)
+        self._check_trial()
+        wp.capture_while(self.state.proceed, self._try_again)
         self._take_trial()
 
     def launch_guess(self, guess, active):
         """Launches d = ``guess`` (N,) [m] for the ``active`` copies (B,), from d = 0, where that lowers φ."""
         wp.copy(self.direction, guess)
-        started = [self.step, self.searching, self.trials, self.proceed]
-        self._launch(kernels.begin_search, self.model.copies, [active], started)
-        self._launch_trial()
-        self._launch(
-            kernels.check_guess, self.model.copies, [self.energy, self.trial_energy, active], [self.step, self.proceed]
-        )
-        wp.capture_if(self.proceed, self._launch_trial)
+        self._begin(active)
+        self._launch_sums(kernels.check_guess)
+        wp.capture_if(self.state.proceed, self._return_to_start)
         self._take_trial()
 
-    def _take_trial(self):
-        wp.copy(self.correction, self.trial)
-        wp.copy(self.energy, self.trial_energy)
+    def _begin(self, active):
+        """Launches the first trial, with steps of 1."""
+        given = [self.correction, self.direction, active, self.model.per_copy, self.lanes.count]
+        self._launch(kernels.begin_search, self.lanes.dim, given, [self.gradient, self.state, self.trial, self._slopes])
+        self._launch_trial()
+
+    def _try_again(self):
+        self._set_trial()
+        self._launch_trial()
+        self._check_trial()
+
+    def _return_to_start(self):
+        """Launches the trial again, after a guess that some copies rejected."""
+        self._set_trial()
+        self._launch_trial()
+        self._launch_sums(kernels.check_guess)
+
+    def _set_trial(self):
+        given = [self.correction, self.direction, self.model.per_copy]
+        self._launch(kernels.set_trial, self.model.count, given, [self.state, self.trial, self.gradient])
 
     def _launch_trial(self):
-        """Launches trial = d + step·p, with its φ, ∇φ and slope φ′."""
-        model = self.model
-        N, n = model.count, model.per_copy
-        given = [self.correction, self.direction, self.step, n]
-        self._launch(kernels.set_trial, N, given, [self.trials, self.proceed, self.trial, self.gradient])
+        """Launches ∇φ at the trial, and the parts of what a trial sums."""
+        model, lanes = self.model, self.lanes
         self.gradient_of.add(self.base, self.gradient, self.trial)
         if self.pairs is not None:
             self.pairs.forces.launch_forces(self.base, self.trial)
             self.pairs.forces.add_gradient(self.gradient)
-        self.inertia.add(self.trial, self.gradient)
-        self.sums.sum(self.inertia.work, n, self.trial_energy)
-        self.energy_of.add(self.base, self.trial_energy, self.trial)
+        given = [self.inertia, self.trial, self.direction, model.per_copy, lanes.count]
+        self._launch(kernels.finish_gradient, lanes.dim, given, [self.gradient, self._parts])
+        self.energy_of.launch(self.base, self.trial, self.state.other)
         if self.pairs is not None:
-            self.pairs.forces.add_energy(self.sums, self.trial_energy)
-        self.sums.dot(self.gradient, self.direction, self.trial_slope)
+            self.pairs.forces.add_energy(self.sums, self.state.other)
 
-    def _try_step(self):
-        self._launch_trial()
-        given = [self.energy, self.trial_energy, self.slope, self.trial_slope, self.noise, self.trials, HALVINGS]
-        self._launch(kernels.check_trial, self.model.copies, given, [self.step, self.searching, self.proceed])
+    def _launch_sums(self, kernel):
+        self._launch(kernel, self.lanes.of_block, [self._parts, self.energy_of.parts], [self.state])
+
+    def _check_trial(self):
+        given = [self._parts, self.energy_of.parts, self._slopes, self.noise, HALVINGS]
+        self._launch(kernels.check_trial, self.lanes.of_block, given, [self.state])
+
+    def _take_trial(self):
+        self._launch(kernels.take_trial, self.model.count, [self.trial], [self.state, self.correction])

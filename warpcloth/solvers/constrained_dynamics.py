@@ -154,7 +154,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
             self._linear = FactorisedRows(self.constraints, (self._right, self._change, self._active.array))
         self._unbalanced, self._open, self._rounding, self._carried = (Mirror(model.scalars()) for _ in range(4))
         self._of_vectors = model.launcher(((kernels.mismatch, kernels.add_step), model.dtype), ((kernels.begin_step,),))
-        self._of_rows = model.launcher(((kernels.negate, kernels.add_step), model.dtype, True))
+        self._of_rows = model.launcher(((kernels.negate,), model.dtype), ((kernels.add_step,), model.dtype, True))
         self._gravity_scale = GravityScale(model)
         self._start = Segment(device, self._launch_start)
         self._solve = Segment(device, self._launch_solve) if self._linear.capturable else self._launch_solve

@@ -1,0 +1,324 @@
+"""Factories of the kernels of the line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d along p in every copy.
+
+A trial takes a launch for its positions, those of the gradient, one for inertia, one for the energy of each term, and one that
+adds up the parts of all sums, see :func:`.reduce.block_sums`, and decides.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from .reduce import block_largest, block_sums, larger
+from .vectors import types
+
+MODULE = "warpcloth.search"
+# Rows of the sums over vertices that a trial needs, and their number.
+WORK, SLOPE, SQUARE, LARGEST, ROWS = 0, 1, 2, 3, 4
+
+
+@wp.struct
+class LineSearch:
+    """The line search of each copy, (B,) arrays, and of all, (1,).
+
+    ``energy`` is φ at d [J], ``slope`` its derivative along p and ``step`` the length of the trial step. At the trial they are
+    ``trial_energy`` and ``trial_slope``, with ``square``, ‖∇φ‖² [N²], and ``acceleration``, max ‖∇φᵢ‖/mᵢ [m/s²]. ``other`` is
+    an energy that is not in the parts. ``searching`` is 1 until a step is found. ``trials`` counts, and ``proceed`` is 1 if
+    another is needed.
+    """
+
+    energy: wp.array(dtype=wp.float64)
+    slope: wp.array(dtype=wp.float64)
+    step: wp.array(dtype=wp.float64)
+    trial_energy: wp.array(dtype=wp.float64)
+    trial_slope: wp.array(dtype=wp.float64)
+    square: wp.array(dtype=wp.float64)
+    acceleration: wp.array(dtype=wp.float64)
+    other: wp.array(dtype=wp.float64)
+    searching: wp.array(dtype=wp.int32)
+    trials: wp.array(dtype=wp.int32)
+    proceed: wp.array(dtype=wp.int32)
+
+
+@cache
+def inertia_struct(dtype):
+    """Struct of the quadratic part of φ; ``mobility`` is None without locked coordinates, ``shared`` vertices have one g."""
+    vec3, _ = types(dtype)
+
+    @wp.struct
+    class InertiaOfVertices:
+        mass: wp.array(dtype=dtype)
+        inverse_mass: wp.array(dtype=dtype)
+        mobility: wp.array(dtype=vec3)
+        gravity: wp.array(dtype=vec3)
+        shared: int
+        s: dtype
+        load: dtype
+
+    return InertiaOfVertices
+
+
+@cache
+def begin_search(dtype, block: int):
+    """Kernel over (copies, lanes): the first trial d + p of active copies, d of others; the parts of φ′; the gradient is 0."""
+    vec3, _ = types(dtype)
+    store, _add_up = block_sums(block)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def begin(
+        # state in
+        correction: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        lanes: int,
+        # in and out
+        gradient: wp.array(dtype=vec3),
+        # out
+        search: LineSearch,
+        trial: wp.array(dtype=vec3),
+        slopes: wp.array2d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        step, slope = dtype(active[copy]), wp.float64(0.0)
+        for j in range(lane, per_copy, lanes):
+            i = copy * per_copy + j
+            slope += wp.float64(wp.dot(gradient[i], direction[i]))
+            trial[i] = correction[i] + step * direction[i]
+            gradient[i] = vec3()
+        store(lane, slope, slopes, copy)
+        if lane == 0:
+            search.step[copy] = wp.float64(active[copy])
+            search.searching[copy] = active[copy]
+            search.other[copy] = wp.float64(0.0)
+            if copy == 0:
+                search.trials[0] = 1
+                search.proceed[0] = 0
+
+    return begin
+
+
+@cache
+def set_trial(dtype):
+    """Kernel over vertices: trial = d + step·p, with the step length of the copy; the gradient becomes 0; counts the trial."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def set_each_trial(
+        # state in
+        correction: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        # in and out
+        search: LineSearch,
+        # out
+        trial: wp.array(dtype=vec3),
+        gradient: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        if i == copy * per_copy:
+            search.other[copy] = wp.float64(0.0)
+            if copy == 0:
+                search.trials[0] = search.trials[0] + 1
+                search.proceed[0] = 0
+        trial[i] = correction[i] + dtype(search.step[copy]) * direction[i]
+        gradient[i] = vec3()
+
+    return set_each_trial
+
+
+@cache
+def finish_gradient(dtype, block: int):
+    """Kernel over (copies, lanes): gradient += s m d − load m g, 0 at pins and along locks; the parts of ``ROWS`` sums.
+
+    ``WORK`` is Σ s/2 m d·d − load m g·d [J], ``SLOPE`` ∇φ·p, ``SQUARE`` ‖∇φ‖², and ``LARGEST`` max ‖∇φᵢ‖/mᵢ.
+    """
+    vec3, _ = types(dtype)
+    (store, _add_up), (store_largest, _find) = block_sums(block), block_largest(block)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def finish(
+        # elements
+        inertia: inertia_struct(dtype),
+        # state in
+        trial: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # in and out
+        gradient: wp.array(dtype=vec3),
+        # out
+        parts: wp.array3d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        work, slope = wp.float64(0.0), wp.float64(0.0)
+        square, largest = wp.float64(0.0), wp.float64(0.0)
+        for j in range(lane, per_copy, lanes):
+            i = copy * per_copy + j
+            g = vec3()
+            if inertia.inverse_mass[i] > dtype(0.0):
+                d = trial[i]
+                pull = inertia.load * inertia.gravity[i // inertia.shared]
+                g = gradient[i] + inertia.mass[i] * (inertia.s * d - pull)
+                work += wp.float64(inertia.mass[i]) * wp.float64(wp.dot(dtype(0.5) * inertia.s * d - pull, d))
+            if inertia.mobility:
+                for axis in range(3):
+                    if inertia.mobility[i][axis] == dtype(0.0):
+                        g[axis] = dtype(0.0)
+            gradient[i] = g
+            slope += wp.float64(wp.dot(g, direction[i]))
+            square += wp.float64(wp.dot(g, g))
+            largest = larger(largest, wp.float64(inertia.inverse_mass[i]) * wp.float64(wp.length(g)))
+        store(lane, work, parts[WORK], copy)
+        store(lane, slope, parts[SLOPE], copy)
+        store(lane, square, parts[SQUARE], copy)
+        store_largest(lane, largest, parts[LARGEST], copy)
+
+    return finish
+
+
+@cache
+def add_trial(block: int):
+    """Device function (copy, lane, of vertices, of terms, search), which adds up the parts of a trial."""
+    (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
+
+    @wp.func
+    def add(
+        copy: int,
+        lane: int,
+        of_vertices: wp.array3d(dtype=wp.float64),
+        of_terms: wp.array3d(dtype=wp.float64),
+        search: LineSearch,
+    ):
+        energy = add_up(lane, of_vertices[WORK], copy)
+        for k in range(of_terms.shape[0]):
+            energy += add_up(lane, of_terms[k], copy)
+        slope = add_up(lane, of_vertices[SLOPE], copy)
+        square = add_up(lane, of_vertices[SQUARE], copy)
+        largest = find(lane, of_vertices[LARGEST], copy)
+        if lane == 0:
+            search.trial_energy[copy] = energy + search.other[copy]
+            search.trial_slope[copy] = slope
+            search.square[copy] = square
+            search.acceleration[copy] = largest
+
+    return add
+
+
+@cache
+def measure_start(block: int):
+    """Kernel over (copies, lanes of one block): φ and the sums of :class:`LineSearch` at d, which is the trial."""
+    add = add_trial(block)
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def measure(
+        # state in
+        of_vertices: wp.array3d(dtype=wp.float64),
+        of_terms: wp.array3d(dtype=wp.float64),
+        # out
+        search: LineSearch,
+    ):
+        copy, lane = wp.tid()
+        add(copy, lane, of_vertices, of_terms, search)
+        if lane == 0:
+            search.energy[copy] = search.trial_energy[copy]
+
+    return measure
+
+
+@cache
+def check_guess(block: int):
+    """Kernel over (copies, lanes of one block): keeps the step to a guess if φ is lower there, else sets it to 0.
+
+    ``proceed`` is 1 if the trial has to be set again.
+    """
+    add = add_trial(block)
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def check(
+        # state in
+        of_vertices: wp.array3d(dtype=wp.float64),
+        of_terms: wp.array3d(dtype=wp.float64),
+        # in and out
+        search: LineSearch,
+    ):
+        copy, lane = wp.tid()
+        add(copy, lane, of_vertices, of_terms, search)
+        if lane == 0 and search.searching[copy] == 1:
+            search.searching[copy] = 0
+            if not (search.trial_energy[copy] < search.energy[copy]):
+                search.step[copy] = wp.float64(0.0)
+                search.proceed[0] = 1
+
+    return check
+
+
+@cache
+def check_trial(block: int):
+    """Kernel over (copies, lanes of one block): accepts a trial step or halves it; sets it to 0 after ``most`` trials, of which
+    one more is the last.
+
+    A step is accepted if φ(α) ≤ φ(0) + 1e-4 α φ'(0) (Armijo). It is also accepted if φ(α) ≤ φ(0) + noise and
+    φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe, Hager and Zhang 2005). NaN is never
+    accepted.
+    """
+    (_store, add_up), add = block_sums(block), add_trial(block)
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def check(
+        # state in
+        of_vertices: wp.array3d(dtype=wp.float64),
+        of_terms: wp.array3d(dtype=wp.float64),
+        slopes: wp.array2d(dtype=wp.float64),
+        # parameters
+        noise: wp.float64,
+        most: int,
+        # in and out
+        search: LineSearch,
+    ):
+        copy, lane = wp.tid()
+        add(copy, lane, of_vertices, of_terms, search)
+        slope = add_up(lane, slopes, copy)
+        if lane == 0:
+            search.slope[copy] = slope
+            if search.searching[copy] == 1:
+                start = search.energy[copy]
+                trial = search.trial_energy[copy]
+                decrease = trial <= start + wp.float64(1.0e-4) * search.step[copy] * slope
+                level = trial <= start + noise * wp.abs(start)
+                flat = search.trial_slope[copy] <= -wp.float64(1.0 - 2.0e-4) * slope
+                if decrease or (level and flat):
+                    search.searching[copy] = 0
+                else:
+                    search.step[copy] = wp.float64(0.5) * search.step[copy]
+                    if search.trials[0] <= most:
+                        search.proceed[0] = 1
+                    if search.trials[0] >= most:
+                        search.step[copy] = wp.float64(0.0)
+
+    return check
+
+
+@cache
+def take_trial(dtype):
+    """Kernel over vertices: d = the trial, with its φ."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def take(
+        # state in
+        trial: wp.array(dtype=vec3),
+        # in and out
+        search: LineSearch,
+        # out
+        correction: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        correction[i] = trial[i]
+        if i < search.energy.shape[0]:
+            search.energy[i] = search.trial_energy[i]
+
+    return take
