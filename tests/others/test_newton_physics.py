@@ -1,0 +1,154 @@
+"""Scenes in Newton, the physics engine: arrays, motion against the same method here, refusals, and stiffness by samples."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warpcloth as wc
+from warpcloth.others.newton_calibration import calibrate
+from warpcloth.others.newton_model import METHODS, TAKES, newton_model, refuse_inexpressible
+from warpcloth.others.newton_runs import NewtonPhysics, run_newton
+
+newton = pytest.importorskip("newton", reason="Newton is not installed: pip install -e '.[newton]'")
+
+SPRINGS = wc.Spring(pairs=("structural", "shear"), stiffness=300.0)
+MESH = wc.Mesh.grid(4, 4, pattern="alternating")
+TETRAHEDRON = wc.MeshCollider([[0, -3, 0], [1, -3, 0], [0, -2, 0], [0, -3, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+FLOOR = wc.Plane(position=(0.0, -5.0, 0.0))
+COLLIDERS = [
+    FLOOR,
+    wc.Sphere(radius=0.5, position=(0.0, -3.0, 0.0)),
+    wc.Box(size=(1.0, 2.0, 3.0), position=(0.0, -3.0, 4.0), rotation=(0.0, 0.6, 0.0, 0.8)),
+    wc.Capsule(radius=0.1, length=2.0, axis=(1.0, 0.0, 0.0), position=(0.0, -3.0, 0.0)),
+    TETRAHEDRON,
+]
+
+
+def declared(**fields):
+    given = {"masses": np.linspace(0.1, 0.2, 16), "terms": [SPRINGS], "pins": [0, 3], "duration": 0.5}
+    return wc.Scene(MESH, **(given | fields))
+
+
+def float32(values):
+    return np.asarray(values, dtype=np.float32)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_arrays_are_those_of_the_scene_to_the_bit(method):
+    rng = np.random.default_rng(0)
+    positions, velocities = MESH.points + 0.1 * rng.random((16, 3)), rng.random((16, 3))
+    pairs = SPRINGS.stencil(MESH)
+    springs = wc.Spring(pairs=pairs, stiffness=rng.random(len(pairs)) + 1.0, damping=0.25)
+    longer = replace(springs, rest_lengths=0.3 + rng.random(len(pairs)))
+    terms = [replace(springs, damping=None) if method == "style3d" else longer, wc.QuadraticBending(stiffness=1e-3)]
+    scene = declared(positions=positions, velocities=velocities, terms=terms, gravity=(1.0, -2.0, 3.0), colliders=COLLIDERS)
+    model = newton_model(scene, method)
+    expected = {
+        "particle_q": positions,
+        "particle_qd": velocities,
+        "particle_mass": scene.vertex_masses,
+        "particle_radius": np.full(16, scene.contact.distance),
+        "gravity": scene.gravity[None],
+    }
+    if method == "style3d":
+        expected["tri_indices"] = MESH.triangles
+        assert model.spring_count == 0
+    else:
+        expected |= {"spring_indices": pairs.ravel(), "spring_rest_length": longer.rest_lengths}
+        expected |= {"spring_stiffness": longer.stiffness, "spring_damping": np.full(len(pairs), 0.25)}
+        expected["edge_indices"] = MESH.hinges[:, [2, 3, 0, 1]]
+        np.testing.assert_array_equal(model.edge_rest_angle.numpy(), 0.0)
+    for name, values in expected.items():
+        found = getattr(model, name).numpy()
+        np.testing.assert_array_equal(found[:1] if name == "gravity" else found, np.asarray(values, dtype=found.dtype), name)
+    held = np.isin(np.arange(16), [0, 3])
+    np.testing.assert_array_equal(model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE) == 0, held)
+    np.testing.assert_array_equal(model.particle_inv_mass.numpy() == 0.0, held)
+
+
+def test_shapes_are_those_of_the_scene():
+    """Planes and capsules lie along z there, so that a unit vector shows their turn."""
+    model = newton_model(declared(colliders=COLLIDERS), "xpbd")
+    kinds = [newton.GeoType(kind).name for kind in model.shape_type.numpy()]
+    assert kinds == ["PLANE", "SPHERE", "BOX", "CAPSULE", "MESH"]
+    transforms, sizes = model.shape_transform.numpy(), model.shape_scale.numpy()
+    np.testing.assert_array_equal(transforms[:, :3], float32([np.atleast_2d(each.position)[0] for each in COLLIDERS]))
+    turned = [np.asarray(wp.quat_rotate(wp.quat(*map(float, q[3:])), wp.vec3(0.0, 0.0, 1.0))) for q in transforms[[0, 3]]]
+    np.testing.assert_allclose(turned, [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(transforms[2, 3:], float32([0.0, 0.6, 0.0, 0.8]))
+    np.testing.assert_array_equal(sizes[2], float32([0.5, 1.0, 1.5]))
+    np.testing.assert_array_equal(sizes[3, :2], float32([0.1, 1.0]))
+    np.testing.assert_array_equal(model.shape_source[4].vertices, float32(TETRAHEDRON.points))
+
+
+@pytest.mark.parametrize(
+    "term", [SPRINGS, wc.NeoHookeanMembrane(stiffness=300.0, poisson_ratio=0.3)], ids=lambda term: term.label
+)
+def test_semi_implicit_steps_are_explicit_steps(term, device):
+    """Both are symplectic Euler; without damping, they differ by the rounding of float32, which grows with the motion."""
+    scene = declared(terms=[term, wc.DihedralBending(stiffness=1e-2)])
+    ours = wc.simulate(scene, wc.Explicit(substeps=40), device=device, frames=12)
+    found = run_newton(scene, NewtonPhysics("semi-implicit", 40), device=device, frames=12)
+    assert found.status.ok and found.points.dtype == np.float32 and found.points.shape == ours.points.shape
+    np.testing.assert_array_equal(found.points[0], float32(scene.positions))
+    np.testing.assert_array_equal(found.points[:, [0, 3]], np.broadcast_to(float32(scene.positions)[[0, 3]], (13, 2, 3)))
+    assert np.abs(ours.points[-1] - scene.positions).max() > 0.1
+    np.testing.assert_allclose(found.points, ours.points, rtol=0.0, atol=1e-4)
+    assert found.worst_strain == pytest.approx(ours.worst_strain, rel=1e-3)
+    if device == "cpu":
+        pytest.importorskip("igl")
+        assert [len(frame.pairs) for frame in wc.intersections(found).frames] == [0] * 13
+
+
+def test_a_run_that_diverges_ends_before_that_frame(device):
+    found = run_newton(
+        declared(terms=[replace(SPRINGS, stiffness=1e5)]), NewtonPhysics("semi-implicit", 1), device=device, frames=30
+    )
+    assert not found.status.ok and len(found.points) == found.status.frame + 1 < 31
+    assert "diverged in frame" in found.status.message and np.isfinite(found.points).all()
+
+
+MOVED = wc.Sphere(radius=0.1, position=[(0.0, -3.0, 0.0), (0.0, -2.0, 0.0)], name="ball")
+START = MESH.points[[0, 3]]
+REFUSED = [
+    ("vbd", {"pins": wc.Pins([0, 3], axes="y")}, "along some axes"),
+    ("vbd", {"pins": wc.Pins([0, 3], keyframes=[START, START + 0.1])}, "keyframes"),
+    ("vbd", {"loads": wc.Pressure(vertices=np.arange(16), pressure=1.0)}, "loads"),
+    ("vbd", {"air": wc.Air()}, "air"),
+    ("xpbd", {"self_contact": wc.SelfContact()}, "self-contact"),
+    ("vbd", {"colliders": [MOVED]}, "moving colliders.*ball"),
+    ("vbd", {"colliders": [FLOOR, wc.Plane(position=(0, -6, 0), friction=0.1, name="rug")]}, "friction.*rug"),
+    ("vbd", {"terms": [wc.StVKMembrane(stiffness=1.0)]}, "does not take StVKMembrane"),
+    ("xpbd", {"terms": [wc.NeoHookeanMembrane(stiffness=1.0)]}, "does not take NeoHookeanMembrane"),
+    ("vbd", {"terms": [wc.Spring(stiffness=np.inf)]}, "infinite stiffness.*Spring"),
+    ("vbd", {"terms": [SPRINGS, wc.QuadraticBending(stiffness=1.0, damping=1.0)]}, "damping.*QuadraticBending"),
+    ("style3d", {"terms": [wc.Spring(stiffness=1.0, damping=1.0)]}, "damping.*Spring"),
+    ("style3d", {"terms": [wc.Spring(stiffness=1.0, rest_lengths=0.1)]}, "rest lengths.*Spring"),
+    ("style3d", {"terms": [wc.QuadraticBending(stiffness=1.0)]}, "springs or membranes"),
+    ("mpm", {}, "method is 'mpm'"),
+]
+
+
+@pytest.mark.parametrize(("method", "fields", "words"), REFUSED, ids=[words for _, _, words in REFUSED])
+def test_inexpressible_scenes_are_refused(method, fields, words):
+    with pytest.raises(ValueError, match=words):
+        refuse_inexpressible(declared(**fields), method)
+
+
+def test_hinges_between_different_triangles_are_refused():
+    mesh = wc.Mesh([[0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, -3]], [[0, 2, 1], [0, 1, 3]])
+    scene = wc.Scene(mesh, density=1.0, terms=[wc.QuadraticBending(stiffness=1.0)], pins=[0])
+    with pytest.raises(ValueError, match=r"both must be equal; hinge 0 of QuadraticBending has 0\.5 and 1\.5 m²"):
+        newton_model(scene, "semi-implicit")
+    # ∂²U/∂θ² = D|e|²/(A₁+A₂) = 1/2 with |e| = 1
+    assert newton_model(scene, "vbd").edge_bending_properties.numpy()[0, 0] == 0.5
+
+
+@pytest.mark.parametrize("method", ["semi-implicit", *(pytest.param(each, marks=pytest.mark.slow) for each in METHODS[1:])])
+def test_samples_are_as_stiff_there(method):
+    """Within 1 %: a strip of springs, one of a membrane, and a cantilever, at rest."""
+    found = calibrate(method)
+    assert (found.membrane is None) == (wc.NeoHookeanMembrane not in TAKES[method] and method != "style3d")
+    assert [each for each in found if each is not None] == pytest.approx([1.0] * (2 + (found.membrane is not None)), abs=0.01)
