@@ -351,6 +351,8 @@ def test_the_command_and_bad_input(tmp_path, capfd, monkeypatch):
     refused(capfd, ["check", tmp_path / "none.usdc"], "no such file")
     refused(capfd, ["check", path, "--prim", "a", "b"], "must be one name")
     refused(capfd, ["check", path, "--stretch", "-1"], "stretch is -1")
+    refused(capfd, ["check", path, "-p", "n=4"], "a.npz is no scene; leave it out")
+    refused(capfd, ["check", "hangin"], "there is no scene 'hangin'")
     refused(capfd, ["check", path, "--csv", path], "file of the input")
     refused(capfd, ["check", path, "--still", "a.gif"], "must end with .png")
     for call, message in (

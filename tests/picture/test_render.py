@@ -391,7 +391,7 @@ def test_colours_of_ones_own(tmp_path):
 
 
 def test_a_still_of_what_intersects(tmp_path, capfd, monkeypatch):
-    """A corner of a sheet is put through it; the picture of a stage has what is beside it too."""
+    """A corner of a sheet is put through it, in an animation or at the start of a scene."""
     pytest.importorskip("igl")
     monkeypatch.setattr(checking, "SIZE", (160, 90))
     points = np.stack([MESH.points, MESH.points])
@@ -401,10 +401,15 @@ def test_a_still_of_what_intersects(tmp_path, capfd, monkeypatch):
     with AnimationWriter(tmp_path / "a.usdc", MESH, FPS) as writer:
         for each in points:
             writer.append(each, np.zeros_like(each))
-    for name in ("a.npz", "a.usdc"):
-        code, out, _err = run(capfd, "check", tmp_path / name, "--still", tmp_path / "out.png")
+    lines = ["import warpcloth as wc", "def scene(frame: int = 0):", "    seen = wc.open_sequence('a.npz')"]
+    lines.append("    return wc.Scene(seen.mesh, positions=seen[frame], density=1, terms=[wc.Spring(stiffness=1)])")
+    (tmp_path / "a.py").write_text("\n".join(lines))
+    monkeypatch.chdir(tmp_path)
+    assert run(capfd, "check", "a.py")[0] == 0
+    for words, frame in (["a.npz"], 1), (["a.usdc"], 1), (["a.py", "-p", "frame=1"], 0):
+        code, out, _err = run(capfd, "check", *words, "--still", "out.png")
         found = picture(tmp_path / "out.png")
-        assert code == 1 and "out.png" in out and "most in frame 1" in out
+        assert code == 1 and "out.png" in out and f"most in frame {frame}" in out
         assert (found[:, :, 0] > 2 * found[:, :, 2] + 40).sum() > 20
 
 

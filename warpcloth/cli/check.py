@@ -8,8 +8,8 @@ import numpy as np
 
 from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart, write_table
-from ..base.texts import json_text
-from .options import values_of
+from ..base.texts import assignments, json_text
+from .options import add_values, values_of
 from .render import SIZE, check_drawing, draw_film
 from .terminal import Progress, aligned, check_writable, frames_folder_of, location
 
@@ -17,13 +17,15 @@ EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. Of a result of warpcloth the
 cloth is checked, of other stages all meshes whose points move, or else all meshes, but no colliders; --prim names others. Pairs
 of triangles of different meshes count too. Vertices inside the colliders of a stage and stretches beyond the limits that it
-declares are found as well.
+declares are found as well. FILE may also be a scene, a name that 'warpcloth scenes' lists or a .py file. Then its start is
+checked, which 'run' refuses if it intersects.
 
 The exit code is 0 if nothing was found, 1 if something was or if part of a frame could not be judged, and 2 for bad input.
 
   warpcloth check hanging.usdc
   warpcloth check cache.usdc --prim Shirt Trousers --csv pairs.csv -o crossings.usdc --still worst.png
   warpcloth check "frames/*.obj" --fps 24 --rest pattern.obj --stretch 1.1 --json
+  warpcloth check my_scene.py --still start.png
 """
 # Linear Rec. 709 of triangles that intersect, of those that could not be judged, and of others.
 _RED, _UNKNOWN, _OTHER = (0.70, 0.01, 0.01), (0.05, 0.05, 0.05), (0.45, 0.47, 0.50)
@@ -35,7 +37,8 @@ _SENTENCES = 8
 def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
-    add("file", metavar="FILE", help="the animation or mesh to check")
+    add("file", metavar="FILE", help="the animation, mesh or scene to check")
+    add_values(parser, "-p", "parameter", "parameters of a scene")
     add("--prim", nargs="+", metavar="PRIM", help="paths or names of the meshes to check, if not those that are cloth")
     add("--fps", type=float, help="frames per second (default: that of the input)")
     add("--rest", metavar="MESH", help="mesh file with the rest shape, for --stretch (default: as of analyze)")
@@ -65,8 +68,9 @@ def check(arguments):
     folder = frames_folder_of(arguments) if arguments.output else None  # checks the ending
     started = time.perf_counter()
     rest = None if arguments.rest is None else Surface.load(arguments.rest)
-    cloths = cloths_of(arguments.file, rest, arguments.prim, arguments.fps)
-    check_apart(files.values(), [*cloths.files, arguments.file])
+    source, scene = _scene_of(arguments)
+    cloths = cloths_of(arguments.file if scene is None else scene, rest, arguments.prim, arguments.fps)
+    check_apart(files.values(), [*cloths.files, source])
     checker = Checker(cloths, stretch=arguments.stretch, every=arguments.every)
     found = []
     opened = _writer(arguments, cloths)
@@ -86,13 +90,26 @@ def check(arguments):
         write_table(arguments.csv, _COLUMNS, (row for each in found for row in _rows(cloths, checker, each)))
     worst = max(found, key=lambda each: (len(each.pairs), each.vertices_inside))
     if arguments.still:
-        _draw(arguments, cloths, worst)
+        _draw(arguments, scene, cloths, worst)
     facts = _facts(arguments, checker, found, worst) | {"seconds": time.perf_counter() - started, "frames_folder": folder}
     if arguments.json:
         print(json_text(facts | {"frames": [_counts(each) for each in found]}))
     else:
         print(_summary(facts, found))
     return 0 if facts["clean"] else 1
+
+
+def _scene_of(arguments):
+    """Returns the path of FILE, and the scene that it is, or None."""
+    path = Path(arguments.file)
+    if path.suffix != ".py" and (path.suffix or path.name != arguments.file or path.exists()):
+        if arguments.p:
+            raise ValueError(f"-p is given, but {arguments.file} is no scene; leave it out")
+        return arguments.file, None
+    from ..run.scene_files import find_source
+
+    source = find_source(arguments.file)
+    return str(source.path), source.scene(source.values(assignments(arguments.p)))
 
 
 def _writer(arguments, cloths):
@@ -144,10 +161,12 @@ def _append(writer, cloths, each):
         writer.append(each.frame, {"intersections": pairs, "inside": inside}, colours, points=points)
 
 
-def _draw(arguments, cloths, each):
-    """Draws a frame: cloths of a stage with their surroundings, others alone."""
+def _draw(arguments, scene, cloths, each):
+    """Draws a frame: cloths of a stage or a scene with their surroundings, others alone."""
     colours, options = _marks(cloths, each)[2], {"size": SIZE}
-    if len(cloths.stages) == 1:
+    if scene is not None:
+        draw_film(scene, arguments.still, colour=colours[None], **options)
+    elif len(cloths.stages) == 1:
         shown = np.broadcast_to(colours, (len(cloths.labels), *colours.shape))
         draw_film(arguments.file, arguments.still, prim=cloths.stages[0].prim, frame=each.frame, colour=shown, **options)
     else:

@@ -57,7 +57,7 @@ def _of_scene(name):
 
 
 def _scene_name(arguments):
-    name = getattr(arguments, "scene", None) or getattr(arguments, "mesh", None)
+    name = next(filter(None, (getattr(arguments, key, None) for key in ("scene", "mesh", "file"))), None)
     if name is None:
         raise ValueError("-p help lists the parameters of a scene; give SCENE before it")
     return name
