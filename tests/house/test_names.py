@@ -18,6 +18,7 @@ MODULES = {
     "distances": "the pictures of warpcloth.analysis.distances",
     "failures": "the pictures of warpcloth.lab.failures",
     "panels": "the pictures of warpcloth.lab.panels",
+    "cheapest": "the pictures of warpcloth.lab.cheapest",
     "measures": "what writes warpcloth.analysis.measures into a stage",
     "loads": "the arrays on a device of what warpcloth.terms.loads declares",
     "colliders": "what reads warpcloth.scene.colliders from a stage",

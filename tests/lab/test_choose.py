@@ -1,5 +1,6 @@
 """The choice of a solver from recorded measurements."""
 
+import csv
 import itertools
 import json
 from concurrent.futures import ThreadPoolExecutor
@@ -8,10 +9,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from warpcloth.chart.cheapest import text_of_cell
 from warpcloth.cli import main
 from warpcloth.cli.choose import command_line
 from warpcloth.lab import campaign, trajectory
 from warpcloth.lab.campaign import Store
+from warpcloth.lab.cheapest import cheapest_of_each
 from warpcloth.lab.choosing import Measured, choose, climb, ladders, pick
 from warpcloth.lab.measurements import SceneRef, Setup
 
@@ -82,6 +85,13 @@ def test_climbing_picks_the_same_and_measures_no_more_than_it_needs(options):
         assert left_out == {"xpbd substeps=160", "newton substeps=8"}
 
 
+def test_the_cheapest_of_each_solver():
+    """For 0.45 % xpbd needs 160 steps and newton 8; a reference that is known to 0.06 % leaves explicit steps alone."""
+    best = cheapest_of_each(ALL, 0.0045, 0.0)
+    assert [str(each.setup) for each in best] == ["explicit substeps=152", "xpbd substeps=160", "newton substeps=8"]
+    assert cheapest_of_each(ALL, 0.0045, 0.0006) == best[:1]
+
+
 @pytest.mark.parametrize("reason", ["slow", "diverged"])
 def test_a_ladder_ends_where_finer_steps_are_no_help(reason):
     """A setting that took too long, or is refused for its method, is not tried with more steps; one that diverged is."""
@@ -104,7 +114,7 @@ def test_refused_methods_are_asked_once(tmp_path, monkeypatch):
     hard = SceneRef("chain", {"links": 3, "stiffness": "inf"})
     choice, found, _ = choose(hard, 0.05, solvers=["newton", "pbd", "xpbd"], frames=4, store=Store(), workers=1)
     newton = [each for each in found if each.setup.solver == "newton"]
-    assert choice.meets and len(newton) == 3 and all(each.final and "infinite stiffness" in each.reason for each in newton)
+    assert choice.meets and len(newton) == 6 and all(each.final and "infinite stiffness" in each.reason for each in newton)
 
 
 def test_the_sentence_where_nothing_meets_it_says_why():
@@ -136,6 +146,9 @@ def test_ladders_are_of_one_method_each_and_go_on():
     ]
     found = [[setup.options["substeps"] for setup in ladder] for ladder in ladders(setups)]
     assert found == [[10, 40, 80, 160, 320], [5, 10, 20, 40]]
+    (by_error, by_steps) = ladders([Setup("newton", {"error": e}) for e in (1e-4, 1e-3)] + [Setup("newton", {"substeps": 4})])
+    assert [setup.options["error"] for setup in by_error] == pytest.approx([1e-3, 1e-4, 2.5e-5, 6.25e-6, 1.5625e-6])
+    assert [setup.options for setup in by_steps] == [{"substeps": n} for n in (4, 8, 16, 32)]
 
 
 SCENES = [
@@ -189,6 +202,53 @@ def test_the_command_takes_hard_constraints(tmp_path, monkeypatch, capsys):
     assert "links=3 stiffness=inf" in capsys.readouterr().out.splitlines()[-1]
 
 
+MAP = "chart cheapest hanging --x n 4 5 --y stiffness 100 400 --frames 2 --solvers explicit pbd --json".split()
+
+
+@pytest.mark.usefixtures("in_a_thread")
+def test_the_map_of_the_cheapest(tmp_path, monkeypatch, capsys):
+    """Each cell has what was measured in it, and is not measured again; the picture and the table have every cell."""
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    found = []
+    for outputs in (["-o", "map.png"], ["--csv", "map.csv"]):
+        assert main(MAP + outputs) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1] and (tmp_path / "map.png").stat().st_size > 0
+    cells = found[0]["cells"]
+    assert [(cell["x"], cell["y"]) for cell in cells] == [("4", "100"), ("5", "100"), ("4", "400"), ("5", "400")]
+    rows = list(csv.DictReader((tmp_path / "map.csv").open()))
+    for cell, row in zip(cells, rows, strict=True):
+        accurate = [
+            each for each in cell["measured"] if each["error"] is not None and each["error"] + cell["reference_error"] <= 0.01
+        ]
+        assert cell["status"] == "found" and cell["complete"] and 0.0 < cell["reference_error"] < 0.002
+        assert cell["ms"] == min(each["milliseconds"] for each in accurate) == float(row["ms"])
+        explicit = next(each["setup"]["options"] for each in accurate if each["setup"]["solver"] == "explicit")
+        other = cell["second"] or {"options": None}
+        assert explicit in (cell["options"], other["options"]) and cell["solver"] != other.get("solver")
+        assert row["second_options"] == (json.dumps(other["options"]) if cell["second"] else "")
+        assert (row["x_value"], row["y_value"], row["complete"]) == (cell["x"], cell["y"], "True")
+    steps = [each["setup"]["options"]["substeps"] for cell in cells for each in cell["measured"][:1]]
+    assert steps[2] == pytest.approx(2.0 * steps[0], abs=1.0)  # explicit steps grow with the root of the stiffness
+
+
+@pytest.mark.parametrize(
+    ("more", "status", "said"),
+    [
+        (["--solvers", "pbd", "--tolerance", "1e-6%"], "none", "no setting meets 1e-06%; pbd "),
+        (["--limit", "1e-9"], "unknown", "the reference of hanging needs more than 6e-09 s"),
+    ],
+)
+@pytest.mark.usefixtures("in_a_thread")
+def test_cells_without_an_accurate_setting_say_why(more, status, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    assert main([*"chart cheapest hanging --x n 4 --frames 2 --json".split(), *more]) == 0
+    (cell,) = json.loads(capsys.readouterr().out)["cells"]
+    assert cell["status"] == status and cell["reason"].startswith(said) and cell["ms"] is None
+    assert " ".join(text_of_cell(cell)).startswith(said)
+
+
 def test_an_interruption_says_what_is_kept(tmp_path, monkeypatch, capsys):
     def interrupted(tasks, progress, **_):
         progress(1, len(tasks), 2.0)
@@ -215,6 +275,11 @@ def test_the_command_line_has_the_device():
         ("choose hanging --tolerance 5", "tolerance is 5, 5 times the whole"),
         ("choose hanging --budget fast", "budget"),
         ("choose hanging --tolerance 1% --solvers newtons", "newtons"),
+        ("chart cheapest hanging --x n", "--x has 'n' alone"),
+        ("chart cheapest hanging --x n 4 --y n 5", "x and y are both n"),
+        ("chart cheapest hanging --x m 4", "has no parameter 'm'"),
+        ("chart cheapest hanging --x n four", "n is 'four'"),
+        ("chart cheapest hanging --x n 4 --limit 0", "limit is 0.0"),
         ("run hanging --tolerance 1% --solver newton -o o.usdc", "--solver is given, and --tolerance or --budget chooses it"),
     ],
 )

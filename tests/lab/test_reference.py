@@ -293,9 +293,9 @@ def test_what_has_no_reference_says_so(folder, tmp_path):
 
 
 def test_what_is_slow_or_not_known_warns(folder, tmp_path, monkeypatch):
-    stiff = written(tmp_path / "stiff.py", "terms=[wc.RigidCluster(vertices=[[0, 1, 2]], stiffness=1e12)], duration=0.05")
+    stiff = written(tmp_path / "stiff.py", "terms=[wc.RigidCluster(vertices=[[0, 1, 2]], stiffness=1e14)], duration=0.05")
     with pytest.warns(
-        UserWarning, match=r"RigidCluster makes the reference of scene slow: .* below 4096 explicit steps a frame"
+        UserWarning, match=r"RigidCluster makes the reference of scene slow: .* below 20000 explicit steps a frame"
     ):
         assert reference(stiff).method == "Newton"
     with pytest.warns(UserWarning, match=r"chain.* is known to .* only, not to 1e-20: smaller steps make it no less, for"):

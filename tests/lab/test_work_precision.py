@@ -231,6 +231,7 @@ def test_settings_are_of_all_solvers_and_differ(device):
         setups_of_steps(["pbd"])
     assert label(Setup("xpbd", {"substeps": 80, "iterations": 1, "integrator": "bdf2"})) == "xpbd bdf2 80×1"
     assert label(Setup("admm", {"substeps": 4, "weight": 0.1, "tolerance": 1e-9})) == "admm 4 weight=0.1"
+    assert label(Setup("newton", {"substeps": 1, "integrator": "bdf2", "tolerance": 1e3})) == "newton bdf2 1 tolerance=1000"
 
 
 def test_explicit_starts_at_the_fewest_stable_substeps(device):
@@ -248,9 +249,12 @@ def test_steps_are_as_long_at_any_frame_rate(tmp_path):
         "    return wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=10.0)], pins=[0], fps=fps)\n"
     )
     of = {fps: setups_of_runs(SceneRef(str(tmp_path / "frames.py"), {"fps": fps}), ["xpbd", "newton"]) for fps in (60.0, 4.0)}
-    assert [s.options["substeps"] for s in of[4.0]] == [15 * s.options["substeps"] for s in of[60.0]]
+    by_error = [[s.options for s in each if "substeps" not in s.options] for each in of.values()]
+    assert by_error[0] == by_error[1] == [{"error": 1e-3}, {"error": 1e-4}]
+    steps = [[s.options["substeps"] for s in each if "substeps" in s.options] for each in of.values()]
+    assert steps[1] == [15 * each for each in steps[0]]
     fast = setups_of_runs(SceneRef(str(tmp_path / "frames.py"), {"fps": 6e3}))
-    assert {s.options["substeps"] for s in fast if s.solver != "explicit"} == {1, 2}
+    assert {s.options.get("substeps", 1) for s in fast if s.solver != "explicit"} == {1, 2}
     assert len({str(s) for s in fast}) == len(fast) and {s.solver for s in fast} == set(SOLVERS)
 
 

@@ -5,7 +5,7 @@ from collections import Counter
 
 from ..base.checks import number, whole
 from ..base.quiet import find_device
-from ..base.texts import assignments, json_text
+from ..base.texts import assignments, fraction, json_text
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
@@ -35,6 +35,18 @@ within a chart.
   warpcloth chart work-precision hanging -p n=16 --solvers newton xpbd -o chart.png --csv chart.csv
 """
 
+CHEAPEST_EPILOG = """\
+Each cell of the map is a scene with a value of each of the two parameters. It shows the cheapest solver and settings with at
+most the error of --tolerance, the time of a frame, and the second best solver with the ratio of times. The search is that of
+'warpcloth choose', and goes on up to four times the cheapest. A cell in which nothing is accurate within --limit says so, and
+so does one whose reference solution is not accurate enough.
+
+Cells are stored and reused while the code, the scene and the machine are the same; after an interruption the same command
+continues. They are measured one after another, unless --workers says otherwise.
+
+  warpcloth chart cheapest hanging --x n 16 32 64 --y stiffness 1e3 1e4 1e5 1e6 --frames 15 -o map.png --csv map.csv
+"""
+
 FAILURE_EPILOG = """\
 Failures:
   locking      cloth on irregular meshes that is too stiff to bend
@@ -56,6 +68,7 @@ def add_arguments(parser):
     parser.set_defaults(command=lambda arguments: parser.print_help(sys.stderr) or 2, debug=False)
     charts = parser.add_subparsers(title="charts", metavar="CHART")
     _add_work_precision(charts)
+    _add_cheapest(charts)
     _add_failure(charts)
     text = "Map where solvers are stable, are inaccurate, or diverge."
     stability.add_arguments(add(charts, "stability", stability.chart, text, stability.EPILOG))
@@ -101,6 +114,33 @@ def _add_work_precision(charts):
     )
 
 
+def _add_cheapest(charts):
+    text = "Map which solver and settings are the cheapest that meet a tolerance, over two parameters of a scene."
+    sub = add(charts, "cheapest", map_cheapest, text, CHEAPEST_EPILOG)
+    add_scene(sub)
+    for of, needed in (("x", True), ("y", False)):
+        text = f"parameter of the scene on the {of} axis and its values" + ("" if needed else " (default: a map of one row)")
+        sub.add_argument(f"--{of}", nargs="+", required=needed, metavar=("PARAMETER", "VALUE"), help=text)
+    sub.add_argument(
+        "--tolerance",
+        default="1%",
+        metavar="SHARE",
+        help="largest error allowed, as a share of the size of the cloth (default: 1%%)",
+    )
+    sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="solvers to choose among (default: all)")
+    sub.add_argument(
+        "--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)"
+    )
+    sub.add_argument("--dtype", choices=DTYPES, default="float32", help="precision (default: float32)")
+    sub.add_argument(
+        "--limit",
+        type=float,
+        default=60.0,
+        metavar="SECONDS",
+        help="time limit of the search in each cell (default: 60); a reference may take six times as long",
+    )
+
+
 def _add_failure(charts):
     names = list_failures()
     sub = add(
@@ -111,6 +151,68 @@ def _add_failure(charts):
         FAILURE_EPILOG,
     )
     sub.add_argument("failure", metavar="FAILURE", choices=names, help=f"the failure: one of {', '.join(names)}")
+
+
+def map_cheapest(arguments):
+    from ..lab.cheapest import cheapest_map, write_csv
+    from ..lab.measurements import SceneRef
+
+    if arguments.frames is not None:
+        whole("frames", arguments.frames, least=1)
+    check_outputs(arguments, [arguments.scene])
+    device = find_device(arguments.device)
+    axes = {of: _axis(of, getattr(arguments, of)) for of in "xy"}
+    scene = SceneRef(arguments.scene, assignments(arguments.p))
+    with measuring(arguments, device) as run:
+        run["workers"] = arguments.workers or 1
+        found = cheapest_map(
+            scene,
+            **axes,
+            tolerance=fraction("tolerance", arguments.tolerance),
+            device=str(device),
+            **values_of(arguments, "solvers", "frames", "dtype", "limit"),
+            **run,
+        )
+    if arguments.output:
+        from ..chart.cheapest import plot_cheapest
+
+        plot_cheapest(arguments.output, found)
+    if arguments.csv:
+        write_csv(arguments.csv, found)
+    print(json_text(found) if arguments.json else _cheapest_summary(found))
+    return 0
+
+
+def _axis(of, words):
+    """Returns the name of a parameter and its values.
+
+    Raises:
+        ValueError: There is no value.
+    """
+    if words is None:
+        return None
+    name, *values = words
+    if not values:
+        raise ValueError(f"--{of} has {name!r} alone; it must be a parameter of the scene and one value or more")
+    return name, values
+
+
+def _cheapest_summary(found):
+    """Returns a line for each cell."""
+    from ..lab.choosing import percent
+
+    lines = [f"{found['scene']}: cheapest within {percent(found['tolerance'])}", f"  device   {found['machine']['device']}"]
+    for cell in found["cells"]:
+        at = ", ".join(f"{axis[0]}={cell[of]}" for of, axis in (("x", found["x"]), ("y", found["y"])) if axis)
+        if cell["status"] != "found":
+            lines.append(f"  {at}: {cell['reason']}")
+            continue
+        second, known = cell["second"], percent(cell["reference_error"])
+        text = f"{cell['label']}, {cell['ms']:.3g} ms, error {percent(cell['error'])} (reference {known})"
+        text += f"; second {second['label']}, {second['ratio']:.3g} times" if second else "; no second within the search"
+        lines.append(f"  {at}: {text}" + ("" if cell["complete"] else "; the search was not complete"))
+    lines += [f"  measured on {name}" for name in dict.fromkeys(cell["machine"] for cell in found["cells"])]
+    return "\n".join(lines)
 
 
 def failure(arguments):

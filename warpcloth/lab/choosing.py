@@ -11,10 +11,10 @@ from .measurements import Setup, task
 from .reference import reference
 from .setups import setups_of_runs
 
-# Number of rungs by which each ladder is extended, each with twice the substeps.
+# Number of rungs by which each ladder is extended, each with twice the substeps or a quarter of the error of two steps.
 _MORE = 3
 # The reference must be more accurate than the tolerance by this factor.
-_FINER = 5.0
+FINER = 5.0
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Measured:
         reason: Why there is no error, or "".
         machine: The machine that measured it, in a few words.
         final: Whether finer steps would fail too: it took too long, or its method is refused.
+        strain_error: See :func:`warpcloth.lab.reference.strain_error`, or None.
     """
 
     setup: Setup
@@ -38,6 +39,7 @@ class Measured:
     reason: str = ""
     machine: str = ""
     final: bool = False
+    strain_error: float | None = None
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,7 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
         budget: As for :func:`pick`.
         solvers: Names of solvers, by default all.
         frames: Number of frames, by default those of the scene.
-        device: A Warp device.
+        device: A Warp device, also for the reference.
         dtype: Precision of the runs, "float32" or "float64".
         limit: Time limit of each run [s].
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; by default with the
@@ -154,7 +156,7 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
     run = {"workers": 1} | run
     run = run if "store" in run else {"store": kept_store("trajectories", run.get("executor")), **run}
     rungs = ladders(setups_of_runs(scene, solvers, device, dtype))
-    exact = reference(scene, frames, **({} if tolerance is None else {"tolerance": tolerance / _FINER}))
+    exact = reference(scene, frames, device=device, **({} if tolerance is None else {"tolerance": tolerance / FINER}))
 
     def measure(setups):
         tasks = [
@@ -162,35 +164,38 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
                  dtype=dtype, limit=limit)
             for setup in setups
         ]  # fmt: skip
-        return [_measured(setup, *found) for setup, found in zip(setups, collect(tasks, "trajectories", **run), strict=True)]
+        return [measured(setup, *found) for setup, found in zip(setups, collect(tasks, "trajectories", **run), strict=True)]
 
     choice, found = climb(rungs, measure, tolerance, budget, exact.error)
     return choice, found, exact
 
 
 def ladders(setups):
-    """Groups setups that differ only in substeps and iterations, from cheap to expensive, and extends each group.
+    """Groups setups that differ only in substeps, or in the error of steps, from cheap to expensive, and extends each group.
 
     Args:
         setups: A list of :class:`warpcloth.lab.measurements.Setup`.
     """
     found = {}
     for setup in setups:
-        others = {name: value for name, value in setup.options.items() if name != "substeps"}
-        found.setdefault(json.dumps([setup.solver, others], sort_keys=True), []).append(setup)
-    for ladder in found.values():
-        ladder.sort(key=lambda setup: setup.options["substeps"])
+        others = {name: value for name, value in setup.options.items() if name not in ("substeps", "error")}
+        step = "error" if "error" in setup.options else "substeps"
+        found.setdefault((step, json.dumps([setup.solver, others], sort_keys=True)), []).append(setup)
+    for (step, _), ladder in found.items():
+        factor = 0.25 if step == "error" else 2
+        ladder.sort(key=lambda setup, step=step: setup.options[step], reverse=step == "error")
         for _ in range(_MORE):
             last = ladder[-1]
-            ladder.append(Setup(last.solver, last.options | {"substeps": 2 * last.options["substeps"]}))
+            ladder.append(Setup(last.solver, last.options | {step: factor * last.options[step]}))
     return list(found.values())
 
 
-def _measured(setup, result, machine):
+def measured(setup, result, machine):
+    """Returns the :class:`Measured` of a result of :func:`warpcloth.lab.trajectory.measure` and the name of its machine."""
     spread = None if result["spread"] is None else tuple(result["spread"])
     # Only a limited solver may accept a finer step after it refused one.
     final = result["status"] == "slow" or (result["status"] == "refused" and not SOLVERS[setup.solver].limited)
-    return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final)
+    return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final, result["strain_error"])
 
 
 def as_json(choice, found, exact):

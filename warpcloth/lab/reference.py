@@ -22,9 +22,9 @@ from ..solvers.explicit import step_limits
 from .campaign import cache_folder
 from .clock import Clock, TooSlow
 
-# Largest number of explicit steps per frame. A Newton step takes as long as some 250 explicit ones, and 4, 8 and 16 per frame
-# are the fewest that may do.
-_MOST_EXPLICIT = 4096
+# Largest number of explicit steps per frame on the CPU and on CUDA. A Newton step takes as long as some 250 explicit ones in
+# soft cloth and 5000 or more in stiff cloth, on CUDA more, and 4, 8 and 16 per frame are the fewest that may do.
+_MOST_EXPLICIT, _MOST_ON_CUDA = 20000, 65536
 # Tolerance of solves within a step, so small that only the error of the step itself counts.
 _TOLERANCE = 1e-6
 _SOLVED = (Result.COMPLETED, Result.CONVERGED, Result.ROUNDED)
@@ -108,20 +108,19 @@ def strain_error(points, others, mesh):
     return float(np.percentile(np.abs(first - other) / lengths, 99))
 
 
-def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
+def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None, device="cpu"):
     """Returns the :class:`Reference` of a scene, from its file if that is accurate enough; otherwise computes and stores it.
 
     Runs with steps h, h/2, h/4 … in float64 give e(h) = x(h) + (x(h) − x(2h))/(2ᵖ − 1) by Richardson extrapolation, with the
     order p of the method (Hairer, Nørsett and Wanner 1993, *Solving ordinary differential equations I*). The last e(h) is the
     reference. ‖e(h) − e(2h)‖ bounds its error if each halving of h at least halves the error.
 
-    The method is symplectic Euler if some 4000 steps per frame are stable, because BDF2 damps high frequencies unless ωh is
-    small. For ``hanging`` with 32 × 32 vertices over 20 frames, 128 BDF2 steps per frame have an error of 4e-5 after 9 s, and
-    428 explicit ones, extrapolated, less than 4e-6 after 3 s. Stiffer scenes use Newton's method with BDF2, and hard
-    constraints :class:`warpcloth.ConstrainedDynamics`. Scenes with colliders also use Newton's method, because contact in
-    explicit steps is
-    softer: the two motions of ``drape`` with 8 × 8 vertices are 0.6 % apart after half a second. Friction uses the normal
-    forces at the start of a step, which makes BDF2 first order.
+    The method is symplectic Euler if some 20 000 steps per frame are stable, on CUDA 65 000, because BDF2 damps high
+    frequencies unless ωh is small. For ``hanging`` with 32 × 32 vertices over 20 frames, 128 BDF2 steps per frame have an error
+    of 4e-5 after 9 s, and 428 explicit ones, extrapolated, less than 4e-6 after 3 s. Stiffer scenes use Newton's method with
+    BDF2, and hard constraints :class:`warpcloth.ConstrainedDynamics`. Scenes with colliders also use Newton's method, because
+    contact in explicit steps is softer: the two motions of ``drape`` with 8 × 8 vertices are 0.6 % apart after half a second.
+    Friction uses the normal forces at the start of a step, which makes BDF2 first order.
 
     The file is in :func:`warpcloth.lab.campaign.cache_folder`, named by a hash of the scene, the frames and this code.
 
@@ -132,6 +131,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
             motion or rounding.
         limit: Time limit [s].
         progress: Function called with (substeps, frame, frames) after each frame, or None.
+        device: A Warp device, which computes it; on CUDA symplectic Euler is the method of stiffer scenes too.
 
     Warns:
         UserWarning: Its error is above the tolerance, or a term makes it slow.
@@ -151,7 +151,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None):
     if found is None or (found.error > tolerance and found.limit < limit):
         path.parent.mkdir(parents=True, exist_ok=True)  # before minutes of runs
         facts = {"path": str(path), "key": key, "scene": digest, "times": np.arange(frames + 1) / declared.fps}
-        found = Reference(**facts, **_solve(declared, frames, tolerance, limit, progress))
+        found = Reference(**facts, **_solve(declared, frames, tolerance, limit, progress, device))
         found.save()
     if found.error > tolerance:
         idle = "smaller steps make it no less, for the motion is chaotic or rounding is what is left, take fewer frames"
@@ -184,13 +184,13 @@ class _Method:
     order: int
 
 
-def _method(scene):
-    """Returns the :class:`_Method` for a scene.
+def _method(scene, device):
+    """Returns the :class:`_Method` for a scene on a device.
 
     Raises:
         ValueError: No method takes the scene.
     """
-    model = scene.build(dtype="float64")
+    model = scene.build(device=device, dtype="float64")
     if any(elements.hard for elements in model.terms):
         method = _Method(lambda s: ConstrainedDynamics(substeps=s, iterations=100, tolerance=_TOLERANCE), 4, 1)
         try:
@@ -201,28 +201,29 @@ def _method(scene):
     if scene.colliders:
         return _Method(lambda s: Newton(substeps=s, tolerance=_TOLERANCE, integrator="bdf2"), 4, 1)
     fewest = 1.0 / (scene.fps * min(step_limits(model)))
-    if fewest < _MOST_EXPLICIT:
+    most = _MOST_ON_CUDA if model.device.is_cuda else _MOST_EXPLICIT
+    if fewest < most:
         return _Method(lambda s: Explicit(substeps=s), max(4, int(fewest) + 1), 1)
     for elements in model.terms:
         if elements.cells and not elements.term.whole.quadratic:
             warnings.warn(
                 f"{elements.label} makes the reference of {scene.name} slow: Newton's method takes many iterations for bodies; "
-                f"with less stiffness, below {_MOST_EXPLICIT} explicit steps a frame, it is faster",
+                f"with less stiffness, below {most} explicit steps a frame, it is faster",
                 stacklevel=4,
             )
     return _Method(lambda s: Newton(substeps=s, tolerance=_TOLERANCE, integrator="bdf2"), 4, 2)
 
 
-def _solve(scene, frames, tolerance, limit, progress):
+def _solve(scene, frames, tolerance, limit, progress, device):
     """Computes ``points``, ``error``, ``strain_error``, ``substeps``, ``seconds``, ``method`` and ``limit`` of a reference."""
-    method = _method(scene)
+    method = _method(scene, device)
     started, substeps = time.perf_counter(), method.first
     runs, errors, best, trouble = [], [], None, ""  # points of up to three runs, each with half the step of the one before
     while True:
         before = time.perf_counter()
         clock = Clock(limit - (before - started), progress and (lambda *at, s=substeps: progress(s, *at)))
         try:
-            run = simulate(scene, method.record(substeps), dtype="float64", frames=frames, progress=clock)
+            run = simulate(scene, method.record(substeps), device=device, dtype="float64", frames=frames, progress=clock)
         except TooSlow:
             break
         if run.status.result in _SOLVED:

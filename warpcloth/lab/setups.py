@@ -7,6 +7,9 @@ from ..solvers import SOLVERS
 from ..solvers.step import fewest_substeps
 from .measurements import Setup
 
+# Tolerances of :attr:`warpcloth.solvers.facts.Facts.one_step` are below this.
+_NEVER = 1e-6
+
 
 def setups_of_steps(solvers=None):
     """Returns the :class:`Setup`\\s that minimise one step, of all solvers or of those named.
@@ -35,17 +38,21 @@ def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32"):
             if "fewest" in options:
                 factor, options = options["fewest"], {key: value for key, value in options.items() if key != "fewest"}
                 substeps = round(factor * fewest)
-            else:
+            elif "substeps" in options:
                 fps = fps or scene.load().fps
                 substeps = max(round(options["substeps"] * 60.0 / fps), 1)
+            else:  # steps by error
+                setups.append(Setup(name, options))
+                continue
             setups.append(Setup(name, options | {"substeps": substeps}))
     return list({str(setup): setup for setup in setups}.values())
 
 
 def label(setup):
-    """Returns a setup in a few words, such as "xpbd bdf2 80×1"."""
+    """Returns a setup in a few words, such as "xpbd bdf2 80×1", without tolerances that never end a step."""
     options = dict(setup.options)
-    options.pop("tolerance", None)
+    if options.get("tolerance", 1.0) < _NEVER:
+        del options["tolerance"]
     count = "×".join(str(options.pop(name)) for name in ("substeps", "iterations") if name in options)
     integrator = options.pop("integrator", "")
     others = (f"{name}={value:g}" if isinstance(value, float) else str(value) for name, value in options.items())

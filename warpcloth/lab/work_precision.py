@@ -74,7 +74,7 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
         scene: A :class:`SceneRef`.
         solvers: Names as on the command line; None for all.
         frames: Number of frames; by default half of the scene's.
-        device: A Warp device.
+        device: A Warp device, also for the reference solution.
         dtype: Precision of the runs; the reference solution has float64.
         limit: Time limit of each setting [s]; that of the reference solution is six times this, but at least 120 s.
         watch: Function called with the progress of the reference solution, see :func:`reference`, or None.
@@ -88,7 +88,8 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
     """
     setups = setups_of_runs(scene, solvers, device, dtype)
     frames = frames or max(scene.load().frames // _RUN, 1)
-    exact = reference(scene, frames=frames, tolerance=_KNOWN, limit=max(_TIMES * limit, _SECONDS), progress=watch)
+    longest = max(_TIMES * limit, _SECONDS)
+    exact = reference(scene, frames=frames, tolerance=_KNOWN, limit=longest, progress=watch, device=device)
     if (exact.points == exact.points[0]).all():
         raise ValueError(f"nothing moves in {scene} within {frames} frames; a chart of errors needs motion")
     given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}

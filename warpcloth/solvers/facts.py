@@ -29,7 +29,7 @@ class Facts:
         benchmarks: The :class:`Benchmark` settings.
         runs: Options of settings that trade speed for accuracy: those near the Pareto front of error and time on ``hanging``
             with 32² and 64² vertices. Substeps are per 1/60 s; for a limited solver ``fewest``, a multiple of the fewest stable
-            substeps, replaces them.
+            substeps, replaces them, and steps by ``error`` have none.
         one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler. Tolerances are
             so small that they never end a step.
         limits: Names of the limits, see :data:`warpcloth.lab.stability_limits.LIMITS`, that maps of stability draw.
