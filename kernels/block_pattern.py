@@ -1,4 +1,4 @@
-"""Kernels that find the pattern of a sparse matrix of blocks which is a sum of element matrices.
+"""Kernels that find the pattern of a sparse matrix of blocks which is a sum of element matrices, or a product.
 
 A corner q is an index into the vertices of all elements, one element after another. In the matrix row of its vertex, it has one
 block for each vertex of its element. Elements have K vertices each, or are cells with different numbers of vertices. Rows and
@@ -56,6 +56,19 @@ def find_column(columns: wp.array(dtype=wp.int32), first: int, last: int, column
     return low
 
 
+@wp.func
+def insert_column(columns: wp.array(dtype=wp.int32), start: int, count: int, column: int):
+    """Inserts a column into the ascending columns[start : start + count], if it is not there; returns their number."""
+    last = start + count
+    index = find_column(columns, start, last, column)
+    if index < last and columns[index] == column:
+        return count
+    for after in range(last - index):
+        columns[last - after] = columns[last - after - 1]
+    columns[index] = column
+    return count + 1
+
+
 @cache
 def add_diagonal():
     """Kernel over vertices: the first of the columns, from ``firsts`` on, is the vertex itself."""
@@ -101,16 +114,39 @@ def add_columns():
                     j = corners.vertices[k]
                     if fixed[j] == 0:
                         total += 1
-                        index = find_column(columns, start, start + count, j)
-                        if index == start + count or columns[index] != j:
-                            for after in range(count + start - index):
-                                columns[start + count - after] = columns[start + count - after - 1]
-                            columns[index] = j
-                            count += 1
+                        count = insert_column(columns, start, count, j)
         counts[i] = count
         blocks[i] = total
 
     return add_each_column
+
+
+@cache
+def add_product_columns():
+    """Kernel over rows: the ascending columns of a product of two sparse matrices, from ``firsts`` on, and their number."""
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def add_columns_of_product(
+        # elements
+        left_offsets: wp.array(dtype=wp.int32),
+        left_columns: wp.array(dtype=wp.int32),
+        right_offsets: wp.array(dtype=wp.int32),
+        right_columns: wp.array(dtype=wp.int32),
+        # parameters
+        firsts: wp.array(dtype=wp.int32),
+        # out
+        columns: wp.array(dtype=wp.int32),
+        counts: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        start, count = firsts[i], wp.int32(0)
+        for s in range(left_offsets[i], left_offsets[i + 1]):
+            k = left_columns[s]
+            for t in range(right_offsets[k], right_offsets[k + 1]):
+                count = insert_column(columns, start, count, right_columns[t])
+        counts[i] = count
+
+    return add_columns_of_product
 
 
 @cache

@@ -9,6 +9,7 @@ from functools import cache
 
 import warp as wp
 
+from .block_pattern import find_column
 from .linear import Solves
 from .vectors import types
 
@@ -21,6 +22,15 @@ SPARED = 2
 CYCLE = 4
 # The other preconditioner is tried again after so many solves, times its disadvantage.
 AGED = 64
+
+
+@wp.struct
+class Rows:
+    """A sparse matrix of one copy in compressed rows: where each starts, and its ascending columns; P has weights."""
+
+    offsets: wp.array(dtype=wp.int32)
+    columns: wp.array(dtype=wp.int32)
+    weights: wp.array(dtype=wp.float64)
 
 
 @cache
@@ -54,6 +64,102 @@ def _module(dtype, products):
 
 
 @cache
+def find_slots():
+    """Kernel over coarse rows: where PᵀAP has the multiple of each block of A, or −1 left of the diagonal, from ``firsts`` on.
+
+    The multiples come in the order of the rows of A with this parent, of the blocks of a row, and of the parents of its column.
+    ``mirrors`` has the transposed block of each block of PᵀAP, ``counts`` the number of multiples that are not left out.
+    """
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def find_each_slot(
+        # elements
+        A: Rows,
+        P: Rows,
+        transposed: Rows,
+        coarse: Rows,
+        # parameters
+        firsts: wp.array(dtype=wp.int32),
+        # out
+        slots: wp.array(dtype=wp.int32),
+        counts: wp.array(dtype=wp.int32),
+        mirrors: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        first, end = coarse.offsets[i], coarse.offsets[i + 1]
+        at, count = int(firsts[i]), wp.int32(0)
+        for t in range(first, end):
+            j = coarse.columns[t]
+            mirrors[t] = find_column(coarse.columns, coarse.offsets[j], coarse.offsets[j + 1], i)
+        for s in range(transposed.offsets[i], transposed.offsets[i + 1]):
+            row = transposed.columns[s]
+            for block in range(A.offsets[row], A.offsets[row + 1]):
+                column = A.columns[block]
+                for p in range(P.offsets[column], P.offsets[column + 1]):
+                    slot = wp.int32(-1)
+                    if P.columns[p] >= i:
+                        slot = find_column(coarse.columns, first, end, P.columns[p])
+                        count += 1
+                    slots[at] = slot
+                    at += 1
+        counts[i] = count
+
+    return find_each_slot
+
+
+@cache
+def list_multiples(dtype):
+    """Kernel over coarse rows: the multiples Σ weight·A of which each block of PᵀAP is the sum, and where they end.
+
+    ``slots`` and ``firsts`` are those of :func:`find_slots`, ``starts`` the first multiple of each row.
+    """
+
+    @wp.kernel(module=_module(dtype, False), enable_backward=False)
+    def list_each_multiple(
+        # elements
+        A: Rows,
+        P: Rows,
+        transposed: Rows,
+        coarse: Rows,
+        # state in
+        slots: wp.array(dtype=wp.int32),
+        # parameters
+        firsts: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int32),
+        # out
+        ends: wp.array(dtype=wp.int32),
+        sources: wp.array(dtype=wp.int32),
+        weights: wp.array(dtype=dtype),
+    ):
+        i = wp.tid()
+        first, end = coarse.offsets[i], coarse.offsets[i + 1]
+        for t in range(first, end):
+            ends[t] = 0
+        for at in range(firsts[i], firsts[i + 1]):
+            if slots[at] >= 0:
+                ends[slots[at]] = ends[slots[at]] + 1
+        before = int(starts[i])
+        for t in range(first, end):
+            count = ends[t]
+            ends[t] = before
+            before += count
+        at = int(firsts[i])
+        for s in range(transposed.offsets[i], transposed.offsets[i + 1]):
+            row = transposed.columns[s]
+            for block in range(A.offsets[row], A.offsets[row + 1]):
+                column = A.columns[block]
+                for p in range(P.offsets[column], P.offsets[column + 1]):
+                    slot = slots[at]
+                    at += 1
+                    if slot >= 0:
+                        sources[ends[slot]] = block
+                        weights[ends[slot]] = dtype(transposed.weights[s] * P.weights[p])
+                        ends[slot] = ends[slot] + 1
+
+    return list_each_multiple
+
+
+@cache
 def multiply_by_transfers(dtype):
     """Kernel over (copies, upper blocks): A_c = Σ weight·A, a block of PᵀAP, which is stored with its transpose."""
     _, mat33 = types(dtype)
@@ -74,12 +180,13 @@ def multiply_by_transfers(dtype):
         coarse: wp.array(dtype=mat33),
     ):
         copy, t = wp.tid()
+        block = blocks[t]
         total = mat33()
-        for s in range(offsets[t], offsets[t + 1]):
+        for s in range(offsets[block[0]], offsets[block[0] + 1]):
             total += weights[s] * values[copy * per_copy + sources[s]]
         first = copy * coarse_per_copy
-        coarse[first + blocks[t][0]] = total
-        coarse[first + blocks[t][1]] = wp.transpose(total)
+        coarse[first + block[0]] = total
+        coarse[first + block[1]] = wp.transpose(total)
 
     return multiply_blocks
 

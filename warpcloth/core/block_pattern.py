@@ -1,4 +1,4 @@
-"""The pattern of a sparse matrix of blocks, a sum of element matrices, found on the device of a model."""
+"""The pattern of a sparse matrix of blocks, a sum of element matrices or a product, found on the device of a model."""
 
 from typing import NamedTuple
 
@@ -30,7 +30,7 @@ class BlockPattern(NamedTuple):
         """Returns the pattern of all copies of a model from that of one; ``blocks`` has the number of blocks of each term."""
         if model.copies == 1:
             return self
-        n, count = model.per_copy, len(self.columns)
+        n, count = len(self.diagonal), len(self.columns)
 
         def offsets(array, step):
             return model.of_copies(array[1:], step, start=0)
@@ -65,7 +65,7 @@ class TermCorners:
             starts, firsts = np.cumsum(of_corners) - of_corners, np.repeat(np.cumsum(sizes) - sizes, sizes)
             given |= {"firsts": firsts, "sizes": of_corners, "starts": starts}
             self.most = np.bincount(vertices, weights=of_corners, minlength=model.per_copy).astype(np.int64)
-        self._arrays = {name: _put(model, values) for name, values in given.items()}  # structs hold no references
+        self._arrays = {name: to_device(model, values) for name, values in given.items()}  # structs hold no references
         self.data = kernels.Corners()
         self.data.K = K
         for name, array in self._arrays.items():
@@ -86,25 +86,54 @@ def find_pattern(model, terms, fixed):
         return wp.empty(count, dtype=wp.int32, device=device)
 
     launch = model.launcher(((kernels.add_diagonal, kernels.add_columns, kernels.pack_columns, kernels.list_blocks),))
-    fixed, starts = _put(model, fixed), _before(sum((term.most for term in terms), start=np.ones(n, dtype=np.int64)))
-    firsts, found = _put(model, starts[:-1]), empty(int(starts[-1]))
+    fixed, starts = to_device(model, fixed), _before(sum((term.most for term in terms), start=np.ones(n, dtype=np.int64)))
+    firsts, found = to_device(model, starts[:-1]), empty(int(starts[-1]))
     counts, of_terms = empty(n), [empty(n) for _ in terms]
     launch(kernels.add_diagonal, n, [firsts], [found, counts])
     for term, of_term in zip(terms, of_terms, strict=True):
         launch(kernels.add_columns, n, [fixed, term.data, firsts], [found, counts, of_term])
     starts = _before(counts.numpy())
     count = int(starts[-1])
-    offsets, columns, rows, diagonal = _put(model, starts), empty(count), empty(count), empty(n)
+    offsets, columns, rows, diagonal = to_device(model, starts), empty(count), empty(count), empty(n)
     launch(kernels.pack_columns, n, [firsts, offsets, found], [columns, rows, diagonal])
     sums = []
     for term, of_term in zip(terms, of_terms, strict=True):
         starts = _before(of_term.numpy())
         ends, sources = empty(count + 1), empty(int(starts[-1]))
         ends[:1].zero_()
-        given = [fixed, term.data, offsets, columns, _put(model, starts[:-1])]
+        given = [fixed, term.data, offsets, columns, to_device(model, starts[:-1])]
         launch(kernels.list_blocks, n, given, [ends[1:], sources])
         sums.append((ends, sources))
     return BlockPattern(offsets, columns, rows, diagonal, sums)
+
+
+def pattern_of_product(model, left, right):
+    """Returns the pattern of a product of sparse matrices, of one copy, as :class:`BlockPattern` without sums.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        left: (offsets, columns) of the rows of the left matrix, on the device.
+        right: Those of the right one.
+    """
+    host = [array.numpy() for array in (*left, right[0])]
+    most = np.append(0, np.cumsum(np.diff(host[2])[host[1]]))[host[0]]
+    n, firsts = len(most) - 1, to_device(model, most[:-1])
+    found, counts = (wp.empty(int(size), dtype=wp.int32, device=model.device) for size in (most[-1], n))
+    launch = model.launcher(((kernels.add_product_columns, kernels.pack_columns),))
+    launch(kernels.add_product_columns, n, [*left, *right, firsts], [found, counts])
+    starts = _before(counts.numpy())
+    offsets = to_device(model, starts)
+    columns, rows, diagonal = (wp.empty(int(size), dtype=wp.int32, device=model.device) for size in (starts[-1], starts[-1], n))
+    launch(kernels.pack_columns, n, [firsts, offsets, found], [columns, rows, diagonal])
+    return BlockPattern(offsets, columns, rows, diagonal, [])
+
+
+def dense_pattern(model, n):
+    """Returns the :class:`BlockPattern` of n rows with all blocks."""
+    every = np.arange(n)
+    arrays = np.arange(n + 1) * n, np.tile(every, n), np.repeat(every, n), every * (n + 1)
+    offsets, columns, rows, diagonal = (to_device(model, values) for values in arrays)
+    return BlockPattern(offsets, columns, rows, diagonal, [])
 
 
 def slots_of(model, sums, count):
@@ -118,7 +147,8 @@ def slots_of(model, sums, count):
     return slots
 
 
-def _put(model, values):
+def to_device(model, values):
+    """Returns indices as an array of int32 on the device of a model."""
     return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=wp.int32, device=model.device)
 
 

@@ -6,6 +6,8 @@ reproduce each affine function of the rest positions, and therefore translations
 shape the cloth is. So they do not change during a run, and one weight serves all three coordinates.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 # A level has at least this many times fewer vertices than the finer one; otherwise it is not worth its launches.
@@ -28,8 +30,41 @@ def neighbours(mesh):
         return mesh.edges
 
 
+class Interpolation(NamedTuple):
+    """The interpolation P (n, n_c) to a level from the next coarser one, in compressed rows.
+
+    Attributes:
+        offsets: Where each row starts, (n + 1,).
+        parents: The coarse vertices that each vertex follows, ascending in a row.
+        weights: Their weights, which sum to 1 in a row, or to 0 for vertices that do not move.
+        coarse: n_c.
+    """
+
+    offsets: np.ndarray
+    parents: np.ndarray
+    weights: np.ndarray
+    coarse: int
+
+    def transposed(self):
+        """Returns (offsets, vertices, weights) of the columns."""
+        order = np.argsort(self.parents, kind="stable")
+        rows = np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+        return _offsets(self.parents, self.coarse), rows[order], self.weights[order]
+
+    def matrix(self):
+        """Returns P as a scipy matrix in compressed rows."""
+        from scipy.sparse import csr_array
+
+        return csr_array((self.weights, self.parents, self.offsets), (len(self.offsets) - 1, self.coarse))
+
+
 def interpolations(points, pairs, free, coarsest):
-    """Returns the interpolation to each level from the next coarser one, finer ones first.
+    """Returns the interpolation to each level from the next coarser one, as scipy matrices; see :func:`find`."""
+    return [level.matrix() for level in find(points, pairs, free, coarsest)]
+
+
+def find(points, pairs, free, coarsest):
+    """Finds the interpolation to each level from the next coarser one, finer ones first.
 
     Args:
         points: Rest positions (n, 3) [m].
@@ -38,44 +73,45 @@ def interpolations(points, pairs, free, coarsest):
         coarsest: The number of vertices below which a level gets no coarser one.
 
     Returns:
-        A list of scipy matrices in compressed rows, (n, n₁), (n₁, n₂) …, whose rows sum to 1, or to 0 for vertices that do not
-        move.
+        A list of :class:`Interpolation`.
     """
-    from scipy.sparse import coo_array, csr_array
-
-    found, n = [], len(points)
-    vertices, ones = np.flatnonzero(free), np.ones(len(pairs), dtype=np.int32)
-    joined = coo_array((ones, pairs.T), shape=(n, n)).tocsr()[vertices][:, vertices]
-    graph, at = _pattern(joined + joined.T), np.asarray(points, dtype=np.float64)[vertices]
+    found, vertices = [], np.flatnonzero(free)
+    number = np.full(len(free), -1)
+    number[vertices] = np.arange(len(vertices))
+    one, two = number[np.asarray(pairs)].T
+    both = (one >= 0) & (two >= 0)
+    edges = _symmetric(one[both], two[both], len(vertices))
+    at = np.asarray(points, dtype=np.float64)[vertices]
     while len(at) > coarsest:
-        kept = np.flatnonzero(_independent(graph))
-        if len(kept) * SHRINKS > len(at):
+        is_kept = _independent(edges, len(at))
+        coarse = int(np.count_nonzero(is_kept))
+        if coarse * SHRINKS > len(at):
             break
-        weights, graph = _coarser(graph, at, kept)
+        rows, parents, weights, edges = _coarser(edges, at, is_kept)
         if not found:
-            first = csr_array((np.ones(len(vertices)), (vertices, np.arange(len(vertices)))), (n, len(vertices)))
-            weights = first @ weights
-        weights.sort_indices()
-        found.append(weights)
-        at = at[kept]
+            rows = vertices[rows]
+        found.append(Interpolation(_offsets(rows, len(at) if found else len(free)), parents, weights, coarse))
+        at = at[is_kept]
     return found
 
 
-def _pattern(matrix):
-    """Returns a matrix of ones where ``matrix`` has an entry off its diagonal."""
-    from scipy.sparse import csr_array
-
-    whole = matrix.tocoo()
-    off = whole.row != whole.col
-    ones = np.ones(np.count_nonzero(off), dtype=np.int32)
-    return csr_array((ones, (whole.row[off], whole.col[off])), shape=matrix.shape)
+def _offsets(rows, n):
+    """Returns where each of n rows starts, (n + 1,), from the row of each entry."""
+    return np.append(0, np.cumsum(np.bincount(rows, minlength=n)))
 
 
-def _independent(graph):
+def _symmetric(one, two, n):
+    """Returns (row, column) of the entries of a symmetric pattern with its diagonal, sorted and once each."""
+    n, itself = np.int64(n), np.arange(n)
+    keys = np.sort(np.concatenate([one * n + two, two * n + one, itself * n + itself]))
+    return np.divmod(keys[np.flatnonzero(np.diff(keys, prepend=-1))], max(n, 1))
+
+
+def _independent(edges, n):
     """Returns which vertices are kept, (n,): in order, each one without a kept neighbour."""
-    offsets, neighbours = graph.indptr.tolist(), graph.indices.tolist()
-    kept, decided = np.zeros(graph.shape[0], dtype=bool), bytearray(graph.shape[0])
-    for v in range(graph.shape[0]):
+    offsets, neighbours = _offsets(edges[0], n).tolist(), edges[1].tolist()
+    kept, decided = np.zeros(n, dtype=bool), bytearray(n)
+    for v in range(n):
         if not decided[v]:
             kept[v] = True
             for u in neighbours[offsets[v] : offsets[v + 1]]:
@@ -83,40 +119,48 @@ def _independent(graph):
     return kept
 
 
-def _coarser(graph, points, kept):
-    """Returns the interpolation from the ``kept`` vertices, (n, n_c), and the graph of these.
+def _coarser(edges, points, is_kept):
+    """Finds the interpolation from the kept vertices, and which of these are neighbours.
 
-    Each vertex belongs to the nearest kept vertex among itself and its neighbours. Kept vertices are neighbours if the graph
-    joins vertices that belong to them.
+    Each vertex belongs to the nearest kept vertex among itself and its neighbours. Kept vertices are neighbours if vertices
+    that belong to them are.
+
+    Args:
+        edges: (row, column) of the vertices and their neighbours, sorted.
+        points: Positions (n, 3) [m].
+        is_kept: Which vertices are kept, (n,).
+
+    Returns:
+        (rows, parents, weights, edges): the entries of the interpolation, sorted, and the edges of the coarser level.
     """
-    from scipy.sparse import csr_array, eye_array
-
-    n, coarse = len(points), len(kept)
-    itself = eye_array(n, dtype=np.int32, format="csr")
-    chosen = csr_array((np.ones(coarse, dtype=np.int32), (kept, np.arange(coarse))), shape=(n, coarse))
-    near = _sorted(((graph + itself) @ chosen).tocoo(), points, kept)
-    owner = near[1][np.searchsorted(near[0], np.arange(n))]
-    belongs = csr_array((np.ones(n, dtype=np.int32), (np.arange(n), owner)), shape=(n, coarse))
-    joined = _pattern(belongs.T @ graph @ belongs)
-    candidates = belongs @ (joined + eye_array(coarse, dtype=np.int32, format="csr"))
-    rows, parents, distances = _sorted(candidates.tocoo(), points, kept)
-    first = np.searchsorted(rows, np.arange(n))
-    used = np.arange(len(rows)) - first[rows] < PARENTS
+    kept, dropped = np.flatnonzero(is_kept), np.flatnonzero(~is_kept)
+    coarse = len(kept)
+    number = np.cumsum(is_kept) - 1
+    near = is_kept[edges[1]]
+    rows, parents, _ = _sorted(edges[0][near], number[edges[1][near]], points, kept)
+    owner = np.empty(len(points), dtype=np.int64)
+    owner[rows[::-1]] = parents[::-1]  # the first of each row, which is the nearest
+    joined = _symmetric(owner[edges[0]], owner[edges[1]], coarse)
+    starts = _offsets(joined[0], coarse)
+    own = owner[dropped]
+    counts = starts[own + 1] - starts[own]
+    first = np.cumsum(counts) - counts
+    others = joined[1][np.arange(counts.sum()) + np.repeat(starts[own] - first, counts)]
+    rows, parents, distances = _sorted(np.repeat(dropped, counts), others, points, kept)
+    used = np.arange(len(rows)) - _offsets(rows, len(points))[rows] < PARENTS
     rows, parents, distances = rows[used], parents[used], distances[used]
     weights = _moving_least_squares(rows, points[kept[parents]] - points[rows], distances)
-    own = kept[parents] == rows
-    is_kept = np.zeros(n, dtype=bool)
-    is_kept[kept] = True
-    weights = np.where(is_kept[rows], own.astype(float), weights)
     used = weights != 0.0
-    return csr_array((weights[used], (rows[used], parents[used])), shape=(n, coarse)), joined
+    rows, parents = np.concatenate([kept, rows[used]]), np.concatenate([number[kept], parents[used]])
+    order = np.argsort(rows * np.int64(coarse) + parents)
+    return rows[order], parents[order], np.concatenate([np.ones(coarse), weights[used]])[order], joined
 
 
-def _sorted(pairs, points, kept):
-    """Returns (row, kept vertex, distance) of the entries of a matrix, sorted by row and distance."""
-    distances = np.linalg.norm(points[pairs.row] - points[kept[pairs.col]], axis=1)
-    order = np.lexsort((pairs.col, distances, pairs.row))
-    return pairs.row[order], pairs.col[order], distances[order]
+def _sorted(rows, parents, points, kept):
+    """Returns (row, kept vertex, distance), sorted by row and distance, and where these are equal as they were given."""
+    distances = np.linalg.norm(points[kept[parents]] - points[rows], axis=1)
+    order = np.lexsort((distances, rows))
+    return rows[order], parents[order], distances[order]
 
 
 def _moving_least_squares(rows, offsets, distances):

@@ -3,9 +3,10 @@
 import numpy as np
 import warp as wp
 
+from ..core.block_pattern import dense_pattern, pattern_of_product, to_device
 from ..kernels import multigrid as kernels
 from ..kernels.linear import multiply
-from .interpolation import interpolations, neighbours
+from .interpolation import find, neighbours
 
 # Meshes of fewer vertices are solved faster without.
 LEAST = 200
@@ -27,21 +28,13 @@ class _Level:
         r, x, d: Residual, solution, and what the coarser level adds to it, (B·n,).
     """
 
-    def __init__(self, model, n, offsets, columns):
-        """``offsets`` and ``columns`` are the block rows of one copy."""
-        B, count, device = model.copies, len(columns), model.device
-        copies = np.arange(B)[:, None]
-        diagonal = np.flatnonzero(np.repeat(np.arange(n), np.diff(offsets)) == columns)
-
-        def put(values):
-            return wp.array(values.astype(np.int32), dtype=wp.int32, device=device)
-
-        self.n = n
-        self.offsets = put(np.append(offsets[:-1] + copies * count, B * count))
-        self.columns, self.diagonal = put((columns + copies * n).ravel()), put((diagonal + copies * count).ravel())
-        self.values = wp.zeros(B * count, dtype=model.mat33, device=device)
-        self.sweep = wp.zeros(B * n, dtype=model.mat33, device=device)
-        self.r, self.x, self.d = (wp.zeros(B * n, dtype=model.vec3, device=device) for _ in range(3))
+    def __init__(self, model, pattern):
+        """``pattern`` is that of one copy, a :class:`warpcloth.core.block_pattern.BlockPattern`."""
+        whole, self.n, device = pattern.of_copies(model, []), len(pattern.diagonal), model.device
+        self.offsets, self.columns, self.diagonal = whole.offsets, whole.columns, whole.diagonal
+        self.values = wp.zeros(len(whole.columns), dtype=model.mat33, device=device)
+        self.sweep = wp.zeros(model.copies * self.n, dtype=model.mat33, device=device)
+        self.r, self.x, self.d = (wp.zeros(model.copies * self.n, dtype=model.vec3, device=device) for _ in range(3))
 
 
 class _Finest:
@@ -60,82 +53,78 @@ class _Finest:
 
 
 class _Transfer:
-    """P from a coarser level, by rows and by columns, and the blocks of which those of PᵀAP are sums."""
+    """P from a coarser level, by rows and by columns, and the blocks of which those of PᵀAP are sums.
 
-    def __init__(self, model, P, pattern, dense):
-        """P is a scipy matrix (n, n_c), ``pattern`` the block rows (offsets, columns) of one copy of A."""
-        device = model.device
-
-        def put(values):
-            return wp.array(values.astype(np.int32), dtype=wp.int32, device=device)
-
-        def compressed(matrix):
-            return put(matrix.indptr), put(matrix.indices), model.array(matrix.data, model.dtype)
-
-        self.rows, self.columns = compressed(P), compressed(P.T.tocsr())
-        entries, sources, weights, self.coarse = products(P, *pattern, dense)
-        self.sums = put(entries), put(sources), model.array(weights, model.dtype)
-        rows = np.repeat(np.arange(P.shape[1]), np.diff(self.coarse[0]))
-        columns = self.coarse[1]
-        upper = np.flatnonzero(rows <= columns)
-        mirror = np.searchsorted(rows * P.shape[1] + columns, columns[upper].astype(np.int64) * P.shape[1] + rows[upper])
-        self.blocks = wp.array(np.stack([upper, mirror], axis=1).astype(np.int32), dtype=wp.vec2i, device=device)
-
-
-def products(P, offsets, columns, dense=False):
-    """Finds the blocks of PᵀAP as sums over those of A, which is symmetric.
-
-    Args:
-        P: The interpolation, scipy (n, n_c).
-        offsets: Starts of the block rows of A, (n + 1,).
-        columns: Columns of its blocks.
-        dense: Whether PᵀAP has all blocks.
-
-    Returns:
-        (starts, sources, weights, pattern): the upper block u is Σ weights·A[sources] over starts[u] … starts[u + 1] − 1, upper
-        blocks in the order of ``pattern``, the block rows (offsets, columns) of PᵀAP.
+    Attributes:
+        rows, columns: (offsets, columns, weights) of P and of Pᵀ.
+        coarse: The pattern of PᵀAP of one copy, :class:`warpcloth.core.block_pattern.BlockPattern`.
+        sums, blocks: (offsets, sources, weights) of the multiples, and (upper, lower) blocks, see
+            :func:`warpcloth.kernels.multigrid.multiply_by_transfers`.
     """
-    n, coarse = P.shape
-    rows = np.repeat(np.arange(n), np.diff(offsets))
-    parents, shares = _padded(P)
-    weights = shares[rows][:, :, None] * shares[columns][:, None, :]
-    one = np.broadcast_to(parents[rows][:, :, None], weights.shape)
-    two = np.broadcast_to(parents[columns][:, None, :], weights.shape)
-    entries = np.flatnonzero((weights != 0.0) & (one <= two))
-    keys = one.reshape(-1)[entries] * np.int64(coarse) + two.reshape(-1)[entries]
-    keys, order = _by_key(keys, entries, coarse * coarse, weights.size)
-    if dense:
-        one, two = np.triu_indices(coarse)
-        unique = one * coarse + two
-    else:
-        diagonal = np.arange(coarse, dtype=np.int64) * (coarse + 1)
-        unique = np.union1d(keys[np.flatnonzero(np.diff(keys, prepend=-1))], diagonal)
-    starts = np.searchsorted(keys, np.append(unique, coarse * coarse))
-    one, two = np.divmod(unique, coarse)
-    lower = one != two
-    whole = np.sort(np.concatenate([unique, two[lower] * coarse + one[lower]]))
-    pattern = np.searchsorted(whole, np.arange(coarse + 1) * coarse), whole % coarse
-    return starts, order // weights[0].size, weights.reshape(-1)[order], pattern
+
+    def __init__(self, model, P, fine, dense):
+        """P is a :class:`.interpolation.Interpolation`, ``fine`` (offsets, columns) of A in one copy.
+
+        If ``dense``, PᵀAP has all blocks.
+        """
+        by_rows, by_columns = (P.offsets, P.parents, P.weights), P.transposed()
+        exact = [_rows(model, *each) for each in (by_rows, by_columns)]
+        self.rows, self.columns = (
+            [*each[:2], model.array(weights, model.dtype)]
+            for each, (_, _, weights) in zip(exact, (by_rows, by_columns), strict=True)
+        )
+        if dense:
+            self.coarse = dense_pattern(model, P.coarse)
+        else:
+            products = pattern_of_product(model, fine, self.rows[:2])
+            self.coarse = pattern_of_product(model, self.columns[:2], (products.offsets, products.columns))
+        self._list_multiples(model, [fine, *exact, (self.coarse.offsets, self.coarse.columns)])
+
+    def _list_multiples(self, model, matrices):
+        """Finds ``sums`` and ``blocks`` from the rows of A, P, Pᵀ and PᵀAP."""
+        n, count = len(self.coarse.diagonal), len(self.coarse.columns)
+
+        def empty(size, dtype=wp.int32):
+            return wp.empty(size, dtype=dtype, device=model.device)
+
+        given = [_struct(*each) for each in matrices]
+        launch = model.launcher(((kernels.find_slots,),), ((kernels.list_multiples,), model.dtype))
+        (A_offsets, A_columns), P, transposed = ([array.numpy() for array in each[:2]] for each in matrices[:3])
+        of_rows = _sums(np.diff(P[0])[A_columns], A_offsets)  # products of each row of A with the weights of its columns
+        most = _starts(_sums(of_rows[transposed[1]], transposed[0]))
+        firsts, slots = to_device(model, most), empty(int(most[-1]))
+        counts, mirrors = empty(n), empty(count)
+        launch(kernels.find_slots, n, [*given, firsts], [slots, counts, mirrors])
+        starts = _starts(counts.numpy())
+        ends, sources, weights = empty(count + 1), empty(int(starts[-1])), empty(int(starts[-1]), model.dtype)
+        ends[:1].zero_()
+        launch(kernels.list_multiples, n, [*given, slots, firsts, to_device(model, starts)], [ends[1:], sources, weights])
+        mirrors = mirrors.numpy()
+        upper = np.flatnonzero(mirrors >= np.arange(count))
+        pairs = np.stack([upper, mirrors[upper]], axis=1).astype(np.int32)
+        self.sums, self.blocks = (ends, sources, weights), wp.array(pairs, dtype=wp.vec2i, device=model.device)
 
 
-def _padded(P):
-    """Returns the parents and the weights of each row of P, (n, most), with weights of 0 behind the last."""
-    count = np.diff(P.indptr)
-    rows = np.repeat(np.arange(len(count)), count)
-    at = np.arange(len(rows)) - P.indptr[rows]
-    parents = np.zeros((len(count), count.max()), dtype=np.int32)
-    weights = np.zeros(parents.shape)
-    parents[rows, at], weights[rows, at] = P.indices, P.data
-    return parents, weights
+def _rows(model, offsets, columns, weights):
+    """Returns a matrix in compressed rows on the device, with weights in float64."""
+    return *(to_device(model, each) for each in (offsets, columns)), wp.array(weights, dtype=wp.float64, device=model.device)
 
 
-def _by_key(keys, entries, most_keys, most_entries):
-    """Returns both sorted by key, then by entry; as packed numbers, if they fit, which is several times as fast."""
-    if most_keys * most_entries < 2**62:
-        packed = np.sort(keys * most_entries + entries)
-        return np.divmod(packed, most_entries)
-    order = np.argsort(keys, kind="stable")
-    return keys[order], entries[order]
+def _struct(offsets, columns, weights=None):
+    """Returns the :class:`warpcloth.kernels.multigrid.Rows`, which hold no references."""
+    rows = kernels.Rows()
+    rows.offsets, rows.columns, rows.weights = offsets, columns, weights
+    return rows
+
+
+def _starts(counts):
+    """Returns the sums of the counts before each, and of all."""
+    return np.append(0, np.cumsum(counts))
+
+
+def _sums(values, offsets):
+    """Returns the sum of the values of each row."""
+    return np.diff(_starts(values)[offsets])
 
 
 class Multigrid:
@@ -158,17 +147,18 @@ class Multigrid:
     def __init__(self, hessian, iterations):
         model = self.model = hessian.model
         self.hessian, n = hessian, model.per_copy
-        offsets = hessian.offsets.numpy()[: n + 1]
-        pattern = offsets, hessian.columns.numpy()[: offsets[-1]]
+        blocks = len(hessian.columns) // model.copies
+        pattern = hessian.offsets[: n + 1], hessian.columns[:blocks]
         joined = model.in_model(neighbours(model.scene.mesh))
-        found = interpolations(model.rest_points, joined, model.inverse_mass.numpy()[:n] > 0.0, COARSEST)
-        self.sizes = [n, *(P.shape[1] for P in found)]
+        found = find(model.rest_points, joined, model.inverse_mass.numpy()[:n] > 0.0, COARSEST)
+        self.sizes = [n, *(P.coarse for P in found)]
         self._dense = len(found) > 0 and self.sizes[-1] <= DENSE
         self._levels, self._transfers = [_Finest(hessian)], []
         for P in found:
             self._transfers.append(_Transfer(model, P, pattern, dense=self._dense and P is found[-1]))
-            pattern = self._transfers[-1].coarse
-            self._levels.append(_Level(model, P.shape[1], *pattern))
+            coarse = self._transfers[-1].coarse
+            self._levels.append(_Level(model, coarse))
+            pattern = coarse.offsets, coarse.columns
         if self._dense:
             self._other = wp.zeros_like(self._levels[-1].values)
         self.sweep = self._levels[0].sweep
