@@ -20,7 +20,7 @@ OMEGA = 1.8
 SPARED = 2
 # An iteration with a cycle costs about as much as so many with diagonal blocks.
 CYCLE = 4
-# The other preconditioner is tried again after so many solves, times its disadvantage.
+# The other preconditioner is tried again after so many solves.
 AGED = 64
 
 
@@ -318,11 +318,12 @@ def scale_sweeps(dtype):
 
 @wp.struct
 class PreconditionerChoice:
-    """Which preconditioner solves use, (1,) arrays; of ``rates`` and ``ages`` the first is that of diagonal blocks.
+    """Which preconditioner solves use, (1,) arrays; of ``rates`` the first is that of diagonal blocks.
 
     ``used`` is 1 for multigrid, ``outdated`` 1 if its coarse matrices must be computed again. ``fresh`` is the number of
     iterations of the first solve with these, or −1 before it. ``rates`` are decades of √(rᵀPr) for the cost of an iteration
-    with diagonal blocks, (2,), 0 if unknown; ``ages`` the number of solves since, (2,).
+    with diagonal blocks, (2,), of the last solve with each, 0 if it was cut off. ``trial`` is 1 if a solve tries the other
+    preconditioner, ``age`` the number of solves since the last trial.
     """
 
     used: wp.array(dtype=wp.int32)
@@ -330,7 +331,8 @@ class PreconditionerChoice:
     fresh: wp.array(dtype=wp.int32)
     progress: wp.array(dtype=wp.float64)
     rates: wp.array(dtype=wp.float64)
-    ages: wp.array(dtype=wp.int32)
+    trial: wp.array(dtype=wp.int32)
+    age: wp.array(dtype=wp.int32)
 
 
 @cache
@@ -356,9 +358,10 @@ def measure_progress():
 def choose():
     """Kernel over one thread: chooses the preconditioner of the next solve by the decades that each gained for its cost.
 
-    After the first solve, which is by multigrid, diagonal blocks are tried, with at most as many iterations as cost the same.
-    The better one stays. The other is tried again after ``AGED`` solves times its disadvantage, so that trials cost little. The
-    coarse matrices are outdated if a solve takes 3/2 times as many iterations as the first with them.
+    The first solve is by multigrid. The other preconditioner is tried in the second, then ``AGED`` solves after the last trial,
+    or if its last solve gained more for its cost than this one. A trial that costs twice as much as the solve before is cut off
+    and has failed. The better one stays. The coarse matrices are outdated if a solve takes 3/2 times as many iterations as the
+    first with them.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -380,18 +383,27 @@ def choose():
                 choice.fresh[0] = count
             elif 2 * count > 3 * choice.fresh[0] + wp.static(2 * SPARED):
                 choice.outdated[0] = 1
-        if choice.progress[0] > wp.float64(0.0):
+        if count >= solves.most[0]:
+            choice.rates[used] = wp.float64(0.0)
+        elif choice.progress[0] > wp.float64(0.0):
             choice.rates[used] = choice.progress[0] / wp.float64(cost)
-            choice.ages[used] = 0
         choice.progress[0] = wp.float64(0.0)
-        choice.ages[other] = choice.ages[other] + 1
         solves.most[0] = most
-        aged = wp.float64(choice.ages[other]) * choice.rates[other] > wp.float64(wp.static(AGED)) * choice.rates[used]
-        if choice.rates[other] == wp.float64(0.0) or aged or choice.rates[other] > choice.rates[used]:
-            choice.used[0] = other
-            choice.outdated[0] = 1
-            if used == 1:
-                solves.most[0] = wp.min(most, cost)
+        if choice.trial[0] == 1:
+            choice.trial[0] = 0
+            choice.age[0] = 0
+            if choice.rates[used] <= choice.rates[other]:
+                choice.used[0] = other
+        else:
+            choice.age[0] = choice.age[0] + 1
+            if choice.age[0] >= wp.static(AGED) or choice.rates[other] > choice.rates[used]:
+                choice.trial[0] = 1
+                choice.used[0] = other
+                limit = 2 * cost
+                if other == 1:
+                    choice.outdated[0] = 1
+                    limit = limit / wp.static(CYCLE) + 1
+                solves.most[0] = wp.min(most, limit)
 
     return choose_next
 

@@ -10,7 +10,7 @@ import warpcloth as wc
 from support.continuum import flat, hill, jittered
 from support.scenes import scene
 from warpcloth.core.hessian import Hessian
-from warpcloth.kernels.multigrid import OMEGA
+from warpcloth.kernels.multigrid import CYCLE, OMEGA, SPARED
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.numerics import minimise
 from warpcloth.numerics.interpolation import interpolations, neighbours
@@ -149,7 +149,8 @@ def test_coarse_matrices_are_products_with_the_interpolation(device):
 
 def keep(multigrid, used):
     """Lets all solves use multigrid, or diagonal blocks."""
-    multigrid._choice.rates.assign([1e-30, 1.0] if used else [1.0, 1e-30])
+    multigrid._choice.rates.assign([0.0, 1.0] if used else [1.0, 0.0])
+    multigrid._choice.age.fill_(-1_000_000)
     multigrid.used.fill_(int(used))
 
 
@@ -222,3 +223,23 @@ def test_solves_choose_what_costs_less(device):
         for _ in range(2):
             stepper.frame()
         assert int(stepper.minimiser.linear.multigrid.used.numpy()[0]) == used
+
+
+@pytest.mark.parametrize("blocks, cycles", [(500, 5), (20, 40), (4000, 200)])
+def test_trials_cost_little(device, blocks, cycles):
+    """Most of the gain of a solve comes early, so that a trial that is cut off looks good; it may not win."""
+    hessian = Hessian(scene("hanging", n=3).build(device=device), HessianPolicy.CLAMP)
+    solver = ConjugateGradients(hessian, 10_000, Multigrid(hessian, 10_000))
+    solves, choose, used = solver._solves, solver.multigrid.choose, solver.multigrid.used
+    solves.first.fill_(1.0)
+    total, count = 0, 300
+    for _ in range(count):
+        multigrid = bool(used.numpy()[0])
+        needed = cycles if multigrid else blocks
+        taken = min(needed, int(solves.most.numpy()[0]))
+        solves.iteration.fill_(taken)
+        solves.next_rz.fill_(10.0 ** (-3.0 * np.sqrt(taken / needed)))
+        total += CYCLE * (taken + SPARED) if multigrid else taken + 1
+        choose(solves)
+    best = min(blocks + 1, CYCLE * (cycles + SPARED))
+    assert total <= 1.1 * count * best

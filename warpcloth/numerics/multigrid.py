@@ -169,7 +169,8 @@ class Multigrid:
         choice.used, choice.outdated, choice.fresh = (wp.ones(1, dtype=wp.int32, device=model.device) for _ in range(3))
         choice.progress = wp.zeros(1, dtype=wp.float64, device=model.device)
         choice.rates = wp.zeros(2, dtype=wp.float64, device=model.device)
-        choice.ages = wp.zeros(2, dtype=wp.int32, device=model.device)
+        choice.trial = wp.zeros(1, dtype=wp.int32, device=model.device)
+        choice.age = wp.full(1, kernels.AGED, dtype=wp.int32, device=model.device)
         self.used = choice.used
         of_matrix = kernels.multiply_by_transfers, kernels.factorise_diagonal, kernels.scale_sweeps, kernels.eliminate
         products = kernels.subtract_product, kernels.sweep_after
