@@ -12,6 +12,7 @@ from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.lab import elastica
 from warpcloth.lab.laboratory import check_sample, drape_coefficient
+from warpcloth.scene.measured_fabrics import DRAPES
 
 COTTON = wc.fabrics["cotton"]
 
@@ -136,6 +137,13 @@ def test_a_stiff_disc_sinks_like_a_plate(device):
     constants = np.linalg.solve(equations, -np.array(loads))
     expected = constants @ [1.0, log, outer**2, outer**2 * log] + q * outer**4 / 64
     assert -rest.points[:, 1].min() == pytest.approx(expected, rel=1e-2)
+
+
+def test_a_listed_drape_is_computed(device):
+    """All eight starts of canvas read 90.9 % with rows=8, and the first 91.1 % with rows=4."""
+    assert read(scene("cusick", fabric="canvas", rows=4), device)["drape coefficient"] == pytest.approx(
+        DRAPES["canvas"], abs=0.3
+    )
 
 
 def test_what_has_no_reading_is_refused(device):

@@ -283,3 +283,5 @@ def test_refusals_of_files(name, text, sentence, tmp_path):
 def test_the_command_lists_them(capfd):
     code, out, _ = run(capfd, "fabrics")
     assert code == 0 and all(name in out for name in wc.fabrics) and "1673" in out and "Clyde" in out
+    drapes = {line.split()[0]: line.split()[-2] for line in out.splitlines()[1 : 1 + len(wc.fabrics)]}
+    assert drapes["silk"] == "52.1" and drapes["denim-wang"] == "–"  # which has no ν₁₂
