@@ -1,12 +1,12 @@
 """A strip clamped at one end that bends under its own weight, Γ = ρgL³/D (Romero et al. 2021), on an equilateral mesh.
 
 The strip extends along x. With a width of 0 it is one row of triangles, which bends with 1 − ν² = 8/9 of D, because both
-bending energies have the Poisson's ratio ν = −1/3. Otherwise it has rows of edges across its width. L is measured from the
-middle of the pins, half an element from x = 0, to the free end (of a single row, its mean).
+bending energies of hinges have the Poisson's ratio ν = −1/3. Otherwise it has rows of edges across its width. A plate, with
+ν = 0, needs a width. L is measured from the middle of the pins, half an element from x = 0, to the free end (of a single row,
+its mean); for a plate from the clamp, 0.18 elements behind the second row of pins.
 
 With a fabric, it is the sample of a Shirley tester: a strip 25 mm wide, if no width is given, cut at an angle to the warp. L
-follows from Γ, with the fabric's own ρ and D; for Γ = 8, twice the bending length, the tip hangs 41.5° below the clamp. This
-clamp, from which L is measured, is 0.18 elements behind the second row of pins, as for every `PlateBending`.
+follows from Γ, with the fabric's own ρ and D; for Γ = 8, twice the bending length, the tip hangs 41.5° below the clamp.
 """
 
 import numpy as np
@@ -27,14 +27,17 @@ def scene(
     fabric: str | None = None,
     angle: float = 0.0,
 ):
-    """Γ, width [m], elements along, quadratic or dihedral, kL²/D of springs, L [m], duration [s]; fabric, its angle [°]."""
+    """Γ, width [m], elements along, quadratic, dihedral or plate, kL²/D of springs, L [m], duration [s]; fabric, angle [°]."""
     wc.checks.number("gamma", gamma, above=0.0)
     wc.checks.number("width", width, least=0.0)
     wc.checks.whole("elements", elements, 2)
     wc.checks.number("length", length, above=0.0)
-    wc.checks.choice("bending", bending, ("quadratic", "dihedral"))
+    wc.checks.choice("bending", bending, ("quadratic", "dihedral", "plate"))
+    if bending == "plate" and width == 0.0 and fabric is None:
+        raise ValueError("bending is 'plate' and width is 0, one row of triangles, which has no plate; give a width")
     wc.checks.number("angle", angle)
-    spacing, stiffness = length / (elements - (0.25 if width == 0.0 else 0.5)), 1e-3  # D [N·m]
+    held = 0.25 if width == 0.0 else 1.0 - CLAMP if bending == "plate" else 0.5  # elements from x = 0 to where L begins
+    spacing, stiffness = length / (elements - held), 1e-3  # D [N·m]
     if fabric is not None:
         cloth = wc.fabrics.find(fabric)
         length = (gamma * cloth.bending_along(np.radians(angle)) / (9.81 * cloth.density)) ** (1 / 3)
@@ -49,7 +52,7 @@ def scene(
         across = max(round(width / spacing * np.sqrt(0.75)), 1)
         rows = wc.Mesh.grid(across + 1, elements + 1, size=across * spacing / np.sqrt(0.75), pattern="equilateral")
         mesh = wc.Mesh(rows.points[:, ::-1], rows.triangles[:, ::-1])  # x and z change places
-    bend = wc.QuadraticBending if bending == "quadratic" else wc.DihedralBending
+    bend = {"quadratic": wc.QuadraticBending, "dihedral": wc.DihedralBending, "plate": wc.PlateBending}[bending]
     springs = wc.Spring(pairs="edges", stiffness=stretching * stiffness / length**2)
     return wc.Scene(
         mesh,

@@ -77,6 +77,15 @@ def test_a_shirley_tester_reads_twice_the_bending_length(strip, device):
     assert found["angle of the tip"] == pytest.approx(41.49, abs=0.1)
 
 
+@pytest.mark.parametrize(
+    ("bending", "width", "stiffness", "tolerance"), [("plate", 0.3, 1.0, 1.5e-2), ("quadratic", 0.0, 8.0 / 9.0, 2e-3)]
+)
+def test_a_shirley_tester_reads_strips_of_no_fabric(bending, width, stiffness, tolerance, device):
+    """Of 12 elements; a row of triangles has 8/9 of D. The clamp of a plate is 0.18 elements behind its pins."""
+    found = read(scene("cantilever", gamma=8.0, elements=12, bending=bending, width=width), device)
+    assert found["bending length"] == pytest.approx(500.0 * stiffness ** (1 / 3), rel=tolerance)
+
+
 @pytest.mark.host
 @pytest.mark.parametrize("strip", slow_but(["warp"], STRIPS))
 def test_a_heart_loop_reads_the_bending_length(strip, device):

@@ -148,7 +148,8 @@ def _cantilever(scene, rest):
     flat = scene.mesh.points[:, 0]
     clamp, _ = _clamps(scene)
     spacing = np.unique(flat.round(12))[1] - flat.min()
-    tip = flat > flat.max() - 1.5 * spacing if scene.mesh.grid_shape is None else flat > flat.max() - 0.5 * spacing
+    narrow = len(np.unique(scene.mesh.points[:, 2].round(12))) == 2  # one row of triangles, of which the end is the mean
+    tip = flat > flat.max() - (1.5 if narrow and scene.mesh.grid_shape is None else 0.5) * spacing
     x, y, _ = rest.points[tip].mean(axis=0)
     gamma = elastica.gamma_of(-y / (x - clamp), 1.0, 8.0)
     if gamma is None:
