@@ -22,6 +22,8 @@ SPARED = 2
 CYCLE = 4
 # The other preconditioner is tried again after so many solves.
 AGED = 64
+# A solve with diagonal blocks ends where it has cost so many times what multigrid would.
+PATIENCE = 1.5
 
 
 @wp.struct
@@ -337,7 +339,10 @@ class PreconditionerChoice:
 
 @cache
 def measure_progress():
-    """Kernel over copies: progress = the largest fall of √(rᵀPr) in a solve, in decades."""
+    """Kernel over copies: progress = the largest fall of √(rᵀPr) in a solve, in decades.
+
+    A solve that ends at a negative curvature does not count: its few iterations say nothing of the many that others take.
+    """
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def measure(
@@ -347,6 +352,8 @@ def measure_progress():
         choice: PreconditionerChoice,
     ):
         copy = wp.tid()
+        if solves.negative[copy] == 1:
+            return
         if solves.first[copy] > wp.float64(0.0) and solves.next_rz[copy] > wp.float64(0.0):
             decades = wp.float64(0.5) * wp.log10(solves.first[copy] / solves.next_rz[copy])
             wp.atomic_max(choice.progress, 0, decades)
@@ -361,7 +368,8 @@ def choose():
     The first solve is by multigrid. The other preconditioner is tried in the second, then ``AGED`` solves after the last trial,
     or if its last solve gained more for its cost than this one. A trial that costs twice as much as the solve before is cut off
     and has failed. The better one stays. The coarse matrices are outdated if a solve takes 3/2 times as many iterations as the
-    first with them.
+    first with them. After a negative curvature in every copy they are outdated too, because the matrix will differ, and the
+    preconditioner stays. ``most`` becomes 0 before a solve with diagonal blocks that is no trial, see :func:`limit_iterations`.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -375,6 +383,12 @@ def choose():
         used = choice.used[0]
         other = 1 - used
         count = solves.iteration[0]
+        if choice.progress[0] <= wp.float64(0.0) and count < solves.most[0]:
+            if used == 1:
+                choice.outdated[0] = 1
+            elif choice.trial[0] == 0:
+                solves.most[0] = 0
+            return
         cost = count + 1
         if used == 1:
             cost = wp.static(CYCLE) * (count + wp.static(SPARED))
@@ -404,8 +418,39 @@ def choose():
                     choice.outdated[0] = 1
                     limit = limit / wp.static(CYCLE) + 1
                 solves.most[0] = wp.min(most, limit)
+        if choice.used[0] == 0 and choice.trial[0] == 0:
+            solves.most[0] = 0
 
     return choose_next
+
+
+@cache
+def limit_iterations():
+    """Kernel over copies: a solve with diagonal blocks has at most the iterations of ``PATIENCE`` times the cost of multigrid.
+
+    That cost follows from the rate of the last one and from the tolerance of each copy. ``most`` is 0 before. Trials have their
+    own limit.
+    """
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def limit_each(
+        # parameters
+        wanted: wp.array(dtype=wp.int32),
+        iterations: int,
+        # in and out
+        solves: Solves,
+        choice: PreconditionerChoice,
+    ):
+        copy = wp.tid()
+        if wanted[copy] == 0 or choice.trial[0] == 1:
+            return
+        most = wp.float64(iterations)
+        if choice.rates[1] > wp.float64(0.0):
+            decades = wp.max(-wp.log10(solves.tolerance[copy]), wp.float64(1.0))
+            most = wp.min(most, wp.ceil(wp.float64(PATIENCE) * decades / choice.rates[1]))
+        wp.atomic_max(solves.most, 0, int(most))
+
+    return limit_each
 
 
 @cache

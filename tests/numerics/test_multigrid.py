@@ -154,20 +154,25 @@ def keep(multigrid, used):
     multigrid.used.fill_(int(used))
 
 
-def iterations(n, stiffness, device, used):
-    """Of conjugate gradients to 1e-3, for the weight, at the start of ``hanging``."""
+def weighed(n, stiffness, device, used):
+    """Conjugate gradients after a solve to 1e-3 for the weight, at the start of ``hanging``; ``used`` prepares them."""
     declared = scene("hanging", n=n, stiffness=stiffness)
     bent = declared.mesh.points + np.outer(np.sin(np.pi * declared.mesh.points[:, 0]), [0.0, 0.1, 0.0])
     model = replace(declared, positions=bent).build(device=device, dtype="float64")
     hessian = Hessian(model, HessianPolicy.CLAMP)
     hessian.assemble(model.positions, 240.0**2)
     solver = ConjugateGradients(hessian, 10_000, Multigrid(hessian, 10_000))
-    keep(solver.multigrid, used)
+    used(solver)
     solver.tolerance.fill_(1e-3)
     b, x = model.vectors(), model.vectors()
     b.assign(model.mass.numpy()[:, None] * [0.0, -9.81, 0.0] * (model.inverse_mass.numpy() > 0.0)[:, None])
     solver.solve(b, x, wp.ones(1, dtype=wp.int32, device=device))
-    return int(solver.iteration.numpy()[0])
+    return solver
+
+
+def iterations(n, stiffness, device, used):
+    """Of such a solve by multigrid if ``used``, or else with diagonal blocks."""
+    return int(weighed(n, stiffness, device, lambda solver: keep(solver.multigrid, used)).iteration.numpy()[0])
 
 
 @pytest.mark.parametrize("stiffness, most", [(1e3, 40), (1e5, 120)])
@@ -232,9 +237,13 @@ def test_trials_cost_little(device, blocks, cycles):
     solver = ConjugateGradients(hessian, 10_000, Multigrid(hessian, 10_000))
     solves, choose, used = solver._solves, solver.multigrid.choose, solver.multigrid.used
     solves.first.fill_(1.0)
+    solves.tolerance.fill_(1e-3)
+    wanted = wp.ones(1, dtype=wp.int32, device=device)
     total, count = 0, 300
     for _ in range(count):
         multigrid = bool(used.numpy()[0])
+        if not multigrid:
+            solver.multigrid.limit(solves, wanted)
         needed = cycles if multigrid else blocks
         taken = min(needed, int(solves.most.numpy()[0]))
         solves.iteration.fill_(taken)
@@ -243,3 +252,34 @@ def test_trials_cost_little(device, blocks, cycles):
         choose(solves)
     best = min(blocks + 1, CYCLE * (cycles + SPARED))
     assert total <= 1.1 * count * best
+
+
+def test_diagonal_blocks_stop_where_multigrid_costs_less(device):
+    """Three decades cost multigrid 30 iterations with diagonal blocks; these may take half as many more, and lose."""
+
+    def use(solver):
+        solver._solves.most.zero_()
+        solver.multigrid.used.zero_()
+        solver.multigrid._choice.rates.assign([1.0, 0.1])
+
+    assert iterations(16, 1e5, device, False) > 60
+    solver = weighed(16, 1e5, device, use)
+    assert int(solver.iteration.numpy()[0]) == 45
+    assert int(solver.multigrid.used.numpy()[0]) == 1
+
+
+def test_a_negative_curvature_changes_no_choice(device):
+    """A solve that it ends early has no rate; the coarse matrices are computed again for the matrix that follows."""
+    hessian, rates = compressed(device, copies=1), [1e-3, 1e-3]
+    model = hessian.model
+    hessian.assemble(model.positions, 7e5)
+    solver = ConjugateGradients(hessian, 1000, Multigrid(hessian, 1000))
+    choice = solver.multigrid._choice
+    solver.tolerance.fill_(1e-6)
+    b, x = (model.array(np.random.default_rng(k).normal(size=(model.count, 3)), model.vec3) for k in range(2))
+    for used in (1, 0):
+        choice.used.fill_(used)
+        choice.rates.assign(rates)
+        solver.solve(b, x, wp.ones(1, dtype=wp.int32, device=device))
+        assert solver.negative.numpy()[0] == 1 and choice.used.numpy()[0] == used
+        assert (choice.rates.numpy() == rates).all() and choice.outdated.numpy()[0] == 1

@@ -2,6 +2,7 @@
 
 import importlib.util
 import time
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -71,7 +72,7 @@ class ConjugateGradients:
         if self.multigrid is None:
             self._prepare_diagonal()
         else:
-            wp.capture_if(self.multigrid.used, self.multigrid.update, self._prepare_diagonal)
+            wp.capture_if(self.multigrid.used, self.multigrid.update, partial(self._prepare_limited, wanted))
         given = [self.preconditioner, b, wanted, self.matrix.per_copy, self._lanes]
         out = [x, self.r, self.z, self.p, self._parts, self._solves]
         self._launch(linear.start_iteration, self._dim, given, out)
@@ -89,6 +90,10 @@ class ConjugateGradients:
 
     def _prepare_diagonal(self):
         self.matrix.invert_diagonal(self.preconditioner)
+
+    def _prepare_limited(self, wanted):
+        self._prepare_diagonal()
+        self.multigrid.limit(self._solves, wanted)
 
     def _refine_first(self, wanted):
         self._refine(wanted)

@@ -177,7 +177,7 @@ class Multigrid:
         self._launch = model.launcher(
             (of_matrix + products + (kernels.restrict, kernels.prolong), model.dtype),
             ((multiply,), model.dtype),
-            ((kernels.measure_progress, kernels.choose),),
+            ((kernels.measure_progress, kernels.choose, kernels.limit_iterations),),
         )
         self._launch_finest = self._launch
         if self._further is not None:
@@ -197,6 +197,10 @@ class Multigrid:
         """Launches the choice whether the next solve uses multigrid, see :func:`warpcloth.kernels.multigrid.choose`."""
         self._launch(kernels.measure_progress, self.model.copies, [solves], [self._choice])
         self._launch(kernels.choose, 1, [self._iterations], [solves, self._choice])
+
+    def limit(self, solves, wanted):
+        """Launches the limit of iterations of a solve with diagonal blocks, see `limit_iterations` of the kernels."""
+        self._launch(kernels.limit_iterations, self.model.copies, [wanted, self._iterations], [solves, self._choice])
 
     def refine(self, r, z, active):
         """Launches the rest of a cycle: from z = S r to z ≈ A⁻¹ r, in the copies that are ``active`` (B,)."""
