@@ -76,11 +76,18 @@ def _times(A, b):
 class _History:
     """The dot products of the last m steps: sᵢ·yⱼ for j no older than i, and zᵢ·yⱼ = yᵢᵀA⁻¹yⱼ for all.
 
+    Every PLAIN iterations there is a plain step. With accelerated steps alone, Anderson acceleration and L-BFGS of a few steps
+    often settle into slow convergence, from which a plain step frees them: in a step of ``hanging`` of 32 × 32 vertices and
+    1/240 s, Anderson acceleration takes 1378 iterations to a residual of 1e-5 without plain steps, 356 with them (float64,
+    medians of 7 states; 345 with one every 12). Pratapa, Suryanarayana and Pask (2016) mix both for linear systems.
+
     Args:
         copies: B.
         window: m.
         epsilon: Relative rounding of the products.
     """
+
+    PLAIN = 24
 
     def __init__(self, copies, window, epsilon):
         self.window, self.epsilon = window, epsilon
@@ -99,6 +106,8 @@ class _History:
         newest = iteration % m
         self.sy[:, :, newest] = products[:, 2]
         self.zy[:, :, newest] = self.zy[:, newest] = products[:, 3]
+        if iteration % self.PLAIN == 0:
+            return proposal
         slots = [(newest - age) % m for age in range(min(iteration, m))]
         with np.errstate(all="ignore"):  # a copy may be NaN or infinite
             a, b = self._coefficients(slots, products[:, 0, slots], products[:, 1, slots])
