@@ -12,6 +12,7 @@ from ..core.capture import Mirror, on_host
 from ..core.sums import Lanes
 from ..kernels import linear
 from ..kernels.elementwise import scale
+from .constant_multigrid import CopyCycles
 
 # Largest number of unknowns for which all eigenvalues are computed.
 SMALL = 100
@@ -379,10 +380,13 @@ class CopyFactors:
 
     Attributes:
         seconds: Time of the factorisations [s].
+        error: See :class:`warpcloth.numerics.constant_multigrid.CopyCycles`, here 0.
 
     Raises:
         ValueError: A matrix is not finite or not positive definite.
     """
+
+    error = 0.0
 
     def __init__(self, model, matrices):
         self.per_copy, found = model.per_copy, {}
@@ -408,13 +412,19 @@ class CopyFactors:
         return self._parts[array.ptr]
 
 
-class AxisFactors:
-    """Solves A x = b as :class:`CopyFactors` with locked coordinates: for each axis, over the vertices free along it.
+class AxisSolves:
+    """Solves A x = b with locked coordinates: for each axis, over the vertices free along it.
 
-    Arguments and attributes are those of :class:`CopyFactors`.
+    Args:
+        model, matrices: See :class:`CopyFactors`.
+        solver: Class that solves without locks, :class:`CopyFactors` or
+            :class:`warpcloth.numerics.constant_multigrid.CopyCycles`.
+
+    Attributes:
+        seconds, error: The sum and the largest of those of its solvers.
     """
 
-    def __init__(self, model, matrices):
+    def __init__(self, model, matrices, solver):
         from scipy.sparse import diags
 
         self.model, self._found, self._take = model, model.vectors(), model.kernel(linear.take_axes, model.dtype)
@@ -422,9 +432,10 @@ class AxisFactors:
         self._parts = []
         for column in np.unique(free, axis=1).T:
             kept, rest = diags(column), diags(1.0 - column)
-            factors = CopyFactors(model, [(kept @ matrix @ kept + rest).tocsc() for matrix in matrices])
+            factors = solver(model, [(kept @ matrix @ kept + rest).tocsc() for matrix in matrices])
             self._parts.append((factors, wp.vec3i(*(free == column[:, None]).all(axis=0).astype(int).tolist())))
         self.seconds = sum(factors.seconds for factors, _ in self._parts)
+        self.error = np.max([factors.error for factors, _ in self._parts], axis=0)
 
     def solve(self, b, x):
         """Solves for x = A⁻¹ b of free coordinates, both (N,) vectors, from the host; x = b for the others."""
@@ -433,9 +444,14 @@ class AxisFactors:
             self.model.launch(self._take, self.model.count, [self._found, taken], [x])
 
 
-def factorise_copies(model, matrices):
-    """Factorises a constant scalar matrix of each copy, as :class:`CopyFactors`, or with locks as :class:`AxisFactors`."""
-    return (CopyFactors if model.mobility is None else AxisFactors)(model, matrices)
+def solve_copies(model, matrices):
+    """Returns what solves A x = b for each copy with a constant scalar matrix: factors on the CPU, cycles of multigrid on CUDA.
+
+    Factors are solved on one copy after another. On an H100 that takes 4 to 35 times as long as cycles with one copy of 8² to
+    256² vertices, on a core of a CPU 0.15 to 0.3 times as long.
+    """
+    solver = CopyCycles if model.device.is_cuda else CopyFactors
+    return solver(model, matrices) if model.mobility is None else AxisSolves(model, matrices, solver)
 
 
 class DiagonalScaling:
@@ -446,7 +462,7 @@ class DiagonalScaling:
         diagonal: D of each copy, (B, n), above 0.
     """
 
-    seconds = 0.0  # there is nothing to factorise
+    seconds, error = 0.0, 0.0  # there is nothing to factorise
 
     def __init__(self, model, diagonal):
         self.model, self._inverse = model, model.array(1.0 / diagonal.ravel(), model.dtype)

@@ -19,7 +19,7 @@ from ..model.model import Model
 from ..numerics.contact_system import PairSystem
 from ..numerics.inertia import Inertia
 from ..numerics.iterate import GravityScale
-from ..numerics.linear import factorise_copies
+from ..numerics.linear import solve_copies
 from ..numerics.local_weights import best_weights, curvatures
 from ..terms.needs import ELEMENTS, FINITE
 from ..terms.refresh import EVALUATION, Moment
@@ -165,7 +165,7 @@ class ADMMStepper(ImplicitStepper):
             elements if elements.term.whole.quadratic else elements.weighed(curvatures(model, elements))
             for elements in self._whole
         ]
-        self._factors = factorise_copies(model, constant_matrices(model.with_terms(weighed + whole), self._inertia.s))
+        self._factors = solve_copies(model, constant_matrices(model.with_terms(weighed + whole), self._inertia.s))
         self._gradient = Gradient(model, corrected=True, terms=self._whole) if self._whole else None
         self.factorise_seconds = self._factors.seconds
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
