@@ -8,6 +8,7 @@ from functools import cache
 
 import warp as wp
 
+from .reduce import block_sums
 from .vectors import types
 
 
@@ -65,9 +66,13 @@ def note_change(dtype):
 
 
 @cache
-def partial_products(dtype):
-    """Kernel over (copies, chunks, 4m): out = sⱼ·∇φ, zⱼ·∇φ, sⱼ·y and zⱼ·y for j < m, with the y of the current slot."""
+def partial_products(dtype, block: int):
+    """Kernel over (copies, 4m, lanes): the parts of sⱼ·∇φ, zⱼ·∇φ, sⱼ·y and zⱼ·y for j < m, with the y of the current slot.
+
+    See :func:`.reduce.block_sums`.
+    """
     vec3, _ = types(dtype)
+    store, _add_up = block_sums(block)
 
     @wp.kernel(module="unique", enable_backward=False)
     def multiply(
@@ -79,10 +84,11 @@ def partial_products(dtype):
         # parameters
         slot: wp.array(dtype=wp.int32),
         per_copy: int,
+        lanes: int,
         # out
-        out: wp.array3d(dtype=wp.float64),
+        parts: wp.array3d(dtype=wp.float64),
     ):
-        copy, chunk, row = wp.tid()
+        copy, row, lane = wp.tid()
         m = s.shape[0]
         j, kind = row % m, row // m
         a = s[j]
@@ -92,31 +98,31 @@ def partial_products(dtype):
         if kind >= 2:
             b = y[slot[0]]
         total = wp.float64(0.0)
-        for i in range(copy * per_copy + chunk, (copy + 1) * per_copy, out.shape[1]):
+        for i in range(copy * per_copy + lane, (copy + 1) * per_copy, lanes):
             total += wp.float64(wp.dot(a[i], b[i]))
-        out[copy, chunk, row] = total
+        store(lane, total, parts[row], copy)
 
     return multiply
 
 
 @cache
-def finish_products():
-    """Kernel over (copies, 4m): out = the sum over chunks."""
+def finish_products(block: int):
+    """Kernel over (copies, 4m, lanes of one block): out = the sum of the parts."""
+    _store, add_up = block_sums(block)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def add_chunks(
+    def add_parts(
         # state in
-        partial: wp.array3d(dtype=wp.float64),
+        parts: wp.array3d(dtype=wp.float64),
         # out
         out: wp.array2d(dtype=wp.float64),
     ):
-        copy, row = wp.tid()
-        total = wp.float64(0.0)
-        for chunk in range(partial.shape[1]):
-            total += partial[copy, chunk, row]
-        out[copy, row] = total
+        copy, row, lane = wp.tid()
+        total = add_up(lane, parts[row], copy)
+        if lane == 0:
+            out[copy, row] = total
 
-    return add_chunks
+    return add_parts
 
 
 @cache

@@ -1,8 +1,7 @@
 """Sums and maxima per copy, in double precision and in a fixed order, so that results are bitwise reproducible.
 
-Two launches: (copies, chunks) threads sum every chunks-th entry of their copy, then one thread per copy adds the chunks. Or
-lanes: a kernel over (copies, lanes), whose blocks store parts of sums, and the next kernel that adds these up, see
-:func:`block_sums`.
+Two launches: one over (copies, lanes), whose blocks store parts of sums, and the next, which adds these up, see
+:func:`block_sums`. On the CPU a copy has one lane.
 """
 
 from functools import cache
@@ -24,168 +23,6 @@ def stands_aside(active: wp.array(dtype=wp.int32), copy: int):
 def larger(most: wp.float64, value: wp.float64):
     """The larger of two numbers; NaN if either is NaN."""
     return wp.where(most == most and not (value <= most), value, most)
-
-
-@cache
-def partial_sum():
-    """Kernel over (copies, chunks): out[copy, chunk] = Σ values."""
-
-    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
-    def sum_chunks(
-        # state in
-        values: wp.array(dtype=wp.float64),
-        # parameters
-        per_copy: int,
-        # out
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        copy, chunk = wp.tid()
-        total = wp.float64(0.0)
-        for i in range(chunk, per_copy, out.shape[1]):
-            total += values[copy * per_copy + i]
-        out[copy, chunk] = total
-
-    return sum_chunks
-
-
-@cache
-def partial_dot(dtype, numbers: bool = False):
-    """Kernel over (copies, chunks): out[copy, chunk] = Σ a·b of vectors or ``numbers``, in active copies."""
-    value = dtype if numbers else types(dtype)[0]
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def dot_chunks(
-        # state in
-        a: wp.array(dtype=value),
-        b: wp.array(dtype=value),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        # out
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        copy, chunk = wp.tid()
-        if stands_aside(active, copy):
-            return
-        total = wp.float64(0.0)
-        for j in range(chunk, per_copy, out.shape[1]):
-            i = copy * per_copy + j
-            if wp.static(numbers):
-                total += wp.float64(a[i]) * wp.float64(b[i])
-            else:
-                total += wp.float64(wp.dot(a[i], b[i]))
-        out[copy, chunk] = total
-
-    return dot_chunks
-
-
-@cache
-def finish_sum():
-    """Kernel over copies: out[copy] = Σ partial[copy], or += if ``accumulate`` is 1."""
-
-    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
-    def add_chunks(
-        # state in
-        partial: wp.array2d(dtype=wp.float64),
-        # parameters
-        accumulate: int,
-        # in and out
-        out: wp.array(dtype=wp.float64),
-    ):
-        copy = wp.tid()
-        total = wp.float64(0.0)
-        if accumulate == 1:  # not by a factor, for 0·NaN is NaN
-            total = out[copy]
-        for chunk in range(partial.shape[1]):
-            total += partial[copy, chunk]
-        out[copy] = total
-
-    return add_chunks
-
-
-@cache
-def partial_largest(dtype):
-    """Kernel over (copies, chunks): out[copy, chunk] = max wᵢ‖aᵢ‖ over vertices; NaN if one is NaN."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def largest_of_chunks(
-        # elements
-        weights: wp.array(dtype=dtype),
-        # state in
-        a: wp.array(dtype=vec3),
-        # parameters
-        per_copy: int,
-        # out
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        copy, chunk = wp.tid()
-        most = wp.float64(0.0)
-        for j in range(chunk, per_copy, out.shape[1]):
-            i = copy * per_copy + j
-            most = larger(most, wp.float64(weights[i]) * wp.float64(wp.length(a[i])))
-        out[copy, chunk] = most
-
-    return largest_of_chunks
-
-
-@cache
-def partial_largest_number():
-    """Kernel over (copies, chunks): out[copy, chunk] = max of nonnegative numbers; NaN if one is NaN."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def largest_number_of_chunks(
-        # state in
-        values: wp.array(dtype=wp.float64),
-        # parameters
-        per_copy: int,
-        # out
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        copy, chunk = wp.tid()
-        most = wp.float64(0.0)
-        for i in range(chunk, per_copy, out.shape[1]):
-            most = larger(most, values[copy * per_copy + i])
-        out[copy, chunk] = most
-
-    return largest_number_of_chunks
-
-
-@cache
-def finish_largest():
-    """Kernel over copies: out[copy] = max partial[copy]; NaN if one is NaN."""
-
-    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
-    def largest_chunk(
-        # state in
-        partial: wp.array2d(dtype=wp.float64),
-        # out
-        out: wp.array(dtype=wp.float64),
-    ):
-        copy = wp.tid()
-        most = wp.float64(0.0)
-        for chunk in range(partial.shape[1]):
-            most = larger(most, partial[copy, chunk])
-        out[copy] = most
-
-    return largest_chunk
-
-
-@cache
-def keep_largest():
-    """Kernel over copies: out[copy] = max(out[copy], value[copy]) of nonnegative numbers; NaN if either is NaN."""
-
-    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
-    def keep(
-        # state in
-        values: wp.array(dtype=wp.float64),
-        # in and out
-        out: wp.array(dtype=wp.float64),
-    ):
-        copy = wp.tid()
-        out[copy] = larger(out[copy], values[copy])
-
-    return keep
 
 
 @cache
@@ -252,3 +89,172 @@ def block_largest(block: int):
         return most
 
     return store, find
+
+
+@cache
+def partial_sum(block: int):
+    """Kernel over (copies, lanes): the parts of Σ values."""
+    store, _add_up = block_sums(block)
+
+    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
+    def sum_parts(
+        # state in
+        values: wp.array(dtype=wp.float64),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # out
+        parts: wp.array2d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        total = wp.float64(0.0)
+        for i in range(lane, per_copy, lanes):
+            total += values[copy * per_copy + i]
+        store(lane, total, parts, copy)
+
+    return sum_parts
+
+
+@cache
+def partial_dot(dtype, numbers: bool, block: int):
+    """Kernel over (copies, lanes): the parts of Σ a·b of vectors or ``numbers``, 0 in copies that are not active."""
+    value = dtype if numbers else types(dtype)[0]
+    store, _add_up = block_sums(block)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def dot_parts(
+        # state in
+        a: wp.array(dtype=value),
+        b: wp.array(dtype=value),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        per_copy: int,
+        lanes: int,
+        # out
+        parts: wp.array2d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        total = wp.float64(0.0)
+        if not stands_aside(active, copy):
+            for j in range(lane, per_copy, lanes):
+                i = copy * per_copy + j
+                if wp.static(numbers):
+                    total += wp.float64(a[i]) * wp.float64(b[i])
+                else:
+                    total += wp.float64(wp.dot(a[i], b[i]))
+        store(lane, total, parts, copy)
+
+    return dot_parts
+
+
+@cache
+def finish_sum(block: int):
+    """Kernel over (copies, lanes of one block): out[copy] = the sum of the parts, or += if ``accumulate`` is 1."""
+    _store, add_up = block_sums(block)
+
+    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
+    def add_parts(
+        # state in
+        parts: wp.array2d(dtype=wp.float64),
+        # parameters
+        accumulate: int,
+        # in and out
+        out: wp.array(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        total = add_up(lane, parts, copy)
+        if lane == 0:
+            if accumulate == 1:  # not by a factor, for 0·NaN is NaN
+                total = out[copy] + total
+            out[copy] = total
+
+    return add_parts
+
+
+@cache
+def partial_largest(dtype, block: int):
+    """Kernel over (copies, lanes): the parts of max wᵢ‖aᵢ‖ over vertices; NaN if one is NaN."""
+    vec3, _ = types(dtype)
+    store, _find = block_largest(block)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def largest_parts(
+        # elements
+        weights: wp.array(dtype=dtype),
+        # state in
+        a: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # out
+        parts: wp.array2d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        most = wp.float64(0.0)
+        for j in range(lane, per_copy, lanes):
+            i = copy * per_copy + j
+            most = larger(most, wp.float64(weights[i]) * wp.float64(wp.length(a[i])))
+        store(lane, most, parts, copy)
+
+    return largest_parts
+
+
+@cache
+def partial_largest_number(block: int):
+    """Kernel over (copies, lanes): the parts of the maximum of nonnegative numbers; NaN if one is NaN."""
+    store, _find = block_largest(block)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def largest_number_parts(
+        # state in
+        values: wp.array(dtype=wp.float64),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # out
+        parts: wp.array2d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        most = wp.float64(0.0)
+        for i in range(lane, per_copy, lanes):
+            most = larger(most, values[copy * per_copy + i])
+        store(lane, most, parts, copy)
+
+    return largest_number_parts
+
+
+@cache
+def finish_largest(block: int):
+    """Kernel over (copies, lanes of one block): out[copy] = the largest of the parts; NaN if one is NaN."""
+    _store, find = block_largest(block)
+
+    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
+    def largest_part(
+        # state in
+        parts: wp.array2d(dtype=wp.float64),
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        most = find(lane, parts, copy)
+        if lane == 0:
+            out[copy] = most
+
+    return largest_part
+
+
+@cache
+def keep_largest():
+    """Kernel over copies: out[copy] = max(out[copy], value[copy]) of nonnegative numbers; NaN if either is NaN."""
+
+    @wp.kernel(module="warpcloth.reduce", enable_backward=False)
+    def keep(
+        # state in
+        values: wp.array(dtype=wp.float64),
+        # in and out
+        out: wp.array(dtype=wp.float64),
+    ):
+        copy = wp.tid()
+        out[copy] = larger(out[copy], values[copy])
+
+    return keep

@@ -16,6 +16,8 @@ import warpcloth as wc
 from support.energies import DECLARED, energy_and_gradient
 from support.rows import slow_but
 from warpcloth.base.kernel_cache import HEADERS
+from warpcloth.core import sums as of_copies
+from warpcloth.core.capture import Mirror
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import RowSums, Sums
 from warpcloth.model.elements import incidences_of
@@ -628,19 +630,27 @@ def test_a_sum_replaces_what_an_overflow_left(device):
     assert out.numpy()[0] == 4.0 * model.count
 
 
-@pytest.mark.parametrize("chunks", [1, 5, 256])
+def test_an_update_writes_what_changed(device):
+    """The first one always, for the host does not know the array."""
+    mirror, written = Mirror(wp.full(2, 3, dtype=wp.int32, device=device)), []
+    write, mirror.write = mirror.write, lambda values: (written.append(list(values)), write(values))
+    for values in ([3, 3], [3, 3], [1, 3]):
+        mirror.update(np.array(values))
+        assert (mirror.array.numpy() == values).all()
+    assert written == [[3, 3], [1, 3]]
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_sums_of_any_number_of_chunks(chunks, dtype, device):
-    """One on the CPU, many on a GPU: sums, products and maxima of each copy, but for copies that are left out."""
+def test_sums_and_maxima(dtype, device, monkeypatch):
+    """Sums, products and maxima of each copy, but for copies that are left out; on CUDA with more entries than lanes."""
+    monkeypatch.setattr(of_copies, "MOST_BLOCKS", 2)
     model = scene().build(device=device, dtype=dtype, copies=COPIES)
-    random, n, rows = np.random.default_rng(5), model.per_copy, 37
+    random, n, rows = np.random.default_rng(5), model.per_copy, 1100
     a, b = (random.normal(size=(COPIES, n, 3)).astype(dtype) for _ in range(2))
     c, d = (random.normal(size=(COPIES, rows)).astype(dtype) for _ in range(2))
     weights, values = random.uniform(size=(COPIES, n)).astype(dtype), random.uniform(size=(COPIES, n))
     active = wp.array([1, 0, 1], dtype=wp.int32, device=device)
     of_vertices, of_rows = Sums(model), RowSums(model, rows)
-    for sums in (of_vertices, of_rows):
-        sums.partial = wp.zeros((COPIES, chunks), dtype=wp.float64, device=device)
 
     def array(values, kind):
         return wp.array(values.reshape(-1, 3) if kind is model.vec3 else values.ravel(), dtype=kind, device=device)

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from warpcloth.core.constant_matrix import constant_matrices
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
 from warpcloth.core.status import Result, digits
+from warpcloth.core.sums import Lanes
 from warpcloth.kernels import accelerate
 from warpcloth.numerics import linear
 from warpcloth.numerics.acceleration import LBFGS, Anderson, Chebyshev
@@ -284,18 +286,20 @@ def test_residual_of_admm_hides_nothing(weight, device):
     assert expected <= 2.0 * stepper.residual[0]
 
 
-@pytest.mark.parametrize("chunks", [1, 5])
-def test_products_of_past_corrections_are_sums_over_chunks(chunks, device):
-    """sⱼ·∇φ, zⱼ·∇φ, and sⱼ·y and zⱼ·y with the y of a slot, of each copy: one chunk on the CPU, many on a GPU."""
-    random, copies, n, m, slot = np.random.default_rng(6), 2, 13, 3, 1
+@pytest.mark.parametrize("n", [13, 600])
+def test_products_of_past_corrections(n, device):
+    """sⱼ·∇φ, zⱼ·∇φ, and sⱼ·y and zⱼ·y with the y of a slot, of each copy: one lane on the CPU, blocks of them on a GPU."""
+    random, copies, m, slot = np.random.default_rng(6), 2, 3, 1
+    lanes = Lanes(SimpleNamespace(device=wp.get_device(device), copies=copies), n)
     s, y, z = random.normal(size=(3, m, copies * n, 3))
     gradient = random.normal(size=(copies * n, 3))
     histories = (wp.array(each, dtype=wp.vec3d, device=device) for each in (s, y, z))
-    given = [wp.array(gradient, dtype=wp.vec3d, device=device), *histories, wp.array([slot], dtype=wp.int32, device=device), n]
-    partial = wp.zeros((copies, chunks, 4 * m), dtype=wp.float64, device=device)
-    out = wp.zeros((copies, 4 * m), dtype=wp.float64, device=device)
-    wp.launch(accelerate.partial_products(wp.float64), partial.shape, given, [partial], device=device)
-    wp.launch(accelerate.finish_products(), out.shape, [partial], [out], device=device)
+    slots = wp.array([slot], dtype=wp.int32, device=device)
+    given = [wp.array(gradient, dtype=wp.vec3d, device=device), *histories, slots, n, lanes.count]
+    parts, out = lanes.parts(4 * m), wp.zeros((copies, 4 * m), dtype=wp.float64, device=device)
+    products, finish = accelerate.partial_products(wp.float64, lanes.block), accelerate.finish_products(lanes.block)
+    wp.launch(products, (copies, 4 * m, lanes.count), given, [parts], device=device)
+    wp.launch(finish, (copies, 4 * m, lanes.of_block[1]), [parts], [out], device=device)
     pairs = [(a, b) for b in (gradient, y[slot]) for a in (s, z)]
     exact = [(a * b).reshape(m, copies, -1).sum(axis=2) for a, b in pairs]
     np.testing.assert_allclose(out.numpy(), np.vstack(exact).T, atol=3 * n * 8 * np.finfo(float).eps)

@@ -1,5 +1,6 @@
 """Graph capture, on the CPU and on CUDA: a segment of launches is captured once and replayed."""
 
+import numpy as np
 import warp as wp
 
 from ..base.collector import uncollected
@@ -29,6 +30,7 @@ class Mirror:
         self.array = array
         self.host = array if array.device.is_cpu else wp.empty_like(array, device="cpu", pinned=True)
         self._values = self.host.numpy()
+        self._written = False
 
     def read(self):
         """Returns the values as a NumPy array, valid until the next call or launch.
@@ -49,10 +51,15 @@ class Mirror:
             RuntimeError: A graph is being captured on the device.
         """
         on_host(self.array.device, "writing an array")
-        self._values[...] = values
+        self._values[...], self._written = values, True
         if self.host is not self.array:
             wp.copy(self.array, self.host)
             wp.synchronize_stream(self.array.device)  # before the next write changes the host array
+
+    def update(self, values):
+        """Sets the values as :meth:`write`, or does nothing if they were the last that it wrote. No launch may change them."""
+        if not (self._written and np.array_equal(self._values, values)):
+            self.write(values)
 
 
 class Segment:

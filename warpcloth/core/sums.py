@@ -1,12 +1,10 @@
-"""Sums and maxima of each copy, in two launches: over chunks, then over the results of the chunks; and by lanes."""
+"""Sums and maxima of each copy, in two launches: parts of blocks of lanes, then the sum or the largest of the parts."""
 
 import warp as wp
 
 from ..base.turns import in_turn
 from ..kernels import reduce
 
-# Chunks per copy on a GPU, enough to occupy it. The CPU has one.
-CHUNKS = 256
 # Threads of a block that share a sum, and the most blocks of a copy, on a GPU; on the CPU one thread takes a copy.
 BLOCKS, MOST_BLOCKS = {"cuda": 256, "cpu": 0}, 1024
 
@@ -15,7 +13,7 @@ class Lanes:
     """How threads share the sums of a kernel over (copies, lanes), see :func:`warpcloth.kernels.reduce.block_sums`.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
+        model: The :class:`warpcloth.model.model.Model`, or another object with ``device`` and ``copies``.
         per_copy: Number of summands of a copy.
 
     Attributes:
@@ -43,33 +41,39 @@ class Sums:
     @in_turn
     def __init__(self, model, per_copy=None):
         self.model, self.per_copy = model, model.per_copy if per_copy is None else per_copy
-        chunks = CHUNKS if model.device.is_cuda else 1
-        self.partial = wp.zeros((model.copies, chunks), dtype=wp.float64, device=model.device)
-        self._finish, self._finish_largest = model.kernel(reduce.finish_sum), model.kernel(reduce.finish_largest)
-        self._sum, self._dot = model.kernel(reduce.partial_sum), model.kernel(reduce.partial_dot, model.dtype, self.numbers)
+        self._lanes = lanes = Lanes(model, self.per_copy)
+        self._parts, block = lanes.parts(), lanes.block
+        self._finish, self._finish_largest = (model.kernel(make, block) for make in (reduce.finish_sum, reduce.finish_largest))
+        self._sum, self._dot = (
+            model.kernel(reduce.partial_sum, block),
+            model.kernel(reduce.partial_dot, model.dtype, self.numbers, block),
+        )
         largest = (reduce.partial_largest_number,) if self.numbers else (reduce.partial_largest, model.dtype)
-        self._largest = model.kernel(*largest)
+        self._largest = model.kernel(*largest, block)
 
     def dot(self, a, b, out, active=None):
-        """Launches out (B,) = Σ a·b of each copy; undefined for copies that are not ``active`` (B,), if that is given."""
-        self.model.launch(self._dot, self.partial.shape, [a, b, active, self.per_copy], [self.partial])
-        self._add_chunks(0, out)
+        """Launches out (B,) = Σ a·b of each copy, 0 for copies that are not ``active`` (B,), if that is given."""
+        self._launch_parts(self._dot, [a, b, active], self.per_copy)
+        self._add_parts(0, out)
 
     def sum(self, values, per_copy, out, accumulate=0):
         """Launches out (B,) = Σ of the ``per_copy`` values of each copy, or out += that if ``accumulate`` is 1."""
-        self.model.launch(self._sum, self.partial.shape, [values, per_copy], [self.partial])
-        self._add_chunks(accumulate, out)
+        self._launch_parts(self._sum, [values], per_copy)
+        self._add_parts(accumulate, out)
 
     def largest(self, weights, a, out):
         """Launches out (B,) = max wᵢ‖aᵢ‖ over the vertices of each copy."""
         self._find_largest([weights, a], out)
 
-    def _add_chunks(self, accumulate, out):
-        self.model.launch(self._finish, self.model.copies, [self.partial, accumulate], [out])
+    def _launch_parts(self, kernel, given, per_copy):
+        self.model.launch(kernel, self._lanes.dim, [*given, per_copy, self._lanes.count], [self._parts])
+
+    def _add_parts(self, accumulate, out):
+        self.model.launch(self._finish, self._lanes.of_block, [self._parts, accumulate], [out])
 
     def _find_largest(self, given, out):
-        self.model.launch(self._largest, self.partial.shape, [*given, self.per_copy], [self.partial])
-        self.model.launch(self._finish_largest, self.model.copies, [self.partial], [out])
+        self._launch_parts(self._largest, given, self.per_copy)
+        self.model.launch(self._finish_largest, self._lanes.of_block, [self._parts], [out])
 
 
 class RowSums(Sums):

@@ -3,6 +3,7 @@
 import importlib.util
 import warnings
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Literal
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..base.types import Precision
 from ..core.capture import Mirror, Segment
-from ..core.sums import CHUNKS
+from ..core.sums import Lanes
 from ..kernels import arap_cells as cells
 from ..kernels import reduce
 from ..kernels.vectors import types
@@ -311,7 +312,8 @@ class Arap:
         order = np.argsort(elements.min(axis=1), kind="stable")  # so that neighbours are read one after another
         elements, weights = wp.array(elements[order], dtype=index, device=self.device), self._array(weights[order], kind)
         energies = self._zeros(len(elements), wp.float64)
-        partial = self._zeros((1, CHUNKS if self.device.is_cuda else 1), wp.float64)
+        lanes = Lanes(SimpleNamespace(device=self.device, copies=1), len(elements))
+        block, of_lanes, of_block, parts = lanes.block, lanes.dim, lanes.of_block, lanes.parts()
         placed = self._array(rest[self._order], vec3)
         # Local variables, because a graph that refers to self would keep the factors alive until the garbage collector runs.
         device, scalar, x, rotations = self.device, self._scalar, self._x.array, self._rotations.array
@@ -323,8 +325,8 @@ class Arap:
         def fit_cells():
             launch(cells.fit_rotations(scalar), n, [*rows, x], rotations)
             launch(kernel(scalar), len(elements), [elements, weights, placed, rotations, x], energies)
-            launch(reduce.partial_sum(), partial.shape, [energies, len(elements)], partial)
-            launch(reduce.finish_sum(), 1, [partial, 0], total)
+            launch(reduce.partial_sum(block), of_lanes, [energies, len(elements), of_lanes[1]], parts)
+            launch(reduce.finish_sum(block), of_block, [parts, 0], total)
             if len(b):
                 launch(cells.gather_moments(scalar), len(b), [*columns, rotations, start], b)
 

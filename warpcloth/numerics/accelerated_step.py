@@ -5,7 +5,7 @@ import warp as wp
 
 from ..core.capture import Mirror, Segment
 from ..core.energy import Energy
-from ..core.sums import CHUNKS
+from ..core.sums import Lanes
 from ..kernels import accelerate as kernels
 
 
@@ -26,19 +26,27 @@ class AcceleratedStep:
         self.s, self.y, self.z = (wp.zeros((m, model.count), dtype=model.vec3, device=device) for _ in range(3))
         self.plain, self.accelerated, self.last_gradient, self.last_w, self.unused = (model.vectors() for _ in range(5))
         self.slot = wp.zeros(1, dtype=wp.int32, device=device)
-        self.partial = wp.zeros((B, CHUNKS if device.is_cuda else 1, 4 * m), dtype=wp.float64, device=device)
-        self.products = Mirror(wp.zeros((B, 4 * m), dtype=wp.float64, device=device))
+        lanes = Lanes(model, model.per_copy)
+        self._lanes, self._parts = lanes, lanes.parts(4 * m)
+        # The two energies and the products of each copy, which the host reads at once.
+        self._found = Mirror(wp.zeros(B * (2 + 4 * m), dtype=wp.float64, device=device))
+        found = self._found.array
+        self._plain_energy, self._energy, self._products = found[:B], found[B : 2 * B], found[2 * B :].reshape((B, 4 * m))
         self.coefficients = Mirror(wp.zeros((B, 1 + 2 * m), dtype=wp.float64, device=device))
-        self.plain_energy, self.energy = (Mirror(model.scalars()) for _ in range(2))
         self._lowest = model.scalars() if falls else None
         self._stayed = Mirror(model.scalars(wp.int32)) if falls else None
         self._part = Mirror(wp.zeros((B, 1 + 2 * m), dtype=wp.float64, device=device)) if shortens else None
         # Relative rise of φ that counts as rounding, as in a line search.
         self._noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
         self.energy_of = Energy(model, stepper.sums, corrected=True)
-        of_vertices = kernels.note_change, kernels.partial_products, kernels.combine, kernels.accept
-        of_copies = kernels.finish_products, kernels.next_slot, *([kernels.note_lowest] if falls else [])
-        self._launch = model.launcher((of_vertices, model.dtype), (of_copies,))
+        of_vertices = kernels.note_change, kernels.combine, kernels.accept
+        of_copies = kernels.next_slot, *([kernels.note_lowest] if falls else [])
+        self._launch = model.launcher(
+            (of_vertices, model.dtype),
+            (of_copies,),
+            ((kernels.partial_products,), model.dtype, lanes.block),
+            ((kernels.finish_products,), lanes.block),
+        )
         self._note = Segment(device, self._launch_note)
 
     def start(self):
@@ -50,9 +58,9 @@ class AcceleratedStep:
     def propose(self, active):
         """Sets the coefficients of the accelerated step of the ``active`` copies (B,)."""
         self._note()
-        accepted = self.energy.read() <= self.plain_energy.read() if self._iteration else np.ones(len(active), dtype=bool)
-        products = self.products.read().reshape(len(active), 4, -1)
-        proposed = self.method.propose(self._iteration, products, accepted)
+        found, B = self._found.read(), len(active)
+        accepted = found[B : 2 * B] <= found[:B] if self._iteration else np.ones(B, dtype=bool)
+        proposed = self.method.propose(self._iteration, found[2 * B :].reshape(B, 4, -1), accepted)
         if self._part is not None:
             self._step = np.where(self.stayed(), 0.5 * self._step, np.minimum(2.0 * self._step, 1.0))
             proposed = self._step[:, None] * proposed
@@ -74,12 +82,13 @@ class AcceleratedStep:
             self._launch_energy(self.stepper.correction, self._lowest)
 
     def _launch_note(self):
-        stepper, model = self.stepper, self.stepper.model
+        stepper, model, lanes = self.stepper, self.stepper.model, self._lanes
         given = [stepper.gradient, stepper.w, self.slot]
         self._launch(kernels.note_change, model.count, given, [self.last_gradient, self.last_w, self.y, self.z])
-        given = [stepper.gradient, self.s, self.y, self.z, self.slot, model.per_copy]
-        self._launch(kernels.partial_products, self.partial.shape, given, [self.partial])
-        self._launch(kernels.finish_products, self.products.array.shape, [self.partial], [self.products.array])
+        given = [stepper.gradient, self.s, self.y, self.z, self.slot, model.per_copy, lanes.count]
+        B, rows = self._products.shape
+        self._launch(kernels.partial_products, (B, rows, lanes.count), given, [self._parts])
+        self._launch(kernels.finish_products, (B, rows, lanes.of_block[1]), [self._parts], [self._products])
 
     def launch_move(self):
         """Launches d = the better of the plain and the accelerated step."""
@@ -91,10 +100,10 @@ class AcceleratedStep:
             self._launch(kernels.combine, N, [d, stepper.w, self.s, self.z, self._part.array, n], [self.plain])
         given = [d, stepper.w, self.s, self.z, self.coefficients.array, n]
         self._launch(kernels.combine, N, given, [self.accelerated])
-        self._launch_energy(self.plain, self.plain_energy.array)
-        self._launch_energy(self.accelerated, self.energy.array)
+        self._launch_energy(self.plain, self._plain_energy)
+        self._launch_energy(self.accelerated, self._energy)
         self._launch(kernels.next_slot, 1, [self.method.window], [self.slot])
-        energies = [self.plain_energy.array, self.energy.array]
+        energies = [self._plain_energy, self._energy]
         if self._lowest is not None:
             self._launch(kernels.note_lowest, model.copies, [*energies, self._noise], [self._lowest, self._stayed.array])
         given = [self.plain, self.accelerated, *energies, self._stayed and self._stayed.array, self.slot, n]

@@ -70,7 +70,10 @@ def _dot(a, b):
 
 def _times(A, b):
     """Returns A b of each copy, from (B, m, m) and (B, m), as :func:`_dot`."""
-    return np.stack([_dot(row, b) for row in A.transpose(1, 0, 2)], axis=1)
+    total = np.zeros(A.shape[:2])
+    for j in range(A.shape[2]):
+        total = total + A[:, :, j] * b[:, j, None]
+    return total
 
 
 class _History:

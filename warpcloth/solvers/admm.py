@@ -214,7 +214,7 @@ class ADMMStepper(ImplicitStepper):
 
     def iterate(self, active):
         self._iterating = active.copy()
-        self._active.write(active)
+        self._active.update(active)
         self._factors.solve(self._force, self._w)
         if self._pressed is not None:
             self._pressed.correct(self.correction, self._force, self._w, active)

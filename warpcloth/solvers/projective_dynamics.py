@@ -184,7 +184,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         return self._acceleration.read() / self._scale, {}
 
     def iterate(self, active):
-        self._active.write(active)
+        self._active.update(active)
         self._linear.solve(self.gradient, self.w)
         if self._contact:
             if self._accelerated:
