@@ -532,6 +532,7 @@ def test_command(tmp_path, monkeypatch, capsys):
         (["chain", "--diagram", "physics", "--frames", "3"], "--solvers and --frames are for the others"),
         (["hanging", "--diagram", "physics"], "the diagram physics is of cantilever"),
         (["hanging", "--diagram", "spectrum", "--dtype", "float32"], "--solvers and --dtype are for the others"),
+        (["hanging", "--with", "newton", "--diagram", "solver"], "--with is for the diagram time, not for solver"),
         (["hanging", "-o", "chart.gif"], "ending is '.gif'"),
         (["hanging", "--csv", "none/chart.csv"], "does not exist"),
         (["hanged"], "there is no scene 'hanged'"),

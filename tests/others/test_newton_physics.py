@@ -1,15 +1,23 @@
 """Scenes in Newton, the physics engine: arrays, motion against the same method here, refusals, and stiffness by samples."""
 
-from dataclasses import replace
+import csv
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import warp as wp
 
 import warpcloth as wc
+from warpcloth.chart.pareto import plot_time
+from warpcloth.lab import trajectory
+from warpcloth.lab.campaign import Store
+from warpcloth.lab.choosing import choose
+from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.work_precision import time_diagram, write_csv
 from warpcloth.others.newton_calibration import calibrate
 from warpcloth.others.newton_model import METHODS, TAKES, newton_model, refuse_inexpressible
-from warpcloth.others.newton_runs import NewtonPhysics, run_newton
+from warpcloth.others.newton_runs import SIMULATORS, NewtonPhysics, run_newton
 
 newton = pytest.importorskip("newton", reason="Newton is not installed: pip install -e '.[newton]'")
 
@@ -152,3 +160,32 @@ def test_samples_are_as_stiff_there(method):
     found = calibrate(method)
     assert (found.membrane is None) == (wc.NeoHookeanMembrane not in TAKES[method] and method != "style3d")
     assert [each for each in found if each is not None] == pytest.approx([1.0] * (2 + (found.membrane is not None)), abs=0.01)
+
+
+def test_charts_and_choices_have_its_solvers(tmp_path, monkeypatch):
+    """With one of the four, whose steps are those of Explicit, and so its errors, but for the angles of hinges."""
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setitem(SIMULATORS, "newton", ("newton-semi-implicit",))
+    scene, given = SceneRef("hanging", {"n": 4, "bending": 0.0}), {"frames": 6, "others": ["newton"], "solvers": ["explicit"]}
+    with ThreadPoolExecutor(1) as executor:
+        given |= {"executor": executor, "store": Store()}
+        found = time_diagram(scene, limit=30.0, **given)
+        choice, measured, _exact = choose(scene, tolerance=0.01, **given)
+    rows = {(row["solver"], row["options"]["substeps"]): row for row in found["rows"] if row["status"] == "ok"}
+    ours = {substeps: row for (solver, substeps), row in rows.items() if solver == "explicit"}
+    others = {substeps: row for (solver, substeps), row in rows.items() if solver == "newton-semi-implicit"}
+    assert len(ours) == 3 and len(others) == 4 and set(ours) < set(others)
+    for substeps, row in ours.items():
+        assert others[substeps]["error"] == pytest.approx(row["error"], rel=0.05) and "own_error" not in row
+    own = found["others"]["newton-semi-implicit"]
+    assert own["apart"] < 1e-3 and all(abs(row["own_error"] - row["error"]) <= own["apart"] for row in others.values())
+    assert found["machine"]["newton"] == newton.__version__
+    plot_time(tmp_path / "chart.png", found)
+    write_csv(tmp_path / "chart.csv", found)
+    with (tmp_path / "chart.csv").open() as file:
+        assert {(row["newton"], row["own_error"] != "") for row in csv.DictReader(file) if row["solver"] != "explicit"} == {
+            (newton.__version__, True)
+        }
+    assert choice.meets and {each.setup.solver for each in measured} == {"explicit", "newton-semi-implicit"}
+    refused = trajectory.measure(asdict(scene), asdict(Setup("newton-vbd", {"substeps": 1})), frames=1, dtype="float64")
+    assert refused["status"] == "refused" and "Newton has float32 only" in refused["reason"]

@@ -1,11 +1,11 @@
-"""The version of this package."""
+"""Versions of packages."""
 
 
-def installed_version():
-    """Returns the installed version, or None if the package is not installed."""
+def installed_version(package="warpcloth"):
+    """Returns the installed version of a package, or None if it is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        return version("warpcloth")
+        return version(package)
     except PackageNotFoundError:
         return None

@@ -4,6 +4,7 @@ import textwrap
 
 from ..lab.machine import in_words
 from ..lab.work_precision import WITHIN, cheapest, front, quartiles, without_point
+from ..others.newton_runs import OTHERS
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
 from ..solvers import SOLVERS
 
@@ -22,7 +23,8 @@ def plot_time(path, found):
 
     Two panels show the error of positions and the 99th percentile of the error of strains. In each panel the settings that no
     other beats by more than the spread of times are joined and numbered, with their names beside the panel. Settings without an
-    error are named with the reason. The error of the reference solution is a line; points below it mean nothing.
+    error are named with the reason. The error of the reference solution is a line; points below it mean nothing. For solvers of
+    other simulators, hollow markers show the error relative to the motion to which the solver itself converges.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -51,7 +53,10 @@ def plot_time(path, found):
     ends = {axes: [] for axes in panels}
     for (solver, integrator), line in lines.items():
         line.sort(key=lambda row: row["ms_per_second"])
-        colour, marker = SOLVERS[solver].facts.style
+        colour, marker = OTHERS[solver].style if solver in OTHERS else SOLVERS[solver].facts.style
+        own = [(row["ms_per_second"], row["own_error"]) for row in line if row.get("own_error") is not None]
+        if own:
+            panels[0].plot(*zip(*own, strict=True), marker, color=colour, markersize=5, linestyle=":", markerfacecolor="none")
         for axes, name in zip(panels, _ERRORS, strict=True):
             x, y = ([row[of] for row in line] for of in ("ms_per_second", name))
             axes.plot(x, y, color=colour, linewidth=0.7, alpha=0.6)
@@ -65,6 +70,9 @@ def plot_time(path, found):
             point, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": _TEXT}
             axes.annotate(str(best.index(i) + 1), point, (-4, -4), textcoords="offset points", **below)
         axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="quartiles of the times")
+        if found.get("others"):
+            label = "from the solver's own converged motion"
+            axes.plot([], [], "o", color=GREY, markersize=5, markerfacecolor="none", label=label)
         _floor(axes, reference[name], "error of the reference")
         axes.set(xlabel="ms for a second of motion", ylabel=text)
     title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}"
@@ -218,5 +226,5 @@ def _finish(figure, axes, notes, title, texts, found):
     notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=_SMALL, borderaxespad=0.0)
     top = 1.0 - 0.19 * (len(known) + 1) / figure.get_size_inches()[1]
     notes.text(0.0, top, "\n".join(texts), fontsize=_SMALL, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
-    title = f"{title}, on {in_words(found['machine'])}"
+    title = f"{title}, on {in_words(found['machine'], bool(found.get('others')))}"
     figure.suptitle(title, fontsize=_TEXT + 1.0, color=GREY, parse_math=False)

@@ -9,7 +9,7 @@ from ..base.texts import assignments, fraction, json_text
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
-from .options import HelpFormatter, add_import, add_scene, solvers, values_of
+from .options import HelpFormatter, add_import, add_scene, add_with, solvers, values_of
 from .setup import named_scene
 from .terminal import DTYPES, add_dask, check_outputs, measuring
 
@@ -97,6 +97,7 @@ def _add_work_precision(charts):
     sub.add_argument(
         "--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure only these solvers (default: all)"
     )
+    add_with(sub)
     sub.add_argument(
         "--frames",
         type=int,
@@ -260,7 +261,9 @@ def work_precision(arguments):
     device = find_device(arguments.device)
     _source, values, _scene = named_scene(arguments)
     given = {name: values[name] for name in assignments(arguments.p)}
-    chosen = values_of(arguments, "solvers", "frames", "dtype")
+    if arguments.others and arguments.diagram != "time":
+        raise ValueError(f"--with is for the diagram time, not for {arguments.diagram}")
+    chosen = values_of(arguments, "solvers", "frames", "dtype", "others")
     options = {name: value for name, value in chosen.items() if value is not None}
     if arguments.diagram == "physics" and (set(options) & {"solvers", "frames"}):
         raise ValueError("the diagram physics is of equilibria; --solvers and --frames are for the others")
@@ -325,11 +328,18 @@ def _time_lines(found):
 
     exact, rows = found["reference"], found["rows"]
     lines = [f"  reference     known to {100.0 * exact['error']:.2g} %, {exact['substeps']} steps a frame"]
+    for name, own in found.get("others", {}).items():
+        said = "doublings of its substeps do not converge within the time limit"
+        if own is not None:
+            known = f"own motion known to {100.0 * own['error']:.2g} %, {own['substeps']} steps a frame"
+            said = f"{known}, {100.0 * own['apart']:.2g} % from the reference"
+        lines.append(f"  {'converged':<13} {name}: {said}")
     best = sorted((row for row in rows if row.get("front")), key=lambda row: row["ms_per_second"])
     for head, chosen in (("nothing beats", best), (f"within {100.0 * WITHIN:g} %", cheapest(rows, exact["error"]))):
         for row in chosen:
             error, strain = 100.0 * row["error"], 100.0 * row["strain_error"]
             numbers = f"{row['ms_per_second']:.3g} ms a second, {error:.2g} %, strain {strain:.2g} %"
+            numbers += f", {100.0 * row['own_error']:.2g} % from its own" if row.get("own_error") is not None else ""
             lines.append(f"  {head:<13} {numbers}: {row['label']}")
     return lines
 

@@ -5,7 +5,7 @@ import sys
 
 from ..base.quiet import find_device
 from ..base.texts import assignments, fraction, json_text, milliseconds
-from .options import add_scene, values_of
+from .options import add_scene, add_with, values_of
 from .setup import named_scene
 from .terminal import Interrupted, Settings, add_dask, executing
 
@@ -32,6 +32,7 @@ def add_arguments(parser):
     )
     add("--budget", metavar="TIME", help="longest time per frame allowed, such as 16ms; needed unless --tolerance is given")
     add("--solvers", nargs="+", metavar="SOLVER", help="solvers to choose among (default: all)")
+    add_with(parser)
     add("--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)")
     add("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
     add_dask(parser)
@@ -41,8 +42,10 @@ def choose(arguments):
     device = find_device(arguments.device)
     choice, found, exact, values = choice_for(arguments, device)
     from ..lab.choosing import as_json
+    from ..solvers import SOLVERS
 
-    command = None if choice.chosen is None else command_line(arguments, values, choice.chosen.setup)
+    known = choice.chosen is not None and choice.chosen.setup.solver in SOLVERS  # run has no solvers of other simulators
+    command = None if not known else command_line(arguments, values, choice.chosen.setup)
     facts = {"scene": arguments.scene, "parameters": values, **as_json(choice, found, exact), "command": command}
     advise = shlex.join(["warpcloth", "info", *_scene(arguments, values), "--advise"])
     print(json_text(facts) if arguments.json else _text(facts, choice, found, exact, advise))
@@ -67,6 +70,7 @@ def choice_for(arguments, device):
                 device=str(device),
                 progress=progress,
                 **values_of(arguments, "solvers", "frames", "dtype", "limit"),
+                others=getattr(arguments, "others", None) or (),
                 **executor,
             )
     except KeyboardInterrupt:

@@ -137,6 +137,18 @@ def add_solver(parser, text):
     parser.add_argument("--solver", choices=names, metavar="SOLVER", help=f"{text}: one of {', '.join(names)}")
 
 
+def add_with(parser):
+    """Adds the option that names other simulators."""
+    parser.add_argument(
+        "--with",
+        dest="others",
+        nargs="+",
+        metavar="SIMULATOR",
+        choices=("newton",),
+        help="measure solvers of other simulators too: newton, the physics engine, which the extra newton installs",
+    )
+
+
 def add_scene(parser, **more):
     """Adds the scene and its parameters."""
     text = "a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage"

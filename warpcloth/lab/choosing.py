@@ -130,7 +130,9 @@ def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=Non
     return pick(found, tolerance, budget, floor), found
 
 
-def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device="cpu", dtype="float32", limit=60.0, **run):
+def choose(
+    scene, tolerance=None, budget=None, solvers=None, frames=None, device="cpu", dtype="float32", limit=60.0, others=(), **run
+):
     """Measures setups of a scene until the choice is clear, on this machine or, with an executor, on its workers.
 
     Args:
@@ -142,6 +144,7 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
         device: A Warp device, also for the reference.
         dtype: Precision of the runs, "float32" or "float64".
         limit: Time limit of each run [s].
+        others: Simulators whose solvers are measured too, such as ``["newton"]``.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; by default with the
             store in the cache folder.
 
@@ -149,13 +152,14 @@ def choose(scene, tolerance=None, budget=None, solvers=None, frames=None, device
         tuple: :class:`Choice`, the list of :class:`Measured`, and the :class:`warpcloth.lab.reference.Reference`.
 
     Raises:
-        ValueError: As for :func:`pick`, or there is no solver of a name.
+        ImportError: A simulator is not installed.
+        ValueError: As for :func:`pick`, or there is no solver or simulator of a name.
     """
     pick([], tolerance, budget)  # checks the arguments before anything is measured
     # One at a time, because parallel runs would slow one another.
     run = {"workers": 1} | run
     run = run if "store" in run else {"store": kept_store("trajectories", run.get("executor")), **run}
-    rungs = ladders(setups_of_runs(scene, solvers, device, dtype))
+    rungs = ladders(setups_of_runs(scene, solvers, device, dtype, others))
     exact = reference(scene, frames, device=device, **({} if tolerance is None else {"tolerance": tolerance / FINER}))
 
     def measure(setups):
@@ -178,9 +182,9 @@ def ladders(setups):
     """
     found = {}
     for setup in setups:
-        others = {name: value for name, value in setup.options.items() if name not in ("substeps", "error")}
+        fixed = {name: value for name, value in setup.options.items() if name not in ("substeps", "error")}
         step = "error" if "error" in setup.options else "substeps"
-        found.setdefault((step, json.dumps([setup.solver, others], sort_keys=True)), []).append(setup)
+        found.setdefault((step, json.dumps([setup.solver, fixed], sort_keys=True)), []).append(setup)
     for (step, _), ladder in found.items():
         factor = 0.25 if step == "error" else 2
         ladder.sort(key=lambda setup, step=step: setup.options[step], reverse=step == "error")
@@ -194,7 +198,8 @@ def measured(setup, result, machine):
     """Returns the :class:`Measured` of a result of :func:`warpcloth.lab.trajectory.measure` and the name of its machine."""
     spread = None if result["spread"] is None else tuple(result["spread"])
     # Only a limited solver may accept a finer step after it refused one.
-    final = result["status"] == "slow" or (result["status"] == "refused" and not SOLVERS[setup.solver].limited)
+    limited = setup.solver in SOLVERS and SOLVERS[setup.solver].limited
+    final = result["status"] == "slow" or (result["status"] == "refused" and not limited)
     return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final, result["strain_error"])
 
 

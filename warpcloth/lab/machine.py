@@ -30,6 +30,7 @@ def machine(device="cpu"):
         "numpy": numpy.__version__,
         "scipy": scipy.__version__,
         "warp": wp.__version__,
+        "newton": installed_version("newton"),
         "warpcloth": installed_version() or "checkout",
         "source": source_digest(),
     }
@@ -42,10 +43,10 @@ def name(device="cpu"):
     return ", ".join([platform.node(), facts["processor"], *([] if facts["device"] == "cpu" else [facts["device"]])])
 
 
-def in_words(facts):
-    """Formats the device of :func:`machine` (for a CPU its name and cores) and the version of Warp for a title."""
+def in_words(facts, others=False):
+    """Formats the device of :func:`machine` (for a CPU its name and cores) and versions for a title; of ``others`` too."""
     device = facts["device"] if facts["device"] != "cpu" else f"{facts['processor']}, {facts['cores']} cores"
-    return f"{device}, Warp {facts['warp']}"
+    return f"{device}, Warp {facts['warp']}" + (f", Newton {facts['newton']}" if others else "")
 
 
 def processor():

@@ -10,6 +10,7 @@ from functools import cache
 from importlib import import_module
 
 from ..base.digest import source_digest
+from ..others.newton_runs import OTHERS, NewtonPhysics
 from ..run import scene_files
 from ..solvers import SOLVERS
 from . import machine
@@ -56,7 +57,7 @@ class Setup:
     """A solver with options, as data.
 
     Attributes:
-        solver: Its name on the command line, such as "projective-dynamics".
+        solver: Its name on the command line, such as "projective-dynamics", or in charts, such as "newton-vbd".
         options: Options of its record by name; others have their defaults.
     """
 
@@ -64,11 +65,13 @@ class Setup:
     options: dict = field(default_factory=dict)
 
     def record(self):
-        """Returns the record, such as ``wc.Newton(substeps=4)``.
+        """Returns the record, such as ``wc.Newton(substeps=4)``, or that of a solver of another simulator.
 
         Raises:
             ValueError: There is no such solver, or an option is not allowed.
         """
+        if self.solver in OTHERS:
+            return NewtonPhysics(OTHERS[self.solver].method, **self.options)
         if self.solver not in SOLVERS:
             raise ValueError(f"solver is {self.solver!r}; it must be one of {', '.join(SOLVERS)}")
         try:

@@ -147,7 +147,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None, de
     digest = scene_digest(declared)
     key = hashlib.sha256(json.dumps([digest, int(frames), source_digest()]).encode()).hexdigest()[:24]
     path = cache_folder() / "references" / f"{key}.npz"
-    found = _kept(path, key)
+    found = kept_reference(path, key)
     if found is None or (found.error > tolerance and found.limit < limit):
         path.parent.mkdir(parents=True, exist_ok=True)  # before minutes of runs
         facts = {"path": str(path), "key": key, "scene": digest, "times": np.arange(frames + 1) / declared.fps}
@@ -160,7 +160,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None, de
     return found
 
 
-def _kept(path, key):
+def kept_reference(path, key):
     """Returns the reference in a file, or None if there is none, or a broken one."""
     try:
         found = Reference.load(path)

@@ -3,7 +3,9 @@
 Each solver's record has its own, see :class:`warpcloth.solvers.facts.Facts`.
 """
 
-from ..solvers import SOLVERS
+from ..others.newton_model import engine
+from ..others.newton_runs import OTHERS, SIMULATORS
+from ..solvers import SOLVERS, Explicit
 from ..solvers.step import fewest_substeps
 from .measurements import Setup
 
@@ -21,20 +23,27 @@ def setups_of_steps(solvers=None):
     return [Setup(name, options) for name in names for options in SOLVERS[name].facts.one_step]
 
 
-def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32"):
+def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32", others=()):
     """Returns the :class:`Setup`\\s of runs of a :class:`SceneRef`, of all solvers or of those named, each once.
+
+    Those of ``others``, simulators of :data:`warpcloth.others.newton_runs.SIMULATORS`, come last.
 
     Steps do not depend on the frame rate of the scene, unless they would be longer than a frame. The substeps of a limited
     solver are multiples of its fewest stable substeps on a device.
 
     Raises:
-        ValueError: There is no solver of a name.
+        ImportError: A simulator is not installed.
+        ValueError: There is no solver or simulator of a name.
     """
     setups, fps = [], None
-    for name in _checked(solvers, list(SOLVERS)):
-        record = SOLVERS[name]
+    if others:
+        engine()
+    runs = {name: SOLVERS[name].facts.runs for name in _checked(solvers, list(SOLVERS))}
+    runs |= {name: OTHERS[name].runs for other in _checked(others, list(SIMULATORS)) for name in SIMULATORS[other]}
+    for name, each in runs.items():
+        record = SOLVERS.get(name, Explicit)
         fewest = _fewest(record, scene, device, dtype) if record.limited else None
-        for options in record.facts.runs:
+        for options in each:
             if "fewest" in options:
                 factor, options = options["fewest"], {key: value for key, value in options.items() if key != "fewest"}
                 substeps = round(factor * fewest)

@@ -6,13 +6,14 @@ import numpy as np
 
 from ..base.checks import number, whole
 from ..base.digest import scene_digest
+from ..others.newton_runs import NewtonPhysics, run_newton
 from ..run.simulate import simulate
 from .clock import Clock, TooSlow
 from .measurements import SceneRef, Setup, finite
 from .reference import Reference, position_error, strain_error
 
 
-def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="float32", limit=60.0, repeats=1):
+def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="float32", limit=60.0, repeats=1, own=None):
     """Runs a scene with a setup. Arguments and results are JSON values.
 
     Args:
@@ -24,12 +25,14 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         dtype: ``"float32"`` or ``"float64"``.
         limit: Time limit [s] of the frames of all runs, without compilation and factorisation, checked once per frame.
         repeats: Number of runs to time; fewer if the limit is reached after the first.
+        own: Path of the :class:`warpcloth.lab.reference.Reference` to which the solver itself converges, or None.
 
     Returns:
         dict: Unknown values are None.
 
         - ``status``: "ok", "diverged", "slow" or "refused"; ``reason``: a sentence, "" if ok.
         - ``error``: :func:`warpcloth.lab.reference.position_error` relative to the reference, of the frames after the start.
+        - ``own_error``: With ``own``, the same relative to that.
         - ``strain_error``: :func:`warpcloth.lab.reference.strain_error` of the same frames.
         - ``ms``: Median time of a frame, without the first of each run, which warms up [ms]. If there is one frame, a second
           is run.
@@ -58,7 +61,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         for _ in range(repeats):
             clock = Clock(left)
             try:
-                runs.append(simulate(declared, record, device=device, dtype=dtype, frames=least, progress=clock))
+                runs.append(_run(declared, record, dtype, device=device, frames=least, progress=clock))
             except TooSlow:
                 if not runs:
                     reason = f"{len(clock.frames)} of {least} frames took {sum(clock.frames):.3g} s, more than {limit:g} s"
@@ -84,7 +87,18 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         points, others = first.points[1 : frames + 1].astype(np.float64), exact.points[1 : frames + 1]
         for name, error in (("error", position_error), ("strain_error", strain_error)):
             found[name] = finite(error(points, others, declared.mesh))
+        if own is not None:
+            found["own_error"] = finite(position_error(points, Reference.load(own).points[1 : frames + 1], declared.mesh))
     return found
+
+
+def _run(scene, record, dtype, **given):
+    """Runs a scene with a solver of warpcloth, or with one of Newton, which has float32 only."""
+    if not isinstance(record, NewtonPhysics):
+        return simulate(scene, record, dtype=dtype, **given)
+    if dtype != "float32":
+        raise ValueError(f"dtype is {dtype!r}; Newton has float32 only")
+    return run_newton(scene, record, **given)
 
 
 def _checked_frames(frames, scene, exact):

@@ -9,11 +9,13 @@ import math
 
 from ..base.digest import scene_digest
 from ..base.outputs import write_table
+from ..others.newton_runs import OTHERS
 from . import convergence, physics, spectrum, trajectory
 from .campaign import collect
 from .machine import machine
 from .measurements import task
-from .reference import reference
+from .own_reference import own_reference
+from .reference import position_error, reference
 from .setups import label, setups_of_runs, setups_of_steps
 
 # Divisors of a scene's frames: the frames before the step of "solver" and "spectrum", and the frames of "time". Later motion is
@@ -25,11 +27,38 @@ WITHIN = 0.01  # error at which the cheapest setting of each solver is named
 # minimum time limit [s].
 _KNOWN, _TIMES, _SECONDS = 1e-4, 6.0, 120.0
 # Columns of a CSV for a setting; unknown values are empty.
-COLUMNS = ("solver", "label", "options", "status", "reason", "front", "error", "strain_error", "ms", "ms_low", "ms_high")
+COLUMNS = (
+    "solver",
+    "label",
+    "options",
+    "status",
+    "reason",
+    "front",
+    "error",
+    "strain_error",
+    "own_error",
+    "ms",
+    "ms_low",
+    "ms_high",
+)
 COLUMNS += ("h", "stiffness", "ms_per_second", "iterations", "gap", "predicted", "floor", "compile_s", "factorise_s")
 COLUMNS += ("residual", "frames", "message", "machine")
 # Columns that are equal for all settings.
-FACTS = ("scene", "dtype", "seed", "processor", "cores", "device", "system", "python", "numpy", "scipy", "warp", "warpcloth")
+FACTS = (
+    "scene",
+    "dtype",
+    "seed",
+    "processor",
+    "cores",
+    "device",
+    "system",
+    "python",
+    "numpy",
+    "scipy",
+    "warp",
+    "newton",
+    "warpcloth",
+)
 FACTS += ("source",)
 
 
@@ -67,8 +96,11 @@ def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float6
     return {**_facts("solver", scene, device, dtype), **facts, "rows": rows}
 
 
-def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32", limit=20.0, watch=None, **run):
+def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32", limit=20.0, watch=None, others=(), **run):
     """Measures the error of trajectories and their time, over steps and iterations, see :func:`trajectory.measure`.
+
+    The rows of solvers of other simulators also have ``own_error``, that relative to the motion to which the solver itself
+    converges, see :func:`warpcloth.lab.own_reference.own_reference`.
 
     Args:
         scene: A :class:`SceneRef`.
@@ -78,26 +110,37 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
         dtype: Precision of the runs; the reference solution has float64.
         limit: Time limit of each setting [s]; that of the reference solution is six times this, but at least 120 s.
         watch: Function called with the progress of the reference solution, see :func:`reference`, or None.
+        others: Simulators whose solvers are measured too, such as ``["newton"]``.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
 
     Returns:
-        dict: See the module; ``reference`` describes the reference solution.
+        dict: See the module; ``reference`` describes the reference solution. ``others`` has for each solver of another
+        simulator the substeps and the error of its own converged motion, and ``apart``, the distance of that from the
+        reference; or None if it has none.
 
     Raises:
+        ImportError: A simulator is not installed.
         ValueError: There is no solver of a name, or the scene has no reference solution.
     """
-    setups = setups_of_runs(scene, solvers, device, dtype)
+    setups = setups_of_runs(scene, solvers, device, dtype, others)
     frames = frames or max(scene.load().frames // _RUN, 1)
     longest = max(_TIMES * limit, _SECONDS)
     exact = reference(scene, frames=frames, tolerance=_KNOWN, limit=longest, progress=watch, device=device)
     if (exact.points == exact.points[0]).all():
         raise ValueError(f"nothing moves in {scene} within {frames} frames; a chart of errors needs motion")
     given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}
-    rows = _measured(trajectory.measure, scene, setups, given, run)
+    own = {}
+    for name in (name for name in OTHERS if any(setup.solver == name for setup in setups)):
+        same = [setup for setup in setups if setup.solver == name]
+        own[name] = own_reference(scene, same, frames, device, _KNOWN, max(_TIMES * limit, _SECONDS), watch)
+    more = [{"own": str(own[setup.solver].path)} if own.get(setup.solver) else {} for setup in setups]
+    rows = _measured(trajectory.measure, scene, setups, given, run, more)
     for i in front(rows, exact.error):
         rows[i]["front"] = True
     known = {name: getattr(exact, name) for name in ("error", "strain_error", "substeps", "seconds", "key")}
     facts = {"seed": None, "frames": frames, "reference": known}  # nothing is drawn at random
+    if own:
+        facts["others"] = {name: each and _own_facts(each, exact, scene.load().mesh) for name, each in own.items()}
     return {**_facts("time", scene, device, dtype), **facts, "rows": rows}
 
 
@@ -270,9 +313,16 @@ def _has_error(row):
     return row["status"] == "ok" and row["error"] is not None
 
 
-def _measured(function, scene, setups, given, run):
-    """Measures and returns a row for each setup, in order."""
-    tasks = [task(function, scene=scene, setup=setup, **given) for setup in setups]
+def _own_facts(own, exact, mesh):
+    frames = len(own.points) - 1
+    apart = position_error(own.points[1:], exact.points[1 : frames + 1], mesh)
+    return {"substeps": own.substeps, "error": own.error, "apart": apart, "seconds": own.seconds}
+
+
+def _measured(function, scene, setups, given, run, more=None):
+    """Measures and returns a row for each setup, in order; ``more`` has further arguments for each."""
+    more = more or [{}] * len(setups)
+    tasks = [task(function, scene=scene, setup=setup, **given, **each) for setup, each in zip(setups, more, strict=True)]
     return [
         {"solver": setup.solver, "options": setup.options, "label": label(setup), **result}
         for setup, result in zip(setups, _results(tasks, run), strict=True)

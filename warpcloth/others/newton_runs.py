@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -39,6 +40,36 @@ class NewtonPhysics:
         whole("iterations", self.iterations, 1)
         if self.method == "semi-implicit" and self.iterations != 1:
             raise ValueError(f"iterations is {self.iterations}; semi-implicit steps have none, so it must be 1")
+
+
+class Other(NamedTuple):
+    """A solver of another simulator, for charts.
+
+    Attributes:
+        method: One of :data:`warpcloth.others.newton_model.METHODS`.
+        runs: Options of settings that trade speed for accuracy, as in :class:`warpcloth.solvers.facts.Facts`; ``fewest`` is a
+            multiple of the fewest stable substeps of ``Explicit``.
+        style: Colour and marker.
+    """
+
+    method: str
+    runs: tuple
+    style: tuple
+
+
+def _grid(substeps, iterations):
+    return tuple({"substeps": s, "iterations": i} for i in iterations for s in substeps)
+
+
+# By their names in charts. The grids are those of substeps and iterations within which the fronts on hanging lie.
+OTHERS = {
+    "newton-semi-implicit": Other("semi-implicit", tuple({"fewest": f} for f in (1.0, 1.5, 2.0, 4.0)), ("olive", "s")),
+    "newton-xpbd": Other("xpbd", _grid((10, 20, 40, 80, 160), (1, 2, 4)), ("navy", "X")),
+    "newton-vbd": Other("vbd", _grid((2, 4, 8, 16, 32), (2, 5, 10)), ("darkgreen", "o")),
+    "newton-style3d": Other("style3d", _grid((1, 2, 4, 8, 16), (1, 3, 10)), ("indigo", "D")),
+}
+# By the simulator, as --with names it.
+SIMULATORS = {"newton": tuple(OTHERS)}
 
 
 @in_turn
