@@ -107,9 +107,12 @@ def test_an_elastic_catenary(stretching, sag, device):
 
 
 def test_load_steps_end_in_the_same_shape(device):
-    strip = scene("cantilever", gamma=10.0, elements=20, stretching=1e5)
-    shapes = [wc.equilibrium(strip, load_steps=steps, device=device).points for steps in (1, 3)]
-    assert np.abs(shapes[0] - shapes[1]).max() < 1e-6
+    """With one load step the strip starts from softer ones, in fewer than half of the iterations of stiff load steps."""
+    strip = scene("cantilever", gamma=10.0, elements=20)
+    soft, stiff = (wc.equilibrium(strip, load_steps=steps, device=device) for steps in (1, 3))
+    print(f"{soft.iterations} and {stiff.iterations} iterations")
+    assert np.abs(soft.points - stiff.points).max() < 1e-6
+    assert soft.iterations < stiff.iterations / 2
 
 
 def test_without_anything_that_holds_it_is_not_converged(device):

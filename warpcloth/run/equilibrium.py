@@ -18,13 +18,17 @@ from ..core.state import State
 from ..core.status import Residual, Result, Status, digits, sentence
 from ..kernels.terms.air import AIR
 from ..numerics.minimise import Minimiser
+from ..numerics.multigrid import LEAST
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
 from ..terms.refresh import STEP, Moment
 from .history import Evaluation, checked_record, collider_names, last_frame
+from .softened import softened, softening
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
+# Iterations after which stiff cloth starts from the rest shape of softer cloth; the tolerance of that, and its iterations.
+PATIENCE, ROUGHLY, MOST_SOFT = 10, 1e-3, 200
 # A descent that ended by rounding, and moved by less than this fraction of the size of the cloth, is not repeated.
 NEAR = 1e-5
 
@@ -66,7 +70,7 @@ def equilibrium(
     iterations: int = 1000,
     device: str = "cpu",
     dtype: Precision = "float64",
-    linear: Literal["factorised", "cg"] = "factorised",
+    linear: Literal["auto", "factorised", "cg"] = "auto",
     record: str | Sequence[str] = (),
     vary: Mapping[str, ArrayLike] | None = None,
     start: ArrayLike | None = None,
@@ -92,7 +96,9 @@ def equilibrium(
     mass moves in it until it rests. ``stable`` and ``lowest_eigenvalue`` are those under the final forces, held constant.
     Flutter needs mass, so a shape that rests here may flutter in a run.
 
-    The method is Newton's with a line search, without inertia; gravity is applied in equal load steps. If the Hessian is
+    The method is Newton's with a line search, without inertia; gravity is applied in equal load steps. Cloth that gravity
+    hardly stretches and that does not settle in 10 iterations starts from the rest shape of cloth that stretches more easily,
+    unless the scene has colliders, self-contact, loads, air or pins with keyframes, or ``start`` is given. If the Hessian is
     singular, for example because a flat cloth without bending stiffness cannot carry its weight, a term s/2‖x − x_now‖²_M is
     added, and s is lowered from there. This is a proximal point method, in which the energy never rises. Cloth that nothing
     holds has no equilibrium and is reported as not converged. If the final Hessian has a negative eigenvalue, the shape is in
@@ -109,7 +115,8 @@ def equilibrium(
         iterations: Maximum number of Newton iterations in total.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
-        linear: ``"factorised"``, which stiff and slender cloth needs, or ``"cg"``.
+        linear: ``"factorised"``; ``"cg"``, conjugate gradients with multigrid; or ``"auto"``, the first below 200 vertices and
+            else the second.
         record: ``"energies"``, ``"reactions"`` or both, to be included in the result.
         vary: Values in place of those of the scene, one each, as for one copy; see :class:`warpcloth.model.model.Model`.
         start: Positions from which it descends, (n, 3) [m], instead of those of the scene; the energy of gravity is
@@ -136,7 +143,7 @@ def equilibrium(
     number("tolerance", tolerance, above=0.0)
     whole("load_steps", load_steps, 1)
     whole("iterations", iterations, 1)
-    choice("linear", linear, ("factorised", "cg"))
+    choice("linear", linear, ("auto", "factorised", "cg"))
     record = checked_record(record)
     scene = _with_colliders_at_rest(scene)
     model = scene.build(device=device, dtype=dtype, vary=vary)
@@ -152,9 +159,13 @@ def equilibrium(
     if scene.self_contact is not None:
         pairs = SelfSteps(model, State(base, model.vectors(), 1), h=0.0, steps_per_frame=1, bounded=False, colliders=None)
         pairs.filter.iterates()
+    if linear == "auto":
+        linear = "cg" if model.per_copy >= LEAST else "factorised"
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
     wind = _Wind(model, base) if scene.air_terms else None
     descent = _Descent(minimiser, base, tolerance, iterations, wind)
+    if start is None and load_steps == 1 and _only_hangs(scene):
+        _start_softly(model, base, descent, linear)
     for part in range(1, load_steps + 1):
         result = _settle_on_meshes(model, base, descent, part / load_steps, contact)
     # Forces balance, but they do for a straight chain that stands on its pin too. A small perturbation tells them apart.
@@ -203,6 +214,31 @@ def equilibrium(
     return Equilibrium(np.array(base.numpy()), status, descent.used, lowest, result in SETTLED, *recorded)
 
 
+def _only_hangs(scene):
+    """Whether a scene has gravity and energies alone, so that its rest shape hardly depends on how the cloth came there."""
+    others = scene.colliders, scene.loads, scene.air_terms
+    return not any(others) and scene.self_contact is None and scene.pins.keyframes is None
+
+
+def _start_softly(model, base, descent, linear):
+    """Sets the positions to the rest shape of softer cloth, see :mod:`.softened`, unless few iterations suffice without.
+
+    Where softer cloth does not come to rest, the positions stay as they are.
+    """
+    factors = softening(model)
+    if not factors or descent.settle(0.0, 1.0, PATIENCE) in SETTLED:
+        return
+    before = wp.clone(base)
+    for factor in factors:
+        minimiser = Minimiser(softened(model, factor), base, "adaptive", linear, s=0.0)
+        stage = _Descent(minimiser, base, ROUGHLY, min(MOST_SOFT, descent.iterations - descent.used), None)
+        result = stage.run(1.0, _frequency_scale(model))
+        descent.used += stage.used
+        if result not in SETTLED:
+            wp.copy(base, before)
+            return
+
+
 def _with_colliders_at_rest(scene):
     """Returns the scene with static colliders at their last keyframes; raises ValueError if there is friction."""
     for collider in scene.colliders:
@@ -240,17 +276,17 @@ class _Descent:
     def run(self, load, s):
         """Settles without inertia, with proximal steps in between if it gets stuck; returns the last result."""
         while True:
-            result = self._settle(0.0, load, self.iterations)
+            result = self.settle(0.0, load, self.iterations)
             least, found = (np.inf, np.inf), (self.moved, self.unbalanced)
             # A long d has a large rounding, so start again from here; it is short then, unless moves cost no energy.
             while result is Result.ROUNDED and self.moved > NEAR and self.used < self.iterations and _halved(found, least):
                 least = tuple(map(min, found, least))
-                result = self._settle(0.0, load, self.iterations)
+                result = self.settle(0.0, load, self.iterations)
                 found = self.moved, self.unbalanced
             if result in SETTLED or result is Result.DIVERGED or self.used >= self.iterations:
                 return result
             for _ in range(8):
-                self._settle(s, load, 20)
+                self.settle(s, load, 20)
             s /= 16.0
             self.used += 1  # so that rounds without a direction end too
 
@@ -272,7 +308,8 @@ class _Descent:
         """The fraction of the load that is unbalanced after the last descent."""
         return self.unbalanced / self.load
 
-    def _settle(self, s, load, most):
+    def settle(self, s, load, most):
+        """Minimises once, with at most so many iterations; returns the result."""
         self.minimiser.set_objective(s, load)
         self._begin()
         if self.load == 0.0:

@@ -1,0 +1,47 @@
+"""Cloth that stretches more easily, whose rest shape is a start for that of stiff cloth.
+
+Newton's method turns a stiff sheet only a little in an iteration, because a straight move of a vertex on an arc stretches edges
+by the square of the angle. If the stiffness against stretch is lowered until gravity strains the cloth noticeably, it takes a
+few long steps. The rest shape of cloth 10 times as stiff is then near.
+"""
+
+import numpy as np
+
+from ..core.energy import Energy
+from ..core.sums import Sums
+
+# Strain under gravity that the softest cloth has about, and the factor from one stiffness to the next.
+STRAIN, FACTOR = 8e-3, 10.0
+# Relative expansion at which the stiffness of a cloth is measured.
+EXPANSION = 1e-2
+
+
+def softening(model):
+    """Returns the factors of the stiffness against stretch, the smallest first, all below 0.3; none for cloth that is soft.
+
+    The strain under gravity is estimated as WL/(2S), with the weight W, the diagonal L of the cloth and S = ∂²U/∂ε² for the
+    expansion of its rest shape by ε.
+    """
+    terms = [each for each in model.terms if _stretches(each)]
+    weight = float(np.linalg.norm(model.gravity.numpy()[0])) * float(model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum())
+    if not terms or weight == 0.0:
+        return []
+    stretched, points = model.with_terms(terms), model.rest_points
+    at, energy = model.vectors(), model.scalars()
+    at.assign((1.0 + EXPANSION) * points)
+    Energy(stretched, Sums(stretched)).add(at, energy)
+    stiffness = 2.0 * float(energy.numpy()[0]) / EXPANSION**2
+    softest = weight * float(np.linalg.norm(np.ptp(points, axis=0))) / (2.0 * STRAIN * stiffness) if stiffness > 0.0 else 1.0
+    count = int(np.ceil(np.log(0.3 / softest) / np.log(FACTOR))) if softest < 0.1 else 0
+    return [softest * FACTOR**k for k in range(count)]
+
+
+def softened(model, factor):
+    """Returns the model with ``factor`` times the stiffness of springs and membranes."""
+    return model.with_terms(each.weighed(factor) if _stretches(each) else each for each in model.terms)
+
+
+def _stretches(elements):
+    """Whether a term is that of springs or membranes, of which the local coordinate are the edges of an element."""
+    term = elements.term
+    return term.vertices in (2, 3) and term.rows == term.vertices - 1 and elements.refresh is None and elements.cells is None
