@@ -12,6 +12,8 @@ from ..core.sums import Sums
 
 # Strain under gravity that the softest cloth has about, and the factor from one stiffness to the next.
 STRAIN, FACTOR = 8e-3, 10.0
+# Cloth whose softest factor is above this wrinkles as it stiffens again, which may take more iterations than it saves.
+SOFT = 1e-3
 # Relative expansion at which the stiffness of a cloth is measured.
 EXPANSION = 1e-2
 
@@ -32,7 +34,7 @@ def softening(model):
     Energy(stretched, Sums(stretched)).add(at, energy)
     stiffness = 2.0 * float(energy.numpy()[0]) / EXPANSION**2
     softest = weight * float(np.linalg.norm(np.ptp(points, axis=0))) / (2.0 * STRAIN * stiffness) if stiffness > 0.0 else 1.0
-    count = int(np.ceil(np.log(0.3 / softest) / np.log(FACTOR))) if softest < 0.1 else 0
+    count = int(np.ceil(np.log(0.3 / softest) / np.log(FACTOR))) if softest < SOFT else 0
     return [softest * FACTOR**k for k in range(count)]
 
 
