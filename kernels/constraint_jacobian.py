@@ -7,11 +7,12 @@ from functools import cache
 
 import warp as wp
 
-from .constraint_rows import RowLayout, first_row, row_count, slope_type
+from .constraint_rows import RowLayout, covector_row, first_row, row_count, slope_type
 from .local import local_coordinate
+from .memory import add_to
 from .reduce import stands_aside
 from .term import Term
-from .transpose import LocalSource, gather, scatter
+from .transpose import LocalSource, gather, scatter, to_corner
 from .vectors import types
 
 
@@ -145,3 +146,106 @@ def rows_in_full(term: Term, dtype, scalar: bool, curved: bool):
                 out[e, Q * i + j] = row
 
     return expand
+
+
+@cache
+def product_of_corners(term: Term, dtype, scalar: bool, curved: bool):
+    """Device function (i, j, rest, slopes, penalties, s) → the block of corners i and j of JᵀDJ, D the ``penalties``.
+
+    J has the rows of one element, of which the first is s.
+    """
+    _, mat33 = types(dtype)
+    M, Q = wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
+    rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
+    weight, share_of, row_of = term.weight, to_corner(term, dtype), covector_row(term, dtype, scalar, curved)
+
+    @wp.func
+    def of_constraint(i: int, j: int, rest: rest_type, slopes: slope, penalties: wp.array(dtype=dtype), s: int):
+        block = mat33()
+        for q in range(Q):
+            row = row_of(slopes, q)
+            block += penalties[s + q] * wp.outer(share_of(rest, i, row), share_of(rest, j, row))
+        return block
+
+    @wp.func
+    def of_projection(i: int, j: int, rest: rest_type, slopes: slope, penalties: wp.array(dtype=dtype), s: int):
+        block = mat33()
+        wi, wj = weight(rest, i), weight(rest, j)
+        for m in range(M):
+            w = slopes * wi[m] * wj[m]
+            for a in range(3):
+                block[a, a] = block[a, a] + w * penalties[s + 3 * m + a]
+        return block
+
+    return of_constraint if scalar else of_projection
+
+
+@cache
+def product_blocks(term: Term, dtype, scalar: bool, curved: bool):
+    """Kernel over elements: out[e, K·i + j] = the block of corners i and j of JᵀDJ, see :func:`product_of_corners`."""
+    _, mat33 = types(dtype)
+    K, Q = wp.constant(term.vertices), wp.constant(row_count(term, scalar, curved))
+    rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
+    product = product_of_corners(term, dtype, scalar, curved)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def blocks_of_elements(
+        # elements
+        rest: wp.array(dtype=rest_type),
+        slopes: wp.array(dtype=slope),
+        # state in
+        penalties: wp.array(dtype=dtype),
+        # parameters
+        layout: RowLayout,
+        # out
+        out: wp.array2d(dtype=mat33),
+    ):
+        e = wp.tid()
+        s = first_row(e, layout, Q)
+        corners = out.shape[1] // K  # K, but not a constant: the compiler would take seconds to unroll the loops
+        for i in range(corners):
+            for j in range(corners):
+                out[e, K * i + j] = product(i, j, rest[e], slopes[e], penalties, s)
+
+    return blocks_of_elements
+
+
+@cache
+def scatter_products(term: Term, dtype, scalar: bool, curved: bool):
+    """Kernel over elements: adds block q = K·i + j of :func:`product_blocks` to values[slots[K²e + q]], if it is not below 0.
+
+    For the CPU, where one thread takes the elements in order: no addition is atomic. Block (j, i) is the transpose of (i, j).
+    """
+    _, mat33 = types(dtype)
+    K, Q = wp.constant(term.vertices), wp.constant(row_count(term, scalar, curved))
+    rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
+    product = product_of_corners(term, dtype, scalar, curved)
+    put, put_transposed = add_to(mat33), add_to(mat33, transposed=True)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def scatter_blocks(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        rest: wp.array(dtype=rest_type),
+        slopes: wp.array(dtype=slope),
+        slots: wp.array(dtype=wp.int32),
+        # state in
+        penalties: wp.array(dtype=dtype),
+        # parameters
+        layout: RowLayout,
+        # in and out
+        values: wp.array(dtype=mat33),
+    ):
+        e = wp.tid()
+        s, first = first_row(e, layout, Q), K * K * e
+        corners = stencil.shape[1]  # K, but not a constant: the compiler would take seconds to unroll the loops
+        for i in range(corners):
+            for j in range(i, corners):
+                at = slots[first + K * i + j]
+                if at >= 0:
+                    block = product(i, j, rest[e], slopes[e], penalties, s)
+                    put(values, at, block)
+                    if i < j:
+                        put_transposed(values, slots[first + K * j + i], block)
+
+    return scatter_blocks

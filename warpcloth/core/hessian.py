@@ -15,7 +15,7 @@ def _is_sparse(elements):
     return elements.cells is not None and elements.cells.weights is not None
 
 
-class _Elements:
+class ElementBlocks:
     """The Hessian blocks of the elements of one term, (B·E·K²,)."""
 
     factories = assemble.hessian_blocks, assemble.scatter_hessian
@@ -39,7 +39,7 @@ class _Elements:
         self.model.launch(kernel, self.count, [*self._given, *slots, x, correction, self._per_copy, policy], [out])
 
 
-class _Cells(_Elements):
+class _Cells(ElementBlocks):
     """The Hessian blocks of the cells of one term, cell by cell, see :mod:`warpcloth.kernels.sparse`."""
 
     factories = sparse.blocks, sparse.scatter_blocks
@@ -62,34 +62,34 @@ class _Cells(_Elements):
 
 
 def _of(model, elements):
-    return (_Cells if _is_sparse(elements) else _Elements)(model, elements)
+    return (_Cells if _is_sparse(elements) else ElementBlocks)(model, elements)
 
 
-class _Sum:
+class BlockSum:
     """Adds the blocks of a term to those of the matrix: scatters from elements on the CPU, gathers on CUDA, in a fixed order.
 
     Args:
-        of_term: The blocks, :class:`_Elements` or :class:`_Cells`.
+        of_term: The blocks, such as :class:`ElementBlocks`.
         sums: What the blocks of the matrix are the sums of, see :class:`warpcloth.core.block_pattern.BlockPattern`.
-        corrected: Whether positions are x + correction.
+        key: Arguments of the factories of ``of_term``.
     """
 
-    def __init__(self, of_term, sums, corrected):
+    def __init__(self, of_term, sums, *key):
         model = self.model = of_term.model
         self._of_term, self._sums, cuda = of_term, sums, model.device.is_cuda
         gather, scatter = of_term.factories
-        self._kernel = model.kernel(gather if cuda else scatter, of_term.term, model.dtype, corrected)
+        self._kernel = model.kernel(gather if cuda else scatter, *key)
         if cuda:
             self._blocks, self._add_blocks = of_term.array(), model.kernel(linear.add_blocks, model.dtype)
         else:
             self._slots, self._sums = slots_of(model, sums, of_term.blocks), None
 
-    def add(self, x, correction, policy, values):
-        """Launches values += ∂²U/∂x² of the term."""
+    def add(self, values, *state):
+        """Launches values += the blocks of the term, which depend on ``state``."""
         if self._sums is None:
-            self._of_term.launch(self._kernel, x, correction, policy, values, [self._slots])
+            self._of_term.launch(self._kernel, *state, values, [self._slots])
             return
-        self._of_term.launch(self._kernel, x, correction, policy, self._blocks)
+        self._of_term.launch(self._kernel, *state, self._blocks)
         self.model.launch(self._add_blocks, len(values), [*self._sums, self._blocks.flatten()], [values])
 
 
@@ -98,7 +98,61 @@ def _is_constant(elements):
     return elements.term.whole.linear and (elements.refresh is None or _is_sparse(elements))  # that of cells stores forces
 
 
-class Hessian:
+class BlockMatrix:
+    """A symmetric matrix of 3×3 blocks over the vertices of all copies, in block compressed rows (BSR).
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        found: Its :class:`warpcloth.core.block_pattern.BlockPattern`.
+        contact: Whether blocks may have condition numbers of 1e5 and more, as in contact.
+
+    Attributes:
+        offsets, columns: Block rows (N+1,) and the column of each block.
+        diagonal: Index of each diagonal block (N,).
+        values: The blocks.
+        count, per_copy: Vertices of all copies, and of one copy.
+        vector, block: Warp types of an unknown and of a block.
+    """
+
+    pairs = None
+
+    def __init__(self, model, found, contact):
+        self.model, self._ill_conditioned = model, contact
+        self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
+        self.offsets, self.columns, self.diagonal = found.offsets, found.columns, found.diagonal
+        self._rows = None if model.mobility is None else found.rows
+        self.values = wp.empty(len(found.columns), dtype=model.mat33, device=model.device)
+        self._add_masses = model.kernel(linear.add_masses, model.dtype)
+        self._multiply = self._invert_diagonal = None
+
+    def launch_masses(self, scale):
+        """Launches values += ``scale`` times the masses on the diagonal, and the identity for pins."""
+        model = self.model
+        model.launch(self._add_masses, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values])
+
+    def launch_locks(self):
+        """Launches rows and columns of locked coordinates as 0 but for the diagonal, see :class:`Hessian`."""
+        if self._rows is not None:
+            lock = self.model.kernel(linear.lock_blocks, self.model.dtype)
+            self.model.launch(lock, len(self.values), [self._rows, self.columns, self.model.mobility], [self.values])
+
+    def prepare(self):
+        """Makes the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""
+        self._multiply = self.model.kernel(linear.multiply, self.model.dtype)
+        self._invert_diagonal = self.model.kernel(linear.invert_diagonal, self.model.dtype)
+        self._lost = 16.0 * float(np.finfo(self.model.numpy_dtype).eps) * self._ill_conditioned
+
+    @property
+    def block_rows(self):
+        """The offsets, columns and values of the rows, without pairs; else None, because values are not all of the matrix."""
+        return None if self.pairs is not None else (self.offsets, self.columns, self.values)
+
+    def invert_diagonal(self, out):
+        """Launches out (N,) = the inverse diagonal blocks."""
+        self.model.launch(self._invert_diagonal, self.count, [self.diagonal, self.values, self._lost], [out])
+
+
+class Hessian(BlockMatrix):
     """∂²U/∂x² + scale·M of all terms, or of the ``terms`` given, in block compressed rows (BSR). Rows of pins are the identity.
 
     The row and column of a locked coordinate are 0 but for the diagonal, which keeps its value, or is 1 if that is not above 0
@@ -108,67 +162,44 @@ class Hessian:
     uses all of their blocks.
 
     Attributes:
-        offsets, columns: Block rows (N+1,) and the column of each block.
-        diagonal: Index of each diagonal block (N,).
-        values: The blocks [N/m].
+        values: The blocks [N/m]. Others are those of :class:`BlockMatrix`.
         policy: (B,) int32, a :class:`HessianPolicy` for each copy.
-        count, per_copy: Vertices of all copies, and of one copy.
-        vector, block: Warp types of an unknown and of a block.
     """
 
     @in_turn
     def __init__(self, model, policy=0, corrected=False, terms=None, pairs=None):
         self.pairs = pairs
-        self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
-        self.model, self.terms = model, model.terms if terms is None else terms
+        self.terms = model.terms if terms is None else terms
         self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=model.device)
-        self._add_masses = model.kernel(linear.add_masses, model.dtype)
-        self._multiply = self._invert_diagonal = None
         found = pattern_of(model, self.terms)
-        self.offsets, self.columns, self.diagonal = found.offsets, found.columns, found.diagonal
-        self._rows = None if model.mobility is None else found.rows
-        self.values = wp.empty(len(found.columns), dtype=model.mat33, device=model.device)
+        touches = pairs is not None or any(elements.collider is not None for elements in self.terms)
+        super().__init__(model, found, touches)
         self._varying, self._constant = [], None
         for elements, sums in zip(self.terms, found.sums, strict=True):
-            one = _Sum(_of(model, elements), sums, corrected)
+            one = BlockSum(of_term := _of(model, elements), sums, of_term.term, model.dtype, corrected)
             if not _is_constant(elements):
                 self._varying.append(one)
                 continue
             if self._constant is None:
                 self._constant, zero = wp.zeros_like(self.values), model.vectors()
-            one.add(zero, zero, self.policy, self._constant)
+            one.add(self._constant, zero, zero, self.policy)
 
     def assemble(self, x, scale, correction=None):
         """Launches the assembly of ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal.
 
         The sum of the terms whose Hessian is constant is computed once, and copied.
         """
-        model = self.model
         if self._constant is None:
             self.values.zero_()
         else:
             wp.copy(self.values, self._constant)
-        model.launch(self._add_masses, model.count, [self.diagonal, model.mass, model.inverse_mass, scale], [self.values])
+        self.launch_masses(scale)
         for one in self._varying:
-            one.add(x, correction, self.policy, self.values)
+            one.add(self.values, x, correction, self.policy)
         if self.pairs is not None:
             self.pairs.forces.launch_forces(x, correction)
             self.pairs.forces.add_diagonal(self.diagonal, self.values)
-        if self._rows is not None:
-            lock = model.kernel(linear.lock_blocks, model.dtype)
-            model.launch(lock, len(self.values), [self._rows, self.columns, model.mobility], [self.values])
-
-    def prepare(self):
-        """Makes the kernels of :meth:`multiply` and :meth:`invert_diagonal`, which not every solver needs."""
-        self._multiply = self.model.kernel(linear.multiply, self.model.dtype)
-        self._invert_diagonal = self.model.kernel(linear.invert_diagonal, self.model.dtype)
-        contact = self.pairs is not None or any(elements.collider is not None for elements in self.terms)
-        self._lost = 16.0 * float(np.finfo(self.model.numpy_dtype).eps) * contact
-
-    @property
-    def block_rows(self):
-        """The offsets, columns and values of the rows, without pairs; else None, because values are not all of the matrix."""
-        return None if self.pairs is not None else (self.offsets, self.columns, self.values)
+        self.launch_locks()
 
     def multiply(self, p, q, active):
         """Launches q = A p for the copies that are ``active`` (B,)."""
@@ -176,10 +207,6 @@ class Hessian:
         self.model.launch(self._multiply, self.count, given, [q])
         if self.pairs is not None:
             self.pairs.forces.add_products(p, q, active)
-
-    def invert_diagonal(self, out):
-        """Launches out (N,) = the inverse diagonal blocks."""
-        self.model.launch(self._invert_diagonal, self.count, [self.diagonal, self.values, self._lost], [out])
 
     def matrices(self):
         """Returns the present values of each copy as a scipy BSR matrix (3n, 3n) in float64."""

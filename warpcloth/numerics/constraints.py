@@ -31,16 +31,18 @@ class TermRows:
 
     Attributes:
         count: Number of rows of one copy.
+        slopes: The Jacobian of each element, see :func:`warpcloth.kernels.constraint_rows.slope_type`.
+        key: Arguments of the factories of kernels.
     """
 
     def __init__(self, model, elements, curved):
         term = elements.term
         scalar = term.constraint is not None
         key = (term, model.dtype, scalar, curved and scalar)
-        self.model, self.elements, self._key = model, elements, key
+        self.model, self.elements, self.key = model, elements, key
         self.rows = kernels.row_count(term, *key[2:])
         self.count = self.rows * elements.per_copy
-        self._slopes = wp.zeros(elements.count, dtype=kernels.slope_type(*key), device=model.device)
+        self.slopes = wp.zeros(elements.count, dtype=kernels.slope_type(*key), device=model.device)
         self._linearise, self._apply = model.kernel(kernels.linearise, *key), model.kernel(jacobian.apply_rows, *key)
         self._transpose = Transpose(model, elements, jacobian.scatter_rows, jacobian.gather_rows, *key)
 
@@ -60,17 +62,17 @@ class TermRows:
         """
         model = self.model
         given = [*self.elements.arguments, model.inverse_mass, x, d, h, least, self.layout]
-        model.launch(self._linearise, self.elements.count, given, [self._slopes, values])
+        model.launch(self._linearise, self.elements.count, given, [self.slopes, values])
 
     def launch_apply(self, v, out, active=None):
         """Launches out += J v, for the copies that are ``active`` (B,), or for all if it is None."""
-        given = [self.elements.stencil, self.elements.rest, self._slopes, v, self.layout, active]
+        given = [self.elements.stencil, self.elements.rest, self.slopes, v, self.layout, active]
         self.model.launch(self._apply, self.elements.count, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
         """Launches out += Jᵀ rows, for the copies that are ``active`` (B,), or for all if it is None."""
-        held = jacobian.held_rows(*self._key)()
-        held.slopes, held.multipliers, held.layout = self._slopes, rows, self.layout
+        held = jacobian.held_rows(*self.key)()
+        held.slopes, held.multipliers, held.layout = self.slopes, rows, self.layout
         if active is not None:
             held.active = active
         self._transpose.add(held, out)
@@ -86,12 +88,12 @@ class TermRows:
         rows = copy * self.layout.rows_per_copy + self.layout.first + e * Q
         rows = np.broadcast_to(rows[:, None, None, None] + np.arange(Q)[None, None, :, None], (E, K, Q, 3))
         columns = np.broadcast_to(3 * stencil[:, :, None, None] + np.arange(3), (E, K, Q, 3))
-        return blocks, self.model.kernel(jacobian.rows_in_full, *self._key), rows.ravel(), columns.ravel()
+        return blocks, self.model.kernel(jacobian.rows_in_full, *self.key), rows.ravel(), columns.ravel()
 
     def entries(self):
         """Returns J on the host: values, rows and columns."""
         blocks, kernel, rows, columns = self._in_full
-        self.model.launch(kernel, self.elements.count, [self.elements.rest, self._slopes], [blocks.array])
+        self.model.launch(kernel, self.elements.count, [self.elements.rest, self.slopes], [blocks.array])
         return blocks.read().ravel(), rows, columns
 
 
@@ -116,6 +118,7 @@ class Constraints:
         count, per_copy: Number of rows of all copies and of one.
         multipliers: λ (count,) [J·s² over the unit of the constraint].
         gap: C + α̃λ (count,).
+        compliance, inverse: α̃, and the inverse diagonal of A, 0 where that is 0, (count,).
         residual, rounding, carried: (count,) [m], see :func:`warpcloth.kernels.constraint_rows.linearise`.
     """
 
@@ -142,11 +145,11 @@ class Constraints:
         def rows(dtype=model.dtype):
             return wp.zeros(self.count, dtype=dtype, device=model.device)
 
-        self.multipliers, self.gap, self._compliance, self._inverse = (rows() for _ in range(4))
+        self.multipliers, self.gap, self.compliance, self.inverse = (rows() for _ in range(4))
         self.residual, self.rounding, self.carried = (rows(wp.float64) for _ in range(3))
         self._values = kernels.row_values(model.dtype)()
         self._values.multipliers, self._values.gap = self.multipliers, self.gap
-        self._values.compliance, self._values.inverse = self._compliance, self._inverse
+        self._values.compliance, self._values.inverse = self.compliance, self.inverse
         self._values.residual, self._values.rounding, self._values.carried = self.residual, self.rounding, self.carried
         self._vectors = model.vectors()
         self._weigh, self._scale = (model.kernel(scale, model.dtype, numbers) for numbers in (False, True))
@@ -183,17 +186,22 @@ class Constraints:
     def multiply(self, p, q, active):
         """Launches q = A p, for the copies that are ``active`` (B,)."""
         self.launch_moves(p, self._vectors, active)
-        self.model.launch(self._scale, self.count, [self._compliance, p], [q])
+        self.model.launch(self._scale, self.count, [self.compliance, p], [q])
         self.launch_apply(self._vectors, q, active)
 
     def invert_diagonal(self, out):
         """Launches out = the inverse of the diagonal of A, 0 where that is 0."""
-        wp.copy(out, self._inverse)
+        wp.copy(out, self.inverse)
+
+    @property
+    def of_elements(self):
+        """Whether there are rows, and all belong to elements with a fixed number of vertices."""
+        return self.count > 0 and all(isinstance(part, TermRows) for part in self.parts)
 
     @cached_property
     def _on_host(self):
         """Inverse masses of coordinates, and the mirror of the compliances."""
-        return self.model.coordinate_mobility(), Mirror(self._compliance)
+        return self.model.coordinate_mobility(), Mirror(self.compliance)
 
     def matrices(self):
         """Returns A of each copy as scipy matrices in double precision."""

@@ -16,6 +16,8 @@ from ..model.model import Model
 from ..numerics.constraints import Constraints
 from ..numerics.iterate import GravityScale
 from ..numerics.linear import ConjugateGradients, FactorisedRows
+from ..numerics.multigrid import LEAST
+from ..numerics.primal import PrimalSolver
 from ..numerics.search import Search
 from ..terms.needs import FINITE, MERGED_DAMPING, ROWS, STEADY_ROWS
 from .facts import Benchmark, Facts, grid
@@ -57,7 +59,8 @@ class ConstrainedDynamics(ImplicitStep):
             value at the first iterate): the largest unbalanced one of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest one
             with which a single constraint would reach C + α̃λ = 0 in a step.
         stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
-        linear: ``"cg"``, or ``"factorised"`` on the host.
+        linear: ``"cg"`` solves by conjugate gradients over λ; on meshes of 200 vertices and more over positions, with
+            multigrid, unless rigid clusters, plates or self-contact have rows. ``"factorised"`` factorises on the host.
 
     Both linear solvers take redundant constraints: α̃ of a hard one is at least ε^0.7 of the diagonal of J W Jᵀ, so that the
     smallest of all possible λ is found, and hard constraints keep a gap of that fraction of the move that they cause in a step
@@ -75,7 +78,7 @@ class ConstrainedDynamics(ImplicitStep):
     facts = Facts(
         method="implicit steps with hard or compliant constraints and Lagrange multipliers",
         suits="constraints of any stiffness, met at the point nearest to x̃; bodies that hang from one another",
-        weakness="slow with thousands of constraints; one iteration overshoots",
+        weakness="slower than `Newton` on soft cloth; one iteration overshoots",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 1}, cpu=(8, 16, 32), cuda=(16, 32, 64)),),
         runs=(
             *grid([(4, 1), (8, 1), (16, 1), (32, 1)], integrator="midpoint"),
@@ -148,7 +151,8 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
 
         self._active, self._stepped = Mirror(model.scalars(wp.int32)), Mirror(self._step)
         if options.linear == "cg":
-            self._linear = ConjugateGradients(self.constraints, LINEAR_ITERATIONS)
+            through = model.per_copy >= LEAST and self.constraints.of_elements
+            self._linear = (PrimalSolver if through else ConjugateGradients)(self.constraints, LINEAR_ITERATIONS)
             self._tolerance = Mirror(self._linear.tolerance)
         else:
             self._linear = FactorisedRows(self.constraints, (self._right, self._change, self._active.array))
