@@ -363,8 +363,9 @@ def test_infinite_stiffness_is_refused(solver, device):
         solver.bind(hard.build(device=device))
 
 
+@pytest.mark.host
 def test_one_factorisation_serves_all_steps(monkeypatch, device):
-    """One matrix for ten steps of any integrator; another, built when a solver is bound to other weights or pins."""
+    """One factorisation of the CPU for ten steps of any integrator; another when a solver is bound."""
     built = []
     factor = linear.constant_factor
     monkeypatch.setattr(linear, "constant_factor", lambda *given: built.append(1) or factor(*given))

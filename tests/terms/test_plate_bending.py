@@ -301,7 +301,8 @@ def test_wrinkles_of_a_stretched_sheet(over, device):
     """λ = 2√π (DL²/T)^¼ to 5 % (Cerda and Mahadevan 2003, *Geometry and physics of wrinkling*).
 
     The sheet is stretched between hinged ends L apart, and its sides are brought together by ``over`` times what buckles it, a
-    stress of N = 2π√(DT)/L, the least of Dk² + T(π/L)²/k² over the wave number k.
+    stress of N = 2π√(DT)/L, the least of Dk² + T(π/L)²/k² over the wave number k. A stress of 1.018 N also lets 5½ waves
+    buckle, which are stable too; so the shape of least energy of three starts counts.
     """
     L, Y, stretch = 0.2, 100.0, 1.01
     T = 0.5 * Y * (stretch**2 - 1.0)
@@ -313,13 +314,15 @@ def test_wrinkles_of_a_stretched_sheet(over, device):
     ends, sides = (np.minimum(at, L - at) < 1e-9 for at in (x, z))
     held = np.flatnonzero(ends | sides)
     axes = ["x" * bool(ends[i]) + "y" + "z" * bool(sides[i]) for i in held]
-    start = mesh.points * [stretch, 1.0, narrow]
-    start[:, 1] = np.where(ends | sides, 0.0, 1e-5 * np.random.default_rng(0).normal(size=len(x)))
     terms = [wc.StVKMembrane(stiffness=Y, poisson_ratio=0.0), wc.PlateBending(stiffness=plate)]
-    pins = wc.Pins(held, axes=axes)
-    sheet = wc.Scene(mesh, density=0.1, terms=terms, pins=pins, positions=start, gravity=(0.0, 0.0, 0.0))
-    rest = wc.equilibrium(sheet, device=device, tolerance=1e-9)
-    assert rest.status.ok and rest.stable, rest.status
+    pins, rests = wc.Pins(held, axes=axes), []
+    for seed in range(3):
+        start = mesh.points * [stretch, 1.0, narrow]
+        start[:, 1] = np.where(ends | sides, 0.0, 1e-5 * np.random.default_rng(seed).normal(size=len(x)))
+        sheet = wc.Scene(mesh, density=0.1, terms=terms, pins=pins, positions=start, gravity=(0.0, 0.0, 0.0))
+        rests.append(wc.equilibrium(sheet, device=device, tolerance=1e-9, record="energies"))
+        assert rests[-1].status.ok and rests[-1].stable, rests[-1].status
+    rest = min(rests, key=lambda each: sum(each.energies.values()))
     middle = rest.points.reshape(41, 21, 3)[:, 10, 1]
     if over < 1.0:
         assert np.abs(middle).max() < 1e-9
