@@ -97,12 +97,12 @@ def equilibrium(
     Flutter needs mass, so a shape that rests here may flutter in a run.
 
     The method is Newton's with a line search, without inertia; gravity is applied in equal load steps. Cloth that gravity
-    hardly stretches and that does not settle in 10 iterations starts from the rest shape of cloth that stretches more easily,
-    unless the scene has colliders, self-contact, loads, air or pins with keyframes, or ``start`` is given. If the Hessian is
-    singular, for example because a flat cloth without bending stiffness cannot carry its weight, a term s/2‖x − x_now‖²_M is
-    added, and s is lowered from there. This is a proximal point method, in which the energy never rises. Cloth that nothing
-    holds has no equilibrium and is reported as not converged. If the final Hessian has a negative eigenvalue, the shape is in
-    balance but not a minimum: it is perturbed a little and settles again.
+    hardly stretches and that does not settle in 10 iterations starts from the equilibrium of cloth that stretches more easily,
+    unless it starts from another shape than its rest shape, or the scene has colliders, self-contact, loads, air or pins with
+    keyframes. If the Hessian is singular, for example because a flat cloth without bending stiffness cannot carry its weight, a
+    term s/2‖x − x_now‖²_M is added, and s is lowered from there. This is a proximal point method, in which the energy never
+    rises. Cloth that nothing holds has no equilibrium and is reported as not converged. If the final Hessian has a negative
+    eigenvalue, the shape is in balance but not a minimum: it is perturbed a little and settles again.
 
     Args:
         scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
@@ -164,7 +164,7 @@ def equilibrium(
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
     wind = _Wind(model, base) if scene.air_terms else None
     descent = _Descent(minimiser, base, tolerance, iterations, wind)
-    if start is None and load_steps == 1 and _only_hangs(scene):
+    if load_steps == 1 and _only_hangs(scene) and _is_at_rest(model, base):
         _start_softly(model, base, descent, linear)
     for part in range(1, load_steps + 1):
         result = _settle_on_meshes(model, base, descent, part / load_steps, contact)
@@ -218,6 +218,12 @@ def _only_hangs(scene):
     """Whether a scene has gravity and energies alone, so that its rest shape hardly depends on how the cloth came there."""
     others = scene.colliders, scene.loads, scene.air_terms
     return not any(others) and scene.self_contact is None and scene.pins.keyframes is None
+
+
+def _is_at_rest(model, base):
+    """Whether the cloth starts from its rest shape. Another start may be near an equilibrium, which softer cloth leaves."""
+    points = model.rest_points
+    return bool(np.abs(base.numpy() - points).max() <= 1e-6 * np.ptp(points, axis=0).max())
 
 
 def _start_softly(model, base, descent, linear):
