@@ -115,6 +115,24 @@ def test_load_steps_end_in_the_same_shape(device):
     assert soft.iterations < stiff.iterations / 2
 
 
+def test_an_arch_that_is_nearly_at_rest_stands(device):
+    """It would fall if it stretched more easily; 10 iterations leave a residual of 1e-8."""
+    angles = np.linspace(-0.9, 0.9, 24)
+    edge = np.stack([np.sin(angles), np.cos(angles), np.zeros(24)], axis=1)
+    triangles = [each for i in range(23) for each in ((i, i + 1, 24 + i), (i + 1, 25 + i, 24 + i))]
+    mesh = wc.Mesh(np.concatenate([edge, edge + np.array([0.0, 0.0, 0.1])]), triangles)
+    terms = [wc.Spring(stiffness=1e5), wc.DihedralBending(stiffness=0.1)]
+    arch = wc.Scene(mesh, density=0.2, terms=terms, pins=[0, 1, 22, 23, 24, 25, 46, 47])
+    rest, as_it_is = wc.equilibrium(arch, device=device), wc.equilibrium(arch, device=device, start=arch.positions)
+    assert rest.stable and rest.points[12, 1] > 0.98 and np.abs(rest.points - as_it_is.points).max() < 1e-9
+
+
+def test_softer_cloth_leaves_iterations_for_the_cloth_itself(device):
+    """A hanging chain settles in 4 iterations once its proximal steps begin; of 12, half are for softer chains."""
+    chain = wc.Scene(wc.Mesh.chain(8), masses=[1] * 8, terms=[wc.Spring(stiffness=1e9)], pins=[0])
+    assert wc.equilibrium(chain, iterations=12, device=device).status.result in SETTLED
+
+
 def test_without_anything_that_holds_it_is_not_converged(device):
     """A free cloth under gravity has no rest shape, and that is said."""
     free = wc.Scene(wc.Mesh.grid(3, 3), density=0.1, terms=[wc.Spring(stiffness=10.0)])

@@ -27,8 +27,9 @@ from .softened import softened, softening
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
 RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
-# Iterations after which stiff cloth starts from the rest shape of softer cloth; the tolerance of that, and its iterations.
-PATIENCE, ROUGHLY, MOST_SOFT = 10, 1e-3, 200
+# Iterations after which stiff cloth starts from the rest shape of softer cloth, and the residual below which it does not; the
+# tolerance of softer cloth, its most iterations for one stiffness, and for all of them as a share of those that are left.
+PATIENCE, NEARLY, ROUGHLY, MOST_SOFT, SOFT_SHARE = 10, 0.1, 1e-3, 200, 0.5
 # A descent that ended by rounding, and moved by less than this fraction of the size of the cloth, is not repeated.
 NEAR = 1e-5
 
@@ -98,11 +99,13 @@ def equilibrium(
 
     The method is Newton's with a line search, without inertia; gravity is applied in equal load steps. Cloth that gravity
     hardly stretches and that does not settle in 10 iterations starts from the equilibrium of cloth that stretches more easily,
-    unless it starts from another shape than its rest shape, or the scene has colliders, self-contact, loads, air or pins with
-    keyframes. If the Hessian is singular, for example because a flat cloth without bending stiffness cannot carry its weight, a
-    term s/2‖x − x_now‖²_M is added, and s is lowered from there. This is a proximal point method, in which the energy never
-    rises. Cloth that nothing holds has no equilibrium and is reported as not converged. If the final Hessian has a negative
-    eigenvalue, the shape is in balance but not a minimum: it is perturbed a little and settles again.
+    unless it starts from another shape than its rest shape, the scene has colliders, self-contact, loads, air or pins with
+    keyframes, or ``start`` is given. Where a scene has several rest shapes, this may find another than
+    ``start=scene.positions``, which never takes softer cloth. If the Hessian is singular, for example because a flat cloth
+    without bending stiffness cannot carry its weight, a term s/2‖x − x_now‖²_M is added, and s is lowered from there. This is a
+    proximal point method, in which the energy never rises. Cloth that nothing holds has no equilibrium and is reported as not
+    converged. If the final Hessian has a negative eigenvalue, the shape is in balance but not a minimum: it is perturbed a
+    little and settles again.
 
     Args:
         scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
@@ -164,7 +167,7 @@ def equilibrium(
     minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
     wind = _Wind(model, base) if scene.air_terms else None
     descent = _Descent(minimiser, base, tolerance, iterations, wind)
-    if load_steps == 1 and _only_hangs(scene) and _is_at_rest(model, base):
+    if start is None and load_steps == 1 and _only_hangs(scene) and _is_at_rest(model, base):
         _start_softly(model, base, descent, linear)
     for part in range(1, load_steps + 1):
         result = _settle_on_meshes(model, base, descent, part / load_steps, contact)
@@ -215,7 +218,7 @@ def equilibrium(
 
 
 def _only_hangs(scene):
-    """Whether a scene has gravity and energies alone, so that its rest shape hardly depends on how the cloth came there."""
+    """Whether a scene has gravity and energies alone, so that its rest shape rarely depends on how the cloth came there."""
     others = scene.colliders, scene.loads, scene.air_terms
     return not any(others) and scene.self_contact is None and scene.pins.keyframes is None
 
@@ -229,17 +232,18 @@ def _is_at_rest(model, base):
 def _start_softly(model, base, descent, linear):
     """Sets the positions to the rest shape of softer cloth, see :mod:`.softened`, unless few iterations suffice without.
 
-    Where softer cloth does not come to rest, the positions stay as they are.
+    Where softer cloth does not come to rest, the positions stay as they are. Cloth that is nearly at rest is left to settle: it
+    may stand in a shape in which softer cloth would not, such as an arch.
     """
     factors = softening(model)
-    if not factors or descent.settle(0.0, 1.0, PATIENCE) in SETTLED:
+    if not factors or descent.settle(0.0, 1.0, PATIENCE) in SETTLED or descent.residual < NEARLY:
         return
-    before = wp.clone(base)
+    before, left = wp.clone(base), int(SOFT_SHARE * (descent.iterations - descent.used))
     for factor in factors:
         minimiser = Minimiser(softened(model, factor), base, "adaptive", linear, s=0.0)
-        stage = _Descent(minimiser, base, ROUGHLY, min(MOST_SOFT, descent.iterations - descent.used), None)
+        stage = _Descent(minimiser, base, ROUGHLY, min(MOST_SOFT, left), None)
         result = stage.run(1.0, _frequency_scale(model))
-        descent.used += stage.used
+        descent.used, left = descent.used + stage.used, left - stage.used
         if result not in SETTLED:
             wp.copy(base, before)
             return
