@@ -121,7 +121,8 @@ class BlockMatrix:
         self.count, self.per_copy, self.vector, self.block = model.count, model.per_copy, model.vec3, model.mat33
         self.offsets, self.columns, self.diagonal = found.offsets, found.columns, found.diagonal
         self._rows = None if model.mobility is None else found.rows
-        self.values = wp.empty(len(found.columns), dtype=model.mat33, device=model.device)
+        # Zeros, because matrices() may be called for the pattern before values are assembled.
+        self.values = wp.zeros(len(found.columns), dtype=model.mat33, device=model.device)
         self._add_masses = model.kernel(linear.add_masses, model.dtype)
         self._multiply = self._invert_diagonal = None
 
