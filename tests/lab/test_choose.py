@@ -249,6 +249,13 @@ def test_cells_without_an_accurate_setting_say_why(more, status, said, tmp_path,
     assert " ".join(text_of_cell(cell)).startswith(said)
 
 
+@pytest.mark.parametrize("more", [["-p", "n=9"], ["-p", "stiffness=1e3", "--y", "stiffness", "1e4"]])
+def test_a_parameter_is_not_both_fixed_and_on_an_axis(more, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    assert main([*"chart cheapest hanging --x n 4 --frames 2".split(), *more]) == 2
+    assert "given as a parameter of the scene and as" in capsys.readouterr().err
+
+
 def test_an_interruption_says_what_is_kept(tmp_path, monkeypatch, capsys):
     def interrupted(tasks, progress, **_):
         progress(1, len(tasks), 2.0)

@@ -56,13 +56,16 @@ def cheapest_map(scene, x, y=None, tolerance=0.01, solvers=None, frames=None, de
         ``machine``, and ``cells``: a list of the results of :func:`measure`, with ``x`` and ``y``, in rows of y.
 
     Raises:
-        ValueError: An argument is not allowed, or the scene has no such parameter.
+        ValueError: An argument is not allowed, or the scene has no such parameter or has it already.
     """
     number("tolerance", tolerance, above=0.0)
     number("limit", limit, above=0.0)
     pairs = list(itertools.product([None] if y is None else y[1], x[1]))
     if y is not None and y[0] == x[0]:
         raise ValueError(f"x and y are both {x[0]}; they must be two parameters")
+    for of, axis in (("x", x), ("y", y)):
+        if axis is not None and axis[0] in scene.parameters:
+            raise ValueError(f"{axis[0]} is given as a parameter of the scene and as {of}; give it once")
     tasks = []
     for below, across in pairs:
         at = SceneRef(scene.name, {**scene.parameters, x[0]: across, **({} if y is None else {y[0]: below})}, scene.pins)
