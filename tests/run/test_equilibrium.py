@@ -14,6 +14,7 @@ from warpcloth.core.status import digits
 from warpcloth.lab.elastica import aspect
 from warpcloth.numerics.linear import lowest_eigenvalue
 from warpcloth.run.equilibrium import SETTLED
+from warpcloth.run.softened import softening
 
 # H/W of the tip for Γ, to 8 digits.
 ASPECT = {
@@ -125,6 +126,18 @@ def test_an_arch_that_is_nearly_at_rest_stands(device):
     arch = wc.Scene(mesh, density=0.2, terms=terms, pins=[0, 1, 22, 23, 24, 25, 46, 47])
     rest, as_it_is = wc.equilibrium(arch, device=device), wc.equilibrium(arch, device=device, start=arch.positions)
     assert rest.stable and rest.points[12, 1] > 0.98 and np.abs(rest.points - as_it_is.points).max() < 1e-9
+
+
+def test_tense_cloth_is_not_taken_for_stiffer_cloth(device):
+    """Springs with 0.8 of the length of their edges: ∂²U/∂ε² is that of springs without tension, for equal k A."""
+    mesh, found = wc.Mesh.grid(6, 6), {}
+    for stiffness in (1e3, 1e7):
+        for part in (1.0, 0.8):
+            spring = wc.Spring(stiffness=stiffness, rest_lengths=part * mesh.edge_lengths)
+            tense = wc.Scene(mesh, density=0.2, terms=[spring], pins=[0, 5])
+            found[stiffness, part] = softening(tense.build(device=device, dtype="float64"))
+    assert found[1e3, 1.0] == found[1e3, 0.8] == [] and len(found[1e7, 1.0]) > 0
+    assert 0.8 < found[1e7, 0.8][0] / found[1e7, 1.0][0] < 1.25
 
 
 def test_softer_cloth_leaves_iterations_for_the_cloth_itself(device):

@@ -29,10 +29,13 @@ def softening(model):
     if not terms or weight == 0.0:
         return []
     stretched, points = model.with_terms(terms), model.rest_points
-    at, energy = model.vectors(), model.scalars()
-    at.assign((1.0 + EXPANSION) * points)
-    Energy(stretched, Sums(stretched)).add(at, energy)
-    stiffness = 2.0 * float(energy.numpy()[0]) / EXPANSION**2
+    total, at, energy, found = Energy(stretched, Sums(stretched)), model.vectors(), model.scalars(), []
+    for k in range(3):  # the second difference, because cloth may be tense in its rest shape
+        at.assign(points + k * EXPANSION * (points - points.mean(axis=0)))
+        energy.zero_()
+        total.add(at, energy)
+        found.append(float(energy.numpy()[0]))
+    stiffness = (found[0] - 2.0 * found[1] + found[2]) / EXPANSION**2
     softest = weight * float(np.linalg.norm(np.ptp(points, axis=0))) / (2.0 * STRAIN * stiffness) if stiffness > 0.0 else 1.0
     count = int(np.ceil(np.log(0.3 / softest) / np.log(FACTOR))) if softest < SOFT else 0
     return [softest * FACTOR**k for k in range(count)]
