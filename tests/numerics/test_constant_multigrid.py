@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.sparse
 
 import warpcloth as wc
 from support.continuum import flat
@@ -117,11 +118,15 @@ def test_iterations_end_where_those_with_factors_do(module, solver, small, devic
     assert np.abs(found - expected).max() < 1e-7
 
 
-def test_matrices_that_are_not_positive_are_refused(device):
-    model = model_of(MESHES["grid"], device, (1.0,))
+@pytest.mark.parametrize("dense", [12, 300])
+def test_matrices_that_are_not_positive_are_refused(dense, device, monkeypatch):
+    """Also one with a positive diagonal, whose coarser ones are indefinite."""
+    monkeypatch.setattr(constant_multigrid, "DENSE", dense)
+    model = model_of(MESHES["grid"], device, (1e3,))
     (matrix,) = constant_matrices(model, 100.0)
-    with pytest.raises(ValueError, match="not positive definite"):
-        CopyCycles(model, [-matrix])
+    for wrong in (-matrix, (matrix - scipy.sparse.diags(0.5 * matrix.diagonal())).tocsr()):
+        with pytest.raises(ValueError, match="not positive definite"):
+            CopyCycles(model, [wrong])
     matrix.data[3] = np.nan
     with pytest.raises(ValueError, match="1 entries that are not finite"):
         CopyCycles(model, [matrix])

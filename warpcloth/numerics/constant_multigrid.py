@@ -17,6 +17,8 @@ LEFT, MOST = 0.4, 12
 # Cycles by which the contraction is measured.
 TRIALS = 15
 
+_INDEFINITE = "the matrix is not positive definite, so it has no multigrid cycles"
+
 
 class CopyCycles:
     """Approximates x = A⁻¹ b of each copy by V-cycles of multigrid, with a constant scalar matrix each.
@@ -41,7 +43,8 @@ class CopyCycles:
         seconds: Time of the setup [s].
 
     Raises:
-        ValueError: A matrix is not finite, or its diagonal is not above 0.
+        ValueError: A matrix is not finite; or its diagonal or that of a coarser one is not above 0, or the coarsest is not
+            positive definite.
     """
 
     def __init__(self, model, matrices):
@@ -158,7 +161,7 @@ def _distinct(matrices):
             if not np.isfinite(rows.data).all():
                 raise ValueError(f"the matrix has {np.count_nonzero(~np.isfinite(rows.data))} entries that are not finite")
             if not (rows.diagonal() > 0.0).all():
-                raise ValueError("the matrix is not positive definite, so it has no multigrid cycles")
+                raise ValueError(_INDEFINITE)
             distinct.append(rows)
         of_copy.append(found[key])
     return distinct, of_copy
@@ -190,9 +193,10 @@ class _Hierarchy:
         self.down, self.up, self.own = [], [], []
         for P in [*transfers, None]:
             if P is None and matrix.shape[0] <= DENSE:
-                inverse = np.linalg.inv(matrix.toarray())
-                self.inverse = 0.5 * (inverse + inverse.T)
+                self.inverse = _inverse(matrix.toarray())
                 return
+            if not (matrix.diagonal() > 0.0).all():
+                raise ValueError(_INDEFINITE)
             sweep = diags_array(_sweep(matrix))
             kept = eye_array(matrix.shape[0], format="csr") - sweep @ matrix
             self.own.append((sweep + kept @ sweep).tocsr())
@@ -222,6 +226,16 @@ class _Hierarchy:
         for k in reversed(range(len(self.up))):
             x = self.up[k] @ x + self.own[k] @ right[k]
         return x
+
+
+def _inverse(matrix):
+    """Returns the inverse of a dense symmetric matrix; raises ValueError if it is not positive definite."""
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        raise ValueError(_INDEFINITE) from None
+    inverse = np.linalg.inv(matrix)
+    return 0.5 * (inverse + inverse.T)
 
 
 def _sweep(matrix):
