@@ -9,7 +9,8 @@ preconditioner blocks, or with ``numbers`` scalar ones.
 An iteration of conjugate gradients has three launches over (copies, lanes). A lane takes every lanes-th unknown of its copy. On
 CUDA each unknown has a lane, up to a limit, and blocks of ``block`` threads store their part of a scalar product. The next
 launch adds the parts of a copy, in each of its blocks. The CPU has one lane, and ``block`` is 0. So sums have a fixed order.
-What a launch writes for a copy, no other thread of it reads; the next one finds it in ``next_active`` and ``next_rz``.
+No thread reads what another thread of the same launch writes for a copy; the next launch finds it in ``next_active`` and
+``next_rz``.
 """
 
 from functools import cache

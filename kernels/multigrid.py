@@ -22,7 +22,7 @@ SPARED = 2
 CYCLE = 4
 # The other preconditioner is tried again after so many solves.
 AGED = 64
-# A solve with diagonal blocks ends where it has cost so many times what multigrid would.
+# A solve with diagonal blocks ends once it has cost this many times a solve with multigrid.
 PATIENCE = 1.5
 
 
@@ -67,7 +67,7 @@ def _module(dtype, products):
 
 @cache
 def find_slots():
-    """Kernel over coarse rows: where PᵀAP has the multiple of each block of A, or −1 left of the diagonal, from ``firsts`` on.
+    """Kernel over coarse rows: the block of PᵀAP to which each multiple of a block of A is added, or −1 left of the diagonal.
 
     The multiples come in the order of the rows of A with this parent, of the blocks of a row, and of the parents of its column.
     ``mirrors`` has the transposed block of each block of PᵀAP, ``counts`` the number of multiples that are not left out.
@@ -365,11 +365,12 @@ def measure_progress():
 def choose():
     """Kernel over one thread: chooses the preconditioner of the next solve by the decades that each gained for its cost.
 
-    The first solve is by multigrid. The other preconditioner is tried in the second, then ``AGED`` solves after the last trial,
-    or if its last solve gained more for its cost than this one. A trial that costs twice as much as the solve before is cut off
-    and has failed. The better one stays. The coarse matrices are outdated if a solve takes 3/2 times as many iterations as the
-    first with them. After a negative curvature in every copy they are outdated too, because the matrix will differ, and the
-    preconditioner stays. ``most`` becomes 0 before a solve with diagonal blocks that is no trial, see :func:`limit_iterations`.
+    The first solve is by multigrid. The other preconditioner is tried in the second one. It is tried again ``AGED`` solves
+    after the last trial, or sooner if its last solve gained more for its cost than this one. A trial that costs twice as much
+    as the solve before is cut off and has failed. The better one stays. The coarse matrices are outdated if a solve takes 3/2
+    times as many iterations as the first with them. After a negative curvature in every copy they are outdated too, because the
+    matrix will differ, and the preconditioner stays. ``most`` becomes 0 before a solve with diagonal blocks that is no trial,
+    see :func:`limit_iterations`.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -428,8 +429,8 @@ def choose():
 def limit_iterations():
     """Kernel over copies: a solve with diagonal blocks has at most the iterations of ``PATIENCE`` times the cost of multigrid.
 
-    That cost follows from the rate of the last one and from the tolerance of each copy. ``most`` is 0 before. Trials have their
-    own limit.
+    That cost follows from the rate of the last one and from the tolerance of each copy. The caller sets ``most`` to 0 first,
+    because copies take the maximum. Trials have their own limit.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)

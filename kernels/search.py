@@ -258,8 +258,8 @@ def check_guess(block: int):
 
 @cache
 def check_trial(block: int):
-    """Kernel over (copies, lanes of one block): accepts a trial step or halves it; sets it to 0 after ``most`` trials, of which
-    one more is the last.
+    """Kernel over (copies, lanes of one block): accepts a trial step or halves it; after ``most`` trials the step is 0, and one
+    last trial measures that.
 
     A step is accepted if φ(α) ≤ φ(0) + 1e-4 α φ'(0) (Armijo). It is also accepted if φ(α) ≤ φ(0) + noise and
     φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe, Hager and Zhang 2005). NaN is never

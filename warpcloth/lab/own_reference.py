@@ -20,9 +20,10 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
     """Returns the :class:`warpcloth.lab.reference.Reference` of one solver of Newton, from its file or computed and stored.
 
     It runs the scene with the fewest substeps and the most iterations of its settings, with twice the substeps, and so on. It
-    ends when a doubling moves the cloth by at most the tolerance, or two doublings move it by more than one before, because
-    float32 rounds the motion then, or the solver does not converge. Of all neighbours, the two nearest to each other count.
-    Their distance is the error, which bounds that of the finer one if each doubling at least halves the error.
+    ends when a doubling moves the cloth by at most the tolerance. It also ends when the last two doublings both move it further
+    than an earlier one did; then float32 rounds the motion, or the solver does not converge. The two successive runs that are
+    nearest to each other count. Their distance is the error, which bounds that of the finer one if each doubling at least
+    halves the error.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.

@@ -10,7 +10,7 @@ from ..kernels import constant_multigrid as kernels
 from ..kernels.multigrid import OMEGA
 from .interpolation import interpolations, neighbours
 
-# A level of at most so many vertices is solved by its dense inverse; one with more that has no coarser one by its sweeps.
+# A level of at most so many vertices is solved by its dense inverse; a larger one without a coarser level by its sweeps.
 DENSE = 300
 # Cycles are repeated until the error, in the norm of the matrix, has fallen to this fraction, at most so many times.
 LEFT, MOST = 0.4, 12

@@ -4,8 +4,8 @@
 With D = α̃⁻¹ its inverse is D − D J A⁻¹JᵀD, A = M + JᵀDJ (Sherman, Morrison and Woodbury). A is a matrix over vertices, such
 as that of Newton's method, which conjugate gradients solve with multigrid. α̃ of hard rows is too small for this; they take a
 larger one here, and passes r → r − (J W Jᵀ + α̃)Δλ correct what it leaves (the method of multipliers, Hestenes 1969). They
-also correct what rounding loses in the difference D(r − J y). What redundant hard rows leave, almost in the null space of Jᵀ,
-conjugate gradients over rows solve.
+also correct what rounding loses in the difference D(r − J y). Redundant hard rows leave a residual almost in the null space of
+Jᵀ; conjugate gradients over rows remove it.
 """
 
 import warp as wp

@@ -12,7 +12,7 @@ from ..core.sums import Sums
 
 # Strain under gravity that the softest cloth has about, and the factor from one stiffness to the next.
 STRAIN, FACTOR = 8e-3, 10.0
-# Cloth whose softest factor is above this wrinkles as it stiffens again, which may take more iterations than it saves.
+# Cloth with a larger softest factor is left alone: it wrinkles as it stiffens, which may take more iterations than it saves.
 SOFT = 1e-3
 # Relative expansion at which the stiffness of a cloth is measured.
 EXPANSION = 1e-2
