@@ -387,7 +387,12 @@ def test_time_diagram(device, tmp_path, drawn):
     write_csv(tmp_path / "chart.csv", found)
     lines = table(tmp_path / "chart.csv")
     assert [line["label"] for line in lines] == list(rows) and lines[-1]["error"] == ""
-    facts = {"scene": "hanging(n=6)", "dtype": "float32", "seed": "", **{k: str(v) for k, v in found["machine"].items()}}
+    facts = {
+        "scene": "hanging(n=6)",
+        "dtype": "float32",
+        "seed": "",
+        **{k: "" if v is None else str(v) for k, v in found["machine"].items()},
+    }
     assert all(line[name] == value for line in lines for name, value in facts.items())
     assert float(lines[0]["error"]) == found["rows"][0]["error"] and float(lines[0]["strain_error"]) > 0.0
     drawn[0].draw_without_rendering()  # until then texts have the size that they have in the file, at positions of the figure
