@@ -64,7 +64,7 @@ def text_of_cell(cell):
     if cell["status"] != "found":
         return textwrap.wrap(cell["reason"], _CHARACTERS)
     second = cell["second"]
-    beside = "no second within the search" if second is None else f"{second['label']}: × {second['ratio']:.2g}"
+    beside = "no second within the search" if second is None else f"{second['label']}: ×\u00a0{second['ratio']:.2g}"
     return [
         *textwrap.wrap(cell["label"], _CHARACTERS),
         f"{cell['ms']:.3g} ms{'' if cell['complete'] else '?'}, error {percent(cell['error'])}",
