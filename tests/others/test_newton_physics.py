@@ -10,6 +10,7 @@ import warp as wp
 
 import warpcloth as wc
 from warpcloth.chart.pareto import plot_time
+from warpcloth.cli import options
 from warpcloth.lab import trajectory
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.choosing import choose
@@ -17,7 +18,9 @@ from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.work_precision import time_diagram, write_csv
 from warpcloth.others.newton_calibration import calibrate
 from warpcloth.others.newton_model import METHODS, TAKES, newton_model, refuse_inexpressible
-from warpcloth.others.newton_runs import SIMULATORS, NewtonPhysics, run_newton
+from warpcloth.others.newton_runs import NewtonPhysics
+from warpcloth.others.runs import run_other
+from warpcloth.others.simulators import SIMULATORS
 
 newton = pytest.importorskip("newton", reason="Newton is not installed: pip install -e '.[newton]'")
 
@@ -98,7 +101,7 @@ def test_semi_implicit_steps_are_explicit_steps(term, device):
     """Both are symplectic Euler; without damping, they differ by the rounding of float32, which grows with the motion."""
     scene = declared(terms=[term, wc.DihedralBending(stiffness=1e-2)])
     ours = wc.simulate(scene, wc.Explicit(substeps=40), device=device, frames=12)
-    found = run_newton(scene, NewtonPhysics("semi-implicit", 40), device=device, frames=12)
+    found = run_other(scene, NewtonPhysics("semi-implicit", 40), device=device, frames=12)
     assert found.status.ok and found.points.dtype == np.float32 and found.points.shape == ours.points.shape
     np.testing.assert_array_equal(found.points[0], float32(scene.positions))
     np.testing.assert_array_equal(found.points[:, [0, 3]], np.broadcast_to(float32(scene.positions)[[0, 3]], (13, 2, 3)))
@@ -111,7 +114,7 @@ def test_semi_implicit_steps_are_explicit_steps(term, device):
 
 
 def test_a_run_that_diverges_ends_before_that_frame(device):
-    found = run_newton(
+    found = run_other(
         declared(terms=[replace(SPRINGS, stiffness=1e5)]), NewtonPhysics("semi-implicit", 1), device=device, frames=30
     )
     assert not found.status.ok and len(found.points) == found.status.frame + 1 < 31
@@ -165,7 +168,8 @@ def test_samples_are_as_stiff_there(method):
 def test_charts_and_choices_have_its_solvers(tmp_path, monkeypatch):
     """With one of the four, whose steps are those of Explicit, and so its errors, but for the angles of hinges."""
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setitem(SIMULATORS, "newton", ("newton-semi-implicit",))
+    name = "newton-semi-implicit"
+    monkeypatch.setitem(SIMULATORS, "newton", SIMULATORS["newton"]._replace(solvers={name: SIMULATORS["newton"].solvers[name]}))
     scene, given = SceneRef("hanging", {"n": 4, "bending": 0.0}), {"frames": 6, "others": ["newton"], "solvers": ["explicit"]}
     with ThreadPoolExecutor(1) as executor:
         given |= {"executor": executor, "store": Store()}
@@ -186,6 +190,7 @@ def test_charts_and_choices_have_its_solvers(tmp_path, monkeypatch):
         assert {(row["newton"], row["own_error"] != "") for row in csv.DictReader(file) if row["solver"] != "explicit"} == {
             (newton.__version__, True)
         }
+    assert options._SIMULATORS == tuple(SIMULATORS)
     assert choice.meets and {each.setup.solver for each in measured} == {"explicit", "newton-semi-implicit"}
-    refused = trajectory.measure(asdict(scene), asdict(Setup("newton-vbd", {"substeps": 1})), frames=1, dtype="float64")
+    refused = trajectory.measure(asdict(scene), asdict(Setup(name, {"substeps": 1})), frames=1, dtype="float64")
     assert refused["status"] == "refused" and "Newton has float32 only" in refused["reason"]

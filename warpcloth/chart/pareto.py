@@ -4,7 +4,7 @@ import textwrap
 
 from ..lab.machine import in_words
 from ..lab.work_precision import WITHIN, cheapest, front, quartiles, without_point
-from ..others.newton_runs import OTHERS
+from ..others.simulators import SIMULATORS, other_solvers
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
 from ..solvers import SOLVERS
 
@@ -50,10 +50,10 @@ def plot_time(path, found):
     for row in rows:
         if row["status"] == "ok":
             lines.setdefault((row["solver"], row["options"].get("integrator", "euler")), []).append(row)
-    ends = {axes: [] for axes in panels}
+    ends, others = {axes: [] for axes in panels}, other_solvers()
     for (solver, integrator), line in lines.items():
         line.sort(key=lambda row: row["ms_per_second"])
-        colour, marker = OTHERS[solver].style if solver in OTHERS else SOLVERS[solver].facts.style
+        colour, marker = others[solver].style if solver in others else SOLVERS[solver].facts.style
         own = [(row["ms_per_second"], row["own_error"]) for row in line if row.get("own_error") is not None]
         if own:
             panels[0].plot(*zip(*own, strict=True), marker, color=colour, markersize=5, linestyle=":", markerfacecolor="none")
@@ -226,5 +226,6 @@ def _finish(figure, axes, notes, title, texts, found):
     notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=_SMALL, borderaxespad=0.0)
     top = 1.0 - 0.19 * (len(known) + 1) / figure.get_size_inches()[1]
     notes.text(0.0, top, "\n".join(texts), fontsize=_SMALL, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
-    title = f"{title}, on {in_words(found['machine'], bool(found.get('others')))}"
+    named = [name for name, each in SIMULATORS.items() if set(each.solvers) & {row["solver"] for row in found["rows"]}]
+    title = f"{title}, on {in_words(found['machine'], named)}"
     figure.suptitle(title, fontsize=_TEXT + 1.0, color=GREY, parse_math=False)

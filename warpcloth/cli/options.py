@@ -19,6 +19,7 @@ from .terminal import aligned
 
 _HELP = "help"
 DEFAULT = "newton"  # the default solver
+_SIMULATORS = ("newton",)  # those of warpcloth.others.simulators, which loads Warp
 
 
 def asks_for_help(arguments):
@@ -144,7 +145,7 @@ def add_with(parser):
         dest="others",
         nargs="+",
         metavar="SIMULATOR",
-        choices=("newton",),
+        choices=_SIMULATORS,
         help="measure solvers of other simulators too: newton, the physics engine, which the extra newton installs",
     )
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from ..base.digest import source_digest
 from ..base.quiet import find_device
 from ..base.version import installed_version
+from ..others.simulators import SIMULATORS
 
 
 def machine(device="cpu"):
@@ -30,7 +31,7 @@ def machine(device="cpu"):
         "numpy": numpy.__version__,
         "scipy": scipy.__version__,
         "warp": wp.__version__,
-        "newton": installed_version("newton"),
+        **{name: installed_version(each.package) for name, each in SIMULATORS.items()},
         "warpcloth": installed_version() or "checkout",
         "source": source_digest(),
     }
@@ -43,10 +44,15 @@ def name(device="cpu"):
     return ", ".join([platform.node(), facts["processor"], *([] if facts["device"] == "cpu" else [facts["device"]])])
 
 
-def in_words(facts, others=False):
-    """Formats the device of :func:`machine` (for a CPU its name and cores) and versions for a title; of ``others`` too."""
+def in_words(facts, others=()):
+    """Formats the device of :func:`machine` (for a CPU its name and cores) and versions for a title.
+
+    Args:
+        facts: Those of :func:`machine`.
+        others: Names of simulators whose versions are added.
+    """
     device = facts["device"] if facts["device"] != "cpu" else f"{facts['processor']}, {facts['cores']} cores"
-    return f"{device}, Warp {facts['warp']}" + (f", Newton {facts['newton']}" if others else "")
+    return ", ".join([device, f"Warp {facts['warp']}", *(f"{SIMULATORS[name].title} {facts[name]}" for name in others)])
 
 
 def processor():

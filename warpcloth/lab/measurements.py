@@ -10,7 +10,7 @@ from functools import cache
 from importlib import import_module
 
 from ..base.digest import source_digest
-from ..others.newton_runs import OTHERS, NewtonPhysics
+from ..others.simulators import other_solvers
 from ..run import scene_files
 from ..solvers import SOLVERS
 from . import machine
@@ -70,12 +70,12 @@ class Setup:
         Raises:
             ValueError: There is no such solver, or an option is not allowed.
         """
-        if self.solver in OTHERS:
-            return NewtonPhysics(OTHERS[self.solver].method, **self.options)
-        if self.solver not in SOLVERS:
+        others = other_solvers()
+        if self.solver not in SOLVERS and self.solver not in others:
             raise ValueError(f"solver is {self.solver!r}; it must be one of {', '.join(SOLVERS)}")
+        make = others[self.solver].record if self.solver in others else SOLVERS[self.solver]
         try:
-            return SOLVERS[self.solver](**self.options)
+            return make(**self.options)
         except TypeError as error:
             raise ValueError(f"{self.solver}: {error}") from None
 

@@ -3,12 +3,14 @@
 import hashlib
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 
 from ..base.digest import scene_digest, source_digest
 from ..base.version import installed_version
-from ..others.newton_runs import NewtonPhysics, run_newton
+from ..others.runs import run_other
+from ..others.simulators import simulator_of
 from .campaign import cache_folder
 from .clock import Clock, TooSlow
 from .reference import Reference, kept_reference, position_error, strain_error
@@ -17,7 +19,7 @@ _MOST = 12  # runs, each with twice the substeps of the one before
 
 
 def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120.0, progress=None):
-    """Returns the :class:`warpcloth.lab.reference.Reference` of one solver of Newton, from its file or computed and stored.
+    """Returns the :class:`warpcloth.lab.reference.Reference` of a solver of another simulator, from its file, or computed.
 
     It runs the scene with the fewest substeps and the most iterations of its settings, with twice the substeps, and so on. It
     ends when a doubling moves the cloth by at most the tolerance. It also ends when the last two doublings both move it further
@@ -39,10 +41,11 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
         doubling moves the cloth by less than the first.
     """
     records = [setup.record() for setup in setups]
-    method, iterations = records[0].method, max(record.iterations for record in records)
+    iterations = max(record.iterations for record in records)
     declared = scene.load()
     digest = scene_digest(declared)
-    facts = [digest, int(frames), source_digest(), setups[0].solver, str(device), installed_version("newton"), limit, tolerance]
+    version = installed_version(simulator_of(setups[0].solver).package)
+    facts = [digest, int(frames), source_digest(), setups[0].solver, str(device), version, limit, tolerance]
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:24]
     path = cache_folder() / "references" / f"{key}.npz"
     found = kept_reference(path, key)
@@ -53,7 +56,7 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
         before = time.perf_counter()
         clock = Clock(limit - (before - began), progress and (lambda *at, s=substeps: progress(s, *at)))
         try:
-            run = run_newton(declared, NewtonPhysics(method, substeps, iterations), device, frames, clock)
+            run = run_other(declared, replace(records[0], substeps=substeps, iterations=iterations), device, frames, clock)
         except (TooSlow, ValueError):
             break
         if run.status.ok:

@@ -3,8 +3,7 @@
 Each solver's record has its own, see :class:`warpcloth.solvers.facts.Facts`.
 """
 
-from ..others.newton_model import engine
-from ..others.newton_runs import OTHERS, SIMULATORS
+from ..others.simulators import SIMULATORS
 from ..solvers import SOLVERS, Explicit
 from ..solvers.step import fewest_substeps
 from .measurements import Setup
@@ -26,7 +25,7 @@ def setups_of_steps(solvers=None):
 def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32", others=()):
     """Returns the :class:`Setup`\\s of runs of a :class:`SceneRef`, of all solvers or of those named, each once.
 
-    Those of ``others``, simulators of :data:`warpcloth.others.newton_runs.SIMULATORS`, come last.
+    Those of ``others``, simulators of :data:`warpcloth.others.simulators.SIMULATORS`, come last.
 
     Steps do not depend on the frame rate of the scene, unless they would be longer than a frame. The substeps of a limited
     solver are multiples of its fewest stable substeps on a device.
@@ -36,10 +35,10 @@ def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32", others=()
         ValueError: There is no solver or simulator of a name.
     """
     setups, fps = [], None
-    if others:
-        engine()
     runs = {name: SOLVERS[name].facts.runs for name in _checked(solvers, list(SOLVERS))}
-    runs |= {name: OTHERS[name].runs for other in _checked(others, list(SIMULATORS)) for name in SIMULATORS[other]}
+    for other in _checked(others, list(SIMULATORS)):
+        SIMULATORS[other].check()
+        runs |= {name: solver.runs for name, solver in SIMULATORS[other].solvers.items()}
     for name, each in runs.items():
         record = SOLVERS.get(name, Explicit)
         fewest = _fewest(record, scene, device, dtype) if record.limited else None

@@ -6,7 +6,8 @@ import numpy as np
 
 from ..base.checks import number, whole
 from ..base.digest import scene_digest
-from ..others.newton_runs import NewtonPhysics, run_newton
+from ..others.runs import run_other
+from ..others.simulators import simulator_of
 from ..run.simulate import simulate
 from .clock import Clock, TooSlow
 from .measurements import SceneRef, Setup, finite
@@ -49,7 +50,8 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
     """
     number("limit", limit, above=0.0)
     whole("repeats", repeats, 1)
-    declared, record = SceneRef(**scene).load(), Setup(**setup).record()
+    declared, setup = SceneRef(**scene).load(), Setup(**setup)
+    setup.record()  # checks the options
     exact = None if reference is None else Reference.load(reference)
     frames = _checked_frames(frames, declared, exact)
     least = max(frames, 2)  # as the first warms up
@@ -61,7 +63,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         for _ in range(repeats):
             clock = Clock(left)
             try:
-                runs.append(_run(declared, record, dtype, device=device, frames=least, progress=clock))
+                runs.append(_run(declared, setup, dtype, device=device, frames=least, progress=clock))
             except TooSlow:
                 if not runs:
                     reason = f"{len(clock.frames)} of {least} frames took {sum(clock.frames):.3g} s, more than {limit:g} s"
@@ -92,13 +94,14 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
     return found
 
 
-def _run(scene, record, dtype, **given):
-    """Runs a scene with a solver of warpcloth, or with one of Newton, which has float32 only."""
-    if not isinstance(record, NewtonPhysics):
-        return simulate(scene, record, dtype=dtype, **given)
-    if dtype != "float32":
-        raise ValueError(f"dtype is {dtype!r}; Newton has float32 only")
-    return run_newton(scene, record, **given)
+def _run(scene, setup, dtype, **given):
+    """Runs a scene with a solver of warpcloth, or with one of another simulator, which has one precision only."""
+    other = simulator_of(setup.solver)
+    if other is None:
+        return simulate(scene, setup.record(), dtype=dtype, **given)
+    if dtype != other.dtype:
+        raise ValueError(f"dtype is {dtype!r}; {other.title} has {other.dtype} only")
+    return run_other(scene, setup.record(), **given)
 
 
 def _checked_frames(frames, scene, exact):

@@ -9,7 +9,7 @@ import math
 
 from ..base.digest import scene_digest
 from ..base.outputs import write_table
-from ..others.newton_runs import OTHERS
+from ..others.simulators import SIMULATORS, other_solvers
 from . import convergence, physics, spectrum, trajectory
 from .campaign import collect
 from .machine import machine
@@ -56,7 +56,7 @@ FACTS = (
     "numpy",
     "scipy",
     "warp",
-    "newton",
+    *SIMULATORS,
     "warpcloth",
 )
 FACTS += ("source",)
@@ -130,7 +130,7 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
         raise ValueError(f"nothing moves in {scene} within {frames} frames; a chart of errors needs motion")
     given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}
     own = {}
-    for name in (name for name in OTHERS if any(setup.solver == name for setup in setups)):
+    for name in (name for name in other_solvers() if any(setup.solver == name for setup in setups)):
         same = [setup for setup in setups if setup.solver == name]
         own[name] = own_reference(scene, same, frames, device, _KNOWN, max(_TIMES * limit, _SECONDS), watch)
     more = [{"own": str(own[setup.solver].path)} if own.get(setup.solver) else {} for setup in setups]
