@@ -1,10 +1,13 @@
 """The site of the documentation: sphinx-build -W docs site"""
 
+import os
 import sys
 from importlib.metadata import version as installed
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+# Cells call the command warpcloth of this environment, also if it is not activated.
+os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
 
 project, author, copyright = "warpcloth", "the authors of warpcloth", "the authors of warpcloth, Apache-2.0"
 release = version = installed("warpcloth")
