@@ -11,8 +11,8 @@ A cloth is a Mesh prim (or linear BasisCurves) with attributes. For a linen clot
 
 Our own attributes are on the cloth's prim. They are in SI units and world space, whatever the units of the stage, and in the
 precision of the scene. Standard attributes are read in the units of the stage; where both are authored, ours win.
-`physics:surfaceShearStiffness` is not read, with a warning. Per-point `physics:masses` are not read, nor is a spring stiffness
-guessed from `physics:youngsModulus` or from attributes of other cloth tools.
+:mod:`.deformables` says what the names of the AOUSD proposal and of Newton, the physics engine, mean. Attributes that other
+cloth tools define for themselves are not read.
 
 An attribute may also be on the Xform above the cloth, where Blender puts the properties of an object. Those on the cloth itself
 win. Other data of a stage:
@@ -45,7 +45,7 @@ class Attribute:
         name: Name of the attribute; <name> is any name for a term.
         location: Its prim: "cloth", the cloth or the Xform above it; "body", the cloth or the nearest prim above it with
             PhysicsDeformableBodyAPI; "material", the physics material bound to that; "collider", a collider or the Xform above
-            it; "its material", the physics material bound to a collider; "physics scene".
+            it; "its material", the physics material bound to a collider; "attachment", a PhysicsAttachment; "physics scene".
         type_names: Allowed types, of any precision; the first for one value, the last for several.
         kilograms, metres: Powers of kilogramsPerUnit and metersPerUnit by which to multiply for SI units.
     """
@@ -65,8 +65,10 @@ class Attribute:
     @property
     def infinite(self):
         """Whether it may be infinite: each term checks its own values, and USD uses −inf for the gravity of the earth."""
-        return self.field.startswith("terms.") or self.field in ("(gravity magnitude)", "contact.stiffness")
+        return self.field.startswith("terms.") or self.field in _INFINITE
 
+
+_INFINITE = ("(gravity magnitude)", "contact.stiffness", "(attachment stiffness)", "(shell thickness)")
 
 ATTRIBUTES = (
     # Our own. Of several rows of one field, the first wins.
@@ -125,16 +127,32 @@ ATTRIBUTES = (
     Attribute("(approximation)", "physics:approximation", "collider", ("token",)),
     Attribute("colliders.friction", "physics:dynamicFriction", "its material", ("float",)),
     Attribute("(static friction)", "physics:staticFriction", "its material", ("float",)),
-    # Standard: UsdPhysics, and the AOUSD proposal for deformable bodies.
+    # Standard: UsdPhysics, the AOUSD proposal for deformable bodies, and Newton; see `deformables`.
+    Attribute("(masses)", "physics:masses", "cloth", ("float[]",), kilograms=1),
+    Attribute("(masses of)", "physics:masses:elementType", "cloth", ("token",)),
+    Attribute("(thicknesses)", "physics:thicknesses", "cloth", ("float[]",), metres=1),
+    Attribute("(mass model)", "newton:massModel", "cloth", ("token",)),
+    Attribute("(shell thickness)", "newton:shellThickness", "cloth", ("float",), metres=1),  # if the mass model is "shell"
+    Attribute("(rest angles)", "physics:restBendAnglesDefault", "cloth", ("token",)),
     Attribute("(total mass)", "physics:mass", "body", ("float",), kilograms=1),  # spread evenly
     Attribute("(mass per volume)", "physics:density", "body", ("float",), kilograms=1, metres=-3),
     Attribute("(mass per volume)", "physics:density", "material", ("float",), kilograms=1, metres=-3),
     Attribute("(thickness)", "physics:surfaceThickness", "material", ("float",), metres=1),  # 1 mm where not given
-    # A spring of this stiffness on each edge: an approximation, whose stretch and shear depend on the triangulation.
     Attribute("(stretch stiffness)", "physics:surfaceStretchStiffness", "material", ("float",), kilograms=1),
+    Attribute("(shear stiffness)", "physics:surfaceShearStiffness", "material", ("float",), kilograms=1),
     Attribute("(bend stiffness)", "physics:surfaceBendStiffness", "material", ("float",), kilograms=1, metres=2),
+    Attribute("(Young's modulus)", "physics:youngsModulus", "material", ("float",), kilograms=1, metres=-1),
+    Attribute("(Poisson's ratio)", "physics:poissonsRatio", "material", ("float",)),
+    Attribute("(held points)", "physics:indices0", "attachment", ("int[]",)),
+    Attribute("(kind of points)", "physics:type0", "attachment", ("token",)),
+    Attribute("(kind of anchors)", "physics:type1", "attachment", ("token",)),
+    Attribute("(anchors)", "physics:coords1", "attachment", ("point3f[]",)),
+    Attribute("(attachment stiffness)", "physics:stiffness", "attachment", ("float",), kilograms=1),
+    Attribute("(attachment damping)", "physics:damping", "attachment", ("float",), kilograms=1),
+    Attribute("(attached)", "physics:attachmentEnabled", "attachment", ("bool",)),
     Attribute("(gravity direction)", "physics:gravityDirection", "physics scene", ("vector3f",)),
     Attribute("(gravity magnitude)", "physics:gravityMagnitude", "physics scene", ("float",), metres=1),
+    Attribute("(gravity acts)", "newton:gravityEnabled", "physics scene", ("bool",)),
 )
 
 # Namespace of the attributes of terms.
@@ -172,12 +190,12 @@ def attributes():
 
 
 class Values:
-    """The attributes of a cloth or of a collider by field, in SI units.
+    """The attributes of a cloth, a collider or an attachment by field, in SI units.
 
     Args:
         stage: The stage.
-        prim: The prim of the cloth or collider.
-        kind: "cloth" or "collider".
+        prim: The prim.
+        kind: "cloth", "collider" or "attachment".
 
     Raises:
         ValueError: A name in our namespace is not in the table.
@@ -186,6 +204,9 @@ class Values:
     def __init__(self, stage, prim, kind="cloth"):
         self.kilograms = UsdPhysics.GetStageKilogramsPerUnit(stage)
         self.metres = UsdGeom.GetStageMetersPerUnit(stage)
+        if kind == "attachment":
+            self.locations = {"attachment": [prim]}
+            return
         material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
         if kind == "cloth":
             self.locations = {"cloth": holders(prim), "body": [_body(prim)], "material": [material]}
@@ -234,11 +255,14 @@ class Values:
             if isinstance(value, (Vt.TokenArray, Vt.StringArray)):
                 return tuple(value)
             value = np.array(value)[()]
+            if row.location == "material" and value == -np.inf:  # in the proposal, the default of a simulator
+                continue
             refuse_unknown(attribute.GetName(), np.asarray(value), infinite=row.infinite)
-            if row.location in ("body", "material", "its material") and value < 0:
+            signed = row.field == "(Poisson's ratio)"
+            if row.location in ("body", "material", "its material") and value < 0 and not signed:
                 raise ValueError(f"{attribute.GetName()} is {value}, must be 0 or more")
             # In UsdPhysics and the proposal, 0 stands for a mass, density or stiffness that is not given.
-            if row.location not in ("body", "material") or value != 0:
+            if row.location not in ("body", "material") or value != 0 or signed:
                 scale = self.kilograms**row.kilograms * self.metres**row.metres
                 return value if scale == 1 else value * scale
         return None

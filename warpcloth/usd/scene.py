@@ -1,7 +1,6 @@
 """Reads scenes from USD stages and writes them. `attributes` lists the attributes."""
 
 import os
-import warnings
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
@@ -16,12 +15,22 @@ from ..scene.air import Air
 from ..scene.colliders import Contact
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..scene.self_contact import SelfContact
-from ..terms import TERMS, QuadraticBending, Spring
+from ..terms import TERMS
 from ..terms.limit import Limit
 from ..terms.loads import LOADS
 from .attributes import LOADS_NAMESPACE, TERMS_NAMESPACE, Values, attributes, author, has_api, kind_of, own_names
 from .chunks import export
 from .colliders import errors_at, read_colliders
+from .deformables import (
+    LAWS,
+    THICKNESS,
+    attachments_of,
+    define_deformable,
+    masses_of,
+    refuse_other_rest,
+    terms_of,
+    thickness_of,
+)
 from .gprims import define_colliders
 from .layers import scene_layer
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics
@@ -41,17 +50,15 @@ from .stage import (
 )
 from .values import array_of, refuse_unknown, sentences, time_codes_of, value_of
 
-_SHEAR = "physics:surfaceShearStiffness"
-_THICKNESS = 1e-3  # [m], the default of the proposal
 
-
-def read_scene(path: FilePath, prim: str | None = None) -> Scene:
+def read_scene(path: FilePath, prim: str | None = None, law: str = "proposal") -> Scene:
     """Reads a scene from a stage; `simulate` then writes its animation as a layer over that stage.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
         prim: Path or name of the prim of the cloth. By default all prims with cloth attributes are cloths of the scene, or
             without any the only mesh.
+        law: What the standard names of a material mean: "proposal" or "newton", see :mod:`.deformables`.
 
     Returns:
         Scene: With `stage` set. A file of `write_scene` gives the written scene, except that pins are sorted, that a
@@ -62,6 +69,8 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
         ValueError: See `read_stage_mesh`. Or there is no mass or no term. Or an attribute has a wrong type, an invalid value,
             or an unknown name in the namespace "warpcloth".
     """
+    if law not in LAWS:
+        raise ValueError(f"law is {law!r}; it must be one of {', '.join(LAWS)}")
     with sentences(path):
         stage = open_stage(path)
         found = _cloth_prims(stage, path, prim)
@@ -79,7 +88,7 @@ def read_scene(path: FilePath, prim: str | None = None) -> Scene:
         scenes = []
         for cloth, of_cloth, one in zip(cloths, values, each, strict=True):
             with errors_at(f"{path}, prim {one.prim}"):
-                scenes.append(_scene(stage, cloth, of_cloth, one, fps, duration, values))
+                scenes.append(_scene(stage, cloth, of_cloth, one, fps, duration, values, law))
 
         def codes(samples):  # one more frame than the scene has, so that every step has a keyframe after it
             return frame_codes(samples, surroundings, scenes[0].frames + 1, fps)
@@ -117,16 +126,29 @@ def _names_of(each):
     return names if len(set(names)) == len(names) else [path.replace("/", "_") for path in paths]
 
 
-def _scene(stage, cloth, values, surroundings, fps, duration, of_all):
+def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law):
     """The scene of one cloth without colliders and contact. Any of the cloths may give gravity."""
+    refuse_other_rest(cloth)
     rest = surroundings.mesh.points
     surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
     mesh = surroundings.mesh
-    fabric, density, masses, terms = values.get("fabric"), _density(values, mesh), values.get("masses"), _terms(values, mesh)
+    fabric, terms, frames = values.get("fabric"), [_term(values, key) for key in values.terms], round(duration * fps)
+    standard = not terms and fabric is None
+    masses, own = values.get("masses"), values.get("density")
+    masses = masses_of(values, mesh) if masses is None and own is None and fabric is None else masses
+    density = _density(values, mesh) if masses is None else own
+    vertices = _pinned(values, cloth, surroundings)
+    positions, keyframes = _motion(values, cloth, surroundings, vertices, frames, fps)
+
+    def codes(samples):
+        return frame_codes(samples, surroundings, frames + 1, fps)
+
+    held = attachments_of(stage, cloth, surroundings, rest if positions is None else positions, codes)
+    vertices, keyframes = _with_held(vertices, keyframes, held, rest if positions is None else positions)
+    if standard:
+        terms = [*(terms_of(values, mesh, law) if len(mesh.triangles) else ()), *held.terms]
     if fabric is None:
         _refuse_missing(density is not None or masses is not None, len(terms) > 0)
-    vertices = _pinned(values, cloth, surroundings)
-    positions, keyframes = _motion(values, cloth, surroundings, vertices, round(duration * fps), fps)
     if positions is not None and np.array_equal(positions, rest):
         positions = None
     own_positions, name = values.get("positions"), values.get("name")
@@ -139,14 +161,14 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all):
         terms=terms,
         pins=Pins(vertices, keyframes, values.get("pins.axes") or "xyz"),
         free_axes=_free_axes(values),
-        loads=[_load(values, key, surroundings, round(duration * fps), fps) for key in values.loads],
+        loads=[_load(values, key, surroundings, frames, fps) for key in values.loads],
         gravity=_gravity(stage, _teller("gravity", of_all), surroundings.up_axis),
         duration=duration,
         fps=fps,
         name=cloth.GetName() if name is None else name,
         stage=surroundings,
         fabric=fabric,
-        thickness=values.get("thickness"),
+        thickness=thickness_of(values) if standard and values.get("thickness") is None else values.get("thickness"),
     )
     for term in scene.terms:
         term.elements(mesh, scene.positions)  # raises errors here, where the file is known
@@ -177,8 +199,8 @@ def read_limits(stage, cloth, surroundings):
 
 def _refuse_missing(mass, term):
     wanted = {
-        "mass": (mass, ("density", "fabric", "masses", "(total mass)", "(mass per volume)")),
-        "term": (term, ("terms.type", "(stretch stiffness)", "(bend stiffness)")),
+        "mass": (mass, ("density", "fabric", "masses", "(masses)", "(total mass)", "(mass per volume)")),
+        "term": (term, ("terms.type", "(stretch stiffness)", "(bend stiffness)", "(Young's modulus)")),
     }
     missing = [
         f"{what} ({', '.join(dict.fromkeys(row.name for row in attributes() if row.field in read_from))})"
@@ -257,29 +279,14 @@ def _duration(stage, values, fps):
 
 def _density(values, mesh):
     """Mass per area [kg/m²], or for curves per length [kg/m], from our attribute or the standard ones; or None."""
-    density = values.get("density")
-    if density is not None or values.get("masses") is not None:
+    density, total, per_volume = (values.get(field) for field in ("density", "(total mass)", "(mass per volume)"))
+    if density is not None:
         return density
-    total, per_volume = values.get("(total mass)"), values.get("(mass per volume)")
     if total is not None:
         return total / (mesh.vertex_areas if len(mesh.triangles) else mesh.vertex_lengths).sum()
     if len(mesh.triangles) and per_volume is not None:
-        thickness = values.get("(thickness)")
-        return per_volume * (_THICKNESS if thickness is None else thickness)
+        return per_volume * (thickness_of(values) or THICKNESS)
     return None
-
-
-def _terms(values, mesh):
-    """Terms from our attributes, else from a surface material; warns if that has a shear stiffness."""
-    terms = [_term(values, key) for key in values.terms]
-    if not terms and len(mesh.triangles):
-        stretch, bend = values.get("(stretch stiffness)"), values.get("(bend stiffness)")
-        terms += [] if stretch is None else [Spring(pairs="edges", stiffness=float(stretch))]
-        terms += [] if bend is None else [QuadraticBending(stiffness=float(bend))]
-        shear = terms and values.locations["material"][0].GetAttribute(_SHEAR)
-        if shear and shear.HasAuthoredValue() and shear.Get():
-            warnings.warn(f"{shear.GetPath()} is not read; the springs of the edges resist shear too", stacklevel=2)
-    return terms
 
 
 def _term(values, key):
@@ -346,6 +353,20 @@ def _pinned(values, cloth, surroundings):
     if selection is not None:
         vertices = np.append(vertices, distinct_vertices("warpcloth:pins", selection, surroundings.mesh))
     return np.unique(vertices).astype(np.int32)
+
+
+def _with_held(vertices, keyframes, held, start):
+    """The pins (p,) and their keyframes, or None, with those of attachments; the others stand still where these move."""
+    both = np.union1d(vertices, held.vertices).astype(np.int32)
+    if len(both) == len(vertices) and (keyframes is not None or held.keyframes is None):
+        return vertices, keyframes
+    if held.keyframes is None and keyframes is None:
+        return both, None
+    if keyframes is not None:
+        raise ValueError("pins follow keyframes and a PhysicsAttachment holds other points, must be one of them")
+    moved = np.repeat(start[both][None], len(held.keyframes), axis=0)
+    moved[:, np.searchsorted(both, held.vertices)] = held.keyframes
+    return both, moved
 
 
 def _motion(values, cloth, surroundings, vertices, frames, fps):
@@ -446,6 +467,8 @@ def _gravity(stage, values, up_axis):
     if len(scenes) > 1:
         raise ValueError(f"the stage has {len(scenes)} PhysicsScenes, must have one or warpcloth:gravity on the cloth")
     values.locations["physics scene"] = scenes
+    if values.get("(gravity acts)") is not None and not values.get("(gravity acts)"):
+        return np.zeros(3)
     direction, magnitude = values.get("(gravity direction)"), values.get("(gravity magnitude)")
     if direction is None or not direction.any():
         direction = np.array(DOWN[up_axis])
@@ -454,12 +477,14 @@ def _gravity(stage, values, up_axis):
     return magnitude * direction.astype(np.float64) / np.linalg.norm(direction)
 
 
-def write_scene(scene: Scene, path: FilePath) -> str:
+def write_scene(scene: Scene, path: FilePath, law: str | None = None) -> str:
     """Writes a scene as a new stage: /World/Cloth at rest, in metres, with the whole scene as attributes.
 
     Args:
         scene: The `Scene`. If it was read from a stage, the rest of that stage is not written.
         path: File to write: .usd, .usda or .usdc.
+        law: Also write the names of deformable bodies that other programs read, with the values that mean the same scene by
+            the law "proposal" or "newton", see :mod:`.deformables`. By default these names are not written.
 
     Returns:
         str: The path.
@@ -467,7 +492,7 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     Raises:
         FileNotFoundError: The folder does not exist.
         ValueError: The path has another ending, or is the stage that the scene was read from. Or the scene has no terms, or one
-            that does not fit the mesh, or a wind that is a function.
+            that does not fit the mesh, or a wind that is a function; or something that has no name by ``law``.
         OSError: The file could not be written.
     """
     path = Path(os.path.abspath(followed(path)))
@@ -487,6 +512,8 @@ def write_scene(scene: Scene, path: FilePath) -> str:
     pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
     layer, target, _ = scene_layer(scene.mesh, pins, up_axis, "Cloth")
     define_colliders(layer, scene.colliders, scene.mesh)
+    if law is not None:
+        define_deformable(layer, scene, law)
     stage = Usd.Stage.Open(layer)
     stage.SetTimeCodesPerSecond(scene.fps)
     stage.SetFramesPerSecond(scene.fps)
