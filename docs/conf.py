@@ -7,6 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 # Cells call the command warpcloth of this environment, also if it is not activated.
+os.environ["TQDM_DISABLE"] = "1"  # no progress bars in the output of cells
 os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
 
 project, author, copyright = "warpcloth", "the authors of warpcloth", "the authors of warpcloth, Apache-2.0"
