@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from .base import interrupts as interrupts  # first, so that it handles interrupts while the other modules load
 from .base.collector import collector_paused
 from .base.extensions import load_installed
+from .base.notebooks import show_by
 from .base.quiet import prepare_warp
 
 if TYPE_CHECKING:  # the table below, for type checkers
@@ -33,6 +34,7 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .numerics.rotation import kabsch as kabsch
     from .numerics.rotation import polar as polar
     from .numerics.rotation import svd as svd
+    from .picture.pages import view as view
     from .picture.render import render as render
     from .run.equilibrium import Equilibrium as Equilibrium
     from .run.equilibrium import equilibrium as equilibrium
@@ -82,6 +84,7 @@ _MODULES = {
     "kabsch": "numerics.rotation",
     "polar": "numerics.rotation",
     "svd": "numerics.rotation",
+    "view": "picture.pages",
     "render": "picture.render",
     "Equilibrium": "run.equilibrium",
     "equilibrium": "run.equilibrium",
@@ -109,6 +112,12 @@ _MODULES = {
     "Traction": "terms.loads",
 }
 _CATALOGUES = ("solvers", "terms")
+
+
+@show_by
+def _html(source):
+    """Returns the HTML by which a notebook shows an animation, from the package that draws."""
+    return _from("picture.pages", "notebook_html")(source)
 
 
 if not TYPE_CHECKING:  # with __getattr__, a type checker would accept any name

@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 # What lies in a checkout that is no part of the source.
-NO_SOURCE = (".*", "build", "dist", "*.egg-info", "__pycache__")
+NO_SOURCE = (".*", "build", "dist", "*.egg-info", "__pycache__", "node_modules")
 
 pytestmark = pytest.mark.slow
 
@@ -100,6 +100,7 @@ def test_a_wheel_has_all_files_and_no_others(wheel):
         expected |= {f"{inside}/{path}" for path in paths if path.parts[0] not in ("kernels", "scenes")}
     assert {"warpcloth/kernels/assemble.py", "warpcloth/kernels/terms/spring.py", "warpcloth/scenes/hanging.py"} <= expected
     expected |= {"warpcloth/py.typed", "warpcloth/scenes/character.usda"}
+    expected |= {f"warpcloth/picture/viewer/{name}" for name in ("page.html", "viewer.js", "three.LICENSE")}
     assert {name for name in names if ".dist-info/" not in name} == expected
     assert [name for name in names if name.endswith("/LICENSE")]
 

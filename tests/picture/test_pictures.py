@@ -16,7 +16,7 @@ from warpcloth.chart import Scale, View, draw, plot_percentiles, range_over
 from warpcloth.picture import colour
 from warpcloth.picture.colour import EXCLUDED
 from warpcloth.picture.figures import save
-from warpcloth.picture.view import brightness
+from warpcloth.picture.projection import brightness
 
 FRONT = View(azimuth=0.0, elevation=0.0)
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])

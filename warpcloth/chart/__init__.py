@@ -2,7 +2,7 @@
 
 from ..picture.colour import Scale, range_over
 from ..picture.picture import draw
-from ..picture.view import View
+from ..picture.projection import View
 from .distances import plot_distances
 from .percentiles import plot_percentiles
 from .residuals import plot_residuals

@@ -22,7 +22,24 @@ import numpy as np
 
 from ..base.interrupts import Interrupts
 from ..base.version import installed_version
-from . import analyze, bench, chart, check, choose, compare, deform, fabrics, fit, info, measure, options, render, run, scenes
+from . import (
+    analyze,
+    bench,
+    chart,
+    check,
+    choose,
+    compare,
+    deform,
+    fabrics,
+    fit,
+    info,
+    measure,
+    options,
+    render,
+    run,
+    scenes,
+    view,
+)
 from .terminal import DTYPES, Printable, say, show_warning
 
 
@@ -144,6 +161,8 @@ def _parser():
     check.add_arguments(checks)
     renders = add("render", render.render, "Draw a picture or a film of an animation.", epilog=render.EPILOG)
     render.add_arguments(renders)
+    views = add("view", view.view, "Write a page that shows an animation in a browser.", epilog=view.EPILOG)
+    view.add_arguments(views)
     charts = commands.add_parser("chart", help=chart.TEXT, description=chart.TEXT, allow_abbrev=False)
     chart.add_arguments(charts)
     chooses = add("choose", choose.choose, "Choose the cheapest solver and settings for a scene.", epilog=choose.EPILOG)
@@ -186,7 +205,7 @@ def _parser():
     runs.add_argument(
         "--frames", type=int, metavar="N", help="number of frames after the start (default: those of the scene's duration)"
     )
-    for sub in (runs, infos, deforms, analyzes, compares, measures, checks, renders, chooses, benches, fitted):
+    for sub in (runs, infos, deforms, analyzes, compares, measures, checks, renders, views, chooses, benches, fitted):
         if sub is not checks:
             sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")

@@ -38,6 +38,14 @@ def add_arguments(parser):
     add("--size", type=size, default=SIZE, metavar="WxH", help="width and height in pixels (default: 1280x720)")
     add("--samples", type=int, default=4, metavar="N", help="rays through each pixel (default: 4)")
     add("--colour", metavar="NAME", help="show a measured value as colour, such as stretch_1 (default: plain cloth)")
+    add_camera(parser)
+    add("--time", action="store_true", help="write the time into a corner")
+    add_measuring(parser)
+
+
+def add_camera(parser):
+    """Adds the options of the camera and the ground."""
+    add = parser.add_argument
     add("--azimuth", type=float, default=-38.0, metavar="DEGREES", help="angle of the camera about the vertical (default: -38)")
     add(
         "--elevation",
@@ -49,8 +57,6 @@ def add_arguments(parser):
     add("--zoom", type=float, default=1.0, metavar="FACTOR", help="zoom in by this factor (default: 1, the whole motion)")
     add("--ground", type=float, metavar="HEIGHT", help="height of the ground [m] (default: the lowest point of the motion)")
     add("--no-ground", action="store_true", help="draw no ground")
-    add("--time", action="store_true", help="write the time into a corner")
-    add_measuring(parser)
 
 
 def size(text):

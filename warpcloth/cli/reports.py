@@ -92,7 +92,7 @@ def write_report(
         single_file: Whether the stage is one file, see :class:`warpcloth.usd.AnimationWriter`.
         up_axis: "Y" or "Z", for inputs that have none.
         progress: Function called with (row, rows) after each row, or None.
-        view: The :class:`warpcloth.picture.view.View` of the stills, or None; its up axis is that of the animation.
+        view: The :class:`warpcloth.picture.projection.View` of the stills, or None; its up axis is that of the animation.
         both_sides: Whether stills also show the opposite side of the cloth, see :func:`warpcloth.picture.picture.draw`.
         colormap: Name of a colour map of matplotlib, or None, see :class:`warpcloth.picture.colour.Scale`.
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..base.checks import number, refuse, shown, whole
 from ..base.interrupts import recording
+from ..base.notebooks import ShownInNotebooks
 from ..base.types import FilePath, Precision, Progress, UpAxis
 from ..mesh.mesh import Mesh
 from ..mesh.stage_mesh import StageMesh
@@ -19,7 +20,7 @@ PRIMVAR = "rotationAngle"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Deformation:
+class Deformation(ShownInNotebooks):
     """The result of a deformation: a frame for each keyframe.
 
     Attributes:

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base import checks
+from ..base.notebooks import ShownInNotebooks
 from ..base.types import FilePath, UpAxis
 from .loading import ENDINGS, WELDED, read_arrays
 from .mesh import Mesh, Surface
@@ -50,7 +51,7 @@ class HasPoints(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class Sequence(ShownInNotebooks):
     """Frames of one mesh. Indexing reads a frame and keeps nothing, so that memory stays constant.
 
     `sequence[i]` is a copy of the points of frame i, (n, 3) [m], float64, with infinities and NaN as the input has them. It

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.checks import array, number
-from .view import View
+from .projection import View
 
 # Smallest half height of the picture at the nearest point of a motion, relative to the longest extent.
 _CLOSEST = 0.1
@@ -88,3 +88,18 @@ class Camera:
         middle = np.append(eye[:2], (low[2] + high[2]) / 2.0)
         axes = view.project(np.eye(3))
         return cls(axes @ eye, axes @ middle, axes[:, 1], fov)
+
+    def sun(self, up):
+        """Returns the unit vector towards the sun (3,), over the right shoulder of the camera.
+
+        Args:
+            up: Unit vector (3,) away from the ground.
+        """
+        view = np.subtract(self.target, self.position)
+        right = np.cross(view, self.up)
+        right /= np.linalg.norm(right)
+        back = np.cross(right, up)
+        if not np.linalg.norm(back) > 1e-6:  # a camera that lies on its side
+            back = -view
+        sun = 0.8 * right + 0.9 * back / np.linalg.norm(back) + 0.8 * np.asarray(up)
+        return sun / np.linalg.norm(sun)

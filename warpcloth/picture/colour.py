@@ -131,6 +131,13 @@ def to_linear(colours):
     return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
 
 
+def byte_colour(linear):
+    """Converts linear Rec. 709 to a tuple of sRGB from 0 to 255."""
+    c = np.asarray(linear)
+    coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
+    return tuple(np.round(255.0 * coded).astype(int).tolist())
+
+
 def check_colormap(name):
     """Checks that matplotlib has a colour map.
 

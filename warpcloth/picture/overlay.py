@@ -48,21 +48,7 @@ class Overlay:
     def _ticks(self):
         """Values and labels of the ticks of the bar."""
         room = _BAR * self.height / (2.4 * self.letters)
-        values = round_numbers(self.scale.low, self.scale.high, max(2, min(6, int(room))))
-        factor = 10.0**self._exponent
-        step = float(np.diff(values).min()) / factor if len(values) > 1 else abs(values[0] / factor) or 1.0
-        digits = int(max(0, -np.floor(np.log10(step) + 1e-9), -np.floor(np.log10(step * 10) + 1e-9)))
-        while digits and all(f"{value / factor:.{digits}f}".endswith("0") for value in values):
-            digits -= 1
-        # With a hyphen for negative values, because the font has no minus sign.
-        return [(value, f"{value / factor:.{digits}f}") for value in values]
-
-    @cached_property
-    def _exponent(self):
-        """The power of ten by which the labels of the bar are divided."""
-        most = max(abs(self.scale.low), abs(self.scale.high))
-        exponent = 3 * int(np.floor(np.log10(most) / 3.0)) if most > 0.0 else 0
-        return exponent if not -3 < exponent < 6 else 0
+        return bar_ticks(self.scale, max(2, min(6, int(room))))
 
     @cached_property
     def _head(self):
@@ -72,8 +58,7 @@ class Overlay:
             if lines[-1] and self._length(lines[-1] + part) > widest:
                 lines.append("")
             lines[-1] += part
-        factor = f"1e{self._exponent}" if self._exponent else ""
-        unit = " ".join(filter(None, (factor, "" if self.unit == "1" else self.unit)))
+        unit = bar_unit(self.scale, self.unit)
         return [*lines, f"[{unit}]"] if unit else lines
 
     def _length(self, text):
@@ -141,6 +126,31 @@ class Overlay:
             y = bottom + tip + 1.2 * em
             pen.rectangle([start, y - 0.4 * em, start + 0.8 * em, y + 0.4 * em], tuple(round(255 * c) for c in EXCLUDED))
             pen.text((start + 1.2 * em, y), "no value", INK, self._font, "lm")
+
+
+def bar_ticks(scale, most):
+    """Returns the values and labels of at most some ticks of the bar of a scale; labels are divided by a power of ten."""
+    values = round_numbers(scale.low, scale.high, most)
+    factor = 10.0 ** _exponent(scale)
+    step = float(np.diff(values).min()) / factor if len(values) > 1 else abs(values[0] / factor) or 1.0
+    digits = int(max(0, -np.floor(np.log10(step) + 1e-9), -np.floor(np.log10(step * 10) + 1e-9)))
+    while digits and all(f"{value / factor:.{digits}f}".endswith("0") for value in values):
+        digits -= 1
+    # With a hyphen for negative values, because the font has no minus sign.
+    return [(value, f"{value / factor:.{digits}f}") for value in values]
+
+
+def bar_unit(scale, unit):
+    """Returns the text of the power of ten and the unit of the labels of `bar_ticks`; empty if there are none."""
+    exponent = _exponent(scale)
+    return " ".join(filter(None, (f"1e{exponent}" if exponent else "", "" if unit == "1" else unit)))
+
+
+def _exponent(scale):
+    """Returns the power of ten by which the labels of a bar are divided."""
+    most = max(abs(scale.low), abs(scale.high))
+    exponent = 3 * int(np.floor(np.log10(most) / 3.0)) if most > 0.0 else 0
+    return exponent if not -3 < exponent < 6 else 0
 
 
 def written(text):

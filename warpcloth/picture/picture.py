@@ -7,7 +7,7 @@ import numpy as np
 from ..base.checks import choice
 from .colour import EXCLUDED
 from .figures import GREY, check_path, save
-from .view import View, brightness
+from .projection import View, brightness
 
 # Inches: the longer side of a panel, the margins beside, above and, with several panels, below it, and gaps.
 _SIDE, _RIGHT, _TOP, _FOOT, _GAP = 6.0, 1.2, 0.5, 0.3, 0.15

@@ -187,19 +187,8 @@ class RayCaster:
         viewer.width, viewer.height, viewer.samples = width, height, self._samples
         return unit, viewer
 
-    def sun(self, camera):
-        """Returns the unit vector towards the sun (3,), over the right shoulder of a camera."""
-        view = np.subtract(camera.target, camera.position)
-        right = np.cross(view, camera.up)
-        right /= np.linalg.norm(right)
-        back = np.cross(right, self._up)
-        if not np.linalg.norm(back) > 1e-6:  # a camera that lies on its side
-            back = -view
-        sun = 0.8 * right + 0.9 * back / np.linalg.norm(back) + 0.8 * self._up
-        return sun / np.linalg.norm(sun)
-
     def _light(self, camera, unit):
-        sun = self.sun(camera)
+        sun = camera.sun(self._up)
         light = render.Light()
         light.up, light.sun = wp.vec3(*self._up), wp.vec3(*sun)
         light.sun_rays, light.sky_rays = self._sun_rays, self._sky_rays

@@ -3,7 +3,6 @@
 import os
 import warnings
 from collections.abc import Mapping
-from collections.abc import Sequence as Several
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,13 @@ from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart
 from ..base.types import FilePath, Progress, UpAxis
 from ..mesh.mesh import Mesh
-from .camera import Camera
-from .colour import check_colormap
+from .colour import byte_colour, check_colormap
 from .films import SHORTEST, STILL, check_film, check_times, open_film
+from .framing import frame_motion
 from .measured import GivenColours, GivenScalar, MeasuredScalar
 from .overlay import Overlay
 from .raycast import BACKGROUND, RayCaster
-from .subjects import located, subject_of
-
-# Surroundings that are larger than this, relative to the cloth, are not fitted into the picture.
-_LARGE = 1.5
-# Distance of the ground below the motion, relative to its size, so that cloth that lies on it is visible.
-_BELOW = 1e-3
+from .subjects import subject_of
 
 
 def render(
@@ -204,7 +198,7 @@ def _shots(subjects, ending, frame, frames, every, speed):
     elif frame is not None:
         raise ValueError(f"frame is given, and a {ending} has many; give frames, or a {STILL}")
     else:
-        chosen = _between(first, frames)[::every]
+        chosen = first.between(frames)[::every]
     times = [each.labels - each.labels[0] if each.times is None else each.times for each in subjects]
     times = [np.asarray(t) * (each.interval if each.times is None else 1.0) for t, each in zip(times, subjects, strict=True)]
     shots = [_Shot(times[0][k], [int(k)], _text(first, k)) for k in chosen]
@@ -235,27 +229,8 @@ def _index(subject, label):
     number("frame", label)
     apart = np.abs(subject.labels - label)
     if not apart.min() <= 1e-6:
-        raise ValueError(f"frame is {label:g}; it must be one of the {len(subject)} from {_ends(subject)}")
+        raise ValueError(f"frame is {label:g}; it must be one of the {len(subject)} from {subject.ends}")
     return int(apart.argmin())
-
-
-def _ends(subject):
-    return f"{subject.labels[0]:g} to {subject.labels[-1]:g}"
-
-
-def _between(subject, frames):
-    """Returns the indices of the frames from one number to another."""
-    if frames is None:
-        return np.arange(len(subject))
-    if not isinstance(frames, Several) or isinstance(frames, str) or len(frames) != 2:
-        raise ValueError(f"frames is {shown(frames)}; it must be the numbers of the first and the last frame")
-    low, high = (end if given is None else given for given, end in zip(frames, subject.labels[[0, -1]].tolist(), strict=True))
-    for value in (low, high):
-        number("frames", value)
-    found = np.flatnonzero((subject.labels >= low - 1e-6) & (subject.labels <= high + 1e-6))
-    if not len(found):
-        raise ValueError(f"frames is {low:g} to {high:g}, where there are none; they are {len(subject)}, from {_ends(subject)}")
-    return found
 
 
 def _colours(subjects, colour, given, colormap, rest, device, measuring):
@@ -292,7 +267,7 @@ class _Picture:
         self._up = subjects[0].up_axis
         named = [each.name for each in subjects] if len(subjects) > 1 else []
         title, unit = (values[0].name, values[0].unit) if values else ("", "1")
-        background = _srgb(BACKGROUND)
+        background = byte_colour(BACKGROUND)
         self._overlay = Overlay(size, scale, title, unit, named, background)
         width, height = size
         room = width - self._overlay.beside
@@ -300,7 +275,8 @@ class _Picture:
         widths[0] += room - sum(widths)
         # The bar is on the last panel, so the motion there is shifted to the left of it.
         shifts = [0.0] * (len(subjects) - 1) + [0.5 * self._overlay.beside / height]
-        low = self._frame(view, min(widths) / height)
+        pictures = ([each.read(k) for each, k in zip(subjects, shot.frames, strict=True)] for shot in shots)
+        self._camera, low = frame_motion(subjects, pictures, view, min(widths) / height)
         below = self._camera.position["YZ".index(self._up) + 1] < low
         if isinstance(ground, bool | np.bool_):
             ground = low if ground and not below else None
@@ -308,36 +284,6 @@ class _Picture:
         self._cameras = [replace(self._camera, shift=shift) for shift in shifts]
         widths[-1] += self._overlay.beside
         self._casters = [RayCaster(each.shapes, wide, height, **options) for each, wide in zip(subjects, widths, strict=True)]
-
-    def _frame(self, view, aspect):
-        """Sets the camera; returns the height of the ground."""
-        azimuth, elevation, zoom = view
-        up = "YZ".index(self._up) + 1
-        lowest, span = np.inf, [np.full(3, np.inf), np.full(3, -np.inf)]
-        fitted = [_fitted(each) for each in self._subjects]
-        seen = [[_seen(shape) for shape in each.shapes] for each in self._subjects]
-
-        def frames():
-            nonlocal lowest
-            for shot in self._shots:
-                for subject, k, chosen, drawn in zip(self._subjects, shot.frames, fitted, seen, strict=True):
-                    points = subject.read(k)
-                    for index, (shape, found) in enumerate(zip(subject.shapes, points, strict=True)):
-                        found = found[drawn[index]]
-                        finite = located(found)
-                        if not len(finite):
-                            continue
-                        lowest = min(lowest, finite[:, up].min() - (shape.radius if len(shape.lines) else 0.0))
-                        if index in chosen:
-                            span[0], span[1] = np.minimum(span[0], finite.min(axis=0)), np.maximum(span[1], finite.max(axis=0))
-                            yield finite
-            if lowest == np.inf:
-                raise ValueError(f"{self._subjects[0].name}: no position in the frames is finite; there is nothing to draw")
-
-        camera = Camera.framed(frames(), azimuth, elevation, self._up, aspect)
-        position, target = np.array(camera.position), np.array(camera.target)
-        self._camera = replace(camera, position=tuple(target + (position - target) / zoom))
-        return float(lowest - _BELOW * np.linalg.norm(span[1] - span[0]))
 
     def images(self, with_time):
         """Yields the pictures as Pillow images."""
@@ -371,23 +317,3 @@ def _held(rows, frames):
         if frame != last:
             last, values = frame, next(found)
         yield values
-
-
-def _fitted(subject):
-    """Returns the indices of the shapes that the camera frames: the cloth, and surroundings that are not much larger."""
-    drawn = [each[_seen(shape)] for shape, each in zip(subject.shapes, subject.read(0), strict=True)]
-    finite = [located(each) for each in drawn]
-    sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]
-    return [k for k, size in enumerate(sizes) if k == subject.coloured or size <= _LARGE * sizes[subject.coloured]]
-
-
-def _seen(shape):
-    """Returns the indices of the points of a shape that belong to a triangle, line or ball."""
-    return np.unique(np.concatenate([shape.triangles.ravel(), shape.lines.ravel(), shape.balls]))
-
-
-def _srgb(linear):
-    """Converts linear Rec. 709 to sRGB from 0 to 255."""
-    c = np.asarray(linear)
-    coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
-    return tuple(np.round(255.0 * coded).astype(int).tolist())

@@ -3,12 +3,13 @@
 import glob
 import os
 from collections.abc import Callable
+from collections.abc import Sequence as Several
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ..base.checks import shown, whole
+from ..base.checks import number, shown, whole
 from ..base.outputs import STAGE_ENDINGS
 from ..deformation.deform import Deformation
 from ..mesh.loading import ENDINGS
@@ -74,6 +75,32 @@ class Subject:
         if self.times is None or len(self.times) < 2:
             return 1.0 / 24.0
         return float(np.median(np.diff(self.times)))
+
+    @property
+    def ends(self):
+        """The numbers of the first and the last frame, as text."""
+        return f"{self.labels[0]:g} to {self.labels[-1]:g}"
+
+    def between(self, frames):
+        """Returns the indices of the frames from one number to another.
+
+        Args:
+            frames: Numbers of the first and the last frame, None for one that is left out; or None for all frames.
+
+        Raises:
+            ValueError: There are none, or `frames` is not as above.
+        """
+        if frames is None:
+            return np.arange(len(self))
+        if not isinstance(frames, Several) or isinstance(frames, str) or len(frames) != 2:
+            raise ValueError(f"frames is {shown(frames)}; it must be the numbers of the first and the last frame")
+        low, high = (end if given is None else given for given, end in zip(frames, self.labels[[0, -1]].tolist(), strict=True))
+        for value in (low, high):
+            number("frames", value)
+        found = np.flatnonzero((self.labels >= low - 1e-6) & (self.labels <= high + 1e-6))
+        if not len(found):
+            raise ValueError(f"frames is {low:g} to {high:g}, where there are none; they are {len(self)}, from {self.ends}")
+        return found
 
 
 def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0):

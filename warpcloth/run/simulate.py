@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import choice, whole
 from ..base.interrupts import recording
 from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
+from ..base.notebooks import ShownInNotebooks
 from ..base.turns import in_turn
 from ..base.types import FilePath, Precision, Progress
 from ..core.status import Status, Stopped
@@ -83,7 +84,7 @@ class SelfContactSummary(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Animation:
+class Animation(ShownInNotebooks):
     """The result of a run: the start and every good frame after it.
 
     Attributes:

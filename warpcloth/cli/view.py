@@ -1,0 +1,110 @@
+"""The command ``view``: writes a page that shows an animation in a browser."""
+
+import time
+from pathlib import Path
+
+from ..base.limits import shown_bytes
+from ..base.outputs import check_apart
+from ..base.quiet import find_device
+from ..base.texts import json_text
+from .analyze import add_measuring, measuring_of
+from .options import values_of
+from .render import add_camera, frames
+from .terminal import Bar, check_writable
+
+EPILOG = """\
+FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. The page is one file of HTML
+that loads nothing else: open it in a browser. It plays in real time and turns by the mouse. Positions are stored with 16 bits,
+values with 8: the page is for looking, not for measuring. Colours need matplotlib.
+
+  warpcloth view hanging.usdc -o hanging.html
+  warpcloth view hanging.usdc -o strain.html --colour stretch_1 --range 0.9 1.1 --frames 10:60
+  warpcloth view walk.usdc -o walk.html --colour area_ratio --colour rotation_angle --every 2
+"""
+
+
+def add_arguments(parser):
+    """Adds the arguments of this command, without those of all commands."""
+    add = parser.add_argument
+    add("file", metavar="FILE", help="the animation or mesh to show")
+    add("-o", "--output", metavar="FILE", required=True, help="the .html file to write")
+    add("--frames", type=frames, metavar="A:B", help="the first and the last frame (default: all)")
+    add("--every", type=int, default=1, metavar="K", help="show only every K-th frame")
+    add(
+        "--colour",
+        metavar="NAME",
+        action="append",
+        help="a measured value that the page can show as colour, such as area_ratio; may be given more than once "
+        "(default: stretch_1 and stretch_2, and the page opens with plain cloth)",
+    )
+    add("--plain", action="store_true", help="measure nothing, so that the page is smaller")
+    add_camera(parser)
+    add_measuring(parser)
+
+
+def view(arguments):
+    from ..mesh.mesh import Surface
+    from ..picture.pages import check_page
+    from ..picture.pages import view as write_page
+
+    if arguments.no_ground and arguments.ground is not None:
+        raise ValueError("--ground and --no-ground are given; give one of them")
+    if arguments.plain and arguments.colour:
+        raise ValueError("--plain and --colour are given; give one of them")
+    measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
+    if arguments.colour is None:
+        given = (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else []))
+        for name in given:
+            raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    check_page(arguments.output)
+    check_apart([arguments.output], [arguments.file, arguments.rest])
+    check_writable(arguments.output)
+    device = find_device(arguments.device)
+    rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
+    started = time.perf_counter()
+    progress = _Coding()
+    try:
+        write_page(
+            arguments.file,
+            arguments.output,
+            mesh=rest,
+            colours=() if arguments.plain else arguments.colour,
+            measuring=measuring or None,
+            ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
+            device=device.alias,
+            progress=progress,
+            **values_of(arguments, "prim", "fps", "up_axis", "frames", "every", "colour_range", "colormap"),
+            **values_of(arguments, "azimuth", "elevation", "zoom"),
+        )
+    finally:
+        progress.close()
+    facts = {
+        "input": arguments.file,
+        "file": arguments.output,
+        "frames": progress.frames,
+        "bytes": Path(arguments.output).stat().st_size,
+        "seconds": time.perf_counter() - started,
+        "device": device.alias,
+    }
+    print(json_text(facts) if arguments.json else _summary(facts))
+    return 0
+
+
+class _Coding(Bar):
+    """Counts the frames of a page, and shows them on a terminal."""
+
+    def __init__(self):
+        self.frames = 0
+        self.open(None, "reading", "")
+
+    def __call__(self, done, total):
+        self.frames = done
+        if done == 0:
+            self.open(total, "coding", "{n_fmt} of {total_fmt} frames, {remaining} left")
+        self.move(done)
+
+
+def _summary(facts):
+    count = facts["frames"]
+    frames = f"{count} frame{'s' if count > 1 else ''} in {facts['seconds']:.3g} s"
+    return f"{facts['file']}: {frames}, {shown_bytes(facts['bytes'])}; open it in a browser"

@@ -1,0 +1,67 @@
+"""The camera and the ground of a motion."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from .camera import Camera
+from .subjects import located
+
+# Surroundings that are larger than this, relative to the cloth, are not fitted into the picture.
+_LARGE = 1.5
+# Distance of the ground below the motion, relative to its size, so that cloth that lies on it is visible.
+_BELOW = 1e-3
+
+
+def frame_motion(subjects, pictures, view, aspect):
+    """Returns the camera that shows all of a motion, and the height of the ground below it [m].
+
+    Args:
+        subjects: List of :class:`Subject`, side by side, all with one up axis.
+        pictures: Iterable over pictures, each a list with, for each subject, the positions (n, 3) [m] of its shapes.
+        view: Azimuth and elevation [°], and zoom.
+        aspect: Width of the picture of a subject by its height.
+
+    Raises:
+        ValueError: No position is finite.
+    """
+    azimuth, elevation, zoom = view
+    up_axis = subjects[0].up_axis
+    up = "YZ".index(up_axis) + 1
+    lowest, span = np.inf, [np.full(3, np.inf), np.full(3, -np.inf)]
+    fitted = [_fitted(each) for each in subjects]
+    seen = [[seen_points(shape) for shape in each.shapes] for each in subjects]
+
+    def frames():
+        nonlocal lowest
+        for picture in pictures:
+            for subject, points, chosen, drawn in zip(subjects, picture, fitted, seen, strict=True):
+                for index, (shape, found) in enumerate(zip(subject.shapes, points, strict=True)):
+                    found = found[drawn[index]]
+                    finite = located(found)
+                    if not len(finite):
+                        continue
+                    lowest = min(lowest, finite[:, up].min() - (shape.radius if len(shape.lines) else 0.0))
+                    if index in chosen:
+                        span[0], span[1] = np.minimum(span[0], finite.min(axis=0)), np.maximum(span[1], finite.max(axis=0))
+                        yield finite
+        if lowest == np.inf:
+            raise ValueError(f"{subjects[0].name}: no position in the frames is finite; there is nothing to draw")
+
+    camera = Camera.framed(frames(), azimuth, elevation, up_axis, aspect)
+    position, target = np.array(camera.position), np.array(camera.target)
+    camera = replace(camera, position=tuple(target + (position - target) / zoom))
+    return camera, float(lowest - _BELOW * np.linalg.norm(span[1] - span[0]))
+
+
+def _fitted(subject):
+    """Returns the indices of the shapes that the camera frames: the cloth, and surroundings that are not much larger."""
+    drawn = [each[seen_points(shape)] for shape, each in zip(subject.shapes, subject.read(0), strict=True)]
+    finite = [located(each) for each in drawn]
+    sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]
+    return [k for k, size in enumerate(sizes) if k == subject.coloured or size <= _LARGE * sizes[subject.coloured]]
+
+
+def seen_points(shape):
+    """Returns the indices of the points of a shape that belong to a triangle, line or ball."""
+    return np.unique(np.concatenate([shape.triangles.ravel(), shape.lines.ravel(), shape.balls]))

@@ -1,0 +1,383 @@
+"""Pages: one file of HTML that shows an animation in a browser, from all sides, without a server or a network."""
+
+import base64
+import html
+import importlib.util
+import json
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.checks import array, choice, number, shown, whole
+from ..base.limits import shown_bytes
+from ..base.outputs import TEXT, Output, check_apart
+from ..base.types import FilePath, Progress, UpAxis
+from ..base.version import installed_version
+from ..mesh.mesh import Mesh
+from .coding import LEVELS, STEPS, CodedPositions, CodedValues, coded_indices
+from .colour import byte_colour, check_colormap
+from .framing import frame_motion, seen_points
+from .measured import GivenScalar, MeasuredScalar
+from .overlay import bar_ticks, bar_unit
+from .raycast import BACKGROUND
+from .shape import CLOTH
+from .subjects import located, subject_of
+
+ENDING = ".html"
+# Measures in a page if none are named: both principal stretches.
+USUAL = ("stretch_1", "stretch_2")
+# Largest page [bytes] that a browser can be expected to open, and that a notebook embeds.
+LARGEST, EMBEDDED = 400_000_000, 5_000_000
+# Width of the picture by its height for which the camera is set. A narrower window sees the same width.
+_ASPECT = 1.5
+_TICKS = 6
+_LESS = "fewer frames (frames, every) or colours take less"
+_FOLDER = Path(__file__).parent / "viewer"
+
+
+class TooLarge(ValueError):
+    """A page would be larger than it may be."""
+
+
+def view(
+    source: Any,
+    output: FilePath,
+    *,
+    mesh: Mesh | None = None,
+    prim: str | None = None,
+    fps: float | None = None,
+    up_axis: UpAxis | None = None,
+    copy: int | None = None,
+    frames: tuple[float | None, float | None] | None = None,
+    every: int = 1,
+    colours: str | Sequence[str] | Mapping[str, ArrayLike] | None = None,
+    colour_range: tuple[float, float] | None = None,
+    colormap: str | None = None,
+    measuring: Mapping[str, Any] | None = None,
+    azimuth: float = -38.0,
+    elevation: float = 24.0,
+    zoom: float = 1.0,
+    ground: bool | float = True,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> str:
+    """Writes a page that shows an animation in a browser: one file of HTML, which loads nothing else.
+
+    The page plays the motion in real time, has a slider for the frames, turns about the cloth by the mouse, and colours it by
+    one of its measures. Positions are rounded to 1/65534 of the longest side of the box of the motion of a shape, values to
+    1/254 of the range of their bar: a page is for looking, not for measuring. The same input gives the same bytes.
+
+    Args:
+        source: Any source of :func:`warpcloth.render`, but only one.
+        output: File to write, .html.
+        mesh: The :class:`warpcloth.Mesh` of frames given as an array; for other sources, the rest shape relative to which they
+            are measured.
+        prim: Path or name of the cloth in a stage, or name of the geometry in a mesh file.
+        fps: Frames per second of the source, if the source does not give them or to override them.
+        up_axis: "Y" or "Z", if the source does not give it.
+        copy: Index of the cloth of a batch; None shows all of them side by side.
+        frames: Numbers of the first and the last frame, as the source counts them; None stands for the first or last one.
+        every: Show only every k-th frame.
+        colours: Names of measures that the page can show as colours, such as ("stretch_1", "area_ratio"); or arrays (F, n) or
+            (F, T) of all frames of the source, by the text above their bar. () for none; None for the two principal stretches,
+            if matplotlib is installed and the source is one cloth of triangles with several frames. The page opens with the
+            first of them if they are given, else with plain cloth.
+        colour_range: Values at the ends of the bar of the only measure; by default from the 1st to the 99th percentile of all
+            frames.
+        colormap: A colour map of matplotlib; by default viridis, or coolwarm about the undeformed value.
+        measuring: Further options of :class:`warpcloth.Analyzer`, by name, such as {"reference": "first"}.
+        azimuth: Angle of the camera about the vertical [°], at the start.
+        elevation: Angle of the camera above the horizontal [°].
+        zoom: Factor by which the camera is nearer than needed to see the whole motion.
+        ground: Whether to show a ground at the lowest point of the motion; or its height [m].
+        device: A Warp device, which measures.
+        progress: Function called with (frames coded, frames), from 0; or None.
+
+    Returns:
+        str: The path of the file.
+
+    Raises:
+        FileNotFoundError: There is no such file or folder.
+        ImportError: Colours need matplotlib.
+        ValueError: An argument is not allowed, a source cannot be drawn, a frame of it cannot be read, or the page would be
+            larger than 400 MB.
+
+    Examples:
+        >>> import os, tempfile
+        >>> import warpcloth as wc
+        >>> path = os.path.join(tempfile.mkdtemp(), "sheet.html")
+        >>> os.path.basename(wc.view(wc.Mesh.grid(4, 4), path))
+        'sheet.html'
+    """
+    output = os.fspath(output)
+    check_page(output)
+    subject = _subject(source, mesh, prim, fps, up_axis, copy, azimuth)
+    check_apart([output], subject.files)
+    text = _page(
+        subject,
+        _chosen(subject, frames, every),
+        _values(subject, colours, mesh, measuring, device),
+        opened=bool(colours),
+        scaling=(colour_range, colormap),
+        seen_from=(azimuth, elevation, zoom),
+        ground=ground,
+        progress=progress,
+    )
+    with Output(output, "x", **TEXT) as file:
+        file.file.write(text)
+    return output
+
+
+def notebook_html(source):
+    """Returns the HTML by which a notebook shows an animation: its page, or a line that says how to write a page that is large.
+
+    Args:
+        source: An :class:`warpcloth.Animation`, :class:`warpcloth.Deformation` or :class:`warpcloth.Sequence`.
+
+    Returns:
+        str: None if the source has no mesh, so that it cannot be drawn.
+    """
+    named = html.escape(repr(source) if len(repr(source)) < 200 else type(source).__name__)
+    try:
+        subject = _subject(source)
+    except ValueError:
+        return None
+    try:
+        page = _page(subject, np.arange(len(subject)), _values(subject, None), largest=EMBEDDED)
+    except TooLarge as large:
+        return f'<p>{named}: {large}. <code>wc.view(animation, "animation.html")</code> writes it into a file.</p>'
+    style = "width: 100%; height: 480px; border: 0"
+    return f'<iframe title="{named}" style="{style}" srcdoc="{html.escape(page)}"></iframe>'
+
+
+def check_page(path):
+    """Checks that a page can be written, before anything is read.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ValueError: The ending is not .html, or the path is a folder or a device.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ENDING:
+        raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {ENDING}")
+    if not path.absolute().parent.is_dir():
+        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: is no regular file; it must be one, or free")
+
+
+def _subject(source, mesh=None, prim=None, fps=None, up_axis=None, copy=None, azimuth=-38.0):
+    if fps is not None:
+        number("fps", fps, above=0.0)
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise ValueError(f"mesh is {shown(mesh)}; it must be a Mesh")
+    if up_axis is not None:
+        choice("up_axis", up_axis, ("Y", "Z"))
+    number("azimuth", azimuth)
+    found = subject_of(source, mesh, prim, fps, copy, azimuth)
+    return replace(found, up_axis=found.up_axis or up_axis or "Y")
+
+
+def _chosen(subject, frames, every):
+    whole("every", every, 1)
+    return subject.between(frames)[::every]
+
+
+def _values(subject, colours, rest=None, measuring=None, device="cpu"):
+    """Returns the values by which a page can colour a subject."""
+    if colours is None:
+        cloths = [shape for shape in subject.shapes if len(shape.triangles) and tuple(shape.colour) == CLOTH]
+        can = len(cloths) == 1 and len(subject) > 1 and importlib.util.find_spec("matplotlib")
+        colours = USUAL if can else ()
+    if isinstance(colours, Mapping):
+        if measuring:
+            raise ValueError("measuring is given with values of your own; it must be None with them")
+        return [GivenScalar(values, subject, name) for name, values in colours.items()]
+    colours = (colours,) if isinstance(colours, str) else colours
+    if not isinstance(colours, Sequence):
+        raise ValueError(f"colours is {shown(colours)}; it must be names of measures, or arrays by name")
+    return [MeasuredScalar(subject, name, rest, device, dict(measuring or {})) for name in dict.fromkeys(colours)]
+
+
+def _page(
+    subject,
+    chosen,
+    values,
+    opened=False,
+    scaling=(None, None),
+    seen_from=(-38.0, 24.0, 1.0),
+    ground=True,
+    progress=None,
+    largest=None,
+):
+    """Returns the text of the page of some frames of a subject.
+
+    Args:
+        subject: The :class:`Subject`.
+        chosen: Indices of the frames.
+        values: What colours the cloth: list of `MeasuredScalar` or `GivenScalar`.
+        opened: Whether the page opens with the first of these colours.
+        scaling: Range of the bar of the only colour, or None; and colour map, or None.
+        seen_from: Azimuth and elevation of the camera [°], and its zoom.
+        ground: Whether there is a ground, or its height [m].
+        progress: Function called with (frames coded, frames), or None.
+        largest: Size of the largest page [bytes], or None for that of a file.
+
+    Raises:
+        TooLarge: The page would be larger.
+    """
+    given, colormap = scaling
+    largest = largest or LARGEST
+    if given is not None:
+        if len(values) != 1:
+            raise ValueError(
+                f"colour_range is given for {len(values)} measures; it must be that of one, the only one in colours"
+            )
+        array("colour_range", given, (2,))
+    if colormap is not None:
+        check_colormap(colormap)
+    number("elevation", seen_from[1])
+    number("zoom", seen_from[2], above=0.0)
+    if not isinstance(ground, bool | np.bool_):
+        number("ground", ground)
+    motion = _Motion(subject)
+    camera, lowest = frame_motion([subject], ([motion.note(subject.read(k))] for k in chosen), seen_from, _ASPECT)
+    if isinstance(ground, bool | np.bool_):
+        below = camera.position["YZ".index(subject.up_axis) + 1] < lowest
+        ground = lowest if ground and not below else None
+    scales = [each.scale((), given, colormap) for each in values]
+    positions = motion.coders()
+    coded = [CodedValues(scale) for scale in scales]
+    rows, excluded, counts = [each.rows(chosen) for each in values], [False] * len(values), [0] * len(values)
+    for done, k in enumerate(chosen):
+        if progress is not None:
+            progress(done, len(chosen))
+        for coder, moves, points in zip(positions, motion.moves, subject.read(k), strict=True):
+            if moves or not done:
+                coder.append(points)
+        for index, row in enumerate(rows):
+            found = next(row)
+            counts[index], excluded[index] = len(found), excluded[index] or bool(np.isnan(found).any())
+            coded[index].append(found)
+        size = sum(each.size for each in (*positions, *coded))
+        if size > largest:
+            so_far = f"with {done + 1} of {len(chosen)} frames in it"
+            raise TooLarge(f"{subject.name}: the page would be larger than {shown_bytes(largest)}, {so_far}; {_LESS}")
+    if progress is not None:
+        progress(len(chosen), len(chosen))
+    shapes = [_shape_data(*each) for each in zip(subject.shapes, positions, motion.moves, strict=True)]
+    measures = [_measure_data(*each) for each in zip(values, scales, coded, counts, excluded, strict=True)]
+    times = None if subject.times is None else np.round(subject.times[chosen], 9).tolist()
+    data = {
+        "name": subject.name,
+        "up": subject.up_axis,
+        "labels": subject.labels[chosen].tolist(),
+        "times": times,
+        "interval": subject.interval,
+        "camera": {"position": camera.position, "target": camera.target, "fov": camera.fov, "aspect": _ASPECT},
+        "sun": camera.sun(np.eye(3)["YZ".index(subject.up_axis) + 1]).tolist(),
+        "ground": ground,
+        "background": list(byte_colour(BACKGROUND)),
+        "shapes": shapes,
+        "coloured": subject.coloured,
+        "measures": measures,
+        "opened": 0 if opened and measures else None,
+        "version": installed_version() or "",
+    }
+    text = _filled(subject.name, data)
+    if len(text) > largest:
+        raise TooLarge(f"{subject.name}: the page would be larger than {shown_bytes(largest)}; {_LESS}")
+    return text
+
+
+class _Motion:
+    """The box of the motion of each shape, and whether it moves; found in one pass over the frames."""
+
+    def __init__(self, subject):
+        self._seen = [seen_points(shape) for shape in subject.shapes]
+        self._low = np.full((len(self._seen), 3), np.inf)
+        self._high, self._first = -self._low, None
+        self.moves = [False] * len(self._seen)
+
+    def note(self, picture):
+        """Notes the positions of the shapes in a frame, and returns them."""
+        self._first = picture if self._first is None else self._first
+        for k, (points, start, seen) in enumerate(zip(picture, self._first, self._seen, strict=True)):
+            found = located(points[seen])
+            if len(found):
+                self._low[k], self._high[k] = np.minimum(self._low[k], found.min(0)), np.maximum(self._high[k], found.max(0))
+            self.moves[k] = self.moves[k] or not np.array_equal(points, start, equal_nan=True)
+        return picture
+
+    def coders(self):
+        """Returns what codes the positions of each shape."""
+        found = []
+        for low, high in zip(self._low, self._high, strict=True):
+            known = np.isfinite(low).all()
+            side = float((high - low).max()) if known else 0.0
+            # The smallest quantum is far below the rounding of the coordinates, for a shape that is one point.
+            quantum = max(side / STEPS, np.finfo(np.float64).eps * float(np.abs(low).max()) if known else 0.0) or 1.0
+            found.append(CodedPositions(low if known else np.zeros(3), quantum))
+        return found
+
+
+def _shape_data(shape, coder, moves):
+    return {
+        "count": shape.count,
+        "triangles": coded_indices(shape.triangles),
+        "lines": coded_indices(shape.lines),
+        "radius": float(shape.radius),
+        "balls": coded_indices(shape.balls[:, None]),
+        "ballRadius": float(shape.ball_radius),
+        "colour": shape.colour.tolist(),
+        "back": shape.back.tolist(),
+        "ballColour": shape.ball_colour.tolist(),
+        "moves": moves,
+        "low": coder.low.tolist(),
+        "quantum": coder.quantum,
+        "positions": coder.text(),
+    }
+
+
+def _measure_data(values, scale, coder, count, excluded):
+    table = np.vstack([scale.srgb([np.nan]), scale.srgb(np.linspace(scale.low, scale.high, LEVELS + 1))])
+    return {
+        "name": values.name,
+        "unit": bar_unit(scale, values.unit),
+        "count": count,
+        "low": scale.low,
+        "high": scale.high,
+        "ticks": [[(value - scale.low) / (scale.high - scale.low), text] for value, text in bar_ticks(scale, _TICKS)],
+        "colours": base64.b64encode(np.round(255.0 * table).astype(np.uint8).tobytes()).decode(),
+        "excluded": excluded,
+        "values": coder.text(),
+    }
+
+
+def _filled(title, data):
+    """Returns the page with its parts filled in."""
+    parts = {
+        "title": html.escape(title),
+        "licence": html.escape((_FOLDER / "three.LICENSE").read_text(encoding="utf-8").strip()),
+        "viewer": _viewer(),
+        # In JSON < stands in texts only, where no end of the element may be read into it.
+        "data": json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+    }
+    text = (_FOLDER / "page.html").read_text(encoding="utf-8")
+    first, *rest = text.split("{{")
+    return first + "".join(parts[name] + after for name, after in (part.split("}}", 1) for part in rest))
+
+
+@cache
+def _viewer():
+    """Returns the code of the viewer, deflated, as base64."""
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    code = deflate.compress((_FOLDER / "viewer.js").read_bytes()) + deflate.flush()
+    return base64.b64encode(code).decode()
