@@ -223,6 +223,7 @@ def test_the_viewer_is_built_from_its_sources():
     assert f"of sources {digest} " in (VIEWER / "viewer.js").read_text(encoding="utf-8")[:200], "run viewer/source/build.sh"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium, in which a page is opened")
 def test_a_browser_shows_the_motion_and_fetches_nothing(stage, tmp_path):
     path = tmp_path / "fall.html"

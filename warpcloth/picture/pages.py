@@ -252,6 +252,7 @@ def _page(
     if isinstance(ground, bool | np.bool_):
         below = camera.position["YZ".index(subject.up_axis) + 1] < lowest
         ground = lowest if ground and not below else None
+    ground = None if ground is None else float(ground)
     scales = [each.scale((), given, colormap) for each in values]
     positions = motion.coders()
     coded = [CodedValues(scale) for scale in scales]

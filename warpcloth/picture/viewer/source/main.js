@@ -17,6 +17,7 @@ import { Shape } from "./shapes.js";
 
 const SKY = 0.42; // share of the light, and by how much the sky is darker below
 const TILT = 0.15;
+const BAR = 100; // width of the colour bar [px]
 const element = (id) => document.getElementById(id);
 
 class Player {
@@ -57,12 +58,12 @@ class Player {
     sun.position.set(...data.sun);
     sun.castShadow = true;
     sun.shadow.mapSize.set(2048, 2048);
-    sun.shadow.radius = 3;
+    sun.shadow.radius = 8;
     sun.shadow.normalBias = 0.004;
     Object.assign(sun.shadow.camera, { left: -0.6, right: 0.6, bottom: -0.6, top: 0.6, near: 0.05, far: 4 });
     this.world.add(sky, sun);
     if (data.ground !== null) {
-      const ground = new Mesh(new CircleGeometry(3, 64), new ShadowMaterial({ opacity: 0.3, depthWrite: false }));
+      const ground = new Mesh(new CircleGeometry(3, 64), new ShadowMaterial({ opacity: 0.25, depthWrite: false }));
       const height = (data.ground - shapes[0].origin[up.indexOf(1)]) / unit;
       ground.position.fromArray(up).multiplyScalar(height);
       if (data.up === "Y") ground.rotation.x = -Math.PI / 2;
@@ -91,11 +92,13 @@ class Player {
     const { clientWidth: width, clientHeight: height } = element("view");
     if (!width || !height) return;
     this.renderer.setSize(width, height);
+    // The motion fits beside the colour bar.
+    const room = width - (this.measure ? Math.min(BAR, width / 3) : 0);
     const half = Math.tan((this.data.camera.fov * Math.PI) / 360);
-    const narrower = Math.max(1, (this.data.camera.aspect * height) / width);
+    const narrower = Math.max(1, (this.data.camera.aspect * height) / room);
     this.camera.fov = (Math.atan(half * narrower) * 360) / Math.PI;
-    this.camera.aspect = width / height;
-    this.camera.updateProjectionMatrix();
+    this.camera.aspect = room / height;
+    this.camera.setViewOffset(room, height, 0, 0, width, height);
     this.dirty = true;
   }
 
@@ -197,7 +200,7 @@ class Player {
     element("bar").hidden = index === null;
     if (this.measure) this.legend();
     this.colour();
-    this.dirty = true;
+    this.resize();
   }
 
   colour() {

@@ -73,7 +73,7 @@ class Surface {
       let nx = uy * vz - uz * vy, ny = uz * vx - ux * vz, nz = ux * vy - uy * vx;
       const known = nx - nx + (ny - ny) + (nz - nz) === 0;
       if (!known) nx = ny = nz = 0;
-      const length = Math.hypot(nx, ny, nz) || 1;
+      const length = Math.sqrt(nx * nx + ny * ny + nz * nz) || 1;
       areas[k] = nx, areas[k + 1] = ny, areas[k + 2] = nz;
       faces[k] = nx / length, faces[k + 1] = ny / length, faces[k + 2] = nz / length;
       for (let corner = 0; corner < 3; corner++) {
@@ -85,7 +85,7 @@ class Surface {
     }
     for (let i = 0; i < smooth.length; i++) {
       const nx = normals[3 * i], ny = normals[3 * i + 1], nz = normals[3 * i + 2];
-      const least = SMOOTH * Math.hypot(nx, ny, nz);
+      const least = SMOOTH * Math.sqrt(nx * nx + ny * ny + nz * nz);
       let all = 1;
       for (let k = first[i]; k < first[i + 1] && all; k++) {
         const face = 3 * around[k];
@@ -105,7 +105,7 @@ class Surface {
           if (along > SHARP) nx += areas[face], ny += areas[face + 1], nz += areas[face + 2];
         }
       }
-      const length = Math.hypot(nx, ny, nz) || 1;
+      const length = Math.sqrt(nx * nx + ny * ny + nz * nz) || 1;
       normal[3 * k] = nx / length, normal[3 * k + 1] = ny / length, normal[3 * k + 2] = nz / length;
     }
     this.geometry.attributes.position.needsUpdate = true;
@@ -206,9 +206,14 @@ export class Shape {
     frame = this.data.moves ? frame : 0;
     if (frame === this.shown) return;
     this.shown = frame;
-    for (let i = 0; i < this.data.count; i++) {
-      for (let axis = 0; axis < 3; axis++) {
-        this.points[3 * i + axis] = (this.at(frame, i, axis) - this.origin[axis]) / this.unit;
+    const { count, low, quantum } = this.data;
+    for (let axis = 0; axis < 3; axis++) {
+      const from = (3 * frame + axis) * count;
+      const first = (low[axis] - this.origin[axis]) / this.unit;
+      const step = quantum / this.unit;
+      for (let i = 0; i < count; i++) {
+        const code = this.codes[from + i];
+        this.points[3 * i + axis] = code === NOWHERE ? NaN : first + step * code;
       }
     }
     for (const part of this.parts) part.move(this.points);
