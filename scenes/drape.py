@@ -5,17 +5,26 @@ import numpy as np
 import warpcloth as wc
 
 
-def scene(n: int = 32, radius: float = 0.3, friction: float = 0.3, stiffness: float = 300.0, duration: float = 2.0):
-    """Vertices per side, radius of the ball [m], coefficient of friction, spring stiffness [N/m], duration [s]."""
+def scene(
+    n: int = 32,
+    radius: float = 0.3,
+    friction: float = 0.3,
+    stiffness: float = 300.0,
+    duration: float = 2.0,
+    fabric: str | None = None,
+):
+    """Vertices per side, ball [m], coefficient of friction, springs [N/m], duration [s]; or one of 'warpcloth fabrics'."""
     wc.checks.number("radius", radius, above=0.0)
     wc.checks.whole("n", n, 2)
     grid = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")
-    density, distance = 0.15, max(0.75 / (n - 1) ** 2 / radius, 1e-3)  # also keeps edges of triangles out of the ball
+    springs = [wc.Spring(pairs=("structural", "shear"), stiffness=stiffness), wc.QuadraticBending(stiffness=1e-5)]
+    cloth = {"density": 0.15, "terms": springs} if fabric is None else {"fabric": fabric}
+    density = 0.15 if fabric is None else wc.fabrics.find(fabric).density
+    distance = max(0.75 / (n - 1) ** 2 / radius, 1e-3)  # also keeps edges of triangles out of the ball
     height = max(2.2 * radius, 2.0 * radius + 1.1 * distance)  # above the ball, without contact
     return wc.Scene(
         grid,
-        density=density,
-        terms=[wc.Spring(pairs=("structural", "shear"), stiffness=stiffness), wc.QuadraticBending(stiffness=1e-5)],
+        **cloth,
         positions=grid.points + np.array([-0.5, height, -0.5]),
         colliders=[
             wc.Sphere(radius=radius, position=(0.0, radius, 0.0), friction=friction, name="ball"),

@@ -16,7 +16,7 @@ from warpcloth.cli import check as checking
 from warpcloth.cli import render as drawing
 from warpcloth.picture import render as rendering
 from warpcloth.picture.colour import Scale, to_linear
-from warpcloth.picture.films import durations
+from warpcloth.picture.films import durations, open_film
 from warpcloth.picture.measured import scale_of
 from warpcloth.picture.overlay import Overlay, round_numbers, written
 from warpcloth.picture.shape import CLOTH
@@ -240,7 +240,7 @@ def test_colliders_of_a_run_are_drawn_as_those_of_its_stage(tmp_path):
     assert balls[len(balls) // 2 :] - balls[: len(balls) // 2] == pytest.approx(np.tile(apart, (len(balls) // 2, 1)), abs=1e-6)
 
 
-@pytest.mark.parametrize("ending", [".png", ".gif", ".mp4"])
+@pytest.mark.parametrize("ending", [".png", ".gif", ".webp", ".mp4"])
 def test_the_same_bytes_come_twice(folder, ending, tmp_path, device):
     if ending == ".mp4":
         pytest.importorskip("av")
@@ -470,11 +470,42 @@ def test_what_is_not_finite_is_left_out_and_said(tmp_path):
         wc.render(broken, tmp_path / "out.gif", mesh=MESH, **SMALL)
 
 
-def test_the_second_of_two_goes_on_to_its_end(folder, tmp_path):
-    path = tmp_path / "out.gif"
-    wc.render([wc.as_sequence(MESH, MOTION[:2], dt=1 / FPS), folder / "cloth.usdc"], path, **SMALL)
+def test_several_go_on_to_the_end_of_the_longest_in_rows(folder, tmp_path):
+    """Four cells: the first two sources keep their last frame. The second moves, the fifth would be in a third row."""
+    path, cloth = tmp_path / "out.webp", folder / "cloth.usdc"
+    still = wc.as_sequence(MESH, MOTION[:2], dt=1 / FPS)
+    wc.render([still, still, cloth, still], path, names=["", "", "", "M"], size=(128, 72), samples=1)
     with Image.open(path) as film:
         assert film.n_frames == FRAMES
+        frames = np.array([np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(film)])
+    assert frames.shape[1:] == (72, 128, 3)
+    cells = frames.reshape(FRAMES, 2, 36, 2, 64, 3).transpose(1, 3, 0, 2, 4, 5)
+    spans = np.ptp(cells[:, :, 2:], axis=2).max(axis=(2, 3, 4))
+    assert spans[1, 0] > 100 and spans[[0, 0, 1], [0, 1, 1]].max() < 8, "only the third moves after its second frame"
+    assert (
+        np.abs(cells[0, 0, 0, 16:] - cells[1, 1, 0, 16:]).max() < 40 < np.abs(cells[0, 0, 0, :16] - cells[1, 1, 0, :16]).max()
+    )
+
+
+@pytest.mark.parametrize("size", [(64, 36), (65, 37)])
+def test_a_webp_shows_the_pictures_of_its_film(size, tmp_path):
+    """Frames that change in part, or not at all, have their place and their time."""
+    pictures = np.full((4, size[1], size[0], 3), 200, np.uint8)
+    pictures[1, 10:20, 7:32] = pictures[2:, 10:20, 7:32] = 40
+    pictures[3, -1, -1] = 0
+    with open_film(tmp_path / "out.webp", size, [0.0, 1 / 24, 2 / 24, 1.0]) as film:
+        for each in pictures:
+            film.add(Image.fromarray(each))
+    with Image.open(tmp_path / "out.webp") as film:
+        assert (film.size, film.n_frames, film.info["loop"]) == (size, 4, 0)
+        found = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(film)]
+        durations = []
+        for k in range(4):
+            film.seek(k)
+            film.load()
+            durations.append(film.info["duration"])
+    assert np.abs(np.array(found)[:3] - pictures[:3]).mean() < 1.5 and np.abs(found[3][-1, -1] - 0).max() < 60
+    assert durations == [42, 41, 917, 917]
 
 
 def test_an_interrupt_leaves_the_good_pictures_or_nothing(folder, tmp_path):
@@ -518,7 +549,7 @@ def test_the_command_draws(folder, tmp_path, capfd):
     ("argv", "fragment"),
     [
         (("none.usdc", "-o", "a.png"), "none.usdc: there is no such file"),
-        (("CLOTH", "-o", "a.jpg"), "a.jpg: the ending is '.jpg'; it must be .png, .gif or .mp4"),
+        (("CLOTH", "-o", "a.jpg"), "a.jpg: the ending is '.jpg'; it must be .png, .gif, .webp or .mp4"),
         (("CLOTH", "-o", "nowhere/a.png"), "nowhere"),
         (("CLOTH", "-o", "a.mp4", "--size", "65x36"), "size is 65x36; a film in .mp4 must have even numbers, such as 66x36"),
         (("CLOTH", "-o", "EMPTY.png"), "EMPTY.png: is no regular file; it must be one, or free"),
@@ -546,7 +577,7 @@ def test_the_command_draws(folder, tmp_path, capfd):
         (("CLOTH", "-o", "a.png", "--prim", "Other"), "there is no such prim"),
         (("CLOTH", "-o", "a.png", "--ground", "0", "--no-ground"), "give one of them"),
         (("CLOTH", "-o", "a.png", "--device", "cuda:99"), "device is 'cuda:99'"),
-        (("CLOTH", "CLOTH", "CLOTH", "-o", "a.png"), "unrecognized arguments"),
+        (("CLOTH", "CLOTH", "none.usdc", "-o", "a.png"), "none.usdc: there is no such file"),
         (("CHAIN", "-o", "a.png", "--colour", "stretch_1"), "must have triangles"),
         (("NPY", "-o", "a.png"), "has no triangles; give a rest mesh that has them (--rest)"),
         (("EMPTY", "-o", "a.png"), "no mesh files there"),
@@ -587,7 +618,7 @@ def test_what_cannot_be_drawn_is_refused_in_a_sentence(argv, fragment, folder, t
         (MOTION[:, :3], {"output": "a.png", "mesh": MESH}, r"frames have shape \(3, 3\); they must be \(16, 3\)"),
         (MESH, {"output": "a.png", "size": 64}, "size is 64; it must be a width and a height"),
         (MESH, {"output": "a.png", "measuring": {"lag": 1}}, "measuring is given without colour"),
-        ([MESH] * 3, {"output": "a.png"}, "source is a list of 3"),
+        ([MESH] * 3, {"output": "a.png", "names": ["a", "b"]}, "names is .*; it must be a text for each of the 3 sources"),
         (MESH, {"output": "a.png", "ground": "low"}, "ground is 'low'"),
         (MESH, {"output": "a.gif", "frames": "1:2"}, "frames is '1:2'; it must be the numbers of the first and the last"),
     ],

@@ -222,7 +222,7 @@ def _parser():
             else " (default: named after the scene, such as hanging.usdc; an existing file is then not replaced)"
         )
         sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
-    runs.add_argument("--film", metavar="FILE", help="also draw the run as a film, .mp4 or .gif; see 'warpcloth render'")
+    runs.add_argument("--film", metavar="FILE", help="also draw the run as a film, .mp4, .webp or .gif; see 'warpcloth render'")
     runs.add_argument("--csv", metavar="FILE", help="also write a table of energies and forces, one row per frame")
     runs.add_argument("--report", metavar="FILE", help="also write energies, forces and the reaction of each pin as JSON")
     runs.add_argument(

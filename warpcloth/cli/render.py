@@ -15,8 +15,8 @@ from .terminal import Bar, check_writable
 SIZE = (1280, 720)
 EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. All meshes and linear curves of
-a stage are drawn. A second FILE is drawn to the right of the first. The extension of -o selects the format: .png for one frame,
-.gif or .mp4 for a film in real time (.mp4 needs PyAV: pip install -e '.[video]' in the checkout). --colour needs matplotlib.
+a stage are drawn. Several FILEs are drawn side by side. The extension of -o selects the format: .png for one frame, .gif, .webp
+or .mp4 for a film in real time (.mp4 needs PyAV: pip install -e '.[video]' in the checkout). --colour needs matplotlib.
 
   warpcloth render hanging.usdc -o hanging.mp4
   warpcloth render hanging.usdc -o last.png --size 1920x1080 --samples 16
@@ -29,8 +29,8 @@ def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to draw")
-    add("beside", metavar="FILE", nargs="?", help="a second one to draw beside it")
-    add("-o", "--output", metavar="FILE", required=True, help="the file to write: .png, .gif or .mp4")
+    add("beside", metavar="FILE", nargs="*", help="others to draw beside it")
+    add("-o", "--output", metavar="FILE", required=True, help="the file to write: .png, .gif, .webp or .mp4")
     add("--frame", type=float, metavar="N", help="the frame of a .png, as FILE numbers them (default: the last)")
     add("--frames", type=frames, metavar="A:B", help="the first and the last frame of a film (default: all)")
     add("--every", type=int, default=1, metavar="K", help="draw only every K-th frame")
@@ -82,7 +82,7 @@ def frames(text):
 def render(arguments):
     from ..mesh.mesh import Surface
 
-    files = [file for file in (arguments.file, arguments.beside) if file is not None]
+    files = [arguments.file, *arguments.beside]
     if arguments.no_ground and arguments.ground is not None:
         raise ValueError("--ground and --no-ground are given; give one of them")
     measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}

@@ -1,8 +1,9 @@
-"""Writes pictures as a still, a GIF or a film in real time. Equal pictures give equal bytes."""
+"""Writes pictures as a still, or as a film in real time. Equal pictures give equal bytes."""
 
 import importlib.util
 import io
 import math
+import struct
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,16 +12,19 @@ from PIL import Image
 
 from ..base.outputs import Output
 
-STILL, FILMS = ".png", (".gif", ".mp4")
-# Browsers show frames of a GIF that are shorter than this [s] for 0.1 s.
-SHORTEST = 0.02
+STILL, FILMS = ".png", (".gif", ".webp", ".mp4")
+# Browsers show frames of these that are shorter than this [s] for 0.1 s.
+IN_PAGES, SHORTEST = (".gif", ".webp"), 0.02
 # H.264 quality at which fine folds and the edges of letters stay clean; the default crf is 23. The mbtree rate control reads
 # uninitialised memory, so that bytes would vary.
 _QUALITY = {"crf": "16", "preset": "slow", "x264-params": "mbtree=0"}
 # IEC 61966-2-1 (sRGB) on the primaries of Rec. 709, with the matrix of Rec. 709, 16 to 235.
 _PRIMARIES, _TRANSFER, _MATRIX, _RANGE = 1, 13, 1, 1
-# Shortest and longest time [s] that a picture can be shown. A GIF stores hundredths of seconds in 16 bits.
-_INTERVALS = {".gif": (0.01, 655.0), ".mp4": (1e-6, 1000.0)}
+# Shortest and longest time [s] that a picture can be shown. A GIF stores hundredths of seconds in 16 bits, a WebP thousandths
+# in 24 bits.
+_INTERVALS = {".gif": (0.01, 655.0), ".webp": (0.001, 16777.0), ".mp4": (1e-6, 1000.0)}
+# Quality of a WebP at which the edges of letters stay clean, and the slowest of its searches, which makes the smallest files.
+_WEBP = {"quality": 82, "method": 6}
 # Bins per channel in which the colours of a GIF are counted.
 _BINS = 64
 
@@ -35,7 +39,7 @@ def check_film(path, size):
     Raises:
         FileNotFoundError: The folder does not exist.
         ImportError: PyAV, which writes films, is not installed.
-        ValueError: The ending is none of the three, the size does not suit it, or the path is a folder or a device.
+        ValueError: The ending is none of these, the size does not suit it, or the path is a folder or a device.
     """
     path, (width, height) = Path(path), size
     if path.suffix.lower() not in (STILL, *FILMS):
@@ -49,7 +53,7 @@ def check_film(path, size):
             even = f"{width + width % 2}x{height + height % 2}"
             raise ValueError(f"size is {width}x{height}; a film in .mp4 must have even numbers, such as {even}")
         if not importlib.util.find_spec("av"):
-            raise ImportError("films in .mp4 need PyAV: pip install -e '.[video]' in the checkout; .gif and .png need nothing")
+            raise ImportError("films in .mp4 need PyAV: pip install -e '.[video]' in the checkout; the others need nothing")
 
 
 def check_times(path, times):
@@ -65,7 +69,7 @@ def check_times(path, times):
     ending, intervals = Path(path).suffix.lower(), np.diff(times)
     if not len(intervals) or ending not in _INTERVALS:
         return
-    found = intervals.max() if ending == ".gif" else intervals.min()
+    found = intervals.max() if ending in IN_PAGES else intervals.min()
     least, most = _INTERVALS[ending]
     if not least <= found <= most:
         rule = f"a {ending} can show one for {least:g} to {most:g} s, so that speed must be another"
@@ -76,14 +80,14 @@ def open_film(path, size, times):
     """Opens a file for pictures.
 
     Args:
-        path: Ends with .png, .gif or .mp4.
+        path: Ends with .png, .gif, .webp or .mp4.
         size: Width and height [px].
         times: Times at which pictures are shown [s], ascending (F,). The last is shown as long as the one before it.
 
     Returns:
         Output: With a method ``add`` that takes a Pillow image.
     """
-    kind = {".png": _Still, ".gif": _Gif, ".mp4": _Video}[Path(path).suffix.lower()]
+    kind = {".png": _Still, ".gif": _Gif, ".webp": _WebP, ".mp4": _Video}[Path(path).suffix.lower()]
     return kind(path, size, np.asarray(times, dtype=float))
 
 
@@ -153,11 +157,59 @@ class _Gif(Output):
         return palette
 
 
-def durations(times):
-    """Returns the durations of the frames of a GIF [ms], in whole hundredths of a second that add up to the times."""
+def durations(times, ticks=100):
+    """Returns the durations of frames [ms], in whole ticks, of so many a second, that add up to the times."""
     last = times[-1] - times[-2] if len(times) > 1 else 1.0
-    ends = np.floor(100.0 * (np.append(times, times[-1] + last) - times[0]) + 0.5).astype(int)
-    return (10 * np.diff(ends)).tolist()
+    ends = np.floor(ticks * (np.append(times, times[-1] + last) - times[0]) + 0.5).astype(int)
+    return (1000 // ticks * np.diff(ends)).tolist()
+
+
+class _WebP(Output):
+    """A looping WebP. Each frame is a still of the rectangle that differs from the frame before.
+
+    The container is that of the WebP specification: a header, and frames with their rectangles and durations. Pillow needs all
+    pictures at once to write it, and these may not fit into memory.
+    """
+
+    def __init__(self, path, size, times):
+        super().__init__(path, "xb")
+        self._size, self._times = size, times
+        self._stills, self._last = [], None
+
+    @property
+    def frames(self):
+        return len(self._stills)
+
+    def add(self, image):
+        pixels = np.asarray(image)
+        changed = np.ones(pixels.shape[:2], bool) if self._last is None else (pixels != self._last).any(axis=2)
+        self._last, still = pixels.copy(), io.BytesIO()
+        rows, columns = (np.flatnonzero(changed.any(axis=axis)) for axis in (1, 0))
+        # A frame that does not change is its first pixels again. A rectangle starts at even coordinates.
+        left, top = (int(each[0]) // 2 * 2 if len(each) else 0 for each in (columns, rows))
+        right, bottom = (int(each[-1]) + 1 if len(each) else 2 for each in (columns, rows))
+        image.crop((left, top, right, bottom)).save(still, "WEBP", **_WEBP)
+        self._stills.append(((left // 2, top // 2, right - left - 1, bottom - top - 1), still.getvalue()[12:]))
+
+    def finish(self):
+        if not self._stills:
+            return
+        width, height = self._size
+        shown = durations(self._times[: len(self._stills)], 1000)
+        body = _chunk(b"VP8X", bytes([2, 0, 0, 0]) + _threes(width - 1, height - 1)) + _chunk(b"ANIM", bytes(6))
+        for (rectangle, still), duration in zip(self._stills, shown, strict=True):
+            body += _chunk(b"ANMF", _threes(*rectangle, duration) + bytes([2]) + still)  # in place of what was there
+        self.file.write(_chunk(b"RIFF", b"WEBP" + body))
+
+
+def _chunk(name, data):
+    """Returns a chunk of a RIFF file."""
+    return name + struct.pack("<I", len(data)) + data + bytes(len(data) % 2)
+
+
+def _threes(*numbers):
+    """Returns whole numbers in three bytes each, the lowest first."""
+    return b"".join(number.to_bytes(3, "little") for number in numbers)
 
 
 class _Video(Output):

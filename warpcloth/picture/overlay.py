@@ -23,12 +23,14 @@ class Overlay:
         scale: The :class:`Scale` of the bar, or None for none.
         title: Name of the coloured scalar.
         unit: Its unit, "1" if it has none.
-        names: Names of the panels, which are side by side; empty for a single panel.
+        names: Names of the panels, which are side by side; empty for none.
         background: sRGB of the background, from 0 to 255.
+        columns: Number of panels in a row; None puts all in one row.
     """
 
-    def __init__(self, size, scale=None, title="", unit="1", names=(), background=(255, 255, 255)):
+    def __init__(self, size, scale=None, title="", unit="1", names=(), background=(255, 255, 255), columns=None):
         self.width, self.height = size
+        self.columns = columns
         self.scale, self.title, self.unit = scale, written(title), written(unit)
         self.names, self.background = [written(name) for name in names], tuple(background)
         self.letters = max(_LEAST, round(_LETTERS * min(self.height, self.width * 9 / 16)))
@@ -65,10 +67,10 @@ class Overlay:
         return self._font.getlength(text)
 
     def draw(self, panels, time=None, excluded=False):
-        """Puts panels side by side, and draws the bar, names and time.
+        """Puts panels side by side, in rows, and draws the bar, names and time.
 
         Args:
-            panels: Images (height, width, 3) uint8.
+            panels: Images (height, width, 3) uint8; panels in one row have one height.
             time: Text in the lower left corner, or None.
             excluded: Whether to explain the colour of elements without a value.
 
@@ -77,15 +79,18 @@ class Overlay:
         """
         canvas = Image.new("RGB", (self.width, self.height), self.background)
         pen = ImageDraw.Draw(canvas)
-        left, em = 0, self.letters
+        left, top, em = 0, 0, self.letters
         for k, panel in enumerate(panels):
-            canvas.paste(Image.fromarray(panel), (left, 0))
-            if k:
-                pen.line([(left, 0), (left, self.height)], (205, 207, 210), max(1, em // 12))
+            if self.columns and k and k % self.columns == 0:
+                left, top = 0, top + panels[k - 1].shape[0]
+            tall, wide = panel.shape[:2]
+            canvas.paste(Image.fromarray(panel), (left, top))
+            if left:
+                pen.line([(left, top), (left, top + tall)], (205, 207, 210), max(1, em // 12))
             if k < len(self.names):
-                room = min(panel.shape[1], self.width - self.beside - left) - 1.2 * em  # not over the bar
-                self._write(pen, (left + 0.6 * em, 0.5 * em), self._short(self.names[k], room), "la")
-            left += panel.shape[1]
+                room = min(wide, self.width - self.beside - left) - 1.2 * em  # not over the bar
+                self._write(pen, (left + 0.6 * em, top + 0.5 * em), self._short(self.names[k], room), "la")
+            left += wide
         if time is not None:
             self._write(pen, (0.6 * em, self.height - 0.5 * em), time, "ld")
         if self.scale is not None:

@@ -3,6 +3,7 @@
 import os
 import warnings
 from collections.abc import Mapping
+from collections.abc import Sequence as Several
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from ..base.outputs import check_apart
 from ..base.types import FilePath, Progress, UpAxis
 from ..mesh.mesh import Mesh
 from .colour import byte_colour, check_colormap
-from .films import SHORTEST, STILL, check_film, check_times, open_film
+from .films import IN_PAGES, SHORTEST, STILL, check_film, check_times, open_film
 from .framing import frame_motion
 from .measured import GivenColours, GivenScalar, MeasuredScalar
 from .overlay import Overlay
@@ -28,6 +29,7 @@ def render(
     source: Any,
     output: FilePath,
     *,
+    names: Several[str] | None = None,
     mesh: Mesh | None = None,
     prim: str | None = None,
     fps: float | None = None,
@@ -60,8 +62,9 @@ def render(
         source: A path: a stage, all of whose meshes and linear curves are drawn; a mesh file; a folder or pattern of mesh
             files; .npz or .npy. Or an :class:`warpcloth.Animation`, whose pins, strings and bars are drawn too,
             :class:`warpcloth.Deformation`, :class:`warpcloth.Scene`, :class:`warpcloth.Mesh`, :class:`warpcloth.Sequence`,
-            or frames (F, n, 3) [m]. Two of them in a list are drawn side by side, by one camera.
-        output: File to write: .png, .gif or, with PyAV, .mp4.
+            or frames (F, n, 3) [m]. Several of them in a list are drawn side by side, by one camera.
+        output: File to write: .png, .gif, .webp or, with PyAV, .mp4.
+        names: A text for each source, shown above it; by default the names of the sources if there are several.
         mesh: The :class:`warpcloth.Mesh` of frames given as an array; for other sources, the rest shape relative to which they
             are measured.
         prim: Path or name of the cloth in a stage, or name of the geometry in a mesh file. Without it, the prims of a stage
@@ -129,13 +132,16 @@ def render(
     subjects = [subject_of(each, mesh, prim, fps, copy, azimuth) for each in sources]
     subjects = [replace(each, up_axis=each.up_axis or up_axis or "Y") for each in subjects]
     if len({each.up_axis for each in subjects}) > 1:
-        raise ValueError("source: one is Y up and the other Z up; two that are drawn side by side must have one up axis")
+        raise ValueError("source: one is Y up and another Z up; those that are drawn side by side must have one up axis")
+    names = [each.name for each in subjects] if names is None and len(subjects) > 1 else list(names or ())
+    if len(names) not in (0, len(subjects)) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"names is {shown(names)}; it must be a text for each of the {len(subjects)} sources")
     check_apart([output], [path for each in subjects for path in each.files])
     shots = _shots(subjects, Path(output).suffix.lower(), frame, frames, every, speed)
     times = [shot.time for shot in shots]
     check_times(output, times)
     values, scale = _colours(subjects, colour, colour_range, colormap, mesh, device, measuring)
-    picture = _Picture(subjects, shots, size, samples, (azimuth, elevation, zoom), ground, values, scale, device)
+    picture = _Picture(subjects, names, shots, size, samples, (azimuth, elevation, zoom), ground, values, scale, device)
     with open_film(output, size, times) as film:
         try:
             if progress is not None:
@@ -166,15 +172,10 @@ def _checked_size(size):
 
 
 def _are_several(source):
-    """Returns whether it is a list of two sources, not a list of frames."""
+    """Returns whether it is a list of sources, not a list of frames."""
     if not isinstance(source, (list, tuple)) or not len(source):
         return False
-    frames = [isinstance(each, np.ndarray | list | tuple) for each in source]
-    if any(frames):
-        return False
-    if len(source) > 2:
-        raise ValueError(f"source is a list of {len(source)}; it must be one, or two that are drawn side by side")
-    return True
+    return not any(isinstance(each, np.ndarray | list | tuple) for each in source)
 
 
 class _Shot:
@@ -187,7 +188,8 @@ class _Shot:
 def _shots(subjects, ending, frame, frames, every, speed):
     """Returns the pictures to be drawn.
 
-    There is one for each frame of the first subject, with the frame of the second that is nearest in time, up to its end.
+    There is one for each frame of the first subject, with the frames of the others that are nearest in time. They go on to the
+    end of the longest.
     """
     first = subjects[0]
     if ending == STILL:
@@ -201,19 +203,17 @@ def _shots(subjects, ending, frame, frames, every, speed):
         chosen = first.between(frames)[::every]
     times = [each.labels - each.labels[0] if each.times is None else each.times for each in subjects]
     times = [np.asarray(t) * (each.interval if each.times is None else 1.0) for t, each in zip(times, subjects, strict=True)]
-    shots = [_Shot(times[0][k], [int(k)], _text(first, k)) for k in chosen]
-    for other, own in zip(subjects[1:], times[1:], strict=True):
-        for shot in shots:
-            shot.frames.append(int(np.abs(own - shot.time).argmin()))
-        if ending != STILL and frames is None:
-            late = np.flatnonzero(own > times[0][-1] + 0.5 * other.interval)[every - 1 :: every]
-            shots += [_Shot(own[k], [len(first) - 1, int(k)], _text(other, k)) for k in late]
-    start, kept = shots[0].time, []
-    least = SHORTEST if ending == ".gif" else 0.0
-    for shot in shots:
-        at = (shot.time - start) / speed
+    moments = [(times[0][k], _text(first, k)) for k in chosen]
+    if ending != STILL and frames is None:
+        longest, own = max(zip(subjects, times, strict=True), key=lambda pair: pair[1][-1])
+        late = np.flatnonzero(own > times[0][-1] + 0.5 * longest.interval)[every - 1 :: every]
+        moments += [(own[k], _text(longest, k)) for k in late]
+    start, kept = moments[0][0], []
+    least = SHORTEST if ending in IN_PAGES else 0.0
+    for moment, text in moments:
+        at = (moment - start) / speed
         if not kept or at - kept[-1].time >= least - 1e-9:
-            kept.append(_Shot(at, shot.frames, shot.text))
+            kept.append(_Shot(at, [int(np.abs(own - moment).argmin()) for own in times], text))
     return kept
 
 
@@ -262,28 +262,33 @@ def _colours(subjects, colour, given, colormap, rest, device, measuring):
 class _Picture:
     """Draws all pictures of a film, in one size and with one camera."""
 
-    def __init__(self, subjects, shots, size, samples, view, ground, values, scale, device):
+    def __init__(self, subjects, names, shots, size, samples, view, ground, values, scale, device):
         self._subjects, self._shots, self._values, self._scale, self.left_out = subjects, shots, values, scale, 0
         self._up = subjects[0].up_axis
-        named = [each.name for each in subjects] if len(subjects) > 1 else []
         title, unit = (values[0].name, values[0].unit) if values else ("", "1")
-        background = byte_colour(BACKGROUND)
-        self._overlay = Overlay(size, scale, title, unit, named, background)
         width, height = size
+        # Panels are in rows, as nearly square as possible.
+        columns = -(-len(subjects) // max(1, round(np.sqrt(len(subjects) * height / width))))
+        rows = -(-len(subjects) // columns)
+        self._overlay = Overlay(size, scale, title, unit, names, byte_colour(BACKGROUND), columns)
         room = width - self._overlay.beside
-        widths = [room // len(subjects)] * len(subjects)
+        widths, heights = [room // columns] * columns, [height // rows] * rows
         widths[0] += room - sum(widths)
-        # The bar is on the last panel, so the motion there is shifted to the left of it.
-        shifts = [0.0] * (len(subjects) - 1) + [0.5 * self._overlay.beside / height]
+        heights[0] += height - sum(heights)
         pictures = ([each.read(k) for each, k in zip(subjects, shot.frames, strict=True)] for shot in shots)
-        self._camera, low = frame_motion(subjects, pictures, view, min(widths) / height)
+        self._camera, low = frame_motion(subjects, pictures, view, min(widths) / min(heights))
         below = self._camera.position["YZ".index(self._up) + 1] < low
         if isinstance(ground, bool | np.bool_):
             ground = low if ground and not below else None
         options = {"samples": samples, "ground": ground, "device": device, "up_axis": self._up}
-        self._cameras = [replace(self._camera, shift=shift) for shift in shifts]
-        widths[-1] += self._overlay.beside
-        self._casters = [RayCaster(each.shapes, wide, height, **options) for each, wide in zip(subjects, widths, strict=True)]
+        if values and scale is None:  # colours of the cloth itself are shaded like its plain one
+            options["contrast"] = 1.0
+        # The bar is on the last column, so the motion there is shifted to the left of it.
+        beside = [0] * (columns - 1) + [self._overlay.beside]
+        cells = [divmod(k, columns) for k in range(len(subjects))]
+        self._cameras = [replace(self._camera, shift=0.5 * beside[column] / heights[row]) for row, column in cells]
+        sizes = [(widths[column] + beside[column], heights[row]) for row, column in cells]
+        self._casters = [RayCaster(each.shapes, *each_size, **options) for each, each_size in zip(subjects, sizes, strict=True)]
 
     def images(self, with_time):
         """Yields the pictures as Pillow images."""
