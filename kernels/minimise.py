@@ -144,7 +144,9 @@ def begin_at_guess():
 
 @cache
 def begin_newton():
-    """Kernel over copies: sets the tolerance of the linear system, and the raw Hessian if ``adaptive`` is 1; flags become 0.
+    """Kernel over copies: sets the tolerance of the linear system, and the raw Hessian if ``adaptive`` is 1.
+
+    ``proceed`` and ``more`` become 0, ``unsolved`` 1. Active copies are to be solved.
 
     The tolerance is 0.9 (residual/previous)², choice 2 of Eisenstat and Walker (1996), at most LOOSEST. It is not below LEFT
     times limit/residual, because a more accurate solution would not save an iteration.
@@ -160,12 +162,14 @@ def begin_newton():
         # out
         policy: wp.array(dtype=wp.int32),
         tolerance: wp.array(dtype=wp.float64),
-        indefinite: wp.array(dtype=wp.int32),
+        wanted: wp.array(dtype=wp.int32),
+        unsolved: wp.array(dtype=wp.int32),
     ):
         copy = wp.tid()
         progress.proceed[0] = 0
         progress.more[0] = 0
-        indefinite[0] = 0
+        unsolved[0] = 1
+        wanted[copy] = progress.active[copy]
         if adaptive == 1:
             policy[copy] = RAW
         if progress.active[copy] == 1:
@@ -182,22 +186,27 @@ def begin_newton():
 
 @cache
 def find_indefinite():
-    """Kernel over copies: those with a negative curvature are to be assembled with ``CLAMP`` and solved ``again``."""
+    """Kernel over copies: those of which the raw Hessian has a negative curvature are to be solved with ``CLAMP``.
+
+    ``unsolved`` is 0 before, and then 1 if there are any.
+    """
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def find(
         # state in
         negative: wp.array(dtype=wp.int32),
-        # out
+        # in and out
         policy: wp.array(dtype=wp.int32),
-        again: wp.array(dtype=wp.int32),
-        indefinite: wp.array(dtype=wp.int32),
+        # out
+        wanted: wp.array(dtype=wp.int32),
+        unsolved: wp.array(dtype=wp.int32),
     ):
         copy = wp.tid()
-        again[copy] = negative[copy]
-        if negative[copy] == 1:
+        wanted[copy] = 0
+        if negative[copy] == 1 and policy[copy] != CLAMP:
+            wanted[copy] = 1
             policy[copy] = CLAMP
-            indefinite[0] = 1
+            unsolved[0] = 1
 
     return find
 

@@ -7,11 +7,12 @@ from functools import cache
 
 from .checks import shown
 from .kernel_cache import described, mend, parse_headers_once
+from .kernel_hashes import hash_once
 
 
 @cache
 def prepare_warp():
-    """Sets Warp's log level to warnings, and makes it repair its kernel cache and keep parsed headers there.
+    """Sets Warp's log level to warnings, and makes it repair its kernel cache, keep parsed headers there and hash kernels once.
 
     A log level that the user sets, before or later, is kept.
     """
@@ -21,6 +22,7 @@ def prepare_warp():
         wp.config.log_level = wp.LOG_WARNING
     mend()
     parse_headers_once()
+    hash_once()
 
 
 def find_device(name):

@@ -8,6 +8,12 @@ import warp as wp
 from ..kernels import block_pattern as kernels
 from ..model.elements import incidences_of
 
+# Made together, because a module that gets another kernel is loaded again.
+_KERNELS = (
+    *(kernels.add_diagonal, kernels.add_columns, kernels.pack_columns, kernels.list_blocks),
+    *(kernels.add_product_columns, kernels.set_slots),
+)
+
 
 class BlockPattern(NamedTuple):
     """The pattern of one copy with n vertices, or of all copies, arrays of int32 on the device.
@@ -85,7 +91,7 @@ def find_pattern(model, terms, fixed):
     def empty(count):
         return wp.empty(count, dtype=wp.int32, device=device)
 
-    launch = model.launcher(((kernels.add_diagonal, kernels.add_columns, kernels.pack_columns, kernels.list_blocks),))
+    launch = model.launcher((_KERNELS,))
     fixed, starts = to_device(model, fixed), _before(sum((term.most for term in terms), start=np.ones(n, dtype=np.int64)))
     firsts, found = to_device(model, starts[:-1]), empty(int(starts[-1]))
     counts, of_terms = empty(n), [empty(n) for _ in terms]
@@ -119,7 +125,7 @@ def pattern_of_product(model, left, right):
     most = np.append(0, np.cumsum(np.diff(host[2])[host[1]]))[host[0]]
     n, firsts = len(most) - 1, to_device(model, most[:-1])
     found, counts = (wp.empty(int(size), dtype=wp.int32, device=model.device) for size in (most[-1], n))
-    launch = model.launcher(((kernels.add_product_columns, kernels.pack_columns),))
+    launch = model.launcher((_KERNELS,))
     launch(kernels.add_product_columns, n, [*left, *right, firsts], [found, counts])
     starts = _before(counts.numpy())
     offsets = to_device(model, starts)
@@ -143,7 +149,7 @@ def slots_of(model, sums, count):
     """
     offsets, sources = sums
     slots = wp.full(count, -1, dtype=wp.int32, device=model.device)
-    model.launch(model.kernel(kernels.set_slots), len(offsets) - 1, [offsets, sources], [slots])
+    model.launcher((_KERNELS,))(kernels.set_slots, len(offsets) - 1, [offsets, sources], [slots])
     return slots
 
 

@@ -97,11 +97,11 @@ class Minimiser:
         self._progress.proceed, self._progress.more = flag(), flag()
         self._limits.tolerance, self._limits.scale = wp.zeros(1, dtype=wp.float64, device=model.device), model.scalars()
         self._limits.iterations = flag()
-        self.active, self._again, self._indefinite = self._progress.active, model.scalars(wp.int32), flag()
+        self.active, self._wanted, self._unsolved = self._progress.active, model.scalars(wp.int32), flag()
         read = ("end", "iterations", "residual", "scale", "proceed")
         self._read = {name: Mirror(getattr(self._progress, name)) for name in read}
         self._given = {name: Mirror(getattr(self._limits, name)) for name in ("tolerance", "iterations", "scale")}
-        self._found = Mirror(self._indefinite)
+        self._left = Mirror(self._unsolved)
         self.gravity, self._present = GravityScale(model).gravity, None
 
     def record(self):
@@ -153,13 +153,10 @@ class Minimiser:
         """Iterates with a linear solver of the host."""
         while self._read["proceed"].read()[0]:
             self._begin()
-            self._assemble()
-            self._launch_solve(self.active)
-            if self.adaptive:
+            while self._left.read()[0]:
+                self._assemble()
+                self._launch_solve(self._wanted)
                 self._find()
-                if self._found.read()[0]:
-                    self._assemble()
-                    self._launch_solve(self._again)
             self._end()
 
     def curves_down(self, tolerance):
@@ -222,25 +219,28 @@ class Minimiser:
 
     def _launch_iteration(self):
         self._launch_begin()
-        self._launch_assemble()
-        self._launch_solve(self.active)
         if self.adaptive:
-            self._launch_find()
-            wp.capture_if(self._indefinite, self._launch_again)
+            wp.capture_while(self._unsolved, self._launch_direction)
+        else:
+            self._launch_direction()
         self._launch_end()
 
-    def _launch_again(self):
-        """Launches the assembly and the solution for the copies whose Hessian is now clamped."""
+    def _launch_direction(self):
+        """Launches assembly and solution for the copies that are ``_wanted``, and finds those to be solved clamped."""
         self._launch_assemble()
-        self._launch_solve(self._again)
+        self._launch_solve(self._wanted)
+        self._launch_find()
 
     def _launch_begin(self):
-        out = [self._progress, self.hessian.policy, self.linear.tolerance, self._indefinite]
+        out = [self._progress, self.hessian.policy, self.linear.tolerance, self._wanted, self._unsolved]
         self._launch(kernels.begin_newton, self.model.copies, [int(self.adaptive), self._limits], out)
 
     def _launch_find(self):
-        out = [self.hessian.policy, self._again, self._indefinite]
-        self._launch(kernels.find_indefinite, self.model.copies, [self.linear.negative], out)
+        """Launches the choice of the copies that are solved again, with a clamped Hessian."""
+        self._unsolved.zero_()
+        if self.adaptive:
+            out = [self.hessian.policy, self._wanted, self._unsolved]
+            self._launch(kernels.find_indefinite, self.model.copies, [self.linear.negative], out)
 
     def _launch_end(self):
         """Launches the line search, and finds the copies that have ended."""

@@ -62,10 +62,10 @@ class _Transfer:
             :func:`warpcloth.kernels.multigrid.multiply_by_transfers`.
     """
 
-    def __init__(self, model, P, fine, dense):
+    def __init__(self, model, P, fine, dense, launch):
         """P is a :class:`.interpolation.Interpolation`, ``fine`` (offsets, columns) of A in one copy.
 
-        If ``dense``, PᵀAP has all blocks.
+        If ``dense``, PᵀAP has all blocks. ``launch`` launches the kernels that list the blocks.
         """
         by_rows, by_columns = (P.offsets, P.parents, P.weights), P.transposed()
         exact = [_rows(model, *each) for each in (by_rows, by_columns)]
@@ -78,9 +78,9 @@ class _Transfer:
         else:
             products = pattern_of_product(model, fine, self.rows[:2])
             self.coarse = pattern_of_product(model, self.columns[:2], (products.offsets, products.columns))
-        self._list_multiples(model, [fine, *exact, (self.coarse.offsets, self.coarse.columns)])
+        self._list_multiples(model, [fine, *exact, (self.coarse.offsets, self.coarse.columns)], launch)
 
-    def _list_multiples(self, model, matrices):
+    def _list_multiples(self, model, matrices, launch):
         """Finds ``sums`` and ``blocks`` from the rows of A, P, Pᵀ and PᵀAP."""
         n, count = len(self.coarse.diagonal), len(self.coarse.columns)
 
@@ -88,7 +88,6 @@ class _Transfer:
             return wp.empty(size, dtype=dtype, device=model.device)
 
         given = [_struct(*each) for each in matrices]
-        launch = model.launcher(((kernels.find_slots,),), ((kernels.list_multiples,), model.dtype))
         (A_offsets, A_columns), P, transposed = ([array.numpy() for array in each[:2]] for each in matrices[:3])
         of_rows = _sums(np.diff(P[0])[A_columns], A_offsets)  # products of each row of A with the weights of its columns
         most = _starts(_sums(of_rows[transposed[1]], transposed[0]))
@@ -154,8 +153,9 @@ class Multigrid:
         self.sizes = [n, *(P.coarse for P in found)]
         self._dense = len(found) > 0 and self.sizes[-1] <= DENSE
         self._levels, self._transfers = [_Finest(hessian)], []
+        self._make_kernels()
         for P in found:
-            self._transfers.append(_Transfer(model, P, pattern, dense=self._dense and P is found[-1]))
+            self._transfers.append(_Transfer(model, P, pattern, self._dense and P is found[-1], self._launch))
             coarse = self._transfers[-1].coarse
             self._levels.append(_Level(model, coarse))
             pattern = coarse.offsets, coarse.columns
@@ -172,15 +172,16 @@ class Multigrid:
         choice.trial = wp.zeros(1, dtype=wp.int32, device=model.device)
         choice.age = wp.full(1, kernels.AGED, dtype=wp.int32, device=model.device)
         self.used = choice.used
-        of_matrix = kernels.multiply_by_transfers, kernels.factorise_diagonal, kernels.scale_sweeps, kernels.eliminate
+
+    def _make_kernels(self):
+        model = self.model
+        of_matrix = kernels.list_multiples, kernels.multiply_by_transfers, kernels.factorise_diagonal, kernels.scale_sweeps
         products = kernels.subtract_product, kernels.sweep_after
-        self._launch = model.launcher(
-            (of_matrix + products + (kernels.restrict, kernels.prolong), model.dtype),
-            ((multiply,), model.dtype),
-            ((kernels.measure_progress, kernels.choose, kernels.limit_iterations),),
-        )
+        of_vectors = kernels.eliminate, kernels.restrict, kernels.prolong
+        choices = kernels.find_slots, kernels.measure_progress, kernels.choose, kernels.limit_iterations
+        self._launch = model.launcher((of_matrix + products + of_vectors, model.dtype), ((multiply,), model.dtype), (choices,))
         self._launch_finest = self._launch
-        if self._further is not None:
+        if self.hessian.pairs is not None:
             self._launch_finest = model.launcher((products, model.dtype, True))
 
     def update(self):

@@ -1,0 +1,28 @@
+"""Kept hashes of kernels are those that Warp computes, so that compiled kernels in the cache are found."""
+
+import warp as wp
+
+import warpcloth as wc
+from warpcloth.kernels.transpose import scatter
+from warpcloth.scenes import hanging
+
+
+def test_kept_hashes_are_those_of_warp(monkeypatch):
+    loaded, load = {}, wp.Module.load
+
+    def noting(module, *arguments, **options):
+        loaded[module.name] = module
+        return load(module, *arguments, **options)
+
+    monkeypatch.setattr(wp.Module, "load", noting)
+    wc.Newton(substeps=4).bind(hanging.scene(n=4).build())
+    hasher, codegen = wp._src.context.ModuleHasher, wp._src.codegen
+    monkeypatch.setattr(hasher, "hash_adjoint", hasher.hash_adjoint.__wrapped__)
+    monkeypatch.setattr(codegen, "iter_call_callable_arg_targets", codegen.iter_call_callable_arg_targets.__wrapped__)
+    assert any(
+        scatter.__module__ in str(kernel.func.__module__) for each in loaded.values() for kernel in each._get_live_kernels()
+    )
+    for module in loaded.values():
+        for block, kept in module.hashers.items():
+            kernels = list(kept.unique_kernels.values())
+            assert hasher(kernels, module.resolved_options[block]).hash == kept.hash, module.name
