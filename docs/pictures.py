@@ -11,6 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 import warpcloth as wc
+from warpcloth.chart.style import LEGEND, dress, series_style, small_print
 from warpcloth.cli.reports import write_report
 from warpcloth.lab import elastica
 from warpcloth.scenes import bar_twist, bunny, cantilever, character, cusick, hanging, mobile, tablecloth
@@ -41,9 +42,9 @@ def picture_hanging():
 
 def picture_cantilever(gammas=(1.0, 5.0, 20.0), elements=40):
     """Vertices of the cantilever at rest on the elastica; its one row of triangles bends with 8/9 of D."""
-    figure, axes = plt.subplots(figsize=(4.6, 3.6))
-    colours = plt.get_cmap("viridis")([0.1, 0.45, 0.7])
-    for gamma, colour in zip(gammas, colours, strict=True):
+    figure, axes = plt.subplots(figsize=(4.6, 3.6), layout="constrained")
+    for k, gamma in enumerate(gammas):
+        colour = series_style(k).colour
         scene = cantilever.scene(gamma=8 / 9 * gamma, elements=elements)
         rest = wc.equilibrium(scene)
         assert rest.status.ok, rest.status
@@ -54,14 +55,12 @@ def picture_cantilever(gammas=(1.0, 5.0, 20.0), elements=40):
         axes.annotate(f"Γ = {gamma:g}", points[elements], (8, -4), textcoords="offset points", color=colour)
     axes.plot([], [], "-", color=GREY, label="elastica")
     axes.plot([], [], "o", color=GREY, markersize=4.5, markerfacecolor="white", label="vertices at rest, every second")
-    axes.legend(frameon=False, fontsize=8, labelcolor=GREY, loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2, **LEGEND)
     axes.set_aspect("equal")
     axes.margins(x=0.08)
-    axes.set_xlabel("x / L", color=GREY)
-    axes.set_ylabel("y / L", color=GREY)
-    axes.tick_params(colors=GREY, labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color("0.7")
+    axes.set(xlabel="x / L", ylabel="y / L")
+    dress(axes)
+    small_print(figure)
     save(figure, "cantilever.png")
 
 

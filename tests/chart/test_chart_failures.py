@@ -462,7 +462,7 @@ def test_maps_are_drawn(tunnels, tmp_path, monkeypatch):
     assert words[-2:] == ["a sheet passes", "refused"] and set(words[:-2]) == set(tunnelling.LAWS)
     of_friction = [point("xpbd", kind, x, 0.0, y=0.3) for x, kind in enumerate(friction.KINDS)]
     of_friction.append(point("creep", "xpbd", 0.5, 0.0))
-    plot_failure(tmp_path / "b.svg", {"failure": "friction", "title": friction.TITLE, "rows": of_friction})
+    plot_failure(tmp_path / "b.svg", {**tunnels, "failure": "friction", "title": friction.TITLE, "rows": of_friction})
     assert kept[1].axes[0].collections[0].get_array().tolist() == [[0.0, 1.0, 2.0]]
     assert [text.get_text() for text in kept[1].legends[0].get_texts()] == ["tan θ = μ", *friction.KINDS]
 

@@ -404,7 +404,7 @@ def test_time_diagram(device, tmp_path, drawn):
     assert name + ": diverged" in text
     shown = {label for _, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     assert shown == {"error of the reference", "nothing is better in both", "quartiles of the times"}
-    assert f"{found['machine']['cores']} cores, Warp" in drawn[0]._suptitle.get_text()
+    assert drawn[0].texts[-1].get_text() == machine.in_words(found["machine"])
     good = [row for row in found["rows"] if row["status"] == "ok"]
     for panel, name in ((axes, "error"), (strains, "strain_error")):
         points = np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() not in ("None", "")])

@@ -3,22 +3,20 @@
 import textwrap
 
 from ..lab.choosing import percent
-from ..lab.machine import in_words
-from ..picture.figures import GREY, PICTURES, check_path, save
-from ..solvers import SOLVERS
+from ..picture.figures import PICTURES, check_path, save
+from .style import LABEL, TICK, dress, headline, small_print, style_of
 
-_WIDTH, _HEIGHT = 2.5, 1.25  # of a cell [in]
-_LETTERS = 8.5  # [pt]
+_WIDTH, _HEIGHT = 2.5, 1.2  # of a cell [in]
 _CHARACTERS = 32  # of a line in a cell
-_FADED = 0.30  # opacity of the colour of a solver, so that texts can be read
+_FADED, _BAR = 0.25, 0.035  # opacity of the colour of a solver behind texts, and width of a bar that has the full colour
 
 
 def plot_cheapest(path, found):
     """Draws a cell for each pair of values, with the first value of y in the lowest row.
 
-    A cell has the colour of the cheapest solver. It shows its settings, the time of a frame, its error, the second best with
-    its ratio of times, and the error of the reference. Cells without an accurate setting are hatched and say why. A question
-    mark after the time means that the search was not complete.
+    A cell has the colour and the marker of the cheapest solver. It shows its settings, the time of a frame, its error, the
+    second best with its ratio of times, and the error of the reference. Cells without an accurate setting are hatched and say
+    why. A question mark after the time means that the search was not complete.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -39,23 +37,28 @@ def plot_cheapest(path, found):
     for k, cell in enumerate(found["cells"]):
         row, column = divmod(k, len(xs))
         known = cell["status"] == "found"
-        colour = SOLVERS[cell["solver"]].facts.style[0] if known else "white"
-        style = {"facecolor": colour, "alpha": _FADED} if known else {"facecolor": "white", "edgecolor": "0.85", "hatch": "///"}
-        axes.add_patch(Rectangle((column, row), 1.0, 1.0, **style))
+        looks = {"facecolor": "white", "edgecolor": "0.85", "hatch": "///"}
+        if known:
+            style = style_of(cell["solver"])
+            looks = {"facecolor": style.colour, "alpha": _FADED}
+            axes.add_patch(Rectangle((column, row), _BAR, 1.0, facecolor=style.colour))
+            axes.plot(column + 0.09, row + 0.86, markersize=7, **style.line)
+        axes.add_patch(Rectangle((column, row), 1.0, 1.0, **looks))
         axes.add_patch(Rectangle((column, row), 1.0, 1.0, fill=False, edgecolor="white", linewidth=2.0))
-        text = {"fontsize": _LETTERS, "ha": "center", "va": "center", "parse_math": False}
+        text = {"fontsize": TICK, "ha": "center", "va": "center", "parse_math": False}
         axes.text(column + 0.5, row + 0.5, "\n".join(text_of_cell(cell)), **text)
     axes.set(xlim=(0, len(xs)), ylim=(0, len(ys)))
     axes.set_xticks([i + 0.5 for i in range(len(xs))], map(str, xs))
     axes.set_yticks([j + 0.5 for j in range(len(ys))], ["" if y is None else str(y) for y in ys])
-    axes.set_xlabel(found["x"][0], color=GREY, fontsize=_LETTERS + 1.0)
+    axes.set_xlabel(found["x"][0])
     if found["y"]:
-        axes.set_ylabel(found["y"][0], color=GREY, fontsize=_LETTERS + 1.0)
-    axes.tick_params(length=0, colors=GREY, labelsize=_LETTERS + 1.0)
+        axes.set_ylabel(found["y"][0])
+    dress(axes, grid=False)
+    axes.tick_params(length=0, labelsize=LABEL)
     axes.spines[:].set_visible(False)
     frames = "" if found["frames"] is None else f", {found['frames']} frames"
-    title = f"cheapest within {percent(found['tolerance'])}: {found['scene']}{frames}, {found['dtype']}, ms a frame"
-    figure.suptitle(f"{title}\non {in_words(found['machine'])}", fontsize=_LETTERS + 1.0, color=GREY, parse_math=False)
+    headline(figure, f"cheapest within {percent(found['tolerance'])}: {found['scene']}{frames}, {found['dtype']}, ms a frame")
+    small_print(figure, found["machine"])
     save(figure, path)
 
 

@@ -3,11 +3,10 @@
 import math
 
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
+from .style import LABEL, LEGEND, SMALL, dress, series_style, small_print
 
-_MARKS = "os^Dv"
 
-
-def plot_physics(path, results):
+def plot_physics(path, results, facts=None):
     """Plots the error against h and against the time, with two panels for each case, pattern and angle.
 
     Dashed lines show the effect of the free sides of a cantilever, which no mesh can avoid, and the accuracy of the equilibria,
@@ -16,6 +15,7 @@ def plot_physics(path, results):
     Args:
         path: The file, .png, .svg or .pdf.
         results: Pairs of arguments and result of :func:`physics.measure`, in any order.
+        facts: The machine, as of :func:`warpcloth.lab.machine.machine`; None for this one.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -38,7 +38,7 @@ def plot_physics(path, results):
         for k, (label, points) in enumerate(lines.items()):
             # An error of 0 cannot be drawn on logarithmic axes.
             good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if found["error"])
-            style = {"marker": _MARKS[k % len(_MARKS)], "markersize": 4, "linewidth": 1.0, "color": f"C{k}"}
+            style = series_style(k).line | {"markersize": 4, "linewidth": 1.0}
             left.plot([h for h, _, _ in good], [error for _, error, _ in good], label=label, **style)
             timed = sorted((ms, error) for _, error, ms in good if ms is not None)
             if timed:
@@ -46,12 +46,13 @@ def plot_physics(path, results):
             for side in {found["sides"] for _, found in points if found["sides"] is not None}:
                 for axes in (left, right):
                     text = "_" if k else "what free sides take"
-                    axes.axhline(side, color=f"C{k}", linewidth=0.8, linestyle=(0, (4, 3)), label=text)
+                    axes.axhline(side, color=series_style(k).colour, linewidth=0.8, linestyle=(0, (4, 3)), label=text)
         _finish(left, right, title, [pair for points in lines.values() for pair in points])
     for (left, right), lines in zip(panels, rows.values(), strict=False):
         _floor(left, right, [found["floor"] for points in lines.values() for _, found in points if found["floor"]])
     for axes in panels[len(rows) :].ravel():
         axes.remove()
+    small_print(figure, facts)
     save(figure, path)
 
 
@@ -63,29 +64,27 @@ def _floor(left, right, floors):
     for axes in (left, right):
         axes.axhline(floor, color=GREY, linewidth=0.8, linestyle="--", label=f"equilibria are known to {floor:.1g}")
         axes.set_ylim(low, max(high, 2.0 * floor))
-    left.legend(frameon=False, fontsize=7, labelcolor=GREY)
+    left.legend(**LEGEND)
 
 
 def _finish(left, right, title, points):
-    left.set_title(title, fontsize=9, loc="left", color=GREY)
-    left.set_ylabel("relative error", color=GREY)
-    left.set_xlabel("h / L", color=GREY)
-    right.set_xlabel("time [ms]", color=GREY)
+    left.set_title(title, fontsize=LABEL, loc="left", color=GREY)
+    left.set_ylabel("relative error")
+    left.set_xlabel("h / L")
+    right.set_xlabel("time [ms]")
     for axes in (left, right):
         if not any(len(line.get_xdata(orig=True)) for line in axes.lines):  # such as for a cylinder, which needs no solve
             axes.set_axis_off()
             continue
         axes.set(xscale="log", yscale="log")
-        axes.tick_params(which="both", colors=GREY, labelsize=7)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.spines[["left", "bottom"]].set_color("0.7")
+        dress(axes)
     for axes in (left, right):
         if axes.axison:
             number_axis(axes.xaxis)
     if left.get_legend_handles_labels()[1]:
-        left.legend(frameon=False, fontsize=7, labelcolor=GREY)
+        left.legend(**LEGEND)
     failed = [f"{_label(a)}, {a['resolution']}: {found['status']}" for a, found in points if found["status"] != "ok"]
-    right.set_title("\n".join(failed), fontsize=7, loc="right", color=GREY, parse_math=False)
+    right.set_title("\n".join(failed), fontsize=SMALL, loc="right", color=GREY, parse_math=False)
 
 
 def _title(arguments):

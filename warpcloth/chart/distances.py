@@ -2,16 +2,22 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from ..picture.figures import PICTURES, check_path, save
+from .style import LEGEND, dress, headline, name_ends, series_style, small_print
+
+_FAR = 30.0  # from a line to its name [pt]; beyond, a legend is easier to read
 
 
-def plot_distances(path, found, names):
+def plot_distances(path, found, names, device="cpu"):
     """Plots the distances of two animations over time and, if they have the same triangles, differences of stretches below.
 
     Args:
         path: The file, .png, .svg or .pdf.
         found: The :class:`warpcloth.Comparison`.
         names: Names of the two files.
+        device: The Warp device that compared them.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -26,16 +32,32 @@ def plot_distances(path, found, names):
     lines = {"RMS of vertices": found.rms, "largest of vertices": found.largest, "Hausdorff": found.hausdorff}
     if not found.same_topology:
         lines = {"RMS from A": found.surface_rms[:, 0], "RMS from B": found.surface_rms[:, 1], "Hausdorff": found.hausdorff}
-    for (label, values), style in zip(lines.items(), (".-", ".-", "."), strict=True):
-        axes[0].plot(found.times, values, style, label=label)
-    axes[0].set(title=f"{Path(names[0]).name} and {Path(names[1]).name}", ylabel="distance [m]")
+    panels = [lines]
     if found.same_topology:
-        for label, values in (("RMS", found.stretch_rms), ("largest", found.stretch_largest)):
-            for k, column in enumerate(values.T):
-                axes[1].plot(found.times, column, ".-", label=f"{label} of λ{'₁₂'[k]}")
+        pairs = (("RMS", found.stretch_rms), ("largest", found.stretch_largest))
+        panels.append({f"{label} of λ{'₁₂'[k]}": column for label, both in pairs for k, column in enumerate(both.T)})
+    ends = [_draw(each, found.times, lines) for each, lines in zip(axes, panels, strict=True)]
+    axes[0].set(ylabel="distance [m]")
+    if found.same_topology:
         axes[1].set(ylabel="difference of stretches")
-    for axis in axes:
-        axis.legend()
-        axis.set_ylim(bottom=0.0)
     axes[-1].set_xlabel("time [s]")
+    for each in axes:
+        each.set_ylim(bottom=0.0)
+        dress(each)
+    headline(figure, f"{Path(names[0]).name} and {Path(names[1]).name}")
+    small_print(figure, device=device)
+    if not all(name_ends(figure, each, of, _FAR) for each, of in zip(axes, ends, strict=True)):
+        for each in axes:
+            each.legend(**LEGEND)
     save(figure, path)
+
+
+def _draw(axes, times, lines):
+    """Draws values over time; returns (x, y, label, colour) of the last value of each line."""
+    ends = []
+    for k, (label, values) in enumerate(lines.items()):
+        style = series_style(k)
+        axes.plot(times, values, label=label, markersize=3.5, linewidth=1.0, **style.line)
+        known = np.flatnonzero(np.isfinite(values))
+        ends += [(times[known[-1]], values[known[-1]], label, style.colour)] if len(known) else []
+    return ends

@@ -12,4 +12,4 @@ def plot_failure(path, found):
         ImportError: matplotlib is not installed.
         ValueError: The path has another ending.
     """
-    plot_panels(path, FAILURES[found["failure"]].PANELS, found["rows"], found["title"])
+    plot_panels(path, FAILURES[found["failure"]].PANELS, found["rows"], found["title"], found["machine"])

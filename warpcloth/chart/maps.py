@@ -9,18 +9,19 @@ from ..lab.axes import AXES
 from ..lab.cells import FRAMES
 from ..lab.stability_limits import DIVERGES, KNOWN
 from ..picture.figures import GREY, PICTURES, check_path, save
+from .style import BAD, DOUBTFUL, GOOD, add_legend, dress, headline, small_print, title_style
 
 # sRGB colours. Divergence goes from dark, at once, to light, in the last frame. All differ in lightness too, for people who do
 # not see red.
 _PLAIN = {
-    "stable": (0.66, 0.83, 0.93),
-    "unsure": (0.66, 0.83, 0.93),
+    "stable": GOOD,
+    "unsure": GOOD,
     "inaccurate": (0.98, 0.88, 0.50),
-    "stalled": (0.93, 0.62, 0.20),
+    "stalled": DOUBTFUL,
     "slow": (0.72, 0.72, 0.72),
     "refused": (1.0, 1.0, 1.0),
 }
-_EARLY, _LATE = np.array([0.42, 0.02, 0.11]), np.array([0.87, 0.47, 0.40])
+_EARLY, _LATE = np.array(BAD), np.array([0.87, 0.47, 0.40])
 # Line style and label of each rule; lines are black if runs diverge beyond them.
 _STYLES = {
     "2/ω_max": ("-", "largest stable step about the rest shape"),
@@ -37,10 +38,9 @@ _STYLES = {
 # Hatching of cells that are stable or inaccurate.
 _UNSURE = {"facecolor": _PLAIN["stable"], "edgecolor": _PLAIN["inaccurate"], "hatch": "///", "linewidth": 0.0}
 _TICKS = 4
-_SMALL, _TEXT = 9.5, 11.0  # sizes of letters [pt]
 
 
-def plot_maps(path, survey, cells, accuracy=None):
+def plot_maps(path, survey, cells, accuracy=None, facts=None):
     """Draws the verdict of each cell, a panel for each method, with lines where limits of
     :mod:`warpcloth.lab.stability_limits` are 1.
 
@@ -49,6 +49,7 @@ def plot_maps(path, survey, cells, accuracy=None):
         survey: The :class:`warpcloth.lab.stability.Survey`.
         cells: (setup, y, x), from :meth:`warpcloth.lab.stability.Survey.table`.
         accuracy: The error above which cells are inaccurate, for the legend, or None.
+        facts: The machine, as of :func:`warpcloth.lab.machine.machine`; None for this one.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -61,7 +62,7 @@ def plot_maps(path, survey, cells, accuracy=None):
     count = len(survey.setups)
     columns = min(count, 4)
     lines = math.ceil(count / columns)
-    figure = Figure(figsize=(max(2.9 * columns, 6.0), 2.6 * lines + 2.0), layout="constrained")
+    figure = Figure(figsize=(max(2.5 * columns, 6.0), 2.3 * lines + 1.6), layout="constrained")
     panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
     coordinates = [_coordinates(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
     shown = {}
@@ -72,23 +73,20 @@ def plot_maps(path, survey, cells, accuracy=None):
             style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
             if _line(axes, coordinates, rows, name, style):
                 shown[name] = style
-        axes.set_title(str(setup), fontsize=_TEXT, color=GREY)
+        axes.set_title(str(setup), **title_style(str(setup)))
         for of, name, values, at in zip("xy", (survey.x, survey.y), (survey.xs, survey.ys), coordinates, strict=True):
             ticks, numbers = _ticks(name, values, at)
             axes.set(**{f"{of}ticks": ticks, f"{of}ticklabels": numbers})
             if (of == "x" and k >= count - columns) or (of == "y" and k % columns == 0):
-                getattr(axes, f"set_{of}label")(AXES[name].label, color=GREY, fontsize=_TEXT)
-        axes.tick_params(colors=GREY, labelsize=_SMALL, labelbottom=k >= count - columns)
+                getattr(axes, f"set_{of}label")(AXES[name].label)
+        dress(axes, grid=False)
+        axes.tick_params(labelbottom=k >= count - columns)
     for axes in panels[count:]:
         axes.remove()
     _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row}, accuracy)
     rest = ", ".join(f"{name} {value:.4g}" for name, value in survey.fixed.items())
-    figure.suptitle(
-        f"{survey.scene}, {survey.duration:g} s of motion" + (f", {rest}" if rest else ""),
-        fontsize=10,
-        color=GREY,
-        parse_math=False,
-    )
+    headline(figure, f"{survey.scene}, {survey.duration:g} s of motion" + (f", {rest}" if rest else ""))
+    small_print(figure, facts)
     save(figure, path)
 
 
@@ -171,7 +169,7 @@ def _legend(figure, shown, verdicts, accuracy):
         for name, style in shown.items()
     ]
     columns = 3 if figure.get_size_inches()[0] > 9.0 else 2 if figure.get_size_inches()[0] > 8.0 else 1
-    figure.legend(handles=entries, loc="outside lower center", ncols=columns, frameon=False, fontsize=_SMALL, labelcolor=GREY)
+    add_legend(figure, entries, columns)
 
 
 def write_csv(path, survey, cells):

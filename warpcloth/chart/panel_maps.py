@@ -4,11 +4,10 @@ import numpy as np
 
 from ..picture.figures import GREY
 from .maps import edges
+from .style import BAD, DASHES, DOUBTFUL, GOOD, LABEL, TICK, add_legend
 
-_DASHES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
-# sRGB of kinds, in order; they differ in lightness too, for people who do not see red.
-_KINDS = ((0.66, 0.83, 0.93), (0.93, 0.62, 0.20), (0.42, 0.02, 0.11))
-_LETTERS = 8  # [pt]
+_KINDS = (GOOD, DOUBTFUL, BAD)
+_CROSS = "#E0105A"
 _REFUSED = {"facecolor": "white", "edgecolor": "0.8", "hatch": "////"}
 
 
@@ -43,10 +42,10 @@ def draw_map(axes, panel, rows, lines):
     cells = axes.pcolormesh(*corners, np.ma.masked_invalid(values), **style)
     x = np.geomspace(xs[0], xs[-1], 200) if panel.scales[0] == "log" else np.linspace(xs[0], xs[-1], 200)
     for label, law in panel.laws.items():
-        dashes = lines.setdefault(label, _DASHES[len(lines) % len(_DASHES)])
+        dashes = lines.setdefault(label, DASHES[len(lines) % len(DASHES)])
         axes.plot(x, [law(value) for value in x], linestyle=dashes, color="black", linewidth=1.2)
     if crossed:
-        axes.plot(*np.array(crossed).T, "x", color="tab:red", markersize=5.0)
+        axes.plot(*np.array(crossed).T, "x", color=_CROSS, markersize=5.0)
     axes.set_xlim(corners[0][0], corners[0][-1])
     axes.set_ylim(corners[1][0], corners[1][-1])
     return None if panel.kinds else cells
@@ -73,14 +72,13 @@ def add_keys(figure, maps, lines):
             bars.setdefault((panel.value, panel.colours), (cells, []))[1].append(axes)
     for (label, _colours), (cells, group) in bars.items():
         bar = figure.colorbar(cells, ax=group, pad=0.01, aspect=8.0 * len(group) ** 0.5)
-        bar.set_label(label, color=GREY, fontsize=_LETTERS)
-        bar.ax.tick_params(colors=GREY, labelsize=_LETTERS)
+        bar.set_label(label, color=GREY, fontsize=LABEL)
+        bar.ax.tick_params(colors=GREY, labelsize=TICK)
         bar.outline.set_visible(False)
     keys = [Line2D([], [], color="black", linestyle=dashes, label=label) for label, dashes in lines.items()]
     kinds = dict.fromkeys(kind for _, panel, _ in maps for kind in panel.kinds)
     keys += [Patch(color=colour, label=kind) for kind, colour in zip(kinds, _KINDS, strict=False)]
     for crossed in dict.fromkeys(panel.crossed for _, panel, _ in maps if panel.crossed):
-        keys.append(Line2D([], [], color="tab:red", marker="x", linestyle="", label=f"a sheet {crossed}"))
+        keys.append(Line2D([], [], color=_CROSS, marker="x", linestyle="", label=f"a sheet {crossed}"))
     keys += [Patch(**_REFUSED, label="refused")] * any(cells is not None for *_, cells in maps)
-    style = {"frameon": False, "fontsize": _LETTERS, "labelcolor": GREY, "ncols": min(len(keys), 8)}
-    figure.legend(handles=keys, loc="outside lower center", **style)
+    add_legend(figure, keys, min(len(keys), 8))

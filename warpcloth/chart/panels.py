@@ -5,14 +5,27 @@ import math
 import numpy as np
 
 from ..lab.panels import Map
-from ..picture.figures import GREY, PICTURES, check_path, save
+from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
 from .panel_maps import add_keys, draw_map
+from .style import (
+    DASHES,
+    LEGEND,
+    SMALL,
+    dress,
+    headline,
+    name_ends,
+    series_style,
+    small_print,
+    solver_in,
+    style_of,
+    title_style,
+)
 
-_MARKS = "os^DvPX*"
-_COLOURS = ("black", "tab:red", "tab:blue", "tab:green", "tab:orange", "tab:purple", "tab:cyan", "tab:brown")
+_LAW = "0.55"  # grey of laws
+_FAR = 16.0  # from a line to its name [pt]; beyond, a legend is easier to read
 
 
-def plot_panels(path, panels, rows, title):
+def plot_panels(path, panels, rows, title, facts):
     """Draws points as markers or cells, and laws as lines.
 
     Args:
@@ -20,6 +33,7 @@ def plot_panels(path, panels, rows, title):
         panels: :class:`warpcloth.lab.panels.Panel` records.
         rows: Points, see :func:`warpcloth.lab.panels.point`.
         title: Title of the figure.
+        facts: The machine, as of :func:`warpcloth.lab.machine.machine`.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -34,64 +48,65 @@ def plot_panels(path, panels, rows, title):
     width, height = (3.8, 3.2) if any(isinstance(panel, Map) for panel in panels) else (5.0, 4.1)
     figure = Figure(figsize=(width * across, height * down + 0.3), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
-    grid, maps, lines = figure.subplots(down, across, squeeze=False).ravel(), [], {}
+    grid, maps, lines, named = figure.subplots(down, across, squeeze=False).ravel(), [], {}, []
     for axes, panel in zip(grid, panels, strict=False):
         of = [row for row in rows if row["panel"] == panel.key]
         if isinstance(panel, Map):
             maps.append((axes, panel, draw_map(axes, panel, of, lines)))
         else:
-            _draw(axes, panel, of)
-        _label(axes, panel)
+            named.append((axes, _draw(axes, panel, of)))
+        axes.set_title(panel.title, loc="left", **title_style(panel.title))
+        axes.set(xlabel=panel.x, ylabel=panel.y)
+        dress(axes, grid=not isinstance(panel, Map))
     for axes in grid[len(panels) :]:
         axes.remove()
     if maps:
         add_keys(figure, maps, lines)
-    figure.suptitle(title, fontsize=10, color=GREY)
+    headline(figure, title)
+    small_print(figure, facts)
+    for axes, ends in named:
+        if not name_ends(figure, axes, ends, _FAR):
+            axes.legend(**LEGEND | {"frameon": True}, framealpha=0.85, edgecolor="none")
     save(figure, path)
 
 
 def _draw(axes, panel, rows):
+    """Draws points and laws; returns (x, y, label, colour) of the end of each line."""
     from matplotlib.ticker import LogLocator
 
     axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
-    series = {}
+    series, ends = {}, []
     for row in rows:
         series.setdefault(row["series"], []).append(row)
     for k, (label, points) in enumerate(series.items()):
         known = sorted((row["x"], row["value"]) for row in points if row["value"] is not None)
-        style = {"color": _COLOURS[k % len(_COLOURS)], "marker": _MARKS[k % len(_MARKS)], "markersize": 4.5}
+        style = style_of(solver_in(label)) if solver_in(label) else series_style(k)
         # A line joins points only if no law does.
         width = 0.0 if label in panel.follows else 0.8
-        axes.plot(*np.array(known).reshape(-1, 2).T, label=label, linewidth=width, fillstyle="none", **style)
+        looks = style.line | {"fillstyle": "none", "markersize": 4.5}
+        axes.plot(*np.array(known).reshape(-1, 2).T, label=label, linewidth=width, **looks)
+        ends += [(*known[-1], label, style.colour)] if known else []
     at = [row["x"] for row in rows]
-    for (label, law), dashes in zip(panel.laws.items(), ("-", "--", "-.", ":"), strict=False):
+    for (label, law), dashes in zip(panel.laws.items(), DASHES, strict=False):
         x = _between(min(at), max(at), panel.scales[0])
-        axes.plot(x, [law(value) for value in x], dashes, color="0.55", linewidth=1.2, zorder=1.5, label=label)
+        y = [law(value) for value in x]
+        axes.plot(x, y, linestyle=dashes, color=_LAW, linewidth=1.2, zorder=1.5, label=label)
+        ends.append((x[-1], y[-1], label, _LAW))
     for x, label in panel.marks.items():
         axes.axvline(x, color="0.7", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
-        style = {"ha": "center", "va": "center", "rotation": 90, "fontsize": 7, "color": GREY}
+        style = {"ha": "center", "va": "center", "rotation": 90, "fontsize": SMALL, "color": GREY}
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
         axes.annotate(label, (x, 0.4), xycoords=("data", "axes fraction"), bbox=box, zorder=1, **style)
     if panel.limits:
         axes.set_ylim(panel.limits)
-    for axis, scale in zip((axes.xaxis, axes.yaxis), panel.scales, strict=True):
-        low, high = axis.get_view_interval()
-        if scale == "log" and high < 100.0 * low:  # plain numbers, because there may be no power of ten
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter("{x:g}")
-            if high > 10.0 * low:
-                axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))  # more labels would overlap
-    axes.grid(True, which="major", linewidth=0.3, color="0.85")
-    axes.legend(fontsize=7, labelcolor=GREY, framealpha=0.85, edgecolor="none")
-
-
-def _label(axes, panel):
-    axes.set_title(panel.title, fontsize=9, loc="left", color=GREY)
-    axes.set_xlabel(panel.x, color=GREY, fontsize=9)
-    axes.set_ylabel(panel.y, color=GREY, fontsize=9)
-    axes.tick_params(which="both", colors=GREY, labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color("0.7")
+    if panel.scales[0] == "log":
+        number_axis(axes.xaxis)
+    low, high = axes.get_ylim()
+    if panel.scales[1] == "log" and high < 100.0 * low:  # plain numbers, because there may be no power of ten
+        axes.yaxis.set(major_formatter="{x:g}", minor_formatter="{x:g}")
+        if high > 10.0 * low:
+            axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))  # more labels would overlap
+    return ends
 
 
 def _between(low, high, scale):

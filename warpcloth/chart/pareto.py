@@ -2,15 +2,13 @@
 
 import textwrap
 
-from ..lab.machine import in_words
 from ..lab.work_precision import WITHIN, cheapest, front, quartiles, without_point
-from ..others.simulators import SIMULATORS, other_solvers
+from ..numerics.integrators import INTEGRATORS
+from ..others.simulators import SIMULATORS
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
-from ..solvers import SOLVERS
+from .style import DASHES, LABEL, LEGEND, SMALL, dress, headline, name_ends, series_style, small_print, style_of
 
-_DASHES = ("-", "--", ":", "-.")
 _WIDTH, _LINES = 46, 48  # characters and lines of the texts beside a picture
-_SMALL, _TEXT = 8.5, 10.0  # sizes of letters [pt]
 # Errors of a motion, with the labels of their axes.
 _ERRORS = {
     "error": "error: RMS of all vertices and frames, over the size",
@@ -50,35 +48,36 @@ def plot_time(path, found):
     for row in rows:
         if row["status"] == "ok":
             lines.setdefault((row["solver"], row["options"].get("integrator", "euler")), []).append(row)
-    ends, others = {axes: [] for axes in panels}, other_solvers()
+    ends, dashes = {axes: [] for axes in panels}, dict(zip(INTEGRATORS, DASHES, strict=False))
     for (solver, integrator), line in lines.items():
         line.sort(key=lambda row: row["ms_per_second"])
-        colour, marker = others[solver].style if solver in others else SOLVERS[solver].facts.style
+        style = style_of(solver)
         own = [(row["ms_per_second"], row["own_error"]) for row in line if row.get("own_error") is not None]
         if own:
-            panels[0].plot(*zip(*own, strict=True), marker, color=colour, markersize=5, linestyle=":", markerfacecolor="none")
+            panels[0].plot(*zip(*own, strict=True), ".", color=style.colour, markersize=5, linestyle=":", linewidth=0.7)
         for axes, name in zip(panels, _ERRORS, strict=True):
             x, y = ([row[of] for row in line] for of in ("ms_per_second", name))
-            axes.plot(x, y, color=colour, linewidth=0.7, alpha=0.6)
-            axes.hlines(y, *zip(*map(quartiles, line), strict=True), color=colour, linewidth=2.5, alpha=0.45)
-            axes.plot(x, y, marker, color=colour, markersize=5, linestyle="none")
-            ends[axes].append((x[-1], y[-1], solver if integrator == "euler" else f"{solver} {integrator}", colour))
+            axes.plot(x, y, dashes.get(integrator, "-"), color=style.colour, linewidth=0.7, alpha=0.6)
+            axes.hlines(y, *zip(*map(quartiles, line), strict=True), color=style.colour, linewidth=2.5, alpha=0.45)
+            axes.plot(x, y, linestyle="none", markersize=5, **style.line)
+            ends[axes].append((x[-1], y[-1], solver if integrator == "euler" else f"{solver} {integrator}", style.colour))
     for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
         x, y = ([rows[i][of] for i in curves[name]] for of in ("ms_per_second", name))
         axes.plot(x, y, color="gold", linewidth=5.0, zorder=0, label="nothing is better in both")
         for i in curves[name]:
-            point, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": _TEXT}
+            point, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": LABEL}
             axes.annotate(str(best.index(i) + 1), point, (-4, -4), textcoords="offset points", **below)
         axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="quartiles of the times")
         if found.get("others"):
             label = "from the solver's own converged motion"
-            axes.plot([], [], "o", color=GREY, markersize=5, markerfacecolor="none", label=label)
+            axes.plot([], [], ".", color=GREY, markersize=5, linestyle=":", linewidth=0.7, label=label)
         _floor(axes, reference[name], "error of the reference")
         axes.set(xlabel="ms for a second of motion", ylabel=text)
     title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}"
     _finish(figure, panels, notes, title, texts, found)
     for axes, of in ends.items():
-        _name_ends(figure, axes, of)
+        if of:
+            name_ends(figure, axes, of)
     save(figure, path)
 
 
@@ -98,14 +97,14 @@ def plot_solver(path, found):
     figure, panels, notes = _figure(path, texts)
     seen, floor = {}, max((row["floor"] for row in found["rows"]), default=None)
     for row in found["rows"]:
-        colour, marker = SOLVERS[row["solver"]].facts.style
-        style = _DASHES[seen.setdefault(row["solver"], 0) % len(_DASHES)]
+        dashes = DASHES[seen.setdefault(row["solver"], 0) % len(DASHES)]
         seen[row["solver"]] += 1
         if not row["points"]:
             continue
         for axes, name in zip(panels, ("iterations", "ms"), strict=True):
             x, y = ([point[name] for point in row["points"]], [max(point["gap"], floor) for point in row["points"]])
-            axes.plot(x, y, style, marker=marker, color=colour, markersize=3, linewidth=1.0, label=row["label"])
+            style = style_of(row["solver"]).line
+            axes.plot(x, y, linestyle=dashes, markersize=3, linewidth=1.0, label=row["label"], **style)
     for axes, text in zip(panels, ("iterations", "ms of the step"), strict=True):
         axes.set(xlabel=text)
         if floor is not None:
@@ -133,7 +132,7 @@ def plot_spectrum(path, found):
     figure, panels, notes = _figure(path, texts)
     good = [row for row in found["rows"] if row["points"]]
     for k, row in enumerate(good):
-        mu, colour, points = row["eigenvalues"], f"C{k}", row["points"]
+        mu, colour, points = row["eigenvalues"], series_style(k).colour, row["points"]
         panels[0].plot(range(1, len(mu) + 1), mu, color=colour, linewidth=1.2)
         at, errors = ([point[name] for point in points] for name in ("iterations", "error"))
         panels[1].plot(
@@ -143,7 +142,7 @@ def plot_spectrum(path, found):
         at, errors = ([point[name] for point in known] for name in ("iterations", "predicted"))
         panels[1].plot(at, errors, color=colour, linewidth=0.8)
     for k, row in enumerate(good):
-        _floor(panels[1], row["floor"], "rounding of the positions", f"C{k}")
+        _floor(panels[1], row["floor"], "rounding of the positions", series_style(k).colour)
     panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
     panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
     title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
@@ -162,40 +161,6 @@ def _missing(head, found):
     return ["", head, *lines] if lines else []
 
 
-def _name_ends(figure, axes, ends):
-    """Writes the name of each line beside its end, in its colour, as near as possible without overlaps and inside the panel.
-
-    Args:
-        figure: Figure of the axes, which are otherwise finished.
-        axes: A panel.
-        ends: (x, y, text, colour) of each line.
-    """
-    from matplotlib.patheffects import withStroke
-
-    low, high = axes.get_xlim()
-    axes.set_xlim(low, high * (high / low) ** 0.3)  # room for names
-    number_axis(axes.xaxis)
-    figure.draw_without_rendering()  # so that sizes are known
-    style, taken = {"fontsize": _SMALL, "va": "center", "path_effects": [withStroke(linewidth=2.5, foreground="white")]}, []
-    for x, y, text, colour in sorted(ends, key=lambda end: -end[1]):
-        note = axes.annotate(
-            text, (x, y), (7, 0), textcoords="offset points", annotation_clip=False, zorder=1.9, color=colour, **style
-        )
-        note.set_in_layout(False)
-        for shift in range(120):
-            for side, up in ((side, up) for up in (-3 * shift, 3 * shift) for side in ("left", "right")):
-                note.set(ha=side)
-                note.xyann = (7 if side == "left" else -7, up)
-                box, around = note.get_window_extent(), axes.bbox
-                inside = around.y0 <= box.y0 and box.y1 <= around.y1 and around.x0 <= box.x0 and box.x1 <= around.x1
-                if inside and not box.count_overlaps(taken):
-                    break
-            else:
-                continue
-            break
-        taken.append(box.padded(2.0))
-
-
 def _figure(path, texts):
     """Returns a figure with two panels on logarithmic scales, and one for text."""
     check_path(path, PICTURES)
@@ -203,29 +168,25 @@ def _figure(path, texts):
 
     if len(texts) > _LINES:
         texts[_LINES:] = [f"… {len(texts) - _LINES} lines more in the table"]
-    height = max(5.4, 0.165 * (len(texts) + 14))
-    figure = Figure(figsize=(13.0, height), layout="constrained")
+    height = max(4.6, 0.135 * (len(texts) + 14))
+    figure = Figure(figsize=(11.0, height), layout="constrained")
     *axes, notes = figure.subplots(1, 3, width_ratios=[1.7, 1.7, 1.0])
     for each in axes:
         each.set(xscale="log", yscale="log")
-        each.grid(True, which="major", linewidth=0.3, color="0.8")
-        each.tick_params(which="both", colors=GREY, labelsize=_TEXT)
-        each.xaxis.label.set_size(_TEXT + 1.0)
-        each.yaxis.label.set_size(_TEXT + 1.0)
-        each.spines[["top", "right"]].set_visible(False)
     notes.axis("off")
     return figure, axes, notes
 
 
 def _finish(figure, axes, notes, title, texts, found):
-    """Adds the title with the machine, the legend, and the text below it."""
+    """Adds the title, the legend, the text below it, and the machine."""
     known = {}
     for each in axes:
         number_axis(each.xaxis)
+        dress(each)
         known.update(zip(*reversed(each.get_legend_handles_labels()), strict=True))
-    notes.legend(known.values(), known, loc="upper left", frameon=False, fontsize=_SMALL, borderaxespad=0.0)
-    top = 1.0 - 0.19 * (len(known) + 1) / figure.get_size_inches()[1]
-    notes.text(0.0, top, "\n".join(texts), fontsize=_SMALL, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
-    named = [name for name, each in SIMULATORS.items() if set(each.solvers) & {row["solver"] for row in found["rows"]}]
-    title = f"{title}, on {in_words(found['machine'], named)}"
-    figure.suptitle(title, fontsize=_TEXT + 1.0, color=GREY, parse_math=False)
+    notes.legend(known.values(), known, loc="upper left", borderaxespad=0.0, **LEGEND)
+    top = 1.0 - 0.17 * (len(known) + 1) / figure.get_size_inches()[1]
+    notes.text(0.0, top, "\n".join(texts), fontsize=SMALL, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
+    headline(figure, title)
+    named = [name for name, each in SIMULATORS.items() if set(each.solvers) & {row.get("solver") for row in found["rows"]}]
+    small_print(figure, found["machine"], others=named)

@@ -6,14 +6,15 @@ import numpy as np
 
 from ..base.checks import choice
 from ..picture.figures import GREY, PICTURES, check_path, save
+from .style import COLOURS, LEGEND, SMALL, dress, small_print
 
 # Columns of each band among the percentiles 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, its grey and its label.
 _BANDS = ((1, 7, "0.88", "1 to 99 %"), (2, 6, "0.76", "5 to 95 %"), (3, 5, "0.6", "25 to 75 %"))
 _MEDIAN, _EXTREMES = 4, (0, 8)
-_NOTE = {"ha": "right", "fontsize": 7, "color": GREY, "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1.0}}
+_NOTE = {"ha": "right", "fontsize": SMALL, "color": GREY, "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 1.0}}
 
 
-def plot_percentiles(path, summaries, along="time", neutrals=None):
+def plot_percentiles(path, summaries, along="time", neutrals=None, device="cpu"):
     """Plots each scalar in a panel: its median, bands from 25 to 75, 5 to 95 and 1 to 99 %, and its extremes as thin lines.
 
     Rows without values leave gaps. Extremes far outside the bands leave the panel, which then gives their values.
@@ -24,6 +25,7 @@ def plot_percentiles(path, summaries, along="time", neutrals=None):
             ``percentiles``: of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %.
         along: "time" or "frame".
         neutrals: Values of an undeformed element by name, drawn as a line; None for no line.
+        device: The Warp device that measured them.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -47,15 +49,17 @@ def plot_percentiles(path, summaries, along="time", neutrals=None):
         at = np.array([getattr(summary, along) for summary in found], dtype=np.float64)
         _panel(axes, at, np.array([summary.percentiles for summary in found], dtype=np.float64), (neutrals or {}).get(name))
         unit = "" if found[0].unit == "1" else f" [{found[0].unit}]"
-        axes.set_ylabel(f"{name}{unit}", color=GREY, parse_math=False)
+        axes.set_ylabel(f"{name}{unit}", parse_math=False)
+        axes.set_xlabel("time [s]" if along == "time" else "frame")
+        dress(axes)
         axes.tick_params(labelbottom=True)
-        axes.set_xlabel("time [s]" if along == "time" else "frame", color=GREY)
     for axes in panels[len(rows) :]:
         axes.remove()
     known = {}
     for axes in panels[: len(rows)]:
         known.update(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    figure.legend(known.values(), known, loc="outside upper center", ncols=3, frameon=False, fontsize=8, labelcolor=GREY)
+    figure.legend(known.values(), known, loc="outside upper center", ncols=3, **LEGEND)
+    small_print(figure, device=device)
     save(figure, path)
 
 
@@ -74,10 +78,7 @@ def _panel(axes, at, percentiles, neutral):
     axes.plot(at, percentiles[:, _MEDIAN], color="black", linewidth=1.2, label="median")
     axes.plot(at[alone], percentiles[alone, _MEDIAN], "o", color="black", markersize=3)
     if neutral is not None:
-        axes.axhline(neutral, color="tab:blue", linewidth=0.8, linestyle=(0, (4, 3)), label="undeformed")
-    axes.tick_params(colors=GREY, labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color("0.7")
+        axes.axhline(neutral, color=COLOURS[2], linewidth=0.8, linestyle=(0, (4, 3)), label="undeformed")
 
 
 def _alone(known):

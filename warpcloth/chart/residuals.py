@@ -2,16 +2,18 @@
 
 import numpy as np
 
-from ..picture.figures import PICTURES, check_path, save
+from ..picture.figures import GREY, PICTURES, check_path, save
+from .style import dress, headline, name_ends, series_style, small_print
 
 
-def plot_residuals(path, found, fps):
+def plot_residuals(path, found, fps, device="cpu"):
     """Plots the RMS residual of each frame of a fit over time.
 
     Args:
         path: The file, .png, .svg or .pdf.
         found: The :class:`warpcloth.Fit`.
         fps: Frames per second of the scene.
+        device: The Warp device of the fit.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -23,9 +25,13 @@ def plot_residuals(path, found, fps):
 
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     axes = figure.subplots()
-    axes.plot(np.arange(1, len(found.residuals) + 1) / fps, found.residuals, ".-")
-    axes.axhline(found.residual, color="0.6", linewidth=1.0, label=f"over all frames, {found.residual:.3g} m")
+    times, style = np.arange(1, len(found.residuals) + 1) / fps, series_style(1)
+    axes.plot(times, found.residuals, markersize=3.5, linewidth=1.0, **style.line)
+    axes.axhline(found.residual, color="0.6", linewidth=1.0)
     parameters = ", ".join(f"{name} = {value:.4g}" for name, value in found.parameters.items())
-    axes.set(title=parameters, xlabel="time [s]", ylabel="RMS residual along an axis [m]", ylim=(0.0, None))
-    axes.legend()
+    axes.set(xlabel="time [s]", ylabel="RMS residual along an axis [m]", ylim=(0.0, None))
+    dress(axes)
+    headline(figure, parameters)
+    small_print(figure, device=device)
+    name_ends(figure, axes, [(times[-1], found.residual, f"over all frames, {found.residual:.3g} m", GREY)])
     save(figure, path)

@@ -298,7 +298,7 @@ def _parts(diagram):
 def _plot_physics(path, found):
     from ..chart.closed_forms import plot_physics
 
-    plot_physics(path, [(row["arguments"], row) for row in found["rows"]])
+    plot_physics(path, [(row["arguments"], row) for row in found["rows"]], found["machine"])
 
 
 def _physics_lines(found):

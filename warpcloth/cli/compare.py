@@ -59,7 +59,7 @@ def compare(arguments):
     if arguments.plot:
         from ..chart import plot_distances
 
-        plot_distances(arguments.plot, found, (arguments.a, arguments.b))
+        plot_distances(arguments.plot, found, (arguments.a, arguments.b), device)
     facts = _facts(arguments, found, (a, b))
     if arguments.json:
         per_frame = {name: np.asarray(column).tolist() for name, column in columns.items()}

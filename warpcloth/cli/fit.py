@@ -87,7 +87,7 @@ def fit(arguments):
     if arguments.plot:
         from ..chart import plot_residuals
 
-        plot_residuals(arguments.plot, found, scene.fps)
+        plot_residuals(arguments.plot, found, scene.fps, str(device))
     facts = {"scene": arguments.scene, "measured": measured, "readings": arguments.reading, "scene_parameters": values}
     facts |= {"device": str(device), "dtype": arguments.dtype}
     facts |= solver_facts(arguments, setup, scene.fps) if setup else {"solver": None}

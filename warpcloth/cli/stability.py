@@ -106,7 +106,7 @@ def chart(arguments):
         if arguments.csv:
             write_csv(arguments.csv, survey, cells)
         if arguments.output:
-            plot_maps(arguments.output, survey, cells, arguments.accuracy)
+            plot_maps(arguments.output, survey, cells, arguments.accuracy, machine(device))
     methods = [str(setup) for setup in survey.setups]
     if arguments.json:
         axes = {survey.x: survey.xs, survey.y: survey.ys}

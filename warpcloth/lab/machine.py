@@ -45,14 +45,15 @@ def name(device="cpu"):
 
 
 def in_words(facts, others=()):
-    """Formats the device of :func:`machine` (for a CPU its name and cores) and versions for a title.
+    """Formats the versions and the device of :func:`machine`, for a CPU its name and cores, for a chart.
 
     Args:
         facts: Those of :func:`machine`.
         others: Names of simulators whose versions are added.
     """
     device = facts["device"] if facts["device"] != "cpu" else f"{facts['processor']}, {facts['cores']} cores"
-    return ", ".join([device, f"Warp {facts['warp']}", *(f"{SIMULATORS[name].title} {facts[name]}" for name in others)])
+    own = f"warpcloth {facts['warpcloth']} ({facts['source'][:8]})"
+    return ", ".join([own, f"Warp {facts['warp']}", *(f"{SIMULATORS[name].title} {facts[name]}" for name in others), device])
 
 
 def processor():

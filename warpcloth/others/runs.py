@@ -44,13 +44,11 @@ class OtherSolver(NamedTuple):
             methods ``frame()``, ``points()`` and ``velocities()``, both (n, 3), which are called in the scope of the device.
         runs: Options of settings that trade speed for accuracy, as in :class:`warpcloth.solvers.facts.Facts`; ``fewest`` is a
             multiple of the fewest stable substeps of ``Explicit``.
-        style: Colour and marker.
         iterates: Whether it has iterations.
     """
 
     record: Callable
     runs: tuple
-    style: tuple
     iterates: bool = True
 
 

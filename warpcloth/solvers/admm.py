@@ -116,7 +116,6 @@ class ADMM(ImplicitStep):
         ),
         one_step=({"tolerance": 1e-14}, {"weight": 1.0, "tolerance": 1e-14}),
         limits=("r = 1/(2hω)", "h² = m/(k(L/l − 1))"),
-        style=("tab:cyan", "v"),
     )
 
     iterations: int = 20

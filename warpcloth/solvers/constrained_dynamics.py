@@ -90,7 +90,6 @@ class ConstrainedDynamics(ImplicitStep):
             {"stabilisation": stabilisation, "tolerance": 1e-8} for stabilisation in ("geometric-stiffness", "line-search")
         ),
         limits=("h² = m/(k(L/l − 1))",),
-        style=("tab:green", "p"),
     )
     residual = Residual(
         "largest residual of a vertex or a constraint (as an acceleration)", "times its value at the start of the step"

@@ -62,7 +62,6 @@ class Explicit(Step):
         benchmarks=(Benchmark({}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),),
         runs=tuple({"fewest": factor} for factor in (1.0, 1.5, 2.0)),
         limits=("forward Euler", "2/ω_max", "2/√(2 Σk/m)"),
-        style=("tab:gray", "s"),
     )
 
     scheme: Literal["symplectic", "forward"] = "symplectic"

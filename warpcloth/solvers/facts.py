@@ -1,4 +1,4 @@
-"""The settings of a solver for benchmarks, charts and `choose`, and its style in charts."""
+"""The settings of a solver for benchmarks, charts and `choose`."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class Facts:
-    """Settings by which a solver is measured, and its style in charts.
+    """Settings by which a solver is measured.
 
     Attributes:
         method: The method, in a few words for tables.
@@ -33,7 +33,6 @@ class Facts:
         one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler. Tolerances are
             so small that they never end a step.
         limits: Names of the limits, see :data:`warpcloth.lab.stability_limits.LIMITS`, that maps of stability draw.
-        style: Colour and marker in every picture.
     """
 
     method: str = ""
@@ -43,7 +42,6 @@ class Facts:
     runs: tuple = tuple({"substeps": substeps} for substeps in (1, 4, 16, 64))
     one_step: tuple = ()
     limits: tuple = ()
-    style: tuple = ("tab:brown", "*")
 
 
 def grid(settings, **options):

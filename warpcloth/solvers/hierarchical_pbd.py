@@ -60,7 +60,6 @@ class HierarchicalPBD(Step):
         weakness="less exact than `PBD` once the constraints are nearly met; makes soft cloth stiffer",
         benchmarks=(Benchmark({"substeps": 4, "iterations": 20}, cpu=(16, 32, 64, 128), cuda=(64, 128, 256, 512, 1024)),),
         runs=grid([(4, 1), (8, 1), (15, 1), (30, 1), (8, 2), (15, 2), (30, 2), (60, 2), (120, 2)]),
-        style=("tab:purple", "P"),
     )
 
     iterations: int = 20

@@ -69,7 +69,6 @@ class Newton(ImplicitStep):
         ),
         one_step=({"tolerance": 1e-14},),
         limits=("h² = m/(k(L/l − 1))",),
-        style=("black", "o"),
     )
 
     tolerance: float = 1e-3

@@ -73,7 +73,6 @@ class PBD(Step):
         ),
         runs=grid([(30, 1), (60, 1), (120, 1), (240, 1)], correction="per-step"),
         limits=("ω λ_max = 2", "Gauss–Seidel, |z| = 1", "a ring an iteration"),
-        style=("tab:pink", "D"),
     )
 
     iterations: int = 20

@@ -94,7 +94,6 @@ class ProjectiveDynamics(ImplicitStep):
         ),
         one_step=tuple({"acceleration": acceleration, "tolerance": 1e-14} for acceleration in ACCELERATIONS),
         limits=("1 + Σk h²/m iterations", "h² = m/(k(L/l − 1))"),
-        style=("tab:blue", "^"),
     )
 
     iterations: int = 20

@@ -90,7 +90,6 @@ class XPBD(ImplicitStep):
         ),
         one_step=({}, {"sweep": "constraint-averaged"}),
         limits=("ω λ_max = 2", "Gauss–Seidel, |z| = 1", "a ring an iteration", "h² = m/(k(L/l − 1))"),
-        style=("tab:red", "X"),
     )
 
     iterations: int = 20
