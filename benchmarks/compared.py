@@ -1,48 +1,112 @@
-"""Compares the time of a frame of solvers of Newton, the physics engine, with solvers of warpcloth, alternating in one process.
+"""Draws the charts and prints the tables of docs/compared.md: solvers of warpcloth and of other simulators, side by side.
 
-    python benchmarks/compared.py      # settings with errors below 1 % on hanging with 32 × 32 vertices; about three minutes
+    python benchmarks/compared.py                                          # all scenes, on the CPU
+    python benchmarks/compared.py --scene drape --device cuda:0 --out gpu  # one of them
+    python benchmarks/compared.py --tables cpu/*.json gpu/*.json           # tables of stored results
 
-Times are CPU times of the process, divided by those of ``Explicit``: medians over frames with their quartiles. Errors come from
-`warpcloth chart work-precision hanging -p n=32 --frames 10 --with newton`.
+Each scene takes the cheapest solver of warpcloth within 1 % of the reference solution, and the cheapest setting of each solver
+of the others, searched by doubling substeps and iterations until it is within 1 % or the limits are reached. These settings are
+then timed in turns, frame by frame. A file of JSON and a chart is written for each scene. Measurements are stored in
+WARPCLOTH_CACHE and reused, so that the same command goes on after an interruption.
 """
 
+import argparse
+import json
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
-import numpy as np
+import warp as wp
 
-import warpcloth as wc
-from warpcloth.others.newton_model import engine
-from warpcloth.others.newton_runs import NewtonPhysics, NewtonSteps
-from warpcloth.scenes import hanging
+from warpcloth.chart.pareto import plot_time
+from warpcloth.lab.choosing import percent
+from warpcloth.lab.measurements import SceneRef
+from warpcloth.lab.own_reference import words_of_own
+from warpcloth.lab.setups import grid_in_words
+from warpcloth.lab.side_by_side import side_by_side
+from warpcloth.lab.work_precision import WITHIN
+from warpcloth.others.simulators import SIMULATORS
 
-OURS = {
-    "Explicit, 107 substeps": wc.Explicit(substeps=107),
-    "XPBD, BDF2, 10 substeps, 4 sweeps": wc.XPBD(substeps=10, iterations=4, integrator="bdf2"),
+# Scenes by name, with parameters and frames.
+SCENES = {
+    "hanging": (("hanging", {"n": 32}), 10),
+    "stiff": (("hanging", {"n": 24, "stiffness": 1e5}), 10),
+    "drape": (("drape", {"n": 24}), 20),
+    "fold": (("fold", {"nx": 8, "ny": 24}), 20),
 }
-OTHERS = {
-    "newton-semi-implicit, 107 substeps": NewtonPhysics("semi-implicit", 107),
-    "newton-xpbd, 160 substeps, 1 iteration": NewtonPhysics("xpbd", 160),
-    "newton-style3d, 16 substeps, 10 iterations": NewtonPhysics("style3d", 16, 10),
-    "newton-vbd, 8 substeps, 5 iterations": NewtonPhysics("vbd", 8, 5),
-}
-FRAMES = 10
 
 
 def main():
-    scene = hanging.scene(n=32)
-    runs = {name: record.bind(scene.build()) for name, record in OURS.items()}
-    runs |= {name: NewtonSteps(scene, record, "cpu") for name, record in OTHERS.items()}
-    times = {name: [] for name in runs}
-    for _ in range(FRAMES):
-        for name, run in runs.items():
-            began = time.process_time()
-            run.frame()
-            times[name].append(time.process_time() - began)
-    first = np.array(next(iter(times.values())))[1:]
-    print(f"hanging, 32 × 32 vertices, CPU, Newton {engine().__version__}")
-    for name, spent in times.items():
-        low, middle, high = np.percentile(np.array(spent)[1:] / first, [25, 50, 75])
-        print(f"  {name:<44} {middle:8.2f}  ({low:.2f} to {high:.2f})")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scene", nargs="+", choices=SCENES, default=list(SCENES), help="scenes (default: all)")
+    parser.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+    parser.add_argument("--with", dest="others", nargs="+", choices=SIMULATORS, default=list(SIMULATORS), help="simulators")
+    parser.add_argument("--solvers", nargs="+", metavar="SOLVER", help="solvers of warpcloth to choose among (default: all)")
+    parser.add_argument("-p", nargs="+", default=[], metavar="NAME=VALUE", help="parameters that replace those of the scenes")
+    parser.add_argument("--frames", type=int, help="frames (default: those of each scene here)")
+    parser.add_argument("--tolerance", type=float, default=WITHIN, help="error of settings that are compared (default: 0.01)")
+    parser.add_argument("--limit", type=float, default=20.0, help="time limit of each run [s] (default: 20)")
+    parser.add_argument("--total", type=float, default=float("inf"), help="time limit of each scene [s] (default: none)")
+    parser.add_argument("--out", type=Path, default=Path("compared"), help="folder of results (default: compared)")
+    parser.add_argument("--tables", type=Path, nargs="+", metavar="JSON", help="print the tables of stored results, and end")
+    options = parser.parse_args()
+    if options.tables:
+        for path in options.tables:
+            print(text_of(json.loads(path.read_text(encoding="utf-8"))))
+        return
+    options.out.mkdir(parents=True, exist_ok=True)
+    wp.config.quiet = True
+    given = dict(assignment.split("=", 1) for assignment in options.p)
+    for name in options.scene:
+        (scene, parameters), frames = SCENES[name]
+        began = time.perf_counter()
+        with ThreadPoolExecutor(1) as executor:  # one process for all, so that kernels are compiled once
+            found = side_by_side(
+                SceneRef(scene, parameters | given),
+                options.others,
+                options.tolerance,
+                frames=options.frames or frames,
+                device=options.device,
+                solvers=options.solvers,
+                limit=options.limit,
+                total=options.total,
+                executor=executor,
+            )
+        path = options.out / f"{name}.json"
+        path.write_text(json.dumps(found, indent=1, default=float), encoding="utf-8")
+        try:
+            plot_time(path.with_suffix(".png"), found)
+        except ImportError as error:
+            print(f"no chart: {error}")
+        print(f"{text_of(found)}\n  {time.perf_counter() - began:.0f} s, {path}", flush=True)
+
+
+def text_of(found):
+    """Returns the tables of a result: ratios at equal error, how each search ended, and its grid of settings."""
+    machine, rows = found["machine"], found["rows"]
+    device = machine["processor"] if machine["device"] == "cpu" else machine["device"]
+    versions = ", ".join(f"{SIMULATORS[name].title} {machine[name]}" for name in SIMULATORS if machine.get(name))
+    known = f"reference known to {percent(found['reference']['error'])} by {found['reference']['method']}"
+    lines = [f"\n{found['scene']}, {found['frames']} frames, {device}, Warp {machine['warp']}, {versions}; {known}"]
+    lines.append("| setting | error | to its own | ratio of times | quartiles | ms | crossings | inside |")
+    lines.append("|---|---|---|---|---|---|---|---|")
+    for each in found["ratios"]:
+        own = "–" if each["own_error"] is None else percent(each["own_error"])
+        numbers = f"{each['ratio']:.3g} | {each['spread'][0]:.3g} to {each['spread'][1]:.3g} | {each['ms']:.3g}"
+        error = percent(each["error"]) + ("" if each["to"] == "reference" else " (its own counts)")
+        lines.append(f"| {each['label']} | {error} | {own} | {numbers} | {each['crossings']} | {each['inside']} |")
+    for solver, ended in found["searched"].items():
+        same = [row for row in rows if row["solver"] == solver]
+        own, statuses = found["others"][solver], [row["status"] for row in same]
+        counts = ", ".join(f"{statuses.count(status)} {status}" for status in dict.fromkeys(statuses))
+        lines.append(f"  {solver}: {ended} ({counts})")
+        lines.append(f"    its own motion: {words_of_own(own)}")
+        tried = [row["options"] for row in same]
+        errors = [row["error"] for row in same if row["error"] is not None]
+        lines.append(f"    least error {percent(min(errors))}" if errors else "    no error is known")
+        lines.append(f"    settings: {grid_in_words(tried)}")
+        lines += [f"    {why}" for why in dict.fromkeys(row["reason"] for row in same if row["status"] != "ok")]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

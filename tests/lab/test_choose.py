@@ -4,7 +4,7 @@ import csv
 import itertools
 import json
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
@@ -15,8 +15,9 @@ from warpcloth.cli.choose import command_line
 from warpcloth.lab import campaign, trajectory
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.cheapest import cheapest_of_each
-from warpcloth.lab.choosing import Measured, choose, climb, ladders, pick
+from warpcloth.lab.choosing import Measured, choose, climb, climb_others, ladders, ladders_of_others, pick
 from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.setups import grid_in_words
 
 # hanging, 64 × 64 vertices: error and ms a frame, with quartiles, of ladders from coarse to fine.
 TABLE = {
@@ -83,6 +84,32 @@ def test_climbing_picks_the_same_and_measures_no_more_than_it_needs(options):
         # xpbd 80 meets it, and newton 4 is dearer than what does.
         left_out = {str(setup) for ladder in LADDERS for setup in ladder} - {str(setup) for setup in asked}
         assert left_out == {"xpbd substeps=160", "newton substeps=8"}
+
+
+def test_solvers_of_others_are_searched_for_their_own_cheapest():
+    """Newton's 4 is measured, though explicit 152 is cheaper; without time, what is left is not measured and not kept."""
+
+    def measure(setups):
+        return [replace(measured(setup), seconds=1.0) for setup in setups]
+
+    found, ended = climb_others(LADDERS, measure, 0.01)
+    left_out = {str(setup) for ladder in LADDERS for setup in ladder} - {str(each.setup) for each in found}
+    assert left_out == {"xpbd substeps=160", "newton substeps=8"}
+    assert ended["xpbd"] == "3 settings in 3 s; other settings cost more"
+    found, ended = climb_others(LADDERS, measure, 0.001, seconds=1.5)
+    assert [each.setup.options["substeps"] for each in found if each.setup.solver == "xpbd"] == [20, 40]
+    assert ended["xpbd"] == "2 settings in 2 s; the time of 1.5 s is used up"
+    assert ended["explicit"] == "1 settings in 1 s; finer settings take too long or are refused"
+
+
+def test_ladders_of_others_double_substeps_and_iterations():
+    setups = [Setup("newton-vbd", {"substeps": s, "iterations": i}) for s, i in ((3, 2), (8, 2), (3, 5))]
+    found = [[(each.options["substeps"], each.options["iterations"]) for each in one] for one in ladders_of_others(setups)]
+    assert [one[0] for one in found] == [(3, 2), (3, 5), (3, 10), (3, 20)]
+    assert found[0] == [(s, 2) for s in sorted([8, *(3 * 2**k for k in range(11))])]
+    (alone,) = ladders_of_others([Setup("newton-semi-implicit", {"substeps": 7})])
+    assert [each.options for each in alone] == [{"substeps": 7 * 2**k} for k in range(11)]
+    assert grid_in_words([{"substeps": 4, "iterations": 2}, {"substeps": 2, "iterations": 2}, {"substeps": 9}]) == "9; 2, 4 × 2"
 
 
 def test_the_cheapest_of_each_solver():

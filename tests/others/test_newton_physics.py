@@ -15,12 +15,14 @@ from warpcloth.lab import trajectory
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.choosing import choose
 from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.own_reference import of_own, own_facts, own_reference, words_of_own
 from warpcloth.lab.work_precision import time_diagram, write_csv
 from warpcloth.others.newton_calibration import calibrate
 from warpcloth.others.newton_model import METHODS, TAKES, newton_model, refuse_inexpressible
 from warpcloth.others.newton_runs import NewtonPhysics
 from warpcloth.others.runs import run_other
 from warpcloth.others.simulators import SIMULATORS
+from warpcloth.scenes import fold
 
 newton = pytest.importorskip("newton", reason="Newton is not installed: pip install -e '.[newton]'")
 
@@ -79,6 +81,40 @@ def test_arrays_are_those_of_the_scene_to_the_bit(method):
     np.testing.assert_array_equal(model.particle_inv_mass.numpy() == 0.0, held)
 
 
+def test_self_contact_has_the_whole_surface():
+    """Triangles and edges without energy are there too; contact of particles with each other and with shapes is apart."""
+    contact = {"contact": wc.Contact(distance=0.01, stiffness=3e3), "colliders": [replace(FLOOR, friction=0.5)]}
+    bending = wc.QuadraticBending(stiffness=2e-3, damping=1e-4)
+    scene = declared(
+        terms=[SPRINGS, bending], self_contact=wc.SelfContact(distance=0.02, stiffness=4e3, friction=0.1), **contact
+    )
+    model = newton_model(scene, "vbd")
+    np.testing.assert_array_equal(model.tri_indices.numpy(), MESH.triangles)
+    assert not model.tri_materials.numpy().any()
+    edges = np.sort(model.edge_indices.numpy()[:, 2:], axis=1)
+    np.testing.assert_array_equal(np.unique(edges, axis=0), np.unique(np.sort(MESH.edges, axis=1), axis=0))
+    assert len(edges) == len(MESH.edges)
+    stiffness, damping = model.edge_bending_properties.numpy().T
+    np.testing.assert_allclose(damping, 0.05 * stiffness, rtol=1e-6)
+    assert (stiffness > 0.0).sum() == len(MESH.hinges)
+    area = MESH.vertex_areas.mean()
+    of_shape = model.shape_material_ke.numpy()[0], model.shape_material_mu.numpy()[0]
+    assert (model.soft_contact_ke, model.soft_contact_mu) == pytest.approx((4e3 * area, 0.1))
+    assert 0.5 * (model.soft_contact_ke + of_shape[0]) == pytest.approx(3e3 * area)
+    assert np.sqrt(model.soft_contact_mu * of_shape[1]) == pytest.approx(0.5)
+
+
+@pytest.mark.slow
+def test_a_sheet_that_folds_does_not_cross_itself_or_the_floor():
+    """Within 0.5 s it lies on the floor and on itself; without self-contact in the model it crosses itself."""
+    pytest.importorskip("igl")
+    scene = fold.scene(nx=4, ny=16)
+    found = run_other(scene, NewtonPhysics("vbd", 32, 5), frames=20)
+    assert found.status.ok and wc.intersections(found).clean
+    assert found.points[-1][:, 1].min() < 2.0 * scene.contact.distance
+    assert not wc.intersections(run_other(replace(scene, self_contact=None), NewtonPhysics("vbd", 32, 5), frames=20)).clean
+
+
 def test_shapes_are_those_of_the_scene():
     """Planes and capsules lie along z there, so that a unit vector shows their turn."""
     model = newton_model(declared(colliders=COLLIDERS), "xpbd")
@@ -134,7 +170,7 @@ REFUSED = [
     ("vbd", {"terms": [wc.StVKMembrane(stiffness=1.0)]}, "does not take StVKMembrane"),
     ("xpbd", {"terms": [wc.NeoHookeanMembrane(stiffness=1.0)]}, "does not take NeoHookeanMembrane"),
     ("vbd", {"terms": [wc.Spring(stiffness=np.inf)]}, "infinite stiffness.*Spring"),
-    ("vbd", {"terms": [SPRINGS, wc.QuadraticBending(stiffness=1.0, damping=1.0)]}, "damping.*QuadraticBending"),
+    ("xpbd", {"terms": [SPRINGS, wc.QuadraticBending(stiffness=1.0, damping=1.0)]}, "damping.*QuadraticBending"),
     ("style3d", {"terms": [wc.Spring(stiffness=1.0, damping=1.0)]}, "damping.*Spring"),
     ("style3d", {"terms": [wc.Spring(stiffness=1.0, rest_lengths=0.1)]}, "rest lengths.*Spring"),
     ("style3d", {"terms": [wc.QuadraticBending(stiffness=1.0)]}, "springs or membranes"),
@@ -174,7 +210,7 @@ def test_charts_and_choices_have_its_solvers(tmp_path, monkeypatch):
     with ThreadPoolExecutor(1) as executor:
         given |= {"executor": executor, "store": Store()}
         found = time_diagram(scene, limit=30.0, **given)
-        choice, measured, _exact = choose(scene, tolerance=0.01, **given)
+        choice, measured, exact = choose(scene, tolerance=0.01, **given)
     rows = {(row["solver"], row["options"]["substeps"]): row for row in found["rows"] if row["status"] == "ok"}
     ours = {substeps: row for (solver, substeps), row in rows.items() if solver == "explicit"}
     others = {substeps: row for (solver, substeps), row in rows.items() if solver == "newton-semi-implicit"}
@@ -182,7 +218,8 @@ def test_charts_and_choices_have_its_solvers(tmp_path, monkeypatch):
     for substeps, row in ours.items():
         assert others[substeps]["error"] == pytest.approx(row["error"], rel=0.05) and "own_error" not in row
     own = found["others"]["newton-semi-implicit"]
-    assert own["apart"] < 1e-3 and all(abs(row["own_error"] - row["error"]) <= own["apart"] for row in others.values())
+    assert own["converged"] and own["error"] <= own["bound"] == 1e-3 and own["apart"] < 1e-3
+    assert all(abs(row["own_error"] - row["error"]) <= own["apart"] for row in others.values())
     assert found["machine"]["newton"] == newton.__version__
     plot_time(tmp_path / "chart.png", found)
     write_csv(tmp_path / "chart.csv", found)
@@ -192,5 +229,13 @@ def test_charts_and_choices_have_its_solvers(tmp_path, monkeypatch):
         }
     assert options._SIMULATORS == tuple(SIMULATORS)
     assert choice.meets and {each.setup.solver for each in measured} == {"explicit", "newton-semi-implicit"}
+    assert all((each.own_error is None) == (each.setup.solver == "explicit") for each in measured if each.error is not None)
+    assert choice.others[name]["converged"] and "other settings cost more" in choice.others[name]["searched"]
+    rough = own_reference(scene, [Setup(name, {"substeps": 30})], 6, tolerance=1e-2)
+    facts = own_facts(rough, exact, scene.load().mesh, 0.5 * rough.error)
+    assert not facts["converged"] and words_of_own(facts).startswith(
+        "not converged: a doubling to 60 steps a frame moved it by"
+    )
+    assert of_own(rough, 0.5 * rough.error) == {} != of_own(rough, rough.error)
     refused = trajectory.measure(asdict(scene), asdict(Setup(name, {"substeps": 1})), frames=1, dtype="float64")
     assert refused["status"] == "refused" and "Newton has float32 only" in refused["reason"]

@@ -324,16 +324,12 @@ def _summary(found, lines_of):
 
 def _time_lines(found):
     """Returns lines with the Pareto front, and the cheapest setting of each solver."""
+    from ..lab.own_reference import words_of_own
     from ..lab.work_precision import WITHIN, cheapest
 
     exact, rows = found["reference"], found["rows"]
     lines = [f"  reference     known to {100.0 * exact['error']:.2g} %, {exact['substeps']} steps a frame"]
-    for name, own in found.get("others", {}).items():
-        said = "doublings of its substeps do not converge within the time limit"
-        if own is not None:
-            known = f"own motion known to {100.0 * own['error']:.2g} %, {own['substeps']} steps a frame"
-            said = f"{known}, {100.0 * own['apart']:.2g} % from the reference"
-        lines.append(f"  {'converged':<13} {name}: {said}")
+    lines += [f"  {'own motion':<13} {name}: {words_of_own(own)}" for name, own in found.get("others", {}).items()]
     best = sorted((row for row in rows if row.get("front")), key=lambda row: row["ms_per_second"])
     for head, chosen in (("nothing beats", best), (f"within {100.0 * WITHIN:g} %", cheapest(rows, exact["error"]))):
         for row in chosen:

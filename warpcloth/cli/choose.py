@@ -12,9 +12,9 @@ from .terminal import Interrupted, Settings, add_dask, executing
 EPILOG = """\
 --tolerance finds the cheapest setting with at most this error, --budget the most accurate setting within this time, and both
 together the cheapest setting that meets both. The settings of each solver are tried from coarse to fine. A solver is done when
-a setting meets the tolerance, exceeds the budget, or takes longer than the fastest setting found to meet the tolerance. The
-error is the RMS distance over vertices and frames to a reference solution, divided by the longest side of the cloth.
-Measurements are stored and reused.
+a setting meets the tolerance, exceeds the budget, or takes longer than the fastest setting found to meet the tolerance. Each
+solver of --with is searched until its own fastest setting is found, or for six times --limit. The error is the RMS distance
+over vertices and frames to a reference solution, divided by the longest side of the cloth. Measurements are stored and reused.
 
   warpcloth choose hanging -p n=32 --tolerance 1%
   warpcloth choose hanging --budget 16ms
@@ -118,6 +118,8 @@ def _scene(arguments, values):
 
 def _text(facts, choice, found, exact, advise):
     from ..lab.choosing import percent
+    from ..lab.own_reference import words_of_own
+    from ..lab.setups import grid_in_words
 
     measured = f"{facts['scene']}: {len(found)} settings measured over {len(exact.points) - 1} frames"
     lines = [f"{measured}; the reference is known to {percent(exact.error)}"]
@@ -129,8 +131,13 @@ def _text(facts, choice, found, exact, advise):
         else:
             lines.append(
                 f"  {name}  {each.milliseconds:9.3g} ms  {percent(each.error):>9}"
+                + (f"  {percent(each.own_error)} from its own" if each.own_error is not None else "")
                 + ("  chosen" if each is choice.chosen else "")
             )
+    for solver, own in choice.others.items():
+        same = [each.setup.options for each in found if each.setup.solver == solver]
+        lines.append(f"  {solver}: own motion {words_of_own(own if 'error' in own else None)}")
+        lines.append(f"  {solver}: {own['searched']}; substeps × iterations: {grid_in_words(same)}")
     lines += [f"  measured on {name}" for name in dict.fromkeys(each.machine for each in found)]
     lines.append(choice.certainty)
     lines.append(f"errors are those on this mesh; whether a finer mesh, air or anisotropy matters: {advise}")

@@ -1,18 +1,29 @@
 """The cheapest solver and settings that meet a tolerance, or the most accurate within a budget, from measurements."""
 
+import itertools
 import json
-from dataclasses import asdict, dataclass
+import math
+import time
+from dataclasses import asdict, dataclass, field, replace
 
 from ..base.checks import number
+from ..others.simulators import simulator_of
 from ..solvers import SOLVERS
 from . import trajectory
 from .campaign import collect, kept_store
 from .measurements import Setup, task
+from .own_reference import SHARE, of_own, own_facts, own_references
 from .reference import reference
 from .setups import setups_of_runs
+from .work_precision import WITHIN
 
 # Number of rungs by which each ladder is extended, each with twice the substeps or a quarter of the error of two steps.
 _MORE = 3
+# Ladders of a solver of another simulator: number of doublings, and number of doublings of its most iterations. The settings
+# of one such solver, and its own reference, may each take this number of time limits.
+_DOUBLINGS, _BEYOND, LIMITS = 10, 2, 6.0
+# Time limit of the reference [s].
+_LONGEST = 600.0
 # The reference must be more accurate than the tolerance by this factor.
 FINER = 5.0
 
@@ -30,6 +41,9 @@ class Measured:
         machine: The machine that measured it, in a few words.
         final: Whether finer steps would fail too: it took too long, or its method is refused.
         strain_error: See :func:`warpcloth.lab.reference.strain_error`, or None.
+        own_error: Error relative to the motion to which a solver of another simulator itself converges, or None.
+        seconds: Time of its frames [s].
+        status: "ok", "diverged", "slow", "refused", or "left" if it was not measured.
     """
 
     setup: Setup
@@ -40,6 +54,9 @@ class Measured:
     machine: str = ""
     final: bool = False
     strain_error: float | None = None
+    own_error: float | None = None
+    seconds: float = 0.0
+    status: str = "ok"
 
 
 @dataclass(frozen=True)
@@ -51,12 +68,15 @@ class Choice:
         meets: Whether it meets the tolerance and the budget that were given.
         rivals: Others that are as good within the spread of times, the best first.
         certainty: A sentence about the certainty of the choice.
+        others: By solver of another simulator, the :func:`warpcloth.lab.own_reference.own_facts` of its own motion, if there is
+            one, and ``searched``, how its search ended.
     """
 
     chosen: Measured | None
     meets: bool
     rivals: list
     certainty: str
+    others: dict = field(default_factory=dict)
 
 
 def pick(measurements, tolerance=None, budget=None, floor=0.0):
@@ -130,8 +150,80 @@ def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=Non
     return pick(found, tolerance, budget, floor), found
 
 
+def climb_others(ladders, measure, tolerance=None, budget=None, floor=0.0, seconds=float("inf")):
+    """Measures the ladders of solvers of other simulators: of each until its own cheapest setting is found.
+
+    Other than by :func:`climb` of all ladders, a solver is not given up because another one is cheaper.
+
+    Args:
+        ladders: As for :func:`climb`.
+        measure: As for :func:`climb`.
+        tolerance: As for :func:`pick`.
+        budget: As for :func:`pick`.
+        floor: As for :func:`pick`.
+        seconds: Time of frames [s] after which the search of a solver ends.
+
+    Returns:
+        tuple: The list of all :class:`Measured`, and by solver how its search ended, a sentence.
+    """
+    found, ended = [], {}
+    for solver, same in itertools.groupby(ladders, key=lambda ladder: ladder[0].solver):
+        tried, left = [], []
+
+        def limited(setups, tried=tried, left=left):
+            """Measures setups until the time is used up; the rest end their ladders."""
+            results = []
+            for setup in setups:
+                if sum(each.seconds for each in tried) > seconds:
+                    left.append(setup)
+                    results.append(Measured(setup, None, None, final=True))
+                else:
+                    results += measure([setup])
+                    tried.append(results[-1])
+            return results
+
+        climb(list(same), limited, tolerance, budget, floor)
+        found += tried
+        spent = f"{len(tried)} settings in {sum(each.seconds for each in tried):.3g} s"
+        meets = any(_meets(each, tolerance, floor) for each in tried)
+        why = "other settings cost more" if meets else "finer settings take too long or are refused"
+        ended[solver] = f"{spent}; " + (f"the time of {seconds:g} s is used up" if left else why)
+    return found, ended
+
+
+def ladders_of_others(setups):
+    """Groups setups of solvers of other simulators by solver and iterations, and doubles substeps and iterations further.
+
+    Args:
+        setups: A list of :class:`warpcloth.lab.measurements.Setup`, sorted by solver.
+    """
+    found = []
+    for solver, group in itertools.groupby(setups, key=lambda setup: setup.solver):
+        same = list(group)
+        first = min(setup.options["substeps"] for setup in same)
+        counts = sorted({setup.options["iterations"] for setup in same if "iterations" in setup.options})
+        counts += [2**k * counts[-1] for k in range(1, _BEYOND + 1)] if counts else [None]
+        for count in counts:
+            options = {} if count is None else {"iterations": count}
+            steps = {first * 2**k for k in range(_DOUBLINGS + 1)}
+            steps |= {setup.options["substeps"] for setup in same if setup.options.get("iterations") == count}
+            found.append([Setup(solver, {"substeps": substeps, **options}) for substeps in sorted(steps)])
+    return found
+
+
 def choose(
-    scene, tolerance=None, budget=None, solvers=None, frames=None, device="cpu", dtype="float32", limit=60.0, others=(), **run
+    scene,
+    tolerance=None,
+    budget=None,
+    solvers=None,
+    frames=None,
+    device="cpu",
+    dtype="float32",
+    limit=60.0,
+    others=(),
+    clock="wall",
+    total=math.inf,
+    **run,
 ):
     """Measures setups of a scene until the choice is clear, on this machine or, with an executor, on its workers.
 
@@ -144,7 +236,11 @@ def choose(
         device: A Warp device, also for the reference.
         dtype: Precision of the runs, "float32" or "float64".
         limit: Time limit of each run [s].
-        others: Simulators whose solvers are measured too, such as ``["newton"]``.
+        others: Simulators whose solvers are measured too, such as ``["newton"]``, each until its own cheapest setting is
+            found by :func:`climb_others`, within six time limits; its own reference has as much time again.
+        clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for limits and times.
+        total: Time on the wall [s] after which nothing more is measured; of it, the reference may take a third, the searches
+            of other simulators a third, and their own references a third.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; by default with the
             store in the cache folder.
 
@@ -155,23 +251,37 @@ def choose(
         ImportError: A simulator is not installed.
         ValueError: As for :func:`pick`, or there is no solver or simulator of a name.
     """
+    began = time.perf_counter()
     pick([], tolerance, budget)  # checks the arguments before anything is measured
     # One at a time, because parallel runs would slow one another.
     run = {"workers": 1} | run
     run = run if "store" in run else {"store": kept_store("trajectories", run.get("executor")), **run}
-    rungs = ladders(setups_of_runs(scene, solvers, device, dtype, others))
-    exact = reference(scene, frames, device=device, **({} if tolerance is None else {"tolerance": tolerance / FINER}))
+    setups = setups_of_runs(scene, solvers, device, dtype, others)
+    rivals = [setup for setup in setups if simulator_of(setup.solver)]
+    setups = [setup for setup in setups if not simulator_of(setup.solver)]
+    given = {"limit": min(_LONGEST, total / 3.0)} | ({} if tolerance is None else {"tolerance": tolerance / FINER})
+    exact = reference(scene, frames, device=device, **given)
+    bound, own = SHARE * (tolerance or WITHIN), {}
 
     def measure(setups):
+        if time.perf_counter() - began > total:
+            return [Measured(setup, None, None, reason="not measured", final=True, status="left") for setup in setups]
         tasks = [
             task(trajectory.measure, scene=scene, setup=setup, frames=frames, reference=str(exact.path), device=str(device),
-                 dtype=dtype, limit=limit)
+                 dtype=dtype, limit=limit, clock=clock, **of_own(own.get(setup.solver), bound))
             for setup in setups
         ]  # fmt: skip
         return [measured(setup, *found) for setup, found in zip(setups, collect(tasks, "trajectories", **run), strict=True)]
 
-    choice, found = climb(rungs, measure, tolerance, budget, exact.error)
-    return choice, found, exact
+    choice, found = climb(ladders(setups), measure, tolerance, budget, exact.error)
+    if not rivals:
+        return choice, found, exact
+    seconds = min(LIMITS * limit, total / 3.0 / len({setup.solver for setup in rivals}))
+    own |= own_references(scene, rivals, len(exact.points) - 1, device, SHARE * bound, seconds, None, clock)
+    more, ended = climb_others(ladders_of_others(rivals), measure, tolerance, budget, exact.error, seconds)
+    found, mesh = found + more, scene.load().mesh
+    facts = {name: (own_facts(own[name], exact, mesh, bound) or {}) | {"searched": why} for name, why in ended.items()}
+    return replace(pick(found, tolerance, budget, exact.error), others=facts), found, exact
 
 
 def ladders(setups):
@@ -200,14 +310,19 @@ def measured(setup, result, machine):
     # Only a limited solver may accept a finer step after it refused one.
     limited = setup.solver in SOLVERS and SOLVERS[setup.solver].limited
     final = result["status"] == "slow" or (result["status"] == "refused" and not limited)
-    return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final, result["strain_error"])
+    seconds = 1e-3 * (result["ms"] or 0.0) * result["frames"]
+    own = result.get("own_error")
+    strain, status = result["strain_error"], result["status"]
+    return Measured(
+        setup, result["error"], result["ms"], spread, result["reason"], machine, final, strain, own, seconds, status
+    )
 
 
 def as_json(choice, found, exact):
     """Returns the choice and its reasons as JSON values."""
     rows = [asdict(each) | {"label": str(each.setup)} for each in found]
     chosen = None if choice.chosen is None else asdict(choice.chosen)
-    facts = {"chosen": chosen, "meets": choice.meets, "certainty": choice.certainty}
+    facts = {"chosen": chosen, "meets": choice.meets, "certainty": choice.certainty, "others": choice.others}
     facts["rivals"] = [str(each.setup) for each in choice.rivals]
     return facts | {"reference_error": exact.error, "reference": str(exact.path), "measured": rows}
 

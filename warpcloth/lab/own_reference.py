@@ -10,22 +10,25 @@ import numpy as np
 from ..base.digest import scene_digest, source_digest
 from ..base.version import installed_version
 from ..others.runs import run_other
-from ..others.simulators import simulator_of
+from ..others.simulators import other_solvers, simulator_of
 from .campaign import cache_folder
-from .clock import Clock, TooSlow
+from .clock import CLOCKS, Clock, TooSlow
 from .reference import Reference, kept_reference, position_error, strain_error
 
 _MOST = 12  # runs, each with twice the substeps of the one before
+# A motion counts as converged if the last doubling moved it by at most this share of the tolerance.
+SHARE = 0.1
 
 
-def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120.0, progress=None):
+def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120.0, progress=None, clock="wall"):
     """Returns the :class:`warpcloth.lab.reference.Reference` of a solver of another simulator, from its file, or computed.
 
     It runs the scene with the fewest substeps and the most iterations of its settings, with twice the substeps, and so on. It
     ends when a doubling moves the cloth by at most the tolerance. It also ends when the last two doublings both move it further
     than an earlier one did; then float32 rounds the motion, or the solver does not converge. The two successive runs that are
-    nearest to each other count. Their distance is the error, which bounds that of the finer one if each doubling at least
-    halves the error.
+    nearest to each other count. The coarser of them is run with twice the iterations too. The larger of both moves is the
+    error, which bounds that of the finer run if each doubling at least halves the error. A caller must compare it with a bound
+    of its own before it takes the motion for converged, see :func:`own_facts`.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
@@ -33,60 +36,132 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
         frames: Number of frames.
         device: A Warp device.
         tolerance: Relative to the size of the cloth.
-        limit: Time limit [s] of all runs.
+        limit: Time limit [s] of the runs with more and more substeps; the one with more iterations may take as long again.
         progress: Function called with (substeps, frame, frames) after each frame, or None.
+        clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for the limit.
 
     Returns:
-        The reference, or None if the solver does not take the scene, diverges, or takes too long for three runs, or if no
-        doubling moves the cloth by less than the first.
+        The reference, or None if the solver does not take the scene, diverges, or takes too long for two runs. Its error is
+        infinite if there was no time for the run with more iterations.
     """
     records = [setup.record() for setup in setups]
     iterations = max(record.iterations for record in records)
-    declared = scene.load()
+    declared, name, now = scene.load(), setups[0].solver, CLOCKS[clock]
     digest = scene_digest(declared)
-    version = installed_version(simulator_of(setups[0].solver).package)
-    facts = [digest, int(frames), source_digest(), setups[0].solver, str(device), version, limit, tolerance]
+    version = installed_version(simulator_of(name).package)
+    facts = [digest, int(frames), source_digest(), name, str(device), version, limit, tolerance, iterations]
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:24]
     path = cache_folder() / "references" / f"{key}.npz"
     found = kept_reference(path, key)
     if found is not None:
         return found
-    runs, moves, began, substeps = [], [], time.perf_counter(), min(each.substeps for each in records)
-    while len(runs) < _MOST:
-        before = time.perf_counter()
-        clock = Clock(limit - (before - began), progress and (lambda *at, s=substeps: progress(s, *at)))
+
+    def run(substeps, iterations, left):
+        """Returns the points of a run, or None if it is refused or takes too long, or "diverged"."""
+        watch = Clock(left, progress and (lambda *at: progress(substeps, *at)), clock)
+        record = replace(records[0], substeps=substeps, iterations=iterations)
         try:
-            run = run_other(declared, replace(records[0], substeps=substeps, iterations=iterations), device, frames, clock)
+            ran = run_other(declared, record, device, frames, watch)
         except (TooSlow, ValueError):
+            return None
+        return ran.points.astype(np.float64) if ran.status.ok else "diverged"
+
+    runs, moves, began, substeps = [], [], now(), min(each.substeps for each in records)
+    started = time.perf_counter()
+    for _ in range(_MOST):
+        before = now()
+        points = run(substeps, iterations, limit - (before - began))
+        if points is None or (runs and isinstance(points, str)):
             break
-        if run.status.ok:
-            runs.append((substeps, run.points.astype(np.float64)))
-        elif runs:
-            break
+        if not isinstance(points, str):
+            runs.append((substeps, points))
         if len(runs) > 1:
             moves.append(position_error(runs[-1][1][1:], runs[-2][1][1:], declared.mesh))
             if moves[-1] <= tolerance or (len(moves) > 2 and min(moves[-2:]) > min(moves)):
                 break
-        now = time.perf_counter()
-        if now - began + 2.0 * (now - before) > limit:
+        if now() - began + 2.0 * (now() - before) > limit:
             break
         substeps *= 2
-    best = int(np.argmin(moves)) if moves else 0
-    if not moves or (best == 0 and moves[0] > tolerance):
+    if not moves:
         return None
-    (_, coarse), (substeps, fine) = runs[best : best + 2]
+    best = int(np.argmin(moves))
+    (coarser, coarse), (substeps, fine) = runs[best : best + 2]
+    error = moves[best]
+    if other_solvers()[name].iterates:
+        more = run(coarser, 2 * iterations, limit)
+        known = isinstance(more, np.ndarray)
+        error = max(error, position_error(more[1:], coarse[1:], declared.mesh)) if known else np.inf
     found = Reference(
         points=fine,
         times=np.arange(frames + 1) / declared.fps,
-        error=moves[best],
+        error=float(error),
         strain_error=strain_error(fine[1:], coarse[1:], declared.mesh),
         substeps=substeps,
-        seconds=time.perf_counter() - began,
+        seconds=time.perf_counter() - started,
         path=str(path),
         key=key,
         scene=digest,
-        method=setups[0].solver,
+        method=name,
         limit=limit,
     )
     found.save()
     return found
+
+
+def own_references(scene, setups, frames, device, tolerance, limit, progress=None, clock="wall"):
+    """Returns the :func:`own_reference` of each solver of another simulator among setups, by its name.
+
+    Args:
+        scene: The :class:`warpcloth.lab.measurements.SceneRef`.
+        setups: :class:`warpcloth.lab.measurements.Setup`\\s.
+        frames: Number of frames.
+        device: A Warp device.
+        tolerance: As for :func:`own_reference`.
+        limit: As for :func:`own_reference`, of each solver.
+        progress: As for :func:`own_reference`.
+        clock: As for :func:`own_reference`.
+    """
+    of_each = {}
+    for setup in setups:
+        if simulator_of(setup.solver):
+            of_each.setdefault(setup.solver, []).append(setup)
+    return {
+        name: own_reference(scene, same, frames, device, tolerance, limit, progress, clock) for name, same in of_each.items()
+    }
+
+
+def own_facts(own, exact, mesh, bound):
+    """Returns what is known of the motion to which a solver converges, as JSON values, or None if there is none.
+
+    Args:
+        own: The :func:`own_reference`, or None.
+        exact: The :class:`warpcloth.lab.reference.Reference` of warpcloth.
+        mesh: The mesh.
+        bound: Largest error of a motion that counts as converged.
+
+    Returns:
+        dict: ``substeps``, ``error``, ``converged``, ``bound``, ``seconds``, and ``apart``, the distance from the reference.
+    """
+    if own is None:
+        return None
+    frames = len(own.points) - 1
+    apart = position_error(own.points[1:], exact.points[1 : frames + 1], mesh)
+    error = own.error if np.isfinite(own.error) else None
+    facts = {"substeps": own.substeps, "error": error, "converged": own.error <= bound, "bound": bound}
+    return facts | {"apart": apart, "seconds": own.seconds}
+
+
+def of_own(own, bound):
+    """Returns the argument of :func:`warpcloth.lab.trajectory.measure` for an :func:`own_reference`, if it has converged."""
+    return {"own": str(own.path)} if own is not None and own.error <= bound else {}
+
+
+def words_of_own(facts):
+    """Returns in words whether the motion of :func:`own_facts` has converged, and how far it is from the reference."""
+    if facts is None:
+        return "not known, for two runs did not end well within the time limit"
+    said = "converged" if facts["converged"] else "not converged"
+    moved = "twice the iterations took too long"
+    if facts["error"] is not None:
+        moved = f"a doubling to {facts['substeps']} steps a frame moved it by {100.0 * facts['error']:.2g} %"
+    return f"{said}: {moved} (bound {100.0 * facts['bound']:.2g} %); {100.0 * facts['apart']:.2g} % from the reference"

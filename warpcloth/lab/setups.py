@@ -67,6 +67,16 @@ def label(setup):
     return " ".join(filter(None, (setup.solver, integrator, count, *others)))
 
 
+def grid_in_words(options):
+    """Returns options of settings in words: the substeps for each number of iterations."""
+    found = {}
+    for each in options:
+        found.setdefault(each.get("iterations", 0), set()).add(each["substeps"])
+    return "; ".join(
+        ", ".join(map(str, sorted(steps))) + (f" × {count}" if count else "") for count, steps in sorted(found.items())
+    )
+
+
 def _checked(names, known):
     names = known if names is None else list(dict.fromkeys(names))
     for name in names:

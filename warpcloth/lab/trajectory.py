@@ -14,7 +14,9 @@ from .measurements import SceneRef, Setup, finite
 from .reference import Reference, position_error, strain_error
 
 
-def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="float32", limit=60.0, repeats=1, own=None):
+def measure(
+    scene, setup, frames=None, reference=None, device="cpu", dtype="float32", limit=60.0, repeats=1, own=None, clock="wall"
+):
     """Runs a scene with a setup. Arguments and results are JSON values.
 
     Args:
@@ -27,6 +29,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
         limit: Time limit [s] of the frames of all runs, without compilation and factorisation, checked once per frame.
         repeats: Number of runs to time; fewer if the limit is reached after the first.
         own: Path of the :class:`warpcloth.lab.reference.Reference` to which the solver itself converges, or None.
+        clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for the limit and the times of frames.
 
     Returns:
         dict: Unknown values are None.
@@ -57,21 +60,22 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
     least = max(frames, 2)  # as the first warms up
     found = dict.fromkeys(("error", "strain_error", "ms", "spread", "ms_per_second", "compile_s", "factorise_s", "residual"))
     found = {"status": "ok", "reason": "", **found, "message": "", "frames": 0}
-    runs, left = [], limit
+    runs, spent, left = [], [], limit
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", UserWarning)
         for _ in range(repeats):
-            clock = Clock(left)
+            watch = Clock(left, clock=clock)
             try:
-                runs.append(_run(declared, setup, dtype, device=device, frames=least, progress=clock))
+                runs.append(_run(declared, setup, dtype, device=device, frames=least, progress=watch))
+                spent.append(watch.frames if clock == "process" and watch.frames else runs[-1].timings["frames"])
             except TooSlow:
                 if not runs:
-                    reason = f"{len(clock.frames)} of {least} frames took {sum(clock.frames):.3g} s, more than {limit:g} s"
-                    found |= {"status": "slow", "reason": reason, "frames": len(clock.frames)}
-                    found |= _times([clock.frames], declared.fps)
+                    reason = f"{len(watch.frames)} of {least} frames took {sum(watch.frames):.3g} s, more than {limit:g} s"
+                    found |= {"status": "slow", "reason": reason, "frames": len(watch.frames)}
+                    found |= _times([watch.frames], declared.fps)
             except ValueError as error:
                 return found | {"status": "refused", "reason": str(error)}
-            left -= sum(clock.frames)
+            left -= sum(watch.frames)
             if left <= 0.0 or not runs[-1].status.ok:
                 break
     if not runs:
@@ -80,7 +84,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype="floa
     status, timings = first.status, first.timings
     found |= {"frames": min(int(status.frame), frames), "residual": finite(status.residual)}
     found["message"] = "; ".join(dict.fromkeys([status.message, *(str(warning.message) for warning in warned)]))
-    found |= _times([run.timings["frames"] for run in runs], declared.fps)
+    found |= _times(spent, declared.fps)
     warm_up = timings["frames"][0] - 1e-3 * found["ms"]
     found |= {"compile_s": timings["compile"] - timings["factorise"] + max(warm_up, 0.0), "factorise_s": timings["factorise"]}
     if not status.ok:

@@ -9,13 +9,13 @@ import math
 
 from ..base.digest import scene_digest
 from ..base.outputs import write_table
-from ..others.simulators import SIMULATORS, other_solvers
+from ..others.simulators import SIMULATORS
 from . import convergence, physics, spectrum, trajectory
 from .campaign import collect
 from .machine import machine
 from .measurements import task
-from .own_reference import own_reference
-from .reference import position_error, reference
+from .own_reference import SHARE, of_own, own_facts, own_references
+from .reference import reference
 from .setups import label, setups_of_runs, setups_of_steps
 
 # Divisors of a scene's frames: the frames before the step of "solver" and "spectrum", and the frames of "time". Later motion is
@@ -100,7 +100,7 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
     """Measures the error of trajectories and their time, over steps and iterations, see :func:`trajectory.measure`.
 
     The rows of solvers of other simulators also have ``own_error``, that relative to the motion to which the solver itself
-    converges, see :func:`warpcloth.lab.own_reference.own_reference`.
+    converges, if it does, see :func:`warpcloth.lab.own_reference.own_reference`.
 
     Args:
         scene: A :class:`SceneRef`.
@@ -115,8 +115,8 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
 
     Returns:
         dict: See the module; ``reference`` describes the reference solution. ``others`` has for each solver of another
-        simulator the substeps and the error of its own converged motion, and ``apart``, the distance of that from the
-        reference; or None if it has none.
+        simulator the :func:`warpcloth.lab.own_reference.own_facts` of its own motion, which counts as converged if it is known
+        to a tenth of :data:`WITHIN`; or None if it has none.
 
     Raises:
         ImportError: A simulator is not installed.
@@ -129,18 +129,15 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
     if (exact.points == exact.points[0]).all():
         raise ValueError(f"nothing moves in {scene} within {frames} frames; a chart of errors needs motion")
     given = {"frames": frames, "reference": str(exact.path), "device": str(device), "dtype": dtype, "limit": limit}
-    own = {}
-    for name in (name for name in other_solvers() if any(setup.solver == name for setup in setups)):
-        same = [setup for setup in setups if setup.solver == name]
-        own[name] = own_reference(scene, same, frames, device, _KNOWN, max(_TIMES * limit, _SECONDS), watch)
-    more = [{"own": str(own[setup.solver].path)} if own.get(setup.solver) else {} for setup in setups]
+    own, bound, mesh = own_references(scene, setups, frames, device, _KNOWN, longest, watch), SHARE * WITHIN, scene.load().mesh
+    more = [of_own(own.get(setup.solver), bound) for setup in setups]
     rows = _measured(trajectory.measure, scene, setups, given, run, more)
     for i in front(rows, exact.error):
         rows[i]["front"] = True
     known = {name: getattr(exact, name) for name in ("error", "strain_error", "substeps", "seconds", "key")}
     facts = {"seed": None, "frames": frames, "reference": known}  # nothing is drawn at random
     if own:
-        facts["others"] = {name: each and _own_facts(each, exact, scene.load().mesh) for name, each in own.items()}
+        facts["others"] = {name: own_facts(each, exact, mesh, bound) for name, each in own.items()}
     return {**_facts("time", scene, device, dtype), **facts, "rows": rows}
 
 
@@ -311,12 +308,6 @@ def _facts(kind, scene, device, dtype):
 
 def _has_error(row):
     return row["status"] == "ok" and row["error"] is not None
-
-
-def _own_facts(own, exact, mesh):
-    frames = len(own.points) - 1
-    apart = position_error(own.points[1:], exact.points[1 : frames + 1], mesh)
-    return {"substeps": own.substeps, "error": own.error, "apart": apart, "seconds": own.seconds}
 
 
 def _measured(function, scene, setups, given, run, more=None):

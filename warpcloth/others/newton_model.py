@@ -15,6 +15,9 @@ In the first two, the gradient of the angle is not divided by the length of the 
 2A of a triangle; both triangles of a hinge must then have the same area A. The bending of style3d is that of
 :class:`warpcloth.QuadraticBending`; the others have angles, which agree with it for small angles.
 
+The damping of vbd is ½(κ′|e|/h)(θ − θₙ)² for ``edge_kd`` κ′, which is that of :class:`warpcloth.DihedralBending` with β
+in place of D. The others refuse damped bending.
+
 For membranes, ``tri_ke`` is μ, and ``tri_ka`` is λ in vbd and λ + μ in semi-implicit. style3d has no springs and no lateral
 contraction. Its stiffness along the two axes of the flat cloth is measured by pulling the cloth along them with free sides, and
 its shear stiffness is that under a uniform shear, see :func:`panel_moduli`.
@@ -46,6 +49,7 @@ TAKES = {
     "style3d": (Spring, IsotropicMembrane, *_BENDING),
 }
 _EQUAL = 1e-3  # relative difference of areas that counts as none
+_SLIGHT = 1e-6  # friction of cloth on itself in place of none, so that a mean with it is not 0
 _STRAIN = 1e-4  # of cloth that is pulled to measure its moduli
 
 
@@ -109,6 +113,8 @@ def newton_model(scene, method, device="cpu"):
         builder.add_particles(points.tolist(), still, masses, radius=radii, flags=flags)
         for term in scene.terms:
             _add_term(builder, scene, term, method)
+        if scene.self_contact is not None:
+            _add_surface(builder, scene.mesh)
     builder.particle_q, builder.particle_qd = scene.positions.tolist(), scene.velocities.tolist()
     for collider in scene.colliders:
         _add_collider(builder, collider, newton)
@@ -118,7 +124,7 @@ def newton_model(scene, method, device="cpu"):
         model = builder.finalize()
     model.particle_inv_mass.assign(np.where(held, 0.0, 1.0 / np.where(held, 1.0, scene.vertex_masses)).astype(np.float32))
     model.particle_grid, model.particle_max_radius = None, 0.0  # without contact between particles
-    if scene.colliders:
+    if scene.colliders or scene.self_contact is not None:
         _set_contact(model, scene)
     return model
 
@@ -142,10 +148,10 @@ def newton_solver(model, scene, method, iterations):
             solver = solvers.SolverStyle3D(model, config=solvers.SolverStyle3D.Config(iterations=iterations))
         solver.collision = solver.collision if scene.colliders else None
         return solver
-    given = {}
+    given = {"rigid_soft_contact_use_log_barrier": True}  # the law of warpcloth, for contact with colliders
     if scene.self_contact is not None:
         distance = float(scene.self_contact.distance)
-        given = {"particle_enable_self_contact": True, "particle_self_contact_margin": distance}
+        given |= {"particle_enable_self_contact": True, "particle_self_contact_margin": distance}
         given |= {"particle_self_contact_gap": distance, "particle_topological_contact_filter_threshold": 1}
     return solvers.SolverVBD(model, iterations=iterations, **given)
 
@@ -180,13 +186,16 @@ def refuse_inexpressible(scene, method):
             refuse(f"friction that differs between colliders, as that of {collider.label} from {scene.colliders[0].label}")
     if scene.colliders and not np.isfinite(scene.contact.stiffness):
         refuse("infinite stiffness of contact")
+    if scene.colliders and scene.self_contact is not None and scene.self_contact.stiffness > 2.0 * scene.contact.stiffness:
+        refuse("self-contact that is more than twice as stiff as contact with colliders")
     for term in scene.terms:
         if not isinstance(term, TAKES[method]):
             names = ", ".join(each.__name__ for each in TAKES[method])
             raise ValueError(f"{whose} does not take {type(term).__name__} of the scene {scene.name!r}, only {names}")
         if not np.isfinite(term.stiffness).all():
             refuse(f"infinite stiffness, as that of {term.label}")
-        if np.any(term.damping or 0.0) and not (isinstance(term, Spring) and method != "style3d"):
+        damped = {"vbd": (Spring, *_BENDING), "style3d": ()}.get(method, (Spring,))
+        if np.any(term.damping or 0.0) and not isinstance(term, damped):
             refuse(f"damping with warpcloth's law for {term.label}")
     if method == "style3d":
         _refuse_style3d(scene)
@@ -260,9 +269,9 @@ def _add_term(builder, scene, term, method):
         builder.spring_damping += np.broadcast_to(found.damping, count).tolist()
         builder.spring_control += [0.0] * count
     elif isinstance(term, _BENDING):
-        hinges, ke, angle = _hinges(term, scene, method)
+        hinges, ke, kd, angle = _hinges(term, scene, method)
         i, j, k, l = (hinges[:, c].tolist() for c in (2, 3, 0, 1))
-        builder.add_edges(i, j, k, l, rest=angle.tolist(), edge_ke=ke.tolist(), edge_kd=[0.0] * len(ke))
+        builder.add_edges(i, j, k, l, rest=angle.tolist(), edge_ke=ke.tolist(), edge_kd=kd.tolist())
     else:
         stencil, mu, lam = _lame(term, scene)
         ka, none = (lam if method == "vbd" else lam + mu), [0.0] * len(mu)
@@ -271,17 +280,17 @@ def _add_term(builder, scene, term, method):
 
 
 def _hinges(term, scene, method):
-    """Returns the hinges (E, 4), ``edge_ke`` (E,) by the table of the module, and the rest angles (E,) [rad] of a term."""
+    """Returns the hinges (E, 4) of a term, their ``edge_ke`` and ``edge_kd`` by the table above, and rest angles [rad] (E,)."""
     found, points = term.elements(scene.mesh, scene.positions), scene.mesh.points
-    stiffness = np.broadcast_to(found.stiffness, len(found.stencil))
+    stiffness, damping = (np.broadcast_to(each, len(found.stencil)) for each in (found.stiffness, found.damping))
     angle, shape = rest_state(points, found.stencil).T
     angle = angle if isinstance(term, DihedralBending) else np.zeros_like(angle)
     if method == "style3d":
-        return found.stencil, stiffness / 3.0, angle
+        return found.stencil, stiffness / 3.0, damping, angle
     x0, x1, x2, x3 = (points[found.stencil[:, i]] for i in range(4))
     edge = np.linalg.norm(x1 - x0, axis=1)
     if method == "vbd":
-        return found.stencil, stiffness * shape / edge, angle
+        return found.stencil, stiffness * shape / edge, damping * shape / edge, angle
     first, second = (np.linalg.norm(np.cross(x1 - x0, x - x0), axis=1) for x in (x2, x3))
     for e in np.flatnonzero(np.abs(first - second) > _EQUAL * np.maximum(first, second))[:1]:
         raise ValueError(
@@ -289,7 +298,20 @@ def _hinges(term, scene, method):
             f"hinge {e} of {term.label} has {0.5 * first[e]:.3g} and {0.5 * second[e]:.3g} m²"
         )
     both = 0.5 * (first + second)
-    return found.stencil, stiffness * shape / (both if method == "xpbd" else both * edge), angle
+    return found.stencil, stiffness * shape / (both if method == "xpbd" else both * edge), damping, angle
+
+
+def _add_surface(builder, mesh):
+    """Adds triangles and edges of a mesh that no energy has, without stiffness, so that self-contact has the whole surface."""
+    known = {frozenset(each) for each in np.reshape(builder.tri_indices, (-1, 3)).tolist()}
+    stencil = np.array([each for each in mesh.triangles.tolist() if frozenset(each) not in known], dtype=int).reshape(-1, 3)
+    none = [0.0] * len(stencil)
+    given = dict.fromkeys(("tri_ke", "tri_ka", "tri_kd", "tri_drag", "tri_lift"), none)
+    builder.add_triangles(*(stencil[:, c].tolist() for c in range(3)), **given)
+    known = {frozenset(each[2:]) for each in np.reshape(builder.edge_indices, (-1, 4)).tolist()}
+    edges = np.array([each for each in mesh.edges.tolist() if frozenset(each) not in known], dtype=int).reshape(-1, 2)
+    lone, none = [-1] * len(edges), [0.0] * len(edges)  # without triangles beside it, an edge does not bend
+    builder.add_edges(lone, lone, *(edges[:, c].tolist() for c in range(2)), rest=none, edge_ke=none, edge_kd=none)
 
 
 def _lame(term, scene):
@@ -358,7 +380,7 @@ def _add_style3d(builder, scene, solvers):
     )
     ke = {}
     for term in (each for each in scene.terms if isinstance(each, _BENDING)):
-        hinges, values, _angle = _hinges(term, scene, "style3d")
+        hinges, values, _damping, _angle = _hinges(term, scene, "style3d")
         ke = {frozenset(ends): value for ends, value in zip(hinges[:, :2].tolist(), values.tolist(), strict=True)}
     edges = [frozenset(edge[2:]) for edge in np.asarray(builder.edge_indices).tolist()]
     builder.edge_bending_properties = [(ke.get(ends, 0.0), 0.0) for ends in edges]
@@ -389,12 +411,20 @@ def _add_collider(builder, collider, newton):
 
 
 def _set_contact(model, scene):
-    """Sets stiffness and friction of contact, for particles and shapes alike, because solvers take means of both."""
+    """Sets stiffness and friction of contact.
+
+    A contact of a particle with a shape has the arithmetic mean of their stiffness, and the geometric mean of their friction;
+    a contact of cloth with itself has those of particles.
+    """
     areas = scene.mesh.vertex_areas if len(scene.mesh.triangles) else scene.vertex_masses / scene.vertex_masses.mean()
-    stiffness = float(scene.contact.stiffness * areas.mean())
-    model.soft_contact_ke, model.soft_contact_kd = stiffness, 0.0
-    model.soft_contact_mu = float(scene.colliders[0].friction)
-    model.shape_material_ke.fill_(stiffness)
+    area, declared = float(areas.mean()), scene.self_contact
+    stiffness, friction = (declared.stiffness, declared.friction) if declared else (0.0, 0.0)
+    if scene.colliders:
+        friction = max(friction, _SLIGHT) if declared else scene.colliders[0].friction
+        stiffness = stiffness or scene.contact.stiffness
+        model.shape_material_ke.fill_(area * (2.0 * scene.contact.stiffness - stiffness))
+        model.shape_material_mu.fill_(scene.colliders[0].friction ** 2 / friction if friction else 0.0)
+    model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = area * float(stiffness), 0.0, float(friction)
 
 
 def _colour(builder):
@@ -403,6 +433,7 @@ def _colour(builder):
     stencils.append(np.reshape(builder.edge_indices, (-1, 4)))
     pairs = [each[:, [i, j]] for each in stencils for j in range(each.shape[1]) for i in range(j)]
     pairs = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0).astype(np.int32)
+    pairs = pairs[pairs[:, 0] >= 0]
     with wp.ScopedDevice("cpu"):
         edges, colours = wp.array(pairs, dtype=int), wp.empty(len(builder.particle_q), dtype=int)
         count = wp.utils.graph_coloring_assign(edges, colours, wp.utils.GraphColoringAlgorithm.MCS)

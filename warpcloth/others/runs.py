@@ -71,13 +71,16 @@ def run_other(scene, record, device="cpu", frames=None, progress=None):
 
     Raises:
         ImportError: The simulator is not installed.
-        ValueError: An argument is not allowed, or the solver does not take the scene.
+        ValueError: An argument is not allowed, or the solver does not take or run the scene.
     """
     frames = scene.frames if frames is None else frames
     whole("frames", frames, 1)
     began = time.perf_counter()
     with wp.ScopedDevice(device):
-        run = record.bind(scene, device)
+        try:
+            run = record.bind(scene, device)
+        except RuntimeError as error:  # such as a call that cannot be part of a graph
+            raise ValueError(f"{record.version} does not run {scene.name}: {error}") from error
         timings = {"compile": time.perf_counter() - began, "factorise": 0.0, "frames": []}
         points, velocities = [run.points()], [run.velocities()]
         worst, status = 0.0, Status(Result.COMPLETED, frames, message=f"completed by {record.version}")

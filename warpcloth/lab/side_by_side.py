@@ -1,0 +1,156 @@
+"""Solvers of warpcloth and of other simulators on one scene: each one's cheapest setting within a tolerance, and the ratios.
+
+The result is a diagram of :func:`warpcloth.lab.work_precision.time_diagram` with more keys, so that
+:mod:`warpcloth.chart.pareto` draws it.
+"""
+
+import numpy as np
+import warp as wp
+
+from ..analysis.intersections import intersections
+from ..core.capture import Mirror
+from ..mesh.ordering import order_of_run
+from ..others.simulators import simulator_of
+from .choosing import choose
+from .clock import CLOCKS
+from .machine import machine
+from .measurements import Setup
+from .setups import label
+from .work_precision import WITHIN, front
+
+_FEWEST = 3  # frames with times from which a median is taken
+
+
+def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **given):
+    """Searches the cheapest setting of each solver on one scene, and times these settings alternately.
+
+    Args:
+        scene: The :class:`warpcloth.lab.measurements.SceneRef`.
+        others: Names of simulators.
+        tolerance: Largest error of the settings whose times are compared, relative to the size of the cloth.
+        frames: Number of frames, by default those of the scene.
+        device: A Warp device. On the CPU times are those of the process, which others do not prolong.
+        given: ``solvers``, ``limit``, ``total`` and ``run`` of :func:`warpcloth.lab.choosing.choose`.
+
+    Returns:
+        dict: That of :func:`warpcloth.lab.work_precision.time_diagram`, with ``searched``, by solver of another simulator how
+        its search ended, and ``ratios``: for the cheapest setting of warpcloth, and for that of each other solver, ``label``,
+        ``solver``, ``options``, ``to``, the error that counts, "reference" or "own", the errors, ``ratio``, the median over
+        frames of its time over that of warpcloth, with quartiles ``spread``, ``ms``, and the largest numbers in any
+        frame of pairs of triangles that cross, ``crossings``, and of vertices inside colliders, ``inside``; both are None if
+        libigl is not installed.
+
+    Raises:
+        ImportError: A simulator is not installed.
+        ValueError: As for :func:`warpcloth.lab.choosing.choose`.
+    """
+    clock = "process" if wp.get_device(device).is_cpu else "wall"
+    choice, measured, exact = choose(scene, tolerance, frames=frames, device=device, others=others, clock=clock, **given)
+    declared = scene.load()
+    rows = [_row(each, declared.fps) for each in measured]
+    for i in front(rows, exact.error):
+        rows[i]["front"] = True
+    best = _best(rows, exact.error, tolerance)
+    ratios = _alternate(declared, [row for row, _ in best], len(exact.points) - 1, device, CLOCKS[clock])
+    for (row, to), found in zip(best, ratios, strict=True):
+        found |= {name: row[name] for name in ("label", "solver", "options", "error", "own_error")} | {"to": to}
+    known = {name: getattr(exact, name) for name in ("error", "strain_error", "substeps", "seconds", "key", "method")}
+    return {
+        "diagram": "time",
+        "scene": str(scene),
+        "device": str(device),
+        "dtype": "float32",
+        "machine": machine(device),
+        "seed": None,
+        "frames": len(exact.points) - 1,
+        "reference": known,
+        "others": {name: own if "error" in own else None for name, own in choice.others.items()},
+        "searched": {name: own["searched"] for name, own in choice.others.items()},
+        "tolerance": tolerance,
+        "clock": clock,
+        "ratios": ratios,
+        "rows": rows,
+    }
+
+
+def _row(each, fps):
+    """Returns the row of a :class:`warpcloth.lab.choosing.Measured` in a diagram."""
+    status = each.status if each.error is not None or each.status != "ok" else "diverged"
+    names = ("error", "strain_error", "own_error", "reason", "machine", "spread")
+    row = {"solver": each.setup.solver, "options": each.setup.options, "label": label(each.setup), "status": status}
+    ms = each.milliseconds
+    return row | {name: getattr(each, name) for name in names} | {"ms": ms, "ms_per_second": ms and ms * fps}
+
+
+def _best(rows, floor, tolerance):
+    """Returns (row, error that counts) of the cheapest row of warpcloth, and of each other solver, that meets a tolerance.
+
+    A solver whose cloth is another may meet it for its own motion only.
+    """
+    known = sorted((row for row in rows if row["status"] == "ok"), key=lambda row: row["ms"])
+    best = {}
+    for to, name, error in (("reference", "error", floor), ("own", "own_error", 0.0)):
+        for row in known:
+            other = simulator_of(row["solver"])
+            if (other or to == "reference") and row[name] is not None and row[name] + error <= tolerance:
+                best.setdefault((row["solver"] if other else "", to), (row, to))
+    kept = [key for key in best if key[1] == "reference" or (key[0], "reference") not in best]
+    return [best[key] for key in sorted(kept, key=lambda key: key[0] != "")]  # warpcloth first
+
+
+def _alternate(scene, rows, frames, device, now):
+    """Times the frames of settings in turns, one frame of each after the other, and counts crossings.
+
+    Returns:
+        list: A dictionary for each row with ``ms``, ``ratio``, ``spread``, ``crossings`` and ``inside``.
+    """
+    with wp.ScopedDevice(device):
+        runs = [_bound(scene, Setup(row["solver"], row["options"]), device) for row in rows]
+        times, motions = [[] for _ in rows], [[] for _ in rows]
+        for _ in range(frames):
+            for run, spent, motion in zip(runs, times, motions, strict=True):
+                wp.synchronize_device(device)
+                began = now()
+                points = run()
+                spent.append(now() - began)
+                motion.append(points.copy())
+    times = np.array(times)[:, min(1, frames - _FEWEST) :]
+    found = []
+    for spent, motion in zip(times, motions, strict=True):
+        low, ratio, high = np.percentile(spent / times[0], [25, 50, 75]).tolist()
+        given = {"ms": 1e3 * float(np.median(spent)), "ratio": ratio, "spread": [low, high]}
+        found.append(given | _checked(scene, np.array(motion, dtype=np.float64)))
+    return found
+
+
+def _bound(scene, setup, device):
+    """Returns a function that takes a frame and returns its points (n, 3), in the order of the scene."""
+    record = setup.record()
+    if simulator_of(setup.solver):
+        steps = record.bind(scene, device)
+
+        def run():
+            steps.frame()
+            return steps.points()
+
+        return run
+    order = order_of_run(scene, record)
+    stepper = record.bind(scene.build(device=device, order=order))
+    points, back = Mirror(stepper.state.x), slice(None) if order is None else np.argsort(order)
+
+    def run_own():
+        stepper.frame()
+        return points.read()[back]
+
+    return run_own
+
+
+def _checked(scene, points):
+    """Returns the largest numbers of crossings and of vertices inside colliders in frames of points (F, n, 3)."""
+    if not len(scene.mesh.triangles):
+        return {"crossings": 0, "inside": 0}
+    try:
+        frames = intersections(points, scene.mesh, colliders=list(scene.colliders)).frames
+    except ImportError:
+        return {"crossings": None, "inside": None}
+    return {"crossings": max(len(each.pairs) for each in frames), "inside": max(each.vertices_inside for each in frames)}
