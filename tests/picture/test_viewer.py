@@ -159,7 +159,10 @@ def test_a_notebook_shows_a_page_or_a_line(monkeypatch):
     assert len(decoded(data_of(page)["shapes"][0])) == FRAMES
     monkeypatch.setattr(pages, "EMBEDDED", 100_000)
     line = sequence._repr_html_()
-    assert line.count("\n") == 0 and "larger than 100 kB" in line and 'wc.view(animation, "animation.html")' in line
+    assert "\n" not in line and "where a page may have 100 kB" in line and 'wc.view(animation, "animation.html")' in line
+    monkeypatch.setattr(pages, "_page", None)  # is not called for positions that are surely too many
+    monkeypatch.setattr(pages, "EMBEDDED", 20)
+    assert sequence._repr_html_().startswith("<p>Sequence: too large")
     scene = wc.Scene(MESH, density=0.1, terms=[wc.Spring(stiffness=10.0)], duration=0.1)
     assert "<p>Animation(" in wc.simulate(scene, wc.XPBD(substeps=1), frames=1)._repr_html_()
     start = MESH.points[:3]

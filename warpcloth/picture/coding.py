@@ -19,7 +19,7 @@ class Deflated:
     """
 
     def __init__(self):
-        self._deflate, self._parts, self.size = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS), [], 0
+        self._deflate, self._parts, self.size = zlib.compressobj(wbits=-zlib.MAX_WBITS), [], 0
 
     def add(self, data):
         self._keep(self._deflate.compress(data))

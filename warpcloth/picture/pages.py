@@ -35,6 +35,9 @@ ENDING = ".html"
 USUAL = ("stretch_1", "stretch_2")
 # Largest page [bytes] that a browser can be expected to open, and that a notebook embeds.
 LARGEST, EMBEDDED = 400_000_000, 5_000_000
+# Positions of more than this many times the bytes that a notebook embeds are not coded to see whether they fit. Coding shortens
+# those of cloth in motion to 0.3 or 0.6.
+_SHORTEN = 8
 # Width of the picture by its height for which the camera is set. A narrower window sees the same width.
 _ASPECT = 1.5
 _TICKS = 6
@@ -144,15 +147,19 @@ def notebook_html(source):
     Returns:
         str: None if the source has no mesh, so that it cannot be drawn.
     """
-    named = html.escape(repr(source) if len(repr(source)) < 200 else type(source).__name__)
-    try:
-        subject = _subject(source)
-    except ValueError:
+    if any(getattr(source, name, True) is None for name in ("mesh", "scene")):
         return None
+    named = html.escape(repr(source) if len(repr(source)) < 200 else type(source).__name__)
+    subject = _subject(source)
     try:
+        if 6 * len(subject) * sum(shape.count for shape in subject.shapes) > _SHORTEN * EMBEDDED:
+            raise TooLarge("so many positions are not coded to find out")
         page = _page(subject, np.arange(len(subject)), _values(subject, None), largest=EMBEDDED)
-    except TooLarge as large:
-        return f'<p>{named}: {large}. <code>wc.view(animation, "animation.html")</code> writes it into a file.</p>'
+    except TooLarge:
+        path = getattr(source, "output", None) or getattr(source, "path", None)
+        how = f"warpcloth view {path} -o {Path(path).stem}.html" if path else 'wc.view(animation, "animation.html")'
+        rule = f"too large to be shown here, where a page may have {shown_bytes(EMBEDDED)}"
+        return f"<p>{named}: {rule}. <code>{html.escape(how, quote=False)}</code> writes it into a file.</p>"
     style = "width: 100%; height: 480px; border: 0"
     return f'<iframe title="{named}" style="{style}" srcdoc="{html.escape(page)}"></iframe>'
 

@@ -17,7 +17,6 @@ import { Shape } from "./shapes.js";
 
 const SKY = 0.42; // share of the light, and by how much the sky is darker below
 const TILT = 0.15;
-const BAR = 100; // width of the colour bar [px]
 const element = (id) => document.getElementById(id);
 
 class Player {
@@ -93,7 +92,7 @@ class Player {
     if (!width || !height) return;
     this.renderer.setSize(width, height);
     // The motion fits beside the colour bar.
-    const room = width - (this.measure ? Math.min(BAR, width / 3) : 0);
+    const room = width - (this.measure ? Math.min(element("bar").offsetWidth + 16, width / 3) : 0);
     const half = Math.tan((this.data.camera.fov * Math.PI) / 360);
     const narrower = Math.max(1, (this.data.camera.aspect * height) / room);
     this.camera.fov = (Math.atan(half * narrower) * 360) / Math.PI;
@@ -118,22 +117,26 @@ class Player {
     select.addEventListener("change", () => this.paint(select.value === "" ? null : Number(select.value)));
     element("about").addEventListener("click", () => (element("facts").hidden = !element("facts").hidden));
     element("close").addEventListener("click", () => (element("facts").hidden = true));
+    element("note").textContent = `quantised to ${this.rounding()}, for looking, not for measuring`;
     element("text").textContent = this.facts();
     document.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  /** The quantum of the positions of the cloth. */
+  rounding() {
+    return millimetres(this.shapes[this.data.coloured].data.quantum);
   }
 
   facts() {
     const { data, shapes } = this;
     const cloth = shapes[data.coloured];
-    const number = (value) => Number(value.toPrecision(2)).toString();
-    const worst = Math.max(...shapes.map((shape) => shape.data.quantum)) * 1000;
-    const own = cloth.data.quantum * 1000;
-    const rounded = worst > own ? `${number(own)} mm, those of other shapes to ${number(worst)} mm or less` : `${number(own)} mm`;
+    const worst = Math.max(...shapes.map((shape) => shape.data.quantum));
+    const others = worst > cloth.data.quantum ? `, those of other shapes to ${millimetres(worst)} or less` : "";
     const colours = this.measures.length ? " Values are quantised to 1/254 of the range of their colour bar." : "";
     const made = data.version ? ` Made by warpcloth ${data.version}.` : "";
     return (
       `${this.frames} ${this.frames > 1 ? "frames" : "frame"} of ${cloth.data.count} vertices. ` +
-      `Positions are quantised to ${rounded}, for looking, not for measuring.${colours}${made}`
+      `Positions are quantised to ${this.rounding()}${others}, for looking, not for measuring.${colours}${made}`
     );
   }
 
@@ -225,6 +228,8 @@ class Player {
       tick.textContent = text.replace("-", "−");
       return tick;
     }));
+    const longest = Math.max(...ticks.map(([, text]) => text.length));
+    element("bar").style.width = `${Math.max(78, 30 + 8 * longest)}px`;
     element("excluded").hidden = !excluded;
     element("excluded").style.setProperty("--colour", css(0));
   }
@@ -245,6 +250,10 @@ class Player {
     this.renderer.render(this.world, this.camera);
     if (!this.drawn++) performance.mark("first picture");
   }
+}
+
+function millimetres(length) {
+  return `${Number((1000 * length).toPrecision(2))} mm`;
 }
 
 function linear(bytes) {
