@@ -54,8 +54,13 @@ class Browser:
         return self
 
     def __exit__(self, *_error):
-        self._process.kill()
-        self._process.wait()
+        self._session = None
+        try:
+            self.call("Browser.close")
+            self._process.wait(timeout=10.0)
+        except (AssertionError, OSError, subprocess.TimeoutExpired):
+            self._process.kill()
+            self._process.wait()
         os.close(self._write), os.close(self._read)
 
     def call(self, method, **parameters):
