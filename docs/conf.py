@@ -48,4 +48,5 @@ copybutton_prompt_is_regexp = True
 # The reference.
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
-napoleon_google_docstring, napoleon_numpy_docstring = True, False
+napoleon_numpy_docstring = False
+napoleon_custom_sections = [("Attributes", "params_style")]

@@ -9,6 +9,8 @@ import numpy as np
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from stills import main as picture_records
+from stills import run
 
 import warpcloth as wc
 from warpcloth.chart.style import LEGEND, dress, series_style, small_print
@@ -24,13 +26,6 @@ def save(figure, name):
     """A PNG in docs/, cut to what is drawn."""
     figure.savefig(DOCS / name, dpi=130, bbox_inches="tight", pad_inches=0.08, facecolor="white")
     plt.close(figure)
-
-
-def run(scene, solver, **options):
-    """The animation of a run that ends well."""
-    animation = wc.simulate(scene, solver, **options)
-    assert animation.status.ok, animation.status
-    return animation
 
 
 def picture_hanging():
@@ -132,3 +127,4 @@ if __name__ == "__main__":
     picture_drape()
     picture_deformation()
     picture_cantilever()
+    picture_records()

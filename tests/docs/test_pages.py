@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+import warpcloth.solvers
+import warpcloth.terms
 from warpcloth.analysis.measures import MEASURES
 from warpcloth.cli import _parser
 from warpcloth.solvers import SOLVERS
@@ -163,6 +165,21 @@ def test_every_generated_table_is_on_one_page(name):
 def test_every_scene_is_in_the_docs():
     table = re.search(r"^\| Scene \|.*?(?=\n\n)", PAGES["docs/scenes.md"], re.MULTILINE | re.DOTALL)[0]
     assert set(re.findall(r"^\| `(\w+)`", table, re.MULTILINE)) == {path.stem for path in (ROOT / "scenes").glob("*.py")}
+
+
+def test_every_record_has_a_small_picture():
+    """The pages that the build of the site makes show them."""
+    names = {
+        "energy": warpcloth.terms.__all__,
+        "solver": warpcloth.solvers.__all__,
+        "scene": [path.stem for path in (ROOT / "scenes").glob("*.py")],
+        "fabric": wc.fabrics,
+    }
+    there = {path.stem: path.stat().st_size for path in (ROOT / "docs" / "pictures").glob("*.webp")}
+    needed = {f"{kind}-{name}" for kind, of_kind in names.items() for name in of_kind}
+    assert needed <= there.keys(), "run python docs/stills.py"
+    assert {name for name in there if name.partition("-")[0] in names} <= needed
+    assert max(there.values()) <= 40_000
 
 
 def test_every_solver_of_the_package_says_what_it_suits():

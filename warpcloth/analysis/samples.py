@@ -66,7 +66,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Analysis(Mapping[str, np.ndarray]):
-    """Measures of all rows, arrays (rows, E, *shape) by name: ``analysis["stretch"]``.
+    """Measures of all rows, arrays (rows, E, …) by name: ``analysis["stretch"]``.
 
     Attributes:
         mesh: The mesh, with E triangles or vertices.
