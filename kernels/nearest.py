@@ -35,7 +35,7 @@ def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 @cache
 def distances():
-    """Kernel over points: out[i] = distance of points[i] to the triangles of ``mesh``.
+    """Kernel over points: out[i] = distance of points[i] to the triangles of ``mesh``, faces[i] = the nearest.
 
     All coordinates are in [−1, 1]³, in float32 in ``mesh`` and in float64 in ``x``. A query of the mesh finds the nearest
     triangle; its distance is computed in float64. Queries omit flat triangles and can be wrong about nearly flat ones, so those
@@ -53,18 +53,25 @@ def distances():
         points: wp.array(dtype=wp.vec3d),
         # out
         out: wp.array(dtype=wp.float64),
+        faces: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
         p = points[i]
         nearest = wp.float64(wp.inf)
+        face = wp.int32(0)
         query = wp.mesh_query_point_no_sign(mesh, wp.vec3(p), FAR)
         if query.result:
             v = triangles[query.face]
             nearest = from_triangle(x[v[0]] - p, x[v[1]] - p, x[v[2]] - p)
+            face = wp.int32(query.face)
         for k in range(flat.shape[0]):
             v = triangles[flat[k]]
-            nearest = wp.min(nearest, from_triangle(x[v[0]] - p, x[v[1]] - p, x[v[2]] - p))
+            distance = from_triangle(x[v[0]] - p, x[v[1]] - p, x[v[2]] - p)
+            if distance < nearest:
+                nearest = distance
+                face = flat[k]
         out[i] = wp.sqrt(nearest)
+        faces[i] = face
 
     return measure
 

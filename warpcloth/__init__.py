@@ -21,12 +21,17 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .analysis.compare import compare as compare
     from .analysis.intersections import intersections as intersections
     from .analysis.samples import Analysis as Analysis
+    from .analysis.surface_comparison import SurfaceComparison as SurfaceComparison
+    from .analysis.surface_comparison import compare_surfaces as compare_surfaces
     from .base import checks as checks
     from .deformation.arap import Arap as Arap
     from .deformation.deform import Deformation as Deformation
     from .deformation.deform import deform as deform
     from .lab.laboratory import laboratory_readings as laboratory_readings
     from .mesh import ordering as ordering
+    from .mesh.captures import Capture as Capture
+    from .mesh.captures import as_capture as as_capture
+    from .mesh.captures import open_capture as open_capture
     from .mesh.mesh import Mesh as Mesh
     from .mesh.sequences import Sequence as Sequence
     from .mesh.sequences import as_sequence as as_sequence
@@ -71,12 +76,17 @@ _MODULES = {
     "compare": "analysis.compare",
     "intersections": "analysis.intersections",
     "Analysis": "analysis.samples",
+    "SurfaceComparison": "analysis.surface_comparison",
+    "compare_surfaces": "analysis.surface_comparison",
     "checks": "base",
     "Arap": "deformation.arap",
     "Deformation": "deformation.deform",
     "deform": "deformation.deform",
     "laboratory_readings": "lab.laboratory",
     "ordering": "mesh",
+    "Capture": "mesh.captures",
+    "as_capture": "mesh.captures",
+    "open_capture": "mesh.captures",
     "Mesh": "mesh.mesh",
     "Sequence": "mesh.sequences",
     "as_sequence": "mesh.sequences",

@@ -138,15 +138,9 @@ def compare(
         whole("frames", frames, least=0)
     one = opened("a", a, prim_a, fps if fps_a is None else fps_a)
     other = opened("b", b, prim_b, fps if fps_b is None else fps_b)
-    for name, sequence in (("a", one), ("b", other)):
-        if sequence.times is None:
-            where = name if sequence.path is None else sequence.path
-            raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
     up_axes = up_axis_of("up_axis_a", one, up_axis_a or up_axis), up_axis_of("up_axis_b", other, up_axis_b or up_axis)
     other = to_up_axis(other, *up_axes)
-    pairs = _matching(one, other)
-    unmatched = tuple(np.setdiff1d(np.arange(len(s)), partners) for s, partners in zip((one, other), pairs.T, strict=True))
-    pairs = pairs if frames is None else pairs[: frames + 1]
+    pairs, unmatched = matching(one, other, frames)
     pair = _Pair(one, other, device)
     rows = []
     for frame, (i, j) in enumerate(pairs):
@@ -192,11 +186,38 @@ def to_up_axis(b: Sequence, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Seq
     """Returns b with its frames rotated to the up axis of a, without rounding; b itself if the axes agree or one is unknown."""
     if axis_a is None or axis_b is None or axis_a == axis_b:
         return b
-    columns, signs = ([0, 2, 1], [1.0, 1.0, -1.0]) if axis_a == "Y" else ([0, 2, 1], [1.0, -1.0, 1.0])
-    return replace(b, read=lambda frame: b[frame][:, columns] * signs)
+    return replace(b, read=lambda frame: turned_up(b[frame], axis_a))
 
 
-def _matching(a, b):
+def turned_up(points: np.ndarray, axis: UpAxis) -> np.ndarray:
+    """Returns points (n, 3) of the other up axis, rotated to this one without rounding."""
+    return points[:, [0, 2, 1]] * ([1.0, 1.0, -1.0] if axis == "Y" else [1.0, -1.0, 1.0])
+
+
+def matching(a, b, frames=None):
+    """Returns the indices of frames of a and b at the same time, and those without a partner.
+
+    Args:
+        a: A `Sequence` or a `Capture`.
+        b: A `Sequence` or a `Capture`.
+        frames: Number of frames to keep after the first; None keeps all.
+
+    Returns:
+        tuple: Pairs (F, 2), F at least 1, and two arrays of the indices of a and of b that have no partner.
+
+    Raises:
+        ValueError: One of them has no times, or no two frames have the same time.
+    """
+    for name, each in (("a", a), ("b", b)):
+        if each.times is None:
+            where = name if each.path is None else each.path
+            raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
+    pairs = _at_one_time(a, b)
+    unmatched = tuple(np.setdiff1d(np.arange(len(s)), partners) for s, partners in zip((a, b), pairs.T, strict=True))
+    return pairs if frames is None else pairs[: frames + 1], unmatched
+
+
+def _at_one_time(a, b):
     """Returns the indices of frames at the same time (F, 2), F at least 1."""
     steps = np.concatenate([np.diff(a.times), np.diff(b.times)])
     near = _SAME_TIME * (steps.min() if len(steps) else 1.0)
@@ -223,7 +244,7 @@ class _Pair:
         self.triangles = a.mesh.triangles, b.mesh.triangles
         self.used = [np.unique(triangles) for triangles in self.triangles]
         self.same = same_topology(a.mesh, b.mesh)
-        self.excluded = [[_whole(label, "is missing") for label in s.missing] for s in (a, b)]
+        self.excluded = [[whole_frame(label, "is missing") for label in s.missing] for s in (a, b)]
         if self.same:
             stretch = [MEASURES["triangle"]["stretch"]]
             self.elements = [Triangles(s.mesh, stretch, None, None, device, "float64") for s in (a, b)]
@@ -277,9 +298,9 @@ class _Pair:
                 weights = areas / areas.sum()
                 mean[k], rms[k] = weights @ found, np.sqrt(weights @ found**2)
             else:
-                self.excluded[k].append(_whole(labels[k], "has no area, so that there is no mean over its surface"))
+                self.excluded[k].append(whole_frame(labels[k], "has no area, so that there is no mean over its surface"))
         hausdorff = largest.max()
-        longest = max(_longest_side(x, triangles) for x, triangles in zip(points, self.triangles, strict=True))
+        longest = max(longest_side(x, triangles) for x, triangles in zip(points, self.triangles, strict=True))
         bound = hausdorff + longest / np.sqrt(3.0)
         return {
             "surface_mean": mean,
@@ -290,7 +311,8 @@ class _Pair:
         }
 
 
-def _whole(label, reason):
+def whole_frame(label: float, reason: str) -> Exclusion:
+    """Returns the `Exclusion` of a whole frame."""
     return Exclusion(label, "frame", np.empty(0, dtype=int), reason)
 
 
@@ -298,5 +320,6 @@ def _rms(values):
     return np.sqrt(np.mean(values**2, axis=0))
 
 
-def _longest_side(x, triangles):
+def longest_side(x: np.ndarray, triangles: np.ndarray) -> float:
+    """Returns the length [m] of the longest side of triangles (T, 3) with corners among x (n, 3)."""
     return np.linalg.norm(x[triangles] - x[np.roll(triangles, 1, axis=1)], axis=2).max()

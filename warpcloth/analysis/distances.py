@@ -1,4 +1,4 @@
-"""Distances of points to a surface of triangles, in float64, with Warp's `wp.Mesh` for the search."""
+"""Distances of points to a surface of triangles, in float64, with Warp's `wp.Mesh` for the search; and samples of a surface."""
 
 import numpy as np
 import warp as wp
@@ -7,13 +7,13 @@ from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..kernels import nearest
 from ..mesh.mesh import areas_of
+from ..scene.mesh_collider import nearest_weights
 
 # Threshold of 2·area over the sum of the squared sides, 0.29 for an equilateral triangle. Below it, a search in float32 is
 # dominated by rounding.
 _FLAT = 1e-3
 
 
-@in_turn
 def surface_distances(points, x, triangles, device="cpu"):
     """Returns the distance (k,) [m] of each point to a surface of triangles, degenerate ones included.
 
@@ -27,6 +27,21 @@ def surface_distances(points, x, triangles, device="cpu"):
         triangles: (T, 3), at least one.
         device: A Warp device.
     """
+    return _nearest(points, x, triangles, device)[0]
+
+
+def nearest_on_surface(points, x, triangles, device="cpu"):
+    """Returns the distance (k,) [m] of each point to a surface, the triangle (k,) and the weights (k, 3) of its nearest point.
+
+    The nearest point is Σ wᵢxᵢ over the corners of the triangle. A weight is exactly 0 where it lies on a side or a corner
+    that the point is not above. Arguments and rounding are those of :func:`surface_distances`.
+    """
+    distances, faces = _nearest(points, x, triangles, device)
+    return distances, faces, nearest_weights(points, x[triangles[faces]])
+
+
+@in_turn
+def _nearest(points, x, triangles, device):
     low, high = (bound(np.stack([bound(points, axis=0), bound(x, axis=0)]), axis=0) for bound in (np.min, np.max))
     centre = low + 0.5 * (high - low)
     # A power of two, which adds no rounding.
@@ -39,6 +54,59 @@ def surface_distances(points, x, triangles, device="cpu"):
         mesh = wp.Mesh(wp.array(x, dtype=wp.vec3), wp.array(triangles.ravel(), dtype=wp.int32))
         elements = [mesh.id, wp.array(triangles, dtype=wp.vec3i), wp.array(np.flatnonzero(flat), dtype=wp.int32)]
         state = [wp.array(x, dtype=wp.vec3d), wp.array(points, dtype=wp.vec3d)]
-        out = wp.empty(len(points), dtype=wp.float64)
-        wp.launch(nearest.distances(), len(points), inputs=elements + state, outputs=[out])
-        return out.numpy() * scale
+        out, faces = wp.empty(len(points), dtype=wp.float64), wp.empty(len(points), dtype=wp.int32)
+        wp.launch(nearest.distances(), len(points), inputs=elements + state, outputs=[out, faces])
+        return out.numpy() * scale, faces.numpy()
+
+
+def surface_samples(x, triangles, count):
+    """Returns points that sample a surface by its area: triangles (k,), weights of their corners (k, 3) and areas (k,) [m²].
+
+    Each triangle is cut into m² equal parts, none larger than 3/count of the whole area, so that k is at least ``count``. In
+    each part three points with the weights (2/3, 1/6, 1/6) stand for a third of it. This rule is exact for polynomials of
+    degree 2 (Strang & Fix 1973), so for squares of distances that are linear over a triangle.
+
+    Args:
+        x: Vertices (n, 3) [m], finite.
+        triangles: (T, 3), at least one; the surface has an area.
+        count: Number of points at least.
+    """
+    areas = areas_of(x, triangles)
+    cuts = np.maximum(np.ceil(np.sqrt(count / 3.0 * areas / areas.sum())), 1).astype(int)
+    faces, weights, shares = [], [], []
+    for m in np.unique(cuts):
+        i, j, corner = (each.ravel() for each in np.meshgrid(np.arange(m), np.arange(m), np.arange(3), indexing="ij"))
+        second, third = i + np.choose(corner, [1 / 6, 2 / 3, 1 / 6]), j + np.choose(corner, [1 / 6, 1 / 6, 2 / 3])
+        turned = i + j >= m  # the cells beyond the diagonal, turned about the middle of the long side, are those between others
+        second, third = (np.where(turned, m - each, each) / m for each in (second, third))
+        chosen = np.flatnonzero(cuts == m)
+        faces.append(np.repeat(chosen, 3 * m * m))
+        weights.append(np.tile(np.stack([1.0 - second - third, second, third], axis=1), (len(chosen), 1)))
+        shares.append(np.repeat(areas[chosen] / (3 * m * m), 3 * m * m))
+    return np.concatenate(faces), np.concatenate(weights), np.concatenate(shares)
+
+
+class Boundary:
+    """The boundary of a surface: sides of one triangle only, where vertices at the same position count as one.
+
+    Args:
+        x: Vertices (n, 3) [m].
+        triangles: (T, 3).
+    """
+
+    def __init__(self, x, triangles):
+        _, one = np.unique(x + 0.0, axis=0, return_inverse=True)
+        corners = one.ravel()[triangles]
+        sides = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)], axis=2), axis=2)
+        _, number, counts = np.unique(sides @ [len(x), 1], return_inverse=True, return_counts=True)
+        self._sides = (counts == 1)[number.reshape(-1, 3)]  # of each triangle that opposite to each corner
+        ends = np.zeros(len(x), dtype=bool)
+        ends[sides[self._sides]] = True
+        self._corners = ends[corners]
+
+    def has(self, faces, weights):
+        """Returns which points with weights (k, 3) in triangles (k,) lie on the boundary, (k,)."""
+        zero = weights == 0.0
+        on_side, at_corner = zero.sum(axis=1) == 1, zero.sum(axis=1) == 2
+        of_side = self._sides[faces, np.argmax(zero, axis=1)]
+        return (on_side & of_side) | (at_corner & self._corners[faces, np.argmin(zero, axis=1)])

@@ -3,8 +3,17 @@
 from ..picture.colour import Scale, range_over
 from ..picture.picture import draw
 from ..picture.projection import View
-from .distances import plot_distances
+from .distances import plot_distances, plot_surface_distances
 from .percentiles import plot_percentiles
 from .residuals import plot_residuals
 
-__all__ = ["Scale", "View", "draw", "plot_distances", "plot_percentiles", "plot_residuals", "range_over"]
+__all__ = [
+    "Scale",
+    "View",
+    "draw",
+    "plot_distances",
+    "plot_percentiles",
+    "plot_residuals",
+    "plot_surface_distances",
+    "range_over",
+]

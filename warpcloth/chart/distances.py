@@ -52,6 +52,38 @@ def plot_distances(path, found, names, device="cpu"):
     save(figure, path)
 
 
+def plot_surface_distances(path, found, names, device="cpu"):
+    """Plots the RMS distances of two surfaces over time from each, of all points and of inner ones, and the 95 % of the latter.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        found: The :class:`warpcloth.SurfaceComparison`.
+        names: Names of the two files.
+        device: The Warp device that compared them.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    check_path(path, PICTURES)
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    axes = figure.subplots()
+    lines = {f"RMS from {of}": found.all.rms[:, k] for k, of in enumerate("AB")}
+    lines |= {f"RMS from {of} without holes": found.inner.rms[:, k] for k, of in enumerate("AB")}
+    lines |= {f"95 % from {of} without holes": found.inner.percentile[:, k] for k, of in enumerate("AB")}
+    _draw(axes, found.times, lines)
+    axes.set(xlabel="time [s]", ylabel="distance [m]")
+    axes.set_ylim(bottom=0.0)
+    dress(axes)
+    headline(figure, f"{Path(names[0]).name} and {Path(names[1]).name}")
+    small_print(figure, device=device)
+    axes.legend(**LEGEND)
+    save(figure, path)
+
+
 def _draw(axes, times, lines):
     """Draws values over time; returns (x, y, label, colour) of the last value of each line."""
     ends = []

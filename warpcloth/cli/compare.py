@@ -5,14 +5,13 @@ from contextlib import closing
 import numpy as np
 
 from ..base.checks import whole
-from ..base.outputs import check_apart, write_table
+from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
 from ..picture.figures import PICTURES, check_path
+from .compare_surfaces import compare_by_surface, left_out, metres, over_frames, shown_at, shown_frame, worst_of, write_csv
 from .options import values_of
 from .terminal import Progress, check_writable
-
-_SHOWN = 8  # largest number of frames or exclusions of each in the summary
 
 EPILOG = """\
 A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames are
@@ -21,7 +20,12 @@ same triangles, the positions of vertices and the stretches are compared too. Th
 shape. The rest shape of a folder or an .npz file is its first frame, unless --rest-a or --rest-b gives another. If one is Y up
 and the other Z up, B is rotated to the up axis of A.
 
+With --by surface, A and B may be captures: their triangles may change from frame to frame, with noise and holes. Points
+that sample each surface by its area are measured to the other: all, and those alone whose nearest point is not on its boundary,
+which leaves out what faces a hole.
+
   warpcloth compare hanging.usdc frames --fps-b 24 --rest-b rest.obj --csv apart.csv
+  warpcloth compare scan hanging.usdc --by surface --fps-a 60 --scale-a 0.001 --csv apart.csv
 """
 
 
@@ -34,6 +38,21 @@ def add_arguments(parser):
         parser.add_argument(f"--rest-{name}", metavar="MESH", help=f"mesh file with the rest shape of {of}")
         parser.add_argument(f"--fps-{name}", type=float, metavar="FPS", help=f"frames per second of {of}; overrides its own")
         parser.add_argument(f"--up-axis-{name}", choices=("Y", "Z"), help=f"up axis of {of}; overrides its own")
+        parser.add_argument(
+            f"--scale-{name}",
+            type=float,
+            metavar="M",
+            help=f"with --by surface: length of a unit of the mesh files of {of} [m]",
+        )
+    parser.add_argument(
+        "--by",
+        choices=("vertices", "surface"),
+        default="vertices",
+        help="compare meshes that keep their triangles (vertices, default), or surfaces that may change them (surface)",
+    )
+    parser.add_argument(
+        "--samples", type=int, metavar="N", help="with --by surface: number of points on each surface (default: 10000)"
+    )
     parser.add_argument("--fps", type=float, help="frames per second of A and B; overrides their own")
     parser.add_argument("--up-axis", choices=("Y", "Z"), help="up axis of A and B; overrides their own")
     parser.add_argument("--frames", type=int, metavar="N", help="compare the first frame and N frames after it (default: all)")
@@ -48,6 +67,11 @@ def compare(arguments):
         whole("frames", arguments.frames, least=0)
     _check_outputs(arguments)
     device = find_device(arguments.device)
+    if arguments.by == "surface":
+        return compare_by_surface(arguments, device)
+    for option in ("scale_a", "scale_b", "samples"):
+        if getattr(arguments, option) is not None:
+            raise ValueError(f"--{option.replace('_', '-')} is for --by surface; leave it out")
     a, b = (_open(arguments, name, opened) for name in ("a", "b"))
     check_apart([arguments.csv, arguments.plot], [*a.files, *b.files, arguments.rest_a, arguments.rest_b])
     with closing(Progress()) as progress:
@@ -55,7 +79,7 @@ def compare(arguments):
         found = compare(a, b, frames=arguments.frames, device=device, progress=progress, **axes)
     columns = _columns(found)
     if arguments.csv:
-        _write_csv(arguments.csv, columns)
+        write_csv(arguments.csv, columns)
     if arguments.plot:
         from ..chart import plot_distances
 
@@ -96,11 +120,6 @@ def _columns(found):
     return columns | {"hausdorff": found.hausdorff, "hausdorff_bound": found.hausdorff_bound}
 
 
-def _write_csv(path, columns):
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    write_table(path, columns, ([None if value != value else value for value in row] for row in rows))
-
-
 def _facts(arguments, found, sequences):
     """Returns the facts of the summary: the largest value of each number with its frame, and the RMS over all frames."""
     facts = {
@@ -116,37 +135,22 @@ def _facts(arguments, found, sequences):
             [s.labels[index].item() for index in partners] for s, partners in zip(sequences, found.unmatched, strict=True)
         ],
         "excluded": [[str(one) for one in excluded] for excluded in found.excluded],
-        "hausdorff": _worst(found, found.hausdorff),
-        "hausdorff_bound": _worst(found, found.hausdorff_bound),
-        "surface_rms": [_over_frames(column) for column in found.surface_rms.T],
-        "surface_largest": [_worst(found, column) for column in found.surface_largest.T],
+        "hausdorff": worst_of(found, found.hausdorff),
+        "hausdorff_bound": worst_of(found, found.hausdorff_bound),
+        "surface_rms": [over_frames(column) for column in found.surface_rms.T],
+        "surface_largest": [worst_of(found, column) for column in found.surface_largest.T],
     }
     if found.same_topology:
         facts |= {
-            "rms": _over_frames(found.rms),
-            "relative_rms": _over_frames(found.relative_rms),
-            "worst_rms": _worst(found, found.rms),
-            "largest": _worst(found, found.largest),
-            "stretch_rms": [_over_frames(column) for column in found.stretch_rms.T],
-            "stretch_largest": _worst(found, found.stretch_largest.max(axis=1)),
+            "rms": over_frames(found.rms),
+            "relative_rms": over_frames(found.relative_rms),
+            "worst_rms": worst_of(found, found.rms),
+            "largest": worst_of(found, found.largest),
+            "stretch_rms": [over_frames(column) for column in found.stretch_rms.T],
+            "stretch_largest": worst_of(found, found.stretch_largest.max(axis=1)),
         }
         facts["largest"]["vertex"] = int(found.largest_vertex[np.nanargmax(found.largest)])
     return facts
-
-
-def _over_frames(values):
-    """Returns the RMS over the frames with a value, NaN if there are none."""
-    values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
-
-
-def _worst(found, values):
-    """Returns the largest of the values (F,) and its frame, or None if there are none."""
-    if np.isnan(values).all():
-        return None
-    row = int(np.nanargmax(values))
-    frame_a, frame_b = found.labels[row].tolist()
-    return {"value": float(values[row]), "frame_a": frame_a, "frame_b": frame_b, "time": float(found.times[row])}
 
 
 def _summary(facts, found):
@@ -158,14 +162,15 @@ def _summary(facts, found):
     ]
     if facts["same_topology"]:
         lines += [
-            f"  vertices      RMS {_metres(facts['rms'])} over all frames, {100.0 * facts['relative_rms']:.3g} % of the size",
-            f"                worst RMS {_at(facts['worst_rms'])}",
-            f"                largest {_at(facts['largest'])}, of vertex {facts['largest']['vertex']}",
+            f"  vertices      RMS {metres(facts['rms'])} over all frames, {100.0 * facts['relative_rms']:.3g} % of the size",
+            f"                worst RMS {shown_at(facts['worst_rms'])}",
+            f"                largest {shown_at(facts['largest'])}, of vertex {facts['largest']['vertex']}",
         ]
-    rms = " and ".join(_metres(value) for value in facts["surface_rms"])
+    rms = " and ".join(metres(value) for value in facts["surface_rms"])
     lines += [
         f"  surfaces      RMS {rms} over all frames, from A and from B",
-        f"  Hausdorff     {_at(facts['hausdorff'])}, sampled at vertices; at most {_metres(facts['hausdorff_bound']['value'])}",
+        f"  Hausdorff     {shown_at(facts['hausdorff'])}, sampled at vertices; "
+        f"at most {metres(facts['hausdorff_bound']['value'])}",
     ]
     if facts["same_topology"]:
         worst = facts["stretch_largest"]
@@ -173,34 +178,9 @@ def _summary(facts, found):
             lines.append("  stretches     none compared")
         else:
             rms = " and ".join(f"{value:.3g}" for value in facts["stretch_rms"])
-            largest = f"{worst['value']:.3g} in {_frame(worst)}"
+            largest = f"{worst['value']:.3g} in {shown_frame(worst)}"
             lines.append(f"  stretches     RMS of the differences of λ₁ and λ₂ {rms} over all frames, largest {largest}")
         first = [of for of, declared in zip("AB", facts["rest_declared"], strict=True) if not declared]
         if first:
             lines.append(f"                from the first frame of {' and of '.join(first)}, where no rest shape is given")
-    up_a, up_b = facts["up_axes"]
-    if up_a and up_b and up_a != up_b:
-        lines.append(f"  up axis       A is {up_a} up and B {up_b} up; B was turned to {up_a} up")
-        lines.append("                (with --up-axis both are taken as they are)")
-    for of, labels in zip("AB", facts["unmatched"], strict=True):
-        if labels:
-            few = ", ".join(f"{label:g}" for label in labels[:_SHOWN]) + (", …" if len(labels) > _SHOWN else "")
-            lines.append(f"  not compared  {len(labels)} of the frames of {of}, without a partner: {few}")
-    for of, excluded in zip("AB", facts["excluded"], strict=True):
-        lines += [f"  excluded      {of}: {one}" for one in excluded[:_SHOWN]]
-        if len(excluded) > _SHOWN:
-            lines.append(f"                {of}: {len(excluded) - _SHOWN} more, which --json names")
-    return "\n".join(lines)
-
-
-def _metres(value):
-    return f"{value:.4g} m"
-
-
-def _at(worst):
-    return f"{_metres(worst['value'])} in {_frame(worst)}"
-
-
-def _frame(worst):
-    a, b = worst["frame_a"], worst["frame_b"]
-    return f"frame {a:g} ({worst['time']:.4g} s)" if a == b else f"frames {a:g} and {b:g} ({worst['time']:.4g} s)"
+    return "\n".join([*lines, *left_out(facts)])

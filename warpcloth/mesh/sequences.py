@@ -20,6 +20,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable
+from collections.abc import Sequence as List
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -39,7 +40,8 @@ from .stage_mesh import StageMesh
 # Functions that open a sequence, by file ending: (path, prim, fps) → :class:`Sequence`. `usd` registers that of stages.
 OPENERS: dict[str, Callable[[FilePath, str | None, float | None], Any]] = {}
 _MOST_MISSING = 1_000_000
-_FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
+_CHANGES = "only 'compare --by surface' and open_capture take meshes that change from frame to frame"
+FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
 
 
 class HasPoints(Protocol):
@@ -101,27 +103,36 @@ class Sequence(ShownInNotebooks):
 
     @cached_property
     def missing(self) -> list[float]:
-        """Labels that are missing from the sequence.
-
-        The spacing is the smallest interval between labels. If another interval is not a multiple of it, nothing counts as
-        missing. Fractional time codes may be shutter samples within a frame, so nothing counts as missing either if more than
-        a third of their intervals, and more than one, would be gaps.
+        """Labels that are missing from the sequence; see `missing_labels`.
 
         Raises:
             ValueError: More than a million labels are missing.
         """
-        intervals = np.diff(self.labels)
-        spacing = intervals.min() if len(intervals) else 1
-        multiples = np.rint(intervals / spacing)
-        gaps = np.flatnonzero(multiples > 1)
-        uneven = np.abs(intervals / spacing - multiples) > 1e-6  # time codes have fewer than 10 digits, float64 has 16
-        if uneven.any() or (self.labels.dtype.kind == "f" and 3 * len(gaps) > max(3, len(intervals))):
-            return []
-        if (multiples[gaps] - 1.0).sum() > _MOST_MISSING:
-            first, last = self.labels[[gaps[0], gaps[0] + 1]].tolist()
-            where = "" if self.path is None else f"{self.path}: "
-            raise ValueError(f"{where}more than {_MOST_MISSING:,} frames are missing, from {first} to {last} and on")
-        return [(self.labels[gap] + k * spacing).item() for gap in gaps for k in range(1, int(multiples[gap]))]
+        return missing_labels(self.labels, self.path)
+
+
+def missing_labels(labels: np.ndarray, path: FilePath | None = None) -> list[float]:
+    """Returns the labels that are missing between ascending labels (F,).
+
+    The spacing is the smallest interval between labels. If another interval is not a multiple of it, nothing counts as missing.
+    Fractional time codes may be shutter samples within a frame, so nothing counts as missing either if more than a third of
+    their intervals, and more than one, would be gaps.
+
+    Raises:
+        ValueError: More than a million labels are missing. The message begins with ``path``, if it is given.
+    """
+    intervals = np.diff(labels)
+    spacing = intervals.min() if len(intervals) else 1
+    multiples = np.rint(intervals / spacing)
+    gaps = np.flatnonzero(multiples > 1)
+    uneven = np.abs(intervals / spacing - multiples) > 1e-6  # time codes have fewer than 10 digits, float64 has 16
+    if uneven.any() or (labels.dtype.kind == "f" and 3 * len(gaps) > max(3, len(intervals))):
+        return []
+    if (multiples[gaps] - 1.0).sum() > _MOST_MISSING:
+        first, last = labels[[gaps[0], gaps[0] + 1]].tolist()
+        where = "" if path is None else f"{path}: "
+        raise ValueError(f"{where}more than {_MOST_MISSING:,} frames are missing, from {first} to {last} and on")
+    return [(labels[gap] + k * spacing).item() for gap in gaps for k in range(1, int(multiples[gap]))]
 
 
 def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = None, mesh: Mesh | None = None) -> Sequence:
@@ -150,10 +161,8 @@ def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = N
         checks.number("fps", fps, above=0.0)
     if open_file := OPENERS.get(Path(path).suffix.lower()):
         return open_file(path, prim, fps)
-    if os.path.isdir(path):
-        return _open_files(path, sorted(Path(path).iterdir()), prim, fps)
-    if not os.path.exists(path) and glob.has_magic(path):
-        return _open_files(path, [Path(name) for name in sorted(glob.glob(path))], prim, fps)
+    if files := numbered_files(path):
+        return _open_files(path, *files, prim, fps)
     if not os.path.exists(path):
         raise FileNotFoundError(f"{path}: no such file or folder")
     try:
@@ -193,26 +202,40 @@ def as_sequence(mesh: Mesh, frames: ArrayLike | HasPoints, dt: float | None = No
     elif times is None:
         times = getattr(frames, "times", None)
     count, read, precision = _array("frames", getattr(frames, "points", frames), mesh)
-    given = dt * np.arange(count) if dt is not None else None if times is None else _increasing(times, count)
+    given = dt * np.arange(count) if dt is not None else None if times is None else increasing(times, count)
     return Sequence(mesh, np.arange(count), given, read, precision=precision, up_axis=mesh.up_axis)
 
 
-def _open_files(path, found, prim, fps):
+def numbered_files(path: FilePath, endings: List[str] = FRAME_ENDINGS) -> tuple[np.ndarray, list[Path]] | None:
+    """Returns the numbers (F,), ascending, and the paths of the mesh files of a folder or pattern; None if it is neither.
+
+    Args:
+        path: The folder or pattern.
+        endings: Endings that frames may have.
+
+    Raises:
+        ValueError: There are no such files, they are of several kinds, or a name has no number of its own.
+    """
+    path = os.fspath(path)
+    if os.path.isdir(path):
+        found = sorted(Path(path).iterdir())
+    elif not os.path.exists(path) and glob.has_magic(path):
+        found = [Path(name) for name in sorted(glob.glob(path))]
+    else:
+        return None
     paths = [file for file in found if file.suffix.lower() in ENDINGS and file.is_file() and file.name[0] != "."]
-    allowed = " ".join(_FRAME_ENDINGS)
-    endings = sorted({file.suffix.lower() for file in paths})
+    allowed = " ".join(endings)
+    kinds = sorted({file.suffix.lower() for file in paths})
     if not paths:
         raise ValueError(f"{path}: no mesh files there; they must end with {allowed}")
-    if len(endings) > 1:
+    if len(kinds) > 1:
+        raise ValueError(f'{path}: has files of several kinds, {" ".join(kinds)}; give a pattern of one, such as "*{kinds[0]}"')
+    if kinds[0] not in endings:
         raise ValueError(
-            f'{path}: has files of several kinds, {" ".join(endings)}; give a pattern of one, such as "*{endings[0]}"'
-        )
-    if endings[0] in WELDED:
-        raise ValueError(
-            f"{path}: {endings[0]} files repeat vertices, and which of them are one may change between frames; "
+            f"{path}: {kinds[0]} files repeat vertices, and which of them are one may change between frames; "
             f"the files must end with {allowed}"
         )
-    numbered = {}
+    numbered: dict[int, Path] = {}
     for file in paths:
         digits = re.findall(r"\d+", file.stem)
         if not digits:
@@ -225,7 +248,10 @@ def _open_files(path, found, prim, fps):
                 f"{file}: has number {int(digits[-1])}, the last in its name, as {other} has; each must be used once"
             )
     labels = np.array(sorted(numbered), dtype=np.int64)
-    paths = [numbered[label] for label in labels.tolist()]
+    return labels, [numbered[label] for label in labels.tolist()]
+
+
+def _open_files(path, labels, paths, prim, fps):
     points, triangles, st = read_arrays(paths[0], prim)
     try:
         mesh = Surface(points, triangles, texture_coordinates=st)
@@ -242,12 +268,12 @@ def _read_file(paths, prim, expected, count, frame):
     points, triangles, _ = read_arrays(path, prim)
     for name, here, there in (("vertices", len(points), count), ("triangles", len(triangles), len(expected))):
         if here != there:
-            raise ValueError(f"{path}: {here} {name}, must be {there} as in {paths[0]}")
+            raise ValueError(f"{path}: {here} {name}, must be {there} as in {paths[0]}; {_CHANGES}")
     differ = (triangles != expected).any(axis=1)
     if differ.any():
         row = int(np.argmax(differ))
         here, there = triangles[row].tolist(), expected[row].tolist()
-        raise ValueError(f"{path}: triangle {row} has vertices {here}, must be {there} as in {paths[0]}")
+        raise ValueError(f"{path}: triangle {row} has vertices {here}, must be {there} as in {paths[0]}; {_CHANGES}")
     return points
 
 
@@ -266,7 +292,7 @@ def _open_npz(path, fps):
         raise ValueError(f"points has shape {points.shape}; it must be (frames, vertices, 3), of one frame or more")
     mesh = Surface(points[0], triangles)
     count, read, precision = _array("points", points, mesh)
-    times = _even(count, fps) if times is None else _increasing(times, count)
+    times = _even(count, fps) if times is None else increasing(times, count)
     return Sequence(mesh, np.arange(count), times, read, path, declared=False, precision=precision, files=(path,))
 
 
@@ -344,7 +370,7 @@ def _even(count, fps):
     return None if fps is None else np.arange(count) / fps
 
 
-def _increasing(times, count):
+def increasing(times, count):
     times = checks.array("times", times, (count,))
     checks.refuse("times", times, np.diff(times, prepend=-np.inf) <= 0.0, "must be later than the one before")
     return times

@@ -209,7 +209,7 @@ def first_extended(points):
 def nearest_points(points, vertices, triangles):
     """The triangle nearest to each of points (k, 3), to within float32, (k,), and the weights (k, 3) of its nearest point."""
     faces = _nearest_faces(points, vertices, triangles)
-    return faces, _nearest_weights(points, vertices[triangles[faces]])
+    return faces, nearest_weights(points, vertices[triangles[faces]])
 
 
 @in_turn
@@ -224,7 +224,7 @@ def _nearest_faces(points, vertices, triangles):
         return out.numpy()
 
 
-def _nearest_weights(points, corners):
+def nearest_weights(points, corners):
     """Barycentric coordinates (k, 3) of the points of triangles (k, 3, 3) that are nearest to points (k, 3)."""
     a, b, c = corners.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
