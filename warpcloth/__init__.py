@@ -45,6 +45,7 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .run.equilibrium import equilibrium as equilibrium
     from .run.fit import Fit as Fit
     from .run.fit import fit as fit
+    from .run.readings import CapturePoints as CapturePoints
     from .run.readings import Markers as Markers
     from .run.readings import Reading as Reading
     from .run.simulate import Animation as Animation
@@ -100,6 +101,7 @@ _MODULES = {
     "equilibrium": "run.equilibrium",
     "Fit": "run.fit",
     "fit": "run.fit",
+    "CapturePoints": "run.readings",
     "Markers": "run.readings",
     "Reading": "run.readings",
     "Animation": "run.simulate",

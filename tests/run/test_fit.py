@@ -11,6 +11,7 @@ from scipy.stats import binomtest
 import warpcloth as wc
 from warpcloth.cli import main
 from warpcloth.lab.laboratory import drape_coefficient
+from warpcloth.lab.scans import scan, write_capture
 from warpcloth.scenes import catenary, chain, loop
 from warpcloth.scenes.hanging import scene as hanging
 
@@ -45,6 +46,49 @@ def test_it_finds_the_parameters_of_a_motion(device):
     found = wc.fit(sheet(1.0, 1.0), SOLVER, start, seen, device=device)
     assert found.parameters == pytest.approx(TRUE, rel=1e-6)
     assert found.residual < 1e-9 and found.runs < 15
+
+
+def captured(seed=0, noise=NOISE):
+    """A sheet as a scanner sees it: other triangles in each frame, noise, and 10 % of the area in holes."""
+    scene = sheet(*TRUE.values())
+    frames = np.concatenate([[scene.positions], motion(scene)])
+    return scan(scene.mesh, frames, 1 / scene.fps, 0.05, noise, 0.1, 0.08, seed=seed)
+
+
+def test_it_fits_a_capture_whose_triangles_change(tmp_path, capsys):
+    """By the distances along the normal. Both parameters are within 4 standard errors; the residual is the noise."""
+    start = {"Spring.stiffness": 300.0, "QuadraticBending.stiffness": 2e-4}
+    capture = captured()
+    assert len({len(capture[k].points) for k in range(3)}) == 3
+    found = wc.fit(sheet(1.0, 1.0), SOLVER, start, capture)
+    for name, value in TRUE.items():
+        assert 1e-4 < found.errors[name] < 0.1 and abs(np.log(found.parameters[name] / value)) < 4.0 * found.errors[name]
+    assert found.residual == pytest.approx(NOISE, rel=4.0 / np.sqrt(2.0 * found.freedom))
+    exact = wc.fit(sheet(1.0, 1.0), SOLVER, start, captured(noise=0.0))
+    assert exact.parameters == pytest.approx(TRUE, rel=1e-6)
+    # From files in millimetres, of fewer points, with errors that are larger accordingly.
+    write_capture(capture, tmp_path / "seen", scale=1e-3)
+    few = wc.CapturePoints(wc.open_capture(tmp_path / "seen", fps=60, scale=1e-3), points=40, sigma=NOISE)
+    fewer = wc.fit(sheet(1.0, 1.0), SOLVER, start, few)
+    assert fewer.errors["Spring.stiffness"] > 1.2 * found.errors["Spring.stiffness"] and fewer.freedom == np.inf
+    words = ["fit", "hanging", "-p", "n=4", "--capture", str(tmp_path / "seen"), "--start", "Spring.stiffness=700"]
+    for wrong, sentence in (
+        (words, "seen: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"),
+        ([*words, "--fps", "24", "--frames", "1"], "none at the time of a frame of the scene"),
+        ([*words, "--fps", "60", "--vertices", "corners"], "--vertices is given, and the vertices of --capture are not"),
+        (["fit", "hanging", "seen.npz", *words[4:]], "MEASURED and --capture are given; one of the three must be"),
+        (["fit", "hanging", "seen.npz", "--points", "3", *words[6:]], "--scale and --points are for --capture"),
+    ):
+        assert main(wrong) == 2 and sentence in capsys.readouterr().err, wrong
+
+
+def test_a_capture_of_a_rest_shape_gives_a_stiffness():
+    """Of a chain of triangles that hangs aslant, from the last frame; k is that of the equilibrium that was scanned."""
+    scene = sheet(40.0, 3e-4)
+    rest = wc.equilibrium(scene)
+    seen = scan(scene.mesh, np.array([scene.positions, rest.points]), 1.0, 0.05)
+    found = wc.fit(sheet(40.0, 1.0), None, {"QuadraticBending.stiffness": 2e-4}, seen)
+    assert found.parameters["QuadraticBending.stiffness"] == pytest.approx(3e-4, rel=1e-4)
 
 
 def expected_error():
@@ -241,9 +285,9 @@ def test_readings_on_the_command_line(capsys):
     assert main([*words, "--reading", "modulus=1500"]) == 0 and "its error is not known" in capsys.readouterr().out
     cantilever = ["fit", "cantilever", "--reading", "D=800", "--start"]
     for wrong, sentence in (
-        (words, "none of MEASURED and --reading is given; one of the two must be"),
+        (words, "none of MEASURED, --reading and --capture is given; one of the three must be"),
         ([*words, "seen.usdc", "--reading", "modulus=1"], "is not of the form name=value"),
-        (["fit", "strip", "seen.usdc", *cantilever[2:], "a=1"], "both of MEASURED and --reading is given"),
+        (["fit", "strip", "seen.usdc", *cantilever[2:], "a=1"], "MEASURED and --reading are given"),
         ([*words, "--reading", "module=1"], "--reading is 'module'; it must be one of 'modulus'"),
         ([*words, "--reading", "modulus=1+-0"], "reading.sigma is 0.0; it must be a finite number above 0"),
         ([*words, "--reading", "modulus=1", "--fps", "24"], "--prim and --fps are for animations, and --reading is given"),

@@ -35,7 +35,7 @@ def compare_by_surface(arguments, device):
     if arguments.plot:
         from ..chart import plot_surface_distances
 
-        plot_surface_distances(arguments.plot, found, (arguments.a, arguments.b))
+        plot_surface_distances(arguments.plot, found, (arguments.a, arguments.b), device)
     facts = _facts(arguments, found, each)
     if arguments.json:
         per_frame = {name: np.asarray(column).tolist() for name, column in columns.items()}

@@ -21,11 +21,15 @@ with the columns time, id, x, y, z [s, m]: rows at time 0 bind the markers to th
 Without the column id, rows are free points on the cloth. --start names the parameters and the values to start from. Errors are
 one standard deviation, relative to the value; intervals contain the true value with a probability of 95 %.
 
+--capture stands for MEASURED: a folder of meshes whose triangles may change from frame to frame, with noise and holes, as of a
+scanner. Its vertices are compared with the surface of the cloth, along the normal.
+
 --reading stands for MEASURED: numbers that the device of a laboratory reads from its sample at rest, in the units of 'warpcloth
 measure'. Each of several needs its standard deviation, NAME=VALUE+-DEVIATION; one without gives an estimate without an error.
 
   warpcloth fit hanging seen.usdc --start Spring.stiffness=300 QuadraticBending.stiffness=1e-4 --frames 30
   warpcloth fit hanging markers.csv --start QuadraticBending.stiffness=1e-4 --at-rest
+  warpcloth fit hanging --capture scan --fps 60 --scale 0.001 --start QuadraticBending.stiffness=1e-4 --frames 30
   warpcloth fit loop -p fabric=cotton --reading "depth of the loop=19+-0.2" --start PlateBending.stiffness=1e-5
 """
 
@@ -33,7 +37,14 @@ measure'. Each of several needs its standard deviation, NAME=VALUE+-DEVIATION; o
 def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
     add_scene(parser)
-    parser.add_argument("measured", nargs="?", metavar="MEASURED", help="the measured animation; without --reading")
+    parser.add_argument(
+        "measured", nargs="?", metavar="MEASURED", help="the measured animation; without --reading and --capture"
+    )
+    parser.add_argument("--capture", metavar="FOLDER", help="fit surfaces whose triangles may change: a folder of mesh files")
+    parser.add_argument("--scale", type=float, metavar="M", help="length of a unit of the files of --capture [m] (default: 1)")
+    parser.add_argument(
+        "--points", type=int, metavar="N", help="use at most N vertices of each frame of --capture (default: all)"
+    )
     parser.add_argument(
         "--reading",
         nargs="+",
@@ -80,6 +91,8 @@ def fit(arguments):
     setup = None if arguments.at_rest or read else solver_setup(arguments, scene, device)
     if read:
         seen = _readings(arguments.reading, start, scene)
+    elif arguments.capture:
+        seen = _captured(arguments, prim)
     else:
         seen = measured if _is_table(measured) else open_sequence(measured, prim, arguments.fps)
     options = {"device": device, "dtype": arguments.dtype, "record": ("reactions",) if read else ()}
@@ -88,7 +101,12 @@ def fit(arguments):
         from ..chart import plot_residuals
 
         plot_residuals(arguments.plot, found, scene.fps, str(device))
-    facts = {"scene": arguments.scene, "measured": measured, "readings": arguments.reading, "scene_parameters": values}
+    facts = {
+        "scene": arguments.scene,
+        "measured": measured or arguments.capture,
+        "readings": arguments.reading,
+        "scene_parameters": values,
+    }
     facts |= {"device": str(device), "dtype": arguments.dtype}
     facts |= solver_facts(arguments, setup, scene.fps) if setup else {"solver": None}
     facts |= {**asdict(found), "intervals": found.intervals}
@@ -100,17 +118,32 @@ def fit(arguments):
 def _check(arguments):
     """Checks that options go together."""
     measured, read = arguments.measured, arguments.reading
-    if bool(measured) == bool(read):
-        raise ValueError(f"{'both' if measured else 'none'} of MEASURED and --reading is given; one of the two must be")
+    given = [name for name, one in (("MEASURED", measured), ("--reading", read), ("--capture", arguments.capture)) if one]
+    if len(given) != 1:
+        said = f"{given[0]} and {given[1]} are" if given else "none of MEASURED, --reading and --capture is"
+        raise ValueError(f"{said} given; one of the three must be")
+    if not arguments.capture and (arguments.scale is not None or arguments.points is not None):
+        raise ValueError("--scale and --points are for --capture; leave them out")
+    if arguments.capture and arguments.vertices != "all":
+        raise ValueError("--vertices is given, and the vertices of --capture are not those of the scene; leave it out")
     kind = "--reading is given" if read else "MEASURED is a file of markers"
-    if (read or _is_table(measured)) and (arguments.prim or arguments.fps is not None):
+    if (read or (measured and _is_table(measured))) and (arguments.prim or arguments.fps is not None):
         raise ValueError(f"--prim and --fps are for animations, and {kind}; leave them out")
-    if arguments.at_rest and not read and not _is_table(measured):
-        raise ValueError("--at-rest is given, but MEASURED is an animation; it must be a .csv file of markers")
+    if arguments.at_rest and measured and not _is_table(measured):
+        raise ValueError("--at-rest is given, but MEASURED is an animation; it must be a .csv file of markers, or --capture")
     motion = arguments.solver or arguments.s or arguments.plot or arguments.frames is not None
     if motion and (arguments.at_rest or read):
         option = "--reading" if read else "--at-rest"
         raise ValueError(f"{option} is given with --solver, -s, --plot or --frames, which are for motions; leave them out")
+
+
+def _captured(arguments, prim):
+    """Returns the :class:`warpcloth.CapturePoints` of --capture."""
+    from ..mesh.captures import open_capture
+    from ..run.readings import CapturePoints
+
+    scale = 1.0 if arguments.scale is None else arguments.scale
+    return CapturePoints(open_capture(arguments.capture, prim, arguments.fps, scale), arguments.points)
 
 
 def _is_table(measured):

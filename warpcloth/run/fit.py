@@ -13,14 +13,16 @@ from numpy.typing import ArrayLike
 from ..analysis.compare import to_up_axis
 from ..base.checks import shown
 from ..base.types import FilePath, Precision
+from ..mesh.captures import Capture
 from ..mesh.selection import distinct_vertices
 from ..mesh.sequences import Sequence, open_sequence
 from ..scene.scene import Scene
 from ..solvers.step import Step
 from .equilibrium import Equilibrium, equilibrium
-from .readings import Markers, Reading, frames_at
+from .readings import CapturePoints, Markers, Reading, frames_at, no_common_frame
 from .simulate import Animation, simulate
 
+Measurement = Markers | Reading | CapturePoints
 _DIFFERENCE = 1e-3  # of the logarithm of a parameter, to both sides
 _TOLERANCE = 1e-8  # of the relative change of parameters and residuals
 _UNDETERMINED = 1e-5  # smallest ratio of a singular value of the Jacobian to the largest
@@ -36,8 +38,8 @@ class Fit:
             the noise is not known, because there is no sigma and no more numbers than parameters.
         correlation: Correlation of the logarithms of the parameters, (P, P); NaN where the data do not determine them.
         freedom: Degrees of freedom of the estimate of the noise; infinite if data have a sigma.
-        residual: RMS of the residuals: of positions along an axis [m], of free points to the cloth [m]; divided by sigma, where
-            it is given, so that it should be about 1.
+        residual: RMS of the residuals: of positions along an axis [m], of free points and captures to the cloth [m]; divided by
+            sigma, where it is given, so that it should be about 1.
         residuals: The same in each of the frames 1 … F, (F,), over markers; NaN in frames without any.
         runs: Number of batches that were run, or of sets of equilibria.
         message: How the fit ended.
@@ -71,7 +73,7 @@ def fit(
     scene: Scene,
     solver: Step | None,
     start: Mapping[str, float],
-    measured: ArrayLike | FilePath | Sequence | Markers | Reading | List[Markers | Reading],
+    measured: ArrayLike | FilePath | Sequence | Capture | Measurement | List[Measurement],
     vertices: str | ArrayLike = "all",
     device: str = "cpu",
     dtype: Precision = "float64",
@@ -90,11 +92,12 @@ def fit(
         scene: The :class:`warpcloth.Scene`.
         solver: Its solver, with steps so small that their error is below that of the measurement; None for the equilibrium.
         start: Parameters by their name in ``vary``, such as ``"Spring.stiffness"``, and values to start from, above 0.
-        measured: :class:`warpcloth.Markers`, :class:`warpcloth.Reading`, or a list of these, each with a sigma. Or, in short
-            for the markers ``vertices``, their positions at frames 1 … F of the scene, (F, v, 3) [m], NaN where there is none;
-            or an animation of v vertices: a path or a sequence that `open_sequence` takes or returns, with times from the start
-            of the scene on. Its frames at the times of frames of the scene are used. It is turned to the up axis of the mesh of
-            the scene. Or the path of a .csv file, see :meth:`warpcloth.Markers.read`.
+        measured: :class:`warpcloth.Markers`, :class:`warpcloth.Reading`, :class:`warpcloth.CapturePoints` or a list of these,
+            each with a sigma. Or a :class:`warpcloth.Capture`, in short for all its points. Or, in short for the markers
+            ``vertices``, their positions at frames 1 … F of the scene, (F, v, 3) [m], NaN where there is none; or an animation
+            of v vertices: a path or a sequence that `open_sequence` takes or returns, with times from the start of the scene
+            on. Its frames at the times of frames of the scene are used. It is turned to the up axis of the mesh of the scene.
+            Or the path of a .csv file, see :meth:`warpcloth.Markers.read`.
         vertices: The v vertices that were measured, indices or a selection, in their order in ``measured``.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
@@ -195,15 +198,18 @@ def _checked_names(start):
 
 def _bound_data(scene, measured, vertices, most, resting):
     """Returns the residuals of each of the data on a scene of ``most`` frames, or at rest."""
-    if isinstance(measured, (Markers, Reading)):
+    if isinstance(measured, Capture):
+        measured = CapturePoints(measured)
+    kinds = (Markers, Reading, CapturePoints)
+    if isinstance(measured, kinds):
         measured = [measured]
-    if isinstance(measured, List) and measured and all(isinstance(each, (Markers, Reading)) for each in measured):
+    if isinstance(measured, List) and measured and all(isinstance(each, kinds) for each in measured):
         if not (isinstance(vertices, str) and vertices == "all"):
             raise ValueError(f"vertices is {shown(vertices)}; it is for animations and arrays; leave it out")
         named = [(f"measured[{k}]", each) for k, each in enumerate(measured)]
     else:
         named = [("measured", _of_vertices(scene, measured, vertices, resting))]
-    data = [each.bind(name, scene, most) for name, each in named]
+    data = [each.bind(name, scene, most, resting) for name, each in named]
     for (name, _), each in zip(named, data, strict=True):
         if not len(each.frames):
             raise ValueError(f"{name} has 0 numbers; it must have at least 1 that is finite")
@@ -238,10 +244,7 @@ def _positions(scene, measured, count):
     frames, used = frames_at(sequence.times, scene)
     used = np.flatnonzero(used & (frames >= 1))
     if not len(used):
-        raise ValueError(
-            f"{where}: has {len(frames)} frames from {sequence.times[0]:g} to {sequence.times[-1]:g} s, none at the time of a "
-            f"frame of the scene; it must have one at a multiple of 1/{scene.fps:g} s, up to {scene.frames / scene.fps:g} s"
-        )
+        raise ValueError(no_common_frame(str(where), sequence.times, scene))
     positions = np.full((frames[used].max(), count, 3), np.nan)
     for index in used:
         positions[frames[index] - 1] = sequence[index]

@@ -1,4 +1,4 @@
-"""Measurements to which :func:`warpcloth.fit` fits parameters: points on the cloth, and numbers read from it."""
+"""Measurements to which :func:`warpcloth.fit` fits parameters: points on the cloth, captures, and numbers read from it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import array, number, numeric, refuse
+from ..analysis.surface_comparison import capture_to_up_axis, solid_triangles
+from ..base.checks import array, number, numeric, refuse, shown, whole
 from ..base.tables import number_in, read_table
 from ..base.types import FilePath
+from ..mesh.captures import Capture
 from ..mesh.selection import distinct_vertices
 from ..scene.mesh_collider import nearest_points
 from ..scene.scene import Scene
@@ -134,8 +136,8 @@ class Markers:
             bound = {"triangles": triangles, "weights": weights}
         return Markers(positions=positions, sigma=sigma, **bound)
 
-    def bind(self, name: str, scene: Scene, most: int) -> _Seen:
-        """Returns the residuals of these markers on a scene, in at most ``most`` frames.
+    def bind(self, name: str, scene: Scene, most: int, resting: bool = False) -> _Seen:
+        """Returns the residuals of these markers on a scene, in at most ``most`` frames, or at rest.
 
         Raises:
             ValueError: Something does not fit the scene. The message begins with ``name``.
@@ -156,6 +158,69 @@ class Markers:
                 f"{name} has shape {seen.shape}; it must be (F, {count}, 3) with F from 1 to {most}, the frames of the scene"
             )
         return _Seen(seen, chosen, scene.mesh.triangles, self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class CapturePoints:
+    """Vertices of a capture, whose triangles may change from frame to frame, as free points on the cloth.
+
+    Each residual is the distance of a vertex from the nearest triangle of the cloth, along the normal of that triangle. The
+    nearest triangles are found again for all parameters in question, and are held while these are varied. What the cloth has in
+    a hole of the capture is not compared. Motion along the surface, as of flat cloth that stretches, is not seen.
+
+    Attributes:
+        capture: The :class:`warpcloth.Capture`, with times from the start of the scene on. Its frames at the times of frames of
+            the scene are used, but that at the start. At rest the last frame counts. It is turned to the up axis of the mesh of
+            the scene. Vertices that are not finite, or in no triangle with finite corners, are left out.
+        points: Largest number of vertices of a frame, which are then every second, third and so on; None takes all.
+        sigma: Standard deviation of the error along the normal [m]; None if it is not known. Errors of vertices count as
+            independent.
+
+    Raises:
+        ValueError: A value is not allowed.
+    """
+
+    capture: Capture
+    points: int | None = None
+    sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.capture, Capture):
+            raise ValueError(
+                f"capture_points.capture is {shown(self.capture)}; it must be a Capture, such as open_capture(path)"
+            )
+        if self.points is not None:
+            whole("capture_points.points", self.points, least=1)
+        if self.sigma is not None:
+            number("capture_points.sigma", self.sigma, above=0.0)
+
+    def bind(self, name: str, scene: Scene, _most: int, resting: bool = False) -> _OnSurface:
+        """Returns the residuals of these points on a scene.
+
+        Raises:
+            ValueError: The capture has no times, or no frame at the time of a frame of the scene. The message begins with its
+                path, or ``name``.
+        """
+        _refuse_no_triangles(name, scene)
+        capture = capture_to_up_axis(self.capture, scene.mesh.up_axis, self.capture.up_axis)
+        where = name if capture.path is None else str(capture.path)
+        if resting:
+            return _OnSurface({0: self._vertices(capture[len(capture) - 1])}, scene.mesh.triangles, self.sigma)
+        if capture.times is None:
+            raise ValueError(
+                f"{where}: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"
+            )
+        frames, used = frames_at(capture.times, scene)
+        used &= frames >= 1
+        if not used.any():
+            raise ValueError(no_common_frame(where, capture.times, scene))
+        seen = {int(frames[k]) - 1: self._vertices(capture[int(k)]) for k in np.flatnonzero(used)}
+        return _OnSurface(seen, scene.mesh.triangles, self.sigma)
+
+    def _vertices(self, surface):
+        used = np.unique(solid_triangles(surface))
+        every = 1 if self.points is None else -(-len(used) // self.points)
+        return surface.points[used[::every]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +252,7 @@ class Reading:
                 raise ValueError(f"reading.sigma has shape {sigma.shape}; it must be one number, or have shape {value.shape}")
             refuse("reading.sigma", sigma, ~((sigma > 0.0) & np.isfinite(sigma)), "must be a finite number above 0")
 
-    def bind(self, name: str, _scene: Scene, _most: int) -> _Read:
+    def bind(self, name: str, _scene: Scene, _most: int, _resting: bool = False) -> _Read:
         """Returns the residuals of this reading. Errors begin with ``name``."""
         return _Read(name, self)
 
@@ -224,12 +289,33 @@ class _Seen:
             away = seen - _at(chosen, triangles, points[0][frame])
             size = np.linalg.norm(away, axis=1)
             corners = points[0][frame][triangles[chosen[0]]]
-            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+            normal = _normals(corners)
             # On the cloth itself, or above it by rounding, the direction to it is the normal.
             near = size <= 1e-12 * np.abs(corners).max()
             direction = np.where(near[:, None], normal, away / np.where(near, 1.0, size)[:, None])
             found.append([np.einsum("ki,ki->k", seen - _at(chosen, triangles, each[frame]), direction) for each in points])
+        return np.concatenate(found, axis=1)
+
+
+class _OnSurface:
+    """Residuals of points of captures, by frame; see :class:`_Seen`."""
+
+    def __init__(self, seen, triangles, sigma):
+        self._seen = {frame: points for frame, points in sorted(seen.items()) if len(points)}
+        self._triangles, self.sigma = triangles, sigma
+        self.last = max(self._seen, default=0) + 1
+        numbers = [np.full(len(points), frame) for frame, points in self._seen.items()]
+        self.frames = np.concatenate([np.empty(0, dtype=int), *numbers])
+
+    def residuals(self, runs):
+        triangles = self._triangles
+        points = [np.asarray(run.points, dtype=np.float64) for run in runs]
+        points = [each[None] if each.ndim == 2 else each[1:] for each in points]
+        found = []
+        for frame, seen in self._seen.items():
+            chosen = nearest_points(seen, points[0][frame], triangles)
+            normal = _normals(points[0][frame][triangles[chosen[0]]])
+            found.append([np.einsum("ki,ki->k", seen - _at(chosen, triangles, each[frame]), normal) for each in points])
         return np.concatenate(found, axis=1)
 
 
@@ -257,6 +343,20 @@ class _Read:
         return np.array([array(f"{self._name}.function", each, self._value.shape) - self._value for each in read])[
             :, self._known
         ]
+
+
+def no_common_frame(where: str, times: np.ndarray, scene: Scene) -> str:
+    """Returns the sentence that no frame of an animation with these times is at that of a frame of a scene."""
+    return (
+        f"{where}: has {len(times)} frames from {times[0]:g} to {times[-1]:g} s, none at the time of a frame of the scene; it "
+        f"must have one at a multiple of 1/{scene.fps:g} s, up to {scene.frames / scene.fps:g} s"
+    )
+
+
+def _normals(corners):
+    """Unit normals (k, 3) of triangles with corners (k, 3, 3); 0 without area."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
 
 
 def _at(chosen, triangles, points):
