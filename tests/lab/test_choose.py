@@ -7,16 +7,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from warpcloth.chart.cheapest import text_of_cell
 from warpcloth.cli import main
 from warpcloth.cli.choose import command_line
-from warpcloth.lab import campaign, trajectory
+from warpcloth.lab import campaign, choosing, trajectory
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.cheapest import cheapest_of_each
-from warpcloth.lab.choosing import Measured, choose, climb, climb_others, ladders, ladders_of_others, pick
+from warpcloth.lab.choosing import Measured, choose, climb, climb_others, ladders, ladders_of_others, pick, run_limit
 from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.reference import Reference
 from warpcloth.lab.setups import grid_in_words
 
 # hanging, 64 × 64 vertices: error and ms a frame, with quartiles, of ladders from coarse to fine.
@@ -176,6 +178,23 @@ def test_ladders_are_of_one_method_each_and_go_on():
     (by_error, by_steps) = ladders([Setup("newton", {"error": e}) for e in (1e-4, 1e-3)] + [Setup("newton", {"substeps": 4})])
     assert [setup.options["error"] for setup in by_error] == pytest.approx([1e-3, 1e-4, 2.5e-5, 6.25e-6, 1.5625e-6])
     assert [setup.options for setup in by_steps] == [{"substeps": n} for n in (4, 8, 16, 32)]
+
+
+def test_runs_end_soon_after_the_cheapest_that_meets_it():
+    """20 frames of 10 ms, three times and 1 s, are 1.6 s: a limit of 60 s is halved five times, one of 1 s is kept."""
+    assert [run_limit(60.0, 20, meeting) for meeting in ([], [50.0, 10.0], [1e5])] == [60.0, 1.875, 60.0]
+    assert run_limit(1.0, 20, [10.0]) == 1.0
+
+
+@pytest.mark.parametrize(("limit", "why"), [(np.inf, "smaller steps make it no less"), (300.0, "halved for 300 s")])
+def test_nothing_is_measured_if_the_reference_cannot_tell(limit, why, monkeypatch):
+    points = np.zeros((5, 2, 3))
+    facts = {"strain_error": 0.0, "substeps": 64, "seconds": 1.0, "path": "", "key": "", "scene": "", "method": "Newton"}
+    exact = Reference(points=points, times=np.arange(5.0), error=0.02, limit=limit, **facts)
+    monkeypatch.setattr(choosing, "reference", lambda *given, **options: exact)
+    choice, found, _ = choose(SceneRef("chain", {"links": 3}), 0.01, solvers=["newton"], frames=4, store=Store())
+    assert (choice.chosen, choice.meets, found) == (None, False, []) and choice.untried > 0
+    assert "is known to 2% only (Newton, 64 substeps" in choice.certainty and why in choice.certainty
 
 
 SCENES = [

@@ -123,7 +123,7 @@ def _text(facts, choice, found, exact, advise):
 
     measured = f"{facts['scene']}: {len(found)} settings measured over {len(exact.points) - 1} frames"
     lines = [f"{measured}; the reference is known to {percent(exact.error)}"]
-    width = max(len(str(each.setup)) for each in found)
+    width = max((len(str(each.setup)) for each in found), default=0)
     for each in sorted(found, key=lambda each: (each.milliseconds is None, each.milliseconds or 0.0)):
         name = str(each.setup).ljust(width)
         if each.error is None or each.milliseconds is None:
@@ -139,6 +139,8 @@ def _text(facts, choice, found, exact, advise):
         lines.append(f"  {solver}: own motion {words_of_own(own if 'error' in own else None)}")
         lines.append(f"  {solver}: {own['searched']}; substeps × iterations: {grid_in_words(same)}")
     lines += [f"  measured on {name}" for name in dict.fromkeys(each.machine for each in found)]
+    if choice.untried and found:
+        lines.append(f"{choice.untried} settings were not tried: coarser ones of their solvers meet it, cost more or fail")
     lines.append(choice.certainty)
     lines.append(f"errors are those on this mesh; whether a finer mesh, air or anisotropy matters: {advise}")
     return "\n".join([*lines, *([facts["command"]] if facts["command"] else [])])

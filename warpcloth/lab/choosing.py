@@ -22,10 +22,12 @@ _MORE = 3
 # Ladders of a solver of another simulator: number of doublings, and number of doublings of its most iterations. The settings
 # of one such solver, and its own reference, may each take this number of time limits.
 _DOUBLINGS, _BEYOND, LIMITS = 10, 2, 6.0
-# Time limit of the reference [s].
-_LONGEST = 600.0
 # The reference must be more accurate than the tolerance by this factor.
 FINER = 5.0
+# The reference may take so many times the limit of one run.
+_REFERENCE = 5.0
+# A run ends after so many times the frames of the cheapest setting that meets the tolerance, and so many seconds.
+_DEARER, _START = 3.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ class Choice:
         certainty: A sentence about the certainty of the choice.
         others: By solver of another simulator, the :func:`warpcloth.lab.own_reference.own_facts` of its own motion, if there is
             one, and ``searched``, how its search ended.
+        untried: Number of settings that :func:`climb` left out.
     """
 
     chosen: Measured | None
@@ -77,6 +80,7 @@ class Choice:
     rivals: list
     certainty: str
     others: dict = field(default_factory=dict)
+    untried: int = 0
 
 
 def pick(measurements, tolerance=None, budget=None, floor=0.0):
@@ -139,6 +143,7 @@ def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=Non
         tuple: The :class:`Choice` and the list of all :class:`Measured`.
     """
     left, found = [list(ladder) for ladder in ladders if ladder], []
+    settings = sum(map(len, left))
     while left:
         round_ = measure([ladder.pop(0) for ladder in left])
         found += round_
@@ -147,7 +152,7 @@ def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=Non
         meeting = [each.milliseconds for each in found if _meets(each, tolerance, floor)]
         most = min([*meeting, float("inf") if budget is None else budget])
         left = [ladder for ladder, last in zip(left, round_, strict=True) if ladder and not _ends(last, tolerance, floor, most)]
-    return pick(found, tolerance, budget, floor), found
+    return replace(pick(found, tolerance, budget, floor), untried=settings - len(found)), found
 
 
 def climb_others(ladders, measure, tolerance=None, budget=None, floor=0.0, seconds=float("inf")):
@@ -227,6 +232,9 @@ def choose(
 ):
     """Measures setups of a scene until the choice is clear, on this machine or, with an executor, on its workers.
 
+    The reference may take five times the limit of one run. If it is not known to the tolerance, nothing is measured, because
+    nothing could be said to meet it. Runs of warpcloth end at three times the time of its cheapest setting that meets it.
+
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
         tolerance: As for :func:`pick`.
@@ -258,22 +266,28 @@ def choose(
     run = run if "store" in run else {"store": kept_store("trajectories", run.get("executor")), **run}
     setups = setups_of_runs(scene, solvers, device, dtype, others)
     rivals = [setup for setup in setups if simulator_of(setup.solver)]
-    setups = [setup for setup in setups if not simulator_of(setup.solver)]
-    given = {"limit": min(_LONGEST, total / 3.0)} | ({} if tolerance is None else {"tolerance": tolerance / FINER})
+    rungs = ladders([setup for setup in setups if not simulator_of(setup.solver)])
+    given = {"limit": min(_REFERENCE * limit, total / 3.0)} | ({} if tolerance is None else {"tolerance": tolerance / FINER})
     exact = reference(scene, frames, device=device, **given)
-    bound, own = SHARE * (tolerance or WITHIN), {}
+    if tolerance is not None and exact.error >= tolerance:
+        return Choice(None, False, [], _unknown(exact, tolerance), untried=sum(map(len, rungs))), [], exact
+    bound, own, meeting = SHARE * (tolerance or WITHIN), {}, []
 
     def measure(setups):
         if time.perf_counter() - began > total:
             return [Measured(setup, None, None, reason="not measured", final=True, status="left") for setup in setups]
+        most = run_limit(limit, len(exact.points) - 1, meeting)
         tasks = [
             task(trajectory.measure, scene=scene, setup=setup, frames=frames, reference=str(exact.path), device=str(device),
-                 dtype=dtype, limit=limit, clock=clock, **of_own(own.get(setup.solver), bound))
+                 dtype=dtype, limit=limit if simulator_of(setup.solver) else most, clock=clock,
+                 **of_own(own.get(setup.solver), bound))
             for setup in setups
         ]  # fmt: skip
-        return [measured(setup, *found) for setup, found in zip(setups, collect(tasks, "trajectories", **run), strict=True)]
+        found = [measured(setup, *each) for setup, each in zip(setups, collect(tasks, "trajectories", **run), strict=True)]
+        meeting.extend(each.milliseconds for each in found if _meets(each, tolerance, exact.error))
+        return found
 
-    choice, found = climb(ladders(setups), measure, tolerance, budget, exact.error)
+    choice, found = climb(rungs, measure, tolerance, budget, exact.error)
     if not rivals:
         return choice, found, exact
     seconds = min(LIMITS * limit, total / 3.0 / len({setup.solver for setup in rivals}))
@@ -281,7 +295,23 @@ def choose(
     more, ended = climb_others(ladders_of_others(rivals), measure, tolerance, budget, exact.error, seconds)
     found, mesh = found + more, scene.load().mesh
     facts = {name: (own_facts(own[name], exact, mesh, bound) or {}) | {"searched": why} for name, why in ended.items()}
-    return replace(pick(found, tolerance, budget, exact.error), others=facts), found, exact
+    return replace(pick(found, tolerance, budget, exact.error), others=facts, untried=choice.untried), found, exact
+
+
+def run_limit(limit, frames, meeting):
+    """Returns the time limit of a run [s]: ``limit`` halved as often as leaves enough for a setting that may be chosen.
+
+    Halves, so that stored measurements are found again where times differ a little.
+
+    Args:
+        limit: The limit that is given [s].
+        frames: Number of frames.
+        meeting: Times of a frame of settings that meet the tolerance [ms].
+    """
+    if not meeting:
+        return limit
+    enough = _START + _DEARER * 1e-3 * min(meeting) * frames
+    return limit / 2 ** max(0, math.floor(math.log2(limit / enough)))
 
 
 def ladders(setups):
@@ -323,7 +353,7 @@ def as_json(choice, found, exact):
     rows = [asdict(each) | {"label": str(each.setup)} for each in found]
     chosen = None if choice.chosen is None else asdict(choice.chosen)
     facts = {"chosen": chosen, "meets": choice.meets, "certainty": choice.certainty, "others": choice.others}
-    facts["rivals"] = [str(each.setup) for each in choice.rivals]
+    facts |= {"rivals": [str(each.setup) for each in choice.rivals], "untried": choice.untried}
     return facts | {"reference_error": exact.error, "reference": str(exact.path), "measured": rows}
 
 
@@ -353,6 +383,13 @@ def _certainty(chosen, rivals, tolerance, floor):
         return f"{margin}{known}; nothing else that meets it is as cheap"
     names = ", ".join(f"{each.setup} ({each.milliseconds:.3g} ms)" for each in rivals[:3])
     return f"{margin}{known}; within the spread of the times as cheap: {names}"
+
+
+def _unknown(exact, tolerance):
+    """Returns a sentence that says why nothing is known to meet the tolerance."""
+    why = "smaller steps make it no less" if exact.limit == math.inf else f"its steps were halved for {exact.limit:g} s"
+    known = f"the reference is known to {percent(exact.error)} only ({exact.method}, {exact.substeps} substeps; {why})"
+    return f"{known}, so nothing can be said to meet {percent(tolerance)}"
 
 
 def percent(share):
