@@ -144,6 +144,19 @@ def test_measures_are_those_of_an_analysis(stage, tmp_path):
     ) == pytest.approx((0.9, 1.1))
 
 
+def test_of_several_cloths_one_is_measured_by_its_name(tmp_path):
+    moved = "0: [(0, 0, 0), (1, 0, 0), (0, 1, 0)], 1: [(0, 0, 1), (1, 0, 1), (0, 1, 1)]"
+    points = f"point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]\npoint3f[] points.timeSamples = {{{moved}}}"
+    sheet = f'def Mesh "Sheet" {{\nint[] faceVertexCounts = [3]\nint[] faceVertexIndices = [0, 1, 2]\n{points}\n}}\n'
+    rope = f'def BasisCurves "Rope" {{\nuniform token type = "linear"\nint[] curveVertexCounts = [3]\n{points}\n}}\n'
+    for others, named in (("", 2), (sheet.replace("Sheet", "Other"), 0), (rope, 0)):
+        (tmp_path / "cloths.usda").write_text(f'#usda 1.0\n(upAxis = "Z")\n{sheet}{others}')
+        for prim, count in ((None, named), ("Sheet", 2)):
+            wc.view(tmp_path / "cloths.usda", tmp_path / "a.html", prim=prim)
+            data = data_of((tmp_path / "a.html").read_text())
+            assert (len(data["measures"]), data["up"], len(data["shapes"])) == (count, "Z", 1 + bool(others))
+
+
 def test_values_of_ones_own(tmp_path):
     values = {"height [m]": POINTS[..., 1]}
     wc.view(POINTS, tmp_path / "a.html", mesh=MESH, colours=values)

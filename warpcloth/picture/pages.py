@@ -200,8 +200,8 @@ def _chosen(subject, frames, every):
 def _values(subject, colours, rest=None, measuring=None, device="cpu"):
     """Returns the values by which a page can colour a subject."""
     if colours is None:
-        cloths = [shape for shape in subject.shapes if len(shape.triangles) and tuple(shape.colour) == CLOTH]
-        can = len(cloths) == 1 and len(subject) > 1 and importlib.util.find_spec("matplotlib")
+        cloths = [shape for shape in subject.shapes if tuple(shape.colour) == CLOTH]
+        can = len(cloths) == 1 and len(cloths[0].triangles) and len(subject) > 1 and importlib.util.find_spec("matplotlib")
         colours = USUAL if can else ()
     if isinstance(colours, Mapping):
         if measuring:
