@@ -27,6 +27,8 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .deformation.arap import Arap as Arap
     from .deformation.deform import Deformation as Deformation
     from .deformation.deform import deform as deform
+    from .deformation.registration import Resampled as Resampled
+    from .deformation.registration import resample as resample
     from .lab.laboratory import laboratory_readings as laboratory_readings
     from .mesh import ordering as ordering
     from .mesh.captures import Capture as Capture
@@ -83,6 +85,8 @@ _MODULES = {
     "Arap": "deformation.arap",
     "Deformation": "deformation.deform",
     "deform": "deformation.deform",
+    "Resampled": "deformation.registration",
+    "resample": "deformation.registration",
     "laboratory_readings": "lab.laboratory",
     "ordering": "mesh",
     "Capture": "mesh.captures",

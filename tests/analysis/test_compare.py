@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 import warpcloth as wc
-from warpcloth.analysis.distances import surface_distances
 from warpcloth.cli import main
+from warpcloth.mesh.distances import surface_distances
 from warpcloth.mesh.mesh import Surface
 from warpcloth.mesh.sequences import Sequence, as_sequence
 from warpcloth.usd import AnimationWriter

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from warpcloth.analysis.distances import surface_distances
 from warpcloth.core.capture import Segment
+from warpcloth.mesh.distances import surface_distances
 from warpcloth.scenes import hanging
 from warpcloth.solvers.explicit import step_limits
 

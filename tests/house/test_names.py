@@ -15,7 +15,7 @@ MODULES = {
     "fit": "the command of warpcloth.run.fit",
     "render": "the command of warpcloth.picture.render",
     "stability": "the command of warpcloth.lab.stability",
-    "distances": "the pictures of warpcloth.analysis.distances",
+    "distances": "the pictures of warpcloth.mesh.distances",
     "failures": "the pictures of warpcloth.lab.failures",
     "panels": "the pictures of warpcloth.lab.panels",
     "cheapest": "the pictures of warpcloth.lab.cheapest",
@@ -27,7 +27,7 @@ MODULES = {
 # Classes and functions that mean one thing in several modules, and why.
 NAMES = {
     "add_arguments": "each command declares its own",
-    "analyze compare deform choose fit render view": "the command and what it calls",
+    "analyze compare deform choose fit render view resample": "the command and what it calls",
     "measure tasks": "each file of the laboratory has its measurement and the list of them; a term has its rest measure",
     "write_csv": "each table has one",
     "run": "runs what it is given",

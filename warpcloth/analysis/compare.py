@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import choice, number, shown, whole
 from ..base.types import FilePath, Progress, UpAxis
+from ..mesh.distances import surface_distances
 from ..mesh.mesh import UP_AXES, Mesh, areas_of, same_topology
 from ..mesh.sequences import HasPoints, Sequence, as_sequence, open_sequence
-from .distances import surface_distances
 from .measures import MEASURES
 from .samples import Exclusion
 from .surfaces import Triangles

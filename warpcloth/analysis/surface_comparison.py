@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import number, shown, whole
 from ..base.types import FilePath, Progress, UpAxis
-from ..mesh.captures import Capture, as_capture, open_capture
+from ..mesh.captures import Capture, as_capture, open_capture, solid_triangles
+from ..mesh.distances import Boundary, nearest_on_surface, surface_samples
 from ..mesh.mesh import Mesh, Surface, areas_of
 from ..mesh.sequences import HasPoints, Sequence, as_sequence
 from .compare import longest_side, matching, turned_up, up_axis_of, whole_frame
-from .distances import Boundary, nearest_on_surface, surface_samples
 from .samples import Exclusion
 
 Captured = FilePath | Capture | Sequence | tuple[Mesh, ArrayLike | HasPoints] | Iterable[Mesh]
@@ -101,7 +101,7 @@ def compare_surfaces(
 ) -> SurfaceComparison:
     """Compares the surfaces of two animations at the times that both have; the triangles of each may change.
 
-    Means are over the area, by `analysis.distances.surface_samples`. If the vertices of a have independent errors with
+    Means are over the area, by `mesh.distances.surface_samples`. If the vertices of a have independent errors with
     the standard deviation σ along the normal, the RMS from a, over its area, is σ/√2, as errors partly cancel within triangles.
 
     Args:
@@ -194,11 +194,6 @@ def capture_to_up_axis(b: Capture, axis_a: UpAxis | None, axis_b: UpAxis | None)
         return Surface(turned_up(surface.points, axis_a), surface.triangles)
 
     return replace(b, read=read)
-
-
-def solid_triangles(surface: Surface) -> np.ndarray:
-    """Returns the triangles (T, 3) of a surface whose corners are all finite."""
-    return surface.triangles[np.isfinite(surface.points).all(axis=1)[surface.triangles].all(axis=1)]
 
 
 def _measured(a, b, labels, excluded, samples, device):

@@ -36,6 +36,7 @@ from . import (
     measure,
     options,
     render,
+    resample,
     run,
     scenes,
     view,
@@ -154,6 +155,9 @@ def _parser():
     analyze.add_arguments(analyzes)
     compares = add("compare", compare.compare, "Measure the distance between two animations.", epilog=compare.EPILOG)
     compare.add_arguments(compares)
+    text = "Move a mesh onto each frame of a capture, so that its triangles stay."
+    resamples = add("resample", resample.resample, text, epilog=resample.EPILOG)
+    resample.add_arguments(resamples)
     measures = add("measure", measure.measure, "Read what a device of a textile laboratory measures.", epilog=measure.EPILOG)
     options.add_scene(measures)
     measure.add_arguments(measures)
@@ -205,7 +209,21 @@ def _parser():
     runs.add_argument(
         "--frames", type=int, metavar="N", help="number of frames after the start (default: those of the scene's duration)"
     )
-    for sub in (runs, infos, deforms, analyzes, compares, measures, checks, renders, views, chooses, benches, fitted):
+    for sub in (
+        runs,
+        infos,
+        deforms,
+        analyzes,
+        compares,
+        resamples,
+        measures,
+        checks,
+        renders,
+        views,
+        chooses,
+        benches,
+        fitted,
+    ):
         if sub is not checks:
             sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
@@ -214,14 +232,14 @@ def _parser():
     for sub in (runs, infos, deforms, analyzes, chooses, benches, fitted):
         default = "float64" if sub in (deforms, analyzes, fitted) else "float32"
         sub.add_argument("--dtype", choices=DTYPES, default=default, help=f"precision (default: {default})")
-    for sub in (runs, deforms):
+    for sub in (runs, deforms, resamples):
         text = "the .usd, .usda, .usdc or .usdz file to write"
         text += (
             ""
-            if sub is deforms
+            if sub is not runs
             else " (default: named after the scene, such as hanging.usdc; an existing file is then not replaced)"
         )
-        sub.add_argument("-o", "--output", required=sub is deforms, metavar="FILE", help=text)
+        sub.add_argument("-o", "--output", required=sub is not runs, metavar="FILE", help=text)
     runs.add_argument("--film", metavar="FILE", help="also draw the run as a film, .mp4, .webp or .gif; see 'warpcloth render'")
     runs.add_argument("--csv", metavar="FILE", help="also write a table of energies and forces, one row per frame")
     runs.add_argument("--report", metavar="FILE", help="also write energies, forces and the reaction of each pin as JSON")
@@ -230,7 +248,7 @@ def _parser():
         action="store_true",
         help="continue the interrupted run to this output from its last checkpoint; there is one every ten frames",
     )
-    for sub in (runs, deforms, analyzes, checks):
+    for sub in (runs, deforms, resamples, analyzes, checks):
         sub.add_argument("--single-file", action="store_true", help="write one file instead of a file and a folder of frames")
     lists = add("fabrics", fabrics.fabrics, "List measured fabrics, their moduli, bending lengths and sources.")
     text = "list those of a file instead: .json of ARCSim, or a .csv table of KES-F or FAST measurements"

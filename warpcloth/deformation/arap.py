@@ -142,7 +142,7 @@ class Arap:
         n = len(mesh.points)
         f = n - len(self.handles)
 
-        pairs, w = _edge_weights(mesh, weights)
+        pairs, w = edge_weights(mesh, weights)
         self.negative_edges = pairs[w < -_ROUNDING * np.abs(w).max(initial=0.0)]
         if len(self.negative_edges) and not rims:
             others = "" if weights == "intrinsic" else 'weights = "intrinsic" do inside the mesh, '
@@ -363,7 +363,7 @@ def _half_cotangents(mesh):
     return 0.5 * np.einsum("tki,tki->tk", one, other) / np.linalg.norm(np.cross(one, other), axis=2)
 
 
-def _edge_weights(mesh, weights):
+def edge_weights(mesh, weights):
     """Returns edges (E, 2) and their weights (E,)."""
     from scipy.sparse import coo_matrix, triu
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..analysis.distances import surface_distances
 from ..base.checks import number, whole
+from ..mesh.distances import surface_distances
 from ..run.simulate import simulate
 from ..terms.woven import Woven
 

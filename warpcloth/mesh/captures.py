@@ -132,3 +132,8 @@ def as_capture(frames: Sequence | Iterable[Mesh], dt: float | None = None, times
     given = dt * np.arange(len(meshes)) if dt is not None else given
     surfaces = [Surface(mesh.points, mesh.triangles) for mesh in meshes]
     return Capture(np.arange(len(meshes)), given, surfaces.__getitem__, up_axis=meshes[0].up_axis)
+
+
+def solid_triangles(surface: Surface) -> np.ndarray:
+    """Returns the triangles (T, 3) of a surface whose corners are all finite."""
+    return surface.triangles[np.isfinite(surface.points).all(axis=1)[surface.triangles].all(axis=1)]

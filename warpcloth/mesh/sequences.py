@@ -40,7 +40,10 @@ from .stage_mesh import StageMesh
 # Functions that open a sequence, by file ending: (path, prim, fps) → :class:`Sequence`. `usd` registers that of stages.
 OPENERS: dict[str, Callable[[FilePath, str | None, float | None], Any]] = {}
 _MOST_MISSING = 1_000_000
-_CHANGES = "only 'compare --by surface' and open_capture take meshes that change from frame to frame"
+_CHANGES = (
+    "meshes that change from frame to frame are captures: 'compare --by surface' and 'fit --capture' take them, "
+    "'resample' gives them fixed triangles"
+)
 FRAME_ENDINGS = [ending for ending in ENDINGS if ending not in WELDED]
 
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..analysis.surface_comparison import capture_to_up_axis, solid_triangles
+from ..analysis.surface_comparison import capture_to_up_axis
 from ..base.checks import array, number, numeric, refuse, shown, whole
 from ..base.tables import number_in, read_table
 from ..base.types import FilePath
-from ..mesh.captures import Capture
+from ..mesh.captures import Capture, solid_triangles
 from ..mesh.selection import distinct_vertices
 from ..scene.mesh_collider import nearest_points
 from ..scene.scene import Scene

@@ -13,6 +13,7 @@ from ..base.turns import in_turn
 from ..base.types import Converted, default
 from ..kernels import nearest
 from ..kernels.contact.mesh_facets import FACETS, FAR
+from ..mesh.distances import nearest_weights
 from ..mesh.mesh import Mesh
 from .colliders import Collider, from_y, turned
 
@@ -222,24 +223,3 @@ def _nearest_faces(points, vertices, triangles):
         local: wp.array = wp.array((points - centre) * scale, dtype=wp.vec3)
         wp.launch(nearest.faces(), len(points), inputs=[mesh.id, local], outputs=[out])
         return out.numpy()
-
-
-def nearest_weights(points, corners):
-    """Barycentric coordinates (k, 3) of the points of triangles (k, 3, 3) that are nearest to points (k, 3)."""
-    a, b, c = corners.transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    size = np.maximum(np.einsum("ki,ki->k", normal, normal), 1e-300)
-    parts = [np.einsum("ki,ki->k", np.cross(q - p, points - p), normal) / size for p, q in ((b, c), (c, a), (a, b))]
-    found = np.stack(parts, axis=1)
-    outside = (found < 0.0).any(axis=1) | ~found.any(axis=1)  # or of triangles without area
-    best = np.full(len(points), np.inf)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        p, along = corners[:, i], corners[:, j] - corners[:, i]
-        t = np.einsum("ki,ki->k", points - p, along) / np.maximum(np.einsum("ki,ki->k", along, along), 1e-300)
-        t = np.clip(t, 0.0, 1.0)
-        distance = np.linalg.norm(p + t[:, None] * along - points, axis=1)
-        nearer = outside & (distance < best)
-        best[nearer] = distance[nearer]
-        found[nearer] = 0.0
-        found[nearer, i], found[nearer, j] = 1.0 - t[nearer], t[nearer]
-    return found

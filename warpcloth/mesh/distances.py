@@ -6,8 +6,7 @@ import warp as wp
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..kernels import nearest
-from ..mesh.mesh import areas_of
-from ..scene.mesh_collider import nearest_weights
+from .mesh import areas_of
 
 # Threshold of 2·area over the sum of the squared sides, 0.29 for an equilateral triangle. Below it, a search in float32 is
 # dominated by rounding.
@@ -57,6 +56,27 @@ def _nearest(points, x, triangles, device):
         out, faces = wp.empty(len(points), dtype=wp.float64), wp.empty(len(points), dtype=wp.int32)
         wp.launch(nearest.distances(), len(points), inputs=elements + state, outputs=[out, faces])
         return out.numpy() * scale, faces.numpy()
+
+
+def nearest_weights(points, corners):
+    """Barycentric coordinates (k, 3) of the points of triangles (k, 3, 3) that are nearest to points (k, 3)."""
+    a, b, c = corners.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    size = np.maximum(np.einsum("ki,ki->k", normal, normal), 1e-300)
+    parts = [np.einsum("ki,ki->k", np.cross(q - p, points - p), normal) / size for p, q in ((b, c), (c, a), (a, b))]
+    found = np.stack(parts, axis=1)
+    outside = (found < 0.0).any(axis=1) | ~found.any(axis=1)  # or of triangles without area
+    best = np.full(len(points), np.inf)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        p, along = corners[:, i], corners[:, j] - corners[:, i]
+        t = np.einsum("ki,ki->k", points - p, along) / np.maximum(np.einsum("ki,ki->k", along, along), 1e-300)
+        t = np.clip(t, 0.0, 1.0)
+        distance = np.linalg.norm(p + t[:, None] * along - points, axis=1)
+        nearer = outside & (distance < best)
+        best[nearer] = distance[nearer]
+        found[nearer] = 0.0
+        found[nearer, i], found[nearer, j] = 1.0 - t[nearer], t[nearer]
+    return found
 
 
 def surface_samples(x, triangles, count):

@@ -1,0 +1,307 @@
+"""Resampling of captures to one topology: a template is moved onto each frame, as rigidly as possible."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.checks import array, number, shown, whole
+from ..base.types import FilePath, Progress
+from ..mesh.captures import Capture, solid_triangles
+from ..mesh.distances import Boundary, nearest_on_surface
+from ..mesh.mesh import Mesh, Surface, areas_of
+from ..scene.scene import Pins, checked_pins
+from ..usd import AnimationWriter
+from .arap import edge_weights
+
+_TURNED = np.cos(np.radians(60.0))  # cosine of the largest angle between the normals of a point and of the template
+_REGULAR = 1e-12  # added to the diagonal, relative to its largest entry, so that the matrix has an inverse
+_CORNERS = np.arange(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Resampled:
+    """A capture resampled to one topology, with a frame for each label from the first to the last.
+
+    Attributes:
+        mesh: The template at rest.
+        points: Its vertices (F, n, 3) [m]. In frames that the capture lacks, they are interpolated linearly.
+        distances: Distances of the vertices from the surface of the capture (F, n) [m]; NaN in frames that it lacks.
+        observed: Whether a vertex faces the capture (F, n): the nearest point is within ``within`` and not on the boundary, as
+            that of a vertex over a hole is. Other vertices follow their neighbours alone.
+        rms: RMS distance of the points of the capture that count from the template (F,) [m]; NaN in frames that it lacks.
+        used: Share of the area of the capture that counts (F,) [1]; NaN in frames that it lacks.
+        iterations: Number of iterations (F,); 0 in frames that the capture lacks.
+        converged: Whether the last iteration moved no vertex by more than the tolerance (F,).
+        labels: Numbers of the frames (F,).
+        times: (F,) [s].
+        pins: Vertices whose positions were given (p,).
+    """
+
+    mesh: Mesh
+    points: np.ndarray
+    distances: np.ndarray
+    observed: np.ndarray
+    rms: np.ndarray
+    used: np.ndarray
+    iterations: np.ndarray
+    converged: np.ndarray
+    labels: np.ndarray
+    times: np.ndarray
+    pins: np.ndarray
+
+    def write(self, output: FilePath, single_file: bool = False) -> None:
+        """Writes the animation as USD, with the primvars ``captureDistance`` [m], −1 where it is NaN, and ``captureObserved``.
+
+        Args:
+            output: Path of a .usd, .usda, .usdc or .usdz file.
+            single_file: Whether it is one file, without a folder of frames beside it.
+        """
+        fps = (len(self.times) - 1) / (self.times[-1] - self.times[0]) if len(self.times) > 1 else 24.0
+        primvars = {"captureDistance": "vertex", "captureObserved": "vertex"}
+        writer = AnimationWriter(output, self.mesh, round(float(fps), 6), pins={"pins": self.pins}, primvars=primvars)
+        velocities = np.diff(self.points, axis=0, prepend=self.points[:1]) * fps
+        for points, v, distances, observed in zip(self.points, velocities, self.distances, self.observed, strict=True):
+            known = {"captureDistance": np.where(np.isnan(distances), -1.0, distances), "captureObserved": observed * 1.0}
+            writer.append(points, v, known)
+        writer.close(single_file=single_file)
+
+
+def resample(
+    capture: Capture,
+    template: Mesh,
+    positions: ArrayLike | None = None,
+    pins: Pins | None = None,
+    stiffness: float = 1e-3,
+    within: float | None = None,
+    iterations: int = 60,
+    tolerance: float = 1e-5,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> Resampled:
+    """Moves a template onto each frame of a capture, so that the result has one topology, as :func:`warpcloth.analyze` needs.
+
+    Minimises α·E(x, R) + Σ aₚ dₚ²/Σ aₚ over the vertices p of the capture (non-rigid iterative closest points, after Amberg,
+    Romdhani & Vetter 2007). E is the energy of :class:`warpcloth.Arap` with clamped weights, and aₚ a third of the area of the
+    triangles at p. dₚ is the distance of p from the tangent plane of the nearest point of the template; where that lies on the
+    boundary, from the point itself, which keeps the outline where it was seen. Points count within a distance, and, if they are
+    not beyond the outline, if the planes there enclose less than 60°. An iteration finds nearest points and rotations, and
+    solves a sparse system for all x. Each frame starts from the last one, moved on by as much as that had moved.
+
+    Args:
+        capture: The :class:`warpcloth.Capture`, with times.
+        template: The :class:`warpcloth.Mesh`; its points are the rest shape.
+        positions: Its positions near those of the first frame (n, 3) [m]; by default the rest shape.
+        pins: Vertices whose positions are known: :class:`warpcloth.Pins`, which stay at ``positions``, or follow keyframes, one
+            for each label from the first on.
+        stiffness: α [1]. With less, the result follows noise and slides; with more, it cuts across folds.
+        within: Largest distance of points that count [m]; by default 10 % of the diagonal of the template.
+        iterations: Largest number of iterations of a frame.
+        tolerance: Iterations end when one moves no vertex by more than this share of the diagonal.
+        device: A Warp device, for nearest points.
+        progress: Function called with (frame, frames) once each frame is found, ``frames`` being those after the first.
+
+    Returns:
+        :class:`Resampled`.
+
+    Raises:
+        ValueError: An argument is not allowed, the capture has no times, or no point of a frame counts.
+
+    Examples:
+        >>> import warpcloth as wc
+        >>> template, seen = wc.Mesh.grid(5, 5), wc.Mesh.grid(8, 7)
+        >>> moved = wc.Mesh(seen.points + [0.05, 0.05, 0.0], seen.triangles)
+        >>> found = wc.resample(wc.as_capture([moved], dt=1.0), template)
+        >>> (found.points[0] - template.points).mean(axis=0).round(3).tolist()
+        [0.05, 0.05, 0.0]
+    """
+    if not isinstance(capture, Capture):
+        raise ValueError(f"capture is {shown(capture)}; it must be a Capture, such as open_capture(path, fps=24)")
+    if not isinstance(template, Mesh) or not len(template.triangles):
+        raise ValueError(f"template is {shown(template)}; it must be a Mesh with triangles, such as Mesh.load(path)")
+    where = "capture" if capture.path is None else str(capture.path)
+    if capture.times is None:
+        raise ValueError(f"{where}: has no times; open it with open_capture(path, fps=…), or give --fps on the command line")
+    diagonal = float(np.linalg.norm(np.ptp(template.points, axis=0)))
+    within = 0.1 * diagonal if within is None else within
+    for name, value in (("stiffness", stiffness), ("within", within), ("tolerance", tolerance)):
+        number(name, value, above=0.0)
+    whole("iterations", iterations, least=1)
+    x = array("positions", template.points if positions is None else positions, template.points.shape)
+    pins = None if pins is None else checked_pins(pins, template)
+    if pins is not None and not pins.held.all():
+        raise ValueError("pins.axes leaves some axes of a pin free; resample takes pins that hold all three")
+    held = np.empty(0, dtype=int) if pins is None else pins.vertices
+    labels = np.sort(np.concatenate([capture.labels, np.asarray(capture.missing, dtype=capture.labels.dtype)]))
+    frames = np.searchsorted(labels, capture.labels)
+    registration = Registration(template, held, stiffness, within, device)
+    found = []
+    for index, frame in enumerate(frames.tolist()):
+        start = x.copy()
+        if index > 1:
+            start += (x - found[-2][0]) * ((frame - frames[index - 1]) / (frames[index - 1] - frames[index - 2]))
+        start[held] = x[held]
+        if pins is not None and pins.keyframes is not None:
+            start[held] = pins.keyframes[min(frame, len(pins.keyframes) - 1)]
+        try:
+            found.append(registration.solve(capture[index], start, iterations, tolerance * diagonal))
+        except ValueError as error:
+            raise ValueError(f"{where}: frame {capture.labels[index]} {error}") from error
+        x = found[-1][0]
+        if progress is not None:
+            progress(frame, len(labels) - 1)
+    points, *rest = (np.array(column) for column in zip(*found, strict=True))
+    times = np.interp(np.arange(len(labels)), frames, capture.times)
+    return Resampled(
+        template,
+        _filled(points, frames, len(labels)),
+        *(_spread(each, frames, len(labels)) for each in rest),
+        labels,
+        times,
+        held,
+    )
+
+
+def _filled(points, frames, count):
+    """Returns points (F, n, 3) of all ``count`` frames, interpolated linearly between the given ``frames`` (F,)."""
+    after = np.searchsorted(frames, np.arange(count)).clip(min=min(1, len(frames) - 1))
+    before = np.maximum(after - 1, 0)
+    share = (np.arange(count) - frames[before]) / np.maximum(frames[after] - frames[before], 1)
+    return points[before] + share[:, None, None] * (points[after] - points[before])
+
+
+def _spread(values, frames, count):
+    """Returns values (count, …), which are NaN, False or 0 in frames that are not given."""
+    result = (
+        np.full((count, *values.shape[1:]), np.nan)
+        if values.dtype.kind == "f"
+        else np.zeros((count, *values.shape[1:]), values.dtype)
+    )
+    result[frames] = values
+    return result
+
+
+class Registration:
+    """Moves a template onto one surface after another; see :func:`resample`.
+
+    Args:
+        mesh: The template.
+        held: Vertices that stay where a solve starts (p,).
+        stiffness: α [1].
+        within: Largest distance of points that count [m].
+        device: A Warp device.
+    """
+
+    def __init__(self, mesh: Mesh, held: np.ndarray, stiffness: float, within: float, device: str) -> None:
+        self._mesh, self._within, self._device = mesh, within, device
+        self._triangles, n = mesh.triangles.astype(np.int64), len(mesh.points)
+        pairs, w = edge_weights(mesh, "clamped")
+        i, j = pairs.T
+        self._ends, self._weights = (np.r_[i, j], np.r_[j, i]), stiffness * np.r_[w, w]
+        self._rest = mesh.points[self._ends[0]] - mesh.points[self._ends[1]]
+        free = np.setdiff1d(np.arange(n), held)
+        self._free = (3 * free[:, None] + _CORNERS).ravel()
+        # E is 2 Σ w ‖·‖² over edges if each is in two cells, so that its gradient over 4 is L x − b.
+        rows, columns = np.r_[i, j, i, j], np.r_[i, j, j, i]
+        values = 2.0 * stiffness * np.r_[w, w, -w, -w]
+        corners = (3 * self._triangles[:, :, None] + _CORNERS).reshape(-1, 9)
+        self._corners = corners
+        self._pattern = (
+            np.concatenate([(3 * rows[:, None] + _CORNERS).ravel(), np.repeat(corners, 9, axis=1).ravel()]),
+            np.concatenate([(3 * columns[:, None] + _CORNERS).ravel(), np.tile(corners, (1, 9)).ravel()]),
+        )
+        self._arap = np.repeat(values, 3)
+
+    def solve(self, surface: Surface, start: np.ndarray, iterations: int, tolerance: float) -> tuple:
+        """Moves the template from ``start`` (n, 3) [m] onto a surface.
+
+        Returns:
+            tuple: Points (n, 3) [m], distances (n,) [m], observed (n,), RMS [m], share of the area that counts, number of
+            iterations and whether the last moved no vertex by more than ``tolerance`` [m].
+
+        Raises:
+            ValueError: No point of the surface counts; the message is the end of a sentence about it.
+        """
+        triangles = solid_triangles(surface)
+        used, corners = np.unique(triangles, return_inverse=True)
+        points, triangles = surface.points[used], corners.reshape(-1, 3)
+        if not areas_of(points, triangles).sum() > 0.0:
+            raise ValueError("has no area")
+        areas = np.bincount(triangles.ravel(), np.repeat(areas_of(points, triangles) / 3.0, 3), len(points))
+        areas, normals = areas / areas.sum(), _vertex_normals(points, triangles)
+        x, moved, count = start.copy(), np.inf, 0
+        while count < iterations and moved > tolerance:
+            step = self._step(x, points, normals, areas)
+            x.reshape(-1)[self._free] += step
+            moved, count = np.abs(step).max(initial=0.0), count + 1
+        away, _faces, _weights, _tangent, counts = self._pairs(x, points, normals)
+        share = areas[counts].sum()
+        distances, faces, weights = nearest_on_surface(x, points, triangles, self._device)
+        observed = (distances <= self._within) & ~Boundary(points, triangles).has(faces, weights)
+        rms = np.sqrt(areas[counts] @ away[counts] ** 2 / share)
+        return x, distances, observed, rms, share, count, bool(moved <= tolerance)
+
+    def _pairs(self, x, points, normals):
+        """Returns the distance of each point to the template, its triangle, weights and projection, and whether it counts."""
+        distances, faces, weights = nearest_on_surface(points, x, self._triangles, self._device)
+        normal = _normals(x, self._triangles)[faces]
+        beyond = Boundary(x, self._triangles).has(faces, weights)
+        counts = (distances <= self._within) & (beyond | (np.abs(np.einsum("ki,ki->k", normals, normal)) > _TURNED))
+        if not counts.any():
+            raise ValueError(
+                f"has no point within {self._within:.3g} m of the template whose normal is near that of the template"
+            )
+        projection = np.einsum("ki,kj->kij", normal, normal)
+        projection[beyond] = np.eye(3)
+        return distances, faces, weights, projection, counts
+
+    def _step(self, x, points, normals, areas):
+        """Returns the step of the free coordinates to the minimum with rotations and nearest points held."""
+        from scipy.sparse import coo_matrix, identity
+        from scipy.sparse.linalg import splu
+
+        _, faces, weights, projection, counts = self._pairs(x, points, normals)
+        areas = areas * counts
+        i, j = self._ends
+        rotations = self._rotations(x)
+        turned = self._weights[:, None] * np.einsum("kab,kb->ka", rotations[i] + rotations[j], self._rest)
+        right = np.stack([np.bincount(i, column, len(x)) for column in turned.T], axis=1).ravel()
+        blocks = np.einsum("k,kc,kij,kd->kcidj", areas, weights, projection, weights).reshape(-1, 81)
+        order = np.argsort(faces, kind="stable")
+        firsts = np.flatnonzero(np.diff(faces[order], prepend=-1))
+        of_triangles = np.zeros((len(self._triangles), 81))
+        of_triangles[faces[order][firsts]] = np.add.reduceat(blocks[order], firsts, axis=0)
+        pulls = np.einsum("k,kc,kij,kj->kci", areas, weights, projection, points).reshape(-1, 9)
+        right += np.bincount(self._corners[faces].ravel(), pulls.ravel(), len(right))
+        entries = np.concatenate([self._arap, of_triangles.ravel()])
+        matrix = coo_matrix((entries, self._pattern), shape=(x.size, x.size)).tocsc()[self._free]
+        residual, matrix = right[self._free] - matrix @ x.ravel(), matrix[:, self._free]
+        matrix = matrix + _REGULAR * matrix.diagonal().max(initial=0.0) * identity(len(self._free), format="csc")
+        options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
+        return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options).solve(residual)
+
+    def _rotations(self, x):
+        """Returns the rotations of the cells (n, 3, 3) that minimise E for x."""
+        i, j = self._ends
+        moments = self._weights[:, None, None] * np.einsum("ka,kb->kab", x[i] - x[j], self._rest)
+        sums = [np.bincount(i, column, len(x)) for column in moments.reshape(-1, 9).T]
+        left, _, right = np.linalg.svd(np.stack(sums, axis=1).reshape(-1, 3, 3))
+        left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+        return left @ right
+
+
+def _normals(x, triangles):
+    """Unit normals (T, 3) of triangles; 0 without area."""
+    a, b, c = x[triangles].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+
+
+def _vertex_normals(x, triangles):
+    """Unit normals (n, 3) of vertices, the mean over their triangles by area."""
+    a, b, c = x[triangles].transpose(1, 0, 2)
+    normal = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    sums = np.stack([np.bincount(triangles.ravel(), column, len(x)) for column in normal.T], axis=1)
+    return sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None]
