@@ -19,7 +19,7 @@ from .terminal import aligned
 
 _HELP = "help"
 DEFAULT = "newton"  # the default solver
-_SIMULATORS = ("newton",)  # those of warpcloth.others.simulators, which loads Warp
+_SIMULATORS = ("newton", "pbd")  # those of warpcloth.others.simulators, which loads Warp
 
 
 def asks_for_help(arguments):
@@ -146,7 +146,7 @@ def add_with(parser):
         nargs="+",
         metavar="SIMULATOR",
         choices=_SIMULATORS,
-        help="measure solvers of other simulators too: newton, the physics engine, which the extra newton installs",
+        help="measure solvers of other simulators too: newton, the physics engine, or pbd, which is pyPBD; extras install them",
     )
 
 

@@ -99,6 +99,10 @@ class NewtonSteps:
         """Returns velocities (n, 3) float32 [m/s]."""
         return self.states[0].particle_qd.numpy().copy()
 
+    def stop(self):
+        """Sets velocities to 0."""
+        self.states[0].particle_qd.zero_()
+
 
 # The grids are those of substeps and iterations within which the fronts on hanging lie.
 NEWTON = Simulator(

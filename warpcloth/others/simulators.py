@@ -1,8 +1,9 @@
 """The simulators that ``--with`` names. A row adds one to charts, choices and tables."""
 
 from .newton_runs import NEWTON
+from .pbd_runs import PBD
 
-SIMULATORS = {"newton": NEWTON}
+SIMULATORS = {"newton": NEWTON, "pbd": PBD}
 
 
 def other_solvers():

@@ -1,0 +1,19 @@
+"""Stiffness of scenes in pyPBD against that in warpcloth, by samples."""
+
+from ..terms import CorotatedMembrane
+from .calibration import calibrated
+from .pbd_runs import PositionBasedDynamics
+
+# Steps per frame that converge to the rest shape of the samples, for the strips and for the cantilever.
+_COARSE, _FINE = 20, 200
+
+
+def calibrate(method, iterations=1):
+    """Measures the :class:`warpcloth.others.calibration.Calibration` of a method of pyPBD.
+
+    Args:
+        method: One of :data:`warpcloth.others.pbd_model.METHODS`.
+        iterations: Iterations per step.
+    """
+    coarse, fine = (PositionBasedDynamics(method, substeps, iterations) for substeps in (_COARSE, _FINE))
+    return calibrated(coarse, fine, CorotatedMembrane(stiffness=50.0))
