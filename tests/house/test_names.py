@@ -36,6 +36,7 @@ NAMES = {
     "open_sequence": "reads any sequence, and one of a stage",
     "vertex_normals turned": "on the host and on the device",
     "scene": "each file of scenes/ has its own",
+    "engine refuse_inexpressible calibrate": "each other simulator has its own",
     "energy": "of a term, and its kernel",
 }
 # Where the functions of terms are, whose names are given.

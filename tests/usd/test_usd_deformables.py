@@ -55,6 +55,11 @@ def test_a_scene_is_the_same_with_the_names_and_close_by_the_names_alone(tmp_pat
     assert both.density == scene.density and both.thickness == scene.thickness and both.pins.vertices.tolist() == [0, 3]
     stage = Usd.Stage.Open(path)
     assert stage.GetPrimAtPath("/World/Cloth").HasAPI("PhysicsCollisionAPI")
+    # Of two cloths, one that is read alone does not touch the other.
+    Sdf.CopySpec(stage.GetRootLayer(), "/World/Cloth", stage.GetRootLayer(), "/World/Other")
+    stage.Export(str(tmp_path / "two.usda"))
+    stage.RemovePrim("/World/Other")
+    assert len(read_scene(tmp_path / "two.usda", prim="Cloth").colliders) == 1
     found = read_scene(alone(path), law=law)
     np.testing.assert_allclose(found.vertex_masses, scene.vertex_masses, rtol=8 * EPS)
     np.testing.assert_allclose(found.gravity, scene.gravity, rtol=4 * EPS)

@@ -9,7 +9,7 @@ import numpy as np
 from ..mesh.flat_triangles import without_slivers
 from ..scene.colliders import Box, Capsule, Plane, Sphere
 from ..scene.mesh_collider import MeshCollider, first_extended
-from .attributes import Values, holders
+from .attributes import Values, has_api, holders
 from .modules import Usd, UsdGeom, UsdPhysics
 from .solids import SOLIDS
 from .stage import face_corners, local_to_metres, moving_space, placed, refuse_moving_topology, space_codes
@@ -69,9 +69,13 @@ def errors_at(where):
 
 
 def _mark(prim):
-    """Returns the attribute that marks a prim as a collider, on it or on the prim above it, ours first; or None."""
+    """Returns the attribute that marks a prim as a collider, on it or on the prim above it, ours first; or None.
+
+    A PhysicsCollisionAPI of simulated cloth lets it touch colliders, and makes it none.
+    """
     own = [each.GetAttribute("warpcloth:collider") for each in holders(prim)]
     of_physics = [UsdPhysics.CollisionAPI(each) for each in holders(prim) if each.HasAPI(UsdPhysics.CollisionAPI)]
+    of_physics = [] if has_api(prim, "PhysicsSurfaceDeformableSimAPI") else of_physics
     found = [each for each in own if each and each.HasAuthoredValue()]
     return next(iter([*found, *(each.GetCollisionEnabledAttr() for each in of_physics)]), None)
 
