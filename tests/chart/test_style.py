@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from warpcloth.chart import style
 from warpcloth.chart.cheapest import plot_cheapest
@@ -122,3 +123,15 @@ def test_cells_have_the_colour_of_their_solver_and_charts_small_print(tmp_path, 
     plot_residuals(tmp_path / "fit.png", fit, 24)
     assert {figure.texts[-1].get_text() for figure in kept} == {in_words(machine())}
     assert "over all frames, 1.6 m" in [text.get_text() for text in kept[1].axes[0].texts]
+
+
+def test_panels_end_above_the_legend_and_the_legend_above_the_small_print():
+    figure = Figure(figsize=(6.0, 3.9), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xlabel("step [s]")
+    style.add_legend(figure, [Patch(label=f"entry {k}") for k in range(5)], 1)
+    style.small_print(figure)
+    figure.draw_without_rendering()
+    (legend,), (text,) = figure.legends, figure.texts
+    assert axes.get_tightbbox().y0 >= legend.get_window_extent().y1 - 2.0  # the padding of the layout
+    assert legend.get_window_extent().y0 >= text.get_window_extent().y1 - 2.0

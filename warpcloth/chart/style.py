@@ -127,7 +127,10 @@ def small_print(figure, facts=None, device="cpu", others=()):
     """
     text = in_words(machine(device) if facts is None else facts, others)
     low = _bottom(figure)
-    figure.get_layout_engine().set(rect=(0.0, low, 1.0, 1.0 - low))
+    # The layout makes no room for a legend that does not stand at the edge of the figure, as that of add_legend.
+    boxes = [legend.get_window_extent() for legend in figure.legends]
+    above = low + sum(box.height for box in boxes if box.y0 < 0.5 * figure.bbox.height) / figure.bbox.height
+    figure.get_layout_engine().set(rect=(0.0, above, 1.0, 1.0 - above))
     figure.text(0.995, 0.3 * low, text, ha="right", fontsize=PRINT, color="0.5", parse_math=False)
 
 
