@@ -76,11 +76,12 @@ def sh(*commands):
 
 
 def described(kind, name):
-    """The signature and the docstring of a name, with the methods of a class but for old names of fields."""
+    """The docstring of a name and of its members, but for old names of fields and for properties that have none."""
     value = getattr(wc, name)
-    old = ", ".join(getattr(value, "renamed_fields", ()))
+    bare = [each for each, of_class in vars(value).items() if isinstance(of_class, property) and not of_class.__doc__]
+    left_out = ", ".join([*getattr(value, "renamed_fields", ()), *bare])
     path = value.__name__ if kind == "module" else f"warpcloth.{name}"
-    options = {"class": ["members:"], "module": ["members:"]}.get(kind, []) + [f"exclude-members: {old}"] * bool(old)
+    options = {"class": ["members:"], "module": ["members:"]}.get(kind, []) + [f"exclude-members: {left_out}"] * bool(left_out)
     return f"```{{eval-rst}}\n.. auto{kind}:: {path}\n" + "".join(f"   :{option}\n" for option in options) + "```"
 
 
@@ -89,10 +90,11 @@ def members(names, folder=""):
     return ", ".join(f"[`{name}`]({folder}{name}.md)" for name in names) or "none"
 
 
-def index(title, names, kind, text, caption):
-    """The page that lists records as cards with their pictures, and has their pages in the contents."""
+def index(title, names, kind, text, caption, better=None):
+    """The page that lists records as cards with pictures of a kind, or of a better one if there is such a picture."""
+    kinds = {name: better if (DOCS / "pictures" / f"{better}-{name}.webp").is_file() else kind for name in names}
     cards = "".join(
-        f":::{{grid-item-card}} {name}\n:link: {name}\n:link-type: doc\n:img-top: ../pictures/{kind}-{name}.webp\n\n"
+        f":::{{grid-item-card}} {name}\n:link: {name}\n:link-type: doc\n:img-top: ../pictures/{kinds[name]}-{name}.webp\n\n"
         f"{caption(name)}\n:::\n\n"
         for name in names
     )
@@ -202,9 +204,15 @@ def supporters(scene):
     return able, unable
 
 
+def known_answers():
+    """What is known of the result of each scene, from the table of scenes.md."""
+    rows = (row.strip("| ").split(" | ") for row in tables_of("scenes") if row.startswith("| `"))
+    return {cells[0].strip("`"): cells[2] if len(cells) > 2 else "" for cells in rows}
+
+
 def scene(listed, built, able, unable):
     name, module = listed.name, import_module(f"warpcloth.scenes.{listed.name}")
-    known = next((row.split(" | ")[2] for row in tables_of("scenes") if row.startswith(f"| `{name}` |")), "").strip(" |")
+    known = known_answers()[name]
     parameters = [text.partition("=")[::2] for text in listed.parameters]
     kinds = dict.fromkeys(type(term).__name__ for term in built.terms)
     mesh, more = built.mesh, []
@@ -299,6 +307,7 @@ def failures():
             shown(f"{name}.png", what, ".") if own else shown(f"failure-{number}.webp", what),
             sh(f"chart {command} -o {name}.png"),
             "" if own else made(f"failure-{number}"),
+            "*The picture has the map of every solver; [its command](../stability.md).*" if number == "1" else "",
             f"*It has fewer cells, by `{MAPS[number]}`.*" if MAPS.get(number) else "",
             more and f"{more[0].upper()}{more[1:]}.",
             f"[What it shows](../stability.md#{name if command.startswith('failure') else 'theoretical-limits'}).",
@@ -382,20 +391,23 @@ def pages():
         "Pictures show the same moment of the scene `hanging`, coloured by its largest stretch.\n\n" + tables.solvers(),
         lambda name: f"{records[name].facts.method[0].upper()}{records[name].facts.method[1:]}.",
     )
+    known = [name for name, answer in known_answers().items() if answer and name in summaries]
     found["scenes/index.md"] = index(
         "Every scene",
         summaries,
         "scene",
-        "Files in `scenes/` are known by name, as in `warpcloth run hanging`. [Scenes](../scenes.md) says how to write one.",
+        "Files in `scenes/` are known by name, as in `warpcloth run hanging`. [Scenes](../scenes.md) says how to write one.\n\n"
+        f"The pages of these say what is known of their results: {members(known)}.",
         summaries.get,
     )
     found["fabrics/index.md"] = index(
         "Every fabric",
         wc.fabrics,
         "fabric",
-        "Pictures show the numbers of a fabric among those of all. [Fabrics](../fabrics.md) has the table, and says how far to "
-        "trust it.",
+        "Pictures show a drape from above, or the numbers of a fabric among those of all. [Fabrics](../fabrics.md) has the "
+        "table, and says how far to trust it.",
         lambda name: f"{1e3 * wc.fabrics[name].density:.0f} g/m²",
+        better="drape",
     )
     return found
 
