@@ -100,6 +100,24 @@ def test_every_page_is_linked_and_every_picture_shown():
     assert {str(path.relative_to(ROOT)) for path in shown} <= linked
 
 
+def test_the_gallery_shows_its_files_with_the_commands_that_make_them():
+    """Entries of docs/gallery.py have their names in files and commands; charts are made by ``warpcloth``."""
+    entries = re.findall(r"^@entry\ndef (\w+)", (ROOT / "docs" / "gallery.py").read_text(encoding="utf-8"), re.MULTILINE)
+    shown = re.findall(r"^!\[[^\]]+\]\((\S+)\)\n\n(.+?)(?=\n\n|\Z)", PAGES["docs/gallery.md"], re.MULTILINE | re.DOTALL)
+    named = []
+    for path, text in shown:
+        (command,) = re.findall(r"`((?:warpcloth|python docs/gallery\.py) [^`]+)`", text)
+        if command.startswith("warpcloth"):
+            assert _parser().parse_args(shlex.split(command)[1:]).output == f"docs/{path}"
+        else:
+            named.append(command.split()[-1])
+            assert Path(path).stem == named[-1]
+    assert len(shown) >= 20 and sorted(named) == sorted(entries)
+    files = {path.relative_to(ROOT / "docs").as_posix(): path.stat().st_size for path in (ROOT / "docs" / "gallery").iterdir()}
+    assert set(files) == {path for path, _ in shown if path.startswith("gallery/")} and max(files.values()) < 400e3
+    assert sum(path.stat().st_size for path in (ROOT / "docs").rglob("*") if path.is_file()) < 15e6
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_every_name_of_the_api_exists(page):
     for name in re.findall(r"\bwc\.(\w+)", PAGES[page]):
