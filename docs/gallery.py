@@ -7,20 +7,25 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pictures
 from pictures import run
+from PIL import Image
 
 import warpcloth as wc
+from warpcloth.lab.laboratory import laboratory_readings
 from warpcloth.scenes import (
     bunny,
     cards,
     character,
     curtain,
+    cusick,
     drape,
     flag,
     hanging,
     knot,
+    mobile,
     tablecloth,
 )
 
@@ -147,6 +152,13 @@ def cards_leaning(frictions=(0.6, 0.15)):
 
 
 @entry
+def mobile_turning():
+    animation = run(mobile.scene(n=13, push=0.8, duration=3.0), wc.ConstrainedDynamics(substeps=4))
+    colour = dyed(animation, parts(animation, 3), (RED, OCHRE, INDIGO))
+    film(animation, "mobile_turning", size=(360, 290), colour=colour, every=4, azimuth=-30.0, elevation=14.0)
+
+
+@entry
 def eight_methods():
     solvers = {
         "Explicit": wc.Explicit(substeps=120),
@@ -184,6 +196,37 @@ def bunny_turning():
     colour = {"rotation [°]": np.degrees(found.angles)}
     looks = {"mesh": scene.mesh, "fps": scene.fps, "colormap": "YlOrRd", "azimuth": -20.0, "elevation": 14.0}
     film(found.points, "bunny_turning", size=(340, 280), colour=colour, every=2, **looks)
+
+
+@entry
+def shadows_of_drapes(names=("silk", "cotton", "canvas", "wool")):
+    """Drapes of fabrics above their shadows, with the drape coefficients."""
+    scenes = [cusick.scene(name, rows=8) for name in names]
+    rests = [wc.equilibrium(scene) for scene in scenes]
+    assert all(rest.status.ok for rest in rests)
+    drapes = [wc.Mesh(rest.points, scene.mesh.triangles) for rest, scene in zip(rests, scenes, strict=True)]
+    figure, axes = plt.subplots(2, len(names), figsize=(2.2 * len(names), 3.7))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drapes.png"
+        wc.render(drapes, path, names=[""] * len(names), size=(280 * len(names), 200), samples=16, ground=False)
+        picture = np.asarray(Image.open(path))
+    for k, (name, scene, rest) in enumerate(zip(names, scenes, rests, strict=True)):
+        (coefficient, _unit), *_ = laboratory_readings(scene, rest).values()
+        axes[0, k].imshow(picture[:, 280 * k + 1 : 280 * (k + 1)])
+        axes[0, k].set_title(name, color=pictures.GREY, fontsize=10)
+        corners = rest.points[scene.mesh.triangles][..., [0, 2]]
+        for triangle in corners:
+            axes[1, k].fill(*triangle.T, color="0.25", linewidth=0.4)
+        axes[1, k].add_patch(plt.Circle((0, 0), cusick.SUPPORT, color="0.25"))
+        axes[1, k].add_patch(plt.Circle((0, 0), cusick.RADIUS, fill=False, color="0.6", linestyle=":"))
+        axes[1, k].set_aspect("equal")
+        axes[1, k].set_xlabel(f"drape coefficient {coefficient:.0f} %", color=pictures.GREY)
+    for each in axes.ravel():
+        each.set_xticks([])
+        each.set_yticks([])
+        each.spines[:].set_visible(False)
+    figure.tight_layout(pad=0.3)
+    pictures.save(figure, "gallery/shadows_of_drapes.png")
 
 
 @entry
