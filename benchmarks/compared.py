@@ -2,7 +2,7 @@
 
     python benchmarks/compared.py                                          # all scenes, on the CPU
     python benchmarks/compared.py --scene drape --device cuda:0 --out gpu  # one of them
-    python benchmarks/compared.py --tables cpu/*.json gpu/*.json           # tables of stored results
+    python benchmarks/compared.py --stored cpu/*.json gpu/*.json           # tables and charts of stored results
 
 Each scene takes the cheapest solver of warpcloth within 1 % of the reference solution, and the cheapest setting of each solver
 of the others, searched by doubling substeps and iterations until it is within 1 % or the limits are reached. These settings are
@@ -48,11 +48,11 @@ def main():
     parser.add_argument("--limit", type=float, default=20.0, help="time limit of each run [s] (default: 20)")
     parser.add_argument("--total", type=float, default=float("inf"), help="time limit of each scene [s] (default: none)")
     parser.add_argument("--out", type=Path, default=Path("compared"), help="folder of results (default: compared)")
-    parser.add_argument("--tables", type=Path, nargs="+", metavar="JSON", help="print the tables of stored results, and end")
+    parser.add_argument("--stored", type=Path, nargs="+", metavar="JSON", help="only print and draw stored results")
     options = parser.parse_args()
-    if options.tables:
-        for path in options.tables:
-            print(text_of(json.loads(path.read_text(encoding="utf-8"))))
+    if options.stored:
+        for path in options.stored:
+            show(path, json.loads(path.read_text(encoding="utf-8")))
         return
     options.out.mkdir(parents=True, exist_ok=True)
     wp.config.quiet = True
@@ -74,11 +74,17 @@ def main():
             )
         path = options.out / f"{name}.json"
         path.write_text(json.dumps(found, indent=1, default=float), encoding="utf-8")
-        try:
-            plot_time(path.with_suffix(".png"), found)
-        except ImportError as error:
-            print(f"no chart: {error}")
-        print(f"{text_of(found)}\n  {time.perf_counter() - began:.0f} s, {path}", flush=True)
+        show(path, found)
+        print(f"  {time.perf_counter() - began:.0f} s, {path}", flush=True)
+
+
+def show(path, found):
+    """Prints the tables of a result and draws its chart beside its file."""
+    print(text_of(found), flush=True)
+    try:
+        plot_time(path.with_suffix(".png"), found)
+    except ImportError as error:
+        print(f"no chart: {error}")
 
 
 def text_of(found):
