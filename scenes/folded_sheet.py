@@ -13,7 +13,8 @@ def scene(n: int = 64, layers: int = 2, gap: float = 1e-3, distance: float = 1e-
     grid, points = wc.Mesh.grid(n, n, size=1.0, pattern="alternating"), None
     if layers == 2:
         radius = 0.5 * gap
-        s, half = grid.points[:, 0] - 0.5, 0.5 * np.pi * radius
+        # A row of vertices lies in the fold: edges across it without one would start as short as the gap, and spring open.
+        s, half = grid.points[:, 0] - (n // 2) / (n - 1), 0.5 * np.pi * radius
         bent = np.abs(s) < half
         x = np.where(bent, radius * np.cos(s / radius), half - np.abs(s))
         y = np.where(bent, radius * np.sin(s / radius), np.sign(s) * radius)

@@ -458,6 +458,15 @@ def test_thrown_at_each_other(name, speed, dtype, device):
         assert crossed(stepper.state.x.numpy(), scene.mesh.triangles) == 0
 
 
+@pytest.mark.parametrize("n", [2, 8, 9, 64])
+def test_the_scene_of_a_folded_sheet_starts_at_rest(n):
+    """Only the edges that bend around the fold are shorter than at rest, by less than the fold is long, π/2 of the gap."""
+    declared = scene("folded_sheet", n=n)
+    vectors = [points[declared.mesh.edges] for points in (declared.positions, declared.mesh.points)]
+    now, rest = (np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) for ends in vectors)
+    assert np.all(now <= rest + 1e-12) and np.all(now >= rest - 0.5 * np.pi * 1e-3)
+
+
 @few_solvers
 def test_folded_sheet_closes(name, device):
     """Thrown shut at 100 m/s, in frames of 1/24 s: the two halves meet, and their layers do not cross."""
