@@ -27,7 +27,7 @@ MODULES = {
 # Classes and functions that mean one thing in several modules, and why.
 NAMES = {
     "add_arguments": "each command declares its own",
-    "analyze compare deform choose fit render view resample": "the command and what it calls",
+    "analyze compare convert deform choose fit render view resample": "the command and what it calls",
     "measure tasks": "each file of the laboratory has its measurement and the list of them; a term has its rest measure",
     "write_csv": "each table has one",
     "run": "runs what it is given",

@@ -29,6 +29,7 @@ from . import (
     check,
     choose,
     compare,
+    convert,
     deform,
     fabrics,
     fit,
@@ -167,6 +168,8 @@ def _parser():
     render.add_arguments(renders)
     views = add("view", view.view, "Write a page that shows an animation in a browser.", epilog=view.EPILOG)
     view.add_arguments(views)
+    converts = add("convert", convert.convert, "Write an animation in another format.", epilog=convert.EPILOG)
+    convert.add_arguments(converts)
     charts = commands.add_parser("chart", help=chart.TEXT, description=chart.TEXT, allow_abbrev=False)
     chart.add_arguments(charts)
     chooses = add("choose", choose.choose, "Choose the cheapest solver and settings for a scene.", epilog=choose.EPILOG)

@@ -6,7 +6,8 @@
 - a folder of .obj, .ply or .off files, or a pattern such as "frames/cloth_*.obj": the last number in a name is the frame, and a
   frame takes 1/fps s, so that file 12 is two frames after file 10;
 - an .npz file, as `np.savez` writes it: `points` (F, n, 3) [m], `triangles` (T, 3), and `times` (F,) [s] unless fps is given;
-- an .npy file, (F, n, 3) [m], with a mesh that has the triangles.
+- an .npy file, (F, n, 3) [m], with a mesh that has the triangles;
+- a point cache, .pc2 or .mdd, with a mesh that has the triangles, by default an .obj file of the same name beside it.
 
 `as_sequence` takes arrays. Lengths are metres unless a file says otherwise.
 """
@@ -33,8 +34,10 @@ from numpy.typing import ArrayLike
 from ..base import checks
 from ..base.notebooks import ShownInNotebooks
 from ..base.types import FilePath, UpAxis
+from .caches import CACHES, open_mdd, open_pc2
 from .loading import ENDINGS, WELDED, read_arrays
 from .mesh import Mesh, Surface
+from .parts import Part
 from .stage_mesh import StageMesh
 
 # Functions that open a sequence, by file ending: (path, prim, fps) → :class:`Sequence`. `usd` registers that of stages.
@@ -149,7 +152,7 @@ def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = N
         prim: Path or name of the prim, or name of the geometry in each file, if there are several.
         fps: Frames per second: of numbers in file names, or of time codes in place of the stage's rate. Without it, ``times``
             is None unless the input has times.
-        mesh: The `Mesh` of an .npy file, which has no triangles; ignored for other inputs.
+        mesh: The `Mesh` of an .npy, .pc2 or .mdd file, which has no triangles; ignored for other inputs.
 
     Returns:
         Sequence: Only its first frame has been read.
@@ -173,11 +176,13 @@ def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = N
             return _open_npz(path, fps)
         if path.lower().endswith(".npy"):
             return _open_npy(path, fps, mesh)
+        if Path(path).suffix.lower() in CACHES:
+            return _open_cache(path, fps, mesh)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if Path(path).suffix.lower() in ENDINGS:
         raise ValueError(f'{path}: is one mesh; it must be a folder of them, or a pattern such as "{Path(path).parent}/*.obj"')
-    raise ValueError(f"{path}: must be a folder or pattern of mesh files, or end with {' '.join(OPENERS)} .npz .npy")
+    raise ValueError(f"{path}: must be a folder or pattern of mesh files, or end with {' '.join(OPENERS)} .npz .npy .pc2 .mdd")
 
 
 def as_sequence(mesh: Mesh, frames: ArrayLike | HasPoints, dt: float | None = None, times: ArrayLike | None = None) -> Sequence:
@@ -289,11 +294,16 @@ def _open_npz(path, fps):
             raise ValueError(f"has no array {lacking[0]!r}, only {', '.join(archive.files) or 'none'}")
         triangles = archive["triangles"]
         times = archive["times"] if "times" in archive.files and fps is None else None
+        named = (archive["parts"], archive["first"]) if {"parts", "first"} <= set(archive.files) else None
     with _numpy_reads():
         points = _mapped(path, "points.npy")
     if points.ndim != 3 or not len(points):
         raise ValueError(f"points has shape {points.shape}; it must be (frames, vertices, 3), of one frame or more")
-    mesh = Surface(points[0], triangles)
+    parts = None
+    if named is not None:
+        names, first = named[0].ravel().astype(str).tolist(), np.append(named[1].ravel().astype(np.int64), points.shape[1])
+        parts = {name: Part(int(a), int(b - a)) for name, a, b in zip(names, first[:-1], first[1:], strict=True)}
+    mesh = Surface(points[0], triangles, parts=parts)
     count, read, precision = _array("points", points, mesh)
     times = _even(count, fps) if times is None else increasing(times, count)
     return Sequence(mesh, np.arange(count), times, read, path, declared=False, precision=precision, files=(path,))
@@ -338,6 +348,29 @@ def _open_npy(path, fps, mesh):
     count, read, precision = _array("points", points, mesh)
     times = _even(count, fps)
     return Sequence(mesh, np.arange(count), times, read, path, precision=precision, files=(path,), up_axis=mesh.up_axis)
+
+
+def _open_cache(path, fps, mesh):
+    """Opens a .pc2 file, which has frame numbers, or an .mdd file, which has times."""
+    beside, declared, times = Path(path).with_suffix(".obj"), mesh is not None, None
+    if path.lower().endswith(".pc2"):
+        labels, points = open_pc2(path)
+        labels = labels.astype(np.int64) if np.array_equal(labels, np.rint(labels)) else labels
+    else:
+        times, points = open_mdd(path)
+        labels = np.arange(len(points))
+    if mesh is None:
+        if not beside.is_file():
+            raise ValueError(f"has no triangles; give a rest mesh that has them (--rest), or put it beside as {beside.name}")
+        mesh = Surface.load(beside)
+    count, read, precision = _array("points", points, mesh)
+    if fps is not None:
+        times = (labels - labels[0]) / fps
+    elif times is not None:
+        times = increasing(times, count)
+    return Sequence(
+        mesh, labels, times, read, path, declared=declared, precision=precision, files=(path,), up_axis=mesh.up_axis
+    )
 
 
 def _array(name, frames, mesh):

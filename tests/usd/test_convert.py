@@ -1,0 +1,180 @@
+"""Animations in other formats: what is read back has the bits, the order, the triangles, the times and the names."""
+
+import re
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+
+import warpcloth as wc
+from warpcloth.cli import main
+from warpcloth.mesh.mesh import Surface
+from warpcloth.mesh.sequences import open_sequence
+from warpcloth.usd.conversion import convert
+from warpcloth.usd.frames import FrameSequence
+from warpcloth.usd.writer import AnimationWriter
+
+pytestmark = pytest.mark.host
+COUNT, FPS = 5, 24
+
+
+def moved(mesh, frame):
+    """Points (n, 3) whose coordinates have all bits of float32."""
+    return (mesh.points + 0.1 * np.sin(mesh.points[:, ::-1] * 7.0 + frame)).astype(np.float32)
+
+
+@pytest.fixture
+def stage(tmp_path):
+    """A stage of a sheet whose velocities are no differences of its points."""
+    mesh = wc.Mesh.grid(4, 3)
+    with AnimationWriter(tmp_path / "sheet.usdc", mesh, FPS, prim="Sheet") as writer:
+        for frame in range(COUNT):
+            writer.append(moved(mesh, frame), np.full((12, 3), float(frame)))
+    return tmp_path / "sheet.usdc"
+
+
+def check(sequence, original, times=True):
+    assert np.array_equal(sequence.mesh.triangles, original.mesh.triangles) and len(sequence) == len(original)
+    for a, b in zip(sequence, original, strict=True):
+        assert np.array_equal(a.astype(np.float32), b.astype(np.float32))
+    assert np.array_equal(sequence.labels, original.labels)
+    assert not times or sequence.times == pytest.approx(original.times, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.pc2", "a.mdd", "a.npz", "a.usda", "a.obj", "a.ply"])
+def test_what_is_read_back_is_the_same(name, stage, tmp_path):
+    """To the bits of float32, also of what is converted twice; caches fit the mesh beside them, of the first frame."""
+    original = open_sequence(stage)
+    (tmp_path / "out").mkdir()
+    _, paths = convert(stage, tmp_path / "out" / name)
+    source = tmp_path / "out" if name[2:] in ("obj", "ply") else paths[0]
+    check(open_sequence(source, fps=FPS if name[2:] in ("obj", "ply", "pc2") else None), original)
+    if name[2:] in ("pc2", "mdd"):
+        beside = Surface.load(tmp_path / "out" / "a.obj")
+        assert np.array_equal(beside.points.astype(np.float32), original[0].astype(np.float32))
+        check(open_sequence(paths[0], fps=FPS, mesh=wc.Mesh.grid(4, 3)), original)
+    convert(source, tmp_path / "again.npz", fps=FPS)
+    check(open_sequence(tmp_path / "again.npz"), original)
+    with np.load(tmp_path / "again.npz") as arrays:
+        assert arrays["points"].dtype == (np.float64 if name[2:] in ("obj", "ply") else np.float32)
+
+
+def test_formats_are_those_of_others(stage, tmp_path):
+    """The bytes of the headers, and names of frames."""
+    convert(stage, tmp_path / "c.pc2")
+    data = (tmp_path / "c.pc2").read_bytes()
+    assert struct.unpack("<12siiffi", data[:32]) == (b"POINTCACHE2\0", 1, 12, 0.0, 1.0, COUNT) and len(data) == 32 + 12 * 12 * 5
+    convert(stage, tmp_path / "c.mdd")
+    data = (tmp_path / "c.mdd").read_bytes()
+    assert struct.unpack(">7f", data[8:36])[:5] == pytest.approx(np.arange(COUNT) / FPS) and data[:8] == b"\0\0\0\5\0\0\0\x0c"
+    _, paths = convert(stage, tmp_path / "c_.ply")
+    assert [path.name for path in paths[:2]] == ["c__0000.ply", "c__0001.ply"]
+    assert paths[0].read_bytes().startswith(b"ply\nformat binary_little_endian")
+
+
+def test_velocities_of_stages_are_kept_and_others_are_differences(stage, tmp_path):
+    convert(stage, tmp_path / "v.npz")
+    with np.load(tmp_path / "v.npz") as arrays:
+        assert arrays["velocities"].dtype == np.float32 and (arrays["velocities"] == np.arange(COUNT)[:, None, None]).all()
+    convert(stage, tmp_path / "v.usdc")
+    assert (np.asarray(FrameSequence(tmp_path / "v.usdc", "Sheet", "velocities")) == np.arange(COUNT)[:, None, None]).all()
+    convert(stage, tmp_path / "v.pc2")
+    convert(tmp_path / "v.pc2", tmp_path / "w.usdc", fps=FPS)
+    found, points = FrameSequence(tmp_path / "w.usdc", None, "velocities"), open_sequence(stage)
+    assert found[2] == pytest.approx((points[3] - points[1]) * FPS / 2, rel=1e-5)
+    assert found[4] == pytest.approx((points[4] - points[3]) * FPS, rel=1e-5)
+
+
+def test_cloths_keep_their_names(tmp_path):
+    mesh = wc.Mesh.join({"felt": wc.Mesh.grid(3, 3), "silk": wc.Mesh.grid(2, 4)})
+    with AnimationWriter(tmp_path / "two.usdc", mesh, FPS, cloths={"felt": "felt", "silk": "silk"}) as writer:
+        for frame in range(2):
+            writer.append(moved(mesh, frame), np.ones((17, 3)))
+    (tmp_path / "out").mkdir()
+    original = open_sequence(tmp_path / "two.usdc")
+    convert(tmp_path / "two.usdc", tmp_path / "two.npz")
+    convert(tmp_path / "two.npz", tmp_path / "back.usdc")
+    convert(tmp_path / "two.usdc", tmp_path / "out" / "two.obj")
+    check(open_sequence(tmp_path / "back.usdc"), original)
+    check(open_sequence(tmp_path / "out"), original, times=False)
+    for name in ("two.npz", "back.usdc"):
+        parts = open_sequence(tmp_path / name).mesh.parts
+        assert {each: part.first for each, part in parts.items()} == {"felt": 0, "silk": 9}
+    assert re.findall(r"g (\w+)", (tmp_path / "out" / "two_0001.obj").read_text()) == ["felt", "silk"]
+    with np.load(tmp_path / "two.npz") as arrays:
+        assert (arrays["velocities"] == 1.0).all()
+
+
+def saved(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+def test_wrong_input_is_refused_in_a_sentence(stage, tmp_path, capfd):
+    mesh = wc.Mesh.grid(3, 3)
+    points = np.stack([moved(mesh, frame) for frame in range(3)]).astype(np.float64)
+    good = {"points": points, "triangles": mesh.triangles}
+    bad = points.copy()
+    bad[1, 4, 2] = np.nan
+    saved(tmp_path / "nan.npz", points=bad, triangles=mesh.triangles, times=[0.0, 1.0, 2.0])
+    saved(tmp_path / "huge.npz", points=1e39 * points, triangles=mesh.triangles)
+    saved(tmp_path / "empty.npz", points=points[:0], triangles=mesh.triangles)
+    saved(tmp_path / "untimed.npz", **good)
+    saved(tmp_path / "uneven.npz", **good, times=[0.0, 1.0, 3.0])
+    (tmp_path / "mixed").mkdir()
+    for frame, width in enumerate((3, 3, 4)):
+        shape = wc.Mesh.grid(3, width)
+        text = "".join(f"v {x} {y} {z}\n" for x, y, z in shape.points)
+        (tmp_path / "mixed" / f"f{frame}.obj").write_text(text + "".join(f"f {a} {b} {c}\n" for a, b, c in shape.triangles + 1))
+    (tmp_path / "short.pc2").write_bytes(struct.pack("<12siiffi", b"POINTCACHE2\0", 1, 12, 0.0, 1.0, 5) + bytes(100))
+    (tmp_path / "none.mdd").write_bytes(struct.pack(">ii", 0, 12))
+    (tmp_path / "alone.mdd").write_bytes(struct.pack(">iif9f", 1, 3, 0.0, *range(9)))
+    (tmp_path / "s_0099.ply").write_bytes(b"")
+    (tmp_path / "rest.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    cases = [
+        ("nan.npz a.pc2", r"nan\.npz, frame 1: point 4 is \[.*nan\]; it must be finite as float32"),
+        ("nan.npz a.usdc", r"frame 1: point 4 is .*finite"),
+        ("nan.npz a.npz", r"frame 1: point 4 is .*finite"),
+        ("huge.npz a.obj", r"frame 0: point .* finite as float32"),
+        ("empty.npz a.pc2", "of one frame or more"),
+        ("untimed.npz a.mdd", r"has no times; give the frames per second \(--fps\)"),
+        ("uneven.npz a.usdc", "times are uneven after frame 1"),
+        ("mixed a.pc2", r"f2\.obj: 12 vertices, must be 9 as in"),
+        ("short.pc2 a.npz", "has 132 bytes; 5 frames of 12 points must have 752"),
+        ("none.mdd a.npz", "has 0 frames of 12 points"),
+        ("alone.mdd a.npz", "has no triangles; give a rest mesh .* put it beside as alone.obj"),
+        ("sheet.usdc a.abc", r"the ending is '\.abc'; it must be one of \.obj \.ply \.pc2 \.mdd"),
+        ("sheet.usdc sheet.usdc", "is a file of the input"),
+        ("sheet.usdc s.ply", r"s_0099\.ply: is a frame of another sequence; remove it"),
+        ("sheet.usdc rest.pc2", r"rest\.obj: is another mesh, which the first frame would replace"),
+        ("sheet.usdc nowhere/a.pc2", "nowhere does not exist"),
+        ("gone.usdc a.pc2", "no such file"),
+    ]
+    before = {path.name for path in tmp_path.iterdir()}
+    for words, says in cases:
+        source, output = words.split()
+        code = main(["convert", str(tmp_path / source), str(tmp_path / output)])
+        out, err = capfd.readouterr()
+        assert code == 2 and re.search(says, err) and err.count("\n") == 1 and not out, (words, err)
+    assert {path.name for path in tmp_path.iterdir()} == before
+
+
+def test_the_command(stage, tmp_path, capfd):
+    assert main(["convert", str(stage), str(tmp_path / "a.pc2")]) == 0
+    assert f"a.pc2 and {tmp_path / 'a.obj'}: {COUNT} frames of 12 vertices" in capfd.readouterr().out
+    assert main(["convert", str(tmp_path / "a.pc2"), str(tmp_path / "b.ply"), "--json"]) == 0
+    assert '"frames": 5' in capfd.readouterr().out
+
+
+def test_frames_are_streamed(tmp_path):
+    """Of 400 frames, 9.6 MB, no more than some are in memory; NumPy reports its arrays to tracemalloc."""
+    mesh = wc.Mesh.grid(40, 25)
+    saved(tmp_path / "a.npz", points=np.tile(mesh.points, (400, 1, 1)), triangles=mesh.triangles, times=np.arange(400.0))
+    convert(tmp_path / "a.npz", tmp_path / "warm.pc2")
+    for name in ("b.pc2", "b.mdd", "b.npz"):
+        tracemalloc.start()
+        convert(tmp_path / "a.npz", tmp_path / name)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert most < 2e6, name

@@ -1,0 +1,71 @@
+"""The command ``convert``: writes an animation in another format."""
+
+from ..base.texts import json_text
+from .terminal import Bar, check_writable
+
+EPILOG = """\
+FILE is a USD stage, a folder or pattern of .obj, .ply or .off files, or arrays in .npz, .npy, .pc2 or .mdd. The ending of
+OUTPUT sets the format:
+  .obj .ply                a file for each frame, such as cloth_0012.obj for cloth.obj
+  .pc2 .mdd                points of all frames; the first frame is written beside them as .obj
+  .npz                     points, triangles and times, and the velocities of a stage
+  .usd .usda .usdc .usdz   a stage
+Vertices keep their order, and coordinates their axes; lengths are metres.
+
+  warpcloth convert hanging.usdc hanging.pc2
+  warpcloth convert hanging.usdc frames/hanging.obj
+  warpcloth convert frames hanging.npz --fps 24
+"""
+
+
+def add_arguments(parser):
+    """Adds the arguments of this command, without those of all commands."""
+    parser.add_argument("file", metavar="FILE", help="the animation to convert")
+    parser.add_argument("output", metavar="OUTPUT", help="the file to write; its ending sets the format")
+    parser.add_argument("--prim", help="path or name of the prim, or name of the geometry in each file, if there are several")
+    parser.add_argument("--fps", type=float, help="frames per second (default: those of FILE, if it has them)")
+    parser.add_argument("--rest", metavar="FILE", help="mesh with the triangles of an .npy, .pc2 or .mdd file")
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
+
+
+def convert(arguments):
+    from ..mesh.mesh import Surface
+    from ..usd.conversion import convert as write
+
+    check_writable(arguments.output)
+    rest = None if arguments.rest is None else Surface.load(arguments.rest)
+    progress = _Writing()
+    try:
+        sequence, paths = write(arguments.file, arguments.output, arguments.prim, arguments.fps, rest, progress)
+    finally:
+        progress.close()
+    facts = {
+        "input": arguments.file,
+        "frames": len(sequence),
+        "vertices": len(sequence.mesh.points),
+        "triangles": len(sequence.mesh.triangles),
+        "files": [str(path) for path in paths],
+        "missing": sequence.missing,
+    }
+    print(json_text(facts) if arguments.json else _summary(facts))
+    return 0
+
+
+class _Writing(Bar):
+    """Shows the frames written on a terminal."""
+
+    def __init__(self):
+        self.open(None, "reading", "")
+
+    def __call__(self, done, total):
+        if done == 1:
+            self.open(total, "writing", "{n_fmt} of {total_fmt} frames, {remaining} left")
+        self.move(done)
+
+
+def _summary(facts):
+    first, *more = facts["files"]
+    names = f"{first} and {more[-1]}" if len(more) == 1 else f"{first} to {more[-1]}" if more else first
+    count, missing = facts["frames"], facts["missing"]
+    text = f"{names}: {count} frame{'s' if count > 1 else ''} of {facts['vertices']} vertices"
+    return text + (f"; {len(missing)} frames are missing, the first is {missing[0]}" if missing else "")

@@ -1,0 +1,191 @@
+"""Files of animations: the point caches .pc2 and .mdd, .npz files, and sequences of .obj and .ply files.
+
+A point cache has points and no triangles; a mesh beside it, an .obj file of the same name, has them. A .pc2 file is
+little-endian: "POINTCACHE2", the version 1, the numbers of points, first frame, frames per sample and number of samples, and
+float32 points. An .mdd file is big-endian: the numbers of frames and of points, float32 times [s], and float32 points.
+
+Files are written under a temporary name, and an error or interrupt leaves no part of one.
+"""
+
+import os
+import re
+import struct
+import zipfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from ..base.outputs import Output
+
+CACHES = (".pc2", ".mdd")
+# Endings that are written as one file for each frame.
+NUMBERED = (".obj", ".ply")
+_PC2, _MDD = struct.Struct("<12siiffi"), struct.Struct(">ii")
+_SIGNATURE = b"POINTCACHE2\0"
+_DIGITS = 4  # of a frame number, at least
+
+
+def open_pc2(path):
+    """Opens a .pc2 file.
+
+    Returns:
+        Frame numbers (F,) float64, and points (F, n, 3) float32 that are read from the file when used.
+
+    Raises:
+        ValueError: It is no such file, or has another length than its header says.
+    """
+    with open(path, "rb") as file:
+        head = file.read(_PC2.size)
+    if len(head) < _PC2.size or not head.startswith(_SIGNATURE):
+        raise ValueError("is no .pc2 file, which must begin with POINTCACHE2")
+    _name, version, count, first, spacing, frames = _PC2.unpack(head)
+    if version != 1:
+        raise ValueError(f"has version {version} of .pc2; it must be 1")
+    if frames > 1 and not (np.isfinite(first) and np.isfinite(spacing) and spacing > 0.0):
+        raise ValueError(f"has a frame each {spacing:g} from {first:g}; the first must be finite and the interval above 0")
+    points = _mapped(path, "<f4", _PC2.size, frames, count)
+    return first + spacing * np.arange(frames), points
+
+
+def open_mdd(path):
+    """Opens an .mdd file.
+
+    Returns:
+        Times (F,) [s] float64, and points (F, n, 3) float32 that are read from the file when used.
+
+    Raises:
+        ValueError: It has another length than its header says.
+    """
+    with open(path, "rb") as file:
+        head = file.read(_MDD.size)
+        if len(head) < _MDD.size:
+            raise ValueError("is no .mdd file, which must begin with the numbers of frames and points")
+        frames, count = _MDD.unpack(head)
+        start = _MDD.size + 4 * max(frames, 0)
+        points = _mapped(path, ">f4", start, frames, count)
+        times = np.frombuffer(file.read(4 * frames), ">f4").astype(np.float64)
+    return times, points
+
+
+def _mapped(path, dtype, start, frames, count):
+    if frames < 1 or count < 1:
+        raise ValueError(f"has {frames} frames of {count} points; there must be one at least of each")
+    expected, size = start + 12 * frames * count, os.path.getsize(path)
+    if size != expected:
+        raise ValueError(f"has {size} bytes; {frames} frames of {count} points must have {expected}")
+    return np.memmap(path, dtype, "r", start, (frames, count, 3))
+
+
+def write_pc2(path, frames, labels, count):
+    """Writes a .pc2 file.
+
+    Args:
+        path: The file.
+        frames: Iterator over the points (n, 3) [m] of each frame.
+        labels: Frame numbers (F,), evenly spaced.
+        count: Number of points n.
+    """
+    spacing = float(labels[1] - labels[0]) if len(labels) > 1 else 1.0
+    with _all_of(path) as file:
+        file.write(_PC2.pack(_SIGNATURE, 1, count, float(labels[0]), spacing, len(labels)))
+        for points in frames:
+            file.write(points.astype("<f4").tobytes())
+
+
+def write_mdd(path, frames, times, count):
+    """Writes an .mdd file, with times (F,) [s]; for the rest see :func:`write_pc2`."""
+    with _all_of(path) as file:
+        file.write(_MDD.pack(len(times), count) + np.asarray(times, ">f4").tobytes())
+        for points in frames:
+            file.write(points.astype(">f4").tobytes())
+
+
+def write_npz(path, frames, shape, dtype, arrays):
+    """Writes an .npz file as :func:`warpcloth.open_sequence` reads it.
+
+    Args:
+        path: The file.
+        frames: Iterators over arrays (n, 3) of each frame by name, such as "points".
+        shape: (F, n, 3).
+        dtype: Type of these arrays.
+        arrays: Other arrays by name.
+    """
+    header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": tuple(shape)}
+    with _all_of(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, rows in frames.items():
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, header)
+                for row in rows:
+                    member.write(row.astype(dtype).tobytes())
+        for name, array in arrays.items():
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as member:
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+
+
+def write_obj(path, points, mesh, digits=17):
+    """Writes an .obj file: vertices in their order, texture coordinates, and a group for each part of the mesh.
+
+    Args:
+        path: The file.
+        points: (n, 3) [m].
+        mesh: The :class:`warpcloth.Mesh`.
+        digits: Digits of coordinates; 9 keep every bit of float32, 17 those of float64.
+    """
+    coordinates = mesh.texture_coordinates
+    corner = "%d" if coordinates is None else "%d/%d"
+    parts = [(name, part.first) for name, part in (mesh.parts or {}).items()]
+    owner = np.searchsorted([first for _, first in parts], mesh.triangles[:, 0], side="right") - 1
+    with _all_of(path) as file:
+        np.savetxt(file, points, fmt="v" + 3 * f" %.{digits}g")
+        if coordinates is not None:
+            np.savetxt(file, coordinates, fmt="vt %.9g %.9g")
+        for k, name in enumerate([name for name, _ in parts] or [None]):
+            if name is not None:
+                file.write(f"g {'_'.join(name.split())}\n".encode())
+            faces = 1 + (mesh.triangles if name is None else mesh.triangles[owner == k])
+            np.savetxt(file, faces if coordinates is None else np.repeat(faces, 2, axis=1), fmt=f"f {corner} {corner} {corner}")
+
+
+def write_ply(path, points, mesh):
+    """Writes a binary .ply file with points (n, 3) [m] as float32, in their order, and the triangles of a mesh."""
+    import trimesh
+    from trimesh.exchange.ply import export_ply
+
+    shape = trimesh.Trimesh(points, mesh.triangles, process=False, validate=False)
+    with _all_of(path) as file:
+        file.write(export_ply(shape, encoding="binary", vertex_normal=False))
+
+
+def numbered_paths(path, labels):
+    """Returns the path of each frame: its number, with four digits or more, is added to the name.
+
+    Frames are numbered from 0 if a label is negative or no whole number.
+
+    Raises:
+        ValueError: A file of that kind with another number is there, which would be read as a frame of the sequence.
+    """
+    path, numbers = Path(path), np.asarray(labels)
+    if numbers.dtype.kind != "i" or numbers.min() < 0:
+        numbers = np.arange(len(numbers))
+    width = max(_DIGITS, len(str(numbers.max())))
+    paths = [path.with_name(f"{path.stem}_{number:0{width}}{path.suffix}") for number in numbers.tolist()]
+    kept = {each.name for each in paths}
+    if path.parent.is_dir():
+        pattern = re.compile(rf"{re.escape(path.stem)}_\d+{re.escape(path.suffix)}")
+        for other in sorted(os.listdir(path.parent)):
+            if pattern.fullmatch(other) and other not in kept:
+                raise ValueError(f"{path.parent / other}: is a frame of another sequence; remove it, or give another name")
+    return paths
+
+
+@contextmanager
+def _all_of(path):
+    """Opens a binary file that is only kept if all of it is written."""
+    output = Output(path, "xb")
+    try:
+        yield output.file
+    except BaseException:
+        output.discard()
+        raise
+    output.close()

@@ -1,0 +1,175 @@
+"""Converts animations from one format to another, frame by frame."""
+
+import os
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ..base.outputs import STAGE_ENDINGS, check_apart
+from ..mesh.caches import CACHES, NUMBERED, numbered_paths, write_mdd, write_npz, write_obj, write_pc2, write_ply
+from ..mesh.loading import read_arrays
+from ..mesh.sequences import open_sequence
+from .frames import FrameSequence, JoinedFrames
+from .stage import animated_prims, open_stage
+from .writer import AnimationWriter
+
+OUTPUTS = (*NUMBERED, *CACHES, ".npz", *STAGE_ENDINGS)
+_MOST = float(np.finfo(np.float32).max)
+_UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
+
+
+def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
+    """Writes an animation in another format. One frame is in memory at a time, or ten for a stage.
+
+    Args:
+        source: Path of an animation, as for :func:`warpcloth.open_sequence`.
+        output: The file to write; its ending is one of :data:`OUTPUTS`. For .obj and .ply the number of each frame is added to
+            the name. Beside a .pc2 or .mdd file, an .obj file of the same name has the first frame.
+        prim: See :func:`warpcloth.open_sequence`.
+        fps: See :func:`warpcloth.open_sequence`.
+        mesh: The rest mesh of a source without triangles.
+        progress: Function called with (frames written, frames), or None.
+
+    Returns:
+        The :class:`warpcloth.Sequence` of the source, and a list of the paths of the files.
+
+    Raises:
+        FileNotFoundError: There is no such file or folder.
+        ValueError: The source or the ending is not supported, a point is not finite as float32, the times of frames are needed
+            and not known, or frames are unevenly spaced where the format has one interval for all.
+    """
+    ending = Path(output).suffix.lower()
+    if ending not in OUTPUTS:
+        raise ValueError(f"{output}: the ending is {ending!r}; it must be one of {' '.join(OUTPUTS)}")
+    sequence = open_sequence(source, prim, fps, mesh)
+    if ending in NUMBERED:
+        paths = numbered_paths(output, sequence.labels)
+    else:
+        paths = [Path(output), *([Path(output).with_suffix(".obj")] if ending in CACHES else [])]
+    check_apart(paths, [*sequence.files, source])
+    frames = partial(_frames, sequence, progress)
+    if ending in NUMBERED:
+        write = write_ply if ending == ".ply" else partial(write_obj, digits=_digits(sequence))
+        for path, points in zip(paths, frames(), strict=True):
+            write(path, points, sequence.mesh)
+    elif ending == ".npz":
+        _write_npz(paths[0], sequence, frames)
+    elif ending in CACHES:
+        if ending == ".pc2":
+            _interval(sequence, sequence.labels, "frame numbers")
+            write, given = write_pc2, sequence.labels
+        else:
+            write, given = write_mdd, _times(sequence)
+        first = _points(sequence, 0)
+        _check_beside(paths, first, sequence.mesh)
+        write(paths[0], frames(), given, len(first))
+        write_obj(paths[1], first, sequence.mesh, _digits(sequence))
+    else:
+        _write_stage(paths[0], sequence, frames)
+    return sequence, paths
+
+
+def _check_beside(paths, points, mesh):
+    """Refuses to replace a mesh beside a new cache, which nobody named, unless it is the same."""
+    cache, beside = paths
+    if beside.exists() and not cache.exists():
+        try:
+            found, triangles, _ = read_arrays(beside)
+            same = np.array_equal(triangles, mesh.triangles) and np.allclose(found, points, 1e-6, 0.0)
+        except ValueError:
+            same = False
+        if not same:
+            raise ValueError(f"{beside}: is another mesh, which the first frame would replace; give the output another name")
+
+
+def _digits(sequence):
+    return 9 if np.dtype(sequence.precision).itemsize <= 4 else 17
+
+
+def _points(sequence, index):
+    """Returns the points (n, 3) [m] of a frame, which must be finite as float32."""
+    points = sequence[index]
+    bad = np.flatnonzero(~(np.abs(points) <= _MOST).all(axis=1))
+    if len(bad):
+        where, given = f"{sequence.path}, frame {sequence.labels[index]}", points[bad[0]].tolist()
+        raise ValueError(f"{where}: point {bad[0]} is {given}; it must be finite as float32")
+    return points
+
+
+def _frames(sequence, progress=None):
+    """Yields the points of each frame."""
+    for index in range(len(sequence)):
+        yield _points(sequence, index)
+        if progress:
+            progress(index + 1, len(sequence))
+
+
+def _times(sequence):
+    if sequence.times is None:
+        raise ValueError(f"{sequence.path}: has no times; give the frames per second (--fps)")
+    return sequence.times
+
+
+def _interval(sequence, values, name):
+    """Returns the interval of evenly spaced values; 1 for one frame."""
+    intervals = np.diff(values)
+    if not len(intervals):
+        return 1.0
+    if np.ptp(intervals) > _UNEVEN * intervals.min():
+        uneven = int(np.argmax(np.abs(intervals - intervals[0]) > _UNEVEN * intervals[0]))
+        label = sequence.labels[uneven]
+        raise ValueError(f"{sequence.path}: {name} are uneven after frame {label}; this format needs one interval for all")
+    return float(values[-1] - values[0]) / len(intervals)
+
+
+def _velocities(sequence):
+    """Returns a function (index of a frame) → its velocities (n, 3) [m/s] in a stage, or None if there are none."""
+    if sequence.path is None or Path(sequence.path).suffix.lower() not in STAGE_ENDINGS:
+        return None
+    path = os.fspath(sequence.path)
+    try:
+        if sequence.stage is not None:
+            found = FrameSequence(path, sequence.stage.prim, "velocities")
+        else:
+            found = JoinedFrames(path, [str(each.GetPath()) for each in animated_prims(open_stage(path))], "velocities")
+    except ValueError:  # without velocities
+        return None
+    return found.exact if len(found) == len(sequence) and found.shape[1] == len(sequence.mesh.points) else None
+
+
+def _differences(sequence, index):
+    """Returns velocities (n, 3) [m/s] as central differences of the frames, one-sided for the first and the last."""
+    before, after = max(index - 1, 0), min(index + 1, len(sequence) - 1)
+    if before == after:
+        return np.zeros_like(sequence.mesh.points, dtype=np.float64)
+    return (_points(sequence, after) - _points(sequence, before)) / (sequence.times[after] - sequence.times[before])
+
+
+def _write_npz(path, sequence, frames):
+    dtype = np.float32 if _digits(sequence) == 9 else np.float64
+    arrays = {"triangles": sequence.mesh.triangles}
+    if sequence.times is not None:
+        arrays["times"] = sequence.times
+    if sequence.mesh.parts:
+        arrays["parts"] = np.array(list(sequence.mesh.parts))
+        arrays["first"] = np.array([part.first for part in sequence.mesh.parts.values()])
+    velocities = _velocities(sequence)
+    rows = {"points": frames()}
+    if velocities is not None:
+        rows["velocities"] = map(velocities, range(len(sequence)))
+    write_npz(path, rows, (len(sequence), *sequence.mesh.points.shape), dtype, arrays)
+
+
+def _write_stage(path, sequence, frames):
+    interval = _interval(sequence, _times(sequence), "times")
+    fps = 1.0 / interval
+    fps = round(fps) if abs(fps - round(fps)) < 1e-4 * fps else fps
+    velocities = _velocities(sequence) or partial(_differences, sequence)
+    name = None if sequence.stage is None else sequence.stage.prim.rsplit("/", 1)[1]
+    parts = sequence.mesh.parts
+    cloths = {each: each for each in parts} if parts and len(parts) > 1 else None
+    mesh, up_axis = sequence.mesh, sequence.up_axis
+    with AnimationWriter(path, mesh, fps, prim=name, up_axis=up_axis, cloths=cloths) as writer:
+        for index, points in enumerate(frames()):
+            writer.append(points, velocities(index))
