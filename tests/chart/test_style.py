@@ -100,6 +100,9 @@ def test_what_cannot_be_named_legibly_is_left_to_a_legend():
     before = axes.get_xlim()
     assert not style.name_ends(figure, axes, ends, 16.0) and not axes.texts and axes.get_xlim() == before
     assert not style.name_ends(figure, axes, [(10.0, 0.5, "long " * 12, "black")], 16.0) and axes.get_xlim() == before
+    for height in np.linspace(0.0, 1.0, 40):
+        axes.axhline(height)
+    assert not style.name_ends(figure, axes, ends[:1], 16.0), "whatever covers lines"
     axes.annotate("here", (10.0, 0.5), (9.0, 0.0), textcoords="offset points")
     assert style.name_ends(figure, axes, ends) and len(axes.texts) == 10
     here, *boxes = (note.get_window_extent() for note in axes.texts)

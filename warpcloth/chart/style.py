@@ -33,6 +33,7 @@ TITLE, LABEL, TICK, SMALL, PRINT = 10.0, 9.0, 8.0, 7.5, 6.5  # sizes of letters 
 LEGEND = {"fontsize": SMALL, "labelcolor": GREY, "frameon": False}
 _GRID = {"which": "major", "linewidth": 0.3, "color": "0.85"}
 _GAP, _LINE = 7.0, 3.0  # from the end of a line to its name, and between heights that are tried [pt]
+_MARKER = 5  # points of lines that a marker is worth
 _COVERED = 2.0  # distance that a name goes to cover one point less of other lines [pt]
 
 
@@ -203,12 +204,12 @@ def _widen(axes, share):
 
 
 def _drawn(axes):
-    """Returns points along all lines of a panel [pixels], (p, 2), about three pixels apart."""
+    """Returns points along all lines of a panel [pixels], (p, 2), about three pixels apart, and at markers several."""
     parts = []
     for line in axes.lines:
         at = line.get_transform().transform(line.get_xydata())
         at = at[np.isfinite(at).all(axis=1)]
-        parts.append(at)
+        parts.append(np.repeat(at, _MARKER if line.get_marker() not in ("None", "") else 1, axis=0))
         if line.get_linewidth() > 0.0 and line.get_linestyle() != "None":
             for a, b in pairwise(at):
                 count = min(int(np.linalg.norm(b - a) / 3.0), 1000)
