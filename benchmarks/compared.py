@@ -23,7 +23,7 @@ from warpcloth.lab.choosing import percent
 from warpcloth.lab.measurements import SceneRef
 from warpcloth.lab.own_reference import words_of_own
 from warpcloth.lab.setups import grid_in_words
-from warpcloth.lab.side_by_side import side_by_side
+from warpcloth.lab.side_by_side import nearest_setting, side_by_side
 from warpcloth.lab.work_precision import WITHIN
 from warpcloth.others.simulators import SIMULATORS
 
@@ -101,6 +101,7 @@ def text_of(found):
         numbers = f"{each['ratio']:.3g} | {each['spread'][0]:.3g} to {each['spread'][1]:.3g} | {each['ms']:.3g}"
         error = percent(each["error"]) + ("" if each["to"] == "reference" else " (its own counts)")
         lines.append(f"| {each['label']} | {error} | {own} | {numbers} | {each['crossings']} | {each['inside']} |")
+    lines += [f"  {said}" for said in [nearest_setting(found)] if said]
     for solver, ended in found["searched"].items():
         same = [row for row in rows if row["solver"] == solver]
         own, statuses = found["others"][solver], [row["status"] for row in same]
@@ -108,8 +109,8 @@ def text_of(found):
         lines.append(f"  {solver}: {ended} ({counts})")
         lines.append(f"    its own motion: {words_of_own(own)}")
         tried = [row["options"] for row in same]
-        errors = [row["error"] for row in same if row["error"] is not None]
-        lines.append(f"    least error {percent(min(errors))}" if errors else "    no error is known")
+        errors = [(row["error"], row["label"]) for row in same if row["error"] is not None]
+        lines.append(f"    least error {percent(min(errors)[0])}, {min(errors)[1]}" if errors else "    no error is known")
         lines.append(f"    settings: {grid_in_words(tried)}")
         lines += [f"    {why}" for why in dict.fromkeys(row["reason"] for row in same if row["status"] != "ok")]
     return "\n".join(lines)

@@ -20,6 +20,7 @@ from warpcloth.lab.choosing import Measured, choose, climb, climb_others, ladder
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.reference import Reference
 from warpcloth.lab.setups import grid_in_words
+from warpcloth.lab.side_by_side import nearest_setting, side_by_side
 
 # hanging, 64 × 64 vertices: error and ms a frame, with quartiles, of ladders from coarse to fine.
 TABLE = {
@@ -195,6 +196,13 @@ def test_nothing_is_measured_if_the_reference_cannot_tell(limit, why, monkeypatc
     choice, found, _ = choose(SceneRef("chain", {"links": 3}), 0.01, solvers=["newton"], frames=4, store=Store())
     assert (choice.chosen, choice.meets, found) == (None, False, []) and choice.untried > 0
     assert "is known to 2% only (Newton, 64 substeps" in choice.certainty and why in choice.certainty
+    compared = side_by_side(SceneRef("chain", {"links": 3}), [], 0.01, solvers=["newton"], frames=4, store=Store())
+    assert compared["ratios"] == [] and nearest_setting(compared).startswith(
+        "no setting of warpcloth has an error; the reference"
+    )
+    compared["rows"] = [{"solver": "pbd", "label": f"pbd {error}", "error": error} for error in (0.05, 0.03, None)]
+    assert "meets 1%; nearest is pbd 0.03 with 3%" in nearest_setting(compared)
+    assert nearest_setting({"ratios": [{"solver": "pbd"}]}) == ""
 
 
 SCENES = [

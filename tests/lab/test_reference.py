@@ -4,6 +4,7 @@ import json
 import warnings
 from dataclasses import asdict, replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,11 @@ import warpcloth as wc
 from support.rows import slow_but
 from warpcloth.base.digest import scene_digest
 from warpcloth.kernels.terms import SPRING
+from warpcloth.lab import own_reference as own_reference_module
 from warpcloth.lab import reference as module
 from warpcloth.lab import trajectory
-from warpcloth.lab.measurements import SceneRef
+from warpcloth.lab.measurements import SceneRef, Setup
+from warpcloth.lab.own_reference import own_facts, own_reference, words_of_own
 from warpcloth.lab.reference import Reference, cloth_size, position_error, reference, strain_error
 from warpcloth.lab.trajectory import measure
 
@@ -475,3 +478,33 @@ def test_a_measurement_needs_its_reference(shared):
     ):
         with pytest.raises(ValueError, match=words):
             wrong()
+
+
+# Moves of doublings from 2 substeps on, of a motion known to 1e-3 at most: substeps of the motion that is taken, and its error.
+MOVES = [
+    ((8e-4, 4e-4, 2e-4, 1e-4, 5e-5, 2e-5), 128, 5e-5),
+    ((3e-2, 2e-5, 1e-5), 16, 2e-5),
+    ((3e-4, 7e-4, 2e-3), 4, np.inf),  # hardly moved by the first doublings, and far from its limit
+    ((5e-5, 2e-5, 1e-5), 8, 5e-5),
+    ((3e-5, 9e-5), 8, 9e-5),  # below the tolerance rounding may move it
+    ((4e-4, 2e-4, 3e-4, 6e-4), 8, 4e-4),  # later doublings only round it
+]
+
+
+@pytest.mark.parametrize(("moves", "substeps", "error"), MOVES)
+def test_a_motion_converges_by_two_successive_doublings(moves, substeps, error, tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    mesh = CHAIN.load().mesh
+    offsets = dict(zip([2 * 2**k for k in range(len(moves) + 1)], np.cumsum([0.0, *moves]) * cloth_size(mesh), strict=True))
+
+    def ran(scene, record, device, frames, watch):
+        if record.substeps not in offsets:
+            raise ValueError("as much as was asked for")
+        points = np.tile(scene.mesh.points, (frames + 1, 1, 1)) + np.array([offsets[record.substeps], 0.0, 0.0])
+        return SimpleNamespace(points=points, status=SimpleNamespace(ok=True))
+
+    monkeypatch.setattr(own_reference_module, "run_other", ran)
+    found = own_reference(CHAIN, [Setup("newton-vbd", {"substeps": 2, "iterations": 2})], 2, tolerance=1e-4)
+    facts = own_facts(found, found, mesh, 1e-3)
+    assert (found.substeps, found.error) == (substeps, pytest.approx(error)) and facts["converged"] == (error <= 1e-3)
+    assert ("two doublings up to" if facts["converged"] else "no two doublings") in words_of_own(facts)

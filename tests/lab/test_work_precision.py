@@ -273,12 +273,14 @@ def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
     """Of a solver with many settings; and what has no points is no line in the legend."""
     rows = [
         {"solver": solver, "label": f"{solver} {n}", "status": "refused", "reason": why, "points": [], "floor": 1e-9}
-        for solver, n, why in (("newton", 1, "hard"), ("newton", 4, "hard"), ("newton", 8, "soft"), ("admm", 1, "hard"))
-    ]
+        for solver, n, why in (("newton", 1, "hard"), ("newton", 4, "hard"), ("newton", 8, "soft"), ("admm", 1, "hard"),
+                               ("pbd", 1, "strain 1.5e+03"), ("pbd", 2, "strain 76"))
+    ]  # fmt: skip
     points = [{"iterations": n, "gap": 1.0 / n, "ms": 40.0 + n} for n in (1, 2, 4)]
     rows.append({"solver": "xpbd", "label": "xpbd", "status": "ok", "reason": "", "points": points, "floor": 1e-9})
     found = {"scene": "a$^$.py", "frame": 1, "rate": 60.0, "dtype": "float64", "machine": machine.machine(), "rows": rows}
     said = [("newton, 2 settings", "refused: hard"), ("newton 8", "refused: soft"), ("admm 1", "refused: hard")]
+    said.append(("pbd, 2 settings", "refused: strain 1.5e+03; the others alike"))
     assert without_point(found) == said
     pareto.plot_solver(tmp_path / "solver.png", found)
     (legend,) = (axes.get_legend() for axes in drawn[0].axes if axes.get_legend())

@@ -234,7 +234,7 @@ def test_charts_and_choices_have_its_solvers(tmp_path, monkeypatch):
     rough = own_reference(scene, [Setup(name, {"substeps": 30})], 6, tolerance=1e-2)
     facts = own_facts(rough, exact, scene.load().mesh, 0.5 * rough.error)
     assert not facts["converged"] and words_of_own(facts).startswith(
-        "not converged: a doubling to 60 steps a frame moved it by"
+        "not converged: two doublings up to 120 steps a frame moved it by"
     )
     assert of_own(rough, 0.5 * rough.error) == {} != of_own(rough, rough.error)
     refused = trajectory.measure(asdict(scene), asdict(Setup(name, {"substeps": 1})), frames=1, dtype="float64")

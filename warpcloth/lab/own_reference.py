@@ -16,7 +16,7 @@ from .clock import CLOCKS, Clock, TooSlow
 from .reference import Reference, kept_reference, position_error, strain_error
 
 _MOST = 12  # runs, each with twice the substeps of the one before
-# A motion counts as converged if the last doubling moved it by at most this share of the tolerance.
+# A motion counts as converged if two successive doublings moved it by at most this share of the tolerance.
 SHARE = 0.1
 
 
@@ -24,11 +24,14 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
     """Returns the :class:`warpcloth.lab.reference.Reference` of a solver of another simulator, from its file, or computed.
 
     It runs the scene with the fewest substeps and the most iterations of its settings, with twice the substeps, and so on. It
-    ends when a doubling moves the cloth by at most the tolerance. It also ends when the last two doublings both move it further
-    than an earlier one did; then float32 rounds the motion, or the solver does not converge. The two successive runs that are
-    nearest to each other count. The coarser of them is run with twice the iterations too. The larger of both moves is the
-    error, which bounds that of the finer run if each doubling at least halves the error. A caller must compare it with a bound
-    of its own before it takes the motion for converged, see :func:`own_facts`.
+    ends when two successive doublings both move the cloth by at most the tolerance. It also ends when the last two doublings
+    both move it further than an earlier one did; then float32 rounds the motion, or the solver does not converge.
+
+    Two successive doublings count if the second moves the cloth no further than the first, or both move it by at most the
+    tolerance. A single doubling does not count, nor do moves that grow: a solver far from its limit may hardly move. Of those
+    that count, the two with the smallest moves are taken. The middle run is run with twice the iterations too. The largest of
+    the three moves is the error, which bounds that of the finest run if each doubling at least halves the error. A caller must
+    compare it with a bound of its own before it takes the motion for converged, see :func:`own_facts`.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
@@ -42,7 +45,7 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
 
     Returns:
         The reference, or None if the solver does not take the scene, diverges, or takes too long for two runs. Its error is
-        infinite if there was no time for the run with more iterations.
+        infinite if no two doublings count, or if there was no time for the run with more iterations.
     """
     records = [setup.record() for setup in setups]
     iterations = max(record.iterations for record in records)
@@ -77,17 +80,18 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
             runs.append((substeps, points))
         if len(runs) > 1:
             moves.append(position_error(runs[-1][1][1:], runs[-2][1][1:], declared.mesh))
-            if moves[-1] <= tolerance or (len(moves) > 2 and min(moves[-2:]) > min(moves)):
+            if max(moves[-2:]) <= tolerance and len(moves) > 1:
+                break
+            if len(moves) > 2 and min(moves[-2:]) > min(moves):
                 break
         if now() - began + 2.0 * (now() - before) > limit:
             break
         substeps *= 2
     if not moves:
         return None
-    best = int(np.argmin(moves))
+    best, error = _settled(moves, tolerance)
     (coarser, coarse), (substeps, fine) = runs[best : best + 2]
-    error = moves[best]
-    if other_solvers()[name].iterates:
+    if other_solvers()[name].iterates and np.isfinite(error):
         more = run(coarser, 2 * iterations, limit)
         known = isinstance(more, np.ndarray)
         error = max(error, position_error(more[1:], coarse[1:], declared.mesh)) if known else np.inf
@@ -106,6 +110,17 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
     )
     found.save()
     return found
+
+
+def _settled(moves, tolerance):
+    """Returns (index of a doubling, error) of the two successive doublings that move the cloth least and count.
+
+    The index is that of the second of them. If no two count, it is that of the smallest move, and the error is infinite.
+    """
+    pairs = {k: (moves[k - 1], moves[k]) for k in range(1, len(moves))}
+    errors = {k: max(pair) for k, pair in pairs.items() if pair[1] <= pair[0] or max(pair) <= tolerance}
+    best = min(errors, key=errors.get, default=int(np.argmin(moves)))
+    return best, errors.get(best, np.inf)
 
 
 def own_references(scene, setups, frames, device, tolerance, limit, progress=None, clock="wall"):
@@ -161,7 +176,7 @@ def words_of_own(facts):
     if facts is None:
         return "not known, for two runs did not end well within the time limit"
     said = "converged" if facts["converged"] else "not converged"
-    moved = "twice the iterations took too long"
+    moved = "no two doublings in turn moved it less and less, or twice the iterations took too long"
     if facts["error"] is not None:
-        moved = f"a doubling to {facts['substeps']} steps a frame moved it by {100.0 * facts['error']:.2g} %"
+        moved = f"two doublings up to {facts['substeps']} steps a frame moved it by {100.0 * facts['error']:.2g} % at most"
     return f"{said}: {moved} (bound {100.0 * facts['bound']:.2g} %); {100.0 * facts['apart']:.2g} % from the reference"

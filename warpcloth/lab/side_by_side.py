@@ -11,7 +11,7 @@ from ..analysis.intersections import intersections
 from ..core.capture import Mirror
 from ..mesh.ordering import order_of_run
 from ..others.simulators import simulator_of
-from .choosing import choose
+from .choosing import choose, percent
 from .clock import CLOCKS
 from .machine import machine
 from .measurements import Setup
@@ -38,7 +38,8 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
         ``solver``, ``options``, ``to``, the error that counts, "reference" or "own", the errors, ``ratio``, the median over
         frames of its time over that of warpcloth, with quartiles ``spread``, ``ms``, and the largest numbers in any
         frame of pairs of triangles that cross, ``crossings``, and of vertices inside colliders, ``inside``; both are None if
-        libigl is not installed.
+        libigl is not installed. If no setting of warpcloth meets the tolerance, ratios are to the first other that does; if
+        none does, ``ratios`` is empty.
 
     Raises:
         ImportError: A simulator is not installed.
@@ -73,6 +74,19 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
     }
 
 
+def nearest_setting(found):
+    """Returns in words which setting of warpcloth is nearest to the tolerance in a result, or "" if one meets it."""
+    if any(simulator_of(each["solver"]) is None for each in found["ratios"]):
+        return ""
+    known = f"the reference is known to {percent(found['reference']['error'])}"
+    rows = [row for row in found["rows"] if row["error"] is not None and simulator_of(row["solver"]) is None]
+    if not rows:
+        return f"no setting of warpcloth has an error; {known}"
+    best = min(rows, key=lambda row: row["error"])
+    comes = f"nearest is {best['label']} with {percent(best['error'])}"
+    return f"no setting of warpcloth meets {percent(found['tolerance'])}; {comes}; {known}"
+
+
 def _row(each, fps):
     """Returns the row of a :class:`warpcloth.lab.choosing.Measured` in a diagram."""
     status = each.status if each.error is not None or each.status != "ok" else "diverged"
@@ -104,6 +118,8 @@ def _alternate(scene, rows, frames, device, now):
     Returns:
         list: A dictionary for each row with ``ms``, ``ratio``, ``spread``, ``crossings`` and ``inside``.
     """
+    if not rows:
+        return []
     with wp.ScopedDevice(device):
         runs = [_bound(scene, Setup(row["solver"], row["options"]), device) for row in rows]
         times, motions = [[] for _ in rows], [[] for _ in rows]

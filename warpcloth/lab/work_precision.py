@@ -6,6 +6,7 @@ dictionary for each setting in ``rows``. :mod:`warpcloth.chart.pareto` draws it.
 
 import json
 import math
+import re
 
 from ..base.digest import scene_digest
 from ..base.outputs import write_table
@@ -273,15 +274,18 @@ def quartiles(row):
 
 
 def without_point(found):
-    """Returns (label, status and reason) of rows without a point in the picture, one for all equal rows of a solver."""
+    """Returns (label, status and reason) of rows without a point, one for all rows of a solver that differ in numbers only."""
     groups = {}
     for row in found["rows"]:
         if row["status"] != "ok":
-            groups.setdefault((row["solver"], f"{row['status']}: {row['reason']}"), []).append(row["label"])
-    return [
-        (labels[0] if len(labels) == 1 else f"{solver}, {len(labels)} settings", why)
-        for (solver, why), labels in groups.items()
-    ]
+            why = f"{row['status']}: {row['reason']}"
+            groups.setdefault((row["solver"], re.sub(r"\d[\d.e+]*", "", why)), []).append((row["label"], why))
+    said = []
+    for (solver, _), rows in groups.items():
+        labels, whys = zip(*rows, strict=True)
+        label = labels[0] if len(rows) == 1 else f"{solver}, {len(rows)} settings"
+        said.append((label, whys[0] + ("; the others alike" if len(set(whys)) > 1 else "")))
+    return said
 
 
 def write_csv(path, found):
