@@ -23,10 +23,15 @@ from warpcloth.scenes import (
     cusick,
     drape,
     flag,
+    fold,
+    funnel,
     hanging,
     knot,
     mobile,
+    sleeve,
+    stack,
     tablecloth,
+    twist,
 )
 
 DOCS = Path(__file__).parent
@@ -41,6 +46,7 @@ WHITE, CREAM, RED, OCHRE, TEAL, INDIGO = (
     (0.05, 0.09, 0.28),
 )
 WALK = {"azimuth": -60.0, "elevation": 10.0}
+SWING = {"azimuth": -15.0, "elevation": 22.0, "zoom": 1.1, "ground": False}
 ENTRIES, RUNS = {}, tempfile.TemporaryDirectory()
 
 
@@ -53,6 +59,11 @@ def entry(make):
 def film(source, name, size=(360, 270), samples=4, **looks):
     """A film that plays in the page."""
     wc.render(source, FOLDER / f"{name}.webp", size=size, samples=samples, **looks)
+
+
+def page(source, name, **looks):
+    """A page that shows a motion in a browser, to which docs/gallery.md links."""
+    wc.view(source, DOCS / "_static" / "gallery" / f"{name}.html", **looks)
 
 
 def bare(animation):
@@ -118,6 +129,13 @@ def skirt_walking():
 
 
 @entry
+def twisted():
+    animation = run(twist.scene(turns=1.0, around=24, along=20, duration=2.4), wc.XPBD(substeps=8))
+    colour = dyed(animation, bands(animation, 0.05) % 2, (OCHRE, CREAM))
+    film(animation, "twisted", size=(400, 220), colour=colour, every=2, azimuth=-20.0, elevation=14.0, ground=False)
+
+
+@entry
 def knot_tightened():
     animation = run(knot.scene(along=90, across=3), wc.Newton(substeps=2))
     colour = dyed(animation, parts(animation, 2), (RED, INDIGO))
@@ -131,6 +149,13 @@ def denim_and_silk(names=("denim", "silk")):
     dyes = ((INDIGO, np.multiply(1.4, INDIGO)), (CREAM, np.multiply(0.85, CREAM)))
     colour = [dyed(each, bands(each, 0.1) % 2, dye) for each, dye in zip(animations, dyes, strict=True)]
     film(animations, "denim_and_silk", size=(480, 240), names=names, colour=colour, every=4, zoom=1.15)
+
+
+@entry
+def sheets_stacked(sheets=4):
+    animation = bare(run(stack.scene(sheets=sheets, n=12), wc.Explicit(substeps=90)))
+    colour = dyed(animation, parts(animation, sheets), (INDIGO, TEAL, OCHRE, RED))
+    film(animation, "sheets_stacked", colour=colour, every=4, elevation=18.0)
 
 
 @entry
@@ -149,6 +174,27 @@ def cards_leaning(frictions=(0.6, 0.15)):
         elevation=20.0,
         zoom=1.1,
     )
+
+
+@entry
+def sheet_folding():
+    animation = bare(run(fold.scene(ny=49, duration=0.8), wc.XPBD(substeps=10)))
+    colour = dyed(animation, bands(animation, 0.1, 2) % 2, (TEAL, CREAM))
+    looks = {"azimuth": -25.0, "elevation": 16.0, "zoom": 1.1}
+    film(animation, "sheet_folding", size=(300, 320), colour=colour, every=2, **looks)
+
+
+@entry
+def sleeve_and_lining():
+    animation = run(sleeve.scene(around=24, along=18), wc.Explicit(substeps=140))
+    colour = dyed(animation, parts(animation, 2), (INDIGO, OCHRE))
+    film(animation, "sleeve_and_lining", size=(400, 220), colour=colour, every=4, azimuth=25.0, ground=False)
+
+
+@entry
+def cloth_in_funnel():
+    animation = run(funnel.scene(n=25), wc.Newton(substeps=4))
+    film(animation, "cloth_in_funnel", size=(280, 320), colour=gingham(animation, 0.05, TEAL), every=2, elevation=38.0)
 
 
 @entry
@@ -171,8 +217,8 @@ def eight_methods():
         "ConstrainedDynamics": wc.ConstrainedDynamics(substeps=4),
     }
     animations = [run(hanging.scene(n=16, duration=1.5), solver) for solver in solvers.values()]
-    looks = {"colour": "stretch_1", "colour_range": (0.99, 1.01), "azimuth": -50.0, "elevation": 12.0, "ground": False}
-    film(animations, "eight_methods", size=(640, 270), zoom=1.1, names=list(solvers), every=4, **looks)
+    looks = {"colour": "stretch_1", "colour_range": (0.99, 1.01), **SWING}
+    film(animations, "eight_methods", size=(740, 290), names=list(solvers), every=4, **looks)
 
 
 @entry
@@ -180,8 +226,7 @@ def three_integrators():
     scene = hanging.scene(n=12, stiffness=100.0, duration=3.0)
     names = ("euler", "bdf2", "midpoint")
     animations = [run(scene, wc.Newton(substeps=4, integrator=name)) for name in names]
-    looks = {"azimuth": -55.0, "elevation": 12.0, "ground": False, "time": True}
-    film(animations, "three_integrators", size=(540, 220), zoom=1.15, names=names, every=4, **looks)
+    film(animations, "three_integrators", size=(600, 200), names=names, every=4, time=True, **SWING)
 
 
 @entry
@@ -227,6 +272,16 @@ def shadows_of_drapes(names=("silk", "cotton", "canvas", "wool")):
         each.spines[:].set_visible(False)
     figure.tight_layout(pad=0.3)
     pictures.save(figure, "gallery/shadows_of_drapes.png")
+
+
+@entry
+def hanging_in_browser():
+    page(run(hanging.scene(n=24, duration=3.0), wc.Newton(substeps=4)), "hanging_in_browser", ground=False)
+
+
+@entry
+def skirt_in_browser():
+    page(walking().output, "skirt_in_browser", **WALK)
 
 
 @entry
