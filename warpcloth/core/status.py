@@ -77,7 +77,7 @@ class Status(NamedTuple):
         return self.result not in (Result.DIVERGED, Result.STOPPED)
 
 
-def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None, use=None):
+def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None, use=None, held=0.0):
     """Returns a message: how a run ended, whether its result can be used, and the residual with its unit and tolerance.
 
     Args:
@@ -89,6 +89,7 @@ def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=No
         tolerance: The tolerance it was compared with, or None for methods that do not check it.
         copy: The copy whose residual it is, or None if there is one copy.
         use: How the result can be used; None for what holds for a run over time.
+        held: The largest distance by which cloth held back a pin [m], or 0. The result is then usable only if that may be.
     """
     use = use or {
         Result.COMPLETED: "usable" if measure is None else _NEAR,
@@ -96,6 +97,9 @@ def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=No
         Result.ROUNDED: f"usable, as near to the solution as {dtype} comes",
     }.get(result, _NEAR)
     where = " in a step or more" if use is _NEAR and result is not Result.COMPLETED else ""
+    if held > 0.0:
+        rest = use.removeprefix("usable").replace(" if ", " and if ", 1)
+        use = f"usable if cloth may hold pins back from their keyframes by up to {digits(held)} m{rest}"
     text = f"{result.value}{where}; {use}"
     if measure is None:
         return text

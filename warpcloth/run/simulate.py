@@ -296,7 +296,7 @@ def simulate(
                 if progress is not None:
                     progress(number, frames)
         recorder.finish()
-    status = watch.status(solver)
+    status = watch.status(solver, _farthest_held(stepper))
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     recorded = {
@@ -350,6 +350,12 @@ def _self_contact(stepper, ok):
         )
     of_run = of_copies(1.0 - pairs.share), of_copies(gaps), "; ".join(said) or None, "; ".join(held) or None
     return SelfContactSummary(pairs.most, int(pairs.lists.numpy().max()), *of_run)
+
+
+@in_turn
+def _farthest_held(stepper):
+    """Returns the largest distance of a pin from its keyframes to which cloth held it back in a step of any copy [m], or 0."""
+    return 0.0 if stepper.pairs is None else max((pin.farthest for pin in stepper.pairs.pins_held), default=0.0)
 
 
 @in_turn

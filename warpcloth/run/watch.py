@@ -155,8 +155,8 @@ class Watch:
             found[self.alive] = np.abs(np.sqrt(squares) / self.rest - 1.0).max(axis=1, initial=0.0)
         return found
 
-    def status(self, solver):
-        """Returns the :class:`Status` of a run with a solver, from its last frame."""
+    def status(self, solver, held=0.0):
+        """Returns the :class:`Status` of a run from its last frame. Cloth has ``held`` pins back by at most this [m]."""
         results, residual = self.last.results, self.last.residual
         ended = [Result.STOPPED if self.stopped and alive else Result.DIVERGED for alive in self.alive]
         results = [ended[copy] if copy in self.messages else result for copy, result in enumerate(results)]
@@ -170,5 +170,5 @@ class Watch:
         else:
             dtype, tolerance = self.model.numpy_dtype.__name__, getattr(solver, "tolerance", None)
             which = copy if len(residual) > 1 else None
-            message = sentence(result, dtype, residual[copy], measure, unit, tolerance, which)
+            message = sentence(result, dtype, residual[copy], measure, unit, tolerance, which, held=held)
         return Status(result, int(self.good.max()), of_copies(residual), message, self.good, measure, unit)
