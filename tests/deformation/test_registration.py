@@ -80,7 +80,7 @@ def test_flat_cloth_without_its_outline_slides():
     window = wc.Mesh.grid(7, 7, size=0.6)
     frames = [wc.Mesh(window.points + np.array([0.2, 0.0, 0.2]), window.triangles) for _ in range(3)]
     found = wc.resample(wc.as_capture(frames, dt=1.0), TEMPLATE)
-    assert np.abs(found.points - TEMPLATE.points).max() < 1e-6
+    assert np.abs(found.points - TEMPLATE.points).max() < 1e-5  # nearest points are float32, and 60 iterations add roundings
     # The outline shows most of it, of 0.08 m; more iterations show more.
     moved = [wc.Mesh(TEMPLATE.points + k * np.array([0.04, 0.0, 0.02]), TEMPLATE.triangles) for k in range(3)]
     found = wc.resample(wc.as_capture(moved, dt=1.0), TEMPLATE)
