@@ -12,6 +12,7 @@ import warpcloth as wc
 from warpcloth.cli import main
 from warpcloth.lab.laboratory import drape_coefficient
 from warpcloth.lab.scans import scan, write_capture
+from warpcloth.mesh.mesh import Surface
 from warpcloth.scenes import catenary, chain, loop
 from warpcloth.scenes.hanging import scene as hanging
 
@@ -71,10 +72,19 @@ def test_it_fits_a_capture_whose_triangles_change(tmp_path, capsys):
     few = wc.CapturePoints(wc.open_capture(tmp_path / "seen", fps=60, scale=1e-3), points=40, sigma=NOISE)
     fewer = wc.fit(sheet(1.0, 1.0), SOLVER, start, few)
     assert fewer.errors["Spring.stiffness"] > 1.2 * found.errors["Spring.stiffness"] and fewer.freedom == np.inf
+    # Frame 1 of another capture is not finite: what remains is fitted, and the frame is named.
+    broken = [capture[k] for k in range(3)]
+    lost = replace(capture, labels=capture.labels[:3], times=capture.times[:3], read=broken.__getitem__)
+    broken[1] = Surface(np.full((3, 3), np.nan), [[0, 1, 2]])
+    with pytest.warns(UserWarning, match="1 of 2 frames are left out, because no triangle has finite corners: 1$"):
+        assert np.isnan(wc.fit(sheet(1.0, 1.0), SOLVER, {"Spring.stiffness": 300.0}, lost).residuals).tolist() == [True, False]
     words = ["fit", "hanging", "-p", "n=4", "--capture", str(tmp_path / "seen"), "--start", "Spring.stiffness=700"]
     for wrong, sentence in (
         (words, "seen: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"),
         ([*words, "--fps", "24", "--frames", "1"], "none at the time of a frame of the scene"),
+        ([*words, "--fps", "60"], "seen: is about 670 m across, and the cloth 1.41 m; give the length of its unit"),
+        ([*words, "--fps", "60", "--scale", "1e-6"], "seen: is about 0.00067 m across, and the cloth 1.41 m"),
+        (["fit", "chain", *words[4:], "--fps", "60"], "seen: the mesh has no triangles to compare a capture with"),
         ([*words, "--fps", "60", "--vertices", "corners"], "--vertices is given, and the vertices of --capture are not"),
         (["fit", "hanging", "seen.npz", *words[4:]], "MEASURED and --capture are given; one of the three must be"),
         (["fit", "hanging", "seen.npz", "--points", "3", *words[6:]], "--scale and --points are for --capture"),

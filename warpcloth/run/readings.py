@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,7 @@ from ..scene.scene import Scene
 
 _SAME_TIME = 1e-6  # largest distance of a measured time from a frame of the scene, in frames
 _FAR = 1e18  # largest coordinate in a file [m]; squares of residuals stay finite
+_LARGER, _SMALLER = 5.0, 1.0 / 30.0  # largest and smallest size of a capture, relative to that of the cloth at its start
 _BOUND = 1e-9  # largest distance of the sum of weights from 1
 
 
@@ -198,14 +200,19 @@ class CapturePoints:
         """Returns the residuals of these points on a scene.
 
         Raises:
-            ValueError: The capture has no times, or no frame at the time of a frame of the scene. The message begins with its
-                path, or ``name``.
+            ValueError: The mesh has no triangles, or the capture has no times, no frame at the time of a frame of the scene, or
+                another size than the cloth, as with a wrong unit. The message begins with its path, or ``name``.
+
+        Warns:
+            UserWarning: Frames of the capture are left out because all their triangles have a corner that is not finite.
         """
-        _refuse_no_triangles(name, scene)
         capture = capture_to_up_axis(self.capture, scene.mesh.up_axis, self.capture.up_axis)
         where = name if capture.path is None else str(capture.path)
+        _refuse_no_triangles(where, scene, "to compare a capture with; give markers on vertices")
         if resting:
-            return _OnSurface({0: self._vertices(capture[len(capture) - 1])}, scene.mesh.triangles, self.sigma)
+            seen = {0: self._vertices(capture[len(capture) - 1])}
+            _check_size(where, seen, scene)
+            return _OnSurface(seen, scene.mesh.triangles, self.sigma)
         if capture.times is None:
             raise ValueError(
                 f"{where}: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"
@@ -215,6 +222,12 @@ class CapturePoints:
         if not used.any():
             raise ValueError(no_common_frame(where, capture.times, scene))
         seen = {int(frames[k]) - 1: self._vertices(capture[int(k)]) for k in np.flatnonzero(used)}
+        empty = [capture.labels[k] for k in np.flatnonzero(used) if not len(seen[int(frames[k]) - 1])]
+        if empty:
+            listed = ", ".join(f"{label:g}" for label in empty[:10]) + (", …" if len(empty) > 10 else "")
+            said = f"{len(empty)} of {used.sum()} frames are left out, because no triangle has finite corners: {listed}"
+            warnings.warn(f"{where}: {said}", stacklevel=4)
+        _check_size(where, seen, scene)
         return _OnSurface(seen, scene.mesh.triangles, self.sigma)
 
     def _vertices(self, surface):
@@ -407,6 +420,17 @@ def _starts(path, scene, rows):
     return found
 
 
-def _refuse_no_triangles(name, scene):
+def _refuse_no_triangles(name, scene, purpose="for markers; give the vertices that were measured"):
     if not len(scene.mesh.triangles):
-        raise ValueError(f"{name}: the mesh has no triangles for markers; give the vertices that were measured")
+        raise ValueError(f"{name}: the mesh has no triangles {purpose}")
+
+
+def _check_size(where, seen, scene):
+    """Checks that a capture, points (k, 3) [m] by frame, is about as large as the cloth: its box without 5 % at each end."""
+    sizes = [np.linalg.norm(np.ptp(np.percentile(each, [5.0, 95.0], axis=0), axis=0)) for each in seen.values() if len(each)]
+    cloth = np.linalg.norm(np.ptp(scene.positions, axis=0))
+    if sizes and not _SMALLER * cloth <= np.median(sizes) <= _LARGER * cloth:
+        raise ValueError(
+            f"{where}: is about {np.median(sizes):.3g} m across, and the cloth {cloth:.3g} m; give the length of its unit as "
+            "open_capture(path, scale=…), or as --scale on the command line"
+        )
