@@ -565,7 +565,9 @@ def test_the_command_draws(folder, tmp_path, capfd):
         (("CLOTH", "-o", "a.gif", "--speed", "1e-5"), "shown for 4.17e+03 s; a .gif can show one for 0.01 to 655 s"),
         (("CLOTH", "-o", "a.mp4", "--speed", "1e9"), "shown for 4.17e-11 s; a .mp4 can show one for 1e-06 to 1000 s"),
         (("ZERO", "-o", "a.png"), "points has shape (0, 16, 3); it must be (frames, vertices, 3), of one frame or more"),
-        (("NAN", "-o", "a.png"), "nan.npz: no position in the frames is finite; there is nothing to draw"),
+        (("NAN", "-o", "a.png"), "nan.npz: no triangle, line or pin has positions that are finite and below 1e100 m; there is"),
+        (("HUGE", "-o", "a.png"), "huge.npz: no triangle, line or pin has positions that are finite and below 1e100 m"),
+        (("HUGE", "-o", "a.gif"), "huge.npz: no triangle, line or pin has positions that are finite and below 1e100 m"),
         (("CHANGING", "-o", "a.png"), "faceVertexIndices[1] is 2 at time code 1, must stay 1"),
         (("CLOTH", "-o", "a.png", "--zoom", "-1"), "zoom is -1.0"),
         (("CLOTH", "-o", "a.png", "--samples", "0"), "samples is 0"),
@@ -594,11 +596,12 @@ def test_what_cannot_be_drawn_is_refused_in_a_sentence(argv, fragment, folder, t
     moving = "int[] faceVertexIndices.timeSamples = {0: [0, 1, 2, 3], 1: [0, 2, 1, 3]}"
     (tmp_path / "changing.usda").write_text(STAGE.replace("int[] faceVertexIndices = [0, 1, 2, 3]", moving))
     np.savez(tmp_path / "zero.npz", points=MOTION[:0], triangles=MESH.triangles)
+    np.savez(tmp_path / "huge.npz", points=1e199 * MOTION, triangles=MESH.triangles)
     np.savez(tmp_path / "nan.npz", points=np.full_like(MOTION, np.nan), triangles=MESH.triangles)
     before = sorted(os.listdir(tmp_path))
     files = {"CLOTH": folder / "cloth.usdc", "CHAIN": folder / "chain.usdc", "NPY": folder / "cloth.npy"}
     files |= {"EMPTY": "empty", "BARE": "bare.usda", "PNG": "text.png"}
-    files |= {"ZERO": "zero.npz", "NAN": "nan.npz", "CHANGING": "changing.usda"}
+    files |= {"ZERO": "zero.npz", "NAN": "nan.npz", "HUGE": "huge.npz", "CHANGING": "changing.usda"}
     refused(capfd, ["render", *(files.get(word, word) for word in argv)], fragment)
     assert sorted(os.listdir(tmp_path)) == before
 

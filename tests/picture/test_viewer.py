@@ -199,7 +199,11 @@ def test_a_notebook_shows_a_page_or_a_line(monkeypatch):
         ({"colour_range": (0.0, 1.0)}, "colour_range is given for 2 measures; it must be that of one"),
         ({"colours": {"a": np.zeros((FRAMES, 3))}}, r"colour has shape \(6, 3\)"),
         ({"source": MESH, "copy": 1}, "copy is 1; the source is one cloth"),
-        ({"source": np.nan * POINTS}, "no position in the frames is finite; there is nothing to draw"),
+        (
+            {"source": np.nan * POINTS},
+            "no triangle, line or pin has positions that are finite and below 1e100 m; there is nothing",
+        ),
+        ({"source": 1e199 * POINTS}, "finite and below 1e100 m; there is nothing to draw"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(given, message, tmp_path):
@@ -208,6 +212,20 @@ def test_what_cannot_be_shown_is_refused(given, message, tmp_path):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         wc.view(**options)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_finite_is_left_out_and_said(tmp_path, capfd):
+    """A vertex of frame 3 is NaN, one of frame 4 far away: on the page both are nowhere, and it has the same warning."""
+    broken = POINTS.copy()
+    broken[3, 0], broken[4, 0] = np.nan, 1e200
+    count = 2 * int((MESH.triangles == 0).any(axis=1).sum())
+    said = f"{count} triangles, lines or pins are not drawn, in all pictures together, frames 3, 4: a position is not finite, "
+    np.savez(tmp_path / "nan.npz", points=broken, triangles=MESH.triangles)
+    code, _, err = run(capfd, "view", tmp_path / "nan.npz", "-o", tmp_path / "a.html", "--plain")
+    data = data_of((tmp_path / "a.html").read_text())
+    assert code == 0 and f"{said}or too far away" in err and data["leftOut"] == f"{said}or too far away"
+    known = np.isfinite(decoded(data["shapes"][0])).all(axis=2)
+    assert np.argwhere(~known).tolist() == [[3, 0], [4, 0]]
 
 
 def test_a_page_that_is_too_large_is_refused(tmp_path, monkeypatch):
@@ -244,6 +262,7 @@ def test_the_viewer_is_built_from_its_sources():
 def test_a_browser_shows_the_motion_and_fetches_nothing(stage, tmp_path):
     path = tmp_path / "fall.html"
     wc.view(stage, path)
+    path.write_text(path.read_text().replace('"leftOut":""', '"leftOut":"2 are not drawn"'))
     data, sequence = data_of(path.read_text()), wc.open_sequence(stage)
     with Browser(tmp_path / "profile") as browser:
         browser.open(f"{path.as_uri()}#frame=5&colour=stretch_1", "window.player?.drawn > 0")
@@ -266,8 +285,9 @@ def test_a_browser_shows_the_motion_and_fetches_nothing(stage, tmp_path):
         browser.press(" ", " ")
         assert browser.run("player.playing")
         browser.press(" ", " ")
-        said = "quantised to 0.0"
-        assert said in browser.run("document.getElementById('text').textContent")
+        text = browser.run("document.getElementById('text').textContent")
+        assert "quantised to 0.0" in text and " 2 are not drawn." in text
+        assert browser.run("document.getElementById('note').textContent").endswith("; parts are not drawn")
         fetched = [each["params"]["request"]["url"] for each in browser.events if each["method"] == "Network.requestWillBeSent"]
         told = [each for each in browser.events if each["method"] in TOLD]
         entries = browser.run("performance.getEntriesByType('resource').length")

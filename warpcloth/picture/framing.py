@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from .camera import Camera
-from .subjects import located
+from .subjects import are_located, located
 
 # Surroundings that are larger than this, relative to the cloth, are not fitted into the picture.
 _LARGE = 1.5
 # Distance of the ground below the motion, relative to its size, so that cloth that lies on it is visible.
 _BELOW = 1e-3
+_NOTHING = "no triangle, line or pin has positions that are finite and below 1e100 m; there is nothing to draw"
 
 
 def frame_motion(subjects, pictures, view, aspect):
@@ -23,7 +24,7 @@ def frame_motion(subjects, pictures, view, aspect):
         aspect: Width of the picture of a subject by its height.
 
     Raises:
-        ValueError: No position is finite.
+        ValueError: Nothing can be drawn, because no triangle, line or ball has positions that are finite and near enough.
     """
     azimuth, elevation, zoom = view
     up_axis = subjects[0].up_axis
@@ -37,8 +38,7 @@ def frame_motion(subjects, pictures, view, aspect):
         for picture in pictures:
             for subject, points, chosen, drawn in zip(subjects, picture, fitted, seen, strict=True):
                 for index, (shape, found) in enumerate(zip(subject.shapes, points, strict=True)):
-                    found = found[drawn[index]]
-                    finite = located(found)
+                    finite = drawn_points(shape, found, drawn[index])[0]
                     if not len(finite):
                         continue
                     lowest = min(lowest, finite[:, up].min() - (shape.radius if len(shape.lines) else 0.0))
@@ -46,7 +46,7 @@ def frame_motion(subjects, pictures, view, aspect):
                         span[0], span[1] = np.minimum(span[0], finite.min(axis=0)), np.maximum(span[1], finite.max(axis=0))
                         yield finite
         if lowest == np.inf:
-            raise ValueError(f"{subjects[0].name}: no position in the frames is finite; there is nothing to draw")
+            raise ValueError(f"{subjects[0].name}: {_NOTHING}")
 
     camera = Camera.framed(frames(), azimuth, elevation, up_axis, aspect)
     position, target = np.array(camera.position), np.array(camera.target)
@@ -65,3 +65,23 @@ def _fitted(subject):
 def seen_points(shape):
     """Returns the indices of the points of a shape that belong to a triangle, line or ball."""
     return np.unique(np.concatenate([shape.triangles.ravel(), shape.lines.ravel(), shape.balls]))
+
+
+def drawn_points(shape, points, seen):
+    """Returns what is drawn of a frame of a shape.
+
+    Args:
+        shape: The :class:`Shape`.
+        points: Positions (n, 3) [m].
+        seen: Its :func:`seen_points`.
+
+    Returns:
+        tuple: The points of triangles, lines and balls whose points are all :func:`located`, (m, 3), and the number of others.
+    """
+    known = are_located(points)
+    if known[seen].all():
+        return points[seen], 0
+    rows = (shape.triangles, shape.lines, shape.balls[:, None])
+    kept = [each[known[each].all(axis=1)] for each in rows]
+    used = np.unique(np.concatenate([each.ravel() for each in kept]))
+    return points[used], sum(map(len, rows)) - sum(map(len, kept))

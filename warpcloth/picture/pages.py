@@ -5,6 +5,7 @@ import html
 import importlib.util
 import json
 import os
+import warnings
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,12 +24,12 @@ from ..base.version import installed_version
 from ..mesh.mesh import Mesh
 from .coding import LEVELS, STEPS, CodedPositions, CodedValues, coded_indices
 from .colour import byte_colour, check_colormap
-from .framing import frame_motion, seen_points
+from .framing import drawn_points, frame_motion, seen_points
 from .measured import GivenScalar, MeasuredScalar
 from .overlay import bar_ticks, bar_unit
 from .raycast import BACKGROUND
 from .shape import CLOTH
-from .subjects import located, subject_of
+from .subjects import subject_of
 
 ENDING = ".html"
 # Measures in a page if none are named: both principal stretches.
@@ -41,6 +42,7 @@ _SHORTEN = 8
 # Width of the picture by its height for which the camera is set. A narrower window sees the same width.
 _ASPECT = 1.5
 _TICKS = 6
+_LISTED = 10  # largest number of frames that a warning names
 _LESS = "fewer frames (frames, every) or colours take less"
 _FOLDER = Path(__file__).parent / "viewer"
 
@@ -111,6 +113,9 @@ def view(
         ImportError: Colours need matplotlib.
         ValueError: An argument is not allowed, a source cannot be drawn, a frame of it cannot be read, or the page would be
             larger than 400 MB.
+
+    Warns:
+        UserWarning: Triangles, lines or pins are not drawn, because a position is not finite or too far away. The page says so.
 
     Examples:
         >>> import os, tempfile
@@ -260,6 +265,9 @@ def _page(
         below = camera.position["YZ".index(subject.up_axis) + 1] < lowest
         ground = lowest if ground and not below else None
     ground = None if ground is None else float(ground)
+    left_out = _left_out(subject.labels[chosen], motion.left_out)
+    if left_out:
+        warnings.warn(left_out, stacklevel=3)
     scales = [each.scale((), given, colormap) for each in values]
     positions = motion.coders()
     coded = [CodedValues(scale) for scale in scales]
@@ -296,6 +304,7 @@ def _page(
         "shapes": shapes,
         "coloured": subject.coloured,
         "measures": measures,
+        "leftOut": left_out,
         "opened": 0 if opened and measures else None,
         "version": installed_version() or "",
     }
@@ -305,20 +314,37 @@ def _page(
     return text
 
 
+def _left_out(labels, counts):
+    """Returns a sentence about what is not shown, and in which frames; empty if nothing is left out."""
+    lost = [f"{label:g}" for label, count in zip(labels, counts, strict=True) if count]
+    if not lost:
+        return ""
+    listed = ", ".join(lost[:_LISTED]) + (", …" if len(lost) > _LISTED else "")
+    where = f"{'frames' if len(lost) > 1 else 'frame'} {listed}"
+    count = f"{sum(counts)} triangles, lines or pins are not drawn, in all pictures together"
+    return f"{count}, {where}: a position is not finite, or too far away"
+
+
 class _Motion:
-    """The box of the motion of each shape, and whether it moves; found in one pass over the frames."""
+    """The box of the motion of each shape, and whether it moves; found in one pass over the frames.
+
+    Attributes:
+        left_out: Number of triangles, lines and balls that are not shown, in each of the frames so far.
+    """
 
     def __init__(self, subject):
         self._seen = [seen_points(shape) for shape in subject.shapes]
         self._low = np.full((len(self._seen), 3), np.inf)
         self._high, self._first = -self._low, None
-        self.moves = [False] * len(self._seen)
+        self._shapes, self.moves, self.left_out = subject.shapes, [False] * len(self._seen), []
 
     def note(self, picture):
         """Notes the positions of the shapes in a frame, and returns them."""
         self._first = picture if self._first is None else self._first
+        self.left_out.append(0)
         for k, (points, start, seen) in enumerate(zip(picture, self._first, self._seen, strict=True)):
-            found = located(points[seen])
+            found, lost = drawn_points(self._shapes[k], points, seen)
+            self.left_out[-1] += lost
             if len(found):
                 self._low[k], self._high[k] = np.minimum(self._low[k], found.min(0)), np.maximum(self._high[k], found.max(0))
             self.moves[k] = self.moves[k] or not np.array_equal(points, start, equal_nan=True)

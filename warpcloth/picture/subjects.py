@@ -345,7 +345,12 @@ def _shape(count, triangles, edges, radius, pins, size, edge, colour):
 
 def located(points):
     """Returns the points (n, 3) that a camera can show: finite, and near enough that products of distances do not overflow."""
-    return points[(np.abs(points) < _FARTHEST).all(axis=1)]
+    return points[are_located(points)]
+
+
+def are_located(points):
+    """Returns whether each of the points (n, 3) is :func:`located`, (n,)."""
+    return (np.abs(points) < _FARTHEST).all(axis=1)
 
 
 def _size(points):

@@ -117,7 +117,9 @@ class Player {
     select.addEventListener("change", () => this.paint(select.value === "" ? null : Number(select.value)));
     element("about").addEventListener("click", () => (element("facts").hidden = !element("facts").hidden));
     element("close").addEventListener("click", () => (element("facts").hidden = true));
-    element("note").textContent = `quantised to ${this.rounding()}, for looking, not for measuring`;
+    element("note").textContent = `quantised to ${this.rounding()}, for looking, not for measuring${
+      data.leftOut ? "; parts are not drawn" : ""
+    }`;
     element("text").textContent = this.facts();
     document.addEventListener("keydown", (event) => this.key(event));
   }
@@ -134,9 +136,10 @@ class Player {
     const others = worst > cloth.data.quantum ? `, those of other shapes to ${millimetres(worst)} or less` : "";
     const colours = this.measures.length ? " Values are quantised to 1/254 of the range of their colour bar." : "";
     const made = data.version ? ` Made by warpcloth ${data.version}.` : "";
+    const leftOut = data.leftOut ? ` ${data.leftOut}.` : "";
     return (
       `${this.frames} ${this.frames > 1 ? "frames" : "frame"} of ${cloth.data.count} vertices. ` +
-      `Positions are quantised to ${this.rounding()}${others}, for looking, not for measuring.${colours}${made}`
+      `Positions are quantised to ${this.rounding()}${others}, for looking, not for measuring.${colours}${leftOut}${made}`
     );
   }
 
