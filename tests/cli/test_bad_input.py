@@ -137,7 +137,8 @@ def test_a_crate_that_is_cut(tmp_path, capfd, left):
     (tmp_path / "cloth.usda").write_text(STAGE)
     Sdf.Layer.FindOrOpen(str(tmp_path / "cloth.usda")).Export(str(path))
     os.truncate(path, int(left * os.path.getsize(path)))
-    with pytest.raises(ValueError, match=f"^{path}: is no USD stage ") as caught:
+    says = "is no USD stage " if left else "the file is empty$"
+    with pytest.raises(ValueError, match=f"^{path}: {says}") as caught:
         read_scene(path)
     assert "\n" not in str(caught.value) and capfd.readouterr().err == ""
 

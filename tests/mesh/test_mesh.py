@@ -566,7 +566,7 @@ BAD_FILES = [
     ("noise.glb", "no header, but long enough for one", ValueError, "cannot be read as .glb"),
     ("noise.obj", "no vertices\n", ValueError, "has no triangles"),
     ("cloud.obj", CLOTH, ValueError, "has no triangles"),
-    ("range.obj", CLOTH + "f 1 3 9\n", ValueError, "cannot be read as .obj"),
+    ("range.obj", CLOTH + "f 1 3 9\n", ValueError, "face 1 names vertex 9; the file has 4$"),
     ("relative.obj", CLOTH + "f 1/1 2/1 -1/1\n", ValueError, "its faces have relative"),
     ("flat.obj", CLOTH + "f 1 1 3\n", ValueError, r"triangles\[0\] is \[0, 0, 2\]; it must be 3 different"),
     ("nan.obj", CLOTH.replace("1", "nan") + "f 1 3 4\n", ValueError, r"points\[1\] is .*must be finite"),

@@ -111,13 +111,20 @@ def saved(path, **arrays):
     return path
 
 
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def test_wrong_input_is_refused_in_a_sentence(stage, tmp_path, capfd):
     mesh = wc.Mesh.grid(3, 3)
     points = np.stack([moved(mesh, frame) for frame in range(3)]).astype(np.float64)
     good = {"points": points, "triangles": mesh.triangles}
-    bad = points.copy()
-    bad[1, 4, 2] = np.nan
+    bad = points + 1.0
+    bad[2, 4, 2] = np.nan
+    fast = points.copy()
+    fast[1:, 4, 0] = 3e38, -3e38
     saved(tmp_path / "nan.npz", points=bad, triangles=mesh.triangles, times=[0.0, 1.0, 2.0])
+    saved(tmp_path / "fast.npz", points=fast, triangles=mesh.triangles, times=[0.0, 1.0, 2.0])
     saved(tmp_path / "huge.npz", points=1e39 * points, triangles=mesh.triangles)
     saved(tmp_path / "empty.npz", points=points[:0], triangles=mesh.triangles)
     saved(tmp_path / "untimed.npz", **good)
@@ -127,20 +134,36 @@ def test_wrong_input_is_refused_in_a_sentence(stage, tmp_path, capfd):
         shape = wc.Mesh.grid(3, width)
         text = "".join(f"v {x} {y} {z}\n" for x, y, z in shape.points)
         (tmp_path / "mixed" / f"f{frame}.obj").write_text(text + "".join(f"f {a} {b} {c}\n" for a, b, c in shape.triangles + 1))
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "f0.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/1 100/1\nf 1 2 3\n")
+    with AnimationWriter(tmp_path / "chain.usdc", wc.Mesh.chain(3), FPS) as writer:
+        writer.append(np.zeros((3, 3)), np.zeros((3, 3)))
+    for name in ("old.usdc", "old.obj"):
+        convert(tmp_path / "untimed.npz", tmp_path / name, fps=FPS)
+    (tmp_path / "zero.usdc").write_bytes(b"")
+    (tmp_path / "c_0002.obj").mkdir()
     (tmp_path / "short.pc2").write_bytes(struct.pack("<12siiffi", b"POINTCACHE2\0", 1, 12, 0.0, 1.0, 5) + bytes(100))
     (tmp_path / "none.mdd").write_bytes(struct.pack(">ii", 0, 12))
     (tmp_path / "alone.mdd").write_bytes(struct.pack(">iif9f", 1, 3, 0.0, *range(9)))
     (tmp_path / "s_0099.ply").write_bytes(b"")
     (tmp_path / "rest.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     cases = [
-        ("nan.npz a.pc2", r"nan\.npz, frame 1: point 4 is \[.*nan\]; it must be finite as float32"),
-        ("nan.npz a.usdc", r"frame 1: point 4 is .*finite"),
-        ("nan.npz a.npz", r"frame 1: point 4 is .*finite"),
+        ("nan.npz a.pc2", r"nan\.npz, frame 2: point 4 is \[.*nan\]; it must be finite as float32"),
+        ("nan.npz a.usdc", r"frame 2: point 4 is .*finite"),
+        ("nan.npz a.npz", r"frame 2: point 4 is .*finite"),
+        ("nan.npz old.usdc", r"frame 2: point 4 is .*finite"),
+        ("nan.npz old.obj", r"frame 2: point 4 is .*finite"),
+        ("fast.npz old.usdc", r"frame 2: velocity 4 is \[-6e\+38, .*finite as float32"),
         ("huge.npz a.obj", r"frame 0: point .* finite as float32"),
         ("empty.npz a.pc2", "of one frame or more"),
         ("untimed.npz a.mdd", r"has no times; give the frames per second \(--fps\)"),
         ("uneven.npz a.usdc", "times are uneven after frame 1"),
         ("mixed a.pc2", r"f2\.obj: 12 vertices, must be 9 as in"),
+        ("mixed a.ply", r"f2\.obj: 12 vertices, must be 9 as in"),
+        ("mixed old.obj", r"f2\.obj: 12 vertices, must be 9 as in"),
+        ("far a.npz", r"f0\.obj: face 1 names vertex 100; the file has 3$"),
+        ("zero.usdc a.npz", r"zero\.usdc: the file is empty$"),
+        ("chain.usdc a.npz", r"chain\.usdc: has edges and no triangles; a sequence must have triangles$"),
         ("short.pc2 a.npz", "has 132 bytes; 5 frames of 12 points must have 752"),
         ("none.mdd a.npz", "has 0 frames of 12 points"),
         ("alone.mdd a.npz", "has no triangles; give a rest mesh .* put it beside as alone.obj"),
@@ -148,16 +171,17 @@ def test_wrong_input_is_refused_in_a_sentence(stage, tmp_path, capfd):
         ("sheet.usdc sheet.usdc", "is a file of the input"),
         ("sheet.usdc s.ply", r"s_0099\.ply: is a frame of another sequence; remove it"),
         ("sheet.usdc rest.pc2", r"rest\.obj: is another mesh, which the first frame would replace"),
-        ("sheet.usdc nowhere/a.pc2", "nowhere does not exist"),
+        ("untimed.npz c.obj", r"c_0002\.obj: is no regular file"),
+        *((f"sheet.usdc nowhere/a{end}", r": \S+: the folder \S+nowhere does not exist") for end in (".pc2", ".usda", ".obj")),
         ("gone.usdc a.pc2", "no such file"),
     ]
-    before = {path.name for path in tmp_path.iterdir()}
+    before = contents(tmp_path)
     for words, says in cases:
         source, output = words.split()
         code = main(["convert", str(tmp_path / source), str(tmp_path / output)])
         out, err = capfd.readouterr()
         assert code == 2 and re.search(says, err) and err.count("\n") == 1 and not out, (words, err)
-    assert {path.name for path in tmp_path.iterdir()} == before
+        assert contents(tmp_path) == before, words
 
 
 def test_the_command(stage, tmp_path, capfd):

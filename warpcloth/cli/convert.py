@@ -4,8 +4,8 @@ from ..base.texts import json_text
 from .terminal import Bar, check_writable
 
 EPILOG = """\
-FILE is a USD stage, a folder or pattern of .obj, .ply or .off files, or arrays in .npz, .npy, .pc2 or .mdd. The ending of
-OUTPUT sets the format:
+FILE is a USD stage, a folder or pattern of .obj, .ply or .off files, or arrays in .npz, .npy, .pc2 or .mdd. It must have
+triangles, the same in all frames. The ending of OUTPUT sets the format:
   .obj .ply                a file for each frame, such as cloth_0012.obj for cloth.obj
   .pc2 .mdd                points of all frames; the first frame is written beside them as .obj
   .npz                     points, triangles and times, and the velocities of a stage

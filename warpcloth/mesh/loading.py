@@ -95,6 +95,8 @@ def read_arrays(path, name=None):
     except ModuleNotFoundError:  # chardet, which guesses the encoding of text that is not UTF-8
         raise ValueError(f"{path}: cannot be read as {ending}, it is not UTF-8") from None
     except Exception as error:  # a broken file makes trimesh raise errors of many types
+        if ending == ".obj":
+            _refuse_far_corner(path, path.read_bytes())
         raise ValueError(f"{path}: cannot be read as {ending}, {type(error).__name__}: {error}") from error
     found = {node: scene.graph[node] for node in scene.graph.nodes_geometry}
     found = {node: at for node, at in found.items() if len(getattr(scene.geometry[at[1]], "faces", ()))}
@@ -177,6 +179,15 @@ def _check_off(path, data):
     _refuse_more(path, next((number for number, _ in rows[vertices + faces :]), None))
     if rows and len(rows[-1][1]) <= needed:
         _refuse_open_end(f"{path}, line {rows[-1][0]}", data, rows[-1][1][-1], vertices if faces else np.inf)
+
+
+def _refuse_far_corner(path, data):
+    """Raises ValueError if a face of an .obj file has a vertex that the file does not have."""
+    vertices = len(re.findall(rb"^v\s", data, re.MULTILINE))
+    for number, corners in enumerate(re.findall(rb"^f\s([^\r\n#]*)", data, re.MULTILINE), start=1):
+        far = [index for index in map(int, re.findall(rb"(?<!\S)\d+", corners)) if index > vertices]
+        if far:
+            raise ValueError(f"{path}: face {number} names vertex {far[0]}; the file has {vertices}")
 
 
 def _refuse_more(path, line):

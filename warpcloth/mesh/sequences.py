@@ -95,7 +95,7 @@ class Sequence(ShownInNotebooks):
     def __post_init__(self) -> None:
         if not len(self.mesh.triangles):
             where = "mesh" if self.path is None else self.path
-            raise ValueError(f"{where}: has edges and no triangles; it must have triangles, over which a sequence is measured")
+            raise ValueError(f"{where}: has edges and no triangles; a sequence must have triangles")
 
     def __len__(self) -> int:
         return len(self.labels)

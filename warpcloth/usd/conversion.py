@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.outputs import STAGE_ENDINGS, check_apart
+from ..base.outputs import STAGE_ENDINGS, Output, check_apart
 from ..mesh.caches import CACHES, NUMBERED, numbered_paths, write_mdd, write_npz, write_obj, write_pc2, write_ply
 from ..mesh.loading import read_arrays
 from ..mesh.sequences import open_sequence
@@ -20,7 +20,9 @@ _UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
 
 
 def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
-    """Writes an animation in another format. One frame is in memory at a time, or ten for a stage.
+    """Writes an animation in another format. A few frames are in memory at a time, or ten for a stage.
+
+    All frames are read twice: they are checked before the first is written, so that what is refused leaves older files whole.
 
     Args:
         source: Path of an animation, as for :func:`warpcloth.open_sequence`.
@@ -36,8 +38,9 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
 
     Raises:
         FileNotFoundError: There is no such file or folder.
-        ValueError: The source or the ending is not supported, a point is not finite as float32, the times of frames are needed
-            and not known, or frames are unevenly spaced where the format has one interval for all.
+        ValueError: The source or the ending is not supported; a point, or a velocity that is written, is not finite as float32;
+            a frame has other triangles; the times of frames are needed and not known; frames are unevenly spaced where the
+            format has one interval for all; or an output is no regular file.
     """
     ending = Path(output).suffix.lower()
     if ending not in OUTPUTS:
@@ -48,25 +51,34 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
     else:
         paths = [Path(output), *([Path(output).with_suffix(".obj")] if ending in CACHES else [])]
     check_apart(paths, [*sequence.files, source])
+    for path in paths:
+        Output(path, "xb").discard()  # the folder can be written, and the path is that of a file
+    if ending in STAGE_ENDINGS:
+        interval = _interval(sequence, _times(sequence), "times")
+    elif ending == ".mdd":
+        _times(sequence)
+    elif ending == ".pc2":
+        _interval(sequence, sequence.labels, "frame numbers")
+    if ending in CACHES:
+        _check_beside(paths, _points(sequence, 0), sequence.mesh)
+    velocities = _velocities(sequence) if ending in (".npz", *STAGE_ENDINGS) else None
+    moving = partial(_moving, sequence, velocities, ending in STAGE_ENDINGS)
+    for index, (_, found) in enumerate(moving()):
+        if found is not None:
+            _check_finite(sequence, index, "velocity", found)
     frames = partial(_frames, sequence, progress)
     if ending in NUMBERED:
         write = write_ply if ending == ".ply" else partial(write_obj, digits=_digits(sequence))
         for path, points in zip(paths, frames(), strict=True):
             write(path, points, sequence.mesh)
     elif ending == ".npz":
-        _write_npz(paths[0], sequence, frames)
+        _write_npz(paths[0], sequence, frames, velocities)
     elif ending in CACHES:
-        if ending == ".pc2":
-            _interval(sequence, sequence.labels, "frame numbers")
-            write, given = write_pc2, sequence.labels
-        else:
-            write, given = write_mdd, _times(sequence)
-        first = _points(sequence, 0)
-        _check_beside(paths, first, sequence.mesh)
-        write(paths[0], frames(), given, len(first))
-        write_obj(paths[1], first, sequence.mesh, _digits(sequence))
+        write, given = (write_pc2, sequence.labels) if ending == ".pc2" else (write_mdd, sequence.times)
+        write(paths[0], frames(), given, len(sequence.mesh.points))
+        write_obj(paths[1], _points(sequence, 0), sequence.mesh, _digits(sequence))
     else:
-        _write_stage(paths[0], sequence, frames)
+        _write_stage(paths[0], sequence, interval, moving(), progress)
     return sequence, paths
 
 
@@ -90,11 +102,15 @@ def _digits(sequence):
 def _points(sequence, index):
     """Returns the points (n, 3) [m] of a frame, which must be finite as float32."""
     points = sequence[index]
-    bad = np.flatnonzero(~(np.abs(points) <= _MOST).all(axis=1))
-    if len(bad):
-        where, given = f"{sequence.path}, frame {sequence.labels[index]}", points[bad[0]].tolist()
-        raise ValueError(f"{where}: point {bad[0]} is {given}; it must be finite as float32")
+    _check_finite(sequence, index, "point", points)
     return points
+
+
+def _check_finite(sequence, index, name, vectors):
+    bad = np.flatnonzero(~(np.abs(vectors) <= _MOST).all(axis=1))
+    if len(bad):
+        where, given = f"{sequence.path}, frame {sequence.labels[index]}", vectors[bad[0]].tolist()
+        raise ValueError(f"{where}: {name} {bad[0]} is {given}; it must be finite as float32")
 
 
 def _frames(sequence, progress=None):
@@ -138,15 +154,28 @@ def _velocities(sequence):
     return found.exact if len(found) == len(sequence) and found.shape[1] == len(sequence.mesh.points) else None
 
 
-def _differences(sequence, index):
-    """Returns velocities (n, 3) [m/s] as central differences of the frames, one-sided for the first and the last."""
-    before, after = max(index - 1, 0), min(index + 1, len(sequence) - 1)
-    if before == after:
-        return np.zeros_like(sequence.mesh.points, dtype=np.float64)
-    return (_points(sequence, after) - _points(sequence, before)) / (sequence.times[after] - sequence.times[before])
+def _moving(sequence, velocities, differences):
+    """Returns an iterator over the points (n, 3) [m] and the velocities (n, 3) [m/s] of each frame.
+
+    The velocities are those of a function as `_velocities` returns it; else differences, if they are asked for, or None.
+    """
+    if velocities is not None:
+        return zip(_frames(sequence), map(velocities, range(len(sequence))), strict=True)
+    return _differences(sequence) if differences else ((points, None) for points in _frames(sequence))
 
 
-def _write_npz(path, sequence, frames):
+def _differences(sequence):
+    """Yields points and their central differences over time, one-sided for the first and the last frame."""
+    last = len(sequence) - 1
+    before = now = _points(sequence, 0)
+    for index in range(last + 1):
+        after = _points(sequence, index + 1) if index < last else now
+        first, end = max(index - 1, 0), min(index + 1, last)
+        yield now, (after - before) / (sequence.times[end] - sequence.times[first]) if end > first else np.zeros_like(now)
+        before, now = now, after
+
+
+def _write_npz(path, sequence, frames, velocities):
     dtype = np.float32 if _digits(sequence) == 9 else np.float64
     arrays = {"triangles": sequence.mesh.triangles}
     if sequence.times is not None:
@@ -154,22 +183,21 @@ def _write_npz(path, sequence, frames):
     if sequence.mesh.parts:
         arrays["parts"] = np.array(list(sequence.mesh.parts))
         arrays["first"] = np.array([part.first for part in sequence.mesh.parts.values()])
-    velocities = _velocities(sequence)
     rows = {"points": frames()}
     if velocities is not None:
         rows["velocities"] = map(velocities, range(len(sequence)))
     write_npz(path, rows, (len(sequence), *sequence.mesh.points.shape), dtype, arrays)
 
 
-def _write_stage(path, sequence, frames):
-    interval = _interval(sequence, _times(sequence), "times")
+def _write_stage(path, sequence, interval, moving, progress):
     fps = 1.0 / interval
     fps = round(fps) if abs(fps - round(fps)) < 1e-4 * fps else fps
-    velocities = _velocities(sequence) or partial(_differences, sequence)
     name = None if sequence.stage is None else sequence.stage.prim.rsplit("/", 1)[1]
     parts = sequence.mesh.parts
     cloths = {each: each for each in parts} if parts and len(parts) > 1 else None
     mesh, up_axis = sequence.mesh, sequence.up_axis
     with AnimationWriter(path, mesh, fps, prim=name, up_axis=up_axis, cloths=cloths) as writer:
-        for index, points in enumerate(frames()):
-            writer.append(points, velocities(index))
+        for index, (points, velocities) in enumerate(moving):
+            writer.append(points, velocities)
+            if progress:
+                progress(index + 1, len(sequence))

@@ -156,6 +156,8 @@ def open_stage(path):
     refuse_path(path)
     if not os.path.isfile(path):
         raise FileNotFoundError(f"{path}: there is no such file")
+    if os.path.getsize(path) == 0:
+        raise ValueError(f"{path}: the file is empty")
     # pxr caches a layer that is in use, and would return the content from before the file was replaced.
     known = Sdf.Layer.Find(os.path.abspath(path))
     if known and not known.dirty:
