@@ -104,7 +104,9 @@ def test_missing_frames_are_interpolated_and_files_are_written(tmp_path, capsys)
     )
     distances = np.asarray(wc.usd.FrameSequence(tmp_path / "x.usdc", attribute="primvars:captureDistance"))
     assert (distances[2] == -1.0).all() and 0.0 <= distances[[0, 1, 3]].min() and distances.max() < 0.02
-    for wrong, sentence in (
+    for wrong, sentence in (  # wrong outputs with nothing to read: they are refused before the capture
+        (["resample", "none", "--onto", "none.obj", "-o", str(tmp_path / "x.obj")], "x.obj; it must end with one of .usd"),
+        (["resample", "none", "--onto", "none.obj", "-o", str(tmp_path / "no" / "x.usdc")], "no does not exist"),
         (words, "seen: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"),
         ([*words, "--fps", "24"], "seen: frame 0 has no point within 0.141 m of the template"),
         ([*words, "--fps", "24", "-p", "n=3"], "-p is given, and"),

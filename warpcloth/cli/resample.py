@@ -50,7 +50,9 @@ def add_arguments(parser):
 def resample(arguments):
     from ..deformation.registration import resample
     from ..mesh.captures import open_capture
+    from ..usd.chunks import check_output
 
+    check_output(arguments.output)
     check_writable(arguments.output)
     device = find_device(arguments.device)
     capture = open_capture(arguments.capture, arguments.prim, arguments.fps, arguments.scale)

@@ -66,10 +66,7 @@ class ChunkWriter:
             mesh: The `Mesh`.
             chunk: Number of frames per chunk, which memory holds, and which a killed process may lose.
         """
-        self._output = Path(os.path.abspath(followed(output)))
-        _check_output(self._output)
-        if self._output.suffix != Path(output).suffix:
-            raise ValueError(f"output is {output}, a link to {self._output}; it must end as that does")
+        self._output = check_output(output)
         if int(chunk) != chunk or chunk < 1:
             raise ValueError(f"chunk is {chunk}; it must be a whole number, at least 1")
         self.chunk = int(chunk)
@@ -428,7 +425,14 @@ def frames_folder(output):
     return output.parent / f"{output.stem}_frames"
 
 
-def _check_output(output):
+def check_output(path):
+    """Returns the absolute path of the file that a writer of a stage writes; of a link, that of the file behind it.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ValueError: The ending is not that of a stage, a link ends otherwise than its file, or the path is a folder.
+    """
+    output = Path(os.path.abspath(followed(path)))
     refuse_path(output)
     if output.suffix not in _ENDINGS:
         raise ValueError(f"output is {output}; it must end with one of {', '.join(_ENDINGS)}")
@@ -436,6 +440,9 @@ def _check_output(output):
         raise FileNotFoundError(f"output = {output}: the folder {output.parent} does not exist")
     if output.is_dir():
         raise ValueError(f"output is {output}, a folder; it must be a file")
+    if output.suffix != Path(path).suffix:
+        raise ValueError(f"output is {path}, a link to {output}; it must end as that does")
+    return output
 
 
 def check_scene(fps, up_axis):
