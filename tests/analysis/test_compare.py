@@ -378,7 +378,7 @@ def test_a_vertex_without_triangles_is_on_no_surface(device):
         ({"fps": None}, "a: has no times, by which frames belong together; give fps"),
         ({"fps": 0.0}, "fps is 0.0; it must be a number above 0"),
         ({"frames": -1}, "frames is -1; it must be a whole number of 0 or more"),
-        ({"a": (wc.Mesh.chain(3), np.zeros((1, 3, 3)))}, "it must have triangles"),
+        ({"a": (wc.Mesh.chain(3), np.zeros((1, 3, 3)))}, "a sequence must have triangles"),
     ],
 )
 def test_wrong_use_is_refused(change, message):
