@@ -205,7 +205,7 @@ def supporters(scene):
 
 
 def known_answers():
-    """What is known of the result of each scene, from the table of scenes.md."""
+    """Returns the known answer of each scene, from the table of scenes.md."""
     rows = (row.strip("| ").split(" | ") for row in tables_of("scenes") if row.startswith("| `"))
     return {cells[0].strip("`"): cells[2] if len(cells) > 2 else "" for cells in rows}
 

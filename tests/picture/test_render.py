@@ -489,7 +489,7 @@ def test_several_go_on_to_the_end_of_the_longest_in_rows(folder, tmp_path):
 
 @pytest.mark.parametrize("size", [(64, 36), (65, 37)])
 def test_a_webp_shows_the_pictures_of_its_film(size, tmp_path):
-    """Frames that change in part, or not at all, have their place and their time."""
+    """Frames that change in part, or not at all, have their position and their time."""
     pictures = np.full((4, size[1], size[0], 3), 200, np.uint8)
     pictures[1, 10:20, 7:32] = pictures[2:, 10:20, 7:32] = 40
     pictures[3, -1, -1] = 0
