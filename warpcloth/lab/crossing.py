@@ -8,6 +8,8 @@ free sheets of density ρ.
 The other methods know the side of each pair listed at the start of the step, nearer than r plus the skin. The minimiser of such
 a step has a distance d at which kτ²/d, τ = r/2, stops half of v on each side, ρv/2h. Below δ = r/1000 the energy is a parabola,
 so that sheets may end beyond one another.
+
+Vertices move along the line of flight only. Free sheets could tip and pass beside each other, also by iterates within a step.
 """
 
 import numpy as np
@@ -86,6 +88,7 @@ def sheets(h, turn):
         density=DENSITY,
         terms=[Spring(stiffness=0.1)],
         gravity=(0.0, 0.0, 0.0),
+        free_axes=np.tile([False, True, False], (18, 1)),
         fps=1.0 / h,
         duration=h,
         self_contact=SelfContact(DISTANCE, STIFFNESS),
@@ -117,17 +120,20 @@ def meetings(solver, kept, h, speeds, device):
         stepper.step()
         x = stepper.state.x.numpy().reshape(positions.shape)
         below, above = x[:, :9], x[:, 9:]
-        aside = np.linalg.norm((above - below).mean(axis=1)[:, [0, 2]], axis=1)  # sheets may pass beside one another
-        crossed |= (above[..., 1].max(axis=1) < below[..., 1].min(axis=1)) & (aside < 0.5 * SIDE)
+        crossed |= above[..., 1].max(axis=1) < below[..., 1].min(axis=1)
         crossed |= cross(below, above, scene.mesh.triangles[:8])
     return (each.reshape(len(speeds), -1).mean(axis=1) for each in (crossed, stepper.cut > 0.0))
 
 
 def without_filter(stepper):
-    """Removes the filter of self-contact from a stepper, at the end of steps and in the iterates of Newton's method."""
+    """Removes the filter of self-contact from a stepper, at the end of steps and in the iterates of Newton's method.
+
+    Iterates then may pass through, so that a pair knows its side from the start of the step, as with other methods.
+    """
     kept = stepper.pairs.filter
     kept.launch_end = kept.launch_relist = kept.launch_limit = lambda *given: None
     kept.launch_first = lambda base, d: d.zero_()
+    stepper.pairs.forces.apart = False
     stepper.record_again()
 
 
