@@ -12,6 +12,7 @@ from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.lab import elastica
 from warpcloth.lab.laboratory import check_sample, drape_coefficient
+from warpcloth.run.equilibrium import Equilibrium
 from warpcloth.scene.measured_fabrics import DRAPES
 
 COTTON = wc.fabrics["cotton"]
@@ -109,6 +110,16 @@ def test_a_heart_loop_reads_the_bending_length(strip, device):
 )
 def test_depths_of_loops(kind, gamma, depth):
     assert elastica.loop_depth(kind, gamma) == pytest.approx(depth, rel=1e-5)
+
+
+@pytest.mark.parametrize(("height", "folds"), [(0.0, 0), (1e-3, 5)])
+def test_folds_of_an_outline(height, folds):
+    """The rounding of a flat outline has none."""
+    declared = scene("cusick", rows=4)
+    x, _, z = declared.mesh.points.T
+    points = declared.mesh.points * (1.0 + height * np.cos(5.0 * np.arctan2(z, x)))[:, None]
+    rest = Equilibrium(points, None, 0)
+    assert wc.laboratory_readings(declared, rest)["folds"] == (folds, "")
 
 
 @pytest.mark.parametrize("degrees", [60.0, 150.0])

@@ -8,7 +8,7 @@ import numpy as np
 from ..base.checks import number, shown
 from ..terms.declared import Declared
 from ..terms.orthotropic_membrane import OrthotropicMembrane
-from ..terms.plate_bending import PlateBending
+from ..terms.plate_bending import PlateBending, isotropic_twist
 
 _GRAVITY = 9.81  # [m/s²]
 
@@ -119,7 +119,7 @@ class Fabric:
         """
         plate, c, s = self._plate(), np.cos(angle), np.sin(angle)
         root, ratio = plate["weft_ratio"] ** 0.5, plate["poisson_ratio"]
-        twist = plate.get("twist_ratio", 0.5 * (1.0 - ratio) * root)
+        twist = plate.get("twist_ratio", isotropic_twist(ratio, plate["weft_ratio"]))
         mixed = 2.0 * (ratio * root + 2.0 * twist)
         return float(plate["stiffness"] * (c**4 + plate["weft_ratio"] * s**4 + mixed * s**2 * c**2))
 

@@ -19,6 +19,11 @@ from .woven import ABOVE_0, Woven
 Own = TypeVar("Own", bound="PlateBending")
 
 
+def isotropic_twist(ratio: Any, weft: Any) -> Any:
+    """Returns D₆₆/D₁ = ½(1 − ν)√(D₂/D₁) where it is not declared, from ν and D₂/D₁."""
+    return 0.5 * (1.0 - ratio) * np.sqrt(weft)
+
+
 @dataclass(frozen=True, kw_only=True)
 class PlateBending(Woven, Sparse):
     """Plate bending, U = Σ ½AκᵀCκ.
@@ -89,7 +94,7 @@ class PlateBending(Woven, Sparse):
         if not T or not len(mesh.hinges):
             raise ValueError(f"{self.label} has no elements on this mesh of {T} triangles; leave it out")
         ratio, weft = self.of_elements("poisson_ratio", T), self.of_elements("weft_ratio", T)
-        twist = 0.5 * (1.0 - ratio) * np.sqrt(weft) if self.twist_ratio is None else self.of_elements("twist_ratio", T)
+        twist = isotropic_twist(ratio, weft) if self.twist_ratio is None else self.of_elements("twist_ratio", T)
         root = np.zeros((T, 3, 3))  # of C/D₁
         root[:, 0, 0], root[:, 0, 1] = 1.0, ratio * np.sqrt(weft)
         root[:, 1, 1], root[:, 2, 2] = np.sqrt(weft * (1.0 - ratio**2)), 2.0 * np.sqrt(twist)
