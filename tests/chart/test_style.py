@@ -13,6 +13,8 @@ from warpcloth.chart import style
 from warpcloth.chart.cheapest import plot_cheapest
 from warpcloth.chart.residuals import plot_residuals
 from warpcloth.lab.machine import in_words, machine
+from warpcloth.lab.measurements import Setup
+from warpcloth.lab.setups import label
 from warpcloth.others.simulators import other_solvers
 from warpcloth.solvers import SOLVERS
 
@@ -66,7 +68,9 @@ def test_registered_solvers_have_the_next_colours_by_name(monkeypatch):
 
 
 def test_labels_that_begin_with_a_solver():
-    labels = ("xpbd", "xpbd, filter", "newton bdf2", "newton-xpbd 4", "newtonian", "edges, xpbd")
+    engine = label(Setup("newton-xpbd", {"substeps": 4}))
+    assert engine == "Newton engine: XPBD 4"
+    labels = ("xpbd", "xpbd, filter", "newton bdf2", engine, "newtonian", "edges, xpbd")
     assert [style.solver_in(label) for label in labels] == ["xpbd", "xpbd", "newton", "newton-xpbd", None, None]
 
 

@@ -238,4 +238,4 @@ def test_charts_and_choices_have_its_solvers(tmp_path, monkeypatch):
     )
     assert of_own(rough, 0.5 * rough.error) == {} != of_own(rough, rough.error)
     refused = trajectory.measure(asdict(scene), asdict(Setup(name, {"substeps": 1})), frames=1, dtype="float64")
-    assert refused["status"] == "refused" and "Newton has float32 only" in refused["reason"]
+    assert refused["status"] == "refused" and "Newton engine has float32 only" in refused["reason"]

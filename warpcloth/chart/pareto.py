@@ -4,7 +4,7 @@ import textwrap
 
 from ..lab.work_precision import WITHIN, cheapest, front, quartiles, without_point
 from ..numerics.integrators import INTEGRATORS
-from ..others.simulators import SIMULATORS
+from ..others.simulators import SIMULATORS, shown_name
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
 from .style import DASHES, LABEL, LEGEND, SMALL, dress, headline, name_ends, series_style, small_print, style_of
 
@@ -55,12 +55,13 @@ def plot_time(path, found):
         own = [(row["ms_per_second"], row["own_error"]) for row in line if row.get("own_error") is not None]
         if own:
             panels[0].plot(*zip(*own, strict=True), ".", color=style.colour, markersize=5, linestyle=":", linewidth=0.7)
-        for axes, name in zip(panels, _ERRORS, strict=True):
-            x, y = ([row[of] for row in line] for of in ("ms_per_second", name))
+        for axes, error in zip(panels, _ERRORS, strict=True):
+            x, y = ([row[of] for row in line] for of in ("ms_per_second", error))
             axes.plot(x, y, dashes.get(integrator, "-"), color=style.colour, linewidth=0.7, alpha=0.6)
             axes.hlines(y, *zip(*map(quartiles, line), strict=True), color=style.colour, linewidth=2.5, alpha=0.45)
             axes.plot(x, y, linestyle="none", markersize=5, **style.line)
-            ends[axes].append((x[-1], y[-1], solver if integrator == "euler" else f"{solver} {integrator}", style.colour))
+            name = shown_name(solver) if integrator == "euler" else f"{solver} {integrator}"
+            ends[axes].append((x[-1], y[-1], name, style.colour))
     for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
         x, y = ([rows[i][of] for i in curves[name]] for of in ("ms_per_second", name))
         axes.plot(x, y, color="gold", linewidth=5.0, zorder=0, label="nothing is better in both")

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..lab.machine import in_words, machine
-from ..others.simulators import other_solvers
+from ..others.simulators import other_solvers, shown_name
 from ..picture.figures import GREY
 from ..solvers import SOLVERS
 from ..solvers import __all__ as _INCLUDED
@@ -82,8 +82,8 @@ def _style(k):
 
 def solver_in(label):
     """Returns the name of the solver with which a label begins, as of "xpbd" in "xpbd, filter", or None."""
-    names = (*other_solvers(), *SOLVERS)
-    return next((name for name in names if label == name or label.startswith((f"{name} ", f"{name},"))), None)
+    shown = {name: shown_name(name) for name in (*other_solvers(), *SOLVERS)}
+    return next((name for name, text in shown.items() if label == text or label.startswith((f"{text} ", f"{text},"))), None)
 
 
 def title_style(label):

@@ -326,10 +326,11 @@ def _time_lines(found):
     """Returns lines with the Pareto front, and the cheapest setting of each solver."""
     from ..lab.own_reference import words_of_own
     from ..lab.work_precision import WITHIN, cheapest
+    from ..others.simulators import shown_name
 
     exact, rows = found["reference"], found["rows"]
     lines = [f"  reference     known to {100.0 * exact['error']:.2g} %, {exact['substeps']} steps a frame"]
-    lines += [f"  {'own motion':<13} {name}: {words_of_own(own)}" for name, own in found.get("others", {}).items()]
+    lines += [f"  {'own motion':<13} {shown_name(name)}: {words_of_own(own)}" for name, own in found.get("others", {}).items()]
     best = sorted((row for row in rows if row.get("front")), key=lambda row: row["ms_per_second"])
     for head, chosen in (("nothing beats", best), (f"within {100.0 * WITHIN:g} %", cheapest(rows, exact["error"]))):
         for row in chosen:

@@ -10,7 +10,7 @@ from functools import cache
 from importlib import import_module
 
 from ..base.digest import source_digest
-from ..others.simulators import other_solvers
+from ..others.simulators import other_solvers, shown_name
 from ..run import scene_files
 from ..solvers import SOLVERS
 from . import machine
@@ -57,7 +57,7 @@ class Setup:
     """A solver with options, as data.
 
     Attributes:
-        solver: Its name on the command line, such as "projective-dynamics", or in charts, such as "newton-vbd".
+        solver: Its name on the command line, such as "projective-dynamics", or of another simulator, such as "newton-vbd".
         options: Options of its record by name; others have their defaults.
     """
 
@@ -80,7 +80,7 @@ class Setup:
             raise ValueError(f"{self.solver}: {error}") from None
 
     def __str__(self):
-        return " ".join([self.solver, *(f"{name}={value}" for name, value in self.options.items())])
+        return " ".join([shown_name(self.solver), *(f"{name}={value}" for name, value in self.options.items())])
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 Each solver's record has its own, see :class:`warpcloth.solvers.facts.Facts`.
 """
 
-from ..others.simulators import SIMULATORS
+from ..others.simulators import SIMULATORS, check_installed, shown_name
 from ..solvers import SOLVERS, Explicit
 from ..solvers.step import fewest_substeps
 from .measurements import Setup
@@ -36,8 +36,9 @@ def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32", others=()
     """
     setups, fps = [], None
     runs = {name: SOLVERS[name].facts.runs for name in _checked(solvers, list(SOLVERS))}
-    for other in _checked(others, list(SIMULATORS)):
-        SIMULATORS[other].check()
+    others = _checked(others, list(SIMULATORS))
+    check_installed(others)
+    for other in others:
         runs |= {name: solver.runs for name, solver in SIMULATORS[other].solvers.items()}
     for name, each in runs.items():
         record = SOLVERS.get(name, Explicit)
@@ -64,7 +65,7 @@ def label(setup):
     count = "×".join(str(options.pop(name)) for name in ("substeps", "iterations") if name in options)
     integrator = options.pop("integrator", "")
     others = (f"{name}={value:g}" if isinstance(value, float) else str(value) for name, value in options.items())
-    return " ".join(filter(None, (setup.solver, integrator, count, *others)))
+    return " ".join(filter(None, (shown_name(setup.solver), integrator, count, *others)))
 
 
 def grid_in_words(options):

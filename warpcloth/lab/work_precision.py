@@ -10,7 +10,7 @@ import re
 
 from ..base.digest import scene_digest
 from ..base.outputs import write_table
-from ..others.simulators import SIMULATORS
+from ..others.simulators import SIMULATORS, shown_name
 from . import convergence, physics, spectrum, trajectory
 from .campaign import collect
 from .machine import machine
@@ -283,7 +283,7 @@ def without_point(found):
     said = []
     for (solver, _), rows in groups.items():
         labels, whys = zip(*rows, strict=True)
-        label = labels[0] if len(rows) == 1 else f"{solver}, {len(rows)} settings"
+        label = labels[0] if len(rows) == 1 else f"{shown_name(solver)}, {len(rows)} settings"
         said.append((label, whys[0] + ("; the others alike" if len(set(whys)) > 1 else "")))
     return said
 

@@ -74,7 +74,7 @@ def engine():
     try:
         import newton
     except ImportError:
-        raise ImportError("a comparison with Newton needs it: pip install -e '.[newton]' in the checkout") from None
+        raise ImportError("a comparison with the Newton engine needs it: pip install -e '.[newton]' in the checkout") from None
     return newton
 
 

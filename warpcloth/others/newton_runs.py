@@ -106,16 +106,18 @@ class NewtonSteps:
 
 # The grids are those of substeps and iterations within which the fronts on hanging lie.
 NEWTON = Simulator(
-    "Newton",
+    "Newton engine",  # which nobody takes for the method of Newton
     "newton",
     engine,
     "float32",
     {
         "newton-semi-implicit": OtherSolver(
-            partial(NewtonPhysics, "semi-implicit"), tuple({"fewest": f} for f in (1.0, 1.5, 2.0, 4.0)), False
+            "semi-implicit", partial(NewtonPhysics, "semi-implicit"), tuple({"fewest": f} for f in (1.0, 1.5, 2.0, 4.0)), False
         ),
-        "newton-xpbd": OtherSolver(partial(NewtonPhysics, "xpbd"), grid(product((10, 20, 40, 80, 160), (1, 2, 4)))),
-        "newton-vbd": OtherSolver(partial(NewtonPhysics, "vbd"), grid(product((2, 4, 8, 16, 32), (2, 5, 10)))),
-        "newton-style3d": OtherSolver(partial(NewtonPhysics, "style3d"), grid(product((1, 2, 4, 8, 16), (1, 3, 10)))),
+        "newton-xpbd": OtherSolver("XPBD", partial(NewtonPhysics, "xpbd"), grid(product((10, 20, 40, 80, 160), (1, 2, 4)))),
+        "newton-vbd": OtherSolver("VBD", partial(NewtonPhysics, "vbd"), grid(product((2, 4, 8, 16, 32), (2, 5, 10)))),
+        "newton-style3d": OtherSolver(
+            "Style3D", partial(NewtonPhysics, "style3d"), grid(product((1, 2, 4, 8, 16), (1, 3, 10)))
+        ),
     },
 )

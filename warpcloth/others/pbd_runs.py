@@ -97,7 +97,9 @@ PBD = Simulator(
     engine,
     "float64",
     {
-        f"pypbd-{method}": OtherSolver(partial(PositionBasedDynamics, method), grid(product((10, 20, 40, 80, 160), (1, 2, 4))))
+        f"pypbd-{method}": OtherSolver(
+            method.upper(), partial(PositionBasedDynamics, method), grid(product((10, 20, 40, 80, 160), (1, 2, 4)))
+        )
         for method in METHODS
     },
 )

@@ -20,7 +20,7 @@ class Simulator(NamedTuple):
     """A simulator, for charts.
 
     Attributes:
-        title: Its name in titles.
+        title: Its name in tables and charts.
         package: The package whose version is in tables.
         check: Function that raises ImportError if it is not installed.
         dtype: The precision that it has.
@@ -38,6 +38,7 @@ class OtherSolver(NamedTuple):
     """A solver of another simulator, for charts.
 
     Attributes:
+        title: Its name in tables and charts, after that of the simulator.
         record: Function that returns its record for options by name. A record is a frozen dataclass with ``substeps`` and
             ``iterations``, of which more are more accurate, ``version``, the simulator and its version in words, and
             ``bind(scene, device)``. That raises ValueError if the solver does not take the scene. It returns an object with the
@@ -47,6 +48,7 @@ class OtherSolver(NamedTuple):
         iterates: Whether it has iterations.
     """
 
+    title: str
     record: Callable
     runs: tuple
     iterates: bool = True

@@ -6,6 +6,22 @@ from .pbd_runs import PBD
 SIMULATORS = {"newton": NEWTON, "pbd": PBD}
 
 
+def check_installed(names):
+    """Checks that simulators are installed.
+
+    Raises:
+        ImportError: Some are not; the message names all of them.
+    """
+    lacking = []
+    for name in names:
+        try:
+            SIMULATORS[name].check()
+        except ImportError as error:
+            lacking.append(str(error))
+    if lacking:
+        raise ImportError("; ".join(lacking))
+
+
 def other_solvers():
     """Returns the :class:`warpcloth.others.runs.OtherSolver`\\s of all simulators by their names in charts."""
     return {name: solver for each in SIMULATORS.values() for name, solver in each.solvers.items()}
@@ -14,3 +30,9 @@ def other_solvers():
 def simulator_of(name):
     """Returns the :class:`warpcloth.others.runs.Simulator` of a solver, or None for a solver of warpcloth."""
     return next((each for each in SIMULATORS.values() if name in each.solvers), None)
+
+
+def shown_name(solver):
+    """Returns the name of a solver in tables and charts: "Newton engine: VBD" for newton-vbd, but "newton" for that of ours."""
+    simulator = simulator_of(solver)
+    return solver if simulator is None else f"{simulator.title}: {simulator.solvers[solver].title}"
