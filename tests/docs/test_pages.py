@@ -280,7 +280,7 @@ from concurrent.futures import ThreadPoolExecutor
 from warpcloth.cli import main
 from warpcloth.lab import campaign
 
-campaign._processes = lambda workers: ThreadPoolExecutor(1)
+campaign.processes = lambda workers: ThreadPoolExecutor(1)
 names = {"__name__": "page"}
 for language, text in blocks:
     if language == "python":

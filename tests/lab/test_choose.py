@@ -3,6 +3,8 @@
 import csv
 import itertools
 import json
+import re
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -16,10 +18,10 @@ from warpcloth.cli.choose import command_line
 from warpcloth.lab import campaign, choosing, trajectory
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.cheapest import cheapest_of_each
-from warpcloth.lab.choosing import Measured, choose, climb, climb_others, ladders, ladders_of_others, pick, run_limit
+from warpcloth.lab.choosing import Longest, Measured, choose, climb, climb_others, ladders, ladders_of_others, pick, run_limit
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.reference import Reference
-from warpcloth.lab.setups import grid_in_words
+from warpcloth.lab.setups import grid_in_words, setups_of_runs
 from warpcloth.lab.side_by_side import nearest_setting, side_by_side
 
 # hanging, 64 × 64 vertices: error and ms a frame, with quartiles, of ladders from coarse to fine.
@@ -105,6 +107,18 @@ def test_solvers_of_others_are_searched_for_their_own_cheapest():
     assert ended["explicit"] == "1 settings in 1 s; finer settings take too long or are refused"
 
 
+def test_the_longest_time():
+    """Of another simulator, two times of its own reference and one of its search, each of six limits, and a last run."""
+    assert Longest(10.0, 3, 2).seconds == 50.0 + 30.0 + 2 * 190.0
+
+
+def test_all_simulators_that_are_lacking_are_named(monkeypatch):
+    for name in ("newton", "pbd"):
+        monkeypatch.setitem(sys.modules, {"pbd": "pypbd"}.get(name, name), None)
+    with pytest.raises(ImportError, match=r"-e '\.\[newton\]' in the checkout; .* pyPBD needs it: pip install -e '\.\[pbd\]'"):
+        setups_of_runs(SceneRef("hanging"), others=["newton", "pbd"])
+
+
 def test_ladders_of_others_double_substeps_and_iterations():
     setups = [Setup("newton-vbd", {"substeps": s, "iterations": i}) for s, i in ((3, 2), (8, 2), (3, 5))]
     found = [[(each.options["substeps"], each.options["iterations"]) for each in one] for one in ladders_of_others(setups)]
@@ -135,7 +149,7 @@ def test_a_ladder_ends_where_finer_steps_are_no_help(reason):
 @pytest.fixture
 def in_a_thread(monkeypatch):
     """Measures in a thread of this process; test_extending.py has the command start one."""
-    monkeypatch.setattr(campaign, "_processes", lambda workers: ThreadPoolExecutor(1))
+    monkeypatch.setattr(campaign, "processes", lambda workers: ThreadPoolExecutor(1))
 
 
 @pytest.mark.usefixtures("in_a_thread")
@@ -233,7 +247,12 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     command = ["choose", "hanging", "-p", "n=5", "--tolerance", "1%", "--frames", "6", "--solvers", "xpbd", "explicit"]
     assert main(command) == 0
-    last = capsys.readouterr().out.splitlines()[-1].split()
+    said, text = capsys.readouterr()
+    count = re.fullmatch(
+        r"warpcloth: at most (.*) min and .*: 5 min for the reference, 60 s for each of (\d+) settings\n", text
+    )
+    assert float(count[1]) == 5 + int(count[2]) > 5
+    last = said.splitlines()[-1].split()
     # What was measured are 6 frames: what comes after may stray further.
     assert last[:5] == ["warpcloth", "run", "hanging", "-p", "n=5"] and last[-6:-4] == ["--frames", "6"]
     assert main(last[1:]) == 0

@@ -71,6 +71,7 @@ def choice_for(arguments, device):
                 progress=progress,
                 **values_of(arguments, "solvers", "frames", "dtype", "limit"),
                 others=getattr(arguments, "others", None) or (),
+                announce=_announce,
                 **executor,
             )
     except KeyboardInterrupt:
@@ -80,6 +81,18 @@ def choice_for(arguments, device):
     finally:
         progress.close()
     return choice, found, exact, values
+
+
+def _announce(longest):
+    """Prints how long a choice may take."""
+    parts = [f"{_time(longest.reference)} for the reference", f"{_time(longest.limit)} for each of {longest.settings} settings"]
+    if longest.others:
+        parts.append(f"{_time(longest.other)} for each of {longest.others} solvers of other simulators")
+    print(f"warpcloth: at most {_time(longest.seconds)} and the time to compile: {', '.join(parts)}", file=sys.stderr)
+
+
+def _time(seconds):
+    return f"{seconds:.3g} s" if seconds < 90.0 else f"{seconds / 60.0:,.0f} min"
 
 
 def take_choice(arguments, device):
@@ -120,6 +133,7 @@ def _text(facts, choice, found, exact, advise):
     from ..lab.choosing import percent
     from ..lab.own_reference import words_of_own
     from ..lab.setups import grid_in_words
+    from ..others.simulators import shown_name
 
     measured = f"{facts['scene']}: {len(found)} settings measured over {len(exact.points) - 1} frames"
     lines = [f"{measured}; the reference is known to {percent(exact.error)}"]
@@ -136,8 +150,8 @@ def _text(facts, choice, found, exact, advise):
             )
     for solver, own in choice.others.items():
         same = [each.setup.options for each in found if each.setup.solver == solver]
-        lines.append(f"  {solver}: own motion {words_of_own(own if 'error' in own else None)}")
-        lines.append(f"  {solver}: {own['searched']}; substeps × iterations: {grid_in_words(same)}")
+        lines.append(f"  {shown_name(solver)}: own motion {words_of_own(own if 'error' in own else None)}")
+        lines.append(f"  {shown_name(solver)}: {own['searched']}; substeps × iterations: {grid_in_words(same)}")
     lines += [f"  measured on {name}" for name in dict.fromkeys(each.machine for each in found)]
     if choice.untried and found:
         lines.append(f"{choice.untried} settings were not tried: coarser ones of their solvers meet it, cost more or fail")

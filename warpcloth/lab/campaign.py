@@ -113,7 +113,7 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
         return
     with contextlib.ExitStack() as stack:
         if executor is None:
-            executor = stack.enter_context(_processes(min(workers or os.cpu_count() or 1, len(left))))
+            executor = stack.enter_context(processes(min(workers or os.cpu_count() or 1, len(left))))
         futures = {}
         try:
             for task in left:
@@ -167,8 +167,8 @@ def environment(values):
 
 
 @contextlib.contextmanager
-def _processes(workers):
-    """Starts fresh processes, each with one thread for arithmetic."""
+def processes(workers):
+    """Yields an executor of fresh processes, each with one thread for arithmetic, which start with its first task."""
     context = multiprocessing.get_context("spawn")
     with environment(_ONE_THREAD), ProcessPoolExecutor(workers, context, initializer=begin, initargs=(_own(),)) as pool:
         try:

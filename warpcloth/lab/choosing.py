@@ -1,16 +1,17 @@
 """The cheapest solver and settings that meet a tolerance, or the most accurate within a budget, from measurements."""
 
+import contextlib
 import itertools
 import json
 import math
 import time
 from dataclasses import asdict, dataclass, field, replace
+from typing import NamedTuple
 
 from ..base.checks import number
 from ..others.simulators import simulator_of
 from ..solvers import SOLVERS
-from . import trajectory
-from .campaign import collect, kept_store
+from . import campaign, trajectory
 from .measurements import Setup, task
 from .own_reference import SHARE, of_own, own_facts, own_references
 from .reference import reference
@@ -81,6 +82,38 @@ class Choice:
     certainty: str
     others: dict = field(default_factory=dict)
     untried: int = 0
+
+
+class Longest(NamedTuple):
+    """The longest time that :func:`choose` may take, apart from compilation, if no ``total`` is given.
+
+    Attributes:
+        limit: Time limit of a run [s].
+        settings: Number of settings of warpcloth that may be run.
+        others: Number of solvers of other simulators.
+    """
+
+    limit: float
+    settings: int
+    others: int
+
+    @property
+    def reference(self):
+        """Time of the reference [s]."""
+        return _REFERENCE * self.limit
+
+    @property
+    def other(self):
+        """Time of a solver of another simulator [s]: its search, whose last run may end late, and its own reference.
+
+        The finest run of the reference is repeated with more iterations, in as much time again.
+        """
+        return (3.0 * LIMITS + 1.0) * self.limit
+
+    @property
+    def seconds(self):
+        """Sum of all [s]."""
+        return self.reference + self.settings * self.limit + self.others * self.other
 
 
 def pick(measurements, tolerance=None, budget=None, floor=0.0):
@@ -228,6 +261,7 @@ def choose(
     others=(),
     clock="wall",
     total=math.inf,
+    announce=None,
     **run,
 ):
     """Measures setups of a scene until the choice is clear, on this machine or, with an executor, on its workers.
@@ -249,6 +283,7 @@ def choose(
         clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for limits and times.
         total: Time on the wall [s] after which nothing more is measured; of it, the reference may take a third, the searches
             of other simulators a third, and their own references a third.
+        announce: Function called with the :class:`Longest` before anything is measured, or None.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; by default with the
             store in the cache folder.
 
@@ -263,10 +298,12 @@ def choose(
     pick([], tolerance, budget)  # checks the arguments before anything is measured
     # One at a time, because parallel runs would slow one another.
     run = {"workers": 1} | run
-    run = run if "store" in run else {"store": kept_store("trajectories", run.get("executor")), **run}
+    run = run if "store" in run else {"store": campaign.kept_store("trajectories", run.get("executor")), **run}
     setups = setups_of_runs(scene, solvers, device, dtype, others)
     rivals = [setup for setup in setups if simulator_of(setup.solver)]
     rungs = ladders([setup for setup in setups if not simulator_of(setup.solver)])
+    if announce is not None:
+        announce(Longest(limit, sum(map(len, rungs)), len({setup.solver for setup in rivals})))
     given = {"limit": min(_REFERENCE * limit, total / 3.0)} | ({} if tolerance is None else {"tolerance": tolerance / FINER})
     exact = reference(scene, frames, device=device, **given)
     if tolerance is not None and exact.error >= tolerance:
@@ -283,16 +320,21 @@ def choose(
                  **of_own(own.get(setup.solver), bound))
             for setup in setups
         ]  # fmt: skip
-        found = [measured(setup, *each) for setup, each in zip(setups, collect(tasks, "trajectories", **run), strict=True)]
+        found = [
+            measured(setup, *each) for setup, each in zip(setups, campaign.collect(tasks, "trajectories", **run), strict=True)
+        ]
         meeting.extend(each.milliseconds for each in found if _meets(each, tolerance, exact.error))
         return found
 
-    choice, found = climb(rungs, measure, tolerance, budget, exact.error)
-    if not rivals:
-        return choice, found, exact
-    seconds = min(LIMITS * limit, total / 3.0 / len({setup.solver for setup in rivals}))
-    own |= own_references(scene, rivals, len(exact.points) - 1, device, SHARE * bound, seconds, None, clock)
-    more, ended = climb_others(ladders_of_others(rivals), measure, tolerance, budget, exact.error, seconds)
+    with contextlib.ExitStack() as stack:
+        if run.get("executor") is None:  # one for all rounds, because a process takes seconds to load Warp and its kernels
+            run["executor"] = stack.enter_context(campaign.processes(run["workers"]))
+        choice, found = climb(rungs, measure, tolerance, budget, exact.error)
+        if not rivals:
+            return choice, found, exact
+        seconds = min(LIMITS * limit, total / 3.0 / len({setup.solver for setup in rivals}))
+        own |= own_references(scene, rivals, len(exact.points) - 1, device, SHARE * bound, seconds, None, clock)
+        more, ended = climb_others(ladders_of_others(rivals), measure, tolerance, budget, exact.error, seconds)
     found, mesh = found + more, scene.load().mesh
     facts = {name: (own_facts(own[name], exact, mesh, bound) or {}) | {"searched": why} for name, why in ended.items()}
     return replace(pick(found, tolerance, budget, exact.error), others=facts, untried=choice.untried), found, exact
