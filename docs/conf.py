@@ -8,6 +8,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 # Cells call the command warpcloth of this environment, also if it is not activated.
 os.environ["TQDM_DISABLE"] = "1"  # no progress bars in the output of cells
+# A command that fails ends the build, as an exception does.
+os.environ["PYTHONSTARTUP"] = str(Path(__file__).parent / "_ext" / "cells.py")
 os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
 
 project, author, copyright = "warpcloth", "the authors of warpcloth", "the authors of warpcloth, Apache-2.0"
@@ -33,6 +35,7 @@ nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_execution_timeout = 300
 nb_merge_streams = True
+smartquotes = False  # which makes a dash of the two of an option
 
 # The site fetches nothing: MathJax 3.2.2, Apache-2.0, from the package mathjax of npm, lies in _static.
 html_theme = "furo"

@@ -1,4 +1,4 @@
-"""A belt that is pulled over a fixed drum against a load: it slides when the pull is e^{μφ} times the load.
+"""A belt that is pulled over a fixed drum against a load: it slides when the pull is exp(μφ) times the load.
 
 At a vertex where the belt turns by Δ, the tension ahead is at most (1 + μ tan Δ/2)/(1 − μ tan Δ/2) times the tension behind.
 With ``turns`` edges around the drum, the pull is at most the load times that ratio to the power ``turns``. A tension T presses

@@ -1,6 +1,6 @@
 """A sheet of length L without bending stiffness on a table: it slips off if more than L m/(1 + m) hangs over the edge.
 
-m = μ e^{μπ/2} for a small radius of the edge, which has the same friction μ as the table. The sheet starts at rest.
+m = μ exp(μπ/2) for a small radius of the edge, which has the same friction μ as the table. The sheet starts at rest.
 """
 
 import numpy as np

@@ -21,6 +21,7 @@ ROOT = DOCS.parent
 sys.path.insert(0, str(DOCS))
 
 import tables  # noqa: E402
+from formulas import SOLVERS as STEPS  # noqa: E402
 from formulas import latex  # noqa: E402
 from stills import MAPS  # noqa: E402
 
@@ -79,10 +80,17 @@ def described(kind, name):
     """The docstring of a name and of its members, but for old names of fields and for properties that have none."""
     value = getattr(wc, name)
     bare = [each for each, of_class in vars(value).items() if isinstance(of_class, property) and not of_class.__doc__]
+    bare += getattr(value, "_fields", ())  # of named tuples, whose docstrings only count them
     left_out = ", ".join([*getattr(value, "renamed_fields", ()), *bare])
     path = value.__name__ if kind == "module" else f"warpcloth.{name}"
-    options = {"class": ["members:"], "module": ["members:"]}.get(kind, []) + [f"exclude-members: {left_out}"] * bool(left_out)
+    options = {"class": ["members:"], "module": ["members:"], "data": ["no-value:"]}.get(kind, [])
+    options += [f"exclude-members: {left_out}"] * bool(left_out)
     return f"```{{eval-rst}}\n.. auto{kind}:: {path}\n" + "".join(f"   :{option}\n" for option in options) + "```"
+
+
+def sentence(words):
+    """Words as a sentence."""
+    return f"{words[0].upper()}{words[1:]}."
 
 
 def members(names, folder=""):
@@ -122,7 +130,8 @@ def first_sentence(record):
 def energy(name, scenes):
     record = TERMS[name]
     what, equation, source = first_sentence(record)
-    equation, *where = re.split(r": |, |\. ", equation, maxsplit=1)
+    equation, *more = re.split(r"(: |, |\. )", equation, maxsplit=1)
+    where = (f"with {more[1]}." if more[0] == ", " else sentence(more[1])) if more else ""
     finite = [each.__name__ for each in SOLVERS.values() if name not in tables.refused(each, hard=False)]
     hard = [each.__name__ for each in SOLVERS.values() if name not in tables.refused(each, hard=True)]
     kernel = Path(inspect.getfile(record)).stem
@@ -132,7 +141,7 @@ def energy(name, scenes):
         shown(f"energy-{name}.webp", what),
         made(f"energy-{name}"),
         f"$$U = {latex(equation)}$$",
-        "".join(f"{words}. " for words in where) + "[Physics](../physics.md#symbols) explains the symbols.",
+        f"{where} [Physics](../physics.md#symbols) explains the symbols.",
         "## Parameters",
         described("class", name),
         "## Solvers",
@@ -166,6 +175,11 @@ def solver(record, scenes):
         f"the other solvers. {made(f'solver-{name}')[1:]}",
         f"- **Suits:** {facts.suits}.\n- **Weakness:** {facts.weakness}.",
         sh(f"run hanging --solver {record.name} -o hanging.usdc", f"run hanging --solver {record.name} -s help"),
+        "## A step",
+        f"$$\n\\begin{{gathered}} {STEPS[name][0]} \\end{{gathered}}\n$$",
+        f"{STEPS[name][1]}."
+        + ("" if r"\tilde x" not in STEPS[name][0] else " x̃ is where the vertices would be without the energy.")
+        + (" [Solvers](../solvers.md#integrators) has the other integrators." if hasattr(record, "integrator") else ""),
         "## Method and options",
         described("class", name),
         "## Energies",
@@ -236,7 +250,7 @@ def scene(listed, built, able, unable):
         shown(f"scene-{name}.webp", listed.summary),
         made(f"scene-{name}"),
         sh(f"run {name} -o {name}.usdc", f"render {name}.usdc -o {name}.gif"),
-        f"## Known answer\n\n{known.replace('](', '](../')}" if known else "",
+        f"## Known answer\n\n{sentence(known.replace('](', '](../'))}" if known else "",
         "## Parameters",
         listed.meaning,
         "| Parameter | Default |\n|---|---|\n" + "".join(f"| `{key}` | `{value}` |\n" for key, value in parameters),
@@ -256,7 +270,7 @@ def scene(listed, built, able, unable):
 def fabric(found):
     name = found.name
     rows = "".join(
-        f"| {symbol} | {getattr(found, field):.4g} | {unit} |\n"
+        f"| {symbol} | {float(f'{getattr(found, field):.4g}'):g} | {unit} |\n"
         if getattr(found, field) is not None
         else f"| {symbol} | unknown | |\n"
         for field, (symbol, unit) in UNITS.items()
@@ -267,7 +281,7 @@ def fabric(found):
     try:
         found.terms()
     except ValueError as error:
-        first = [f"It lacks a number: {error}. Give one if you know it, as [fabrics](../fabrics.md) says."]
+        first = [f"A number of it is not known: {error}. [Fabrics](../fabrics.md) has an example."]
     else:
         first = [
             shown(f"drape-{name}.webp", f"A drape of {name} from above"),

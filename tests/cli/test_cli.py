@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ import pytest
 
 import warpcloth.cli.run
 import warpcloth.cli.scenes
+import warpcloth.cli.terminal
 import warpcloth.usd
 from support.command_line import refused, run
 from support.rows import slow_but
@@ -551,6 +553,16 @@ def test_the_progress_bar_shows_on_a_terminal(tmp_path):
     states = shown.decode().split("\r")
     assert states[1].startswith("compiling:   0%|") and states[2].startswith("running:   0%|")
     assert any(" of 200 frames, 0.0" in state and " s each, 00:0" in state for state in states)
+
+
+def test_a_progress_bar_that_the_environment_disables_takes_all_calls(monkeypatch):
+    tqdm = pytest.importorskip("tqdm")
+    monkeypatch.setattr(tqdm, "tqdm", partial(tqdm.tqdm, disable=True))  # as TQDM_DISABLE=1 does
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    progress = warpcloth.cli.terminal.Progress(frames=3)
+    for frame in range(1, 4):
+        progress(frame, 3)
+    progress.close()
 
 
 def test_a_process_that_is_interrupted_leaves_a_file_that_opens(tmp_path):

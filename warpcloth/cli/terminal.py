@@ -65,7 +65,7 @@ def check_outputs(arguments, inputs=()):
 
 
 class Bar:
-    """A progress bar on a terminal; nothing elsewhere."""
+    """A progress bar on a terminal; nothing elsewhere, nor if the environment has ``TQDM_DISABLE``."""
 
     bar = None
 
@@ -80,7 +80,8 @@ class Bar:
         size = shutil.get_terminal_size()
         shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
         form = "{desc}{percentage:3.0f}%|{bar}| " + counts
-        self.bar = tqdm(total=total, desc=f"{text}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
+        bar = tqdm(total=total, desc=f"{text}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
+        self.bar = None if bar.disable else bar  # as TQDM_DISABLE asks
 
     def move(self, done, note=None):
         """Moves the bar to ``done``; ``note`` is shown after the counts."""
