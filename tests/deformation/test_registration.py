@@ -110,6 +110,8 @@ def test_missing_frames_are_interpolated_and_files_are_written(tmp_path, capsys)
         (words, "seen: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"),
         ([*words, "--fps", "24"], "seen: frame 0 has no point within 0.141 m of the template"),
         ([*words, "--fps", "24", "-p", "n=3"], "-p is given, and"),
+        ([*words[:3], str(tmp_path), *words[4:], "--fps", "24"], "is a folder; --onto must be a mesh file, a stage or a scene"),
+        ([*words[:3], str(tmp_path / "x.usdc"), *words[4:], "--fps", "24"], "x.usdc: is a file of the input, which must not"),
         ([*words, "--fps", "24", "--hold", "x < -9"], "--hold"),
     ):
         assert main(wrong) == 2 and sentence in capsys.readouterr().err, wrong
@@ -133,3 +135,12 @@ def test_wrong_use_is_refused(change, message):
     given = {"capture": wc.as_capture([TEMPLATE], dt=1.0), "template": TEMPLATE} | change
     with pytest.raises(ValueError, match=message):
         wc.resample(**given)
+
+
+def test_a_wrong_unit_is_said():
+    """Of a capture that is too large few points are near, and one that is too small faces one spot of the template."""
+    large, small = (wc.as_capture([wc.Mesh(scale * TEMPLATE.points, TEMPLATE.triangles)], dt=1.0) for scale in (1e3, 1e-3))
+    with pytest.warns(UserWarning, match=r"^capture: 0.\d+ % of its area is within 0.141 m of the template"):
+        wc.resample(large, TEMPLATE, iterations=1)
+    with pytest.warns(UserWarning, match="the unit of the capture"):
+        wc.resample(small, TEMPLATE, iterations=1)

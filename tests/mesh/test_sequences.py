@@ -334,6 +334,7 @@ REFUSED_FOLDERS = [  # names of files, what is opened, fps, kind of error, messa
     (["1.mtl"], "", 24, ValueError, "no mesh files there; they must end with .obj .ply .off"),
     (["1.obj"], "*.ply", 24, ValueError, r"\*.ply: no mesh files there"),
     (["1.obj"], "1.obj", 24, ValueError, r'1.obj: is one mesh; it must be a folder of them, or a pattern such as ".*/\*.obj"'),
+    (["1.ply"], "1.ply", 24, ValueError, r'1.ply: is one mesh; .* or a pattern such as ".*/\*.ply"'),
     (["1.mtl"], "1.mtl", 24, ValueError, "1.mtl: must be a folder or pattern of mesh files, or end with .usd .* .npz .npy"),
     (["1.obj"], "elsewhere", 24, FileNotFoundError, "elsewhere: no such file or folder"),
 ]
@@ -401,9 +402,10 @@ REFUSED_ARRAYS = [  # ending, what is written, fps, message
         r"times\[2\] is 1.0; it must be la",
     ),
     ("npz", {"points": np.array(["x"]), "triangles": MESH.triangles}, 24, "points.npy has type <U1, must be real numbers"),
-    ("npz", b"no archive", 24, "is no .npz file"),
-    ("npy", b"no array", 24, "magic string"),
-    ("npy", b"", 24, ""),
+    ("npz", b"no archive", 24, "is no .npz file, as np.savez writes it"),
+    ("npy", b"no array", 24, "is no .npy file, as np.save writes it"),
+    ("npy", b"", 24, "is no .npy file"),
+    ("npy", np.array([MESH]), 24, "cannot be read as .npy: .* Python objects"),
     ("npy", frames()[:, :8], 24, r"points has shape \(5, 8, 3\); it must be \(frames, 9, 3\) for the points of the mesh"),
 ]
 
@@ -423,7 +425,9 @@ def test_array_files_that_are_refused(tmp_path, ending, content, fps, message):
 
 def test_array_files_that_need_more(tmp_path):
     np.save(tmp_path / "a.npy", frames())
-    with pytest.raises(ValueError, match=r"a.npy: has no triangles; give a rest mesh that has them \(--rest\)"):
+    with pytest.raises(
+        ValueError, match=r"a.npy: has no triangles; give a rest mesh .* 'warpcloth convert a.npy a.npz --rest MESH'"
+    ):
         open_sequence(tmp_path / "a.npy", fps=24)
     np.savez_compressed(tmp_path / "a.npz", points=frames(), triangles=MESH.triangles)
     with pytest.raises(ValueError, match=r"a.npz: points.npy is compressed, .*; write it by np.savez"):

@@ -82,10 +82,11 @@ def test_it_fits_a_capture_whose_triangles_change(tmp_path, capsys):
     for wrong, sentence in (
         (words, "seen: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"),
         ([*words, "--fps", "24", "--frames", "1"], "none at the time of a frame of the scene"),
-        ([*words, "--fps", "60"], "seen: is about 670 m across, and the cloth 1.41 m; give the length of its unit"),
+        ([*words, "--fps", "60"], "seen: is about 670 m across, and the cloth 1.41 m; lengths must be metres, or, of mesh"),
         ([*words, "--fps", "60", "--scale", "1e-6"], "seen: is about 0.00067 m across, and the cloth 1.41 m"),
         (["fit", "chain", *words[4:], "--fps", "60"], "seen: the mesh has no triangles to compare a capture with"),
         ([*words, "--fps", "60", "--vertices", "corners"], "--vertices is given, and the vertices of --capture are not"),
+        (["fit", "hanging", "-p", "n=4", "seen.npz", *words[6:]], "'seen.npz' is not of the form name=value; MEASURED must"),
         (["fit", "hanging", "seen.npz", *words[4:]], "MEASURED and --capture are given; one of the three must be"),
         (["fit", "hanging", "seen.npz", "--points", "3", *words[6:]], "--scale and --points are for --capture"),
     ):

@@ -119,6 +119,9 @@ def _check(arguments):
     """Checks that options go together."""
     measured, read = arguments.measured, arguments.reading
     given = [name for name, one in (("MEASURED", measured), ("--reading", read), ("--capture", arguments.capture)) if one]
+    taken = next((text for text in (*arguments.p, *arguments.s, *arguments.start) if "=" not in text and text != "help"), None)
+    if taken and not measured:
+        raise ValueError(f"{taken!r} is not of the form name=value; MEASURED must stand directly after SCENE, before -p")
     if len(given) != 1:
         said = f"{given[0]} and {given[1]} are" if given else "none of MEASURED, --reading and --capture is"
         raise ValueError(f"{said} given; one of the three must be")

@@ -57,7 +57,7 @@ def resample(arguments):
     device = find_device(arguments.device)
     capture = open_capture(arguments.capture, arguments.prim, arguments.fps, arguments.scale)
     arguments.prim = None
-    check_apart([arguments.output], capture.files)
+    check_apart([arguments.output], [*capture.files, arguments.onto])
     options = values_of(arguments, "stiffness", "within", "iterations", "tolerance")
     with closing(Progress()) as progress:
         found = resample(capture, **_template(arguments, capture), **options, device=device, progress=progress)
@@ -91,6 +91,8 @@ def _template(arguments, capture):
     from ..scene.scene import Pins
 
     path, keyframes = Path(arguments.onto), None
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; --onto must be a mesh file, a stage or a scene")
     if path.suffix == ".py" or not path.suffix:
         _source, _values, scene = named_scene(argparse.Namespace(scene=arguments.onto, p=arguments.p))
         mesh, positions, pins = scene.mesh, scene.positions, scene.pins

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from ..usd import AnimationWriter
 from .arap import edge_weights
 
 _TURNED = np.cos(np.radians(60.0))  # cosine of the largest angle between the normals of a point and of the template
+_FEW = 0.01  # share of the capture that counts, or of the template that faces it, below which they are hardly the same cloth
 _REGULAR = 1e-12  # added to the diagonal, relative to its largest entry, so that the matrix has an inverse
 _CORNERS = np.arange(3)
 
@@ -109,6 +111,9 @@ def resample(
     Raises:
         ValueError: An argument is not allowed, the capture has no times, or no point of a frame counts.
 
+    Warns:
+        UserWarning: Less than 1 % of the capture counts, or of the template faces it, as with a wrong unit.
+
     Examples:
         >>> import warpcloth as wc
         >>> template, seen = wc.Mesh.grid(5, 5), wc.Mesh.grid(8, 7)
@@ -154,6 +159,12 @@ def resample(
             progress(frame, len(labels) - 1)
     points, *rest = (np.array(column) for column in zip(*found, strict=True))
     times = np.interp(np.arange(len(labels)), frames, capture.times)
+    observed, used = (float(np.mean(rest[k])) for k in (1, 3))
+    if min(observed, used) < _FEW:
+        near = f"{100.0 * used:.2g} % of its area is within {within:.3g} m of the template"
+        faced = f"{100.0 * observed:.2g} % of the template faces it"
+        wrong = "the unit of the capture (scale) or the start of the template may be wrong"
+        warnings.warn(f"{where}: {near}, and {faced}; {wrong}", stacklevel=2)
     return Resampled(
         template,
         _filled(points, frames, len(labels)),

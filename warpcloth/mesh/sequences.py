@@ -180,8 +180,9 @@ def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = N
             return _open_cache(path, fps, mesh)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    if Path(path).suffix.lower() in ENDINGS:
-        raise ValueError(f'{path}: is one mesh; it must be a folder of them, or a pattern such as "{Path(path).parent}/*.obj"')
+    if (ending := Path(path).suffix.lower()) in ENDINGS:
+        pattern = Path(path).parent / f"*{ending if ending in FRAME_ENDINGS else '.obj'}"
+        raise ValueError(f'{path}: is one mesh; it must be a folder of them, or a pattern such as "{pattern}"')
     raise ValueError(f"{path}: must be a folder or pattern of mesh files, or end with {' '.join(OPENERS)} .npz .npy .pc2 .mdd")
 
 
@@ -287,7 +288,7 @@ def _read_file(paths, prim, expected, count, frame):
 
 def _open_npz(path, fps):
     if not zipfile.is_zipfile(path):
-        raise ValueError("is no .npz file")
+        raise ValueError("is no .npz file, as np.savez writes it")
     with _numpy_reads(), np.load(path, allow_pickle=False) as archive:
         lacking = sorted({"points", "triangles"} - set(archive.files))
         if lacking:
@@ -341,10 +342,17 @@ def _mapped(path, member):
 
 
 def _open_npy(path, fps, mesh):
+    with open(path, "rb") as file:
+        if file.read(6) != b"\x93NUMPY":
+            raise ValueError("is no .npy file, as np.save writes it")
     with _numpy_reads():
-        points = np.lib.format.open_memmap(path, mode="r")
+        try:
+            points = np.lib.format.open_memmap(path, mode="r")
+        except ValueError as error:  # such as Python objects in place of numbers
+            raise ValueError(f"cannot be read as .npy: {error}") from error
     if mesh is None:
-        raise ValueError("has no triangles; give a rest mesh that has them (--rest), or an .npz file")
+        join = f"'warpcloth convert {Path(path).name} {Path(path).stem}.npz --rest MESH'"
+        raise ValueError(f"has no triangles; give a rest mesh that has them (--rest), or an .npz file, as of {join}")
     count, read, precision = _array("points", points, mesh)
     times = _even(count, fps)
     return Sequence(mesh, np.arange(count), times, read, path, precision=precision, files=(path,), up_axis=mesh.up_axis)

@@ -431,6 +431,6 @@ def _check_size(where, seen, scene):
     cloth = np.linalg.norm(np.ptp(scene.positions, axis=0))
     if sizes and not _SMALLER * cloth <= np.median(sizes) <= _LARGER * cloth:
         raise ValueError(
-            f"{where}: is about {np.median(sizes):.3g} m across, and the cloth {cloth:.3g} m; give the length of its unit as "
-            "open_capture(path, scale=…), or as --scale on the command line"
+            f"{where}: is about {np.median(sizes):.3g} m across, and the cloth {cloth:.3g} m; lengths must be metres, or, "
+            "of mesh files, of the unit that open_capture(path, scale=…), or --scale on the command line, gives"
         )
