@@ -16,8 +16,11 @@ from ..vectors import types
 from .pair_sums import PairSource
 from .self_gaps import SIDE, ZERO, gap_along, nearest, signed_gap, vertex_of
 from .self_pairs import MODULE, StepPairs, module_of, near_pairs
+from .self_planes import margin_of
 
 potential, slope, bend = contact.potential, contact.slope, contact.bend
+# The force of ψ at the least gap over that of the logarithm.
+STEEP = wp.constant(wp.float64(100.0))
 
 
 @wp.struct
@@ -73,14 +76,31 @@ def gap_in_step(dtype):
 
 
 @cache
+def least_gap(dtype):
+    """Device function (stencil, x, least) → twice the margin of the filter for a pair at x [m], f of the module."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.func
+    def least_gap_of(s: wp.vec4i, x: wp.array(dtype=vec3), least: wp.float64):
+        far = ZERO
+        for i in range(4):
+            far = wp.max(far, wp.max(wp.abs(exact(x[s[i]]))))
+        return wp.float64(2.0) * margin_of(least, far)
+
+    return least_gap_of
+
+
+@cache
 def find_forces(dtype, bounded: bool):
     """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; φ = ½(r − d)² if ``bounded``.
 
     With ``apart`` no pair passes through, so that d is never negative: where cloth slides over an edge, y may turn far from its
-    normal at the start of the step.
+    normal at the start of the step. If ``least`` [m] is above 0, φ includes ψ, for a filter with this least gap; not where r is
+    below 2f, as far from the origin.
     """
     vec3, _ = types(dtype)
-    gap_of = gap_in_step(dtype)
+    gap_of, least_gap_of = gap_in_step(dtype), least_gap(dtype)
 
     @wp.kernel(module=f"{module_of(dtype)}.{bounded}", enable_backward=False)
     def find_forces_of_pairs(
@@ -92,6 +112,7 @@ def find_forces(dtype, bounded: bool):
         correction: wp.array(dtype=vec3),
         # parameters
         apart: bool,
+        least: wp.float64,
         # out
         forces: PairForces,
     ):
@@ -119,6 +140,14 @@ def find_forces(dtype, bounded: bool):
                 forces.energy[e] = k * potential(gap, r)
                 forces.slope[e] = k * slope(gap, r)
                 forces.acting[e] = k * bend(gap, r)
+                if least > ZERO and gap < SIDE * r:
+                    f = least_gap_of(pairs.stencils[e], x, least)
+                    below = wp.float64(2.0) - gap / f
+                    if below > ZERO and wp.float64(2.0) * f <= r:
+                        more = STEEP * SIDE * SIDE * k * r * r * below
+                        forces.energy[e] = forces.energy[e] + more * below * below / wp.float64(3.0)
+                        forces.slope[e] = forces.slope[e] - more * below / f
+                        forces.acting[e] = forces.acting[e] + wp.float64(2.0) * more / (f * f)
             if forces.pressing:
                 forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
 

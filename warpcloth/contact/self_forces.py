@@ -20,11 +20,13 @@ class SelfForces(PairSums):
         energies: Energies of pairs, summed by their first vertex, (N,) [J].
         friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
         apart: Whether pairs never pass through one another where forces are computed.
+        least: The least gap [m] of the filter if that keeps all pairs apart wherever forces are computed, else 0.
     """
 
     def __init__(self, model, bounded):
         super().__init__(model, self_contact.CONTACT_OF_PAIRS, scatters=model.device.is_cpu)
-        self.friction, self._touching, self._clearance, self._kernels, self.apart = None, None, None, {}, False
+        self.friction, self._touching, self._clearance, self._kernels = None, None, None, {}
+        self.apart, self.least = False, 0.0
         self.energies = wp.zeros(model.count, dtype=wp.float64, device=model.device)
         self._find = model.kernel(self_contact.find_forces, model.dtype, bounded)
 
@@ -63,7 +65,7 @@ class SelfForces(PairSums):
         """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""
         if self.model.device.is_cpu:
             self.found.count.zero_()
-        given = [self.pairs, self.begun, x, correction, self.apart]
+        given = [self.pairs, self.begun, x, correction, self.apart, self.least]
         self.model.launch(self._find, len(self.pairs.stencils), given, [self.found])
         if self.friction is not None:
             self.friction.launch_forces(x, correction)

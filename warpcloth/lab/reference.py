@@ -27,6 +27,8 @@ from .clock import Clock, TooSlow
 _MOST_EXPLICIT, _MOST_ON_CUDA = 20000, 65536
 # Tolerance of solves within a step, so small that only the error of the step itself counts.
 _TOLERANCE = 1e-6
+# Iterations of a step of Newton's method. Pairs of self-contact that turn can need over 100, as its Hessian leaves this out.
+_ITERATIONS = 400
 _SOLVED = (Result.COMPLETED, Result.CONVERGED, Result.ROUNDED)
 
 
@@ -200,7 +202,7 @@ def _method(scene, device):
             raise ValueError(f"there is no reference solution of {scene.name}: {error}") from None
         return method
     if scene.colliders:
-        return _Method(lambda s: Newton(substeps=s, tolerance=_TOLERANCE, integrator="bdf2"), 4, 1)
+        return _Method(lambda s: Newton(substeps=s, tolerance=_TOLERANCE, iterations=_ITERATIONS, integrator="bdf2"), 4, 1)
     fewest = 1.0 / (scene.fps * min(step_limits(model)))
     most = _MOST_ON_CUDA if model.device.is_cuda else _MOST_EXPLICIT
     if fewest < most:
@@ -212,7 +214,7 @@ def _method(scene, device):
                 f"with less stiffness, below {most} explicit steps a frame, it is faster",
                 stacklevel=4,
             )
-    return _Method(lambda s: Newton(substeps=s, tolerance=_TOLERANCE, integrator="bdf2"), 4, 2)
+    return _Method(lambda s: Newton(substeps=s, tolerance=_TOLERANCE, iterations=_ITERATIONS, integrator="bdf2"), 4, 2)
 
 
 def _solve(scene, frames, tolerance, limit, progress, device):
