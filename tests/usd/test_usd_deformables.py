@@ -163,6 +163,8 @@ def test_gravity_may_be_switched_off_as_in_newton(tmp_path):
             "physics:masses has 1 values, must have 12",
         ),
         ("Looks/ClothPhysics", {"physics:surfaceStretchStiffness": ("Float", 0.0)}, "surfaceShearStiffness is given without"),
+        ("Cloth", {"newton:massModel": ("Token", "foo")}, "newton:massModel is 'foo', must be one of shell, solid"),
+        ("Cloth", {"physics:restBendAnglesDefault": ("Token", "bent")}, "restBendAnglesDefault is 'bent', must be one of flat"),
         ("Looks/ClothPhysics", {"physics:poissonsRatio": ("Float", 1.0)}, "must be above -1 and below 1"),
     ],
 )
@@ -170,6 +172,20 @@ def test_stages_that_cannot_be_a_scene_are_refused(tmp_path, prim, names, words)
     path = alone(write_scene(declared(), tmp_path / "wrong.usda", law="proposal"))
     with pytest.raises(ValueError, match=words):
         read_scene(edited(path, f"/World/{prim}", names))
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ({"surfaceStretchStiffness": 0.0, "surfaceShearStiffness": 0.0}, "so that nothing but bending resists"),
+        ({"youngsModulus": 1e6}, "StretchStiffness is 200 N/m and is read, but physics:youngsModulus gives 2000 N/m"),
+    ],
+)
+def test_a_doubtful_material_is_read_with_a_warning(tmp_path, names, words):
+    path = alone(write_scene(declared(), tmp_path / "doubtful.usda", law="proposal"))
+    given = {f"physics:{name}": ("Float", value) for name, value in names.items()}
+    with pytest.warns(UserWarning, match=f"doubtful.usda, prim /World/Cloth: .*{words}"):
+        read_scene(edited(path, "/World/Looks/ClothPhysics", given))
 
 
 @pytest.mark.parametrize(

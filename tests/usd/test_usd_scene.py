@@ -2,6 +2,7 @@
 
 import math
 import sys
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 
@@ -474,7 +475,9 @@ SHEET_TERMS = [("NeoHookeanMembrane", 3e3 * 0.91), ("QuadraticBending", 2.0)]
 )
 def test_standard_names_are_read_in_units_of_the_stage(tmp_path, options, density, terms):
     artist(tmp_path / "artist.usda", **options).Save()
-    scene = read_scene(tmp_path / "artist.usda")
+    doubtful = pytest.warns(UserWarning, match="nothing but bending") if terms == SHEET_TERMS[1:] else nullcontext()
+    with doubtful:
+        scene = read_scene(tmp_path / "artist.usda")
     np.testing.assert_allclose(scene.vertex_masses, density * scene.mesh.vertex_areas, rtol=8 * EPS)
     assert [type(term).__name__ for term in scene.terms] == [kind for kind, _ in terms]
     np.testing.assert_allclose([term.stiffness for term in scene.terms], [stiffness for _, stiffness in terms], rtol=4 * EPS)

@@ -108,6 +108,9 @@ class Declared:
     part: str | None = None
 
     def __post_init__(self):
+        for each in fields(self):  # so that a term prints plain numbers
+            if isinstance(value := getattr(self, each.name), np.generic):
+                object.__setattr__(self, each.name, value.item())
         if not (self.part is None or isinstance(self.part, str)):
             raise ValueError(f"{self.label}.part is {shown(self.part)}; it must be the name of a part of the mesh or None")
         if not (self.name is None or isinstance(self.name, str)):

@@ -30,6 +30,7 @@ from .values import array_of, refuse_outside, value_of
 LAWS = ("proposal", "newton")
 THICKNESS = 1e-3  # [m], the default of the proposal
 _POISSON = 0.3  # its default too
+_AGREE = 1e-2  # relative difference of a stretch stiffness and Young's modulus above which they contradict
 _SAME = 1e-5  # relative difference of products of float32 that counts as none
 _NEAR = 1e-5  # distance of an anchor from its point, relative to size and position of the cloth, that counts as none
 
@@ -38,8 +39,9 @@ def thickness_of(values):
     """Returns the thickness [m] that the names give, or None.
 
     Raises:
-        ValueError: It is not the same everywhere.
+        ValueError: It is not the same everywhere, or the mass model is another than shell and solid.
     """
+    _token(values, "(mass model)", "newton:massModel", "shell", "solid")
     several = values.get("(thicknesses)")
     if several is None:
         shell = values.get("(shell thickness)") if values.get("(mass model)") == "shell" else None
@@ -74,16 +76,20 @@ def masses_of(values, mesh):
     return np.bincount(mesh.triangles.ravel(), np.repeat(masses / 3.0, 3), count)
 
 
-def terms_of(values, mesh, law):
+def terms_of(values, mesh, law, where):
     """Returns the terms of a surface material by a law; none if it has no stiffness.
 
     Args:
         values: The :class:`.attributes.Values` of the cloth.
         mesh: Its mesh.
         law: One of :data:`LAWS`.
+        where: The file and the prim, for warnings.
 
     Raises:
-        ValueError: It has a stiffness in shear alone.
+        ValueError: It has a stiffness in shear alone, or a name has a value that is not allowed.
+
+    Warns:
+        UserWarning: It has a stiffness in bending alone, a stiffness is not read, or Young's modulus gives another.
     """
     names = ("stretch stiffness", "shear stiffness", "bend stiffness", "Young's modulus", "Poisson's ratio")
     stretch, shear, bend, modulus, ratio = (values.get(f"({name})") for name in names)
@@ -92,21 +98,43 @@ def terms_of(values, mesh, law):
         raise ValueError(f"physics:poissonsRatio is {ratio}, must be above -1 and below 1")
     if modulus is not None:
         t = thickness_of(values) or THICKNESS
-        stretch = modulus * t / (1.0 - ratio**2) if stretch is None else stretch
+        plate = modulus * t / (1.0 - ratio**2)
+        stretch = plate if stretch is None else stretch
+        if abs(stretch - plate) > _AGREE * max(stretch, plate):
+            other = f"physics:youngsModulus gives {plate:.4g} N/m with a thickness of {t:.4g} m"
+            warnings.warn(
+                f"{where}: physics:surfaceStretchStiffness is {stretch:.4g} N/m and is read, but {other}", stacklevel=2
+            )
         bend = modulus * t**3 / (12.0 * (1.0 - ratio**2)) if bend is None else bend
     if stretch is None and shear is not None:
         raise ValueError("physics:surfaceShearStiffness is given without a surfaceStretchStiffness or a youngsModulus")
+    if stretch is None and bend is not None:
+        lacking = "physics:surfaceStretchStiffness and physics:youngsModulus are not given, or 0"
+        warnings.warn(f"{where}: {lacking}, so that nothing but bending resists", stacklevel=2)
+    angles = _token(values, "(rest angles)", "physics:restBendAnglesDefault", "flat", "restShape")
     terms = []
     if stretch is not None and law == "newton":
         terms.append(NeoHookeanMembrane.from_moduli(mu=float(stretch), lam=0.0))
         if shear is not None:
-            warnings.warn("physics:surfaceShearStiffness is not read, as by the importer of Newton", stacklevel=2)
+            warnings.warn(f"{where}: physics:surfaceShearStiffness is not read, as by the importer of Newton", stacklevel=2)
     elif stretch is not None:
         terms.append(_membrane(float(stretch), shear, ratio, given, mesh))
     if bend is not None:
-        kind = DihedralBending if values.get("(rest angles)") == "restShape" else QuadraticBending
+        kind = DihedralBending if angles == "restShape" else QuadraticBending
         terms.append(kind(stiffness=float(bend) if law == "proposal" else bend / _kappa(mesh)))
     return terms
+
+
+def _token(values, field, name, *allowed):
+    """Returns the value of a name, or None.
+
+    Raises:
+        ValueError: It is none of those ``allowed``.
+    """
+    value = values.get(field)
+    if value is not None and value not in allowed:
+        raise ValueError(f"{name} is {value!r}, must be one of {', '.join(allowed)}")
+    return value
 
 
 def _membrane(stretch, shear, ratio, given, mesh):

@@ -146,7 +146,8 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law):
     held = attachments_of(stage, cloth, surroundings, rest if positions is None else positions, codes)
     vertices, keyframes = _with_held(vertices, keyframes, held, rest if positions is None else positions)
     if standard:
-        terms = [*(terms_of(values, mesh, law) if len(mesh.triangles) else ()), *held.terms]
+        where = f"{surroundings.path}, prim {cloth.GetPath()}"
+        terms = [*(terms_of(values, mesh, law, where) if len(mesh.triangles) else ()), *held.terms]
     if fabric is None:
         _refuse_missing(density is not None or masses is not None, len(terms) > 0)
     if positions is not None and np.array_equal(positions, rest):
