@@ -51,7 +51,7 @@ def add_scaled(dtype):
     """Kernel over vertices: out += factor·a."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def add(
         # state in
         a: wp.array(dtype=vec3),
@@ -71,7 +71,7 @@ def step_back(dtype):
     """Kernel over vertices: d = h v, before = x − d, the position from which a step at the present velocity leads to x."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def back(
         # state in
         x: wp.array(dtype=vec3),
@@ -126,7 +126,7 @@ def add_work(dtype):
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
 
-    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def add(
         # elements
         mass: wp.array(dtype=dtype),
@@ -166,7 +166,7 @@ def add_rubbing_work(dtype):
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
 
-    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def add_each_rubbing(
         # state in
         gradient: wp.array(dtype=vec3),

@@ -18,7 +18,7 @@ def half_way(dtype):
     """Kernel over vertices: out = ½(a + b)."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=f"warpcloth.work.{dtype.__name__}", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def half_way_between(
         # state in
         a: wp.array(dtype=vec3),

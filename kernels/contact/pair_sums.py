@@ -45,7 +45,7 @@ class PairSource:
     product: Callable
 
     def of(self, dtype):
-        """Returns the name of the module of a precision."""
+        """Returns the name of the module of a precision, of the kernels that scatter."""
         return f"{self.module}.{dtype.__name__}"
 
 
@@ -55,7 +55,7 @@ def gather_pair_forces(source: PairSource, dtype):
     vec3, _ = types(dtype)
     pair, force = source.pair, source.force
 
-    @wp.kernel(module=source.of(dtype), enable_backward=False)
+    @wp.kernel(module=f"{source.of(dtype)}.gather", enable_backward=False)
     def gather_forces_of_pairs(
         # elements
         pairs: near_pairs(dtype),
@@ -105,7 +105,7 @@ def scatter_pair_forces(source: PairSource, dtype):
 def gather_pair_energies(source: PairSource, dtype):
     """Kernel over vertices: adds the energies [J] of the pairs whose first vertex it is."""
 
-    @wp.kernel(module=source.of(dtype), enable_backward=False)
+    @wp.kernel(module=f"{source.of(dtype)}.gather", enable_backward=False)
     def gather_energies_of_pairs(
         # elements
         pairs: near_pairs(dtype),
@@ -152,7 +152,7 @@ def gather_pair_diagonal(source: PairSource, dtype):
     _, mat33 = types(dtype)
     pair, curvature = source.pair, source.curvature
 
-    @wp.kernel(module=source.of(dtype), enable_backward=False)
+    @wp.kernel(module=f"{source.of(dtype)}.gather", enable_backward=False)
     def gather_diagonal_of_pairs(
         # elements
         pairs: near_pairs(dtype),
@@ -213,7 +213,7 @@ def gather_pair_products(source: PairSource, dtype):
     _at, exact = vertex_of(dtype)
     pair, part, product = source.pair, source.part, source.product
 
-    @wp.kernel(module=source.of(dtype), enable_backward=False)
+    @wp.kernel(module=f"{source.of(dtype)}.gather", enable_backward=False)
     def gather_products_of_pairs(
         # elements
         pairs: near_pairs(dtype),

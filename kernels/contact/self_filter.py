@@ -156,7 +156,7 @@ def share_of_pins(dtype):
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def find_each_share_of_pins(
         # elements
         pairs: near_pairs(dtype),
@@ -213,7 +213,7 @@ def hold_pins(dtype):
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def hold_each_pin(
         # elements
         inverse_mass: wp.array(dtype=dtype),
@@ -295,7 +295,7 @@ def walk_from_start(dtype):
     """Kernel over vertices: x = x_before, the start of the step, in copies whose colliders have cut a move since ``before``."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def walk_each_from_start(
         # state in
         x_before: wp.array(dtype=vec3),
@@ -321,7 +321,7 @@ def find_held(dtype):
     """
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def find_each_held(
         # elements
         inverse_mass: wp.array(dtype=dtype),
@@ -352,7 +352,7 @@ def push_pairs(dtype):
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def push_each_pair(
         # elements
         pairs: near_pairs(dtype),
@@ -389,7 +389,7 @@ def shorten(dtype):
     """Kernel over vertices: p ← p·min(1, most/max‖pⱼ‖), with the maximum over the vertices of a copy."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def shorten_each_direction(
         # state in
         longest: wp.array(dtype=wp.float64),

@@ -254,7 +254,7 @@ def cut_as_a_whole(dtype):
     _at, exact = vertex_of(dtype)
     stencil = load(wp.vec4i)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def cut_each_as_a_whole(
         # elements
         pairs: near_pairs(dtype),

@@ -9,7 +9,7 @@ from ..terms import contact
 from ..vectors import types
 from .self_contact import PairForces, gap_in_step
 from .self_gaps import ONE, ZERO, gap_along, vertex_of
-from .self_pairs import StepPairs, module_of, near_pairs
+from .self_pairs import StepPairs, near_pairs
 
 gap_after = contact.gap_after
 # Smallest W of a hard pair, over its W with all axes free. If n is at an angle ε to the free axes, the vertices of the pair
@@ -85,7 +85,7 @@ def find_clearances(dtype):
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def find_each_clearance(
         # elements
         pairs: near_pairs(dtype),
@@ -187,7 +187,7 @@ def sweep_pairs(dtype, axes: bool):
 def number_corners(dtype):
     """Kernel over entries of ``corners``: stores the index of each corner in ``slots``."""
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def number_each_corner(
         # elements
         pairs: near_pairs(dtype),
@@ -207,7 +207,7 @@ def touch_pairs(dtype):
     vec3, _ = types(dtype)
     gap_of = gap_in_step(dtype)
 
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False)
     def touch_each_pair(
         # elements
         pairs: near_pairs(dtype),
