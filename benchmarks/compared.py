@@ -31,8 +31,8 @@ from warpcloth.others.simulators import SIMULATORS
 SCENES = {
     "hanging": (("hanging", {"n": 32}), 10),
     "stiff": (("hanging", {"n": 24, "stiffness": 1e5}), 10),
-    "drape": (("drape", {"n": 24}), 20),
-    "fold": (("fold", {"nx": 8, "ny": 24}), 20),
+    "drape": (("drape", {"n": 24}), 10),
+    "fold": (("fold", {"nx": 8, "ny": 24, "bending": 1e-4, "damping": 1e-5}), 20),
 }
 
 
@@ -60,18 +60,22 @@ def main():
     for name in options.scene:
         (scene, parameters), frames = SCENES[name]
         began = time.perf_counter()
+        scene, frames = SceneRef(scene, parameters | given), options.frames or frames
         with ThreadPoolExecutor(1) as executor:  # one process for all, so that kernels are compiled once
-            found = side_by_side(
-                SceneRef(scene, parameters | given),
-                options.others,
-                options.tolerance,
-                frames=options.frames or frames,
-                device=options.device,
-                solvers=options.solvers,
-                limit=options.limit,
-                total=options.total,
-                executor=executor,
-            )
+            try:
+                found = side_by_side(
+                    scene,
+                    options.others,
+                    options.tolerance,
+                    frames=frames,
+                    device=options.device,
+                    solvers=options.solvers,
+                    limit=options.limit,
+                    total=options.total,
+                    executor=executor,
+                )
+            except ValueError as error:  # such as that there is no reference
+                found = {"scene": str(scene), "frames": frames, "device": options.device, "failed": str(error)}
         path = options.out / f"{name}.json"
         path.write_text(json.dumps(found, indent=1, default=float), encoding="utf-8")
         show(path, found)
@@ -81,6 +85,8 @@ def main():
 def show(path, found):
     """Prints the tables of a result and draws its chart beside its file."""
     print(text_of(found), flush=True)
+    if not found.get("rows"):
+        return
     try:
         plot_time(path.with_suffix(".png"), found)
     except ImportError as error:
@@ -89,6 +95,8 @@ def show(path, found):
 
 def text_of(found):
     """Returns the tables of a result: ratios at equal error, how each search ended, and its grid of settings."""
+    if "failed" in found:
+        return f"\n{found['scene']}, {found['frames']} frames, {found['device']}: no result, because {found['failed']}"
     machine, rows = found["machine"], found["rows"]
     device = machine["processor"] if machine["device"] == "cpu" else machine["device"]
     versions = ", ".join(f"{SIMULATORS[name].title} {machine[name]}" for name in SIMULATORS if machine.get(name))

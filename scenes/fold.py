@@ -12,9 +12,12 @@ def scene(
     width: float = 0.2,
     height: float = 0.6,
     friction: float = 0.5,
+    bending: float = 1e-5,
+    damping: float = 1e-7,
     duration: float = 2.0,
 ):
-    """Vertices across and down, folds, width and height [m], friction of the floor, duration [s]."""
+    """Vertices across and down, folds, width and height [m], friction of the floor, stiffness of bending [N·m] and its damping
+    [N·m·s], duration [s]."""
     wc.checks.whole("nx", nx, 2)
     wc.checks.whole("folds", folds, 1)
     wc.checks.whole("ny", ny, 4 * folds)
@@ -33,7 +36,7 @@ def scene(
         positions=positions,
         terms=[
             wc.Spring(pairs=("structural", "shear"), stiffness=200.0, damping=0.02),
-            wc.QuadraticBending(stiffness=1e-5, damping=1e-7),
+            wc.QuadraticBending(stiffness=bending, damping=damping),
         ],
         colliders=[wc.Plane(friction=friction, name="floor")],
         contact=wc.Contact(distance=3e-3),

@@ -4,9 +4,11 @@ import csv
 import itertools
 import json
 import re
+import runpy
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -105,6 +107,10 @@ def test_solvers_of_others_are_searched_for_their_own_cheapest():
     assert [each.setup.options["substeps"] for each in found if each.setup.solver == "xpbd"] == [20, 40]
     assert ended["xpbd"] == "2 settings in 2 s; the time of 1.5 s is used up"
     assert ended["explicit"] == "1 settings in 1 s; finer settings take too long or are refused"
+    found, ended = climb_others(
+        LADDERS, lambda setups: [replace(measured(each), final=True, status="left") for each in setups], 0.01
+    )
+    assert found == [] and set(ended.values()) == {"0 settings in 0 s; the total time is used up"}
 
 
 def test_the_longest_time():
@@ -202,7 +208,7 @@ def test_runs_end_soon_after_the_cheapest_that_meets_it():
 
 
 @pytest.mark.parametrize(("limit", "why"), [(np.inf, "smaller steps make it no less"), (300.0, "halved for 300 s")])
-def test_nothing_is_measured_if_the_reference_cannot_tell(limit, why, monkeypatch):
+def test_nothing_is_measured_if_the_reference_cannot_tell(limit, why, tmp_path, monkeypatch, capsys):
     points = np.zeros((5, 2, 3))
     facts = {"strain_error": 0.0, "substeps": 64, "seconds": 1.0, "path": "", "key": "", "scene": "", "method": "Newton"}
     exact = Reference(points=points, times=np.arange(5.0), error=0.02, limit=limit, **facts)
@@ -214,6 +220,12 @@ def test_nothing_is_measured_if_the_reference_cannot_tell(limit, why, monkeypatc
     assert compared["ratios"] == [] and nearest_setting(compared).startswith(
         "no setting of warpcloth has an error; the reference"
     )
+    (tmp_path / "compared.json").write_text(json.dumps(compared | {"machine": {"device": "cuda:0", "warp": "1"}}))
+    (tmp_path / "failed.json").write_text(json.dumps({"scene": "fold", "frames": 2, "device": "cpu", "failed": "it is slow"}))
+    monkeypatch.setattr(sys, "argv", ["compared", "--stored", *map(str, sorted(tmp_path.iterdir()))])
+    runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "compared.py"), run_name="__main__")
+    said = capsys.readouterr().out
+    assert "no setting of warpcloth has an error" in said and "fold, 2 frames, cpu: no result, because it is slow" in said
     compared["rows"] = [{"solver": "pbd", "label": f"pbd {error}", "error": error} for error in (0.05, 0.03, None)]
     assert "meets 1%; nearest is pbd 0.03 with 3%" in nearest_setting(compared)
     assert nearest_setting({"ratios": [{"solver": "pbd"}]}) == ""

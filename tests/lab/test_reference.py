@@ -20,7 +20,7 @@ from warpcloth.lab import own_reference as own_reference_module
 from warpcloth.lab import reference as module
 from warpcloth.lab import trajectory
 from warpcloth.lab.measurements import SceneRef, Setup
-from warpcloth.lab.own_reference import own_facts, own_reference, words_of_own
+from warpcloth.lab.own_reference import CUT, of_own, own_facts, own_reference, own_references, words_of_own
 from warpcloth.lab.reference import Reference, cloth_size, position_error, reference, strain_error
 from warpcloth.lab.trajectory import measure
 
@@ -528,3 +528,24 @@ def test_a_motion_converges_by_two_successive_doublings(moves, substeps, error, 
     facts = own_facts(found, found, mesh, 1e-3)
     assert (found.substeps, found.error) == (substeps, pytest.approx(error)) and facts["converged"] == (error <= 1e-3)
     assert ("two doublings up to" if facts["converged"] else "no two doublings") in words_of_own(facts)
+
+
+def test_own_motions_end_at_the_total_time(tmp_path, monkeypatch):
+    """The time comes amid the second run of two solvers: neither has a motion, and nothing is stored as if it were known."""
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    ran = []
+
+    def run(scene, record, device, frames, watch):
+        for frame in range(frames + 1):
+            monkeypatch.setattr(own_reference_module.time, "perf_counter", lambda: float(len(ran)))
+            watch(frame, frames)
+        ran.append(record.substeps)
+        points = np.tile(scene.mesh.points, (frames + 1, 1, 1))
+        return SimpleNamespace(points=points, status=SimpleNamespace(ok=True))
+
+    monkeypatch.setattr(own_reference_module, "run_other", run)
+    setups = [Setup(name, {"substeps": 2, "iterations": 2}) for name in ("newton-vbd", "newton-xpbd")]
+    found = own_references(CHAIN, setups, 2, "cpu", 1e-4, 10.0, until=1.0)
+    assert found == {"newton-vbd": CUT, "newton-xpbd": CUT} and ran == [2] and not list(tmp_path.rglob("*.npz"))
+    facts = own_facts(CUT, None, None, 1e-3)
+    assert words_of_own(facts) == "not known, for the total time was used up" and of_own(CUT, 1e-3) == {}

@@ -150,7 +150,7 @@ def _text(facts, choice, found, exact, advise):
             )
     for solver, own in choice.others.items():
         same = [each.setup.options for each in found if each.setup.solver == solver]
-        lines.append(f"  {shown_name(solver)}: own motion {words_of_own(own if 'error' in own else None)}")
+        lines.append(f"  {shown_name(solver)}: own motion {words_of_own(own if len(own) > 1 else None)}")
         lines.append(f"  {shown_name(solver)}: {own['searched']}; substeps × iterations: {grid_in_words(same)}")
     lines += [f"  measured on {name}" for name in dict.fromkeys(each.machine for each in found)]
     if choice.untried and found:

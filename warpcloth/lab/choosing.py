@@ -206,9 +206,9 @@ def climb_others(ladders, measure, tolerance=None, budget=None, floor=0.0, secon
     """
     found, ended = [], {}
     for solver, same in itertools.groupby(ladders, key=lambda ladder: ladder[0].solver):
-        tried, left = [], []
+        tried, left, late = [], [], []
 
-        def limited(setups, tried=tried, left=left):
+        def limited(setups, tried=tried, left=left, late=late):
             """Measures setups until the time is used up; the rest end their ladders."""
             results = []
             for setup in setups:
@@ -217,7 +217,7 @@ def climb_others(ladders, measure, tolerance=None, budget=None, floor=0.0, secon
                     results.append(Measured(setup, None, None, final=True))
                 else:
                     results += measure([setup])
-                    tried.append(results[-1])
+                    (late if results[-1].status == "left" else tried).append(results[-1])
             return results
 
         climb(list(same), limited, tolerance, budget, floor)
@@ -225,7 +225,8 @@ def climb_others(ladders, measure, tolerance=None, budget=None, floor=0.0, secon
         spent = f"{len(tried)} settings in {sum(each.seconds for each in tried):.3g} s"
         meets = any(_meets(each, tolerance, floor) for each in tried)
         why = "other settings cost more" if meets else "finer settings take too long or are refused"
-        ended[solver] = f"{spent}; " + (f"the time of {seconds:g} s is used up" if left else why)
+        used = f"the time of {seconds:g} s is used up" if left else "the total time is used up" if late else ""
+        ended[solver] = f"{spent}; {used or why}"
     return found, ended
 
 
@@ -281,8 +282,8 @@ def choose(
         others: Simulators whose solvers are measured too, such as ``["newton"]``, each until its own cheapest setting is
             found by :func:`climb_others`, within six time limits; its own reference has as much time again.
         clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for limits and times.
-        total: Time on the wall [s] after which nothing more is measured; of it, the reference may take a third, the searches
-            of other simulators a third, and their own references a third.
+        total: Time on the wall [s] after which nothing more is measured or computed; of it, the reference may take a third, the
+            searches of other simulators a third, and their own references a third.
         announce: Function called with the :class:`Longest` before anything is measured, or None.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; by default with the
             store in the cache folder.
@@ -333,7 +334,8 @@ def choose(
         if not rivals:
             return choice, found, exact
         seconds = min(LIMITS * limit, total / 3.0 / len({setup.solver for setup in rivals}))
-        own |= own_references(scene, rivals, len(exact.points) - 1, device, SHARE * bound, seconds, None, clock)
+        given = len(exact.points) - 1, device, SHARE * bound, seconds, None, clock, began + total
+        own |= own_references(scene, rivals, *given)
         more, ended = climb_others(ladders_of_others(rivals), measure, tolerance, budget, exact.error, seconds)
     found, mesh = found + more, scene.load().mesh
     facts = {name: (own_facts(own[name], exact, mesh, bound) or {}) | {"searched": why} for name, why in ended.items()}

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import time
 from dataclasses import replace
 
@@ -18,9 +19,17 @@ from .reference import Reference, kept_reference, position_error, strain_error
 _MOST = 12  # runs, each with twice the substeps of the one before
 # A motion counts as converged if two successive doublings moved it by at most this share of the tolerance.
 SHARE = 0.1
+# In place of a reference that is not known because the time of all was used up.
+CUT = "cut"
 
 
-def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120.0, progress=None, clock="wall"):
+class UsedUp(Exception):
+    """Raised when the time of all references is used up."""
+
+
+def own_reference(
+    scene, setups, frames, device="cpu", tolerance=1e-3, limit=120.0, progress=None, clock="wall", until=math.inf
+):
     """Returns the :class:`warpcloth.lab.reference.Reference` of a solver of another simulator, from its file, or computed.
 
     It runs the scene with the fewest substeps and the most iterations of its settings, with twice the substeps, and so on. It
@@ -42,10 +51,14 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
         limit: Time limit [s] of the runs with more and more substeps; the one with more iterations may take as long again.
         progress: Function called with (substeps, frame, frames) after each frame, or None.
         clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for the limit.
+        until: Reading of ``time.perf_counter`` [s] at which it ends without a result.
 
     Returns:
         The reference, or None if the solver does not take the scene, diverges, or takes too long for two runs. Its error is
         infinite if no two doublings count, or if there was no time for the run with more iterations.
+
+    Raises:
+        UsedUp: It is later than ``until``.
     """
     records = [setup.record() for setup in setups]
     iterations = max(record.iterations for record in records)
@@ -61,7 +74,14 @@ def own_reference(scene, setups, frames, device="cpu", tolerance=1e-3, limit=120
 
     def run(substeps, iterations, left):
         """Returns the points of a run, or None if it is refused or takes too long, or "diverged"."""
-        watch = Clock(left, progress and (lambda *at: progress(substeps, *at)), clock)
+
+        def note(*at):
+            if time.perf_counter() >= until:
+                raise UsedUp
+            if progress is not None:
+                progress(substeps, *at)
+
+        watch = Clock(left, note, clock)
         record = replace(records[0], substeps=substeps, iterations=iterations)
         try:
             ran = run_other(declared, record, device, frames, watch)
@@ -123,8 +143,8 @@ def _settled(moves, tolerance):
     return best, errors.get(best, np.inf)
 
 
-def own_references(scene, setups, frames, device, tolerance, limit, progress=None, clock="wall"):
-    """Returns the :func:`own_reference` of each solver of another simulator among setups, by its name.
+def own_references(scene, setups, frames, device, tolerance, limit, progress=None, clock="wall", until=math.inf):
+    """Returns the :func:`own_reference` of each solver of another simulator among setups, by its name; ``CUT`` after ``until``.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
@@ -135,30 +155,37 @@ def own_references(scene, setups, frames, device, tolerance, limit, progress=Non
         limit: As for :func:`own_reference`, of each solver.
         progress: As for :func:`own_reference`.
         clock: As for :func:`own_reference`.
+        until: As for :func:`own_reference`.
     """
-    of_each = {}
+    of_each, found = {}, {}
     for setup in setups:
         if simulator_of(setup.solver):
             of_each.setdefault(setup.solver, []).append(setup)
-    return {
-        name: own_reference(scene, same, frames, device, tolerance, limit, progress, clock) for name, same in of_each.items()
-    }
+    for name, same in of_each.items():
+        try:
+            found[name] = own_reference(scene, same, frames, device, tolerance, limit, progress, clock, until)
+        except UsedUp:
+            found[name] = CUT
+    return found
 
 
 def own_facts(own, exact, mesh, bound):
     """Returns what is known of the motion to which a solver converges, as JSON values, or None if there is none.
 
     Args:
-        own: The :func:`own_reference`, or None.
+        own: The :func:`own_reference`, None or ``CUT``.
         exact: The :class:`warpcloth.lab.reference.Reference` of warpcloth.
         mesh: The mesh.
         bound: Largest error of a motion that counts as converged.
 
     Returns:
-        dict: ``substeps``, ``error``, ``converged``, ``bound``, ``seconds``, and ``apart``, the distance from the reference.
+        dict: ``substeps``, ``error``, ``converged``, ``bound``, ``seconds``, and ``apart``, the distance from the reference; or
+        ``cut`` alone, which is true.
     """
     if own is None:
         return None
+    if own == CUT:
+        return {"cut": True}
     frames = len(own.points) - 1
     apart = position_error(own.points[1:], exact.points[1 : frames + 1], mesh)
     error = own.error if np.isfinite(own.error) else None
@@ -168,13 +195,15 @@ def own_facts(own, exact, mesh, bound):
 
 def of_own(own, bound):
     """Returns the argument of :func:`warpcloth.lab.trajectory.measure` for an :func:`own_reference`, if it has converged."""
-    return {"own": str(own.path)} if own is not None and own.error <= bound else {}
+    return {"own": str(own.path)} if isinstance(own, Reference) and own.error <= bound else {}
 
 
 def words_of_own(facts):
     """Returns in words whether the motion of :func:`own_facts` has converged, and how far it is from the reference."""
     if facts is None:
         return "not known, for two runs did not end well within the time limit"
+    if facts.get("cut"):
+        return "not known, for the total time was used up"
     said = "converged" if facts["converged"] else "not converged"
     moved = "no two doublings in turn moved it less and less, or twice the iterations took too long"
     if facts["error"] is not None:

@@ -65,7 +65,7 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
         "seed": None,
         "frames": len(exact.points) - 1,
         "reference": known,
-        "others": {name: own if "error" in own else None for name, own in choice.others.items()},
+        "others": {name: own if len(own) > 1 else None for name, own in choice.others.items()},
         "searched": {name: own["searched"] for name, own in choice.others.items()},
         "tolerance": tolerance,
         "clock": clock,
