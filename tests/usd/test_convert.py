@@ -1,6 +1,7 @@
 """Animations in other formats: what is read back has the bits, the order, the triangles, the times and the names."""
 
 import re
+import signal
 import struct
 import tracemalloc
 
@@ -58,6 +59,36 @@ def test_what_is_read_back_is_the_same(name, stage, tmp_path):
     check(open_sequence(tmp_path / "again.npz"), original)
     with np.load(tmp_path / "again.npz") as arrays:
         assert arrays["points"].dtype == (np.float64 if name[2:] in ("obj", "ply") else np.float32)
+
+
+@pytest.mark.parametrize("name", ["a.pc2", "a.mdd", "a.npz", "a.usda", "a.usdz", "a.obj", "a.ply"])
+@pytest.mark.parametrize("older", [True, False])
+def test_an_error_or_interrupt_leaves_older_files_whole(name, older, stage, tmp_path):
+    """And no part of new ones, in the middle or after the last frame."""
+    out, frames = tmp_path / "out", 12
+    out.mkdir()
+    original = open_sequence(stage)
+    if older:
+        convert(stage, out / name)
+    before = contents(out)
+    points = np.array([original[0] + 0.1 * frame for frame in range(frames)], dtype=np.float32)
+    np.savez(tmp_path / "other.npz", points=points, triangles=original.mesh.triangles, times=np.arange(frames) / FPS)
+
+    def full(done, total):
+        if done == frames:
+            raise OSError("No space left on device")
+
+    def interrupted(done, total):
+        if done == 11:
+            signal.raise_signal(signal.SIGINT)
+
+    for stop, kind in ((full, OSError), (interrupted, KeyboardInterrupt)):
+        with pytest.raises(kind):
+            convert(tmp_path / "other.npz", out / name, progress=stop)
+        assert contents(out) == before and (older or not list(out.iterdir()))
+    convert(tmp_path / "other.npz", out / name)
+    source = out if name[2:] in ("obj", "ply") else out / name
+    assert len(open_sequence(source, fps=FPS)) == frames
 
 
 def test_formats_are_those_of_others(stage, tmp_path):

@@ -57,7 +57,7 @@ class Output:
             raise FileNotFoundError(f"{path}: the folder {self.folder} does not exist")
         if os.path.exists(target) and not os.path.isfile(target):
             raise ValueError(f"{path}: is no regular file; it must be one, or free")
-        self.path, self.finished = os.fspath(path), False
+        self.path, self.finished, self._discarded = os.fspath(path), False, False
         self._target, self._unfinished = target, f"{target}.{secrets.token_hex(4)}.unfinished"
         self.file = open(self._unfinished, mode, **options)
 
@@ -70,14 +70,19 @@ class Output:
         else:
             self.discard()
 
+    def complete(self):
+        """Completes the file under its temporary name, so that `close` only renames it. Further calls do nothing."""
+        if not self.file.closed:
+            self.finish()
+            self.file.close()
+
     def close(self):
         """Completes the file and renames it. Further calls do nothing."""
-        if self.file.closed:
+        if self.finished or self._discarded:
             return
         try:
             with deferred():
-                self.finish()
-                self.file.close()
+                self.complete()
                 os.replace(self._unfinished, self._target)
                 self.finished = True
         except BaseException:
@@ -86,6 +91,7 @@ class Output:
 
     def discard(self):
         """Removes the temporary file; an older file at the path stays."""
+        self._discarded = True
         for part in (self.file, *self.parts()):
             with contextlib.suppress(OSError):  # a full disk fails to write the buffer, which is not needed
                 part.close()
@@ -98,6 +104,35 @@ class Output:
     def parts(self):
         """Returns further open files; for subclasses."""
         return ()
+
+
+class OutputSet:
+    """Binary files that replace older ones together, once all are written; an error or interrupt leaves no part of them."""
+
+    def __init__(self):
+        self._outputs = []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        try:
+            if kind is None:
+                with deferred():
+                    for output in self._outputs:
+                        output.close()
+        finally:
+            for output in self._outputs:
+                if not output.finished:
+                    output.discard()
+
+    @contextlib.contextmanager
+    def writing(self, path):
+        """Opens the temporary file of a path for the block."""
+        output = Output(path, "xb")
+        self._outputs.append(output)
+        yield output.file
+        output.complete()
 
 
 def write_table(path, columns, rows):

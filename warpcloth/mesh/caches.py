@@ -4,19 +4,16 @@ A point cache has points and no triangles; a mesh beside it, an .obj file of the
 little-endian: "POINTCACHE2", the version 1, the numbers of points, first frame, frames per sample and number of samples, and
 float32 points. An .mdd file is big-endian: the numbers of frames and of points, float32 times [s], and float32 points.
 
-Files are written under a temporary name, and an error or interrupt leaves no part of one.
+The functions that write take an open binary file, such as that of :class:`warpcloth.base.outputs.OutputSet`.
 """
 
 import os
 import re
 import struct
 import zipfile
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-
-from ..base.outputs import Output
 
 CACHES = (".pc2", ".mdd")
 # Endings that are written as one file for each frame.
@@ -77,42 +74,40 @@ def _mapped(path, dtype, start, frames, count):
     return np.memmap(path, dtype, "r", start, (frames, count, 3))
 
 
-def write_pc2(path, frames, labels, count):
+def write_pc2(file, frames, labels, count):
     """Writes a .pc2 file.
 
     Args:
-        path: The file.
+        file: The open file.
         frames: Iterator over the points (n, 3) [m] of each frame.
         labels: Frame numbers (F,), evenly spaced.
         count: Number of points n.
     """
     spacing = float(labels[1] - labels[0]) if len(labels) > 1 else 1.0
-    with _all_of(path) as file:
-        file.write(_PC2.pack(_SIGNATURE, 1, count, float(labels[0]), spacing, len(labels)))
-        for points in frames:
-            file.write(points.astype("<f4").tobytes())
+    file.write(_PC2.pack(_SIGNATURE, 1, count, float(labels[0]), spacing, len(labels)))
+    for points in frames:
+        file.write(points.astype("<f4").tobytes())
 
 
-def write_mdd(path, frames, times, count):
+def write_mdd(file, frames, times, count):
     """Writes an .mdd file, with times (F,) [s]; for the rest see :func:`write_pc2`."""
-    with _all_of(path) as file:
-        file.write(_MDD.pack(len(times), count) + np.asarray(times, ">f4").tobytes())
-        for points in frames:
-            file.write(points.astype(">f4").tobytes())
+    file.write(_MDD.pack(len(times), count) + np.asarray(times, ">f4").tobytes())
+    for points in frames:
+        file.write(points.astype(">f4").tobytes())
 
 
-def write_npz(path, frames, shape, dtype, arrays):
+def write_npz(file, frames, shape, dtype, arrays):
     """Writes an .npz file as :func:`warpcloth.open_sequence` reads it.
 
     Args:
-        path: The file.
+        file: The open file.
         frames: Iterators over arrays (n, 3) of each frame by name, such as "points".
         shape: (F, n, 3).
         dtype: Type of these arrays.
         arrays: Other arrays by name.
     """
     header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": tuple(shape)}
-    with _all_of(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, rows in frames.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, header)
@@ -123,11 +118,11 @@ def write_npz(path, frames, shape, dtype, arrays):
                 np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
 
 
-def write_obj(path, points, mesh, digits=17):
+def write_obj(file, points, mesh, digits=17):
     """Writes an .obj file: vertices in their order, texture coordinates, and a group for each part of the mesh.
 
     Args:
-        path: The file.
+        file: The open file.
         points: (n, 3) [m].
         mesh: The :class:`warpcloth.Mesh`.
         digits: Digits of coordinates; 9 keep every bit of float32, 17 those of float64.
@@ -136,25 +131,23 @@ def write_obj(path, points, mesh, digits=17):
     corner = "%d" if coordinates is None else "%d/%d"
     parts = [(name, part.first) for name, part in (mesh.parts or {}).items()]
     owner = np.searchsorted([first for _, first in parts], mesh.triangles[:, 0], side="right") - 1
-    with _all_of(path) as file:
-        np.savetxt(file, points, fmt="v" + 3 * f" %.{digits}g")
-        if coordinates is not None:
-            np.savetxt(file, coordinates, fmt="vt %.9g %.9g")
-        for k, name in enumerate([name for name, _ in parts] or [None]):
-            if name is not None:
-                file.write(f"g {'_'.join(name.split())}\n".encode())
-            faces = 1 + (mesh.triangles if name is None else mesh.triangles[owner == k])
-            np.savetxt(file, faces if coordinates is None else np.repeat(faces, 2, axis=1), fmt=f"f {corner} {corner} {corner}")
+    np.savetxt(file, points, fmt="v" + 3 * f" %.{digits}g")
+    if coordinates is not None:
+        np.savetxt(file, coordinates, fmt="vt %.9g %.9g")
+    for k, name in enumerate([name for name, _ in parts] or [None]):
+        if name is not None:
+            file.write(f"g {'_'.join(name.split())}\n".encode())
+        faces = 1 + (mesh.triangles if name is None else mesh.triangles[owner == k])
+        np.savetxt(file, faces if coordinates is None else np.repeat(faces, 2, axis=1), fmt=f"f {corner} {corner} {corner}")
 
 
-def write_ply(path, points, mesh):
+def write_ply(file, points, mesh):
     """Writes a binary .ply file with points (n, 3) [m] as float32, in their order, and the triangles of a mesh."""
     import trimesh
     from trimesh.exchange.ply import export_ply
 
     shape = trimesh.Trimesh(points, mesh.triangles, process=False, validate=False)
-    with _all_of(path) as file:
-        file.write(export_ply(shape, encoding="binary", vertex_normal=False))
+    file.write(export_ply(shape, encoding="binary", vertex_normal=False))
 
 
 def numbered_paths(path, labels):
@@ -177,15 +170,3 @@ def numbered_paths(path, labels):
             if pattern.fullmatch(other) and other not in kept:
                 raise ValueError(f"{path.parent / other}: is a frame of another sequence; remove it, or give another name")
     return paths
-
-
-@contextmanager
-def _all_of(path):
-    """Opens a binary file that is only kept if all of it is written."""
-    output = Output(path, "xb")
-    try:
-        yield output.file
-    except BaseException:
-        output.discard()
-        raise
-    output.close()

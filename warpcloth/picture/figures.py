@@ -3,7 +3,7 @@
 import importlib.util
 from pathlib import Path
 
-from ..base.outputs import Output
+from ..base.outputs import OutputSet
 
 GREY = "0.35"
 PICTURES = (".png", ".svg", ".pdf")
@@ -52,5 +52,6 @@ def save(figure, path):
     from matplotlib import rc_context
 
     ending = Path(path).suffix.lower()
-    with rc_context({"svg.hashsalt": "warpcloth"}), Output(path, "xb") as output:  # ids in an SVG are random without a salt
-        figure.savefig(output.file, format=ending[1:], dpi=150, facecolor="white", metadata=_METADATA[ending])
+    # Ids in an SVG are random without a salt.
+    with rc_context({"svg.hashsalt": "warpcloth"}), OutputSet() as outputs, outputs.writing(path) as file:
+        figure.savefig(file, format=ending[1:], dpi=150, facecolor="white", metadata=_METADATA[ending])

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import array, choice, number, shown, whole
 from ..base.limits import shown_bytes
-from ..base.outputs import TEXT, Output, check_apart
+from ..base.outputs import OutputSet, check_apart
 from ..base.types import FilePath, Progress, UpAxis
 from ..base.version import installed_version
 from ..mesh.mesh import Mesh
@@ -138,8 +138,8 @@ def view(
         ground=ground,
         progress=progress,
     )
-    with Output(output, "x", **TEXT) as file:
-        file.file.write(text)
+    with OutputSet() as outputs, outputs.writing(output) as file:
+        file.write(text.encode())
     return output
 
 

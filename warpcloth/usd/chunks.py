@@ -57,7 +57,7 @@ class ChunkWriter:
     # Name of the set of value clips of all sampled prims. It hides a set with this name in the source.
     _clip_set = METADATA_KEY
 
-    def __init__(self, output, mesh, chunk):
+    def __init__(self, output, mesh, chunk, whole=False):
         """Checks the output; the writer calls `_put_on` next.
 
         Args:
@@ -65,7 +65,9 @@ class ChunkWriter:
                 is written, with the folder beside that; viewers find the frames only through a link in the same folder.
             mesh: The `Mesh`.
             chunk: Number of frames per chunk, which memory holds, and which a killed process may lose.
+            whole: Whether the root is written only by `close`, and an error removes the chunks.
         """
+        self._whole = whole
         self._output = check_output(output)
         if int(chunk) != chunk or chunk < 1:
             raise ValueError(f"chunk is {chunk}; it must be a whole number, at least 1")
@@ -121,9 +123,12 @@ class ChunkWriter:
         if kind is None:
             self.close()
         elif not self._closed:
-            # After an error the frames so far stay in chunks, without packing.
+            # After an error the frames so far stay in chunks, without packing, unless all or none are wanted.
             try:
-                self._write_chunk()
+                if self._whole:
+                    self._remove_run()
+                else:
+                    self._write_chunk()
                 self._closed = True
             finally:
                 self._lock.release()
@@ -160,8 +165,10 @@ class ChunkWriter:
             with deferred(0 if isinstance(sys.exc_info()[1], KeyboardInterrupt) else 1):
                 self._packing = single_file or self._packed
                 self._write_chunk(last=True)
-                if self._chunks and ((self._stale and not keep) or not Path(self.path).exists()):
+                if self._chunks and (self._whole or (self._stale and not keep) or not Path(self.path).exists()):
                     self._write_root(self._chunks)
+                    if self._whole and not self._packed:
+                        self._remove_other_runs()
                 if not keep:
                     self._remove_stale()
                 self._closed = True
@@ -171,6 +178,9 @@ class ChunkWriter:
                         self._write_single_file(keep)
                         self._packing = False
         except OSError as error:
+            if self._whole:
+                self._remove_run()
+                raise
             self._keep_chunks()
             raise OSError(f"{error}; {self.saved()}") from error
         finally:
@@ -309,11 +319,12 @@ class ChunkWriter:
         path = self.run / f"frames_{self._number:06d}.usdc"
         export(layer, path)
         chunks = [*self._chunks, (self._pending[0][0], path)]
-        self._write_root(chunks)
+        if not self._whole:
+            self._write_root(chunks)
         # Only now, so that close writes a chunk again whose writing was interrupted.
         self._chunks, self._pending, self.kept, self._number = chunks, [], self.frames, self._number + 1
         self._remove_stale()
-        if len(chunks) == 1 and not self._packed:
+        if len(chunks) == 1 and not self._packed and not self._whole:
             self._remove_other_runs()
 
     def _start_run(self):
@@ -360,6 +371,12 @@ class ChunkWriter:
         for path in self._stale:
             path.unlink(missing_ok=True)
         self._stale = set()
+
+    def _remove_run(self):
+        """Removes the chunks of this run, and the folder of runs if it has no others."""
+        shutil.rmtree(self.run, ignore_errors=True)
+        with suppress(OSError):  # it is not empty, or was never made
+            self._folder.rmdir()
 
     def _remove_other_runs(self):
         """Removes the files of earlier runs to the same output, to which the output no longer refers."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.outputs import STAGE_ENDINGS, Output, check_apart
+from ..base.outputs import STAGE_ENDINGS, Output, OutputSet, check_apart
 from ..mesh.caches import CACHES, NUMBERED, numbered_paths, write_mdd, write_npz, write_obj, write_pc2, write_ply
 from ..mesh.loading import read_arrays
 from ..mesh.sequences import open_sequence
@@ -22,7 +22,8 @@ _UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
 def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
     """Writes an animation in another format. A few frames are in memory at a time, or ten for a stage.
 
-    All frames are read twice: they are checked before the first is written, so that what is refused leaves older files whole.
+    All frames are read twice: they are checked before the first is written. Older files are replaced once all frames are
+    written: an error or interrupt leaves them whole, and no part of new ones.
 
     Args:
         source: Path of an animation, as for :func:`warpcloth.open_sequence`.
@@ -67,18 +68,24 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
         if found is not None:
             _check_finite(sequence, index, "velocity", found)
     frames = partial(_frames, sequence, progress)
-    if ending in NUMBERED:
-        write = write_ply if ending == ".ply" else partial(write_obj, digits=_digits(sequence))
-        for path, points in zip(paths, frames(), strict=True):
-            write(path, points, sequence.mesh)
-    elif ending == ".npz":
-        _write_npz(paths[0], sequence, frames, velocities)
-    elif ending in CACHES:
-        write, given = (write_pc2, sequence.labels) if ending == ".pc2" else (write_mdd, sequence.times)
-        write(paths[0], frames(), given, len(sequence.mesh.points))
-        write_obj(paths[1], _points(sequence, 0), sequence.mesh, _digits(sequence))
-    else:
+    if ending in STAGE_ENDINGS:
         _write_stage(paths[0], sequence, interval, moving(), progress)
+        return sequence, paths
+    with OutputSet() as outputs:
+        if ending in NUMBERED:
+            write = write_ply if ending == ".ply" else partial(write_obj, digits=_digits(sequence))
+            for path, points in zip(paths, frames(), strict=True):
+                with outputs.writing(path) as file:
+                    write(file, points, sequence.mesh)
+        elif ending == ".npz":
+            with outputs.writing(paths[0]) as file:
+                _write_npz(file, sequence, frames, velocities)
+        else:
+            write, given = (write_pc2, sequence.labels) if ending == ".pc2" else (write_mdd, sequence.times)
+            with outputs.writing(paths[0]) as file:
+                write(file, frames(), given, len(sequence.mesh.points))
+            with outputs.writing(paths[1]) as file:
+                write_obj(file, _points(sequence, 0), sequence.mesh, _digits(sequence))
     return sequence, paths
 
 
@@ -175,7 +182,7 @@ def _differences(sequence):
         before, now = now, after
 
 
-def _write_npz(path, sequence, frames, velocities):
+def _write_npz(file, sequence, frames, velocities):
     dtype = np.float32 if _digits(sequence) == 9 else np.float64
     arrays = {"triangles": sequence.mesh.triangles}
     if sequence.times is not None:
@@ -186,7 +193,7 @@ def _write_npz(path, sequence, frames, velocities):
     rows = {"points": frames()}
     if velocities is not None:
         rows["velocities"] = map(velocities, range(len(sequence)))
-    write_npz(path, rows, (len(sequence), *sequence.mesh.points.shape), dtype, arrays)
+    write_npz(file, rows, (len(sequence), *sequence.mesh.points.shape), dtype, arrays)
 
 
 def _write_stage(path, sequence, interval, moving, progress):
@@ -196,7 +203,7 @@ def _write_stage(path, sequence, interval, moving, progress):
     parts = sequence.mesh.parts
     cloths = {each: each for each in parts} if parts and len(parts) > 1 else None
     mesh, up_axis = sequence.mesh, sequence.up_axis
-    with AnimationWriter(path, mesh, fps, prim=name, up_axis=up_axis, cloths=cloths) as writer:
+    with AnimationWriter(path, mesh, fps, prim=name, up_axis=up_axis, cloths=cloths, whole=True) as writer:
         for index, (points, velocities) in enumerate(moving):
             writer.append(points, velocities)
             if progress:

@@ -52,6 +52,7 @@ class AnimationWriter(ChunkWriter):
         colliders: Sequence[Collider] = (),
         history: Mapping[str, str] | None = None,
         cloths: Mapping[str, str] | None = None,
+        whole: bool = False,
     ) -> None:
         """Checks the arguments. Nothing is written before the first frame.
 
@@ -75,12 +76,13 @@ class AnimationWriter(ChunkWriter):
                 "double", a vector or a number for the whole cloth. With several cloths, the first has those of the whole.
             cloths: Prims by part, if each part of the mesh has its own prim: names under /World, or with a source paths.
                 Primvars are then not allowed.
+            whole: Whether the output is replaced only once all frames are written, and an error leaves none of them.
 
         Raises:
             FileNotFoundError: The folder of the output or the source does not exist.
             ValueError: A parameter is not as above, or the output is a file of the source's stage.
         """
-        super().__init__(output, mesh, chunk)
+        super().__init__(output, mesh, chunk, whole)
         up_axis = up_axis or mesh.up_axis or "Y"
         check_scene(fps, up_axis)
         primvars, history = dict(primvars or {}), dict(history or {})
