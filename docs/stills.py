@@ -1,6 +1,7 @@
 """Makes the small pictures in docs/pictures/ of the pages that are made from records: python docs/stills.py [NAME …]"""
 
 import argparse
+import json
 import re
 import tempfile
 import time
@@ -14,9 +15,12 @@ from PIL import Image
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 import warpcloth as wc
+from warpcloth.chart.style import dress, headline, name_ends, small_print, style_of
 from warpcloth.cli import main as command_line
+from warpcloth.lab.work_precision import WITHIN
 from warpcloth.scenes import cusick, hanging
 from warpcloth.solvers import SOLVERS
 
@@ -63,11 +67,11 @@ MOMENTS = {
     "bar_twist": ({}, "deformed", {}),
     "bunny": ({}, "deformed", {}),
     "cantilever": ({"width": 0.3, "elements": 24, "stretching": 1e5}, None, {}),
-    "capstan": ({"turns": 12}, 0.3, {}),
+    "capstan": ({}, 0.3, {"azimuth": 150.0, "elevation": 30.0}),
     "cards": ({}, 1.0, {}),
     "catenary": ({"links": 40}, None, {}),
     "chain": ({}, 0.5, {}),
-    "chain_over_edge": ({}, 0.5, {}),
+    "chain_over_edge": ({}, 0.5, {"azimuth": 40.0}),
     "character": ({"duration": 1.0}, 0.8, {}),
     "curtain": ({"nx": 33, "ny": 21}, 2.0, {}),
     "cusick": ({"fabric": "silk", "rows": 10}, None, {}),
@@ -77,12 +81,12 @@ MOMENTS = {
     "folded_sheet": ({"n": 12}, 0.6, {}),
     "funnel": ({"n": 13}, 1.2, {}),
     "hanging": ({}, 0.5, {}),
-    "incline": ({}, 0.4, {}),
+    "incline": ({}, 0.4, {"azimuth": 0.0, "elevation": 12.0, "zoom": 0.8}),
     "knot": ({"along": 40, "across": 1}, 0.8, {}),
     "loop": ({"kind": "pear"}, None, {}),
     "mobile": ({}, 1.5, {}),
     "net": ({}, ..., {}),
-    "overhang": ({"elements": 24}, 0.8, {}),
+    "overhang": ({"elements": 80}, 0.8, {"azimuth": 40.0}),
     "picture_frame": ({}, None, {}),
     "resting": ({"n": 16, "collider": "sphere"}, ..., {}),
     "ring": ({"elements": 32}, 0.6, {}),
@@ -91,7 +95,7 @@ MOMENTS = {
     "strip": ({"strain": 0.05}, None, {}),
     "tablecloth": ({"n": 25}, 1.2, {}),
     "twist": ({"around": 16, "along": 14, "turns": 1.0}, 1.0, {}),
-    "usd_cloth": ({}, 0.6, {}),
+    "usd_cloth": ({"duration": 6.0}, 3.5, {}),
 }
 
 
@@ -165,7 +169,7 @@ ENERGIES = {
         moved("pins", NET),
         moved("attachments", NET, wc.Attachment(vertices=CORNERS, stiffness=8.0), pins=None),
     ],
-    "CorotatedMembrane": lambda: [pulled(f"k = {k:g} N/m", wc.CorotatedMembrane(stiffness=k)) for k in (20.0, 5.0)],
+    "CorotatedMembrane": lambda: [pulled(f"k = {k:g} N/m", wc.CorotatedMembrane(stiffness=k)) for k in (20.0, 2.5)],
     "DihedralBending": lambda: [clamped(f"D = {D:g} N·m", wc.DihedralBending(stiffness=D)) for D in (1e-4, 1e-1)],
     "NeoHookeanMembrane": lambda: [
         pulled(f"Poisson's ratio {ν:g}", wc.NeoHookeanMembrane(stiffness=5.0, poisson_ratio=ν)) for ν in (0.0, 0.45)
@@ -218,11 +222,49 @@ STEPS = {"Explicit": {"substeps": 128}, "XPBD": {"substeps": 16}, "ADMM": {"subs
 def still_of_solver(record):
     scene = hanging.scene(n=24)
     animation = run(scene, record(**STEPS.get(record.__name__, {"substeps": 4})), frames=30)
-    still(animation, f"solver-{record.__name__}", colour="stretch_1", colour_range=(0.98, 1.06))
+    still(animation, f"solver-{record.__name__}", colour="stretch_1", colour_range=(0.99, 1.01))
 
 
 for _record in SOLVERS.values():
     picture("solver", _record.__name__)(lambda record=_record: still_of_solver(record))
+
+
+# Speed of solvers, one in its colour: points of `warpcloth chart work-precision hanging -p n=32 --workers 1 --json`.
+POINTS = FOLDER / "work-precision.json"
+
+
+def still_of_speed(record):
+    found = json.loads(POINTS.read_text(encoding="utf-8"))
+    figure = Figure(figsize=(6.4, 4.4), layout="constrained", dpi=110)
+    axes, ends, style = figure.subplots(), [], style_of(record.name)
+    lines = {}
+    for row in found["rows"]:
+        if row["status"] == "ok":
+            lines.setdefault((row["solver"], row["options"].get("integrator", "euler")), []).append(row)
+    for (solver, integrator), rows in lines.items():
+        rows.sort(key=lambda row: row["ms_per_second"])
+        x, y = ([row[of] for row in rows] for of in ("ms_per_second", "error"))
+        if solver == record.name:
+            axes.plot(x, y, linewidth=1.2, markersize=5, zorder=3, **style.line)
+            ends.append((x[-1], y[-1], solver if integrator == "euler" else f"{solver} {integrator}", style.colour))
+        else:
+            axes.plot(x, y, ".-", color="0.82", linewidth=0.8, markersize=4, zorder=1)
+    axes.set(xscale="log", yscale="log", xlabel="ms for a second of motion", ylabel="error: RMS of all vertices, over the size")
+    axes.axhline(WITHIN, color="0.5", linestyle="--", linewidth=0.8)
+    axes.annotate(f"{WITHIN:.0%}", (1.0, WITHIN), (-2, 2), ("axes fraction", "data"), "offset points", ha="right", fontsize=8)
+    dress(axes)
+    headline(figure, f"{found['scene']}, {found['frames']} frames, {found['dtype']}; grey: the other solvers")
+    small_print(figure, found["machine"])
+    name_ends(figure, axes, ends)
+    with tempfile.TemporaryDirectory() as folder:
+        figure.savefig(Path(folder) / "still.png", facecolor="white")
+        Image.open(Path(folder) / "still.png").convert("RGB").save(
+            FOLDER / f"speed-{record.__name__}.webp", quality=70, method=6
+        )
+
+
+for _record in SOLVERS.values():
+    picture("speed", _record.__name__)(lambda record=_record: still_of_speed(record))
 
 
 # Fabrics: their numbers among those of the others, and the drapes of those with all numbers.

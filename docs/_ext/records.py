@@ -188,9 +188,13 @@ def solver(record, scenes):
         f"Included scenes that it runs as they stand: {members(scenes, '../scenes/')}.",
         "## Accuracy and time",
         f"For an error of 1 % in a second of `hanging` with 64 × 64 vertices a frame takes:\n\n{head}{timed}" if timed else "",
-        "[Choosing](../choosing.md#what-one-per-cent-costs) says how this was measured, and has it for other solvers. The "
-        "chart shows all settings of all solvers:",
-        shown("work-precision.png", "Error against time, for all solvers", "."),
+        "[Choosing](../choosing.md#what-one-per-cent-costs) says how this was measured, and has it for other solvers."
+        if timed
+        else "",
+        "Each point is a setting, each line an integrator:",
+        shown(f"speed-{name}.webp", f"Error against time, {name} in colour and the other solvers in grey"),
+        "*On a machine that other processes used too; [all solvers in one chart](../choosing.md#speed-against-accuracy). "
+        f"{made(f'speed-{name}')[1:]}",
         sh(f"chart work-precision hanging --solvers {record.name} -o {record.name}.png"),
         "## Where it fails",
         "[Failures](../failures/index.md) has the charts of what goes wrong with each method, "
@@ -447,10 +451,10 @@ def lead_inside(app, document, source):
 
 
 def escape(app, what, name, value, options, lines):
-    """Escapes vertical bars in docstrings, which mean absolute values there, outside of code."""
+    """Escapes vertical bars in docstrings, which mean absolute values there, and makes dashes of hyphens, outside of code."""
     for k, line in enumerate(lines):
         parts = line.split("``")
-        parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
+        parts[::2] = [part.replace("|", "\\|").replace(" -- ", " – ") for part in parts[::2]]
         lines[k] = "``".join(parts)
 
 

@@ -298,6 +298,35 @@ def test_a_browser_shows_the_motion_and_fetches_nothing(stage, tmp_path):
     assert np.ptp(pictures[2], axis=(0, 1)).min() > 100
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium, in which a page is opened")
+def test_of_many_pages_in_one_those_in_view_are_drawn(stage, tmp_path):
+    """A browser keeps few contexts of WebGL, here 3: of 5 frames of a notebook those in view have one, and get it again."""
+    count, each = 5, "Array.from(frames, (_, k) => frames[k])"
+    wc.view(stage, tmp_path / "fall.html", colours=())
+    frame = f'<iframe srcdoc="{html.escape((tmp_path / "fall.html").read_text())}" width="400" height="300"></iframe><br>'
+    (tmp_path / "notebook.html").write_text("<!DOCTYPE html>" + count * frame)
+    with Browser(tmp_path / "profile", options=["--max-active-webgl-contexts=3"]) as browser:
+        browser.open(
+            (tmp_path / "notebook.html").as_uri(), f"{each}.length == {count} && {each}.every((each) => each.player?.shapes)"
+        )
+        shown = []
+        for k in (*range(count), 0):
+            browser.run(f"document.querySelectorAll('iframe')[{k}].scrollIntoView()")
+            drawn = browser.run(f"frames[{k}].player.drawn")
+            while (
+                browser.run(f"frames[{k}].player.pause(), frames[{k}].player.dirty = true, frames[{k}].player.drawn") <= drawn
+            ):
+                pass
+            if k == 0:
+                shown.append(np.asarray(Image.open(io.BytesIO(browser.picture())).convert("RGB"))[:300, :400])
+        live = browser.run(f"{each}.filter((each) => each.player.renderer?.getContext().isContextLost() === false).length")
+        told = [each for each in browser.events if each["method"] == "Log.entryAdded"]
+    assert live <= 2 and told == []  # the browser tells that it took a context from another frame
+    assert np.ptp(shown[1][60:240], axis=(0, 1)).min() > 100, "the first is drawn again"
+    assert np.abs(shown[0].astype(int) - shown[1]).max(axis=-1).mean() < 20.0
+
+
 def picture(browser):
     drawn = browser.run("player.drawn")
     browser.run("player.dirty = true")

@@ -28,7 +28,7 @@ class Browser:
         events: Events of the protocol, such as requests of the network and messages of the console, as dictionaries.
     """
 
-    def __init__(self, folder, size=(480, 320), wait=180.0):
+    def __init__(self, folder, size=(480, 320), wait=180.0, options=()):
         self.events, self._number, self._session, self._rest = [], 0, None, b""
         self._ends = time.monotonic() + wait
         to_browser, self._write = os.pipe()
@@ -39,7 +39,7 @@ class Browser:
             os.dup2(ends[0], 3)
             os.dup2(ends[1], 4)
 
-        command = [CHROMIUM, *_OPTIONS, f"--user-data-dir={folder}", f"--window-size={size[0]},{size[1]}"]
+        command = [CHROMIUM, *_OPTIONS, *options, f"--user-data-dir={folder}", f"--window-size={size[0]},{size[1]}"]
         self._process = subprocess.Popen(
             command, preexec_fn=pipes, close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )

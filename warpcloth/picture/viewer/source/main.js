@@ -29,7 +29,7 @@ class Player {
     this.frame = 0;
     this.measure = null;
     this.playing = false;
-    this.visible = true;
+    this.visible = false;
     this.dirty = true;
     this.drawn = 0; // pictures
     this.scene();
@@ -39,13 +39,6 @@ class Player {
   scene() {
     const { data, shapes } = this;
     const unit = shapes[0].unit;
-    this.renderer = new WebGLRenderer({ antialias: true });
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
-    this.renderer.shadowMap.enabled = true;
-    this.renderer.shadowMap.type = PCFShadowMap;
-    this.renderer.domElement.setAttribute("role", "img");
-    this.renderer.domElement.setAttribute("aria-label", data.name);
-    element("view").append(this.renderer.domElement);
     this.world = new Scene();
     this.world.background = new Color(`rgb(${data.background})`);
     for (const shape of shapes) this.world.add(shape.object);
@@ -72,24 +65,55 @@ class Player {
     this.camera = new PerspectiveCamera(data.camera.fov, 1, 0.01, 50);
     this.camera.up.set(...up);
     this.camera.position.fromArray(data.camera.position.map((value, k) => (value - data.camera.target[k]) / unit));
-    this.controls = new OrbitControls(this.camera, this.renderer.domElement);
+    this.controls = new OrbitControls(this.camera, element("view"));
     this.controls.dampingFactor = 0.1;
     this.controls.enableDamping = true;
     this.controls.minDistance = 0.05;
     this.controls.maxDistance = 10;
     // In a frame of another page the wheel scrolls that page, until somebody clicks into the picture.
     this.controls.enableZoom = window.parent === window;
-    this.renderer.domElement.addEventListener("pointerdown", () => (this.controls.enableZoom = true));
+    element("view").addEventListener("pointerdown", () => (this.controls.enableZoom = true));
     document.addEventListener("mouseleave", () => (this.controls.enableZoom = window.parent === window));
     this.controls.addEventListener("change", () => (this.dirty = true));
     new ResizeObserver(() => this.resize()).observe(element("view"));
-    new IntersectionObserver((entries) => (this.visible = entries.at(-1).isIntersecting)).observe(element("view"));
+    new IntersectionObserver((entries) => this.see(entries.at(-1).isIntersecting)).observe(element("view"));
+  }
+
+  /** Has a context of WebGL while the picture is in view: a browser keeps about 16 of them for all pages of a notebook. */
+  see(visible) {
+    this.visible = visible;
+    if (!this.renderer) {
+      if (visible) this.open();
+    } else if (visible && this.released) {
+      this.context.restoreContext();
+      this.released = false;
+    } else if (!visible && this.context && !this.renderer.getContext().isContextLost()) {
+      this.context.loseContext();
+      this.released = true;
+    }
+  }
+
+  open() {
+    try {
+      this.renderer = new WebGLRenderer({ antialias: true });
+    } catch (error) {
+      return refuse(error);
+    }
+    this.context = this.renderer.getContext().getExtension("WEBGL_lose_context");
+    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.renderer.shadowMap.enabled = true;
+    this.renderer.shadowMap.type = PCFShadowMap;
+    const canvas = this.renderer.domElement;
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", this.data.name);
+    canvas.addEventListener("webglcontextrestored", () => (this.dirty = true));
+    element("view").append(canvas);
     this.resize();
   }
 
   resize() {
     const { clientWidth: width, clientHeight: height } = element("view");
-    if (!width || !height) return;
+    if (!width || !height || !this.renderer) return;
     this.renderer.setSize(width, height);
     // The motion fits beside the colour bar.
     const room = width - (this.measure ? Math.min(element("bar").offsetWidth + 16, width / 3) : 0);
@@ -239,7 +263,7 @@ class Player {
 
   loop(now) {
     requestAnimationFrame((next) => this.loop(next));
-    if (!this.visible) return;
+    if (!this.visible || !this.renderer) return;
     if (this.playing) {
       const passed = ((now - this.clock.start) / 1000) * Number(element("speed").value);
       const time = (this.clock.from + Math.max(passed, 0)) % this.length;
@@ -298,7 +322,11 @@ async function start() {
   window.player = player; // for scripts
 }
 
-start().catch((error) => {
+function refuse(error) {
+  element("wait").hidden = false;
+  element("note").hidden = true; // which is in the same lines
   element("wait").textContent = `This browser cannot show the animation, which needs WebGL 2: ${error.message}`;
   console.error(error);
-});
+}
+
+start().catch(refuse);
