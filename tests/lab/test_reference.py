@@ -19,6 +19,7 @@ from warpcloth.kernels.terms import SPRING
 from warpcloth.lab import own_reference as own_reference_module
 from warpcloth.lab import reference as module
 from warpcloth.lab import trajectory
+from warpcloth.lab.clock import mean_time, time_spread
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.own_reference import CUT, of_own, own_facts, own_reference, own_references, words_of_own
 from warpcloth.lab.reference import Reference, cloth_size, position_error, reference, strain_error
@@ -315,11 +316,11 @@ def test_what_is_slow_or_not_known_warns(folder, tmp_path, monkeypatch):
 
 def test_motion_that_no_step_resolves_ends_early(folder, monkeypatch):
     """Runs that differ by as much however small the step, as those of chaotic motion do."""
-    scatter, simulate = np.random.default_rng(0), module.simulate
+    time_spread, simulate = np.random.default_rng(0), module.simulate
 
     def scattered(*arguments, **options):
         run = simulate(*arguments, **options)
-        return replace(run, points=run.points + 1e-2 * scatter.normal(size=run.points.shape))
+        return replace(run, points=run.points + 1e-2 * time_spread.normal(size=run.points.shape))
 
     monkeypatch.setattr(module, "simulate", scattered)
     with pytest.warns(UserWarning, match=r"only, not to 1e-09: smaller steps make it no less, for the motion is chaotic"):
@@ -471,9 +472,18 @@ def test_one_frame_is_timed_warm(monkeypatch):
 
 
 def test_the_first_frame_of_a_run_is_not_timed():
-    found = trajectory._times([[9.0, 0.1, 0.2], [7.0, 0.3, 0.4, 0.5]], 50.0)
-    assert found == {"ms": 300.0, "spread": [200.0, 400.0], "ms_per_second": 15000.0}
+    found = trajectory._times([[9.0, 0.1, 0.1], [7.0, 0.3, 0.4, 0.5]], 50.0)
+    assert found["ms"] == pytest.approx(280.0) and found["ms_per_second"] == pytest.approx(14000.0)
     assert trajectory._times([[0.2]], 50.0)["ms"] == 200.0, "unless there is no other"
+
+
+def test_the_time_of_a_motion_counts_frames_in_contact_but_no_interruption():
+    """20 frames of 1 ms, of which one is interrupted for 1 s, and 10 of 7 ms; every other frame takes 10 % more."""
+    times = np.repeat([1.0, 7.0], [20, 10])
+    assert mean_time(times) == pytest.approx(3.0) and time_spread(times) == (1.0, 1.0)
+    times[5] = 1e3
+    assert mean_time(times) == pytest.approx(3.0)
+    assert time_spread(1.0 + 0.1 * (np.arange(31) % 2)) == pytest.approx((1.0, 1.1**2))
 
 
 def test_a_second_run_may_be_left_out():

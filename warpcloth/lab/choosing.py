@@ -38,7 +38,7 @@ class Measured:
     Attributes:
         setup: The :class:`warpcloth.lab.measurements.Setup`.
         error: Error of the trajectory, relative to the size of the cloth, or None.
-        milliseconds: Median time of a frame [ms], or None.
+        milliseconds: Time of a frame, as :func:`warpcloth.lab.trajectory.measure` gives it [ms], or None.
         spread: Quartiles of the time of a frame [ms], (low, high), or None.
         reason: Why there is no error, or "".
         machine: The machine that measured it, in a few words.
@@ -413,7 +413,7 @@ def _meets(each, tolerance, floor):
 
 
 def _as_cheap(chosen, accurate):
-    """Returns others whose times overlap those of the chosen one, sorted by median."""
+    """Returns others whose times overlap those of the chosen one, the cheapest first."""
     if chosen.spread is None:
         return []
     others = [each for each in accurate if each is not chosen and each.spread and each.spread[0] <= chosen.spread[1]]

@@ -1,6 +1,8 @@
-"""A time limit for runs."""
+"""A time limit for runs, and the mean time of their frames."""
 
 import time
+
+import numpy as np
 
 # What a time limit counts: the time on the wall, or that of all threads of this process, which other processes do not prolong.
 CLOCKS = {"wall": time.perf_counter, "process": time.process_time}
@@ -31,3 +33,27 @@ class Clock:
         if frame < frames and sum(self.frames) > self.limit:
             raise TooSlow
         self.last = self.time()
+
+
+def mean_time(times):
+    """Returns the mean of the times of successive frames (F,), of each the median of its own and its neighbours' times.
+
+    A motion takes the mean times its frames, also if some are more work, as in contact, which a median would not show. What
+    interrupts a single frame does not count.
+    """
+    if len(times) < 2:
+        return float(np.mean(times))
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(times, 1, mode="reflect"), 3)
+    return float(np.median(near, axis=1).mean())
+
+
+def time_spread(times):
+    """Returns by how much the times of successive frames (F,) differ from those of their neighbours, (low, high).
+
+    These are the quartiles of the time of a frame over the mean of its neighbours' times, each over the median of that.
+    """
+    if len(times) < 2:
+        return 1.0, 1.0
+    near = np.pad(times, 1, mode="reflect")
+    low, middle, high = np.percentile(np.asarray(times) / (near[:-2] + near[2:]), [25, 50, 75]).tolist()
+    return low / middle, high / middle

@@ -13,7 +13,7 @@ from ..base.version import installed_version
 from ..others.runs import run_other
 from ..others.simulators import other_solvers, simulator_of
 from .campaign import cache_folder
-from .clock import CLOCKS, Clock, TooSlow
+from .clock import Clock, TooSlow
 from .reference import Reference, kept_reference, position_error, strain_error
 
 _MOST = 12  # runs, each with twice the substeps of the one before
@@ -48,7 +48,8 @@ def own_reference(
         frames: Number of frames.
         device: A Warp device.
         tolerance: Relative to the size of the cloth.
-        limit: Time limit [s] of the runs with more and more substeps; the one with more iterations may take as long again.
+        limit: Time limit [s] of the frames of the runs with more and more substeps; those with more iterations may take as long
+            again.
         progress: Function called with (substeps, frame, frames) after each frame, or None.
         clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for the limit.
         until: Reading of ``time.perf_counter`` [s] at which it ends without a result.
@@ -62,7 +63,7 @@ def own_reference(
     """
     records = [setup.record() for setup in setups]
     iterations = max(record.iterations for record in records)
-    declared, name, now = scene.load(), setups[0].solver, CLOCKS[clock]
+    declared, name = scene.load(), setups[0].solver
     digest = scene_digest(declared)
     version = installed_version(simulator_of(name).package)
     facts = [digest, int(frames), source_digest(), name, str(device), version, limit, tolerance, iterations]
@@ -73,7 +74,7 @@ def own_reference(
         return found
 
     def run(substeps, iterations, left):
-        """Returns the points of a run, or None if it is refused or takes too long, or "diverged"."""
+        """Returns the time of the frames of a run [s], and its points, or None if refused or too slow, or "diverged"."""
 
         def note(*at):
             if time.perf_counter() >= until:
@@ -86,14 +87,14 @@ def own_reference(
         try:
             ran = run_other(declared, record, device, frames, watch)
         except (TooSlow, ValueError):
-            return None
-        return ran.points.astype(np.float64) if ran.status.ok else "diverged"
+            return sum(watch.frames), None
+        return sum(watch.frames), ran.points.astype(np.float64) if ran.status.ok else "diverged"
 
-    runs, moves, began, substeps = [], [], now(), min(each.substeps for each in records)
+    runs, moves, spent, substeps = [], [], 0.0, min(each.substeps for each in records)
     started = time.perf_counter()
     for _ in range(_MOST):
-        before = now()
-        points = run(substeps, iterations, limit - (before - began))
+        took, points = run(substeps, iterations, limit - spent)
+        spent += took
         if points is None or (runs and isinstance(points, str)):
             break
         if not isinstance(points, str):
@@ -104,7 +105,7 @@ def own_reference(
                 break
             if len(moves) > 2 and min(moves[-2:]) > min(moves):
                 break
-        if now() - began + 2.0 * (now() - before) > limit:
+        if spent + 2.0 * took > limit:
             break
         substeps *= 2
     if not moves:
@@ -112,7 +113,7 @@ def own_reference(
     best, error = _settled(moves, tolerance)
     (coarser, coarse), (substeps, fine) = runs[best : best + 2]
     if other_solvers()[name].iterates and np.isfinite(error):
-        more = run(coarser, 2 * iterations, limit)
+        _took, more = run(coarser, 2 * iterations, limit)
         known = isinstance(more, np.ndarray)
         error = max(error, position_error(more[1:], coarse[1:], declared.mesh)) if known else np.inf
     found = Reference(

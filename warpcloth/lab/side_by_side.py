@@ -12,13 +12,13 @@ from ..core.capture import Mirror
 from ..mesh.ordering import order_of_run
 from ..others.simulators import simulator_of
 from .choosing import choose, percent
-from .clock import CLOCKS
+from .clock import CLOCKS, mean_time, time_spread
 from .machine import machine
 from .measurements import Setup
 from .setups import label
 from .work_precision import WITHIN, front
 
-_FEWEST = 3  # frames with times from which a median is taken
+_FEWEST = 3  # frames whose times are averaged
 
 
 def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **given):
@@ -35,11 +35,12 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
     Returns:
         dict: That of :func:`warpcloth.lab.work_precision.time_diagram`, with ``searched``, by solver of another simulator how
         its search ended, and ``ratios``: for the cheapest setting of warpcloth, and for that of each other solver, ``label``,
-        ``solver``, ``options``, ``to``, the error that counts, "reference" or "own", the errors, ``ratio``, the median over
-        frames of its time over that of warpcloth, with quartiles ``spread``, ``ms``, and the largest numbers in any
-        frame of pairs of triangles that cross, ``crossings``, and of vertices inside colliders, ``inside``; both are None if
-        libigl is not installed. If no setting of warpcloth meets the tolerance, ratios are to the first other that does; if
-        none does, ``ratios`` is empty.
+        ``solver``, ``options``, ``to``, the error that counts, "reference" or "own", the errors, ``ms``, its time of a
+        frame by :func:`warpcloth.lab.clock.mean_time`, ``ratio``, that over that of warpcloth, ``spread``, the ratio times the
+        quartiles of :func:`warpcloth.lab.clock.time_spread` of ratios of frames, and the largest numbers in a frame of pairs
+        of triangles that cross, ``crossings``, and of vertices inside colliders, ``inside``; both are None if libigl is not
+        installed. If no setting of warpcloth meets the tolerance, ratios are to the first other that does; if none does,
+        ``ratios`` is empty.
 
     Raises:
         ImportError: A simulator is not installed.
@@ -133,8 +134,8 @@ def _alternate(scene, rows, frames, device, now):
     times = np.array(times)[:, min(1, frames - _FEWEST) :]
     found = []
     for spent, motion in zip(times, motions, strict=True):
-        low, ratio, high = np.percentile(spent / times[0], [25, 50, 75]).tolist()
-        given = {"ms": 1e3 * float(np.median(spent)), "ratio": ratio, "spread": [low, high]}
+        ratio = mean_time(spent) / mean_time(times[0])
+        given = {"ms": 1e3 * mean_time(spent), "ratio": ratio, "spread": [ratio * q for q in time_spread(spent / times[0])]}
         found.append(given | _checked(scene, np.array(motion, dtype=np.float64)))
     return found
 

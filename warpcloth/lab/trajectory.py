@@ -9,7 +9,7 @@ from ..base.digest import scene_digest
 from ..others.runs import run_other
 from ..others.simulators import simulator_of
 from ..run.simulate import simulate
-from .clock import Clock, TooSlow
+from .clock import Clock, TooSlow, mean_time, time_spread
 from .measurements import SceneRef, Setup, finite
 from .reference import Reference, position_error, strain_error
 
@@ -38,9 +38,9 @@ def measure(
         - ``error``: :func:`warpcloth.lab.reference.position_error` relative to the reference, of the frames after the start.
         - ``own_error``: With ``own``, the same relative to that.
         - ``strain_error``: :func:`warpcloth.lab.reference.strain_error` of the same frames.
-        - ``ms``: Median time of a frame, without the first of each run, which warms up [ms]. If there is one frame, a second
-          is run.
-        - ``spread``: Lower and upper quartile of that time [ms].
+        - ``ms``: Time of a frame, :func:`warpcloth.lab.clock.mean_time` without the first of each run, which warms up [ms]. If
+          there is one frame, a second is run.
+        - ``spread``: ``ms`` times the quartiles of :func:`warpcloth.lab.clock.time_spread`, (low, high) [ms].
         - ``ms_per_second``: ``ms`` per second of simulated time.
         - ``compile_s``: Time to build, bind and warm up before the first frame, including compilation, without
           ``factorise_s``, that of constant matrices [s].
@@ -129,7 +129,8 @@ def _checked_frames(frames, scene, exact):
 
 
 def _times(runs, fps):
-    """Returns median and quartiles [ms] of the warm frames of runs, given as lists of seconds."""
-    warm = np.concatenate([run[1:] if len(run) > 1 else run for run in runs])
-    low, median, high = (1e3 * np.percentile(warm, [25, 50, 75])).tolist()
-    return {"ms": median, "spread": [low, high], "ms_per_second": median * fps}
+    """Returns the time of a frame and its spread [ms] from the warm frames of runs, given as lists of seconds."""
+    warm = [run[1:] if len(run) > 1 else run for run in runs]
+    ms = 1e3 * float(np.average([mean_time(run) for run in warm], weights=[len(run) for run in warm]))
+    spread = ms * np.mean([time_spread(run) for run in warm], axis=0)
+    return {"ms": ms, "spread": spread.tolist(), "ms_per_second": ms * fps}
