@@ -13,7 +13,7 @@ from .style import (
     SMALL,
     dress,
     headline,
-    name_ends,
+    name_all_ends,
     series_style,
     small_print,
     solver_in,
@@ -64,8 +64,8 @@ def plot_panels(path, panels, rows, title, facts):
         add_keys(figure, maps, lines)
     headline(figure, title)
     small_print(figure, facts)
-    for axes, ends in named:
-        if not name_ends(figure, axes, ends, _FAR):
+    for (axes, _ends), legible in zip(named, name_all_ends(figure, named, _FAR), strict=True):
+        if not legible:
             axes.legend(**LEGEND | {"frameon": True}, framealpha=0.85, edgecolor="none")
     save(figure, path)
 

@@ -6,7 +6,7 @@ from ..lab.work_precision import WITHIN, cheapest, front, quartiles, without_poi
 from ..numerics.integrators import INTEGRATORS
 from ..others.simulators import SIMULATORS, shown_name
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
-from .style import DASHES, LABEL, LEGEND, SMALL, dress, headline, name_ends, series_style, small_print, style_of
+from .style import DASHES, LABEL, LEGEND, SMALL, dress, headline, name_all_ends, series_style, small_print, style_of
 
 _WIDTH, _LINES = 46, 48  # characters and lines of the texts beside a picture
 # Errors of a motion, with the labels of their axes.
@@ -76,9 +76,7 @@ def plot_time(path, found):
         axes.set(xlabel="ms for a second of motion", ylabel=text)
     title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}"
     _finish(figure, panels, notes, title, texts, found)
-    for axes, of in ends.items():
-        if of:
-            name_ends(figure, axes, of)
+    name_all_ends(figure, [(axes, of) for axes, of in ends.items() if of])
     save(figure, path)
 
 

@@ -162,10 +162,42 @@ def name_ends(figure, axes, ends, far=math.inf):
         Whether the names are legible. If a name would be farther away, would cover another line, or needs more than 40 % of
         the width, none is written; then the chart needs a legend.
     """
+    (legible,) = name_all_ends(figure, [(axes, ends)], far)
+    return legible
+
+
+def name_all_ends(figure, panels, far=math.inf):
+    """Does what :func:`name_ends` does for each of several panels (axes, ends) that share no axis, and lays them out once."""
+    if not panels:
+        return []
+    figure.draw_without_rendering()  # so that sizes are known
+    begun = [_begin_names(figure, axes, ends, far) for axes, ends in panels]
+    figure.draw_without_rendering()
+    found = []
+    for (axes, _ends), (before, others, notes, sizes, legible) in zip(panels, begun, strict=True):
+        if legible:
+            extents = [text.get_window_extent() for text in others]
+            drawn, taken = _drawn(axes), [(extent.min, extent.max) for extent in extents]
+            for note, size in zip(notes, sizes, strict=True):
+                legible = legible and _put(axes, note, size, drawn, taken, far)
+        if not legible:
+            for note in notes:
+                note.remove()
+            axes.set_xlim(before)
+        found.append(legible)
+    return found
+
+
+def _begin_names(figure, axes, ends, far):
+    """Writes names at the ends of lines, and makes the panel wider if they can be legible.
+
+    Returns:
+        The limits of x before; the other texts of the panel; the names; their widths and heights [pt]; whether they can be
+        legible.
+    """
     from matplotlib.patheffects import withStroke
 
     before, others = axes.get_xlim(), list(axes.texts)
-    figure.draw_without_rendering()  # so that sizes are known
     style = {"fontsize": SMALL, "va": "center", "annotation_clip": False, "zorder": 4.0, "parse_math": False}
     style |= {"path_effects": [withStroke(linewidth=2.0, foreground="white")], "textcoords": "offset points"}
     notes = [
@@ -175,21 +207,12 @@ def name_ends(figure, axes, ends, far=math.inf):
     for note in notes:
         note.set_in_layout(False)
     point = figure.dpi / 72.0
-    sizes = [note.get_window_extent().size for note in notes]
-    room = (max(size[0] for size in sizes) + 2.0 * _GAP * point) / axes.bbox.width
+    sizes = [note.get_window_extent().size / point for note in notes]
+    room = (max(size[0] for size in sizes) + 2.0 * _GAP) * point / axes.bbox.width
     legible = room < 0.4 or far == math.inf
     if legible:
         _widen(axes, min(room, 0.4))
-        figure.draw_without_rendering()
-        extents = [text.get_window_extent() for text in others]
-        drawn, taken = _drawn(axes), [(extent.min, extent.max) for extent in extents]
-        for note, size in zip(notes, sizes, strict=True):
-            legible = legible and _put(axes, note, size / point, drawn, taken, far)
-    if not legible:
-        for note in notes:
-            note.remove()
-        axes.set_xlim(before)
-    return legible
+    return before, others, notes, sizes, legible
 
 
 def _widen(axes, share):
