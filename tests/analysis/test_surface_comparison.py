@@ -181,6 +181,10 @@ def test_a_sequence_is_a_capture_of_one_topology():
         (lambda folder: wc.open_capture(folder, scale=-1.0), "scale is -1.0; it must be a number above 0"),
         (lambda folder: wc.open_capture(folder.parent / "rest.obj"), "rest.obj: is one mesh"),
         (lambda folder: wc.open_capture(folder.parent / "rest.obj", scale=2.0), "scale is 2; it is for folders and patterns"),
+        (
+            lambda folder: wc.compare_surfaces([wc.Mesh(1e70 * m.points, m.triangles) for m in meshes()], meshes(), fps=1),
+            r"none of the 4 frames .* has a coordinate above 1e\+60 m",
+        ),
         (lambda folder: wc.as_capture([]), "frames has 0 meshes; it must have at least 1"),
         (lambda folder: wc.as_capture([wc.Mesh.chain(3)]), r"frames\[0\] is Mesh.*; it must be a Mesh with triangles"),
         (lambda folder: wc.as_capture(meshes(), dt=1.0, times=[0, 1, 2, 3]), "dt, times: both are given; give one"),
@@ -196,7 +200,7 @@ def test_a_sequence_is_a_capture_of_one_topology():
             "none of the 1 frames that a and b both have can be compared: frame 0 has no area",
         ),
     ],
-    ids=range(12),
+    ids=range(13),
 )
 def test_wrong_use_is_refused(folder, call, message):
     with pytest.raises(ValueError, match=message):

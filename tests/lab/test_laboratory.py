@@ -206,6 +206,7 @@ def test_the_command_prints_the_reading(capfd, tmp_path):
     for given, sentence in (
         (["hanging"], "hanging is no test of a laboratory; it must be one of cantilever"),
         (["strip", "-o", "strip.obj"], "--output is strip.obj; it must end with .npz"),
+        (["strip", "-o", str(tmp_path / "none" / "a.npz")], "none does not exist"),
         (["strip", "-p", "fabric=denim-wang"], "fabric 'denim-wang' has no poisson_ratio"),
         (["picture_frame", "-p", "angle=90"], "angle is 90; it must be below 90, at which the frame is shut"),
         (["cantilever", "-p", "fabric=silk", "width=1e-4"], "width is 0.0001 m, below 4 elements of"),

@@ -429,6 +429,10 @@ def test_array_files_that_need_more(tmp_path):
         ValueError, match=r"a.npy: has no triangles; give a rest mesh .* 'warpcloth convert a.npy a.npz --rest MESH'"
     ):
         open_sequence(tmp_path / "a.npy", fps=24)
+    with pytest.raises(ValueError, match=r"a.npy: prim is 'Sheet', and arrays have no prims; leave it out"):
+        open_sequence(tmp_path / "a.npy", "Sheet", fps=24, mesh=MESH)
+    with pytest.raises(ValueError, match=r"a.npy: times are from 0 to 4e\+100 s; they must be within 1e\+15 s"):
+        open_sequence(tmp_path / "a.npy", fps=1e-100, mesh=MESH)
     np.savez_compressed(tmp_path / "a.npz", points=frames(), triangles=MESH.triangles)
     with pytest.raises(ValueError, match=r"a.npz: points.npy is compressed, .*; write it by np.savez"):
         open_sequence(tmp_path / "a.npz", fps=24)

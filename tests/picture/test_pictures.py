@@ -15,7 +15,7 @@ import warpcloth as wc
 from warpcloth.chart import Scale, View, draw, plot_percentiles, range_over
 from warpcloth.picture import colour
 from warpcloth.picture.colour import EXCLUDED
-from warpcloth.picture.figures import save
+from warpcloth.picture.figures import PICTURES, check_path, save
 from warpcloth.picture.projection import brightness
 
 FRONT = View(azimuth=0.0, elevation=0.0)
@@ -409,3 +409,9 @@ def test_each_scalar_has_a_panel_and_neutral_values_a_line(tmp_path):
     plot_percentiles(tmp_path / "near.png", rows[4:8], neutrals={"scalar_1": 2.5})
     blue = [(np.ptp(imread(tmp_path / name)[..., :3], axis=-1) > 0.3).sum() for name in ("far.png", "near.png")]
     assert blue[0] == pytest.approx(blue[1], rel=0.2), "a line beyond all values is shown too"
+
+
+def test_a_folder_is_refused_before_anything_is_measured(tmp_path):
+    (tmp_path / "a.png").mkdir()
+    with pytest.raises(ValueError, match=r"a\.png: is no regular file; it must be one, or free"):
+        check_path(tmp_path / "a.png", PICTURES)

@@ -156,6 +156,8 @@ def test_the_command_reads_a_file_by_its_times(tmp_path, capsys):
     assert "none at the time of a frame of the scene" in capsys.readouterr().err
     assert main([*words, "--vertices", "x < 0.5"]) == 2
     assert "seen.npz: has 16 vertices; it must have 8, one for each of 'vertices'" in capsys.readouterr().err
+    assert main([*words, "--vertices", "x > 9"]) == 2
+    assert "vertices is 'x > 9', which names no vertex; it must name one at least" in capsys.readouterr().err
 
 
 @pytest.mark.slow

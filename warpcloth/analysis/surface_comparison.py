@@ -20,6 +20,7 @@ from .compare import longest_side, matching, turned_up, up_axis_of, whole_frame
 from .samples import Exclusion
 
 Captured = FilePath | Capture | Sequence | tuple[Mesh, ArrayLike | HasPoints] | Iterable[Mesh]
+_FAR = 1e60  # largest coordinate [m]; squares of areas stay finite
 SHARE = 0.95  # the share of the area that is nearer than ``percentile``
 
 
@@ -197,7 +198,7 @@ def capture_to_up_axis(b: Capture, axis_a: UpAxis | None, axis_b: UpAxis | None)
 
 
 def _measured(a, b, labels, excluded, samples, device):
-    """Returns the numbers of a frame by name; empty if one surface has no area. Adds to what is excluded."""
+    """Returns the numbers of a frame by name; empty if one surface cannot be measured. Adds to what is excluded."""
     surfaces, lost = [], False
     for surface, label, notes in zip((a, b), labels, excluded, strict=True):
         bad = np.flatnonzero(~np.isfinite(surface.points).all(axis=1))
@@ -208,6 +209,9 @@ def _measured(a, b, labels, excluded, samples, device):
         points, triangles = surface.points[used], corners.reshape(-1, 3)
         if not areas_of(points, triangles).sum() > 0.0:
             notes.append(whole_frame(label, "has no area, so that it is not compared"))
+            lost = True
+        elif np.abs(points).max() > _FAR:
+            notes.append(whole_frame(label, f"has a coordinate above {_FAR:g} m, so that it is not compared"))
             lost = True
         surfaces.append((points, triangles))
     if lost:

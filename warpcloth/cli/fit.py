@@ -120,7 +120,7 @@ def _check(arguments):
     measured, read = arguments.measured, arguments.reading
     given = [name for name, one in (("MEASURED", measured), ("--reading", read), ("--capture", arguments.capture)) if one]
     taken = next((text for text in (*arguments.p, *arguments.s, *arguments.start) if "=" not in text and text != "help"), None)
-    if taken and not measured:
+    if taken and not given:
         raise ValueError(f"{taken!r} is not of the form name=value; MEASURED must stand directly after SCENE, before -p")
     if len(given) != 1:
         said = f"{given[0]} and {given[1]} are" if given else "none of MEASURED, --reading and --capture is"
@@ -186,7 +186,8 @@ def _summary(facts, found):
         if np.isnan(error):
             certain = "its error is not known"
         else:
-            certain = f"± {100.0 * error:.2g} %, from {low:.5g} to {high:.5g}" if np.isfinite(error) else "not determined"
+            known = 0.0 < low and high < np.inf
+            certain = f"± {100.0 * error:.2g} %, from {low:.5g} to {high:.5g}" if known else "not determined"
         lines.append(f"  {name.ljust(width)}  {value:.6g}  {certain}")
     names = list(found.parameters)
     for i, j in zip(*np.triu_indices(len(names), 1), strict=True):

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from ..base.outputs import check_apart
+from ..base.outputs import Output, OutputSet, check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
 from .setup import named_scene
@@ -36,6 +36,8 @@ def measure(arguments):
         raise ValueError(f"--output is {arguments.output}; it must end with .npz")
     check_apart([arguments.output] if arguments.output else [], [str(source.path)])
     check_writable(arguments.output)
+    if arguments.output:
+        Output(arguments.output, "xb").discard()  # its folder exists, and it is no folder
     device = find_device(arguments.device)
     began = time.perf_counter()
     rest = equilibrium(scene, device=device, record="reactions")
@@ -44,7 +46,8 @@ def measure(arguments):
         return say(f"{scene.name}: {rest.status.message}", 1)
     readings = laboratory_readings(scene, rest)
     if arguments.output:
-        np.savez(arguments.output, points=rest.points[None], triangles=scene.mesh.triangles, times=np.zeros(1))
+        with OutputSet() as outputs, outputs.writing(arguments.output) as file:
+            np.savez(file, points=rest.points[None], triangles=scene.mesh.triangles, times=np.zeros(1))
     facts = {
         "scene": scene.name,
         "source": str(source.path),

@@ -8,7 +8,7 @@ import time
 from dataclasses import asdict, dataclass, field, replace
 from typing import NamedTuple
 
-from ..base.checks import number
+from ..base.checks import number, whole
 from ..others.simulators import simulator_of
 from ..solvers import SOLVERS
 from . import campaign, trajectory
@@ -297,6 +297,9 @@ def choose(
     """
     began = time.perf_counter()
     pick([], tolerance, budget)  # checks the arguments before anything is measured
+    number("limit", limit, above=0.0)
+    if frames is not None:
+        whole("frames", frames, 1)
     # One at a time, because parallel runs would slow one another.
     run = {"workers": 1} | run
     run = run if "store" in run else {"store": campaign.kept_store("trajectories", run.get("executor")), **run}

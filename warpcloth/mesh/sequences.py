@@ -43,6 +43,7 @@ from .stage_mesh import StageMesh
 # Functions that open a sequence, by file ending: (path, prim, fps) → :class:`Sequence`. `usd` registers that of stages.
 OPENERS: dict[str, Callable[[FilePath, str | None, float | None], Any]] = {}
 _MOST_MISSING = 1_000_000
+_LATEST = 1e15  # latest time of a frame [s]
 _CHANGES = (
     "meshes that change from frame to frame are captures: 'compare --by surface' and 'fit --capture' take them, "
     "'resample' gives them fixed triangles"
@@ -78,7 +79,7 @@ class Sequence(ShownInNotebooks):
         up_axis: "Y" or "Z"; None if the input does not say.
 
     Raises:
-        ValueError: The mesh has no triangles.
+        ValueError: The mesh has no triangles, or times of a file are not within 1e15 s.
     """
 
     mesh: Mesh
@@ -93,8 +94,12 @@ class Sequence(ShownInNotebooks):
     up_axis: UpAxis | None = None
 
     def __post_init__(self) -> None:
+        where = "mesh" if self.path is None else self.path
+        if self.path is not None and self.times is not None and not np.abs(self.times).max(initial=0.0) <= _LATEST:
+            raise ValueError(
+                f"{where}: times are from {self.times[0]:g} to {self.times[-1]:g} s; they must be within {_LATEST:g} s"
+            )
         if not len(self.mesh.triangles):
-            where = "mesh" if self.path is None else self.path
             raise ValueError(f"{where}: has edges and no triangles; a sequence must have triangles")
 
     def __len__(self) -> int:
@@ -171,6 +176,8 @@ def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = N
         return _open_files(path, *files, prim, fps)
     if not os.path.exists(path):
         raise FileNotFoundError(f"{path}: no such file or folder")
+    if prim is not None and Path(path).suffix.lower() in (".npz", ".npy", *CACHES):
+        raise ValueError(f"{path}: prim is {prim!r}, and arrays have no prims; leave it out")
     try:
         if path.lower().endswith(".npz"):
             return _open_npz(path, fps)

@@ -27,7 +27,7 @@ def check_path(path, endings):
     Raises:
         FileNotFoundError: The folder does not exist.
         ImportError: matplotlib is not installed.
-        ValueError: The name has none of the endings.
+        ValueError: The name has none of the endings, or the path is a folder or a device.
     """
     require_matplotlib()
     path = Path(path)
@@ -35,6 +35,8 @@ def check_path(path, endings):
         raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {' or '.join(endings)}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: is no regular file; it must be one, or free")
 
 
 def number_axis(axis):

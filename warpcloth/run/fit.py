@@ -227,6 +227,8 @@ def _of_vertices(scene, measured, vertices, resting):
             raise ValueError(f"vertices is {shown(vertices)} and measured is a file of markers; leave vertices out")
         return Markers.read(measured, scene, resting=resting)
     chosen = distinct_vertices("vertices", vertices, scene.mesh)
+    if not len(chosen):
+        raise ValueError(f"vertices is {shown(vertices)}, which names no vertex; it must name one at least")
     if isinstance(measured, (str, PathLike, Sequence)):
         measured = _positions(scene, measured, len(chosen))
     return Markers(positions=measured, vertices=chosen)
