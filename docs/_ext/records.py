@@ -142,6 +142,7 @@ def energy(name, scenes):
         made(f"energy-{name}"),
         f"$$U = {latex(equation)}$$",
         f"{where} [Physics](../physics.md#symbols) explains the symbols.",
+        f"It is one of the `terms` of a [scene](../scenes.md): `terms=[wc.{name}(…)]`.",
         "## Parameters",
         described("class", name),
         "## Solvers",
