@@ -77,7 +77,10 @@ def test_it_fits_a_capture_whose_triangles_change(tmp_path, capsys):
     lost = replace(capture, labels=capture.labels[:3], times=capture.times[:3], read=broken.__getitem__)
     broken[1] = Surface(np.full((3, 3), np.nan), [[0, 1, 2]])
     with pytest.warns(UserWarning, match="1 of 2 frames are left out, because no triangle has finite corners: 1$"):
-        assert np.isnan(wc.fit(sheet(1.0, 1.0), SOLVER, {"Spring.stiffness": 300.0}, lost).residuals).tolist() == [True, False]
+        some = wc.CapturePoints(lost, points=1000)
+        assert np.isnan(wc.fit(sheet(1.0, 1.0), SOLVER, {"Spring.stiffness": 300.0}, some).residuals).tolist() == [True, False]
+    one = wc.CapturePoints(capture, points=1).bind("measured", sheet(1.0, 1.0), FRAMES)  # its size is that of all points
+    assert one.frames.tolist() == list(range(len(capture) - 1))
     words = ["fit", "hanging", "-p", "n=4", "--capture", str(tmp_path / "seen"), "--start", "Spring.stiffness=700"]
     for wrong, sentence in (
         (words, "seen: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"),

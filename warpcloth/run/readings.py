@@ -212,7 +212,7 @@ class CapturePoints:
         if resting:
             seen = {0: self._vertices(capture[len(capture) - 1])}
             _check_size(where, seen, scene)
-            return _OnSurface(seen, scene.mesh.triangles, self.sigma)
+            return _OnSurface(self._thinned(seen), scene.mesh.triangles, self.sigma)
         if capture.times is None:
             raise ValueError(
                 f"{where}: has no times; open it with open_capture(path, fps=…), or give --fps on the command line"
@@ -228,12 +228,16 @@ class CapturePoints:
             said = f"{len(empty)} of {used.sum()} frames are left out, because no triangle has finite corners: {listed}"
             warnings.warn(f"{where}: {said}", stacklevel=4)
         _check_size(where, seen, scene)
-        return _OnSurface(seen, scene.mesh.triangles, self.sigma)
+        return _OnSurface(self._thinned(seen), scene.mesh.triangles, self.sigma)
 
     def _vertices(self, surface):
-        used = np.unique(solid_triangles(surface))
-        every = 1 if self.points is None else -(-len(used) // self.points)
-        return surface.points[used[::every]]
+        return surface.points[np.unique(solid_triangles(surface))]
+
+    def _thinned(self, seen):
+        """Returns the points (k, 3) [m] of each frame, at most ``points`` of them."""
+        if self.points is None:
+            return seen
+        return {frame: points[:: max(1, -(-len(points) // self.points))] for frame, points in seen.items()}
 
 
 @dataclass(frozen=True, eq=False)
