@@ -25,7 +25,7 @@ from warpcloth.lab.own_reference import words_of_own
 from warpcloth.lab.setups import grid_in_words
 from warpcloth.lab.side_by_side import nearest_setting, side_by_side
 from warpcloth.lab.work_precision import WITHIN
-from warpcloth.others.simulators import SIMULATORS
+from warpcloth.others.simulators import SIMULATORS, shown_name
 
 # Scenes by name, with parameters and frames.
 SCENES = {
@@ -114,7 +114,7 @@ def text_of(found):
         same = [row for row in rows if row["solver"] == solver]
         own, statuses = found["others"][solver], [row["status"] for row in same]
         counts = ", ".join(f"{statuses.count(status)} {status}" for status in dict.fromkeys(statuses))
-        lines.append(f"  {solver}: {ended} ({counts})")
+        lines.append(f"  {shown_name(solver)}: {ended} ({counts})")
         lines.append(f"    its own motion: {words_of_own(own)}")
         tried = [row["options"] for row in same]
         errors = [(row["error"], row["label"]) for row in same if row["error"] is not None]
