@@ -9,6 +9,8 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+from docutils import nodes
+
 import warpcloth as wc
 from warpcloth.cli.fabrics import COLUMNS
 from warpcloth.cli.fabrics import rows as rows_of_fabrics
@@ -452,15 +454,23 @@ def lead_inside(app, document, source):
 
 
 def escape(app, what, name, value, options, lines):
-    """Escapes vertical bars in docstrings, which mean absolute values there, and makes dashes of hyphens, outside of code."""
+    """Escapes vertical bars in docstrings, which mean absolute values there, outside of code."""
     for k, line in enumerate(lines):
         parts = line.split("``")
-        parts[::2] = [part.replace("|", "\\|").replace(" -- ", " – ") for part in parts[::2]]
+        parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
         lines[k] = "``".join(parts)
+
+
+def dash(app, tree):
+    """Makes dashes of the two hyphens that autodoc sets between names and texts; those of options of commands stay."""
+    for text in list(tree.findall(nodes.Text)):
+        if " -- " in text and not isinstance(text.parent, nodes.literal | nodes.literal_block):
+            text.parent.replace(text, nodes.Text(text.replace(" -- ", " – ")))
 
 
 def setup(app):
     app.connect("autodoc-process-docstring", escape)
     app.connect("builder-inited", write_pages)
+    app.connect("doctree-read", dash)
     app.connect("source-read", lead_inside)
     return {"parallel_read_safe": True}
