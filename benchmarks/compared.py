@@ -4,10 +4,10 @@
     python benchmarks/compared.py --scene drape --device cuda:0 --out gpu  # one of them
     python benchmarks/compared.py --stored cpu/*.json gpu/*.json           # tables and charts of stored results
 
-Each scene takes the cheapest solver of warpcloth within 1 % of the reference solution, and the cheapest setting of each solver
-of the others, searched by doubling substeps and iterations until it is within 1 % or the limits are reached. These settings are
-then timed in turns, frame by frame. A file of JSON and a chart is written for each scene. Measurements are stored in
-WARPCLOTH_CACHE and reused, so that the same command goes on after an interruption.
+For each scene it searches for the cheapest setting of warpcloth with an error of at most 1 %, and for that of each solver of
+the other simulators: it doubles substeps and iterations until a setting has such an error or the limits are reached. These
+settings are then timed in turns, frame by frame. A file of JSON and a chart are written for each scene. Measurements are stored
+in WARPCLOTH_CACHE and reused, so that the same command goes on after an interruption.
 """
 
 import argparse

@@ -35,7 +35,7 @@ nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_execution_timeout = 300
 nb_merge_streams = True
-smartquotes = False  # which makes a dash of the two of an option
+smartquotes = False  # they turn the two hyphens of an option into a dash
 
 # The site fetches nothing: MathJax 3.2.2, Apache-2.0, from the package mathjax of npm, lies in _static.
 html_theme = "furo"

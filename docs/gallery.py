@@ -241,7 +241,7 @@ def strain_of_a_capture(frames=36):
     stretch, known = (wc.analyze(each, scene.mesh, measures="stretch")["stretch"][..., 0] for each in (found, true))
     errors = np.linalg.norm(found - true, axis=2), stretch - known
     print("RMS error {:.2g} m, {:.2g} of the stretch".format(*(np.sqrt(np.mean(each**2)) for each in errors)))
-    # All surfaces of the capture are one mesh, of which only those of its own frame have positions.
+    # The surfaces of all frames are one mesh. In each frame only the vertices of its own surface have positions.
     surfaces = list(seen)
     starts = np.cumsum([0, *(len(each.points) for each in surfaces)])
     points = np.full((len(surfaces), starts[-1] + len(scene.mesh.points), 3), np.nan)

@@ -229,7 +229,7 @@ for _record in SOLVERS.values():
     picture("solver", _record.__name__)(lambda record=_record: still_of_solver(record))
 
 
-# Speed of solvers, one in its colour: points of `warpcloth chart work-precision hanging -p n=32 --workers 1 --json`.
+# Charts of speed, one solver in its colour; the points of `warpcloth chart work-precision hanging -p n=32 --workers 1 --json`.
 POINTS = FOLDER / "work-precision.json"
 
 

@@ -1,4 +1,4 @@
-"""Turns the equations of energies, which are plain text in docstrings, into LaTeX, and has those of solvers."""
+"""Turns the equations of energies, which are plain text in docstrings, into LaTeX, and lists the formulas of solvers."""
 
 import re
 
@@ -41,15 +41,16 @@ _SWEEP = r"\Delta\lambda = (G W G^T + \tilde\alpha)^{-1}(p(y) - y{0}), {1}x \get
 SOLVERS = {
     "Explicit": (
         r"v_{n+1} = v_n - h M^{-1} \nabla U(x_n) + h g, \qquad x_{n+1} = x_n + h v_{n+1}",
-        "Here h is the step, M has the masses, U is the energy of the cloth and g gravity",
+        "Here h is the step, M the mass matrix, U the energy of the cloth and g gravity",
     ),
     "Newton": (
         rf"(M/h^2 + \nabla^2 U(x))\, d = -\nabla\varphi(x), \qquad x \gets x + \alpha d, \\ {_OBJECTIVE}",
-        "Here φ is what implicit Euler minimises, U the energy of the cloth, and α comes from a line search",
+        "Here φ is the function that implicit Euler minimises, U the energy of the cloth, and α the length from a line search",
     ),
     "ProjectiveDynamics": (
         r"(M/h^2 + \sum k A\, G^T G)\, x \gets (M/h^2)\, \tilde x + \sum k A\, G^T p(y), \qquad y = G x",
-        "Here p(y) is the nearest state of an element without energy; its stiffness is k, its size A. The matrix is constant",
+        "Here y has the local coordinates of an element, p(y) the nearest ones without energy, k its stiffness and A its size. "
+        "The matrix is constant",
     ),
     "ADMM": (
         r"z \gets \operatorname*{argmin}_z\; U(z) + \tfrac{1}{2}\Vert W(D x - z + u)\Vert^2, \qquad u \gets u + D x - z, \\ "
@@ -58,19 +59,19 @@ SOLVERS = {
     ),
     "PBD": (
         _SWEEP.replace("{0}", "").replace("{1}", r"\qquad ") + r", \qquad \tilde\alpha = 1/(k A h^2)",
-        "Here y = Gx has the local coordinates of an element, p(y) the nearest without energy, W the inverse"
-        " masses; with infinite stiffness α̃ is 0",
+        "Here y = Gx has the local coordinates of an element, p(y) the nearest ones without energy, W the inverse"
+        " masses. With infinite stiffness α̃ is 0",
     ),
     "HierarchicalPBD": (
         r"d_i = \sum_j \frac{d_j}{L_{ij}} \Big/ \sum_j \frac{1}{L_{ij}}, \qquad d = x - \tilde x",
-        "Here the vertices i that a coarse level leaves out follow those of the level, j, at the distances L; sweeps of "
-        "[`PBD`](PBD.md) move those before, and all vertices in the end",
+        "Sweeps of [`PBD`](PBD.md) move the vertices j of a coarse level. The vertices i that the level leaves out then follow "
+        "them; L are the distances between both. The last sweeps move all vertices",
     ),
     "XPBD": (
         _SWEEP.replace("{0}", r" - \tilde\alpha\lambda").replace("{1}", r"\\ \lambda \gets \lambda + \Delta\lambda, \qquad ")
         + r", \qquad \tilde\alpha = 1/(k A h^2)",
-        "Here y = Gx has the local coordinates of an element, p(y) the nearest without energy, W the inverse"
-        " masses; λ starts at 0 in each step",
+        "Here y = Gx has the local coordinates of an element, p(y) the nearest ones without energy, W the inverse"
+        " masses. λ starts at 0 in each step",
     ),
     "ConstrainedDynamics": (
         r"\begin{pmatrix} \tilde M & -J^T \\ J & \tilde\alpha \end{pmatrix} \begin{pmatrix} \Delta x \\ \Delta\lambda "

@@ -194,9 +194,10 @@ def solver(record, scenes):
         "[Choosing](../choosing.md#what-one-per-cent-costs) says how this was measured, and has it for other solvers."
         if timed
         else "",
-        "Each point is a setting, each line an integrator:",
+        "Each point is a setting, and each line has the settings of an integrator:",
         shown(f"speed-{name}.webp", f"Error against time, {name} in colour and the other solvers in grey"),
-        "*On a machine that other processes used too; [all solvers in one chart](../choosing.md#speed-against-accuracy). "
+        "*Measured on a machine that other processes used too. "
+        "[All solvers in one chart](../choosing.md#speed-against-accuracy). "
         f"{made(f'speed-{name}')[1:]}",
         sh(f"chart work-precision hanging --solvers {record.name} -o {record.name}.png"),
         "## Where it fails",

@@ -45,7 +45,7 @@ class PairSource:
     product: Callable
 
     def of(self, dtype):
-        """Returns the name of the module of a precision, of the kernels that scatter."""
+        """Returns the name of the module that has the kernels that scatter, for a precision."""
         return f"{self.module}.{dtype.__name__}"
 
 

@@ -19,7 +19,7 @@ from .self_pairs import MODULE, StepPairs, module_of, near_pairs
 from .self_planes import margin_of
 
 potential, slope, bend = contact.potential, contact.slope, contact.bend
-# The force of ψ at the least gap over that of the logarithm.
+# The force of ψ at the least gap, divided by that of φ there.
 STEEP = wp.constant(wp.float64(100.0))
 
 
@@ -77,7 +77,7 @@ def gap_in_step(dtype):
 
 @cache
 def least_gap(dtype):
-    """Device function (stencil, x, least) → twice the margin of the filter for a pair at x [m], f of the module."""
+    """Device function (stencil, x, least) → the least gap f [m] that the filter leaves a pair at x: twice its margin."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
@@ -96,8 +96,8 @@ def find_forces(dtype, bounded: bool):
     """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; φ = ½(r − d)² if ``bounded``.
 
     With ``apart`` no pair passes through, so that d is never negative: where cloth slides over an edge, y may turn far from its
-    normal at the start of the step. If ``least`` [m] is above 0, φ includes ψ, for a filter with this least gap; not where r is
-    below 2f, as far from the origin.
+    normal at the start of the step. If ``least`` [m], the least gap of the filter, is above 0, ψ is added to φ.
+    Where r is below 2f, as far from the origin, ψ is left out.
     """
     vec3, _ = types(dtype)
     gap_of, least_gap_of = gap_in_step(dtype), least_gap(dtype)

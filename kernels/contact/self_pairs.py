@@ -69,7 +69,8 @@ MODULE = "warpcloth.self_contact"
 def module_of(dtype):
     """Returns the name of the module of the kernels that every scene with self-contact launches.
 
-    A module is compiled as a whole, again for each set of kernels in it. So kernels of some scenes have modules of their own.
+    Warp compiles a module as a whole, and again if other kernels are in it. So kernels that only some scenes launch are in
+    modules of their own.
     """
     return f"{MODULE}.{dtype.__name__}"
 

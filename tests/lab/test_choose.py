@@ -261,7 +261,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert main(command) == 0
     said, text = capsys.readouterr()
     count = re.fullmatch(
-        r"warpcloth: at most (.*) min and .*: 5 min for the reference, 60 s for each of (\d+) settings\n", text
+        r"warpcloth: takes at most (.*) min, .*: 5 min for the reference, 60 s for each of (\d+) settings\n", text
     )
     assert float(count[1]) == 5 + int(count[2]) > 5
     last = said.splitlines()[-1].split()

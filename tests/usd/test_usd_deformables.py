@@ -177,8 +177,8 @@ def test_stages_that_cannot_be_a_scene_are_refused(tmp_path, prim, names, words)
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        ({"surfaceStretchStiffness": 0.0, "surfaceShearStiffness": 0.0}, "so that nothing but bending resists"),
-        ({"youngsModulus": 1e6}, "StretchStiffness is 200 N/m and is read, but physics:youngsModulus gives 2000 N/m"),
+        ({"surfaceStretchStiffness": 0.0, "surfaceShearStiffness": 0.0}, "so the cloth resists bending only"),
+        ({"youngsModulus": 1e6}, "StretchStiffness is 200 N/m and is used, but physics:youngsModulus gives 2000 N/m"),
     ],
 )
 def test_a_doubtful_material_is_read_with_a_warning(tmp_path, names, words):

@@ -20,7 +20,7 @@ from .compare import longest_side, matching, turned_up, up_axis_of, whole_frame
 from .samples import Exclusion
 
 Captured = FilePath | Capture | Sequence | tuple[Mesh, ArrayLike | HasPoints] | Iterable[Mesh]
-_FAR = 1e60  # largest coordinate [m]; squares of areas stay finite
+_FAR = 1e60  # largest coordinate [m]: up to it, squares of areas are finite
 SHARE = 0.95  # the share of the area that is nearer than ``percentile``
 
 
@@ -198,7 +198,7 @@ def capture_to_up_axis(b: Capture, axis_a: UpAxis | None, axis_b: UpAxis | None)
 
 
 def _measured(a, b, labels, excluded, samples, device):
-    """Returns the numbers of a frame by name; empty if one surface cannot be measured. Adds to what is excluded."""
+    """Returns the numbers of a frame by name; empty if a surface cannot be measured. Notes in ``excluded`` what is left out."""
     surfaces, lost = [], False
     for surface, label, notes in zip((a, b), labels, excluded, strict=True):
         bad = np.flatnonzero(~np.isfinite(surface.points).all(axis=1))

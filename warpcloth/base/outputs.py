@@ -107,7 +107,7 @@ class Output:
 
 
 class OutputSet:
-    """Binary files that replace older ones together, once all are written; an error or interrupt leaves no part of them."""
+    """Binary files that replace older files once all of them are written. An error or interrupt leaves nothing of them."""
 
     def __init__(self):
         self._outputs = []

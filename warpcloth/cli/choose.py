@@ -88,7 +88,7 @@ def _announce(longest):
     parts = [f"{_time(longest.reference)} for the reference", f"{_time(longest.limit)} for each of {longest.settings} settings"]
     if longest.others:
         parts.append(f"{_time(longest.other)} for each of {longest.others} solvers of other simulators")
-    print(f"warpcloth: at most {_time(longest.seconds)} and the time to compile: {', '.join(parts)}", file=sys.stderr)
+    print(f"warpcloth: takes at most {_time(longest.seconds)}, without compilation: {', '.join(parts)}", file=sys.stderr)
 
 
 def _time(seconds):

@@ -37,7 +37,7 @@ def measure(arguments):
     check_apart([arguments.output] if arguments.output else [], [str(source.path)])
     check_writable(arguments.output)
     if arguments.output:
-        Output(arguments.output, "xb").discard()  # its folder exists, and it is no folder
+        Output(arguments.output, "xb").discard()  # raises if the folder does not exist, or the path is a folder
     device = find_device(arguments.device)
     began = time.perf_counter()
     rest = equilibrium(scene, device=device, record="reactions")

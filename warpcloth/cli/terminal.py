@@ -81,7 +81,7 @@ class Bar:
         shape = {"ncols": min(size.columns, 120), "nrows": size.lines}
         form = "{desc}{percentage:3.0f}%|{bar}| " + counts
         bar = tqdm(total=total, desc=f"{text}: ", bar_format=form, leave=False, file=sys.stderr, **shape)
-        self.bar = None if bar.disable else bar  # as TQDM_DISABLE asks
+        self.bar = None if bar.disable else bar  # then TQDM_DISABLE is set
 
     def move(self, done, note=None):
         """Moves the bar to ``done``; ``note`` is shown after the counts."""

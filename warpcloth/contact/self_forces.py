@@ -20,7 +20,7 @@ class SelfForces(PairSums):
         energies: Energies of pairs, summed by their first vertex, (N,) [J].
         friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
         apart: Whether pairs never pass through one another where forces are computed.
-        least: The least gap [m] of the filter if that keeps all pairs apart wherever forces are computed, else 0.
+        least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
     """
 
     def __init__(self, model, bounded):

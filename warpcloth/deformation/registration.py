@@ -18,7 +18,7 @@ from ..usd import AnimationWriter
 from .arap import edge_weights
 
 _TURNED = np.cos(np.radians(60.0))  # cosine of the largest angle between the normals of a point and of the template
-_FEW = 0.01  # share of the capture that counts, or of the template that faces it, below which they are hardly the same cloth
+_FEW = 0.01  # `resample` warns if a smaller share of the capture counts, or of the template faces it
 _REGULAR = 1e-12  # added to the diagonal, relative to its largest entry, so that the matrix has an inverse
 _CORNERS = np.arange(3)
 
@@ -112,7 +112,7 @@ def resample(
         ValueError: An argument is not allowed, the capture has no times, or no point of a frame counts.
 
     Warns:
-        UserWarning: Less than 1 % of the capture counts, or of the template faces it, as with a wrong unit.
+        UserWarning: Less than 1 % of the capture counts, or less than 1 % of the template faces it, as with a wrong unit.
 
     Examples:
         >>> import warpcloth as wc

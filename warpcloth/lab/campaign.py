@@ -168,7 +168,7 @@ def environment(values):
 
 @contextlib.contextmanager
 def processes(workers):
-    """Yields an executor of fresh processes, each with one thread for arithmetic, which start with its first task."""
+    """Yields an executor of fresh processes, each with one thread for arithmetic. They start with the first task."""
     context = multiprocessing.get_context("spawn")
     with environment(_ONE_THREAD), ProcessPoolExecutor(workers, context, initializer=begin, initargs=(_own(),)) as pool:
         try:

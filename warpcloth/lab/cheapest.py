@@ -108,7 +108,7 @@ def measure(scene, digest, frames, tolerance, solvers, device, dtype, limit):
         - ``status``: "found", "none" if no setting was accurate within the limit, or "unknown" if the reference solution is
           not accurate enough to tell; ``reason``: a sentence, "" if found.
         - ``solver``, ``options``, ``label``, ``ms``, ``spread``, ``error``, ``strain_error``: the cheapest setting, the time of
-          its frame and its spread [ms], and its errors.
+          a frame and its spread [ms], and its errors.
         - ``second``: The same of the cheapest setting of another solver, with its ``ratio`` of times, or None.
         - ``complete``: Whether the search ended before the limit.
         - ``reference_error``, ``reference_method``, ``reference_substeps``, ``reference_seconds``: The reference solution.

@@ -85,7 +85,7 @@ class Choice:
 
 
 class Longest(NamedTuple):
-    """The longest time that :func:`choose` may take, apart from compilation, if no ``total`` is given.
+    """The longest time that :func:`choose` may take without compilation, if no ``total`` is given.
 
     Attributes:
         limit: Time limit of a run [s].
@@ -104,9 +104,9 @@ class Longest(NamedTuple):
 
     @property
     def other(self):
-        """Time of a solver of another simulator [s]: its search, whose last run may end late, and its own reference.
+        """Time of a solver of another simulator [s]: its search, the run by which that may end late, and its own reference.
 
-        The finest run of the reference is repeated with more iterations, in as much time again.
+        A run of its own reference is repeated with more iterations, which may take as long as all the others.
         """
         return (3.0 * LIMITS + 1.0) * self.limit
 

@@ -36,10 +36,10 @@ class Clock:
 
 
 def mean_time(times):
-    """Returns the mean of the times of successive frames (F,), of each the median of its own and its neighbours' times.
+    """Returns the mean of the times of successive frames (F,), where each is the median of its own and its neighbours' times.
 
-    A motion takes the mean times its frames, also if some are more work, as in contact, which a median would not show. What
-    interrupts a single frame does not count.
+    The mean times the number of frames is the time of the motion, also if some frames are more work, as in contact. A median of
+    all frames would not show that. An interruption of a single frame does not count.
     """
     if len(times) < 2:
         return float(np.mean(times))
@@ -50,7 +50,8 @@ def mean_time(times):
 def time_spread(times):
     """Returns by how much the times of successive frames (F,) differ from those of their neighbours, (low, high).
 
-    These are the quartiles of the time of a frame over the mean of its neighbours' times, each over the median of that.
+    The time of each frame is divided by the mean of its neighbours' times. These are the quartiles of the quotients, divided by
+    their median.
     """
     if len(times) < 2:
         return 1.0, 1.0

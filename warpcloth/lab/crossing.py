@@ -9,7 +9,7 @@ The other methods know the side of each pair listed at the start of the step, ne
 a step has a distance d at which kτ²/d, τ = r/2, stops half of v on each side, ρv/2h. Below δ = r/1000 the energy is a parabola,
 so that sheets may end beyond one another.
 
-Vertices move along the line of flight only. Free sheets could tip and pass beside each other, also by iterates within a step.
+Vertices can move along the line of flight only. Otherwise sheets, or iterates within a step, could tip and pass each other.
 """
 
 import numpy as np
@@ -128,7 +128,8 @@ def meetings(solver, kept, h, speeds, device):
 def without_filter(stepper):
     """Removes the filter of self-contact from a stepper, at the end of steps and in the iterates of Newton's method.
 
-    Iterates then may pass through, so that a pair knows its side from the start of the step, as with other methods.
+    The two sides of a pair may then pass through each other in iterates. So the sign of a gap follows from the start of the
+    step, as with other methods.
     """
     kept = stepper.pairs.filter
     kept.launch_end = kept.launch_relist = kept.launch_limit = lambda *given: None

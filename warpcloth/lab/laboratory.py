@@ -25,7 +25,7 @@ from . import elastica
 Readings = dict[str, tuple[float, str]]
 ANGLE = np.radians(41.5)  # of the Shirley tester
 _LINES = 600  # across the shadow of a drape
-_ROUNDING = 1e-6  # relative height of a wave of an outline that is no fold
+_ROUNDING = 1e-6  # height of a wave of an outline, relative to its mean radius, below which it is no fold
 
 
 def laboratory_readings(scene: Scene, rest: Equilibrium) -> Readings:

@@ -19,12 +19,12 @@ from .reference import Reference, kept_reference, position_error, strain_error
 _MOST = 12  # runs, each with twice the substeps of the one before
 # A motion counts as converged if two successive doublings moved it by at most this share of the tolerance.
 SHARE = 0.1
-# In place of a reference that is not known because the time of all was used up.
+# Stands for a reference that is not known because the total time was used up.
 CUT = "cut"
 
 
 class UsedUp(Exception):
-    """Raised when the time of all references is used up."""
+    """Raised when the total time is used up."""
 
 
 def own_reference(
@@ -48,18 +48,18 @@ def own_reference(
         frames: Number of frames.
         device: A Warp device.
         tolerance: Relative to the size of the cloth.
-        limit: Time limit [s] of the frames of the runs with more and more substeps; those with more iterations may take as long
-            again.
+        limit: Time limit [s] of the frames of all runs that double the substeps. The run with twice the iterations may take as
+            long again.
         progress: Function called with (substeps, frame, frames) after each frame, or None.
         clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for the limit.
-        until: Reading of ``time.perf_counter`` [s] at which it ends without a result.
+        until: A time of ``time.perf_counter`` [s] at which :class:`UsedUp` is raised.
 
     Returns:
         The reference, or None if the solver does not take the scene, diverges, or takes too long for two runs. Its error is
         infinite if no two doublings count, or if there was no time for the run with more iterations.
 
     Raises:
-        UsedUp: It is later than ``until``.
+        UsedUp: The time ``until`` has come before the end.
     """
     records = [setup.record() for setup in setups]
     iterations = max(record.iterations for record in records)
@@ -74,7 +74,7 @@ def own_reference(
         return found
 
     def run(substeps, iterations, left):
-        """Returns the time of the frames of a run [s], and its points, or None if refused or too slow, or "diverged"."""
+        """Returns the time of the frames of a run [s], and its points; None if it is refused or too slow, or "diverged"."""
 
         def note(*at):
             if time.perf_counter() >= until:
@@ -145,7 +145,7 @@ def _settled(moves, tolerance):
 
 
 def own_references(scene, setups, frames, device, tolerance, limit, progress=None, clock="wall", until=math.inf):
-    """Returns the :func:`own_reference` of each solver of another simulator among setups, by its name; ``CUT`` after ``until``.
+    """Returns the :func:`own_reference` of each solver of another simulator among setups, by its name, or ``CUT``.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
@@ -156,7 +156,7 @@ def own_references(scene, setups, frames, device, tolerance, limit, progress=Non
         limit: As for :func:`own_reference`, of each solver.
         progress: As for :func:`own_reference`.
         clock: As for :func:`own_reference`.
-        until: As for :func:`own_reference`.
+        until: A time of ``time.perf_counter`` [s]. Solvers whose reference is not known by then have ``CUT``.
     """
     of_each, found = {}, {}
     for setup in setups:
@@ -181,7 +181,7 @@ def own_facts(own, exact, mesh, bound):
 
     Returns:
         dict: ``substeps``, ``error``, ``converged``, ``bound``, ``seconds``, and ``apart``, the distance from the reference; or
-        ``cut`` alone, which is true.
+        only ``cut``, which is true.
     """
     if own is None:
         return None

@@ -27,7 +27,7 @@ from .clock import Clock, TooSlow
 _MOST_EXPLICIT, _MOST_ON_CUDA = 20000, 65536
 # Tolerance of solves within a step, so small that only the error of the step itself counts.
 _TOLERANCE = 1e-6
-# Iterations of a step of Newton's method. Pairs of self-contact that turn can need over 100, as its Hessian leaves this out.
+# Iterations of a step of Newton's method. If pairs of self-contact turn, a step may need over 100: the Hessian leaves this out.
 _ITERATIONS = 400
 _SOLVED = (Result.COMPLETED, Result.CONVERGED, Result.ROUNDED)
 

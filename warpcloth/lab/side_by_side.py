@@ -33,14 +33,21 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
         given: ``solvers``, ``limit``, ``total`` and ``run`` of :func:`warpcloth.lab.choosing.choose`.
 
     Returns:
-        dict: That of :func:`warpcloth.lab.work_precision.time_diagram`, with ``searched``, by solver of another simulator how
-        its search ended, and ``ratios``: for the cheapest setting of warpcloth, and for that of each other solver, ``label``,
-        ``solver``, ``options``, ``to``, the error that counts, "reference" or "own", the errors, ``ms``, its time of a
-        frame by :func:`warpcloth.lab.clock.mean_time`, ``ratio``, that over that of warpcloth, ``spread``, the ratio times the
-        quartiles of :func:`warpcloth.lab.clock.time_spread` of ratios of frames, and the largest numbers in a frame of pairs
-        of triangles that cross, ``crossings``, and of vertices inside colliders, ``inside``; both are None if libigl is not
-        installed. If no setting of warpcloth meets the tolerance, ratios are to the first other that does; if none does,
-        ``ratios`` is empty.
+        dict: That of :func:`warpcloth.lab.work_precision.time_diagram` with two more keys. ``searched`` has, for each solver of
+        another simulator, how its search ended. ``ratios`` has a dictionary for the cheapest setting of warpcloth, and then for
+        that of each other solver:
+
+        - ``label``, ``solver``, ``options``: The setting.
+        - ``error``, ``own_error``: Its errors.
+        - ``to``: The one that meets the tolerance, "reference" or "own".
+        - ``ms``: Its time of a frame [ms], :func:`warpcloth.lab.clock.mean_time`.
+        - ``ratio``: This time divided by that of the first setting.
+        - ``spread``: The ratio times :func:`warpcloth.lab.clock.time_spread` of the ratios of frames.
+        - ``crossings``, ``inside``: The largest number in a frame of pairs of triangles that cross, and of vertices inside
+          colliders; None if libigl is not installed.
+
+        If no setting of warpcloth meets the tolerance, the first setting is another that does. If none does, ``ratios`` is
+        empty.
 
     Raises:
         ImportError: A simulator is not installed.

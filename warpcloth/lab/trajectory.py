@@ -38,8 +38,8 @@ def measure(
         - ``error``: :func:`warpcloth.lab.reference.position_error` relative to the reference, of the frames after the start.
         - ``own_error``: With ``own``, the same relative to that.
         - ``strain_error``: :func:`warpcloth.lab.reference.strain_error` of the same frames.
-        - ``ms``: Time of a frame, :func:`warpcloth.lab.clock.mean_time` without the first of each run, which warms up [ms]. If
-          there is one frame, a second is run.
+        - ``ms``: Time of a frame [ms], :func:`warpcloth.lab.clock.mean_time` without the first frame of each run, which warms
+          up. If there is one frame, a second is run.
         - ``spread``: ``ms`` times the quartiles of :func:`warpcloth.lab.clock.time_spread`, (low, high) [ms].
         - ``ms_per_second``: ``ms`` per second of simulated time.
         - ``compile_s``: Time to build, bind and warm up before the first frame, including compilation, without

@@ -106,7 +106,7 @@ class NewtonSteps:
 
 # The grids are those of substeps and iterations within which the fronts on hanging lie.
 NEWTON = Simulator(
-    "Newton engine",  # which nobody takes for the method of Newton
+    "Newton engine",  # not to be taken for the method of Newton
     "newton",
     engine,
     "float32",

@@ -33,6 +33,6 @@ def simulator_of(name):
 
 
 def shown_name(solver):
-    """Returns the name of a solver in tables and charts: "Newton engine: VBD" for newton-vbd, but "newton" for that of ours."""
+    """Returns the name of a solver in tables and charts: "Newton engine: VBD" for newton-vbd, "newton" for our own."""
     simulator = simulator_of(solver)
     return solver if simulator is None else f"{simulator.title}: {simulator.solvers[solver].title}"

@@ -65,7 +65,7 @@ class ChunkWriter:
                 is written, with the folder beside that; viewers find the frames only through a link in the same folder.
             mesh: The `Mesh`.
             chunk: Number of frames per chunk, which memory holds, and which a killed process may lose.
-            whole: Whether the root is written only by `close`, and an error removes the chunks.
+            whole: Whether only `close` writes the root, and an error removes the chunks.
         """
         self._whole = whole
         self._output = check_output(output)
@@ -123,7 +123,7 @@ class ChunkWriter:
         if kind is None:
             self.close()
         elif not self._closed:
-            # After an error the frames so far stay in chunks, without packing, unless all or none are wanted.
+            # After an error the frames so far stay in chunks, without packing, unless only the whole animation is wanted.
             try:
                 if self._whole:
                     self._remove_run()

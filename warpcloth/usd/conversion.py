@@ -22,8 +22,8 @@ _UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
 def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
     """Writes an animation in another format. A few frames are in memory at a time, or ten for a stage.
 
-    All frames are read twice: they are checked before the first is written. Older files are replaced once all frames are
-    written: an error or interrupt leaves them whole, and no part of new ones.
+    All frames are read twice, because they are checked before the first is written. Older files are replaced once all frames
+    are written. After an error or interrupt they are as before, and nothing is left of new files.
 
     Args:
         source: Path of an animation, as for :func:`warpcloth.open_sequence`.

@@ -30,7 +30,7 @@ from .values import array_of, refuse_outside, value_of
 LAWS = ("proposal", "newton")
 THICKNESS = 1e-3  # [m], the default of the proposal
 _POISSON = 0.3  # its default too
-_AGREE = 1e-2  # relative difference of a stretch stiffness and Young's modulus above which they contradict
+_AGREE = 1e-2  # relative difference above which a stretch stiffness and that by Young's modulus disagree
 _SAME = 1e-5  # relative difference of products of float32 that counts as none
 _NEAR = 1e-5  # distance of an anchor from its point, relative to size and position of the cloth, that counts as none
 
@@ -39,7 +39,7 @@ def thickness_of(values):
     """Returns the thickness [m] that the names give, or None.
 
     Raises:
-        ValueError: It is not the same everywhere, or the mass model is another than shell and solid.
+        ValueError: It is not the same everywhere, or the mass model is neither shell nor solid.
     """
     _token(values, "(mass model)", "newton:massModel", "shell", "solid")
     several = values.get("(thicknesses)")
@@ -86,10 +86,10 @@ def terms_of(values, mesh, law, where):
         where: The file and the prim, for warnings.
 
     Raises:
-        ValueError: It has a stiffness in shear alone, or a name has a value that is not allowed.
+        ValueError: It has a stiffness in shear alone, or an attribute has a value that is not allowed.
 
     Warns:
-        UserWarning: It has a stiffness in bending alone, a stiffness is not read, or Young's modulus gives another.
+        UserWarning: It has only a bending stiffness, one is not read, or Young's modulus gives another stretch stiffness.
     """
     names = ("stretch stiffness", "shear stiffness", "bend stiffness", "Young's modulus", "Poisson's ratio")
     stretch, shear, bend, modulus, ratio = (values.get(f"({name})") for name in names)
@@ -103,14 +103,14 @@ def terms_of(values, mesh, law, where):
         if abs(stretch - plate) > _AGREE * max(stretch, plate):
             other = f"physics:youngsModulus gives {plate:.4g} N/m with a thickness of {t:.4g} m"
             warnings.warn(
-                f"{where}: physics:surfaceStretchStiffness is {stretch:.4g} N/m and is read, but {other}", stacklevel=2
+                f"{where}: physics:surfaceStretchStiffness is {stretch:.4g} N/m and is used, but {other}", stacklevel=2
             )
         bend = modulus * t**3 / (12.0 * (1.0 - ratio**2)) if bend is None else bend
     if stretch is None and shear is not None:
         raise ValueError("physics:surfaceShearStiffness is given without a surfaceStretchStiffness or a youngsModulus")
     if stretch is None and bend is not None:
         lacking = "physics:surfaceStretchStiffness and physics:youngsModulus are not given, or 0"
-        warnings.warn(f"{where}: {lacking}, so that nothing but bending resists", stacklevel=2)
+        warnings.warn(f"{where}: {lacking}, so the cloth resists bending only", stacklevel=2)
     angles = _token(values, "(rest angles)", "physics:restBendAnglesDefault", "flat", "restShape")
     terms = []
     if stretch is not None and law == "newton":
@@ -126,7 +126,7 @@ def terms_of(values, mesh, law, where):
 
 
 def _token(values, field, name, *allowed):
-    """Returns the value of a name, or None.
+    """Returns the value of an attribute, or None.
 
     Raises:
         ValueError: It is none of those ``allowed``.

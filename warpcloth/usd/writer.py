@@ -76,7 +76,7 @@ class AnimationWriter(ChunkWriter):
                 "double", a vector or a number for the whole cloth. With several cloths, the first has those of the whole.
             cloths: Prims by part, if each part of the mesh has its own prim: names under /World, or with a source paths.
                 Primvars are then not allowed.
-            whole: Whether the output is replaced only once all frames are written, and an error leaves none of them.
+            whole: Whether an older output is replaced only once all frames are written, and an error leaves no frames.
 
         Raises:
             FileNotFoundError: The folder of the output or the source does not exist.
