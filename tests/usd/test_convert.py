@@ -101,6 +101,10 @@ def test_formats_are_those_of_others(stage, tmp_path):
     assert struct.unpack(">7f", data[8:36])[:5] == pytest.approx(np.arange(COUNT) / FPS) and data[:8] == b"\0\0\0\5\0\0\0\x0c"
     _, paths = convert(stage, tmp_path / "c_.ply")
     assert [path.name for path in paths[:2]] == ["c__0000.ply", "c__0001.ply"]
+    (tmp_path / "n").mkdir()
+    _, named = convert(stage, tmp_path / "n" / "c2.##.ply")
+    assert [path.name for path in named[:2]] == ["c2.00.ply", "c2.01.ply"]
+    assert np.array_equal(open_sequence(tmp_path / "n", fps=FPS).labels, np.arange(COUNT))
     assert paths[0].read_bytes().startswith(b"ply\nformat binary_little_endian")
 
 
@@ -201,6 +205,7 @@ def test_wrong_input_is_refused_in_a_sentence(stage, tmp_path, capfd):
         ("sheet.usdc a.abc", r"the ending is '\.abc'; it must be one of \.obj \.ply \.pc2 \.mdd"),
         ("sheet.usdc sheet.usdc", "is a file of the input"),
         ("sheet.usdc s.ply", r"s_0099\.ply: is a frame of another sequence; remove it"),
+        ("sheet.usdc s.##_2.ply", r"has # or a digit after ##; the last number of a name must be that of the frame"),
         ("sheet.usdc rest.pc2", r"rest\.obj: is another mesh, which the first frame would replace"),
         ("untimed.npz c.obj", r"c_0002\.obj: is no regular file"),
         *((f"sheet.usdc nowhere/a{end}", r": \S+: the folder \S+nowhere does not exist") for end in (".pc2", ".usda", ".obj")),

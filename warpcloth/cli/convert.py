@@ -6,7 +6,7 @@ from .terminal import Bar, check_writable
 EPILOG = """\
 FILE is a USD stage, a folder or pattern of .obj, .ply or .off files, or arrays in .npz, .npy, .pc2 or .mdd. It must have
 triangles, the same in all frames. The ending of OUTPUT sets the format:
-  .obj .ply                a file for each frame, such as cloth_0012.obj for cloth.obj
+  .obj .ply                a file for each frame, such as cloth_0012.obj for cloth.obj, cloth.0012.obj for cloth.####.obj
   .pc2 .mdd                points of all frames; the first frame is written beside them as .obj
   .npz                     points, triangles and times, and the velocities of a stage
   .usd .usda .usdc .usdz   a stage

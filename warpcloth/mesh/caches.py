@@ -153,19 +153,26 @@ def write_ply(file, points, mesh):
 def numbered_paths(path, labels):
     """Returns the path of each frame: its number, with four digits or more, is added to the name.
 
-    Frames are numbered from 0 if a label is negative or no whole number.
+    In a name such as cloth.####.obj it replaces the signs, with at least as many digits. Frames are numbered from 0 if a label
+    is negative or no whole number.
 
     Raises:
-        ValueError: A file of that kind with another number is there, which would be read as a frame of the sequence.
+        ValueError: The name has # or a digit after these signs, or a file of that kind with another number is there, which
+            would be read as a frame of the sequence.
     """
     path, numbers = Path(path), np.asarray(labels)
     if numbers.dtype.kind != "i" or numbers.min() < 0:
         numbers = np.arange(len(numbers))
-    width = max(_DIGITS, len(str(numbers.max())))
-    paths = [path.with_name(f"{path.stem}_{number:0{width}}{path.suffix}") for number in numbers.tolist()]
+    before, signs, after = re.fullmatch(r"([^#]*)(#*)(.*)", path.stem).groups()
+    if re.search(r"[#\d]", after):
+        raise ValueError(f"{path}: has # or a digit after {signs}; the last number of a name must be that of the frame")
+    if not signs:
+        before, after = f"{path.stem}_", ""
+    width = max(len(signs) or _DIGITS, len(str(numbers.max())))
+    paths = [path.with_name(f"{before}{number:0{width}}{after}{path.suffix}") for number in numbers.tolist()]
     kept = {each.name for each in paths}
     if path.parent.is_dir():
-        pattern = re.compile(rf"{re.escape(path.stem)}_\d+{re.escape(path.suffix)}")
+        pattern = re.compile(rf"{re.escape(before)}\d+{re.escape(after + path.suffix)}")
         for other in sorted(os.listdir(path.parent)):
             if pattern.fullmatch(other) and other not in kept:
                 raise ValueError(f"{path.parent / other}: is a frame of another sequence; remove it, or give another name")
