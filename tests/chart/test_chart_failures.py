@@ -361,7 +361,7 @@ def test_lines_of_crossing():
 
 @pytest.mark.slow
 def test_sheets_cross_without_the_filter_where_theory_says(device):
-    """Explicit steps of 1 ms by the energy, from 0.443 m/s; others of 20 ms from 1.29 m/s, depending on the phase."""
+    """Sheets cross with explicit steps of 1 ms from 0.443 m/s on, and with others of 20 ms from 1.29 m/s on in some phases."""
 
     def crossed(solver, step, speeds):
         return [p["value"] for p in crossing.measure(solver, "without", [step], speeds, device)]
@@ -383,7 +383,7 @@ def crossings(device):
 
 @pytest.mark.slow
 def test_no_solver_lets_sheets_cross(crossings):
-    """At 1 to 100 m/s, of steps to 1/24 s; without the filter they cross with each that is shown.
+    """At 1 to 100 m/s, with steps of up to 1/24 s. Without the filter, sheets cross with each solver that is shown.
 
     At 21.5 m/s, a step of `Newton` would end with each sheet beyond the other if they could pass beside each other.
     """

@@ -138,7 +138,7 @@ def test_wrong_use_is_refused(change, message):
 
 
 def test_a_wrong_unit_is_said():
-    """Of a capture that is too large few points are near, and one that is too small faces one spot of the template."""
+    """If a capture is too large, few of its points are near the template; if it is too small, it faces one spot of it."""
     large, small = (wc.as_capture([wc.Mesh(scale * TEMPLATE.points, TEMPLATE.triangles)], dt=1.0) for scale in (1e3, 1e-3))
     with pytest.warns(UserWarning, match=r"^capture: 0.\d+ % of its area is within 0.141 m of the template"):
         wc.resample(large, TEMPLATE, iterations=1)

@@ -114,7 +114,7 @@ def test_solvers_of_others_are_searched_for_their_own_cheapest():
 
 
 def test_the_longest_time():
-    """Of another simulator, two times of its own reference and one of its search, each of six limits, and a last run."""
+    """For a solver of another simulator: twelve limits for its own reference, six for its search, and one for its last run."""
     assert Longest(10.0, 3, 2).seconds == 50.0 + 30.0 + 2 * 190.0
 
 

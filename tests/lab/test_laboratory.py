@@ -114,7 +114,7 @@ def test_depths_of_loops(kind, gamma, depth):
 
 @pytest.mark.parametrize(("height", "folds"), [(0.0, 0), (1e-3, 5)])
 def test_folds_of_an_outline(height, folds):
-    """The rounding of a flat outline has none."""
+    """Rounding errors of a flat outline are no folds."""
     declared = scene("cusick", rows=4)
     x, _, z = declared.mesh.points.T
     points = declared.mesh.points * (1.0 + height * np.cos(5.0 * np.arctan2(z, x)))[:, None]

@@ -537,11 +537,11 @@ def test_a_motion_converges_by_two_successive_doublings(moves, substeps, error, 
     found = own_reference(CHAIN, [Setup("newton-vbd", {"substeps": 2, "iterations": 2})], 2, tolerance=1e-4)
     facts = own_facts(found, found, mesh, 1e-3)
     assert (found.substeps, found.error) == (substeps, pytest.approx(error)) and facts["converged"] == (error <= 1e-3)
-    assert ("two doublings up to" if facts["converged"] else "no two doublings") in words_of_own(facts)
+    assert ("two doublings up to" if facts["converged"] else "no doubling moved it less") in words_of_own(facts)
 
 
 def test_own_motions_end_at_the_total_time(tmp_path, monkeypatch):
-    """The time comes amid the second run of two solvers: neither has a motion, and nothing is stored as if it were known."""
+    """The time is used up in the second run of the first of two solvers: neither has a motion, and nothing is stored."""
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
     ran = []
 
@@ -558,4 +558,4 @@ def test_own_motions_end_at_the_total_time(tmp_path, monkeypatch):
     found = own_references(CHAIN, setups, 2, "cpu", 1e-4, 10.0, until=1.0)
     assert found == {"newton-vbd": CUT, "newton-xpbd": CUT} and ran == [2] and not list(tmp_path.rglob("*.npz"))
     facts = own_facts(CUT, None, None, 1e-3)
-    assert words_of_own(facts) == "not known, for the total time was used up" and of_own(CUT, 1e-3) == {}
+    assert words_of_own(facts) == "not known: the total time was used up" and of_own(CUT, 1e-3) == {}

@@ -301,7 +301,7 @@ def test_a_browser_shows_the_motion_and_fetches_nothing(stage, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium, in which a page is opened")
 def test_of_many_pages_in_one_those_in_view_are_drawn(stage, tmp_path):
-    """A browser keeps few contexts of WebGL, here 3: of 5 frames of a notebook those in view have one, and get it again."""
+    """A browser keeps few contexts of WebGL, here 3. Of 5 frames of a notebook, those in view have one, also a second time."""
     count, each = 5, "Array.from(frames, (_, k) => frames[k])"
     wc.view(stage, tmp_path / "fall.html", colours=())
     frame = f'<iframe srcdoc="{html.escape((tmp_path / "fall.html").read_text())}" width="400" height="300"></iframe><br>'

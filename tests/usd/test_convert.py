@@ -64,7 +64,7 @@ def test_what_is_read_back_is_the_same(name, stage, tmp_path):
 @pytest.mark.parametrize("name", ["a.pc2", "a.mdd", "a.npz", "a.usda", "a.usdz", "a.obj", "a.ply"])
 @pytest.mark.parametrize("older", [True, False])
 def test_an_error_or_interrupt_leaves_older_files_whole(name, older, stage, tmp_path):
-    """And no part of new ones, in the middle or after the last frame."""
+    """Nothing is left of new files either, in the middle or after the last frame."""
     out, frames = tmp_path / "out", 12
     out.mkdir()
     original = open_sequence(stage)

@@ -202,11 +202,11 @@ def of_own(own, bound):
 def words_of_own(facts):
     """Returns in words whether the motion of :func:`own_facts` has converged, and how far it is from the reference."""
     if facts is None:
-        return "not known, for two runs did not end well within the time limit"
+        return "not known: fewer than two runs completed in the time limit"
     if facts.get("cut"):
-        return "not known, for the total time was used up"
+        return "not known: the total time was used up"
     said = "converged" if facts["converged"] else "not converged"
-    moved = "no two doublings in turn moved it less and less, or twice the iterations took too long"
+    moved = "no doubling moved it less than the one before, or twice the iterations took too long"
     if facts["error"] is not None:
         moved = f"two doublings up to {facts['substeps']} steps a frame moved it by {100.0 * facts['error']:.2g} % at most"
     return f"{said}: {moved} (bound {100.0 * facts['bound']:.2g} %); {100.0 * facts['apart']:.2g} % from the reference"
