@@ -77,6 +77,7 @@ SOLVERS = {
         r"\begin{pmatrix} \tilde M & -J^T \\ J & \tilde\alpha \end{pmatrix} \begin{pmatrix} \Delta x \\ \Delta\lambda "
         r"\end{pmatrix} = -\begin{pmatrix} M(x - \tilde x) - J^T\lambda \\ C(x) + \tilde\alpha\lambda \end{pmatrix}, \qquad "
         r"\tilde\alpha = 1/(k A h^2)",
-        "Here C has the constraints, J their derivatives and λ their multipliers",
+        "Here C has the constraints, J their derivatives and λ their multipliers. M̃ is M, plus the positive part of −λ∂²C with "
+        '`stabilisation="geometric-stiffness"`',
     ),
 }
