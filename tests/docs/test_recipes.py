@@ -10,7 +10,7 @@ from scipy.sparse.linalg import splu
 import warpcloth as wc
 from support.continuum import TILT, flat, turn
 from warpcloth.core.constant_matrix import constant_matrices
-from warpcloth.deformation.arap import _half_cotangents
+from warpcloth.deformation.arap import half_cotangents
 from warpcloth.scenes import hanging
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")
@@ -23,7 +23,7 @@ def absolute_cotangents():
     values, n, errors = mesh.points[:, 0] + mesh.points[:, 1], len(mesh.points), []
     free = np.setdiff1d(np.arange(n), mesh.boundary)
     opposite = mesh.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
-    for weights in (np.abs(_half_cotangents(mesh)), _half_cotangents(mesh)):
+    for weights in (np.abs(half_cotangents(mesh)), half_cotangents(mesh)):
         W = coo_array((weights.ravel(), tuple(opposite.T)), shape=(n, n)).tocsr()
         W = W + W.T
         laplacian = (diags_array(W.sum(axis=1)) - W).tocsr()

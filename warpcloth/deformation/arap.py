@@ -290,7 +290,7 @@ class Arap:
         rest, rank, n = self._rest, self._rank, len(self._order)
         vec3, _ = types(self._scalar)
         if rims:
-            triangles, cotangents = mesh.triangles, _half_cotangents(mesh)
+            triangles, cotangents = mesh.triangles, half_cotangents(mesh)
             e0, e1, e2 = (rest[triangles[:, (k + 2) % 3]] - rest[triangles[:, (k + 1) % 3]] for k in range(3))
             c0, c1, c2 = cotangents.T[..., None]
             moments = np.stack([c1 * e1 - c2 * e2, c2 * e2 - c0 * e0, c0 * e0 - c1 * e1], axis=1)
@@ -356,7 +356,7 @@ def _points(name, value, count, label):
     return found
 
 
-def _half_cotangents(mesh):
+def half_cotangents(mesh):
     """Returns ½ cot of the angle at each corner of each triangle (T, 3), signed."""
     corners = mesh.points[mesh.triangles]
     one, other = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
@@ -386,7 +386,7 @@ def edge_weights(mesh, weights):
         matrix = igl.intrinsic_delaunay_cotmatrix(np.array(mesh.points), triangles)[0]
     else:
         opposite = mesh.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
-        matrix = coo_matrix((_half_cotangents(mesh).ravel(), np.sort(opposite, axis=1).T), shape=(n, n))
+        matrix = coo_matrix((half_cotangents(mesh).ravel(), np.sort(opposite, axis=1).T), shape=(n, n))
     upper = triu(matrix.tocsr(), 1).tocoo()
     values = np.maximum(upper.data, 0.0) if weights == "clamped" else upper.data
     return np.stack([upper.row, upper.col], axis=1), values

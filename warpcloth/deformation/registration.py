@@ -15,10 +15,11 @@ from ..mesh.distances import Boundary, nearest_on_surface
 from ..mesh.mesh import Mesh, Surface, areas_of
 from ..scene.scene import Pins, checked_pins
 from ..usd import AnimationWriter
-from .arap import edge_weights
+from .arap import edge_weights, half_cotangents
 
 _TURNED = np.cos(np.radians(60.0))  # cosine of the largest angle between the normals of a point and of the template
 _FEW = 0.01  # `resample` warns if a smaller share of the capture counts, or of the template faces it
+_BENDING = 0.1  # weight of the energy of cells, which resists bending too, relative to that of triangles, which resists strain
 _REGULAR = 1e-12  # added to the diagonal, relative to its largest entry, so that the matrix has an inverse
 _CORNERS = np.arange(3)
 
@@ -86,11 +87,13 @@ def resample(
     """Moves a template onto each frame of a capture, so that the result has one topology, as :func:`warpcloth.analyze` needs.
 
     Minimises α·E(x, R) + Σ aₚ dₚ²/Σ aₚ over the vertices p of the capture (non-rigid iterative closest points, after Amberg,
-    Romdhani & Vetter 2007). E is the energy of :class:`warpcloth.Arap` with clamped weights, and aₚ a third of the area of the
-    triangles at p. dₚ is the distance of p from the tangent plane of the nearest point of the template; where that lies on the
-    boundary, from the point itself, which keeps the outline where it was seen. Points count within a distance, and, if they are
-    not beyond the outline, if the planes there enclose less than 60°. An iteration finds nearest points and rotations, and
-    solves a sparse system for all x. Each frame starts from the last one, moved on by as much as that had moved.
+    Romdhani & Vetter 2007), where aₚ is a third of the area of the triangles at p. E is 2 Σ area ‖∇x − R‖² over the triangles,
+    with a rotation for each, so that only strain has energy (Liu, Zhang, Xu, Gotsman & Gortler 2008), plus 0.1 times that of
+    :class:`warpcloth.Arap` with clamped weights, which resists bending too. dₚ is the distance of p from the tangent plane of
+    the nearest point of the template; where that lies on the boundary, from the point itself, which keeps the outline where
+    it was seen. Points count within a distance, and, if they are not beyond the outline, if the planes there enclose less
+    than 60°. An iteration finds nearest points and rotations, and solves a sparse system for all x. Each frame starts from
+    the last one, moved on by as much as that had moved.
 
     Args:
         capture: The :class:`warpcloth.Capture`, with times.
@@ -98,7 +101,7 @@ def resample(
         positions: Its positions near those of the first frame (n, 3) [m]; by default the rest shape.
         pins: Vertices whose positions are known: :class:`warpcloth.Pins`, which stay at ``positions``, or follow keyframes, one
             for each label from the first on.
-        stiffness: α [1]. With less, the result follows noise and slides; with more, it cuts across folds.
+        stiffness: α [1]. With less, the result follows noise and slides; with more, it cuts across folds and has less strain.
         within: Largest distance of points that count [m]; by default 10 % of the diagonal of the template.
         iterations: Largest number of iterations of a frame.
         tolerance: Iterations end when one moves no vertex by more than this share of the diagonal.
@@ -209,21 +212,28 @@ class Registration:
         self._mesh, self._within, self._device = mesh, within, device
         self._triangles, n = mesh.triangles.astype(np.int64), len(mesh.points)
         pairs, w = edge_weights(mesh, "clamped")
-        i, j = pairs.T
-        self._ends, self._weights = (np.r_[i, j], np.r_[j, i]), stiffness * np.r_[w, w]
+        sides = np.stack([np.roll(self._triangles, -1, axis=1), np.roll(self._triangles, -2, axis=1)], axis=2).reshape(-1, 2)
+        # Rotations are those of cells, numbered by their vertices, and then of triangles.
+        cells, of_triangle = np.r_[pairs[:, 0], pairs[:, 1]], n + np.repeat(np.arange(len(self._triangles)), 3)
+        cell_weights, triangle_weights = stiffness * _BENDING * w, 2.0 * stiffness * half_cotangents(mesh).ravel()
+        # An edge is in the cells of both its ends.
+        self._ends = np.concatenate([pairs, pairs, sides]).T
+        self._numbers = np.concatenate([cells, of_triangle])
+        self._weights = np.concatenate([cell_weights, cell_weights, triangle_weights])
         self._rest = mesh.points[self._ends[0]] - mesh.points[self._ends[1]]
         free = np.setdiff1d(np.arange(n), held)
         self._free = (3 * free[:, None] + _CORNERS).ravel()
-        # E is 2 Σ w ‖·‖² over edges if each is in two cells, so that its gradient over 4 is L x − b.
+        # α E is Σ w ‖·‖² over the entries, so that half of its gradient is L x − b.
+        (i, j), w = self._ends, self._weights
         rows, columns = np.r_[i, j, i, j], np.r_[i, j, j, i]
-        values = 2.0 * stiffness * np.r_[w, w, -w, -w]
+        values = np.r_[w, w, -w, -w]
         corners = (3 * self._triangles[:, :, None] + _CORNERS).reshape(-1, 9)
         self._corners = corners
         self._pattern = (
             np.concatenate([(3 * rows[:, None] + _CORNERS).ravel(), np.repeat(corners, 9, axis=1).ravel()]),
             np.concatenate([(3 * columns[:, None] + _CORNERS).ravel(), np.tile(corners, (1, 9)).ravel()]),
         )
-        self._arap = np.repeat(values, 3)
+        self._rigid = np.repeat(values, 3)
 
     def solve(self, surface: Surface, start: np.ndarray, iterations: int, tolerance: float) -> tuple:
         """Moves the template from ``start`` (n, 3) [m] onto a surface.
@@ -276,28 +286,31 @@ class Registration:
         _, faces, weights, projection, counts = self._pairs(x, points, normals)
         areas = areas * counts
         i, j = self._ends
-        rotations = self._rotations(x)
-        turned = self._weights[:, None] * np.einsum("kab,kb->ka", rotations[i] + rotations[j], self._rest)
-        right = np.stack([np.bincount(i, column, len(x)) for column in turned.T], axis=1).ravel()
+        # The residual is a sum of differences, whose rounding is that of the differences, not of positions.
+        turned = np.einsum("kab,kb->ka", self._rotations(x)[self._numbers], self._rest)
+        forces = self._weights[:, None] * (turned - (x[i] - x[j]))
+        sums = [np.bincount(i, column, len(x)) - np.bincount(j, column, len(x)) for column in forces.T]
+        residual = np.stack(sums, axis=1).ravel()
         blocks = np.einsum("k,kc,kij,kd->kcidj", areas, weights, projection, weights).reshape(-1, 81)
         order = np.argsort(faces, kind="stable")
         firsts = np.flatnonzero(np.diff(faces[order], prepend=-1))
         of_triangles = np.zeros((len(self._triangles), 81))
         of_triangles[faces[order][firsts]] = np.add.reduceat(blocks[order], firsts, axis=0)
-        pulls = np.einsum("k,kc,kij,kj->kci", areas, weights, projection, points).reshape(-1, 9)
-        right += np.bincount(self._corners[faces].ravel(), pulls.ravel(), len(right))
-        entries = np.concatenate([self._arap, of_triangles.ravel()])
-        matrix = coo_matrix((entries, self._pattern), shape=(x.size, x.size)).tocsc()[self._free]
-        residual, matrix = right[self._free] - matrix @ x.ravel(), matrix[:, self._free]
+        apart = points - np.einsum("kc,kci->ki", weights, x[self._triangles[faces]])
+        pulls = np.einsum("k,kc,kij,kj->kci", areas, weights, projection, apart).reshape(-1, 9)
+        residual += np.bincount(self._corners[faces].ravel(), pulls.ravel(), len(residual))
+        entries = np.concatenate([self._rigid, of_triangles.ravel()])
+        matrix = coo_matrix((entries, self._pattern), shape=(x.size, x.size)).tocsc()[self._free][:, self._free]
         matrix = matrix + _REGULAR * matrix.diagonal().max(initial=0.0) * identity(len(self._free), format="csc")
         options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
-        return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options).solve(residual)
+        return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options).solve(residual[self._free])
 
     def _rotations(self, x):
-        """Returns the rotations of the cells (n, 3, 3) that minimise E for x."""
+        """Returns the rotations of cells and triangles (n + T, 3, 3) that minimise E for x."""
         i, j = self._ends
         moments = self._weights[:, None, None] * np.einsum("ka,kb->kab", x[i] - x[j], self._rest)
-        sums = [np.bincount(i, column, len(x)) for column in moments.reshape(-1, 9).T]
+        count = len(x) + len(self._triangles)
+        sums = [np.bincount(self._numbers, column, count) for column in moments.reshape(-1, 9).T]
         left, _, right = np.linalg.svd(np.stack(sums, axis=1).reshape(-1, 3, 3))
         left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
         return left @ right
