@@ -477,13 +477,17 @@ def test_the_first_frame_of_a_run_is_not_timed():
     assert trajectory._times([[0.2]], 50.0)["ms"] == 200.0, "unless there is no other"
 
 
-def test_the_time_of_a_motion_counts_frames_in_contact_but_no_interruption():
-    """20 frames of 1 ms, of which one is interrupted for 1 s, and 10 of 7 ms; every other frame takes 10 % more."""
+def test_the_time_of_a_motion_counts_all_frames_and_hardly_an_interruption():
+    """20 frames of 1 ms and 10 of 7 ms; one of 1 s, first, amid or last; work in every fourth frame; scatter of 10 %."""
     times = np.repeat([1.0, 7.0], [20, 10])
     assert mean_time(times) == pytest.approx(3.0) and time_spread(times) == (1.0, 1.0)
-    times[5] = 1e3
-    assert mean_time(times) == pytest.approx(3.0)
-    assert time_spread(1.0 + 0.1 * (np.arange(31) % 2)) == pytest.approx((1.0, 1.1**2))
+    for frame, counts in ((0, 10.0), (1, 10.0), (5, 10.0), (28, 70.0), (29, 70.0)):
+        interrupted = times.copy()
+        interrupted[frame] = 1e3
+        assert mean_time(interrupted) == pytest.approx(3.0 + (counts - times[frame]) / 30.0)
+    assert mean_time([1.0, 1.0, 1.0, 9.0] * 5) == pytest.approx(3.0)
+    assert mean_time([2.0]) == 2.0 and time_spread([2.0, 5.0]) == time_spread([0.0, 0.0, 0.0]) == (1.0, 1.0)
+    assert time_spread(1.0 + 0.1 * (np.arange(31) % 2)) == pytest.approx((1.1**-2, 1.0))
 
 
 def test_a_second_run_may_be_left_out():

@@ -405,7 +405,7 @@ def test_time_diagram(device, tmp_path, drawn):
     assert all(f"{i}  {found['rows'][place]['label']}" in text for i, place in enumerate(numbered, 1))
     assert name + ": diverged" in text
     shown = {label for _, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    assert shown == {"error of the reference", "nothing is better in both", "quartiles of the times"}
+    assert shown == {"error of the reference", "nothing is better in both", "scatter of the times"}
     assert drawn[0].texts[-1].get_text() == machine.in_words(found["machine"])
     good = [row for row in found["rows"] if row["status"] == "ok"]
     for panel, name in ((axes, "error"), (strains, "strain_error")):

@@ -17,7 +17,7 @@ _ERRORS = {
 
 
 def plot_time(path, found):
-    """Draws the error of each setting over its time, with the quartiles of the time, and names each line at its end.
+    """Draws the error of each setting over its time, with the scatter of the times, and names each line at its end.
 
     Two panels show the error of positions and the 99th percentile of the error of strains. In each panel the settings that no
     other beats by more than the spread of times are joined and numbered, with their names beside the panel. Settings without an
@@ -68,7 +68,7 @@ def plot_time(path, found):
         for i in curves[name]:
             point, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": LABEL}
             axes.annotate(str(best.index(i) + 1), point, (-4, -4), textcoords="offset points", **below)
-        axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="quartiles of the times")
+        axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="scatter of the times")
         if found.get("others"):
             label = "from the solver's own converged motion"
             axes.plot([], [], ".", color=GREY, markersize=5, linestyle=":", linewidth=0.7, label=label)

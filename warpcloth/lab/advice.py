@@ -8,6 +8,7 @@ from ..base.checks import number, whole
 from ..mesh.distances import surface_distances
 from ..run.simulate import simulate
 from ..terms.woven import Woven
+from .clock import mean_time
 
 # Kinds of trials that leave something out.
 _LEFT_OUT = ("term", "collider", "friction", "air", "anisotropy", "all")
@@ -49,7 +50,7 @@ class Advice:
         trials: List of :class:`Trial`.
         frames: Number of frames of each run.
         declared: Number of frames of the scene.
-        milliseconds: Median time of a frame of the unchanged scene, in its first and its last run [ms].
+        milliseconds: Mean time of a frame of the unchanged scene without the first frame, in its first and its last run [ms].
         tolerance: Tolerance below which a change does not matter.
     """
 
@@ -137,7 +138,8 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
 
     def run(changed, solver=solver, dtype=dtype):
         found = simulate(changed, solver, device=device, dtype=dtype, frames=frames)
-        return found, 1e3 * float(np.median(found.timings["frames"]))
+        times = found.timings["frames"]
+        return found, 1e3 * mean_time(times[1:] if len(times) > 1 else times)
 
     base, first = run(scene)
     if not base.status.ok:

@@ -39,7 +39,7 @@ class Measured:
         setup: The :class:`warpcloth.lab.measurements.Setup`.
         error: Error of the trajectory, relative to the size of the cloth, or None.
         milliseconds: Time of a frame, as :func:`warpcloth.lab.trajectory.measure` gives it [ms], or None.
-        spread: Quartiles of the time of a frame [ms], (low, high), or None.
+        spread: By how much frames differ from their neighbours, as quartiles [ms], (low, high), or None.
         reason: Why there is no error, or "".
         machine: The machine that measured it, in a few words.
         final: Whether finer steps would fail too: it took too long, or its method is refused.

@@ -7,6 +7,10 @@ import numpy as np
 # What a time limit counts: the time on the wall, or that of all threads of this process, which other processes do not prolong.
 CLOCKS = {"wall": time.perf_counter, "process": time.process_time}
 
+# A frame counts for at most so many times the time of the longer of its neighbours. Newton's method may take 5 times as long in
+# a frame as before and after it.
+MOST = 10.0
+
 
 class TooSlow(Exception):
     """Raised when the time limit is exceeded."""
@@ -36,25 +40,25 @@ class Clock:
 
 
 def mean_time(times):
-    """Returns the mean of the times of successive frames (F,), where each is the median of its own and its neighbours' times.
+    """Returns the mean of the times of successive frames (F,), which times their number is the time of the motion.
 
-    The mean times the number of frames is the time of the motion, also if some frames are more work, as in contact. A median of
-    all frames would not show that. An interruption of a single frame does not count.
+    A frame counts for at most ``MOST`` times as long as the longer of its neighbours, so that an interruption counts little.
     """
-    if len(times) < 2:
-        return float(np.mean(times))
-    near = np.lib.stride_tricks.sliding_window_view(np.pad(times, 1, mode="reflect"), 3)
-    return float(np.median(near, axis=1).mean())
+    times = np.asarray(times, dtype=np.float64)
+    if len(times) > 1:
+        near = np.pad(times, 1, mode="reflect")
+        times = np.minimum(times, MOST * np.maximum(near[:-2], near[2:]))
+    return float(times.mean())
 
 
 def time_spread(times):
     """Returns by how much the times of successive frames (F,) differ from those of their neighbours, (low, high).
 
-    The time of each frame is divided by the mean of its neighbours' times. These are the quartiles of the quotients, divided by
-    their median.
+    The time of each frame but the first and the last is divided by the mean of its neighbours' times. These are the quartiles
+    of the quotients, divided by their median; (1, 1) for less than three frames.
     """
-    if len(times) < 2:
+    if len(times) < 3 or not np.min(times) > 0.0:
         return 1.0, 1.0
-    near = np.pad(times, 1, mode="reflect")
-    low, middle, high = np.percentile(np.asarray(times) / (near[:-2] + near[2:]), [25, 50, 75]).tolist()
+    times = np.asarray(times, dtype=np.float64)
+    low, middle, high = np.percentile(times[1:-1] / (times[:-2] + times[2:]), [25, 50, 75]).tolist()
     return low / middle, high / middle
