@@ -351,10 +351,10 @@ def test_few_iterations_mistake_friction(device):
 
 
 def test_lines_of_crossing():
-    """The energy of explicit steps stops √2 times the speed that it stops at a wall, and half of v on each side is 49 m/s."""
+    """The energy of explicit steps stops √2 times the speed that it stops at a wall; the largest force of a pair stops 98 m/s in 1 ms."""
     by_key = {panel.key: panel.laws for panel in crossing.PANELS}
     assert by_key["explicit, without"]["½ρv² = kr²"](1e-3) == pytest.approx(0.44294, rel=1e-4)
-    assert by_key["newton, filter"]["v = kr²h/(2ρδ)"](1e-3) == pytest.approx(49.05, rel=1e-4)
+    assert by_key["newton, filter"]["v = kr²h/(ρδ)"](1e-3) == pytest.approx(98.1, rel=1e-4)
     assert by_key["pbd, filter"]["v h = r + skin"](1e-2) == pytest.approx(100.0 * (1e-3 + 0.35 * 0.05 * 2.0**0.5))
     assert len(by_key["pbd, filter"]) == 1 and len(by_key) == 12
 
@@ -370,6 +370,8 @@ def test_sheets_cross_without_the_filter_where_theory_says(device):
     for solver in ("newton", "xpbd"):
         slow, slower, some = crossed(solver, 0.02, [0.05, 1.2, 4.0])
         assert slow == slower == 0.0 and some >= 25.0
+    holds, fails = crossed("newton", 2.5e-4, [23.0, 37.0])  # kr²h/(ρδ) is 24.5 m/s
+    assert holds == 0.0 and fails >= 25.0
 
 
 @pytest.fixture(scope="module")
