@@ -1,5 +1,6 @@
 """Newton's method with a line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d, shared by motion and equilibrium."""
 
+from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
@@ -203,12 +204,18 @@ class Minimiser:
         """Launches the start from d = 0, or from the last d."""
         if self.warm:
             wp.copy(self.right, self.correction)
-        self.clear()
+        # At a start in touch, ψ would make the largest acceleration, the scale without gravity, a hundred times as large.
+        steep = self.pairs is not None and self.pairs.forces.least > 0.0 and not self.gravity.all()
+        with self.pairs.forces.without_psi() if steep else nullcontext():
+            self.clear()
         self._progress.proceed.zero_()
         given = [self.search.acceleration, self.search.energy, self._limits]
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
         if self.warm:
             self.search.launch_guess(self.right, self.active)
+        if steep:
+            self.search.launch_again()
+        if self.warm or steep:
             self._progress.proceed.zero_()
             self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
