@@ -97,7 +97,7 @@ def find_forces(dtype, bounded: bool):
 
     With ``apart`` no pair passes through, so that d is never negative: where cloth slides over an edge, y may turn far from its
     normal at the start of the step. If ``least`` [m], the least gap of the filter, is above 0, ψ is added to φ.
-    Where r is below 2f, as far from the origin, ψ is left out.
+    It begins at d = 2f, where it is C². Where r is below 2f, as far from the origin, ψ is left out.
     """
     vec3, _ = types(dtype)
     gap_of, least_gap_of = gap_in_step(dtype), least_gap(dtype)
@@ -140,7 +140,7 @@ def find_forces(dtype, bounded: bool):
                 forces.energy[e] = k * potential(gap, r)
                 forces.slope[e] = k * slope(gap, r)
                 forces.acting[e] = k * bend(gap, r)
-                if least > ZERO and gap < SIDE * r:
+                if least > ZERO:
                     f = least_gap_of(pairs.stencils[e], x, least)
                     below = wp.float64(2.0) - gap / f
                     if below > ZERO and wp.float64(2.0) * f <= r:

@@ -118,7 +118,10 @@ def crossed(points, triangles):
     [(False, 4e-3, 0.0), (False, 1.2e-3, 0.0), (True, 4e-3, 0.0), (True, 1.2e-3, 0.0), (False, 1.2e-3, 1e-3)],
 )
 def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
-    """By central differences with an error of O(η²) = 1e-10 of the third derivative, and ΣF = 0, Σ x × F = 0 to rounding."""
+    """By central differences with an error of O(η²) = 1e-10 of the third derivative, and ΣF = 0, Σ x × F = 0 to rounding.
+
+    Along p, the force kAφ′ of a pair grows by kAφ″ Σ wᵢn·pᵢ.
+    """
     scene = layers(turn=17.0, gap=gap)
     pairs, model = steps_of(scene, device, bounded)
     pairs.forces.least = least
@@ -138,10 +141,20 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
         pairs.forces.add_gradient(out)
         return out.numpy()
 
+    def of_pairs(x, *names):
+        pairs.forces.launch_forces(model.array(x, model.vec3))
+        return [getattr(pairs.forces.found, name).numpy()[acting] for name in names]
+
     force, size, eta = gradient(x), np.abs(gradient(x)).sum(), 1e-7
     assert size > 1.0
+    acting = pairs.forces.pairs.acting.numpy()[: pairs.forces.pairs.number.numpy()[0]]
+    stencils = pairs.forces.pairs.stencils.numpy()[acting]
     for _ in range(3):
         direction = rng.normal(size=x.shape)
+        bend, n, w = of_pairs(x, "acting", "normal", "weights")
+        after, before = (of_pairs(x + sign * eta * direction, "slope")[0] for sign in (1.0, -1.0))
+        growth = np.where(bend > 0.0, bend * np.einsum("ei,ej,eij->e", w, n, direction[stencils]), 0.0)
+        assert (after - before) / (2.0 * eta) == pytest.approx(growth, abs=1e-4 * bend.max())
         slope = (energy(x + eta * direction) - energy(x - eta * direction)) / (2.0 * eta)
         assert slope == pytest.approx((force * direction).sum(), abs=1e-5 * size)
     assert np.abs(force.sum(axis=0)).max() < 1e-13 * size
@@ -240,6 +253,19 @@ def test_a_stack_rests(dtype, mesh, device):
     assert np.ptp(high, axis=1).max() < tolerance * r
     assert rest.energies["self-contact"] > 0.0
     assert rest.collider_forces["floor"][1] == pytest.approx(-9.81 * stack.vertex_masses.sum(), rel=tolerance)
+
+
+@pytest.mark.host
+def test_a_sheet_rests_far_from_the_origin(device):
+    """At 50 m ψ begins at 2f = 0.72 r, f being 6 units in the last place of float32: φ and ψ bear the weight above r/2."""
+    r, k = 1e-4, 2e4
+    two = layers(n=4, gap=0.9 * r, distance=r, stiffness=k, gravity=(0.0, -9.81, 0.0), pins=np.arange(16))
+    two = replace(two, positions=two.positions + np.array([0.0, 50.0, 0.0]), free_axes=np.tile([False, True, False], (32, 1)))
+    rest = wc.equilibrium(two, device=device, dtype="float64")
+    assert rest.status.ok and rest.stable, rest.status
+    d, f = rest.points[16:, 1] - rest.points[:16, 1], 6.0 * 2.0**-23 * two.positions.max()
+    assert 0.5 * r < d.min() and d.max() < 2.0 * f
+    assert k * (r - d + 100.0 * (0.5 * r) ** 2 * (2.0 - d / f) ** 2 / f) == pytest.approx(np.full(16, 0.15 * 9.81), rel=1e-6)
 
 
 @pytest.mark.host
