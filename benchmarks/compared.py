@@ -12,20 +12,25 @@ in WARPCLOTH_CACHE and reused, so that the same command goes on after an interru
 
 import argparse
 import json
+import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import warp as wp
 
+from warpcloth.base.checks import choice, number, whole
+from warpcloth.base.texts import assignments
 from warpcloth.chart.pareto import plot_time
 from warpcloth.lab.choosing import percent
 from warpcloth.lab.measurements import SceneRef
 from warpcloth.lab.own_reference import words_of_own
+from warpcloth.lab.reference import NoReference
 from warpcloth.lab.setups import grid_in_words
 from warpcloth.lab.side_by_side import nearest_setting, side_by_side
 from warpcloth.lab.work_precision import WITHIN
 from warpcloth.others.simulators import SIMULATORS, shown_name
+from warpcloth.solvers import SOLVERS
 
 # Scenes by name, with parameters and frames.
 SCENES = {
@@ -46,7 +51,7 @@ def main():
     parser.add_argument("--frames", type=int, help="frames (default: those of each scene here)")
     parser.add_argument("--tolerance", type=float, default=WITHIN, help="error of settings that are compared (default: 0.01)")
     parser.add_argument("--limit", type=float, default=20.0, help="time limit of each run [s] (default: 20)")
-    parser.add_argument("--total", type=float, default=float("inf"), help="time limit of each scene [s] (default: none)")
+    parser.add_argument("--total", type=float, default=math.inf, help="time limit of each scene [s] (default: none)")
     parser.add_argument("--out", type=Path, default=Path("compared"), help="folder of results (default: compared)")
     parser.add_argument("--stored", type=Path, nargs="+", metavar="JSON", help="only print and draw stored results")
     options = parser.parse_args()
@@ -54,13 +59,14 @@ def main():
         for path in options.stored:
             show(path, json.loads(path.read_text(encoding="utf-8")))
         return
-    options.out.mkdir(parents=True, exist_ok=True)
     wp.config.quiet = True
-    given = dict(assignment.split("=", 1) for assignment in options.p)
-    for name in options.scene:
-        (scene, parameters), frames = SCENES[name]
+    try:
+        scenes = checked_scenes(options)
+    except ValueError as error:
+        parser.exit(2, f"{parser.prog}: {error}\n")
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name, (scene, frames) in scenes.items():
         began = time.perf_counter()
-        scene, frames = SceneRef(scene, parameters | given), options.frames or frames
         with ThreadPoolExecutor(1) as executor:  # one process for all, so that kernels are compiled once
             try:
                 found = side_by_side(
@@ -74,12 +80,36 @@ def main():
                     total=options.total,
                     executor=executor,
                 )
-            except ValueError as error:  # such as that there is no reference
+            except NoReference as error:
                 found = {"scene": str(scene), "frames": frames, "device": options.device, "failed": str(error)}
         path = options.out / f"{name}.json"
         path.write_text(json.dumps(found, indent=1, default=float), encoding="utf-8")
+        path.with_suffix(".png").unlink(missing_ok=True)  # of an older result
         show(path, found)
         print(f"  {time.perf_counter() - began:.0f} s, {path}", flush=True)
+
+
+def checked_scenes(options):
+    """Returns, by name, the scenes to run and their frames, once all options are checked.
+
+    Raises:
+        ValueError: An option is not allowed.
+    """
+    for solver in options.solvers or ():
+        choice("solvers", solver, SOLVERS)
+    number("tolerance", options.tolerance, above=0.0)
+    number("limit", options.limit, above=0.0)
+    if options.total != math.inf:
+        number("total", options.total, above=0.0)
+    if options.frames is not None:
+        whole("frames", options.frames, 1)
+    wp.get_device(options.device)
+    given, scenes = assignments(options.p), {}
+    for name in options.scene:
+        (scene, parameters), frames = SCENES[name]
+        scenes[name] = SceneRef(scene, parameters | given), frames if options.frames is None else options.frames
+        scenes[name][0].load()
+    return scenes
 
 
 def show(path, found):

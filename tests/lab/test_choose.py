@@ -223,12 +223,48 @@ def test_nothing_is_measured_if_the_reference_cannot_tell(limit, why, tmp_path, 
     (tmp_path / "compared.json").write_text(json.dumps(compared | {"machine": {"device": "cuda:0", "warp": "1"}}))
     (tmp_path / "failed.json").write_text(json.dumps({"scene": "fold", "frames": 2, "device": "cpu", "failed": "it is slow"}))
     monkeypatch.setattr(sys, "argv", ["compared", "--stored", *map(str, sorted(tmp_path.iterdir()))])
-    runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "compared.py"), run_name="__main__")
+    runpy.run_path(COMPARED, run_name="__main__")
     said = capsys.readouterr().out
     assert "no setting of warpcloth has an error" in said and "fold, 2 frames, cpu: no result, because it is slow" in said
     compared["rows"] = [{"solver": "pbd", "label": f"pbd {error}", "error": error} for error in (0.05, 0.03, None)]
     assert "meets 1%; nearest is pbd 0.03 with 3%" in nearest_setting(compared)
     assert nearest_setting({"ratios": [{"solver": "pbd"}]}) == ""
+
+
+COMPARED = str(Path(__file__).parents[2] / "benchmarks" / "compared.py")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--solvers newtons", "solvers is 'newtons'; it must be one of 'explicit'"),
+        ("--total 0", "total is 0.0; it must be a number above 0"),
+        ("--limit nan", "limit is nan; it must be a number above 0"),
+        ("--frames 0", "frames is 0; it must be a whole number of 1 or more"),
+        ("--tolerance -1", "tolerance is -1.0; it must be a number above 0"),
+        ("--device cpux", "cpux"),
+        ("-p m=4", "has no parameter 'm'"),
+        ("--total 1e-9", None),
+    ],
+)
+def test_the_benchmark_stores_a_lack_of_a_reference_and_refuses_wrong_use(words, said, tmp_path, monkeypatch, capsys):
+    """An older result stays after wrong use; the chart of an older result does not stay beside a result without one."""
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("warpcloth.lab.setups.check_installed", lambda names: None)
+    result, chart = tmp_path / "hanging.json", tmp_path / "hanging.png"
+    result.write_text("{}")
+    chart.touch()
+    monkeypatch.setattr(sys, "argv", [COMPARED, *"--scene hanging -p n=4 --out".split(), str(tmp_path), *words.split()])
+    if said is None:
+        runpy.run_path(COMPARED, run_name="__main__")
+        assert "the reference of hanging needs more than 3.33333e-10 s" in json.loads(result.read_text())["failed"]
+        assert "no result, because the reference" in capsys.readouterr().out and not chart.exists()
+    else:
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(COMPARED, run_name="__main__")
+        err = capsys.readouterr().err
+        assert ended.value.code == 2 and said in err and err.count("\n") == 1
+        assert result.read_text() == "{}" and chart.exists()
 
 
 SCENES = [

@@ -316,11 +316,11 @@ def test_what_is_slow_or_not_known_warns(folder, tmp_path, monkeypatch):
 
 def test_motion_that_no_step_resolves_ends_early(folder, monkeypatch):
     """Runs that differ by as much however small the step, as those of chaotic motion do."""
-    time_spread, simulate = np.random.default_rng(0), module.simulate
+    scatter, simulate = np.random.default_rng(0), module.simulate
 
     def scattered(*arguments, **options):
         run = simulate(*arguments, **options)
-        return replace(run, points=run.points + 1e-2 * time_spread.normal(size=run.points.shape))
+        return replace(run, points=run.points + 1e-2 * scatter.normal(size=run.points.shape))
 
     monkeypatch.setattr(module, "simulate", scattered)
     with pytest.warns(UserWarning, match=r"only, not to 1e-09: smaller steps make it no less, for the motion is chaotic"):

@@ -32,6 +32,10 @@ _ITERATIONS = 400
 _SOLVED = (Result.COMPLETED, Result.CONVERGED, Result.ROUNDED)
 
 
+class NoReference(ValueError):
+    """Raised if a scene has no reference solution: no method takes it, or the time was too short for any estimate."""
+
+
 @dataclass(frozen=True, eq=False)
 class Reference:
     """The motion of a scene, with a bound of its error.
@@ -140,7 +144,8 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None, de
         UserWarning: Its error is above the tolerance, or a term makes it slow.
 
     Raises:
-        ValueError: An argument is not allowed, no method takes the scene, or ``limit`` is too short for any estimate.
+        NoReference: No method takes the scene, or ``limit`` is too short for any estimate.
+        ValueError: An argument is not allowed.
     """
     number("tolerance", tolerance, above=0.0)
     number("limit", limit, above=0.0)
@@ -191,7 +196,7 @@ def _method(scene, device):
     """Returns the :class:`_Method` for a scene on a device.
 
     Raises:
-        ValueError: No method takes the scene.
+        NoReference: No method takes the scene.
     """
     model = scene.build(device=device, dtype="float64")
     if any(elements.hard for elements in model.terms):
@@ -199,7 +204,7 @@ def _method(scene, device):
         try:
             method.record(method.first).bind(model)
         except ValueError as error:
-            raise ValueError(f"there is no reference solution of {scene.name}: {error}") from None
+            raise NoReference(f"there is no reference solution of {scene.name}: {error}") from None
         return method
     if scene.colliders:
         return _Method(lambda s: Newton(substeps=s, tolerance=_TOLERANCE, iterations=_ITERATIONS, integrator="bdf2"), 4, 1)
@@ -252,7 +257,7 @@ def _solve(scene, frames, tolerance, limit, progress, device):
         substeps *= 2
     if best is None:
         sentence = f"the reference of {scene.name} needs more than {limit:g} s{trouble}"
-        raise ValueError(f"{sentence}; give it more time, fewer frames or a coarser mesh")
+        raise NoReference(f"{sentence}; give it more time, fewer frames or a coarser mesh")
     name = type(method.record(substeps)).__name__
     used_up = 0.0 if errors[-1] <= tolerance else math.inf if _idle(errors) else limit
     return best | {"method": name, "limit": used_up, "seconds": time.perf_counter() - started}
