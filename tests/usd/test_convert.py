@@ -1,5 +1,6 @@
 """Animations in other formats: what is read back has the bits, the order, the triangles, the times and the names."""
 
+import os
 import re
 import signal
 import struct
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from warpcloth.base import outputs
 from warpcloth.cli import main
 from warpcloth.mesh.mesh import Surface
 from warpcloth.mesh.sequences import open_sequence
@@ -61,16 +63,18 @@ def test_what_is_read_back_is_the_same(name, stage, tmp_path):
         assert arrays["points"].dtype == (np.float64 if name[2:] in ("obj", "ply") else np.float32)
 
 
-@pytest.mark.parametrize("name", ["a.pc2", "a.mdd", "a.npz", "a.usda", "a.usdz", "a.obj", "a.ply"])
+@pytest.mark.parametrize("name", ["a.pc2", "a.mdd", "a.npz", "a.usda", "a.usdc", "a.usdz", "a.obj", "a.ply"])
 @pytest.mark.parametrize("older", [True, False])
 def test_an_error_or_interrupt_leaves_older_files_whole(name, older, stage, tmp_path):
-    """Nothing is left of new files either, in the middle or after the last frame."""
+    """Nothing is left of new files either, in the middle or after the last frame. What replaces a file has its permissions."""
     out, frames = tmp_path / "out", 12
     out.mkdir()
     original = open_sequence(stage)
     if older:
         convert(stage, out / name)
     before = contents(out)
+    for path in before:
+        path.chmod(0o600)
     points = np.array([original[0] + 0.1 * frame for frame in range(frames)], dtype=np.float32)
     np.savez(tmp_path / "other.npz", points=points, triangles=original.mesh.triangles, times=np.arange(frames) / FPS)
 
@@ -89,6 +93,25 @@ def test_an_error_or_interrupt_leaves_older_files_whole(name, older, stage, tmp_
     convert(tmp_path / "other.npz", out / name)
     source = out if name[2:] in ("obj", "ply") else out / name
     assert len(open_sequence(source, fps=FPS)) == frames
+    private = contents(out) if older and ".usd" in name else before  # a stage has its frames in new files
+    assert all(path.stat().st_mode & 0o777 == 0o600 for path in private)
+
+
+def test_an_interrupt_while_a_file_is_opened_leaves_nothing(stage, tmp_path, monkeypatch):
+    monkeypatch.setattr(outputs, "keep_mode", lambda *paths: signal.raise_signal(signal.SIGINT))
+    (tmp_path / "out").mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        convert(stage, tmp_path / "out" / "a.obj")
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_files_that_are_renamed_stay_if_the_next_cannot_be(stage, tmp_path, monkeypatch):
+    left, rename = [None, None], os.replace
+    monkeypatch.setattr(outputs.os, "replace", lambda *paths: (left.pop(), rename(*paths)))
+    (tmp_path / "out").mkdir()
+    with pytest.raises(IndexError):
+        convert(stage, tmp_path / "out" / "a.obj")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a_0000.obj", "a_0001.obj"]
 
 
 def test_formats_are_those_of_others(stage, tmp_path):

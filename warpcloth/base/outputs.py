@@ -6,7 +6,9 @@ import errno
 import os
 import secrets
 import socket
+import stat
 import sys
+import tempfile
 import warnings
 
 from .interrupts import deferred
@@ -32,11 +34,44 @@ def check_apart(outputs, inputs=()):
         taken[real] = "is given for two outputs; each must have a file of its own"
 
 
+def check_replaceable(*paths):
+    """Checks that files can be written, or replaced. It makes no file with a name, so that an interrupt leaves nothing.
+
+    Raises:
+        FileNotFoundError: A folder does not exist.
+        OSError: A folder cannot be written.
+        ValueError: A path is a folder or a device.
+    """
+    for folder in dict.fromkeys(os.path.dirname(_file_of(path)) for path in paths):
+        try:
+            with deferred():  # some file systems have only files with names, which are then removed
+                tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, folder) from None
+
+
+def keep_mode(file, path):
+    """Gives a file the permissions of the older file at a path, which it is to replace, if there is one."""
+    with contextlib.suppress(OSError):  # there is none, or the file system has no permissions
+        os.chmod(file, stat.S_IMODE(os.stat(path).st_mode))
+
+
+def _file_of(path):
+    """Returns the file to write for a path, behind links; raises as `Output` does."""
+    target = os.path.realpath(path)  # replace the file behind a link, not the link
+    folder = os.path.dirname(target)
+    if not os.path.isdir(folder):
+        raise FileNotFoundError(f"{path}: the folder {folder} does not exist")
+    if os.path.exists(target) and not os.path.isfile(target):
+        raise ValueError(f"{path}: is no regular file; it must be one, or free")
+    return target
+
+
 class Output:
     """A file that is written under a temporary name and renamed by `close`, so that a failure leaves an older file whole.
 
-    As a context manager it closes the file at the end of the block. An interrupt keeps what is written so far; any other error
-    discards it.
+    It has the permissions of an older file that it replaces. As a context manager it closes the file at the end of the block.
+    An interrupt keeps what is written so far; any other error discards it.
 
     Attributes:
         path: Path of the finished file.
@@ -51,15 +86,12 @@ class Output:
             FileNotFoundError: The folder does not exist.
             ValueError: The path is a folder or a device.
         """
-        target = os.path.realpath(path)  # replace the file behind a link, not the link
+        target = _file_of(path)
         self.folder = os.path.dirname(target)
-        if not os.path.isdir(self.folder):
-            raise FileNotFoundError(f"{path}: the folder {self.folder} does not exist")
-        if os.path.exists(target) and not os.path.isfile(target):
-            raise ValueError(f"{path}: is no regular file; it must be one, or free")
         self.path, self.finished, self._discarded = os.fspath(path), False, False
         self._target, self._unfinished = target, f"{target}.{secrets.token_hex(4)}.unfinished"
         self.file = open(self._unfinished, mode, **options)
+        keep_mode(self._unfinished, target)
 
     def __enter__(self):
         return self
@@ -107,7 +139,11 @@ class Output:
 
 
 class OutputSet:
-    """Binary files that replace older files once all of them are written. An error or interrupt leaves nothing of them."""
+    """Binary files that replace older files, renamed one after another once all of them are written.
+
+    An error or interrupt before the first is renamed leaves nothing of them. An interrupt among the renames waits until all are
+    renamed. If a rename fails, or a second interrupt comes, files renamed before stay, and nothing is left of the others.
+    """
 
     def __init__(self):
         self._outputs = []
@@ -122,15 +158,17 @@ class OutputSet:
                     for output in self._outputs:
                         output.close()
         finally:
-            for output in self._outputs:
-                if not output.finished:
-                    output.discard()
+            with deferred():
+                for output in self._outputs:
+                    if not output.finished:
+                        output.discard()
 
     @contextlib.contextmanager
     def writing(self, path):
         """Opens the temporary file of a path for the block."""
-        output = Output(path, "xb")
-        self._outputs.append(output)
+        with deferred():
+            output = Output(path, "xb")
+            self._outputs.append(output)
         yield output.file
         output.complete()
 

@@ -3,7 +3,7 @@
 from datetime import datetime, timezone
 
 from ..base.checks import whole
-from ..base.outputs import Output, check_apart
+from ..base.outputs import check_apart, check_replaceable
 from ..base.quiet import find_device
 from ..base.texts import assignments, json_text, options
 from .options import DEFAULT, add_scene, add_solver, add_values, values_of
@@ -81,7 +81,7 @@ def bench(arguments):
         whole("sizes", size, 2)
     if arguments.csv:
         check_apart([arguments.csv], [arguments.scene])
-        Output(arguments.csv, "x").discard()
+        check_replaceable(arguments.csv)
         check_writable(arguments.csv)
     device = find_device(arguments.device)
     from ..lab.benchmarks import Run

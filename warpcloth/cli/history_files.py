@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..base.outputs import TEXT, Output, check_apart, write_table
+from ..base.outputs import TEXT, Output, check_apart, check_replaceable, write_table
 from ..base.texts import json_text
 from .terminal import check_writable
 
@@ -19,8 +19,7 @@ def record_of(arguments, scene):
     files = [path for path in (arguments.csv, arguments.report) if path]
     check_apart([arguments.output, arguments.film, *files])
     check_writable(*files)
-    for path in files:
-        Output(path, "x").discard()
+    check_replaceable(*files)
     return ("energies", "reactions", *["pairs"] * (scene.self_contact is not None)) if files else ()
 
 

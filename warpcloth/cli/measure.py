@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from ..base.outputs import Output, OutputSet, check_apart
+from ..base.outputs import OutputSet, check_apart, check_replaceable
 from ..base.quiet import find_device
 from ..base.texts import json_text
 from .setup import named_scene
@@ -37,7 +37,7 @@ def measure(arguments):
     check_apart([arguments.output] if arguments.output else [], [str(source.path)])
     check_writable(arguments.output)
     if arguments.output:
-        Output(arguments.output, "xb").discard()  # raises if the folder does not exist, or the path is a folder
+        check_replaceable(arguments.output)
     device = find_device(arguments.device)
     began = time.perf_counter()
     rest = equilibrium(scene, device=device, record="reactions")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..base.checks import whole
 from ..base.interrupts import Interrupted
-from ..base.outputs import Output, check_apart
+from ..base.outputs import check_apart, check_replaceable
 from ..picture.figures import PICTURES, check_path
 
 # The same as :data:`warpcloth.model.precision.DTYPES`, which loads Warp.
@@ -60,7 +60,7 @@ def check_outputs(arguments, inputs=()):
     if arguments.output:
         check_path(arguments.output, PICTURES)
     if arguments.csv:
-        Output(arguments.csv, "x").discard()
+        check_replaceable(arguments.csv)
     check_writable(arguments.output, arguments.csv)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.interrupts import deferred
-from ..base.outputs import Lock
+from ..base.outputs import Lock, keep_mode
 from .layers import flattened_layer, named_from, relative_path
 from .modules import Sdf, Usd
 from .packages import Contents
@@ -317,7 +317,7 @@ class ChunkWriter:
             layer.pseudoRoot.SetInfo(name, self._root_metadata[name])
         layer.startTimeCode, layer.endTimeCode = self._pending[0][0], self._pending[-1][0]
         path = self.run / f"frames_{self._number:06d}.usdc"
-        export(layer, path)
+        export(layer, path, like=self._output)
         chunks = [*self._chunks, (self._pending[0][0], path)]
         if not self._whole:
             self._write_root(chunks)
@@ -329,8 +329,8 @@ class ChunkWriter:
 
     def _start_run(self):
         self.run.mkdir(parents=True, exist_ok=True)
-        export(self._rest, self.run / "rest.usdc")
-        export(self._declared(Sdf.Layer.CreateAnonymous(".usda")), self.run / "manifest.usda")
+        export(self._rest, self.run / "rest.usdc", like=self._output)
+        export(self._declared(Sdf.Layer.CreateAnonymous(".usda")), self.run / "manifest.usda", like=self._output)
 
     def _declared(self, layer):
         """Declares all sampled attributes in a layer, and returns it."""
@@ -356,7 +356,7 @@ class ChunkWriter:
         self._describe(layer)
         # Last, because an anonymous layer cannot resolve relative paths.
         layer.subLayerPaths = [relative_path(path, folder) for path in self._base_paths()]
-        export(layer, self.path, self.run)
+        export(layer, self.path, self.run, self._output)
 
     def _describe(self, layer):
         """Writes the metadata that USD reads from root layers only."""
@@ -483,15 +483,19 @@ def _facts(metadata, where="metadata"):
     return facts
 
 
-def export(layer, path, unfinished_in=None):
-    """Writes a layer under a temporary name and renames it, so that the path has either the old file or the whole layer."""
+def export(layer, path, unfinished_in=None, like=None):
+    """Writes a layer under a temporary name and renames it, so that the path has either the old file or the whole layer.
+
+    It has the permissions of the file ``like``, by default of that at the path, if there is one.
+    """
     path = Path(path)
     unfinished = Path(unfinished_in or path.parent) / f"unfinished{path.suffix}"
     _export(layer, unfinished, path)
-    _rename(unfinished, path)
+    _rename(unfinished, path, like)
 
 
-def _rename(finished, path):
+def _rename(finished, path, like=None):
+    keep_mode(finished, like or path)
     try:
         os.replace(finished, path)
     except OSError as error:

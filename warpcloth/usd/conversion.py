@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.outputs import STAGE_ENDINGS, Output, OutputSet, check_apart
+from ..base.outputs import STAGE_ENDINGS, OutputSet, check_apart, check_replaceable
 from ..mesh.caches import CACHES, NUMBERED, numbered_paths, write_mdd, write_npz, write_obj, write_pc2, write_ply
 from ..mesh.loading import read_arrays
 from ..mesh.sequences import open_sequence
@@ -22,8 +22,9 @@ _UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
 def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
     """Writes an animation in another format. A few frames are in memory at a time, or ten for a stage.
 
-    All frames are read twice, because they are checked before the first is written. Older files are replaced once all frames
-    are written. After an error or interrupt they are as before, and nothing is left of new files.
+    All frames are read twice, because they are checked before the first is written. New files replace older ones, renamed one
+    after another once all are written. After an error or interrupt before that, older files are as before, and nothing is left
+    of new ones. An interrupt among the renames waits until all are renamed; if a rename fails, files renamed before it stay.
 
     Args:
         source: Path of an animation, as for :func:`warpcloth.open_sequence`.
@@ -39,6 +40,7 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
 
     Raises:
         FileNotFoundError: There is no such file or folder.
+        OSError: A file cannot be written, or not be renamed.
         ValueError: The source or the ending is not supported; a point, or a velocity that is written, is not finite as float32;
             a frame has other triangles; the times of frames are needed and not known; frames are unevenly spaced where the
             format has one interval for all; or an output is no regular file.
@@ -52,8 +54,7 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
     else:
         paths = [Path(output), *([Path(output).with_suffix(".obj")] if ending in CACHES else [])]
     check_apart(paths, [*sequence.files, source])
-    for path in paths:
-        Output(path, "xb").discard()  # the folder can be written, and the path is that of a file
+    check_replaceable(*paths)
     if ending in STAGE_ENDINGS:
         interval = _interval(sequence, _times(sequence), "times")
     elif ending == ".mdd":
