@@ -99,7 +99,7 @@ def test_an_error_is_the_task_s_own_and_the_rest_is_dropped(address, tmp_path):
     with connect(address) as cluster:
         with pytest.raises(ValueError, match=r"^x is -1; it must be 0 or more$"):
             list(sweep(tasks, cluster, store))
-        until(lambda: all(future.status != "pending" for future in cluster._client.futures.values()))
+        until(lambda: not any(cluster._client.processing().values()))  # the scheduler has dropped them
         refused.touch()
         assert next(iter(sweep(squares(1, marks), cluster)))[1]["square"] == 0
     # It is among the first that run; each worker may have begun a few more before it hears of it.
