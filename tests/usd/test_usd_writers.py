@@ -307,6 +307,21 @@ def test_a_run_that_was_cut_short_is_recovered_under_its_own_name(tmp_path, cut)
     np.testing.assert_allclose(again[-1], motion(mesh, 2 * CHUNK - 1)[0], atol=4 * EPS)
 
 
+def test_no_root_is_left_whose_layers_are_gone(tmp_path, monkeypatch):
+    """The process dies while it removes the folder of a package that is finished, in whatever order the files go."""
+    output = tmp_path / "out.usdz"
+
+    def killed(folder, *_):
+        (folder / "rest.usdc").unlink()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(chunks.shutil, "rmtree", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write(output, Mesh.grid(5, 4))
+    assert len(FrameSequence(output)) == FRAMES
+    assert list(tmp_path.rglob("manifest.usda")) and not list(tmp_path.rglob("animation.usdc"))
+
+
 def interrupt_twice(now):
     """Of which the second comes while the first has the file packed."""
     if now:

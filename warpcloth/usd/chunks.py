@@ -21,6 +21,7 @@ from .stage import METADATA_KEY, followed, identity
 from .values import refuse_path, sentences
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+_ROOT = "animation.usdc"  # root of a .usdz until it is packed, and of frames whose output cannot be written
 _COMPLETE = "complete"  # file that marks the folder of a run whose frames are complete but not packed yet
 
 
@@ -78,7 +79,7 @@ class ChunkWriter:
             raise ValueError(f"{self._folder}: is a file, must be free for the folder of frames")
         # A new name, because pxr may still hold layers of an earlier run in this process, and would show those.
         self.run = self._folder / f"{self._output.suffix[1:]}-{secrets.token_hex(4)}"
-        self.path = str(self.run / "animation.usdc" if self._packed else self._output)
+        self.path = str(self.run / _ROOT if self._packed else self._output)
         self.frames = self.kept = 0
         self._given, self._packing, self._lock = os.fspath(output), False, None
         self._span = None  # first and last time code appended
@@ -224,14 +225,14 @@ class ChunkWriter:
         self._number = int(found[-1].stem.removeprefix("frames_")) + 1  # a new name, because pxr may hold the old files
         self._span, self.frames, self.kept = tuple(span), frames, frames
         if self._packed:
-            self.path = str(self.run / "animation.usdc")
+            self.path = str(self.run / _ROOT)
         (self.run / _COMPLETE).unlink(missing_ok=True)
 
     def _keep_chunks(self):
         """Writes a root layer into the folder of the chunks if the output cannot be written."""
         if self._closed or not (self.run / "rest.usdc").exists():
             return
-        before, self.path = self.path, str(self.run / "animation.usdc")
+        before, self.path = self.path, str(self.run / _ROOT)
         try:
             (self.run / _COMPLETE).touch()
             self._write_chunk()
@@ -374,7 +375,7 @@ class ChunkWriter:
 
     def _remove_run(self):
         """Removes the chunks of this run, and the folder of runs if it has no others."""
-        shutil.rmtree(self.run, ignore_errors=True)
+        _remove(self.run, ignore_errors=True)
         with suppress(OSError):  # it is not empty, or was never made
             self._folder.rmdir()
 
@@ -388,12 +389,12 @@ class ChunkWriter:
                 continue
             if (folder / _COMPLETE).exists():
                 warnings.warn(
-                    f"{folder / 'animation.usdc'}: has all frames of an earlier run that was not packed, and is kept; "
+                    f"{folder / _ROOT}: has all frames of an earlier run that was not packed, and is kept; "
                     "remove its folder if nobody needs them",
                     stacklevel=5,
                 )
             else:
-                shutil.rmtree(folder, ignore_errors=True)  # another process may have a file open
+                _remove(folder, ignore_errors=True)  # another process may have a file open
 
     def _write_single_file(self, keep):
         contents = Contents(self.run)
@@ -417,7 +418,7 @@ class ChunkWriter:
         (self.run / _COMPLETE).unlink(missing_ok=True)
         if keep:
             return
-        shutil.rmtree(self.run)
+        _remove(self.run)
         with suppress(OSError):  # it may be gone, or in use by a run to an output with another ending
             if self._packed:
                 self._remove_other_runs()
@@ -500,6 +501,13 @@ def _rename(finished, path, like=None):
         os.replace(finished, path)
     except OSError as error:
         raise OSError(f"{path}: could not be written: {error.strerror or error}") from None
+
+
+def _remove(run, ignore_errors=False):
+    """Removes the folder of a run, its root first. So a process killed meanwhile leaves no root whose layers are gone."""
+    with suppress(OSError):  # which the other files say, too
+        (run / _ROOT).unlink(missing_ok=True)
+    shutil.rmtree(run, ignore_errors)
 
 
 def _export(layer, file, meant=None):
