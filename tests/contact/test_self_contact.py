@@ -645,6 +645,16 @@ def test_the_scale_without_gravity_is_that_of_contact_alone(device):
     assert scales[0] == pytest.approx(scales[1], rel=1e-9) and scales[0] > 100.0
 
 
+def test_an_interrupt_while_forces_are_recorded_without_psi_leaves_psi_in(device):
+    """An interrupt may come between any two launches, and the caller may step on."""
+    forces = wc.Newton(substeps=1).bind(layers(n=3, gap=2e-3, speed=1.0).build(device=device)).pairs.forces
+    before = forces.least
+    with pytest.raises(KeyboardInterrupt), forces.without_psi():
+        assert forces.least == 0.0
+        raise KeyboardInterrupt
+    assert forces.least == before > 0.0
+
+
 @pytest.mark.parametrize("meet", IMPACTS)
 def test_impact_converges(meet, device):
     """Where a step presses sheets flat, pairs of crossing edges have hardly an area. `Newton` used to use up its iterations

@@ -67,8 +67,10 @@ class SelfForces(PairSums):
     def without_psi(self):
         """Leaves ψ out of the forces that are launched in this context."""
         least, self.least = self.least, 0.0
-        yield
-        self.least = least
+        try:
+            yield
+        finally:
+            self.least = least
 
     def launch_forces(self, x, correction=None):
         """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""
