@@ -7,8 +7,10 @@ import re
 import shlex
 import subprocess
 import sys
+from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -222,6 +224,17 @@ def test_every_measure_is_in_the_docs():
             row = re.search(rf"^\| `{measure.name}` \| (.*?) \| (.*?) \|", rates if measure.rate else part, re.MULTILINE)
             assert row, measure.name
             assert row[1] == ("×".join(map(str, measure.shape)) or "–") and row[2] == measure.unit, measure.name
+
+
+@pytest.mark.parametrize("code", [0, 1, 2])
+@pytest.mark.parametrize("said", ["", "  # exit code 1"])
+def test_a_command_of_a_cell_ends_the_build_unless_it_exits_as_the_page_says(code, said):
+    """Code 1 used to pass, which `check` gives where it finds something, and a run where it diverges."""
+    kernel = SimpleNamespace(user_ns={})
+    kernel.system = lambda command: kernel.user_ns.update(_exit_code=subprocess.run(command, shell=True).returncode)
+    exec((ROOT / "docs" / "_ext" / "cells.py").read_text(encoding="utf-8"), {"get_ipython": lambda: kernel})
+    with nullcontext() if code == bool(said) else pytest.raises(RuntimeError, match=f"exit {code}{said} ended with .* {code}$"):
+        kernel.system(f"exit {code}{said}")
 
 
 # --- Results of the Python that pages show.
