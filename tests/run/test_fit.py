@@ -314,6 +314,27 @@ def test_readings_on_the_command_line(capsys):
         assert main(wrong) == 2 and sentence in capsys.readouterr().err, wrong
 
 
+@pytest.mark.parametrize(
+    ("start", "sentence"),
+    [
+        (["300"], "--start '300' is not of the form name=value"),
+        (["Spring.stiffness=1", "Spring.stiffness=2"], "--start Spring.stiffness is given twice, as '1' and '2'"),
+        (["Spring.stiffness=1,2"], "--start Spring.stiffness is '1,2'; it must be a number, or a fraction such as 1/240"),
+        (["Spring.stiffness=nan"], "--start Spring.stiffness is 'nan'; it must be a number"),
+        (["Spring.stiffness=-1"], "start['Spring.stiffness'] is -1.0; it must be a finite number above 0"),
+        (["Spring.stiffness=1e400"], "start['Spring.stiffness'] is inf; it must be a finite number above 0"),
+        (["n=4"], "start['n'] names no number of this scene; allowed are Spring.stiffness, Spring.damping, "),
+    ],
+)
+def test_a_wrong_start_on_the_command_line(start, sentence, tmp_path, capsys):
+    """Nothing is run, so the motion need not be one."""
+    mesh = hanging(n=4).mesh
+    np.savez(tmp_path / "seen.npz", points=[mesh.points] * 2, triangles=mesh.triangles, times=[0.0, 1 / 60])
+    assert main(["fit", "hanging", str(tmp_path / "seen.npz"), "-p", "n=4", "--start", *start]) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith(f"warpcloth: {sentence}") and err.count("\n") == 1 and not out
+
+
 def markers(scene, points):
     """Seven points of triangles of a scene, and their positions at points (F, n, 3)."""
     random = np.random.default_rng(1)
@@ -421,7 +442,14 @@ FILES = {
         ({"Spring.stiffness": 0.0}, SEEN, r"start\['Spring.stiffness'\] is 0.0; it must be a finite number above 0"),
         ({"Spring.stiffness": 1.0}, SEEN[:, :1], r"measured has shape \(3, 1, 3\); it must be \(F, 2, 3\)"),
         ({"Spring.stiffness": 1.0}, np.full((3, 2, 3), np.nan), "measured has 0 numbers; it must have at least 1"),
-        ({"Spring.stifness": 1.0}, SEEN, r"vary\['Spring.stifness'\] names nothing in this scene"),
+        (
+            {"Spring.stifness": 1.0},
+            SEEN,
+            r"start\['Spring.stifness'\] names no number of this scene; allowed are Spring.stiffness",
+        ),
+        ({"gravity": 9.81}, SEEN, r"start\['gravity'\] names no number of this scene"),  # it is a vector
+        ({"masses": 1.0}, SEEN, r"start\['masses'\] names no number"),
+        ({"density": 1.0}, SEEN, r"start\['density'\] names no number"),  # this scene has masses
     ],
 )
 def test_refusals(start, seen, sentence, tmp_path, monkeypatch):

@@ -49,8 +49,8 @@ def numbered(labels, taken=()):
     return found
 
 
-def assignments(texts):
-    """Returns a dict of strings from texts of the form ``name=value``.
+def assignments(texts, option=None):
+    """Returns a dict of strings from texts of the form ``name=value``, those of an option of the command line if one is given.
 
     Raises:
         ValueError: A text has another form, or a name occurs twice.
@@ -59,9 +59,11 @@ def assignments(texts):
     for text in texts:
         name, sign, value = text.partition("=")
         if not (name and sign):
-            raise ValueError(f"{text!r} is not of the form name=value (SCENE stands before -s and -p)")
+            given, hint = (f"{option} {text!r}", "") if option else (repr(text), " (SCENE stands before -s and -p)")
+            raise ValueError(f"{given} is not of the form name=value{hint}")
         if name in result:
-            raise ValueError(f"{name} is given twice, as {result[name]!r} and {value!r}")
+            given = f"{option} {name}" if option else name
+            raise ValueError(f"{given} is given twice, as {result[name]!r} and {value!r}")
         result[name] = value
     return result
 

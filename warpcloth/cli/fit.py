@@ -81,7 +81,9 @@ def fit(arguments):
     if arguments.plot:
         check_path(arguments.plot, PICTURES)
     check_writable(arguments.plot)
-    start = {name: convert(f"--start {name}", value, (float,)) for name, value in assignments(arguments.start).items()}
+    start = {
+        name: convert(f"--start {name}", value, (float,)) for name, value in assignments(arguments.start, "--start").items()
+    }
     measured, prim, arguments.prim = arguments.measured, arguments.prim, None
     _source, values, scene = named_scene(arguments)
     if arguments.frames is not None:
@@ -161,7 +163,7 @@ def _readings(texts, start, scene):
 
     check_sample(scene)
     found = []
-    for quantity, text in assignments(texts).items():
+    for quantity, text in assignments(texts, "--reading").items():
         choice("--reading", quantity, tuple(DEVICES[scene.name][1]))
         if quantity == "D" and "density" in start:
             raise ValueError("--reading has D, which the device computes from the density, and --start has density")

@@ -125,7 +125,7 @@ def fit(
     """
     from scipy.optimize import least_squares
 
-    names, most = _checked_names(start), 1 if solver is None else scene.frames
+    names, most = _checked_names(start, scene), 1 if solver is None else scene.frames
     data = _bound_data(scene, measured, vertices, most, solver is None)
     frames = most if any(each.last is None for each in data) else max(each.last for each in data)
     of_frames = np.concatenate([each.frames for each in data])
@@ -186,14 +186,31 @@ def fit(
     )
 
 
-def _checked_names(start):
+def _checked_names(start, scene):
     """Returns the names of the parameters."""
     if not (isinstance(start, Mapping) and start):
         raise ValueError(f"start is {shown(start)}; it must be a dict of parameters, such as {{'Spring.stiffness': 100.0}}")
+    listed, taken = _parameters_of(scene)
     for name, value in start.items():
+        if name not in taken:
+            raise ValueError(f"start[{shown(name)}] names no number of this scene; allowed are {', '.join(listed)}")
         if not (np.ndim(value) == 0 and np.isreal(value) and 0.0 < value < np.inf):
             raise ValueError(f"start[{name!r}] is {shown(value)}; it must be a finite number above 0")
     return list(start)
+
+
+def _parameters_of(scene):
+    """Returns the names in ``vary`` of what one number gives: those to list, and all, also by the class of a named term."""
+    quantities = [
+        (term, field)
+        for term in (*scene.terms, *scene.contact_terms, *scene.air_terms)
+        for field, each in term.quantities().items()
+        if not each.shape
+    ]
+    quantities += [(load, load.quantity) for load in scene.loads if not load.shape]
+    density = [] if scene.density is None else ["density"]
+    listed = list(dict.fromkeys([*density, *(f"{each.label}.{field}" for each, field in quantities)]))
+    return listed, {*listed, *(f"{type(each).__name__}.{field}" for each, field in quantities)}
 
 
 def _bound_data(scene, measured, vertices, most, resting):
