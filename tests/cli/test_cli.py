@@ -272,6 +272,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(capfd):
     if not os.path.isdir("/proc/self"):
         pytest.skip("needs /proc, a folder that not even root can write")
     refused(capfd, ["run", *SMALL, "-o", "/proc/out.usdc"], "output = /proc/out.usdc: the folder /proc cannot be written (")
+    refused(capfd, ["run", *SMALL, "-o", "out.usdc", "--film", "/proc/a.gif"], "/proc: the folder cannot be written (")
 
 
 @pytest.mark.parametrize(

@@ -661,7 +661,7 @@ def test_a_run_draws_its_film(small_films, capfd):
     wc.render("a.usdc", "b.gif", **SMALL)
     assert (small_films / "a.gif").read_bytes() == (small_films / "b.gif").read_bytes()
     (small_films / "folder.gif").mkdir()
-    refusals = {"a.avi": "the ending is '.avi'", "none/a.gif": "folder none does not exist", "folder.gif": "is no regular file"}
+    refusals = {"a.avi": "the ending is '.avi'", "none/a.gif": "none does not exist", "folder.gif": "is no regular file"}
     for film, fragment in refusals.items():
         refused(capfd, ["run", "hanging", "-p", "n=4", "-o", "c.usdc", "--film", film], fragment)
     assert not (small_films / "c.usdc").exists()

@@ -47,7 +47,7 @@ def check_replaceable(*paths):
             with deferred():  # some file systems have only files with names, which are then removed
                 tempfile.TemporaryFile(dir=folder).close()
         except OSError as error:
-            raise OSError(error.errno, error.strerror, folder) from None
+            raise OSError(error.errno, f"the folder cannot be written ({error.strerror})", folder) from None
 
 
 def keep_mode(file, path):

@@ -3,7 +3,7 @@
 import importlib.util
 from pathlib import Path
 
-from ..base.outputs import OutputSet
+from ..base.outputs import OutputSet, check_replaceable
 
 GREY = "0.35"
 PICTURES = (".png", ".svg", ".pdf")
@@ -26,6 +26,7 @@ def check_path(path, endings):
 
     Raises:
         FileNotFoundError: The folder does not exist.
+        OSError: The folder cannot be written.
         ImportError: matplotlib is not installed.
         ValueError: The name has none of the endings, or the path is a folder or a device.
     """
@@ -33,10 +34,7 @@ def check_path(path, endings):
     path = Path(path)
     if path.suffix.lower() not in endings:
         raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {' or '.join(endings)}")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path}: is no regular file; it must be one, or free")
+    check_replaceable(path)
 
 
 def number_axis(axis):

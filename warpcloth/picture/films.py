@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ..base.outputs import Output
+from ..base.outputs import Output, check_replaceable
 
 STILL, FILMS = ".png", (".gif", ".webp", ".mp4")
 # Browsers show frames of these that are shorter than this [s] for 0.1 s.
@@ -38,16 +38,14 @@ def check_film(path, size):
 
     Raises:
         FileNotFoundError: The folder does not exist.
+        OSError: The folder cannot be written.
         ImportError: PyAV, which writes films, is not installed.
         ValueError: The ending is none of these, the size does not suit it, or the path is a folder or a device.
     """
     path, (width, height) = Path(path), size
     if path.suffix.lower() not in (STILL, *FILMS):
         raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {', '.join((STILL, *FILMS[:-1]))} or {FILMS[-1]}")
-    if not path.absolute().parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path}: is no regular file; it must be one, or free")
+    check_replaceable(path)
     if path.suffix.lower() == ".mp4":
         if width % 2 or height % 2:
             even = f"{width + width % 2}x{height + height % 2}"

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import array, choice, number, shown, whole
 from ..base.limits import shown_bytes
-from ..base.outputs import OutputSet, check_apart
+from ..base.outputs import OutputSet, check_apart, check_replaceable
 from ..base.types import FilePath, Progress, UpAxis
 from ..base.version import installed_version
 from ..mesh.mesh import Mesh
@@ -174,15 +174,13 @@ def check_page(path):
 
     Raises:
         FileNotFoundError: The folder does not exist.
+        OSError: The folder cannot be written.
         ValueError: The ending is not .html, or the path is a folder or a device.
     """
     path = Path(path)
     if path.suffix.lower() != ENDING:
         raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {ENDING}")
-    if not path.absolute().parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path}: is no regular file; it must be one, or free")
+    check_replaceable(path)
 
 
 def _subject(source, mesh=None, prim=None, fps=None, up_axis=None, copy=None, azimuth=-38.0):
