@@ -3,6 +3,7 @@
 import math
 import reprlib
 from collections.abc import Collection
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,29 @@ from numpy.typing import ArrayLike
 
 from .limits import MOST
 
-_SHORT = reprlib.Repr()
+
+class _Short(reprlib.Repr):
+    """Short texts of values, with NumPy's numbers as plain ones, in lists and dicts too."""
+
+    def repr1(self, x: Any, level: int) -> str:
+        x = x.item() if isinstance(x, np.generic) else x
+        return str(x) if isinstance(x, np.generic) else super().repr1(x, level)  # Python has no long double
+
+
+_SHORT = _Short()
 _SHORT.maxother = _SHORT.maxstring = 60
 
 
 def shown(value: object) -> str:
     """Returns a value as one short line of text, for error messages."""
-    return " ".join(_SHORT.repr(value.item() if isinstance(value, np.generic) else value).split())
+    return " ".join(_SHORT.repr(value).split())
+
+
+def keep_plain(record: Any) -> None:
+    """Replaces NumPy's numbers in fields of a frozen dataclass by Python's, so that its text has plain numbers."""
+    for field in fields(record):
+        if isinstance(value := getattr(record, field.name), np.generic):
+            object.__setattr__(record, field.name, value.item())
 
 
 def number(name: str, value: Any, above: float | None = None, least: float | None = None) -> None:

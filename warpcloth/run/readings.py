@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..analysis.surface_comparison import capture_to_up_axis
-from ..base.checks import array, number, numeric, refuse, shown, whole
+from ..base.checks import array, keep_plain, number, numeric, refuse, shown, whole
 from ..base.tables import number_in, read_table
 from ..base.types import FilePath
 from ..mesh.captures import Capture, solid_triangles
@@ -60,6 +60,7 @@ class Markers:
     sigma: float | None = None
 
     def __post_init__(self) -> None:
+        keep_plain(self)
         if (self.triangles is None) != (self.weights is None):
             raise ValueError("one of markers.triangles and markers.weights is given; both or none must be")
         if self.vertices is not None and self.triangles is not None:
@@ -187,6 +188,7 @@ class CapturePoints:
     sigma: float | None = None
 
     def __post_init__(self) -> None:
+        keep_plain(self)
         if not isinstance(self.capture, Capture):
             raise ValueError(
                 f"capture_points.capture is {shown(self.capture)}; it must be a Capture, such as open_capture(path)"
@@ -260,8 +262,11 @@ class Reading:
     sigma: ArrayLike | None = None
 
     def __post_init__(self) -> None:
+        keep_plain(self)
         if not callable(self.function):
-            raise ValueError(f"reading.function is {self.function!r}; it must be a function of an animation or an equilibrium")
+            raise ValueError(
+                f"reading.function is {shown(self.function)}; it must be a function of an animation or an equilibrium"
+            )
         value = numeric("reading.value", self.value, "be a number or an array of numbers")
         if self.sigma is not None:
             sigma = numeric("reading.sigma", self.sigma, "be a number, or one for each value")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..base.checks import array, number, numeric, refuse, shown
+from ..base.checks import array, keep_plain, number, numeric, refuse, shown
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,6 +53,7 @@ class Air:
     max_speed: float | None = None
 
     def __post_init__(self):
+        keep_plain(self)
         if callable(self.wind):
             _check_function(self.wind)
         if (self.blow is None) != (self.max_speed is None):

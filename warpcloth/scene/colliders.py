@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..base.checks import array, as_array, choice, number, shown
+from ..base.checks import array, as_array, choice, keep_plain, number, shown
 from ..base.types import Converted, default
 
 # With the default stiffness, the weight of one layer compresses the contact distance by this fraction.
@@ -38,6 +38,7 @@ class Contact:
     elements: Literal["vertices", "triangles"] = "vertices"
 
     def __post_init__(self) -> None:
+        keep_plain(self)
         choice("contact.elements", self.elements, ("vertices", "triangles"))
         if self.distance is not None:
             number("contact.distance", self.distance, above=0.0)
@@ -66,6 +67,7 @@ class Collider:
     name: str | None = None
 
     def __post_init__(self) -> None:
+        keep_plain(self)
         if not (self.name is None or isinstance(self.name, str)):
             raise ValueError(f"{type(self).__name__}.name is {shown(self.name)}; it must be a text or None")
         number(f"{self.label}.friction", self.friction, least=0.0)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.checks import number, shown
+from ..base.checks import keep_plain, number, shown
 from ..terms.declared import Declared
 from ..terms.orthotropic_membrane import OrthotropicMembrane
 from ..terms.plate_bending import PlateBending, isotropic_twist
@@ -51,6 +51,7 @@ class Fabric:
     notes: str = ""
 
     def __post_init__(self) -> None:
+        keep_plain(self)
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name in ("name", "source", "notes"):

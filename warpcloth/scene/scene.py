@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import array, as_array, number, refuse, shown
+from ..base.checks import array, as_array, keep_plain, number, refuse, shown
 from ..base.types import Converted, Precision, UpAxis, default
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
@@ -192,6 +192,7 @@ class Scene:
         return (self.pins, *self.terms, self.loads, *self.colliders, self.air)
 
     def __post_init__(self, fabric: Fabric | str | None) -> None:
+        keep_plain(self)
         if not isinstance(self.mesh, Mesh):
             raise ValueError(f"mesh is {shown(self.mesh)}; it must be a Mesh, such as Mesh.grid(32, 32)")
         n = len(self.mesh.points)
@@ -221,7 +222,7 @@ class Scene:
         keep("velocities", np.zeros((n, 3)) if self.velocities is None else array("velocities", self.velocities, (n, 3)))
         keep("cloths", tuple(self.cloths))
         if self.cloths and self.cloths != tuple(self.mesh.parts or ()):
-            raise ValueError(f"cloths is {self.cloths}; it must be the names of the parts of the mesh, in their order")
+            raise ValueError(f"cloths is {shown(self.cloths)}; it must be the names of the parts of the mesh, in their order")
         keep("pins", checked_pins(self.pins, self.mesh))
         keep("loads", checked_loads(self.loads, self.mesh))
         keep("free_axes", _checked_axes(self.free_axes, n))

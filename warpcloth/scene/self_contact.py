@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ..base.checks import choice, number
+from ..base.checks import choice, keep_plain, number
 from ..base.types import Converted, default
 
 STARTS = ("refuse", "run")
@@ -37,6 +37,7 @@ class SelfContact:
     crossing_start: Literal["refuse", "run"] = "refuse"
 
     def __post_init__(self) -> None:
+        keep_plain(self)
         if self.distance is not None:
             number("self_contact.distance", self.distance, above=0.0)
         if self.stiffness is not None:

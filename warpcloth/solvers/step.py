@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from ..base.checks import choice, number, shown, whole
+from ..base.checks import choice, keep_plain, number, shown, whole
 from ..base.extensions import note
 from ..base.limits import MOST
 from ..base.texts import words_of
@@ -192,6 +192,7 @@ class Step:
         return stepper(self, model)
 
     def __post_init__(self):
+        keep_plain(self)
         given = [name for name in self.step_options if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"exactly one of {', '.join(self.step_options[:-1])} and {self.step_options[-1]} must be given")

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..base.checks import as_array, numeric, refuse, shown
+from ..base.checks import as_array, keep_plain, numeric, refuse, shown
 from ..kernels.term import Term
 from ..mesh.mesh import Mesh
 from .refresh import Refresh
@@ -108,9 +108,7 @@ class Declared:
     part: str | None = None
 
     def __post_init__(self):
-        for each in fields(self):  # so that a term prints plain numbers
-            if isinstance(value := getattr(self, each.name), np.generic):
-                object.__setattr__(self, each.name, value.item())
+        keep_plain(self)
         if not (self.part is None or isinstance(self.part, str)):
             raise ValueError(f"{self.label}.part is {shown(self.part)}; it must be the name of a part of the mesh or None")
         if not (self.name is None or isinstance(self.name, str)):

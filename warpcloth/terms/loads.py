@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..base.checks import numeric, refuse, shown
+from ..base.checks import keep_plain, numeric, refuse, shown
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 
@@ -36,6 +36,7 @@ class Load:
     name: str | None = None
 
     def __post_init__(self):
+        keep_plain(self)
         if (getattr(self, self.quantity) is None) == (self.keyframes is None):
             raise ValueError(f"{self.label}: exactly one of {self.quantity} and keyframes must be given")
         if not (self.name is None or isinstance(self.name, str)):
