@@ -11,6 +11,7 @@ from matplotlib.image import imread
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 import warpcloth as wc
+from support.rows import slow_but
 from support.usd_validation import validate
 from warpcloth.analysis.measures import scalars
 from warpcloth.base.texts import camel_case
@@ -159,7 +160,7 @@ def test_files_of_the_input_are_not_written_over(folder, kind):
     assert {path: path.read_bytes() for path in before} == before
 
 
-@pytest.mark.parametrize("place", [np.nan, np.inf])
+@pytest.mark.parametrize("place", slow_but([np.nan], [np.nan, np.inf]))
 @pytest.mark.parametrize("frame", ["rest", 2])
 @pytest.mark.parametrize("neighbourhood", [None, "1-ring", "nearest:k=4"])
 def test_points_without_a_place_hide_no_other_directions(tmp_path, recwarn, place, frame, neighbourhood):

@@ -10,6 +10,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 import pytest
 
+from support.rows import slow_but
 from warpcloth.analysis.stacks import NpzWriter
 from warpcloth.analysis.summaries import PERCENTILES, CsvWriter, JsonWriter, Summary, summarise
 
@@ -362,7 +363,7 @@ def peak(write, count):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("ending", WRITERS)
+@pytest.mark.parametrize("ending", slow_but(["csv", "npz"], WRITERS))
 def test_memory_does_not_grow_with_rows(tmp_path, ending):
     """3000 rows more, more than half a MiB on the disk, take no more memory than a buffer of 64 KiB; NPZ holds labels."""
     row = many(2)[1]

@@ -27,9 +27,14 @@ wc.simulate(hanging.scene(n=3, duration=0.1), wc.Explicit(substeps=64), output={
     ("before", "after", "said"),
     [
         ("", "", False),
-        ("", "wp.config.log_level = wp.LOG_INFO", True),
-        ("wp.config.log_level = wp.LOG_DEBUG", "", True),
-        ("wp.config.log_level = wp.LOG_ERROR", "assert wp.config.log_level == wp.LOG_ERROR", False),
+        *(
+            pytest.param(*row, marks=pytest.mark.slow)
+            for row in (
+                ("", "wp.config.log_level = wp.LOG_INFO", True),
+                ("wp.config.log_level = wp.LOG_DEBUG", "", True),
+                ("wp.config.log_level = wp.LOG_ERROR", "assert wp.config.log_level == wp.LOG_ERROR", False),
+            )
+        ),
     ],
 )
 def test_python_is_quiet_unless_asked(tmp_path, before, after, said):

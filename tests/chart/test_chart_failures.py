@@ -3,6 +3,7 @@
 import csv
 import json
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 import numpy as np
 import pytest
@@ -110,6 +111,7 @@ def test_what_stiff_edges_leave_free_is_counted(holding):
         assert left == law(boundary)
 
 
+@pytest.mark.slow
 def test_a_net_that_has_no_freedom_left_keeps_its_curvature_along_its_lines_alone(device):
     """Turned from them it loses the more; regular edges of triangles and rows bend in any direction, irregular ones do not."""
     kept = {}
@@ -137,9 +139,14 @@ def test_what_has_no_stiffness_slides_on(device):
 
 @pytest.fixture(scope="module")
 def charts(device):
-    names = ("isometry", "slivers", "cotangents", "rank")
-    with ThreadPoolExecutor(1) as executor:
-        return {name: failure_chart(name, device, store=Store(), executor=executor) for name in names}
+    """Measures a chart by name, once."""
+
+    @cache
+    def chart(name):
+        with ThreadPoolExecutor(1) as executor:
+            return failure_chart(name, device, store=Store(), executor=executor)
+
+    return chart
 
 
 def laws(found, panel):
@@ -148,20 +155,21 @@ def laws(found, panel):
     return np.array([(row["x"], row["value"], row["expected"]) for row in rows]).T
 
 
+@pytest.mark.slow
 def test_quadratic_bending_holds_on_isometries_of_flat_sheets(charts):
     """x → x + εx² costs ½D(2ε)², exact for quadratic functions; a rest curvature is not seen. Angles see what bends.
 
     Rolled up a hinge of edge h turns by θ ≤ κh, and 2 sin(θ/2) is θ to θ²/24.
     """
-    x, value, expected = laws(charts["isometry"], "stretch")
+    x, value, expected = laws(charts("isometry"), "stretch")
     h = isometry._H
     # Up to the rounding of y, eps|x|, against 2ε h².
     assert np.abs(value - expected).max() < 64 * EPS / h**2 and value.max() == pytest.approx(0.5 * 0.6**2)
     for panel in ("flat", "curved"):
-        x, value, expected = laws(charts["isometry"], panel)
+        x, value, expected = laws(charts("isometry"), panel)
         curvature = np.maximum(np.abs(x), isometry.REST)
         assert (np.abs(value - expected) < (curvature * h) ** 2 / 6.0 * curvature**2).all()
-    rows = charts["isometry"]["rows"]
+    rows = charts("isometry")["rows"]
     at_rest = {name: value for name in physics.BENDING for x, value in of(rows, "curved", name).T if x == isometry.REST}
     for name in ("quadratic", "plate"):
         assert at_rest[name] == pytest.approx(0.5, rel=0.01), name
@@ -172,12 +180,12 @@ def test_slivers_are_stiff_without_bound_down_to_the_guard(charts):
     """|∇θ| = 1/height, the same at any scale; 0 at 1e-6 of the longest side and below; the step goes as the height."""
     for size in ("1 m", "1 mm"):
         for dtype in ("float32", "float64"):
-            x, value = of(charts["slivers"]["rows"], "gradient", f"edge {size}, {dtype}")
+            x, value = of(charts("slivers")["rows"], "gradient", f"edge {size}, {dtype}")
             alive = x > 1e-6
             assert 0 < alive.sum() < len(x) and not value[~alive].any()
             # The height itself is rounded, and a dozen numbers lie between.
             assert np.abs(value[alive] * x[alive] - 1.0).max() < 16 * float(np.finfo(dtype).eps)
-    x, value, expected = laws(charts["slivers"], "step")
+    x, value, expected = laws(charts("slivers"), "step")
     assert value == pytest.approx(expected, rel=1e-9)
     # ω² = cD|∇θ|²/m, where |∇θ|² = (1 + ½)/h² and c = 2/√¾ of a hinge one of whose triangles is a sliver.
     assert value[x < 1e-4] == pytest.approx(x[x < 1e-4] * 2.0 / np.sqrt(1.5 * 2.0 / np.sqrt(0.75)), rel=1e-3)
@@ -186,10 +194,10 @@ def test_slivers_are_stiff_without_bound_down_to_the_guard(charts):
 def test_a_hinge_folded_flat_turns_round(charts):
     """θ − θ̄ in (−π, π]: energy ½c(θ − θ̄)² and torque c(θ − θ̄), which jumps by 2π at θ̄ + π; quadratic 2c sin²(θ/2)."""
     for panel in ("energy", "torque"):
-        _, value, expected = laws(charts["slivers"], panel)
+        _, value, expected = laws(charts("slivers"), panel)
         assert len(value) == 108 and np.abs(value - expected).max() < 64 * EPS
     for series, jump in (("dihedral, 0° at rest", 180.0), ("dihedral, 90° at rest", 270.0), ("quadratic", None)):
-        x, torque = of(charts["slivers"]["rows"], "torque", series)
+        x, torque = of(charts("slivers")["rows"], "torque", series)
         steps = np.diff(torque)
         assert (0.5 * (x[1:] + x[:-1]))[steps < -1.0].tolist() == ([jump] if jump else [])
         if jump:
@@ -199,14 +207,14 @@ def test_a_hinge_folded_flat_turns_round(charts):
 
 def test_cotangent_weights_are_negative_beyond_180_degrees(charts):
     """cot((α + β)/2) of two equal triangles, −.176 of two apexes of 100°; clamped and intrinsic ones are 0 there."""
-    _, value, expected = laws(charts["cotangents"], "weight")
+    _, value, expected = laws(charts("cotangents"), "weight")
     # cot changes by 1/sin² of half the sum, 1.7 at most, times the rounding of angles.
     assert len(value) == 51 and np.abs(value - expected).max() < 64 * EPS
-    rows = charts["cotangents"]["rows"]
+    rows = charts("cotangents")["rows"]
     weights = {name: dict(of(rows, "weight", name).T) for name in ("cotangent", "clamped", "intrinsic Delaunay")}
     assert weights["cotangent"][200.0] == pytest.approx(-0.17632698, rel=1e-7)
     assert weights["clamped"][200.0] == weights["intrinsic Delaunay"][200.0] == 0.0
-    _, value, expected = laws(charts["cotangents"], "precision")
+    _, value, expected = laws(charts("cotangents"), "precision")
     assert len(value) == 45 and np.abs(value - expected).max() < 256 * EPS and expected.max() > 1.0
 
 
@@ -215,7 +223,7 @@ def test_negative_weights_tear_a_sheet_apart(charts):
 
     Those end within 10 times what the tolerance of 1e-6 leaves of edges of 1.
     """
-    rows = charts["cotangents"]["rows"]
+    rows = charts("cotangents")["rows"]
     for name in cotangents.CHOICES:
         x, energy = of(rows, "energy", name)
         failed = x > 180.0 if name == "cotangent" else np.zeros(len(x), dtype=bool)
@@ -227,7 +235,7 @@ def test_negative_weights_tear_a_sheet_apart(charts):
 
 def test_rotations_are_known_to_their_rank(charts):
     """To ε(σ₁/σ₂)² about the line of the points, and the line itself to rounding."""
-    rows = charts["rank"]["rows"]
+    rows = charts("rank")["rows"]
     for dtype, eps in rank.EPS.items():
         x, error = of(rows, "line", f"{dtype}: the rotation")
         law = np.array([rank.known(ratio, dtype) for ratio in x])
@@ -241,11 +249,11 @@ def test_rotations_are_known_to_their_rank(charts):
 
 def test_what_a_line_keeps_of_a_turn(charts):
     """A plane the turn, a line the angle between itself and where it goes, a point nothing."""
-    x, value, expected = laws(charts["rank"], "turn")
+    x, value, expected = laws(charts("rank"), "turn")
     # cos of the angle of a rotation is that of a sum of three numbers; near 180° its root is lost, half the digits.
     assert len(x) == 57 and np.radians(np.abs(value - expected)).max() < 4.0 * np.sqrt(EPS)
-    assert of(charts["rank"]["rows"], "turn", "on a line")[1].max() == pytest.approx(90.0, abs=1e-6)
-    assert not of(charts["rank"]["rows"], "turn", "in one place")[1].any()
+    assert of(charts("rank")["rows"], "turn", "on a line")[1].max() == pytest.approx(90.0, abs=1e-6)
+    assert not of(charts("rank")["rows"], "turn", "in one place")[1].any()
 
 
 # --- 15. Tunnelling.
@@ -268,6 +276,7 @@ def test_lines_of_tunnelling():
     assert len(by_key["pbd, filter"]) == 2 and len(by_key) == 16
 
 
+@pytest.mark.slow
 def test_contact_alone_passes_where_theory_says(device):
     """Speeds of 0.9 and more than 1 or 2 times each line; of a step of 1 ms the energy is what gives way."""
     assert shares("explicit", "energy alone", 1e-3, [0.28, 0.35], device) == ([0.0, 100.0], {"stays outside", "passes"})
@@ -408,37 +417,40 @@ def test_edges_that_go_through_triangles():
 
 # --- Tables, pictures, command.
 
-
-def test_rows_have_their_laws_and_a_table_a_line_for_each(charts, tmp_path):
-    for name, found in charts.items():
-        assert found["failure"] == name and json.dumps(found, allow_nan=False)
-        panels = {panel.key: panel for panel in FAILURES[name].PANELS}
-        assert {row["panel"] for row in found["rows"]} == set(panels) == set(found["panels"])
-        for panel in panels.values():
-            series = {row["series"] for row in found["rows"] if row["panel"] == panel.key}
-            assert set(panel.follows) <= series and set(panel.follows.values()) <= set(panel.laws)
-        write_csv(tmp_path / "t.csv", found)
-        with open(tmp_path / "t.csv", encoding="utf-8") as file:
-            table = list(csv.DictReader(file))
-        assert tuple(table[0]) == COLUMNS and len(table) == len(found["rows"])
-        assert [float(row["x"]) for row in table] == [row["x"] for row in found["rows"]]
+MEASURED = pytest.mark.parametrize("name", slow_but(["rank"], ["isometry", "slivers", "cotangents", "rank"]))
 
 
-@pytest.mark.parametrize("name", slow_but(["isometry"], ["isometry", "slivers", "cotangents", "rank"]))
+@MEASURED
+def test_rows_have_their_laws_and_a_table_a_line_for_each(name, charts, tmp_path):
+    found = charts(name)
+    assert found["failure"] == name and json.dumps(found, allow_nan=False)
+    panels = {panel.key: panel for panel in FAILURES[name].PANELS}
+    assert {row["panel"] for row in found["rows"]} == set(panels) == set(found["panels"])
+    for panel in panels.values():
+        series = {row["series"] for row in found["rows"] if row["panel"] == panel.key}
+        assert set(panel.follows) <= series and set(panel.follows.values()) <= set(panel.laws)
+    write_csv(tmp_path / "t.csv", found)
+    with open(tmp_path / "t.csv", encoding="utf-8") as file:
+        table = list(csv.DictReader(file))
+    assert tuple(table[0]) == COLUMNS and len(table) == len(found["rows"])
+    assert [float(row["x"]) for row in table] == [row["x"] for row in found["rows"]]
+
+
+@MEASURED
 def test_points_and_laws_are_drawn(name, charts, tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
     kept, saving = [], Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (kept.append(self), saving(self, *a, **k)))
-    plot_failure(tmp_path / "a.svg", charts[name])
-    if name == "isometry":
-        plot_failure(tmp_path / "b.svg", charts[name])
+    plot_failure(tmp_path / "a.svg", charts(name))
+    if name == "rank":
+        plot_failure(tmp_path / "b.svg", charts(name))
         assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     assert len(kept[0].axes) == len(FAILURES[name].PANELS)
     for axes, panel in zip(kept[0].axes, FAILURES[name].PANELS, strict=True):
         lines = {line.get_label(): line for line in axes.lines}
         assert set(panel.laws) <= set(lines) and axes.get_xlabel() == panel.x and axes.get_title(loc="left") == panel.title
-        for row in charts[name]["rows"]:
+        for row in charts(name)["rows"]:
             if row["panel"] == panel.key:
                 assert row["value"] in lines[row["series"]].get_ydata(orig=True)
         for series, law in panel.follows.items():
@@ -474,7 +486,7 @@ def test_maps_are_drawn(tunnels, tmp_path, monkeypatch):
 
 
 def test_a_point_without_a_value_is_left_out_and_said(charts, tmp_path, capsys, monkeypatch):
-    lost = {**charts["rank"], "rows": [*charts["rank"]["rows"], point("turn", "on a line", 9.0, None, "too slow")]}
+    lost = {**charts("rank"), "rows": [*charts("rank")["rows"], point("turn", "on a line", 9.0, None, "too slow")]}
     lost["rows"][-1] |= {"law": None, "expected": None}
     plot_failure(tmp_path / "a.png", lost)
     monkeypatch.setattr("warpcloth.lab.failures.failure_chart", lambda *a, **k: lost)
@@ -489,6 +501,7 @@ def test_without_libigl_it_says_what_is_missing(device):
     assert len(lost) == 4 and all(row["value"] is None and "pip install" in row["reason"] for row in lost)
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, capfd, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
     given = ["chart", "failure", "isometry", "--workers", "1"]

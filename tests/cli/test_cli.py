@@ -539,6 +539,7 @@ def test_a_reader_that_has_gone_changes_nothing(tmp_path, capfd, monkeypatch):
         assert capfd.readouterr().err.count("\n") == code  # the line that says how it diverged
 
 
+@pytest.mark.slow
 def test_the_progress_bar_shows_on_a_terminal(tmp_path):
     pty = pytest.importorskip("pty")
     ours, theirs = pty.openpty()
@@ -566,6 +567,7 @@ def test_a_progress_bar_that_the_environment_disables_takes_all_calls(monkeypatc
     progress.close()
 
 
+@pytest.mark.slow
 def test_a_process_that_is_interrupted_leaves_a_file_that_opens(tmp_path):
     output = tmp_path / "out.usdc"
     process = start("run", "hanging", "--frames", 100_000, "-o", output)

@@ -120,6 +120,7 @@ def place(tmp_path_factory):
 STAGES, counts = generated(100, 1000)
 
 
+@pytest.mark.slow
 @counts
 def test_stages(place, capfd, examples):
     @STAGES

@@ -203,7 +203,7 @@ EVERY = [
 @pytest.mark.parametrize(
     ("name", "what", "dtype"),
     slow_but(
-        [("explicit", "spinning box", "float32"), *((name, "mesh", "float32") for name in ("explicit", "xpbd"))],
+        [("xpbd", "mesh", "float32")],
         list(dict.fromkeys(EVERY)),
     ),
 )
@@ -452,6 +452,7 @@ def test_a_step_with_nothing_near_has_few_launches_more(name):
     assert without < with_contact <= without + 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elements", ("vertices", "triangles"))
 def test_a_record_does_not_change_friction_on_a_mesh(elements):
     """A recorded run refreshes contact in every step, and no more than once where contact begins, on a mesh that deforms."""
@@ -473,7 +474,7 @@ def test_a_record_does_not_change_friction_on_a_mesh(elements):
     assert (plain.points == recorded.points).all() and plain.points[-1, :, 1].max() < 0.03
 
 
-@pytest.mark.parametrize("name", ("pbd", "xpbd"))
+@pytest.mark.parametrize("name", slow_but(["pbd"], ["pbd", "xpbd"]))
 def test_a_frame_with_one_test_has_the_bits_of_its_steps(name, device, monkeypatch):
     """A sheet falls onto a ball: frames in which nothing is near, one in which contact begins, and frames with contact."""
     scene = drape.scene(n=6, friction=0.0 if name == "pbd" else 0.3)

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.core.status import Result
 from warpcloth.kernels.contact.mesh_faces import between, first_contact
 from warpcloth.scene.colliders import turned
@@ -87,7 +88,7 @@ CASES = [
         name,
         what,
         dtype,
-        marks=[] if dtype == "float32" and (name == "newton" or (what, name) == ("spike", "explicit")) else SLOW,
+        marks=[] if dtype == "float32" and name == "newton" else SLOW,
     )
     for name in SOLVERS
     for what in MESHES
@@ -171,7 +172,7 @@ EXACT = {
 }
 
 
-@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("name", slow_but(["xpbd"], EXACT))
 def test_all_meet_at_one_minimiser(name):
     """1e-8 m on a spike and a knife, sliding and in tension, where no vertex is near enough to touch them."""
     scene, found = lying(BOTH, 0.3), []

@@ -390,6 +390,7 @@ def test_stops_count_in_active_copies_alone(device):
     assert not stopping.numpy().any()
 
 
+@pytest.mark.slow
 @pytest.mark.host
 def test_gaps_by_blocks(device):
     """They are those of the kernel that takes pairs one by one, to the bit, in full blocks and in others."""
@@ -453,7 +454,7 @@ def test_locked_axes(name, device):
     assert crossed(x, scene.mesh.triangles) == 0
 
 
-@pytest.mark.parametrize("name", ["pbd", "hierarchical_pbd", "pbd_jacobi"])
+@pytest.mark.parametrize("name", slow_but(["pbd", "hierarchical_pbd"], ["pbd", "hierarchical_pbd", "pbd_jacobi"]))
 @pytest.mark.parametrize("tilt", [1e-9, 1e-4])
 def test_locked_axes_almost_along_the_normal(name, tilt, device):
     """Sheets that cannot be moved apart, at an angle to the free axes that is rounding or small, stay about where they are.

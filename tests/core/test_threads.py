@@ -56,7 +56,7 @@ def same(steppers):
     return all(np.array_equal(a, b) for other in others for a, b in zip(expected, other, strict=True))
 
 
-@pytest.mark.parametrize("name", slow_but(("explicit", "xpbd"), SOLVERS))
+@pytest.mark.parametrize("name", slow_but(("xpbd",), SOLVERS))
 def test_copies_shared_out_are_those_of_one_thread(name, device):
     """To the bit, of uneven shares and of more threads than copies; when some are put back, too."""
     record = replace(SOLVERS[name], substeps=2)
@@ -90,7 +90,7 @@ def test_copies_of_stiffness_by_element_are_those_of_one_thread(device):
 
 
 @pytest.mark.parametrize("launches", [1, 10_000])
-@pytest.mark.parametrize("name", [name for name in DIVIDED if name != "explicit"])
+@pytest.mark.parametrize("name", slow_but(["xpbd hard"], [name for name in DIVIDED if name != "explicit"]))
 def test_colours_shared_out_are_those_of_one_thread(name, launches, device, monkeypatch):
     """To the bit, with more threads than the smaller colours have elements, and pins that move."""
     monkeypatch.setattr(solvers, "LAUNCHES", launches)
@@ -105,7 +105,11 @@ def test_colours_shared_out_are_those_of_one_thread(name, launches, device, monk
 
 @pytest.mark.parametrize("launches", [1, 20])
 @pytest.mark.parametrize(
-    ("name", "dtype"), precisions([name for name in TERMS if name not in ("clusters", "plate bending", "several")])
+    ("name", "dtype"),
+    slow_but(
+        precisions(["nothing", "springs", "attachments"]),
+        precisions([name for name in TERMS if name not in ("clusters", "plate bending", "several")]),
+    ),
 )
 def test_ranges_move_as_the_whole(name, dtype, launches, device, monkeypatch):
     """The same but for the order of sums, and in every run the same bits; with pins that move, and from any place."""
@@ -128,6 +132,7 @@ def test_ranges_move_as_the_whole(name, dtype, launches, device, monkeypatch):
         assert np.abs(stepper.state.x.numpy() - steppers[0].state.x.numpy()).max() < 43 * stepper.h * tolerance
 
 
+@pytest.mark.slow
 def test_ranges_far_from_the_origin_move_as_the_whole(device):
     """They too keep places to more digits than x has, those of ghosts as well, and start again."""
     sheet = wc.Mesh.grid(17, 17)

@@ -187,6 +187,7 @@ def test_a_stage_is_sent_with_the_layers_below_it(address, tmp_path, monkeypatch
     assert found == scene_digest(ref.load())
 
 
+@pytest.mark.slow
 def test_charts_are_those_of_processes(address, tmp_path, monkeypatch):
     """But for times, which are kept apart."""
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
@@ -235,6 +236,7 @@ def _free():
         return found.getsockname()[1]
 
 
+@pytest.mark.slow
 def test_addresses(address, tmp_path):
     file = tmp_path / "scheduler.json"
     file.write_text(f'{{"address": "{address}"}}', encoding="utf-8")
@@ -284,6 +286,7 @@ def test_workers_that_are_not_fit():
         clusters._check(Workers({}, {}), "tcp://s")
 
 
+@pytest.mark.slow
 def test_the_scheduler_needs_no_warpcloth(address):
     """It unpickles what is submitted, but not what only workers need."""
     from distributed.protocol.pickle import dumps

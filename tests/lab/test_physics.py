@@ -285,14 +285,15 @@ def converges(found, order):
 
 # Turned by 30° it has rows across, whose sides alone are jagged. Both energies have one stiffness where the membrane is stiff,
 # see test_quadratic_bending_is_wrong_where_the_membrane_is_soft, so that an angle has one of them, and one Γ.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("angle", "bending", "gamma"),
     [
         # The net is its own image at ±60° more.
         (13.0, "quadratic", 1.0),
-        pytest.param(0.0, "dihedral", 1.0, marks=pytest.mark.slow),
-        pytest.param(30.0, "dihedral", 0.5, marks=pytest.mark.slow),
-        pytest.param(45.0, "quadratic", 0.5, marks=pytest.mark.slow),
+        (0.0, "dihedral", 1.0),
+        (30.0, "dihedral", 0.5),
+        (45.0, "quadratic", 0.5),
     ],
 )
 def test_a_cantilever_of_an_equilateral_net_converges(angle, bending, gamma, device):
@@ -343,7 +344,7 @@ def stays_wrong(pattern, angle, found):
         pytest.param(
             "diagonal", 0.0, "quadratic", (0.9, 1.0), marks=pytest.mark.slow
         ),  # it twists, and so is softer than the cylinder
-        ("diagonal", 45.0, "dihedral", (2.85, 3.15)),
+        pytest.param("diagonal", 45.0, "dihedral", (2.85, 3.15), marks=pytest.mark.slow),
         pytest.param("diagonal", -15.0, "quadratic", (0.7, 0.8), marks=pytest.mark.slow),
         pytest.param("alternating", 0.0, "dihedral", (0.8, 0.9), marks=pytest.mark.slow),  # its vertices part: 5/6 of D
         ("alternating", 45.0, "quadratic", (1.2, 1.35)),  # 4/3
@@ -442,6 +443,7 @@ def test_a_patch_is_exact(pattern, device):
     assert found["error"] < 1e-9 and found["elements"] > 100
 
 
+@pytest.mark.slow
 def test_results_are_json_and_run_as_tasks(tmp_path):
     tasks = [task(measure, case="chain", resolution=n) for n in (2, 3)]
     found = {
@@ -466,6 +468,7 @@ def test_the_time_is_the_median_of_warm_solutions(monkeypatch):
     assert len(calls) == 3 and once["spread"] == 2 * [once["ms"]] and once["iterations"] == found["iterations"]
 
 
+@pytest.mark.slow
 def test_what_does_not_settle_says_so(monkeypatch):
     monkeypatch.setattr(physics, "_CHUNK", 2)
     found = measure("cantilever", 6, limit=1e-6)
@@ -499,6 +502,7 @@ def test_arguments_are_checked(arguments, message):
         measure(**{"case": "cantilever", "resolution": 6, "width": 1.0} | arguments)
 
 
+@pytest.mark.slow
 def test_the_plot(tmp_path, monkeypatch):
     results = []
     for angle in (0.0, 0.5):

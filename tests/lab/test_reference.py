@@ -296,6 +296,7 @@ def test_what_has_no_reference_says_so(folder, tmp_path):
     assert not list(folder.glob("*"))
 
 
+@pytest.mark.slow
 def test_what_is_slow_or_not_known_warns(folder, tmp_path, monkeypatch):
     stiff = written(tmp_path / "stiff.py", "terms=[wc.RigidCluster(vertices=[[0, 1, 2]], stiffness=1e14)], duration=0.05")
     with pytest.warns(

@@ -97,7 +97,7 @@ def test_jacobi_diverges_above_its_limit(kind, solver, sweep, iterations, device
     assert found == pytest.approx(limit, rel=0.01)
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 20])
+@pytest.mark.parametrize("iterations", slow_but([1, 2], [1, 2, 20]))
 @pytest.mark.parametrize("solver", ["pbd", "xpbd"])
 def test_gauss_seidel_diverges_above_its_limit(solver, iterations, device):
     """(1 − ω)ⁿ of structural springs is the multiplier q of n sweeps, z² − 2qz + q = 0 that of steps: |z| > 1 iff q < −1/3."""
@@ -280,6 +280,7 @@ IMPLICIT = [Setup("newton", {"hessian": "clamp"}), Setup("newton"), Setup("proje
 OTHERS = [Setup(name) for name in ("explicit", "xpbd", "pbd", "admm", "hierarchical-pbd")]
 
 
+@pytest.mark.slow
 def test_implicit_euler_never_diverges(device):
     """8 decades of stiffness, 0.1 to 1e7 N/m, and the ends of 4 of the step; the others diverge where a rule says so."""
     cells = mapped(

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.base.digest import source_digest
 from warpcloth.lab import measurements as listed
 from warpcloth.lab.campaign import Store, cache_folder, sweep
@@ -37,7 +38,7 @@ def squares(count, folder=None):
     return [task(square, x=x, folder=str(folder) if folder else None) for x in range(count)]
 
 
-@pytest.mark.parametrize("threads", [False, True])
+@pytest.mark.parametrize("threads", slow_but([True], [False, True]))
 def test_every_task_once(threads, tmp_path):
     said = []
     tasks = squares(5, tmp_path)
@@ -130,6 +131,7 @@ def die(after):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_is_said(tmp_path):
     """Finished tasks are kept."""
     store, pipe = tmp_path / "store.jsonl", tmp_path / "pipe"

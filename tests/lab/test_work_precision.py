@@ -364,6 +364,7 @@ def text_of(figure):
     return "\n".join(text.get_text() for axes in figure.axes for text in axes.texts)
 
 
+@pytest.mark.slow
 def test_time_diagram(device, tmp_path, drawn):
     """Errors of first and second order, the front, what diverges; the second time nothing is measured."""
     store, said = tmp_path / "store.jsonl", []
@@ -466,6 +467,7 @@ def test_the_physics_diagram(tmp_path):
             work_precision.physics_diagram(wrong)
 
 
+@pytest.mark.slow
 def test_solver_and_spectrum_diagrams(device, tmp_path, drawn):
     with ThreadPoolExecutor(1) as executor:
         run = {"executor": executor, "device": device, "limit": 0.5, "frames": 12}

@@ -98,6 +98,7 @@ def test_locked_coordinates(small, device):
             assert one @ (matrix @ one) < cycles.error[copy] ** 2 * (other @ (matrix @ other))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "module, solver",
     [

@@ -8,6 +8,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.continuum import flat, hill, jittered
+from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.multigrid import CYCLE, OMEGA, SPARED
@@ -203,7 +204,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", slow_but(["hanging", "locked", "copies"], SCENES))
 def test_the_minimiser_does_not_depend_on_the_preconditioner(device, name, monkeypatch):
     """After three frames, to the tolerance of Newton's iteration."""
     declared, build = SCENES[name]

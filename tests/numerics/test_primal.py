@@ -44,6 +44,7 @@ SOFT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terms", SOFT.values(), ids=SOFT)
 @pytest.mark.parametrize("locked", [False, True])
 def test_both_the_matrix_and_the_solution(terms, locked, device):

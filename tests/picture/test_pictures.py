@@ -396,6 +396,7 @@ def test_axes_say_what_they_show(tmp_path):
     assert "frame" in found and "undeformed" not in found
 
 
+@pytest.mark.slow
 def test_each_scalar_has_a_panel_and_neutral_values_a_line(tmp_path):
     rows = [row for k in range(7) for row in summaries([LEVEL] * 4 if k else [NONE] * 4, name=f"scalar_{k}", unit="1/s")]
     plot_percentiles(tmp_path / "plain.png", rows)

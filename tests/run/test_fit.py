@@ -9,6 +9,7 @@ from scipy.spatial import Delaunay
 from scipy.stats import binomtest
 
 import warpcloth as wc
+from support.rows import slow_but
 from warpcloth.cli import main
 from warpcloth.lab.laboratory import drape_coefficient
 from warpcloth.lab.scans import scan, write_capture
@@ -279,6 +280,7 @@ def coefficient(rest):
     return drape_coefficient(rest.points, FLAT.points, FLAT.triangles)
 
 
+@pytest.mark.slow
 @pytest.mark.host
 def test_a_drape_coefficient_gives_a_bending_stiffness():
     """Of the many rest shapes of a drape, on the branch on which it starts."""
@@ -355,7 +357,7 @@ def table(scene, points, bound):
 
 
 @pytest.mark.parametrize("bound", [True, False])
-@pytest.mark.parametrize("resting", [False, True])
+@pytest.mark.parametrize("resting", slow_but([False], [False, True]))
 def test_markers_in_a_file_give_the_parameters(bound, resting, tmp_path, capsys):
     """Bound to triangles by where they are at the start, or free points, by their distances; of a motion or at rest."""
     scene, path = hanging(n=4), tmp_path / "seen.csv"

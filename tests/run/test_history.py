@@ -380,6 +380,7 @@ def test_wrong_records_and_hidden_forces_are_refused():
         wc.simulate(body, SOLVERS["xpbd"], record="reactions")
 
 
+@pytest.mark.slow
 def test_a_copy_of_a_batch_is_an_animation(device):
     """Of its own numbers, of which those of one copy alone are the same to rounding; and there are no others."""
     cloth = square(pins="corners", self_contact=wc.SelfContact(), colliders=[wc.Sphere(radius=0.1, position=(0.0, -3.0, 0.0))])

@@ -145,7 +145,7 @@ sys.exit(main(sys.argv[2:]))
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", slow_but([signal.SIGKILL], [signal.SIGINT, signal.SIGTERM, signal.SIGKILL]))
 def test_the_command_line_resumes_what_a_signal_ended(number, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command = ["run", "hanging", "-p", "n=6", "--solver", "xpbd", "-s", "substeps=2", "iterations=2"]

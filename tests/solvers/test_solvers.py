@@ -231,7 +231,7 @@ VARIED = {
 }
 
 
-@pytest.mark.parametrize("name", VARIED)
+@pytest.mark.parametrize("name", slow_but(["density", "where they are", "damping"], VARIED))
 def test_limits_of_copies_are_the_least_of_each(name, device, monkeypatch):
     """Found once for those that are alike, and the slow one only of those of which it may be the least; the quick one alone."""
     (copies, vary), built = VARIED[name], {"device": device, "dtype": "float64"}

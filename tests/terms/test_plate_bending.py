@@ -358,7 +358,15 @@ MEET = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "newton" else pytest.mark.host) for name in MEET])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(
+            name, marks=() if name == "newton" else [pytest.mark.host] + [pytest.mark.slow] * (name != "xpbd sequential")
+        )
+        for name in MEET
+    ],
+)
 def test_all_meet(name, device):
     """1e-8 m from Newton in float64, 1e-4 m in float32; without the plate the sheet is elsewhere."""
     solver, declared = MEET[name], swinging()

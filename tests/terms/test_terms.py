@@ -28,6 +28,7 @@ from support.energies import (
     random_rotation,
 )
 from support.outside import Plane
+from support.rows import slow_but
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
 from warpcloth.core.hessian import norms as block_norms
@@ -62,6 +63,12 @@ SCALES = (1.0, 0.1, 0.01, 0.001)
 
 def named(terms):
     return {"argvalues": terms, "ids": [term.name for term in terms]}
+
+
+def quick(terms):
+    """All, of which some run always: those whose kernels compile in a second or so."""
+    kept = [term for term in terms if term.name in ("Spring", "Attachment", "StVKMembrane", "QuadraticBending")]
+    return named(terms) | {"argvalues": slow_but(kept, terms)}
 
 
 every_term = pytest.mark.parametrize("term", **named(CATALOGUE))
@@ -401,7 +408,7 @@ def test_derivatives_are_differences(term, state, scale, device):
     assert (norms(gradient) == 0.0)[~on].all() and (stiff == 0.0)[~on].all()
 
 
-@every_term
+@pytest.mark.parametrize("term", **quick(CATALOGUE))
 @pytest.mark.parametrize("scale", [*SCALES, 1e-5])
 def test_single_precision_rounds_double(term, scale, device):
     """float32 gives the float64 numbers to the rounding of y, at every scale."""
@@ -417,7 +424,7 @@ def test_single_precision_rounds_double(term, scale, device):
         assert (norms(single.hessian(policy) - double.hessian(policy)) <= 10 * error * stiff / length).all()
 
 
-@every_term
+@pytest.mark.parametrize("term", **quick(CATALOGUE))
 def test_a_correction_is_a_move(term, device, dtype="float64"):
     """At x corrected by d all is as at x + d."""
     elements = stencils(term, "random", 1.0, dtype, device)
@@ -1053,7 +1060,7 @@ def test_numbering_of_the_mesh_is_no_matter(term, device, dtype="float64"):
     assert (np.linalg.norm(gradient, axis=1) > 100 * error).any()
 
 
-@pytest.mark.parametrize("term", **named(DECLARABLE))
+@pytest.mark.parametrize("term", **quick(DECLARABLE))
 @every_dtype
 def test_gathering_is_scattering(term, dtype, device, monkeypatch):
     """The sum over the stencils of a vertex, the way of a GPU, is the sum over stencils; and each run gives the same bits.
