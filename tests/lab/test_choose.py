@@ -17,7 +17,7 @@ import pytest
 from warpcloth.chart.cheapest import text_of_cell
 from warpcloth.cli import main
 from warpcloth.cli.choose import command_line
-from warpcloth.lab import campaign, choosing, trajectory
+from warpcloth.lab import campaign, choosing, own_reference, trajectory
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.cheapest import cheapest_of_each
 from warpcloth.lab.choosing import Longest, Measured, choose, climb, climb_others, ladders, ladders_of_others, pick, run_limit
@@ -111,6 +111,27 @@ def test_solvers_of_others_are_searched_for_their_own_cheapest():
         LADDERS, lambda setups: [replace(measured(each), final=True, status="left") for each in setups], 0.01
     )
     assert found == [] and set(ended.values()) == {"0 settings in 0 s; the total time is used up"}
+
+
+def test_the_total_time_also_ends_the_own_motions_of_others(tmp_path, monkeypatch):
+    """It is used up when the reference is known: no setting is measured, and a motion ends at its first frame."""
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    scene, setups = SceneRef("chain", {"links": 5}), [Setup("explicit", {"substeps": 200})]
+    setups += [Setup(f"newton-{name}", {"substeps": 2, "iterations": 2}) for name in ("vbd", "xpbd")]
+    exact = SimpleNamespace(error=1e-5, points=np.zeros((3, 6, 3)), path="none", key="none")
+    ran = []
+
+    def run(scene, record, device, frames, watch):
+        ran.append(record.method)
+        watch(0, frames)
+
+    monkeypatch.setattr(choosing, "reference", lambda *given, **options: exact)
+    monkeypatch.setattr(choosing, "setups_of_runs", lambda *given: setups)
+    monkeypatch.setattr(own_reference, "run_other", run)
+    found, measured, _ = choose(scene, tolerance=0.01, others=["newton"], total=1e-9)
+    facts = {"cut": True, "searched": "0 settings in 0 s; the total time is used up"}
+    assert found.chosen is None and found.others == {"newton-vbd": facts, "newton-xpbd": facts}
+    assert ran == ["vbd", "xpbd"] and {each.status for each in measured} == {"left"}
 
 
 def test_the_longest_time():

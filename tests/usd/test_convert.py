@@ -114,6 +114,35 @@ def test_files_that_are_renamed_stay_if_the_next_cannot_be(stage, tmp_path, monk
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a_0000.obj", "a_0001.obj"]
 
 
+@pytest.mark.parametrize("older", [True, False])
+@pytest.mark.parametrize("ending", ["usda", "usdc", "usdz"])
+def test_a_stage_of_which_a_file_cannot_be_renamed_leaves_nothing(ending, older, stage, tmp_path, monkeypatch):
+    """Whichever it is: the rest shape, the manifest, the frames, the root or the package."""
+    out, rename = tmp_path / "out", os.replace
+    out.mkdir()
+    if older:
+        convert(stage, out / f"a.{ending}")
+    before, failed = contents(out), 0
+    while True:
+        left = iter(range(failed))
+
+        def full(*paths, left=left):
+            if next(left, None) is None:
+                raise OSError("no space left on device")
+            rename(*paths)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(outputs.os, "replace", full)
+            try:
+                convert(stage, out / f"a.{ending}")
+            except OSError:
+                assert contents(out) == before and (older or not list(out.iterdir())), failed
+                failed += 1
+            else:
+                break
+    assert failed == (5 if ending == "usdz" else 4)
+
+
 def test_formats_are_those_of_others(stage, tmp_path):
     """The bytes of the headers, and names of frames."""
     convert(stage, tmp_path / "c.pc2")
