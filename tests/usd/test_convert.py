@@ -2,9 +2,11 @@
 
 import os
 import re
+import shutil
 import signal
 import struct
 import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
@@ -141,6 +143,46 @@ def test_a_stage_of_which_a_file_cannot_be_renamed_leaves_nothing(ending, older,
             else:
                 break
     assert failed == (5 if ending == "usdz" else 4)
+
+
+@pytest.mark.parametrize("name", ["a.pc2", "a.mdd", "a.npz", "a.usda", "a.usdc", "a.usdz", "a.obj", "a.##.ply"])
+def test_what_a_killed_conversion_left_is_removed_by_the_next(name, stage, tmp_path, monkeypatch):
+    """Before any of the renames. Files of other outputs stay, and what is left of a longer sequence does not."""
+    out, rename, moments = tmp_path / "out", os.replace, []
+    out.mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(outputs.os, "replace", lambda *paths: (moments.append(contents(out)), rename(*paths)))
+        convert(stage, out / name)
+    clean = [path.name for path in sorted(contents(out))]
+    others = {out / "b.npz.0123abcd.unfinished": b"b", out / "a.npz.old": b"old"}
+    longer = [out / "a_0099.obj.0123abcd.unfinished"] if name == "a.obj" else []
+    for left in moments:
+        shutil.rmtree(out)
+        for path, data in (left | others | dict.fromkeys(longer, b"")).items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            convert(stage, out / name)
+        assert [path.name for path in sorted(contents(out)) if path not in others] == clean
+        assert all(path.read_bytes() == data for path, data in others.items())
+    assert moments
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [("a.obj", "a_####.obj"), ("a.pc2", "a.mdd"), ("a.npz", "a.npz"), ("a.usdc", "a.usdc")]
+)
+def test_two_conversions_to_one_output_do_not_run_at_a_time(first, second, stage, tmp_path):
+    """The first would else lose its temporary files; .pc2 and .mdd have the same mesh beside them."""
+
+    def meanwhile(done, total):
+        with pytest.raises(BlockingIOError, match="is being written by process"):
+            convert(stage, tmp_path / second)
+        convert(stage, tmp_path / "other.npz")
+
+    convert(stage, tmp_path / first, progress=meanwhile)
+    convert(stage, tmp_path / second)
+    assert not [path for path in contents(tmp_path) if path.name.endswith((".lock", ".unfinished"))]
 
 
 def test_formats_are_those_of_others(stage, tmp_path):

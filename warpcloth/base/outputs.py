@@ -4,6 +4,7 @@ import contextlib
 import csv
 import errno
 import os
+import re
 import secrets
 import socket
 import stat
@@ -241,6 +242,41 @@ class Lock:
             os.remove(self._path)
         self._file.close()
         self._file = None
+
+
+@contextlib.contextmanager
+def writing_alone(paths, numbered=False):
+    """Locks files against other such writers for the block, and first removes what killed ones left of the files.
+
+    Args:
+        paths: Paths of the files.
+        numbered: Whether the last number in the names is that of a frame. All frames together then have one lock, and what is
+            left of frames with other numbers is removed too.
+
+    Raises:
+        BlockingIOError: Another writer, in this or another process, has a lock.
+    """
+    folders = {}  # names of files by folder; # stands for the number of a frame
+    for path in paths:
+        folder, name = os.path.split(os.path.realpath(path))
+        folders.setdefault(folder, set()).add(re.sub(r"\d+(?=\D*$)", "#", name) if numbered else name)
+    locks = []
+    try:
+        with deferred():
+            for folder, names in folders.items():
+                for name in sorted(names):
+                    locks.append(Lock(os.path.join(folder, name)))
+        for folder, names in folders.items():
+            escaped = [r"\d+".join(map(re.escape, name.rsplit("#", 1 if numbered else 0))) for name in names]
+            left = re.compile(rf"({'|'.join(escaped)})\.[0-9a-f]{{8}}\.unfinished")
+            for name in filter(left.fullmatch, os.listdir(folder)):
+                with contextlib.suppress(OSError):
+                    os.remove(os.path.join(folder, name))
+        yield
+    finally:
+        with deferred():
+            for lock in locks:
+                lock.release()
 
 
 def _open_itself(path, flags):

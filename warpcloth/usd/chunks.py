@@ -301,7 +301,7 @@ class ChunkWriter:
         with deferred():
             if self._pending:
                 self._write_pending()
-            if last and self._packed and self._chunks:
+            if last and self._packed and self._chunks and not self._whole:
                 (self.run / _COMPLETE).touch()
 
     def _write_pending(self):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.outputs import STAGE_ENDINGS, OutputSet, check_apart, check_replaceable
+from ..base.outputs import STAGE_ENDINGS, OutputSet, check_apart, check_replaceable, writing_alone
 from ..mesh.caches import CACHES, NUMBERED, numbered_paths, write_mdd, write_npz, write_obj, write_pc2, write_ply
 from ..mesh.loading import read_arrays
 from ..mesh.sequences import open_sequence
@@ -24,7 +24,8 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
 
     All frames are read twice, because they are checked before the first is written. New files replace older ones, renamed one
     after another once all are written. After an error or interrupt before that, older files are as before, and nothing is left
-    of new ones. An interrupt among the renames waits until all are renamed; if a rename fails, files renamed before it stay.
+    of new ones. An interrupt among the renames waits until all are renamed; if a rename fails, files renamed before it stay. A
+    killed process leaves temporary files, which the next conversion to the same output removes.
 
     Args:
         source: Path of an animation, as for :func:`warpcloth.open_sequence`.
@@ -39,6 +40,7 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
         The :class:`warpcloth.Sequence` of the source, and a list of the paths of the files.
 
     Raises:
+        BlockingIOError: Another conversion to this output is running.
         FileNotFoundError: There is no such file or folder.
         OSError: A file cannot be written, or not be renamed.
         ValueError: The source or the ending is not supported; a point, or a velocity that is written, is not finite as float32;
@@ -72,7 +74,7 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
     if ending in STAGE_ENDINGS:
         _write_stage(paths[0], sequence, interval, moving(), progress)
         return sequence, paths
-    with OutputSet() as outputs:
+    with writing_alone(paths, ending in NUMBERED), OutputSet() as outputs:
         if ending in NUMBERED:
             write = write_ply if ending == ".ply" else partial(write_obj, digits=_digits(sequence))
             for path, points in zip(paths, frames(), strict=True):
