@@ -200,7 +200,7 @@ def _checked_names(start, scene):
 
 
 def _parameters_of(scene):
-    """Returns the names in ``vary`` of what one number gives: those to list, and all, also by the class of a named term."""
+    """Returns the names in ``vary`` that take one number: a list of them by label, and a set that has those by class too."""
     quantities = [
         (term, field)
         for term in (*scene.terms, *scene.contact_terms, *scene.air_terms)
