@@ -19,7 +19,8 @@ from .arap import edge_weights, half_cotangents
 
 _TURNED = np.cos(np.radians(60.0))  # cosine of the largest angle between the normals of a point and of the template
 _FEW = 0.01  # `resample` warns if a smaller share of the capture counts, or of the template faces it
-_BENDING = 0.1  # weight of the energy of cells, which resists bending too, relative to that of triangles, which resists strain
+_BENDING = 0.12  # weight of the energy of cells, which resists bending too, relative to that of triangles, which resists strain
+_KEPT = 0.9  # share of the last frame in the shape to which the energy of cells is relative; the rest shape has the other share
 _REGULAR = 1e-12  # added to the diagonal, relative to its largest entry, so that the matrix has an inverse
 _CORNERS = np.arange(3)
 
@@ -88,17 +89,19 @@ def resample(
 
     Minimises α·E(x, R) + Σ aₚ dₚ²/Σ aₚ over the vertices p of the capture (non-rigid iterative closest points, after Amberg,
     Romdhani & Vetter 2007), where aₚ is a third of the area of the triangles at p. E is 2 Σ area ‖∇x − R‖² over the triangles,
-    with a rotation for each, so that only strain has energy (Liu, Zhang, Xu, Gotsman & Gortler 2008), plus 0.1 times that of
-    :class:`warpcloth.Arap` with clamped weights, which resists bending too. dₚ is the distance of p from the tangent plane of
-    the nearest point of the template; where that lies on the boundary, from the point itself, which keeps the outline where
-    it was seen. Points count within a distance, and, if they are not beyond the outline, if the planes there enclose less
-    than 60°. An iteration finds nearest points and rotations, and solves a sparse system for all x. Each frame starts from
-    the last one, moved on by as much as that had moved.
+    with a rotation for each, so that only strain has energy (Liu, Zhang, Xu, Gotsman & Gortler 2008), plus 0.12 times that of
+    :class:`warpcloth.Arap` with clamped weights, which resists bending too. The edges in the latter are 0.9 times those of the
+    last frame, in the first frame those of ``positions``, plus 0.1 times those of the rest shape, turned by the rotations
+    there. So folds stay as they were seen. The share of the rest shape keeps noise from growing over frames. dₚ is the
+    distance of p from the tangent plane of the nearest point of the template; where that lies on the boundary, from the point
+    itself, which keeps the outline where it was seen. Points count within a distance, and, if they are not beyond the outline,
+    if the planes there enclose less than 60°. An iteration finds nearest points and rotations, and solves a sparse system for
+    all x. Each frame starts from the last one, moved on by as much as that had moved.
 
     Args:
         capture: The :class:`warpcloth.Capture`, with times.
         template: The :class:`warpcloth.Mesh`; its points are the rest shape.
-        positions: Its positions near those of the first frame (n, 3) [m]; by default the rest shape.
+        positions: Its positions near those of the first frame (n, 3) [m], with its folds; by default the rest shape.
         pins: Vertices whose positions are known: :class:`warpcloth.Pins`, which stay at ``positions``, or follow keyframes, one
             for each label from the first on.
         stiffness: α [1]. With less, the result follows noise and slides; with more, it cuts across folds and has less strain.
@@ -147,6 +150,7 @@ def resample(
     registration = Registration(template, held, stiffness, within, device)
     found = []
     for index, frame in enumerate(frames.tolist()):
+        registration.keep(x)
         start = x.copy()
         if index > 1:
             start += (x - found[-2][0]) * ((frame - frames[index - 1]) / (frames[index - 1] - frames[index - 2]))
@@ -220,7 +224,9 @@ class Registration:
         self._ends = np.concatenate([pairs, pairs, sides]).T
         self._numbers = np.concatenate([cells, of_triangle])
         self._weights = np.concatenate([cell_weights, cell_weights, triangle_weights])
+        self._of_cells = slice(len(cells))
         self._rest = mesh.points[self._ends[0]] - mesh.points[self._ends[1]]
+        self._edges = self._rest
         free = np.setdiff1d(np.arange(n), held)
         self._free = (3 * free[:, None] + _CORNERS).ravel()
         # α E is Σ w ‖·‖² over the entries, so that half of its gradient is L x − b.
@@ -234,6 +240,13 @@ class Registration:
             np.concatenate([(3 * columns[:, None] + _CORNERS).ravel(), np.tile(corners, (1, 9)).ravel()]),
         )
         self._rigid = np.repeat(values, 3)
+
+    def keep(self, x: np.ndarray) -> None:
+        """Makes the energy of cells relative to the shape x (n, 3) [m], with a share of the rest shape."""
+        (i, j), cells = self._ends, self._of_cells
+        turned = self._turned(x, self._rest)[cells]
+        self._edges = self._rest.copy()
+        self._edges[cells] = turned + _KEPT * ((x[i] - x[j])[cells] - turned)
 
     def solve(self, surface: Surface, start: np.ndarray, iterations: int, tolerance: float) -> tuple:
         """Moves the template from ``start`` (n, 3) [m] onto a surface.
@@ -287,8 +300,7 @@ class Registration:
         areas = areas * counts
         i, j = self._ends
         # The residual is a sum of differences, whose rounding is that of the differences, not of positions.
-        turned = np.einsum("kab,kb->ka", self._rotations(x)[self._numbers], self._rest)
-        forces = self._weights[:, None] * (turned - (x[i] - x[j]))
+        forces = self._weights[:, None] * (self._turned(x, self._edges) - (x[i] - x[j]))
         sums = [np.bincount(i, column, len(x)) - np.bincount(j, column, len(x)) for column in forces.T]
         residual = np.stack(sums, axis=1).ravel()
         blocks = np.einsum("k,kc,kij,kd->kcidj", areas, weights, projection, weights).reshape(-1, 81)
@@ -305,15 +317,15 @@ class Registration:
         options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
         return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options).solve(residual[self._free])
 
-    def _rotations(self, x):
-        """Returns the rotations of cells and triangles (n + T, 3, 3) that minimise E for x."""
+    def _turned(self, x, edges):
+        """Returns edges (k, 3), turned by the rotations of their cells and triangles that minimise E for x."""
         i, j = self._ends
-        moments = self._weights[:, None, None] * np.einsum("ka,kb->kab", x[i] - x[j], self._rest)
+        moments = self._weights[:, None, None] * np.einsum("ka,kb->kab", x[i] - x[j], edges)
         count = len(x) + len(self._triangles)
         sums = [np.bincount(self._numbers, column, count) for column in moments.reshape(-1, 9).T]
         left, _, right = np.linalg.svd(np.stack(sums, axis=1).reshape(-1, 3, 3))
         left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
-        return left @ right
+        return np.einsum("kab,kb->ka", (left @ right)[self._numbers], edges)
 
 
 def _normals(x, triangles):
