@@ -857,6 +857,7 @@ def test_nothing_undeclared_exists(name, probed):
     assert (ATTACHED in found["rows"]) == ("Attachment" in names)
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_that_is_not_launched(probed):
     """Folders of the cache are named wp_<module>_<7 digits>; one has the parsed headers."""
     launched = {module for each in probed.values() for module in each["launched"]}
