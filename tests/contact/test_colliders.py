@@ -802,7 +802,7 @@ def test_the_scene_drape_starts_without_contact(n):
     assert all(collider.distances(scene.positions).min() > scene.contact.distance for collider in scene.colliders)
 
 
-@pytest.mark.parametrize("name", ("explicit", "newton"))
+@pytest.mark.parametrize("name", slow_but(["newton"], ["explicit", "newton"]))
 def test_a_resumed_run_has_its_anchors(name, tmp_path):
     colliders = [wc.Sphere(radius=0.1, position=[(0.25, -0.08 + 0.002 * k, 0.25) for k in range(25)], friction=0.3)]
     scene = falling(colliders, fps=120.0, n=4, duration=0.2)

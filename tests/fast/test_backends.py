@@ -83,7 +83,6 @@ MOVED = [
     slow_but(
         [
             *((name, "float32", "symplectic") for name in FEW if name != "several"),
-            ("limits", "float64", "symplectic"),
             ("springs", "float64", "forward"),
         ],
         [*((*each, "symplectic") for each in MOVED), *((name, "float64", "forward") for name in ("nothing", "springs"))],
@@ -335,7 +334,6 @@ WIDELY = ("springs", "several", "limits")
     ("name", "dtype", "options"),
     slow_but(
         [
-            *(("several", "float64", options) for options in SWEEPS if options != "stiffness per step"),
             ("limits", "float64", "plain"),
             ("springs", "float32", "plain"),
         ],

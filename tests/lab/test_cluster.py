@@ -269,6 +269,7 @@ class Workers:
         return self.facts
 
 
+@pytest.mark.slow
 def test_workers_that_are_not_fit():
     for facts, words in (
         ([], "has no workers; start some"),

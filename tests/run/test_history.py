@@ -101,7 +101,7 @@ WITHOUT_AIR = [("constrained dynamics", "air")]
 @pytest.mark.parametrize(
     ("name", "driven"),
     slow_but(
-        [("newton midpoint", "pins"), ("xpbd", "loads"), ("newton midpoint", "air"), ("explicit", "air")],
+        [("newton midpoint", "pins"), ("xpbd", "loads"), ("xpbd", "air")],
         [(name, driven) for name in ORDERS for driven in ("pins", "loads", "air") if (name, driven) not in WITHOUT_AIR],
     ),
 )

@@ -399,8 +399,9 @@ LOCAL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.host
-@pytest.mark.parametrize("name", slow_but(["DihedralBending"], LOCAL))
+@pytest.mark.parametrize("name", LOCAL)
 def test_admm_solves_local_problems_by_newton(name, device):
     """Energies that are no squared distance: after three steps of a thrown cloth ADMM is where Newton is."""
     mesh = wc.Mesh.grid(5, 5, pattern="alternating")
