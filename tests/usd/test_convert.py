@@ -185,6 +185,17 @@ def test_two_conversions_to_one_output_do_not_run_at_a_time(first, second, stage
     assert not [path for path in contents(tmp_path) if path.name.endswith((".lock", ".unfinished"))]
 
 
+@pytest.mark.parametrize(("first", "second"), [("a####.obj", "a0001.pc2"), ("a0001.pc2", "a####.obj")])
+def test_a_conversion_keeps_unfinished_files_of_another_that_runs(first, second, stage, tmp_path):
+    """a0001.obj is a frame of the one, and the mesh beside the cache of the other."""
+    convert(stage, tmp_path / first, progress=lambda done, total: convert(stage, tmp_path / second))
+    clean = contents(tmp_path)
+    convert(stage, tmp_path / first)
+    convert(stage, tmp_path / second)
+    assert contents(tmp_path).keys() == clean.keys()
+    assert not [path for path in clean if path.name.endswith((".lock", ".unfinished"))]
+
+
 def test_formats_are_those_of_others(stage, tmp_path):
     """The bytes of the headers, and names of frames."""
     convert(stage, tmp_path / "c.pc2")

@@ -33,7 +33,8 @@ def keep_plain(record: Any) -> None:
     """Replaces NumPy's numbers in fields of a frozen dataclass by Python's, so that its text has plain numbers."""
     for field in fields(record):
         if isinstance(value := getattr(record, field.name), np.generic):
-            object.__setattr__(record, field.name, value.item())
+            plain = float(value) if isinstance(value, np.longdouble) else value.item()
+            object.__setattr__(record, field.name, plain)
 
 
 def number(name: str, value: Any, above: float | None = None, least: float | None = None) -> None:

@@ -256,27 +256,35 @@ def writing_alone(paths, numbered=False):
     Raises:
         BlockingIOError: Another writer, in this or another process, has a lock.
     """
-    folders = {}  # names of files by folder; # stands for the number of a frame
+    folders = {}  # names of files by folder
     for path in paths:
         folder, name = os.path.split(os.path.realpath(path))
-        folders.setdefault(folder, set()).add(re.sub(r"\d+(?=\D*$)", "#", name) if numbered else name)
-    locks = []
-    try:
-        with deferred():
-            for folder, names in folders.items():
-                for name in sorted(names):
-                    locks.append(Lock(os.path.join(folder, name)))
+        folders.setdefault(folder, set()).add(_of_all_frames(name) if numbered else name)
+    with contextlib.ExitStack() as locks:
         for folder, names in folders.items():
-            escaped = [r"\d+".join(map(re.escape, name.rsplit("#", 1 if numbered else 0))) for name in names]
-            left = re.compile(rf"({'|'.join(escaped)})\.[0-9a-f]{{8}}\.unfinished")
-            for name in filter(left.fullmatch, os.listdir(folder)):
-                with contextlib.suppress(OSError):
-                    os.remove(os.path.join(folder, name))
+            for name in sorted(names):
+                _locked(locks, folder, name)
+        for folder, names in folders.items():
+            for file in filter(re.compile(r".+\.[0-9a-f]{8}\.unfinished").fullmatch, os.listdir(folder)):
+                name = file.rsplit(".", 2)[0]
+                if (_of_all_frames(name) if numbered else name) in names:
+                    # A file may be one of numbered frames for one writer and not for another.
+                    with contextlib.suppress(OSError), contextlib.ExitStack() as others:
+                        for other in {name, _of_all_frames(name)} - names:
+                            _locked(others, folder, other)
+                        os.remove(os.path.join(folder, file))
         yield
-    finally:
-        with deferred():
-            for lock in locks:
-                lock.release()
+
+
+def _of_all_frames(name):
+    """Returns the name of a file with # for its last number."""
+    return re.sub(r"\d+(?=\D*$)", "#", name)
+
+
+def _locked(locks, folder, name):
+    """Locks a file until the stack of locks is closed."""
+    with deferred():
+        locks.callback(Lock(os.path.join(folder, name)).release)
 
 
 def _open_itself(path, flags):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..analysis.compare import to_up_axis
-from ..base.checks import shown
+from ..base.checks import number, shown
 from ..base.types import FilePath, Precision
 from ..mesh.captures import Capture
 from ..mesh.selection import distinct_vertices
@@ -193,9 +193,8 @@ def _checked_names(start, scene):
     listed, taken = _parameters_of(scene)
     for name, value in start.items():
         if name not in taken:
-            raise ValueError(f"start[{shown(name)}] names no number of this scene; allowed are {', '.join(listed)}")
-        if not (np.ndim(value) == 0 and np.isreal(value) and 0.0 < value < np.inf):
-            raise ValueError(f"start[{name!r}] is {shown(value)}; it must be a finite number above 0")
+            raise ValueError(f"start[{shown(name)}] names no number of this scene; allowed are {', '.join(listed) or 'none'}")
+        number(f"start[{name!r}]", value, above=0.0)
     return list(start)
 
 

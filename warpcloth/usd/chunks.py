@@ -505,8 +505,12 @@ def _rename(finished, path, like=None):
 
 def _remove(run, ignore_errors=False):
     """Removes the folder of a run, its root first. So a process killed meanwhile leaves no root whose layers are gone."""
-    with suppress(OSError):  # which the other files say, too
+    try:
         (run / _ROOT).unlink(missing_ok=True)
+    except OSError:  # on Windows, another process has it open
+        if ignore_errors:
+            return
+        raise
     shutil.rmtree(run, ignore_errors)
 
 
