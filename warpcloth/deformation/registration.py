@@ -91,12 +91,12 @@ def resample(
     Romdhani & Vetter 2007), where aₚ is a third of the area of the triangles at p. E is 2 Σ area ‖∇x − R‖² over the triangles,
     with a rotation for each, so that only strain has energy (Liu, Zhang, Xu, Gotsman & Gortler 2008), plus 0.12 times that of
     :class:`warpcloth.Arap` with clamped weights, which resists bending too. The edges in the latter are 0.9 times those of the
-    last frame, in the first frame those of ``positions``, plus 0.1 times those of the rest shape, turned as the cells are
-    there. So folds stay as they were seen. The share of the rest shape keeps noise from growing over frames. dₚ is the
-    distance of p from the tangent plane of the nearest point of the template; where that lies on the boundary, from the point
-    itself, which keeps the outline where it was seen. Points count within a distance, and, if they are not beyond the outline,
-    if the planes there enclose less than 60°. An iteration finds nearest points and rotations, and solves a sparse system for
-    all x. Each frame starts from the last one, moved on by as much as that had moved.
+    last frame, in the first frame those of ``positions``, plus 0.1 times those of the rest shape, turned by the rotation of
+    each cell in that frame. So folds stay as they were seen. The share of the rest shape keeps noise from growing over frames.
+    dₚ is the distance of p from the tangent plane of the nearest point of the template; where that lies on the boundary, from
+    the point itself, which keeps the outline where it was seen. Points count within a distance, and, if they are not beyond the
+    outline, if the planes there enclose less than 60°. An iteration finds nearest points and rotations, and solves a sparse
+    system for all x. Each frame starts from the last one, moved on by as much as that had moved.
 
     Args:
         capture: The :class:`warpcloth.Capture`, with times.
