@@ -253,6 +253,11 @@ BAD_PAIRS = {
         {"copies": 2, "vary": {"positions": [MESH.points, MESH.points + np.array([0, 0, 2.0])]}},
         "pins.keyframes[0] is 2 m from where the pinned vertices start in copy 1; it must be there",
     ),
+    "a name and its class": (
+        {"terms": [wc.Spring(stiffness=1.0, name="warp")]},
+        {"vary": {"warp.stiffness": [1.0], "Spring.stiffness": [2.0]}},
+        "vary['Spring.stiffness'] changes nothing: every Spring has an entry under its own name; leave it out",
+    ),
     "a limit that is none": (
         {"terms": [wc.SpringLimit(most=1.1)]},
         {"copies": 2, "vary": {"SpringLimit.least": [1.0, 1.2]}},

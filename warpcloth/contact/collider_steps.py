@@ -192,8 +192,10 @@ class ColliderSteps:
             yield
             return
         wp.copy(spare, anchors)
-        yield
-        wp.copy(anchors, spare)
+        try:
+            yield
+        finally:
+            wp.copy(anchors, spare)
 
     @contextmanager
     def reading_anchors(self):

@@ -137,7 +137,7 @@ class Vary:
         """Checks that every name was taken.
 
         Raises:
-            ValueError: A name is nothing that can vary in this scene.
+            ValueError: A name is nothing that can vary in this scene, or is that of a class whose terms all vary by their names.
         """
         rest = sorted(set(self.values) - self.taken, key=str)
         shared = [name for name in rest if name in ("duration", "fps", "pins.keyframes")]
@@ -145,6 +145,10 @@ class Vary:
             raise ValueError(
                 f"vary[{shared[0]!r}] is the same for all copies, which share their time and the motion of their pins"
             )
+        again = [name for name in rest if name in self.fields]
+        if again:
+            kind = again[0].partition(".")[0]
+            raise ValueError(f"vary[{again[0]!r}] changes nothing: every {kind} has an entry under its own name; leave it out")
         if rest:
             allowed = ["gravity", "density or masses", "positions", "velocities", *dict.fromkeys(self.fields)]
             raise ValueError(f"vary[{rest[0]!r}] names nothing in this scene; allowed are {', '.join(allowed)}")
