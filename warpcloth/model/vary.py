@@ -137,7 +137,7 @@ class Vary:
         """Checks that every name was taken.
 
         Raises:
-            ValueError: A name is nothing that can vary in this scene, or is that of a class whose terms all vary by their names.
+            ValueError: A name is nothing that can vary in this scene, or a class whose terms all vary under their own names.
         """
         rest = sorted(set(self.values) - self.taken, key=str)
         shared = [name for name in rest if name in ("duration", "fps", "pins.keyframes")]
