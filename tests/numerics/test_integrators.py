@@ -79,11 +79,11 @@ def slopes(steps, errors):
 def test_order_on_an_oscillator(name, integrator, device):
     """The error after a time falls like h for Euler and like h² for midpoint and BDF2."""
     omega, end = 2.0, 1.0
-    steps, errors = end / np.array([20, 40, 80, 160]), []
+    steps, errors = end / np.array([80, 160]), []
     for h in steps:
         w = swing(bound(oscillator(omega, h), SOLVERS[name], device, integrator=integrator), round(end / h), omega)
         errors.append(abs(w[-1] - w[0] * np.exp(1j * omega * end)))
-    assert slopes(steps, errors)[-1] == pytest.approx(1 if integrator == "euler" else 2, abs=0.15)
+    assert slopes(steps, errors) == pytest.approx(1 if integrator == "euler" else 2, abs=0.15)
 
 
 @pytest.mark.host

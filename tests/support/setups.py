@@ -47,14 +47,18 @@ RUNS = [(name, "float32") for name in SOLVERS] + [(name, "float64") for name in 
 
 
 def square(n=6, solver=None, damping=None, **scene):
-    """A small cloth with springs and both kinds of bending, or what of them ``solver`` takes, 0.1 kg/m²."""
+    """A small cloth with springs and both kinds of bending, or what of them ``solver`` takes, 0.1 kg/m².
+
+    Explicit steps have the kernels of all terms in one, which hinges make three times as long to compile; test_backends.py has
+    them.
+    """
     mesh = wc.Mesh.grid(n, n, pattern="alternating")
     terms = [
         wc.Spring(pairs=("structural", "shear"), stiffness=100.0, damping=damping),
         wc.QuadraticBending(stiffness=1e-4),
         wc.DihedralBending(stiffness=1e-4),
     ]
-    if isinstance(solver, wc.ProjectiveDynamics):  # the angle of a hinge is no distance
+    if isinstance(solver, (wc.Explicit, wc.ProjectiveDynamics)):  # the angle of a hinge is no distance
         terms.pop()
     return wc.Scene(mesh, density=0.1, terms=terms, **scene)
 

@@ -36,7 +36,7 @@ TERMS = {
         wc.Attachment(vertices=[3], stiffness=10.0),
     ],
 }
-# A kernel of a backend is compiled for its terms, options and precision, which takes most of the time of its tests.
+# A kernel is compiled for its terms, options and precision, which takes most of the time of its tests.
 FEW = ("nothing", "springs", "several")
 
 
