@@ -160,9 +160,13 @@ def test_files_of_the_input_are_not_written_over(folder, kind):
     assert {path: path.read_bytes() for path in before} == before
 
 
-@pytest.mark.parametrize("place", slow_but([np.nan], [np.nan, np.inf]))
-@pytest.mark.parametrize("frame", ["rest", 2])
-@pytest.mark.parametrize("neighbourhood", [None, "1-ring", "nearest:k=4"])
+HIDDEN = [(neighbourhood, frame, "nan") for neighbourhood in (None, "1-ring", "nearest:k=4") for frame in ("rest", 2)]
+
+
+@pytest.mark.parametrize(
+    ("neighbourhood", "frame", "place"),
+    slow_but(HIDDEN, [*HIDDEN, (None, "rest", "inf"), ("1-ring", 2, "inf"), ("nearest:k=4", "rest", "inf")]),
+)
 def test_points_without_a_place_hide_no_other_directions(tmp_path, recwarn, place, frame, neighbourhood):
     """All elements that do not touch such a point have their values and their segments, whichever is the frame."""
     mesh = wc.Mesh.grid(6, 6)
@@ -174,7 +178,7 @@ def test_points_without_a_place_hide_no_other_directions(tmp_path, recwarn, plac
     for code in range(3):
         points = mesh.points * [1.0, 1.0, 1.0 + 0.1 * code]
         if code == {"rest": 0}.get(frame, frame):
-            points[7] = place
+            points[7] = float(place)
         sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)), code)
     if frame != "rest":
         sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(mesh.points.astype(np.float32)))

@@ -713,18 +713,20 @@ def test_a_copy_is_a_scene_of_its_own(names, dtype, device):
 NUMBERS = [(kind, field) for kind, energy in KINDS.items() if kind in DECLARED for field in energy.quantities()]
 
 
-@pytest.mark.parametrize("by_element", [False, True], ids=["one number", "one an element"])
-@pytest.mark.parametrize(("kind", "field"), NUMBERS, ids=map(".".join, NUMBERS))
-def test_any_number_of_a_term_varies(kind, field, by_element):
-    """Each copy has the arrays of a scene with its numbers, to the bit."""
+def numbers_vary(kind, fields, by_element):
+    """Checks that each copy has the arrays of a scene with its numbers, to the bit."""
     term, random = DECLARED[kind](MESH), np.random.default_rng(7)
     found = term.elements(MESH, MESH.points)
     count = len(found.stencil if found.cells is None else found.cells[1:]) if by_element else None
-    shape = (COPIES, *([count] if by_element else []), *term.quantities()[field].shape)
-    values = random.uniform(0.5, 0.7, shape) + (0.5 if field == "most" else 0.0)
-    batch = scene(terms=[term]).build(copies=COPIES, dtype="float64", vary={f"{kind}.{field}": values}).terms[0]
+    values = {}
+    for field in fields:
+        shape = (COPIES, *([count] if by_element else []), *term.quantities()[field].shape)
+        values[field] = random.uniform(0.5, 0.7, shape) + (0.5 if field == "most" else 0.0)
+    vary = {f"{kind}.{field}": each for field, each in values.items()}
+    batch = scene(terms=[term]).build(copies=COPIES, dtype="float64", vary=vary).terms[0]
     for b in range(COPIES):
-        alone = scene(terms=[replace(term, **{field: values[b]})]).build(dtype="float64").terms[0]
+        alone = scene(terms=[replace(term, **{field: each[b] for field, each in values.items()})]).build(dtype="float64")
+        (alone,) = alone.terms
         for name in ("stiffness", "rest", "damping"):
             of_batch, of_one = (getattr(elements, name) for elements in (batch, alone))
             if of_one is not None:
@@ -732,6 +734,16 @@ def test_any_number_of_a_term_varies(kind, field, by_element):
         if alone.cells:
             weights = batch.cells.weights.numpy().reshape(COPIES, alone.count, -1)[b]
             assert (weights == alone.cells.weights.numpy()).all()
+
+
+@pytest.mark.parametrize(("kind", "field"), NUMBERS, ids=map(".".join, NUMBERS))
+def test_any_number_of_a_term_varies(kind, field):
+    numbers_vary(kind, [field], by_element=False)
+
+
+@pytest.mark.parametrize("kind", dict(NUMBERS))
+def test_all_numbers_of_a_term_vary_by_element(kind):
+    numbers_vary(kind, [field for each, field in NUMBERS if each == kind], by_element=True)
 
 
 def test_copies_without_differences_are_alike(device):

@@ -279,7 +279,7 @@ def test_no_code_outside_the_class_knows_its_name(integrator, device, monkeypatc
     )
 
     def run(name):
-        return wc.simulate(scene, wc.Newton(substeps=2, integrator=name), device=device, frames=3).points
+        return wc.simulate(scene, wc.Newton(substeps=2, integrator=name), device=device, dtype="float64", frames=3).points
 
     expected, euler = run(integrator), run("euler")
     monkeypatch.setitem(INTEGRATORS, "euler", INTEGRATORS[integrator])

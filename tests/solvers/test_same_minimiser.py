@@ -1,7 +1,7 @@
 """One state, one step, one answer: who minimises ends at the x(t + h) of Newton; who does not is listed, with the reason.
 
-The state is that of ``hanging`` with 16² vertices at 0.3 s, with 8² for methods that take many iterations; springs of
-1e3 N/m and quadratic bending of 1e-5 N·m, h = 1/60 s.
+The state is that of ``hanging`` with 16² vertices at 0.3 s, h = 1/60 s; for methods that take many iterations with 8² and
+h = 1/120 s, which takes them a third of the iterations. Springs of 1e3 N/m and quadratic bending of 1e-5 N·m.
 """
 
 from dataclasses import replace
@@ -31,17 +31,17 @@ ON_16 = {
 }
 ON_8 = {
     "constrained dynamics factorised": replace(CONSTRAINED, linear="factorised"),
-    "projective dynamics none": replace(PD, iterations=30_000, acceleration="none"),
-    "projective dynamics chebyshev": replace(PD, iterations=5_000, acceleration="chebyshev"),
-    "projective dynamics anderson": replace(PD, iterations=5_000, acceleration="anderson"),
-    "projective dynamics l-bfgs": replace(PD, iterations=3_000, acceleration="l-bfgs"),
-    "projective dynamics chebyshev-jacobi": replace(PD, iterations=10_000, acceleration="chebyshev", linear="jacobi"),
-    "projective dynamics matrix-free": replace(PD, iterations=6_000, acceleration="l-bfgs", linear="jacobi"),
-    "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=12_000, weight=0.1),
-    "admm heavy": wc.ADMM(substeps=1, tolerance=1e-11, iterations=5_000),
-    "xpbd coloured": wc.XPBD(substeps=1, iterations=30_000),
-    "xpbd sequential": wc.XPBD(substeps=1, iterations=30_000, sweep="sequential"),
-    "xpbd jacobi": wc.XPBD(substeps=1, iterations=200_000, sweep="constraint-averaged"),
+    "projective dynamics none": replace(PD, iterations=12_000, acceleration="none"),
+    "projective dynamics chebyshev": replace(PD, iterations=3_000, acceleration="chebyshev"),
+    "projective dynamics anderson": replace(PD, iterations=2_000, acceleration="anderson"),
+    "projective dynamics l-bfgs": replace(PD, iterations=1_000, acceleration="l-bfgs"),
+    "projective dynamics chebyshev-jacobi": replace(PD, iterations=5_000, acceleration="chebyshev", linear="jacobi"),
+    "projective dynamics matrix-free": replace(PD, iterations=2_000, acceleration="l-bfgs", linear="jacobi"),
+    "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=3_000, weight=0.1),
+    "admm heavy": wc.ADMM(substeps=1, tolerance=1e-11, iterations=2_000),
+    "xpbd coloured": wc.XPBD(substeps=1, iterations=8_000),
+    "xpbd sequential": wc.XPBD(substeps=1, iterations=8_000, sweep="sequential"),
+    "xpbd jacobi": wc.XPBD(substeps=1, iterations=60_000, sweep="constraint-averaged"),
 }
 QUICK = (
     "newton adaptive cg",
@@ -74,15 +74,21 @@ each_solver = pytest.mark.parametrize(
 
 
 @cache
+def state(n):
+    """The scene before the step."""
+    return replace(swinging(n), fps={8: 120.0, 16: 60.0}[n])
+
+
+@cache
 def newton_step(n, device):
     """x(t + h) (n², 3) [m]."""
     solver = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised")
-    return after_one_step(swinging(n), solver, device)[0]
+    return after_one_step(state(n), solver, device)[0]
 
 
 def unbalanced(x, n, device):
     """The largest ‖∇φᵢ‖/mᵢ over gravity's at x, and what rounding of lengths may make of it: 4ε k times valence and size."""
-    declared = swinging(n)
+    declared = state(n)
     model = declared.build(device=device, dtype="float64")
     gradient, h = model.vectors(), 1.0 / declared.fps
     Gradient(model).add(model.array(x, model.vec3), gradient)
@@ -97,7 +103,7 @@ def unbalanced(x, n, device):
 def test_all_meet(name, device):
     """1e-8 m in float64, where the gradient falls to rounding too, and 1e-4 m in float32."""
     n, solver = (8, ON_8[name]) if name in ON_8 else (16, ON_16[name])
-    declared, newton = swinging(n), newton_step(n, device)
+    declared, newton = state(n), newton_step(n, device)
     x, _ = after_one_step(declared, solver, device)
     residual, noise = unbalanced(x, n, device)
     print(name, "from Newton", np.abs(x - newton).max(), "unbalanced", residual, "of rounding", noise)
@@ -107,8 +113,9 @@ def test_all_meet(name, device):
     x, _ = after_one_step(declared, fewer, device, "float32")
     assert np.abs(x - newton).max() < 1e-4
     if not isinstance(solver, (wc.Newton, wc.ConstrainedDynamics)):  # which need fewer
-        few, _ = after_one_step(declared, replace(solver, iterations=50), device)
-        assert np.abs(few - newton).max() > 1e-4, "fifty iterations are not enough to say anything"
+        few, _ = after_one_step(declared, replace(solver, iterations=10), device)
+        print("after ten iterations", np.abs(few - newton).max())
+        assert np.abs(few - newton).max() > 1e-4, "ten iterations are not enough to say anything"
 
 
 WITHOUT_PROJECTION = {
@@ -122,9 +129,9 @@ WITHOUT_PROJECTION = {
 }
 BY_NEWTON = {
     "projective dynamics": replace(PD, iterations=2_000, acceleration="l-bfgs"),
-    "projective dynamics none": replace(PD, iterations=20_000, acceleration="none"),
-    "xpbd": wc.XPBD(substeps=1, iterations=4_000),
-    "xpbd jacobi": wc.XPBD(substeps=1, iterations=60_000, sweep="constraint-averaged"),
+    "projective dynamics none": replace(PD, iterations=12_000, acceleration="none"),
+    "xpbd": wc.XPBD(substeps=1, iterations=2_000),
+    "xpbd jacobi": wc.XPBD(substeps=1, iterations=20_000, sweep="constraint-averaged"),
 }
 
 
@@ -137,7 +144,7 @@ MET += [("StVKMembrane", "projective dynamics none"), ("OrthotropicMembrane", "x
 @cache
 def without_projection(energy, device):
     """The scene of an energy, and x(t + h) of Newton."""
-    declared = replace(swinging(8), terms=[WITHOUT_PROJECTION[energy], wc.Spring(stiffness=100.0)])
+    declared = replace(state(8), terms=[WITHOUT_PROJECTION[energy], wc.Spring(stiffness=100.0)])
     return declared, after_one_step(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)[0]
 
 
@@ -148,8 +155,8 @@ def without_projection(energy, device):
 )
 def test_energies_without_a_projection_meet_too(energy, name, device):
     declared, newton = without_projection(energy, device)
-    x, _ = after_one_step(declared, BY_NEWTON[name], device)
-    print(name, energy, np.abs(x - newton).max())
+    x, stepper = after_one_step(declared, BY_NEWTON[name], device)
+    print(name, energy, np.abs(x - newton).max(), "after so many iterations", stepper.iterations if "proj" in name else "all")
     assert np.abs(x - newton).max() < 1e-8
     few, _ = after_one_step(declared, replace(BY_NEWTON[name], iterations=20), device)
     assert np.abs(few - newton).max() > 1e-5, "twenty iterations are not enough to say anything"
