@@ -279,32 +279,64 @@ MODULES = {"libigl": "igl", "pillow": "PIL"}
 # install are not found. Other commands are left out: .ci/run runs those of the README, a cluster needs several machines, and
 # bench compiles again what it measures, as test_bench.py has it do. What commands measure in two processes is measured here in
 # a thread; test_work_precision.py, test_extending.py and test_chart_failures.py have them start processes. Runs of whole scenes
-# end after 12 frames.
+# end after 12 frames, their films are small, and the diagram physics has two resolutions.
+# One process imports what all pages need, and forks for each page.
 RUN = """
-import json, shlex, sys
+import functools, json, os, shlex, sys, traceback
 from importlib.machinery import PathFinder
 
-blocks, absent, check = json.load(sys.stdin)
-find = PathFinder.find_spec
+find, absent = PathFinder.find_spec, set(json.loads(sys.stdin.readline()))
 PathFinder.find_spec = lambda name, *more: None if name.partition(".")[0] in absent else find(name, *more)
 
 from concurrent.futures import ThreadPoolExecutor
 
+import pxr.UsdGeom, scipy.sparse.linalg, trimesh
+import warpcloth.cli.run
+import warpcloth.solvers
 from warpcloth.cli import main
-from warpcloth.lab import campaign
+from warpcloth.lab import campaign, work_precision
 
+assert not absent & sys.modules.keys()
 campaign.processes = lambda workers: ThreadPoolExecutor(1)
-names = {"__name__": "page"}
-for language, text in blocks:
-    if language == "python":
-        exec(compile(text, "page", "exec"), names)
-    for line in text.splitlines() if language == "sh" else ():
-        if line.startswith("warpcloth ") and not line.startswith("warpcloth bench "):
-            print("+", line, flush=True)
-            words = shlex.split(line, comments=True)[1:]
-            code = main(words + ["--frames", "12"] * (words[0] == "run" and "--frames" not in words))
-            assert code == 0, f"{line}: {code}"
-exec(check, names)
+warpcloth.cli.run.draw_film = functools.partial(warpcloth.cli.run.draw_film, size=(320, 180))
+for name, (plans, resolutions) in work_precision.PHYSICS.items():
+    work_precision.PHYSICS[name] = plans, resolutions[:2]
+
+
+def page(folder, blocks, there, check):
+    os.chdir(folder)
+    os.environ["WARPCLOTH_CACHE"] = os.path.join(folder, "cache")
+    absent.difference_update(there)
+    names = {"__name__": "page"}
+    for language, text in blocks:
+        if language == "python":
+            exec(compile(text, "page", "exec"), names)
+        for line in text.splitlines() if language == "sh" else ():
+            if line.startswith("warpcloth ") and not line.startswith("warpcloth bench "):
+                print("+", line, flush=True)
+                words = shlex.split(line, comments=True)[1:]
+                code = main(words + ["--frames", "12"] * (words[0] == "run" and "--frames" not in words))
+                assert code == 0, f"{line}: {code}"
+    exec(check, names)
+
+
+for line in sys.stdin:
+    said, *given = json.loads(line)
+    child = os.fork()
+    if child == 0:
+        for number, path, flags in ((0, os.devnull, os.O_RDONLY), (1, said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)):
+            os.dup2(os.open(path, flags), number)
+        os.dup2(1, 2)
+        try:
+            page(*given)
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+            code = 1
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
 # What holds of the names that the Python of a page leaves.
 CHECKS = {
@@ -316,27 +348,40 @@ assert animation.points.shape == (61, 576, 3) and animation.points[-1].shape == 
 }
 
 
+@pytest.fixture(scope="module")
+def pages():
+    """The exit code of the blocks of a page, which run in a folder and write what they say to a file."""
+    names = {MODULES.get(package, package) for extra in set(EXTRAS) - {"test"} for package in EXTRAS[extra]}
+    command, environment = [sys.executable, "-c", RUN], os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True) as process:
+
+        def told(line):
+            print(json.dumps(line), file=process.stdin, flush=True)
+
+        def page(said, folder, shown, there, check):
+            told((str(said), str(folder), shown, [MODULES.get(package, package) for package in there], check))
+            return int(process.stdout.readline())
+
+        told(sorted(names))
+        yield page
+        process.stdin.close()
+
+
 @pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.parametrize("page", [page for page, text in PAGES.items() if {"python", "sh"} & dict(blocks(text)).keys()])
-def test_a_page_as_it_stands(page, tmp_path):
+def test_a_page_as_it_stands(page, pages, tmp_path, tmp_path_factory):
     """All of its blocks in one process, in a folder with the files that it shows."""
     text = PAGES[page]
     named = set(re.findall(r"'\.\[(\w+)\]'", text)) - {"test"}
-    there = {package for extra in named for package in EXTRAS[extra]}
-    absent = {package for extra in set(EXTRAS) - {"test"} for package in EXTRAS[extra]} - there
+    there = [package for extra in named for package in EXTRAS[extra]]
     for name, content in files(text).items():
         (tmp_path / name).write_text(content, encoding="utf-8")
     shown = [block for block in blocks(text) if block[1] not in files(text).values()]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "WARPCLOTH_CACHE": str(tmp_path / "cache")}
-    done = subprocess.run(
-        [sys.executable, "-c", RUN],
-        input=json.dumps((shown, [MODULES.get(package, package) for package in absent], CHECKS.get(page, ""))),
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0 and "Traceback" not in done.stderr, f"{done.stdout}\n{done.stderr}"
+    output = tmp_path_factory.mktemp("said") / "said"
+    code = pages(output, tmp_path, shown, there, CHECKS.get(page, ""))
+    said = output.read_text(encoding="utf-8")
+    assert code == 0 and "Traceback" not in said, said
     lines = [line for language, block in shown if language == "sh" for line in block.splitlines()]
     commands = [line for line in lines if line[:9] == "warpcloth" and line[10:15] != "bench"]
     for option, name in pairwise(shlex.split("\n".join(commands), comments=True)):
