@@ -44,6 +44,8 @@ DECADES = tuple(10.0**e for e in range(-4, 5))  # times 1e3 N/m
 STEPS = (1e-4, 1e-3, 1e-2, 1e-1)
 # What bisection stops at.
 WIDTH = 1e-3
+# How far from theory a limit may be. Runs at both ends of this bracket tell it, without bisection between them.
+WITHIN = 0.01
 
 
 def net(kind, n=10, stiffness=1.0):
@@ -54,6 +56,11 @@ def mapped(scene, setups, x, xs, y, ys, steps=40, fixed=None, duration=None, **o
     """Cells (setup, y, x) of a map, compared over as many steps of 1/60 s if not over a duration."""
     survey = Survey(scene, tuple(setups), x, y, tuple(xs), tuple(ys), fixed or {}, steps, duration or steps / 60)
     return survey.table((task, task.run()) for task in survey.tasks(**options))
+
+
+def check_limit(scene, setup, axis, limit, steps, **options):
+    """Checks that runs diverge on one side of a limit and hold on the other, :data:`WITHIN` it."""
+    boundary(scene, setup, axis, limit / (1.0 + WITHIN), limit * (1.0 + WITHIN), steps, accuracy=3.0 * WITHIN, **options)
 
 
 def verdicts(rows):
@@ -93,8 +100,7 @@ def test_jacobi_diverges_above_its_limit(kind, solver, sweep, iterations, device
     fixed = {**FIXED, "iterations": iterations}
     limit = largest_relaxation(scene_at(hard, fixed, 1), fixed["dt"], record_at(setup, fixed))
     # Amplitudes at the limit of an odd number go as z = −1 − 4δ a step.
-    found = boundary(hard, setup, "relaxation", limit / 2, limit * 2, 600, fixed, WIDTH, device=device)
-    assert found == pytest.approx(limit, rel=0.01)
+    check_limit(hard, setup, "relaxation", limit, 600, fixed=fixed, device=device)
 
 
 @pytest.mark.parametrize("iterations", slow_but([1, 2], [1, 2, 20]))
@@ -102,18 +108,8 @@ def test_jacobi_diverges_above_its_limit(kind, solver, sweep, iterations, device
 def test_gauss_seidel_diverges_above_its_limit(solver, iterations, device):
     """(1 − ω)ⁿ of structural springs is the multiplier q of n sweeps, z² − 2qz + q = 0 that of steps: |z| > 1 iff q < −1/3."""
     limit = 1.0 + 3.0 ** (-1.0 / iterations)
-    found = boundary(
-        net("structural", 8, "inf"),
-        Setup(solver),
-        "relaxation",
-        1.0,
-        3.0,
-        600,
-        {"iterations": iterations},
-        WIDTH,
-        device=device,
-    )
-    assert found == pytest.approx(limit, rel=0.01)
+    fixed = {"iterations": iterations}
+    check_limit(net("structural", 8, "inf"), Setup(solver), "relaxation", limit, 600, fixed=fixed, device=device)
 
 
 def test_compliance_makes_jacobi_more_stable(device):
@@ -123,8 +119,8 @@ def test_compliance_makes_jacobi_more_stable(device):
     for stiffness in (1.0, "inf"):
         scene = net("shear", 8, stiffness)
         limits.append(largest_relaxation(scene_at(scene, fixed, 1), fixed["dt"], record_at(setup, fixed)))
-    found = boundary(net("shear", 8), setup, "relaxation", limits[0] / 2, limits[0] * 2, 600, fixed, WIDTH, device=device)
-    assert found == pytest.approx(limits[0], rel=0.01) and limits[0] > 1.1 * limits[1]
+    check_limit(net("shear", 8), setup, "relaxation", limits[0], 600, fixed=fixed, device=device)
+    assert limits[0] > 1.1 * limits[1]
 
 
 SOFT_JACOBI = [
@@ -145,8 +141,7 @@ def test_limits_of_jacobi_with_compliance(solver, options, iterations, device):
         record_at(setup, fixed).relaxation / limit_ratios(scene_at(scene, fixed, 1), record_at(setup, fixed), 1)["ω λ_max = 2"]
     )
     # The mode that decides about odd numbers is taken for that which decides about even ones.
-    found = boundary(scene, setup, "relaxation", limit / 2, limit * 2, 600, fixed, WIDTH, device=device)
-    assert found == pytest.approx(limit, rel=0.01)
+    check_limit(scene, setup, "relaxation", limit, 600, fixed=fixed, device=device)
 
 
 ORDERED = [
@@ -169,8 +164,7 @@ def test_limits_of_gauss_seidel_in_its_order(kind, solver, options, iterations, 
     fixed, setup, scene = {"dt": 1.0, "iterations": iterations}, Setup(solver, options), net(kind, 8, stiffness)
     ratios = limit_ratios(scene_at(scene, fixed, 1), record_at(setup, fixed), 600)
     limit = 1.0 / ratios["Gauss–Seidel, |z| = 1"]
-    found = boundary(scene, setup, "relaxation", limit / 2, limit * 1.5, 600, fixed, WIDTH, device=device)
-    assert found == pytest.approx(limit, rel=0.01)
+    check_limit(scene, setup, "relaxation", limit, 600, fixed=fixed, device=device)
 
 
 @pytest.mark.parametrize(("stiffness", "pins"), [(0.0, ()), (1.0, "all")], ids=["no stiffness", "all pinned"])
@@ -310,7 +304,7 @@ def test_implicit_euler_never_diverges_on_full_maps(name, parameters, fixed, dev
     """Every second decade with steps between and beyond those of the test above, and the start compressed too."""
     scene, steps = SceneRef(name, {"n": 6, **parameters}), (1e-3, 1e-2, 1.0)
     methods = IMPLICIT if fixed else IMPLICIT + OTHERS
-    cells = mapped(scene, methods, "stiffness", DECADES[::2], "dt", steps, 20, fixed, 1e-4, device=device, reference=False)
+    cells = mapped(scene, methods, "stiffness", DECADES[::2], "dt", steps, 12, fixed, 1e-4, device=device, reference=False)
     assert {cell["verdict"] for cell in flat(cells[:3])} <= {"stable", "stalled"}
     assert not unexplained(cells)
 
@@ -320,13 +314,9 @@ def test_jacobi_limits_of_the_known_nets(device):
     """40 × 40 vertices: 2/λ_max of the table, 1.997 and 5.05, and ω²_max·m/k, 3.99 and 10.09; test_failures.py has all."""
     for kind, frequency, value in (("structural", 3.99, 1.997), ("bending", 10.09, 5.05)):
         setup = Setup("pbd", {"sweep": "jacobi"})
-        found = boundary(
-            net(kind, 40, "inf"), setup, "relaxation", 1 / value, 4 / value, 200, {"iterations": 20}, device=device
-        )
-        assert found == pytest.approx(2.0 / value, rel=0.01)
-        limit = 2.0 / np.sqrt(frequency)
-        found = boundary(net(kind, 40), Setup("explicit"), "dt", 0.5 * limit, 2.0 * limit, 1000, device=device)
-        assert found == pytest.approx(limit, rel=0.01)
+        hard, fixed = net(kind, 40, "inf"), {"iterations": 20}
+        check_limit(hard, setup, "relaxation", 2.0 / value, 200, fixed=fixed, device=device)
+        check_limit(net(kind, 40), Setup("explicit"), "dt", 2.0 / np.sqrt(frequency), 1000, device=device)
 
 
 def test_cells_are_compared_over_the_same_time(device):
@@ -364,7 +354,7 @@ def test_02_a_raw_hessian_stalls_in_compression(device):
     """Newton with the raw Hessian, factorised, stalls beyond h² = m/(k(L/l − 1)) and nowhere before; clamped it never does."""
     soft = SceneRef("hanging", {"n": 5, "stiffness": 10.0})
     setups = [Setup("newton", {"hessian": kind, "linear": "factorised"}) for kind in ("raw", "clamp")]
-    cells = mapped(soft, setups, "compression", [0.0, 0.2, 0.4, 0.8], "dt", [1e-3, 1e-2, 1e-1], 20, device=device)
+    cells = mapped(soft, setups, "compression", [0.0, 0.2, 0.4, 0.8], "dt", [1e-3, 1e-2, 1e-1], 20, device=device, reference=False)
     raw, clamped = (flat([rows]) for rows in cells)
     stalled = [cell for cell in raw if cell["verdict"] == "stalled"]
     assert len(stalled) >= 3 and all(cell["rules"]["h² = m/(k(L/l − 1))"] > 1.0 for cell in stalled)
@@ -398,7 +388,7 @@ def test_06_and_08_few_iterations_fall_behind_as_stiffness_grows(device):
     """Of 8 iterations projective dynamics, plain and accelerated, stays behind by far where Σk h²/m is above them; so ADMM."""
     plain = Setup("projective-dynamics", {"acceleration": "none"})
     setups = [plain, Setup("projective-dynamics"), Setup("admm")]
-    cells = mapped(HANGING, setups, "stiffness", [1e-3, 1.0, 1e3], "iterations", [8, 64], 60, device=device, accuracy=0.25)
+    cells = mapped(HANGING, setups, "stiffness", [1e-3, 1.0, 1e3], "iterations", [8, 64], 30, device=device, accuracy=0.25)
     for rows in cells:
         assert verdicts(rows)[0][0] == "stable" and verdicts(rows)[0][2] == "inaccurate"
         assert rows[1][1]["error"] < 0.6 * rows[0][1]["error"], "more iterations cure it"
@@ -414,7 +404,7 @@ def test_07_weights_of_admm(device):
     The line goes down with the root of the stiffness.
     """
     weights, given = [1e-3, 3e-2, 1.0, 30.0], {"fixed": {"iterations": 50}, "device": device}
-    (rows,) = mapped(HANGING, [Setup("admm")], "stiffness", [1e-2, 1.0, 30.0], "weight", weights, 60, duration=0.4, **given)
+    (rows,) = mapped(HANGING, [Setup("admm")], "stiffness", [1e-2, 1.0, 30.0], "weight", weights, 24, duration=0.4, **given)
     best = np.array([[cell["error"] for cell in row] for row in rows]).argmin(axis=0)
     assert best.tolist() == sorted(best, reverse=True) and best[0] > best[-1]
     ratios = np.array([[cell["rules"]["r = 1/(2hω)"] for cell in row] for row in rows])
@@ -428,7 +418,7 @@ def test_07_weights_of_admm(device):
 def test_14_information_moves_a_ring_an_iteration(solver, device):
     """A chain from the pin down: at fixed sweeps the error grows with its links, at fixed links it falls with sweeps."""
     setup = Setup(solver, {"sweep": "sequential"})
-    (rows,) = mapped(SceneRef("chain"), [setup], "resolution", [5, 10, 20], "iterations", [1, 4, 16], 60, device=device)
+    (rows,) = mapped(SceneRef("chain"), [setup], "resolution", [5, 10, 20], "iterations", [1, 4, 16], 30, device=device)
     errors = np.array([[cell["error"] for cell in row] for row in rows])
     assert (np.diff(errors, axis=1) > 0.0).all() and (np.diff(errors, axis=0) < 0.0).all()
     assert rows[0][1]["rules"]["a ring an iteration"] == 10.0
