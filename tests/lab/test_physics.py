@@ -42,8 +42,15 @@ def measured(*arguments, **options):
     return found
 
 
+def unshaken(*arguments, **options):
+    """What :func:`measured` finds, but for the floor, for which each rest shape is moved and solved for again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(physics, "_moves", lambda scene, size: np.zeros((1, *scene.positions.shape)))
+        return measured(*arguments, **options)
+
+
 def cantilevers(resolutions, device, angle=0.0, **options):
-    found = [measured("cantilever", n, angle=np.radians(angle), device=device, **options) for n in resolutions]
+    found = [unshaken("cantilever", n, angle=np.radians(angle), device=device, **options) for n in resolutions]
     print(options, angle, [(round(each["stiffness"], 4), round(each["error"], 4)) for each in found])
     return found
 
@@ -303,7 +310,7 @@ def test_a_cantilever_of_an_equilateral_net_converges(angle, bending, gamma, dev
 
 def test_a_cantilever_of_plates_has_the_stiffness_of_the_plate_on_an_irregular_mesh(device):
     """The error is of second order, where hinges keep a sixth; the clamp is that of hinges, which leaves a hundredth."""
-    coarse, fine = (measured("cantilever", n, "plate", "jittered", device=device)["stiffness"] - 1.0 for n in (6, 12))
+    coarse, fine = (unshaken("cantilever", n, "plate", "jittered", device=device)["stiffness"] - 1.0 for n in (6, 12))
     assert abs(fine) < abs(coarse) / 3.0 and abs(fine) < 0.06, (coarse, fine)
 
 
@@ -387,7 +394,7 @@ def test_an_irregular_net_locks_and_one_with_rows_across_does_not(device):
 def test_quadratic_bending_is_wrong_where_the_membrane_is_soft(device):
     """Large Γ stretches a soft cloth along its length; the one energy takes the change of that for bending."""
     hard, soft = (
-        [measured("cantilever", 8, bending, gamma=gamma, stretching=k, device=device)["stiffness"] for bending in BENDING]
+        [unshaken("cantilever", 8, bending, gamma=gamma, stretching=k, device=device)["stiffness"] for bending in BENDING]
         for gamma, k in ((1.0, 1e5), (20.0, 100.0))
     )
     # They differ by the strain, Γ over the stretching, in parts of the bending.
@@ -432,7 +439,7 @@ def test_a_loose_tolerance_raises_the_floor(device, monkeypatch):
 
 @pytest.mark.parametrize("stretching", [1e2, 1e4])
 def test_a_catenary_is_of_second_order(stretching, device):
-    errors = [measured("catenary", n, stretching=stretching, device=device)["error"] for n in (20, 40, 80)]
+    errors = [unshaken("catenary", n, stretching=stretching, device=device)["error"] for n in (20, 40, 80)]
     np.testing.assert_allclose(np.diff(np.log2(errors)), -2.0, atol=0.05)
 
 
