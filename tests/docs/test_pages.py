@@ -1,12 +1,10 @@
 """README.md and docs/ hold as they stand: blocks run, links resolve, tables and names are those of the code."""
 
 import importlib.util
-import json
 import os
 import re
 import shlex
 import subprocess
-import sys
 from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +16,7 @@ import pytest
 import warpcloth as wc
 import warpcloth.solvers
 import warpcloth.terms
+from support.forks import Forks
 from warpcloth.analysis.measures import MEASURES
 from warpcloth.cli import _parser
 from warpcloth.solvers import SOLVERS
@@ -282,10 +281,10 @@ MODULES = {"libigl": "igl", "pillow": "PIL"}
 # end after 12 frames, their films are small, and the diagram physics has two resolutions.
 # One process imports what all pages need, and forks for each page.
 RUN = """
-import functools, json, os, shlex, sys, traceback
+import functools, os, shlex, sys
 from importlib.machinery import PathFinder
 
-find, absent = PathFinder.find_spec, set(json.loads(sys.stdin.readline()))
+find, absent = PathFinder.find_spec, set({absent!r})
 PathFinder.find_spec = lambda name, *more: None if name.partition(".")[0] in absent else find(name, *more)
 
 from concurrent.futures import ThreadPoolExecutor
@@ -307,7 +306,7 @@ def page(folder, blocks, there, check):
     os.chdir(folder)
     os.environ["WARPCLOTH_CACHE"] = os.path.join(folder, "cache")
     absent.difference_update(there)
-    names = {"__name__": "page"}
+    names = {{"__name__": "page"}}
     for language, text in blocks:
         if language == "python":
             exec(compile(text, "page", "exec"), names)
@@ -316,27 +315,8 @@ def page(folder, blocks, there, check):
                 print("+", line, flush=True)
                 words = shlex.split(line, comments=True)[1:]
                 code = main(words + ["--frames", "12"] * (words[0] == "run" and "--frames" not in words))
-                assert code == 0, f"{line}: {code}"
+                assert code == 0, f"{{line}}: {{code}}"
     exec(check, names)
-
-
-for line in sys.stdin:
-    said, *given = json.loads(line)
-    child = os.fork()
-    if child == 0:
-        for number, path, flags in ((0, os.devnull, os.O_RDONLY), (1, said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)):
-            os.dup2(os.open(path, flags), number)
-        os.dup2(1, 2)
-        try:
-            page(*given)
-            code = 0
-        except BaseException:
-            traceback.print_exc()
-            code = 1
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
 # What holds of the names that the Python of a page leaves.
 CHECKS = {
@@ -349,38 +329,26 @@ assert animation.points.shape == (61, 576, 3) and animation.points[-1].shape == 
 
 
 @pytest.fixture(scope="module")
-def pages():
-    """The exit code of the blocks of a page, which run in a folder and write what they say to a file."""
-    names = {MODULES.get(package, package) for extra in set(EXTRAS) - {"test"} for package in EXTRAS[extra]}
-    command, environment = [sys.executable, "-c", RUN], os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True) as process:
-
-        def told(line):
-            print(json.dumps(line), file=process.stdin, flush=True)
-
-        def page(said, folder, shown, there, check):
-            told((str(said), str(folder), shown, [MODULES.get(package, package) for package in there], check))
-            return int(process.stdout.readline())
-
-        told(sorted(names))
-        yield page
-        process.stdin.close()
+def forks():
+    absent = {MODULES.get(package, package) for extra in set(EXTRAS) - {"test"} for package in EXTRAS[extra]}
+    with Forks(RUN.format(absent=sorted(absent)), PYTHONPATH=str(ROOT)) as forks:
+        yield forks
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.parametrize("page", [page for page, text in PAGES.items() if {"python", "sh"} & dict(blocks(text)).keys()])
-def test_a_page_as_it_stands(page, pages, tmp_path, tmp_path_factory):
+def test_a_page_as_it_stands(page, forks, tmp_path, tmp_path_factory):
     """All of its blocks in one process, in a folder with the files that it shows."""
     text = PAGES[page]
     named = set(re.findall(r"'\.\[(\w+)\]'", text)) - {"test"}
-    there = [package for extra in named for package in EXTRAS[extra]]
+    there = [MODULES.get(package, package) for extra in named for package in EXTRAS[extra]]
     for name, content in files(text).items():
         (tmp_path / name).write_text(content, encoding="utf-8")
     shown = [block for block in blocks(text) if block[1] not in files(text).values()]
     output = tmp_path_factory.mktemp("said") / "said"
-    code = pages(output, tmp_path, shown, there, CHECKS.get(page, ""))
-    said = output.read_text(encoding="utf-8")
+    forks.start("page(*given)", output, str(tmp_path), shown, there, CHECKS.get(page, ""))
+    code, said = forks.wait(), output.read_text(encoding="utf-8")
     assert code == 0 and "Traceback" not in said, said
     lines = [line for language, block in shown if language == "sh" for line in block.splitlines()]
     commands = [line for line in lines if line[:9] == "warpcloth" and line[10:15] != "bench"]

@@ -354,7 +354,9 @@ def test_02_a_raw_hessian_stalls_in_compression(device):
     """Newton with the raw Hessian, factorised, stalls beyond h² = m/(k(L/l − 1)) and nowhere before; clamped it never does."""
     soft = SceneRef("hanging", {"n": 5, "stiffness": 10.0})
     setups = [Setup("newton", {"hessian": kind, "linear": "factorised"}) for kind in ("raw", "clamp")]
-    cells = mapped(soft, setups, "compression", [0.0, 0.2, 0.4, 0.8], "dt", [1e-3, 1e-2, 1e-1], 20, device=device, reference=False)
+    cells = mapped(
+        soft, setups, "compression", [0.0, 0.2, 0.4, 0.8], "dt", [1e-3, 1e-2, 1e-1], 20, device=device, reference=False
+    )
     raw, clamped = (flat([rows]) for rows in cells)
     stalled = [cell for cell in raw if cell["verdict"] == "stalled"]
     assert len(stalled) >= 3 and all(cell["rules"]["h² = m/(k(L/l − 1))"] > 1.0 for cell in stalled)

@@ -6,7 +6,6 @@ import re
 import resource
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
+from support.forks import Forks
 from support.stages import (
     CHUNK,
     CODES,
@@ -525,36 +525,41 @@ def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step):
     assert len(stage.GetPrimAtPath(f"{prim.GetPath()}_corner").GetAttribute("points").GetTimeSamples()) == len(now)
 
 
-VICTIM = """
+IMPORTS = """
 import itertools, sys
 sys.path[:0] = {path!r}
 from support.stages import measure
 from warpcloth.usd import read_stage_mesh
-source = read_stage_mesh(sys.argv[2])
+"""
+VICTIM = """
+source = read_stage_mesh(given[1])
 print("ready", flush=True)
 for run in itertools.count():
-    measure(sys.argv[1], source.mesh, source, sign=(-1) ** run)
+    measure(given[0], source.mesh, source, sign=(-1) ** run)
 """
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_killed_writer_leaves_a_readable_result(tmp_path):
     mesh = Mesh.grid(40, 40)
     path = artist_stage(tmp_path / "artist.usda", mesh)
     moments, output = random.Random(1), tmp_path / "out.usdc"
     measure(output, read_mesh(path), read_stage_mesh(path))
-    for _ in range(3):
-        arguments = [sys.executable, "-c", VICTIM.format(path=[str(Path(__file__).parents[1]), *sys.path]), str(output), path]
-        victim = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True)
-        assert victim.stdout.readline() == "ready\n"
-        time.sleep(moments.uniform(0, 0.5))
-        victim.send_signal(signal.SIGKILL)
-        assert victim.wait() == -signal.SIGKILL
-        now = FrameSequence(output, attribute="primvars:stretch1")
-        sign = np.sign(now[0][5])
-        for frame, values in enumerate(now):
-            np.testing.assert_array_equal(values, np.float32(measured(mesh, frame, sign)[0]["stretch1"]))
-        assert len(now) in (3, 6, 7) and validate(output, path) == []
+    with Forks(IMPORTS.format(path=[str(Path(__file__).parents[1]), *sys.path])) as forks:
+        for trial in range(3):
+            said, ends = tmp_path / f"{trial}.txt", time.monotonic() + 60.0
+            victim = forks.start(VICTIM, said, str(output), path)
+            while not (said.exists() and said.read_text()) and time.monotonic() < ends:
+                time.sleep(0.001)
+            time.sleep(moments.uniform(0, 0.5))
+            os.kill(victim, signal.SIGKILL)
+            assert forks.wait() == -signal.SIGKILL and said.read_text() == "ready\n"
+            now = FrameSequence(output, attribute="primvars:stretch1")
+            sign = np.sign(now[0][5])
+            for frame, values in enumerate(now):
+                np.testing.assert_array_equal(values, np.float32(measured(mesh, frame, sign)[0]["stretch1"]))
+            assert len(now) in (3, 6, 7) and validate(output, path) == []
 
 
 def test_a_layer_for_which_the_disk_has_no_room_is_named(tmp_path):

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.forks import Forks
 from support.rows import slow_but
 from support.stages import (
     CHUNK,
@@ -336,16 +337,17 @@ def interrupt_twice(now):
         raise KeyboardInterrupt
 
 
-VICTIM = """
+IMPORTS = """
 import itertools, os, sys
 sys.path[:0] = {path!r}
 from support.stages import CHUNK, FRAMES, Mesh, motion
 from warpcloth.usd import read_mesh
 from warpcloth.usd import AnimationWriter
-output, source, single_file, log = sys.argv[1:]
+"""
+VICTIM = """
+output, source, single_file, log = given
 mesh = read_mesh(source) if source else Mesh.grid(40, 40)
 log = os.open(log, os.O_WRONLY | os.O_CREAT)
-print("ready", flush=True)
 for run in itertools.count():
     with AnimationWriter(output, mesh, 24, source=source or None, chunk=CHUNK) as writer:
         for frame in range(FRAMES):
@@ -356,27 +358,34 @@ for run in itertools.count():
 """
 
 
+@pytest.fixture(scope="module")
+def forks():
+    with Forks(IMPORTS.format(path=[str(Path(__file__).parents[1]), *sys.path])) as forks:
+        yield forks
+
+
 @pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.parametrize(
     ("ending", "with_source", "single_file"),
     [("usdc", False, False), ("usda", True, False), ("usdc", True, True), ("usdz", False, True)],
     ids=["chunks", "layer", "one-file", "package"],
 )
-def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, ending, with_source, single_file):
+def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, forks, ending, with_source, single_file):
     """Two kills of each kind. The victim writes one result over the other for ever, so each kill meets it at work."""
     mesh = Mesh.grid(40, 40)
     source = artist_stage(tmp_path / "artist.usda", mesh) if with_source else ""
     mesh = read_mesh(source) if source else mesh
-    script = VICTIM.format(path=[str(Path(__file__).parents[1]), *sys.path])
     moments = random.Random(f"{ending} {with_source} {single_file}")
     for trial in (0, 2):
         output, log = tmp_path / f"{trial}.{ending}", tmp_path / f"{trial}.log"
         arguments = [str(output), source, "yes" if single_file else "", str(log)]
-        victim = subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE, text=True)
-        assert victim.stdout.readline() == "ready\n"
+        victim, ends = forks.start(VICTIM, tmp_path / f"{trial}.txt", *arguments), time.monotonic() + 60.0
+        while not log.exists() and time.monotonic() < ends:
+            time.sleep(0.001)
         time.sleep(moments.uniform(0, 0.2 * trial + 0.02))
-        victim.send_signal(signal.SIGKILL)
-        assert victim.wait() == -signal.SIGKILL
+        os.kill(victim, signal.SIGKILL)
+        assert forks.wait() == -signal.SIGKILL
         check_survivor(output, mesh, log.read_text(), source)
         # The next run is not disturbed by what is left, and clears it away; but not what was only to be packed.
         folder = tmp_path / f"{trial}_frames"
