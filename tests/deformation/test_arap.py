@@ -177,10 +177,10 @@ def test_iterations_are_those_of_plain_numpy(name, energy, weights, library, dev
     arap = bend(mesh, handles, weights=weights, energy=energy, device=device)
     assert type(arap._factor) is (linear.LUFactor if library == "scipy" else linear.CholeskyFactor)
     cells = terms(mesh, energy, weights, arap.laplacian)
-    most = {"bunny": 10, "sphere": 30}.get(name, 100)  # the plain one is slow
+    most = {"bunny": 5, "sphere": 30}.get(name, 100)  # the plain one is slow
     plain = list(plain_arap(cells, mesh.points, handles, targets, mesh.points, most))
     size = np.ptp(mesh.points)
-    for iterations in (1, 10, most):
+    for iterations in (1, most) if name == "bunny" else (1, 10, most):
         found = arap.solve(targets, iterations=iterations, tolerance=0.0, initial=mesh.points)
         x, _ = plain[iterations - 1]
         assert found.iterations == iterations and not found.converged

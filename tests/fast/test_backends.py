@@ -131,7 +131,7 @@ def draped(moving):
     box = wc.Box(size=(0.2, 0.1, 0.2), position=(0.2, -0.2, 0.2), rotation=turns, friction=0.2)
     mesh = wc.Mesh.grid(7, 7)
     other = box if moving else wc.Plane(position=(0.0, -0.05, 0.0))
-    terms = [replace(SPRINGS, damping=0.01), wc.QuadraticBending(stiffness=1e-3)]
+    terms = [replace(SPRINGS, damping=0.01)]
     scene = wc.Scene(mesh, density=0.15, terms=terms, velocities=[0.3, -1.0, 0.0] + 0.0 * mesh.points, fps=24.0, duration=1.0)
     return replace(scene, colliders=[ball, other])
 

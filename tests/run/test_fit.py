@@ -175,7 +175,7 @@ def test_intervals_contain_the_true_value_as_often_as_they_say():
     inside, errors = [], []
     for seed in range(50):
         noise = np.random.default_rng(seed).normal(scale=NOISE, size=seen.shape)
-        found = wc.fit(scene, solver, {"Spring.stiffness": 0.8 * STIFFNESS}, seen + noise, [1])
+        found = wc.fit(scene, solver, {"Spring.stiffness": 0.95 * STIFFNESS}, seen + noise, [1])
         low, high = found.intervals["Spring.stiffness"]
         inside.append(low < STIFFNESS < high)
         errors.append(np.log(found.parameters["Spring.stiffness"] / STIFFNESS) / found.errors["Spring.stiffness"])

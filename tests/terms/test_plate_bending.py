@@ -316,7 +316,7 @@ def test_wrinkles_of_a_stretched_sheet(over, device):
     axes = ["x" * bool(ends[i]) + "y" + "z" * bool(sides[i]) for i in held]
     terms = [wc.StVKMembrane(stiffness=Y, poisson_ratio=0.0), wc.PlateBending(stiffness=plate)]
     pins, rests = wc.Pins(held, axes=axes), []
-    for seed in range(3):
+    for seed in range(1 if over < 1.0 else 3):
         start = mesh.points * [stretch, 1.0, narrow]
         start[:, 1] = np.where(ends | sides, 0.0, 1e-5 * np.random.default_rng(seed).normal(size=len(x)))
         sheet = wc.Scene(mesh, density=0.1, terms=terms, pins=pins, positions=start, gravity=(0.0, 0.0, 0.0))
@@ -343,7 +343,7 @@ def swinging(n=6):
     bending = wc.PlateBending(stiffness=1e-3, poisson_ratio=0.3, weft_ratio=2.0)
     declared = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1e3), bending], pins="corners and z == 0")
     past = wc.simulate(declared, wc.Newton(substeps=8, tolerance=1e-6), dtype="float64", frames=18)
-    return replace(declared, positions=past.points[-1], velocities=past.velocities[-1])
+    return replace(declared, positions=past.points[-1], velocities=past.velocities[-1], fps=100.0)
 
 
 MEET = {
