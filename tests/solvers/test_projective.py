@@ -415,7 +415,8 @@ def test_admm_solves_local_problems_by_newton(name, device):
         fps=120.0,
     )
     weight = 1.0 if name == "DihedralBending" else 0.1  # an angle is concave beyond its inflection: a small weight oscillates
-    for dtype, bound in (("float64", 1e-8), ("float32", 1e-4))[: 1 if name == "damped" else 2]:  # no kernel of its own
+    both = name in ("NeoHookeanMembrane", "DihedralBending")  # float32 for one membrane and for hinges
+    for dtype, bound in (("float64", 1e-8), ("float32", 1e-4))[: 1 + both]:
         ends = []
         for solver in (
             wc.Newton(substeps=1, tolerance=1e-11),
@@ -471,7 +472,7 @@ def test_admm_takes_a_crushed_membrane(dtype, device):
             fps=60.0,
         )
         stepper = wc.ADMM(substeps=4, iterations=30).bind(scene.build(device=device, dtype=dtype))
-        for _ in range(240):
+        for _ in range(120):
             stepper.step()
         points = stepper.state.x.numpy()
         assert np.isfinite(points).all()

@@ -379,7 +379,7 @@ def test_copies_run_as_if_alone(name, unlike, device):
     vary, solver = UNLIKE[unlike], SOLVERS[name]
     velocities = np.random.default_rng(6).normal(scale=0.1, size=(36, 3))
     base = square(solver=solver, fps=600.0, pins="corners", velocities=velocities)
-    kept = {"device": device, "dtype": "float64", "frames": 10}
+    kept = {"device": device, "dtype": "float64", "frames": 5}
     batch = wc.simulate(base, solver, copies=3, vary=vary, **kept).points
     for copy in range(3):
         points = wc.simulate(one_of(base, vary, copy), solver, **kept).points

@@ -1180,7 +1180,11 @@ def agree(found, dtype):
     return np.abs(scattered).max() > 0.0 and np.abs(gathered_ - scattered).max() <= FEW * eps(dtype) * np.abs(scattered).max()
 
 
-@pytest.mark.parametrize("term", **named(DECLARABLE))
+# One of each number of vertices and of rows: no more of a term is in what these write to the vertices.
+WRITTEN = ("Attachment", "Spring", "CorotatedMembrane", "QuadraticBending", "DihedralBending")
+
+
+@pytest.mark.parametrize("term", **named([term for term in DECLARABLE if term.name in WRITTEN]))
 def test_sums_of_splitting_gather_what_they_scatter(term, device, dtype="float64"):
     """Gᵀ of the gaps, the changes and the multipliers of ADMM, added to what is there."""
     found = []
@@ -1209,6 +1213,7 @@ ROWS = [
     for term in DECLARABLE
     for key in ((False, False), (True, False), (True, True))
     if (term.constraint if key[0] else term.project)
+    if term.name in WRITTEN
 ]
 
 
