@@ -5,7 +5,6 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 import warp as wp
 from scipy.sparse import eye_array
@@ -102,17 +101,35 @@ def test_an_interrupt_says_what_was_recorded():
         assert recorder.closed
 
 
-def test_an_interrupt_in_a_factorisation_is_one(monkeypatch):
-    """Where cholespy asks an array for its memory an interrupt became "incompatible function arguments"."""
-    factor = CholeskyFactor(eye_array(2, format="csr"), wp.get_device("cpu"), wp.float64)
+class Checked:
+    """A solver of cholespy that counts the Python functions that run while it solves, and interrupts the first of them."""
 
-    class Solver:
-        def solve(self, b, x):
-            try:
-                signal.raise_signal(signal.SIGINT)
-            except KeyboardInterrupt:
-                raise TypeError("incompatible function arguments") from None
+    def __init__(self, solver):
+        self.solver, self.calls = solver, 0
 
-    monkeypatch.setattr(factor, "solver", Solver())
-    with pytest.raises(KeyboardInterrupt):
-        factor.solve(np.ones(2), np.zeros(2))
+    def note(self, _frame, event, _argument):
+        if event == "call":
+            self.calls += 1
+            sys.setprofile(None)
+            signal.raise_signal(signal.SIGINT)
+
+    def solve(self, b, x):
+        sys.setprofile(self.note)
+        try:
+            self.solver.solve(b, x)
+        finally:
+            sys.setprofile(None)
+
+
+def test_an_interrupt_in_a_solve_is_one(device, monkeypatch):
+    """Where cholespy asked Warp for the memory of an array, an interrupt became "incompatible function arguments"."""
+    factor = CholeskyFactor(2.0 * eye_array(2, format="csr"), wp.get_device(device), wp.float64)
+    b, x = wp.array([2.0, 4.0], dtype=wp.float64, device=device), wp.zeros(2, dtype=wp.float64, device=device)
+    checked = Checked(factor.solver)
+    monkeypatch.setattr(factor, "solver", checked)
+    if wp.get_device(device).is_cpu:
+        factor.solve(b, x)
+        assert checked.calls == 0 and x.numpy() == pytest.approx([1.0, 2.0], rel=1e-14)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            factor.solve(b, x)
