@@ -865,7 +865,8 @@ def test_copies(name, distance, count, device):
     Of these the filter cuts one and not the other, and lists are made anew at other times; of thick sheets the areas are of
     pairs that are farther apart than the skin.
     """
-    scene = layers(count, turn=17.0, speed=1.0, n=5, distance=distance, stiffness=1e5 if distance < 0.1 else 100.0)
+    n = 5 if count == 2 else 4
+    scene = layers(count, turn=17.0, speed=1.0, n=n, distance=distance, stiffness=1e5 if distance < 0.1 else 100.0)
     velocities = np.stack([3.0 * scene.velocities, 0.1 * scene.velocities])
     steppers = [SOLVERS[name].bind(scene.build(device=device, copies=copies)) for copies in (1, 1, 2)]
     for stepper, given in zip(steppers, (velocities[:1], velocities[1:], velocities), strict=True):

@@ -281,6 +281,7 @@ REFUSED |= {
 REFUSED[("mobile", "admm")] = "bars, whose bodies are no elements by themselves"
 # Frames of the larger of them on the CPU; the others have 30.
 FRAMES = {"usd_cloth": 3, "bunny": 2, "bar_twist": 15, "mobile": 15, "cards": 5, "loop": 15, "stack": 5}
+FRAMES |= {"cusick": 10, "strip": 10, "picture_frame": 10}
 
 # Self-contact has tests with all solvers of its own.
 UNFOLDED = [name for name in SMALL if name not in FOLDING]
@@ -385,6 +386,8 @@ def test_no_cloth_crosses_cloth(name, solver, device):
     declared, method = taken(scene(name, **FOLDING[name]), solver, device)
     if solver != "explicit":
         method = replace(method, substeps=1)
+    if solver == "newton":  # what steps leave to be solved does not matter to the filter
+        method = replace(method, iterations=20)
     animation = wc.simulate(declared, method, device=device, frames=min(declared.frames, 20))
     assert animation.status.ok and np.isfinite(animation.points).all(), animation.status
     assert np.abs(animation.points[-1] - animation.points[0]).max() > declared.self_contact.distance
