@@ -166,7 +166,8 @@ def plain_arap(cells, X, handles, targets, x, iterations):
     slow_but(
         [*(("grid", *cells, "cholespy") for cells in CELLS), ("irregular", *CELLS[0], "scipy")],
         [(name, *cells, "cholespy") for name in ("grid", "irregular") for cells in CELLS]
-        + [(name, *cells, "cholespy") for name in ("sphere", "bunny") for cells in (CELLS[0], CELLS[-1])]
+        + [("sphere", *cells, "cholespy") for cells in (CELLS[0], CELLS[-1])]
+        + [("bunny", *CELLS[0], "cholespy")]
         + [("irregular", *cells, "scipy") for cells in CELLS],
     ),
 )
@@ -177,7 +178,7 @@ def test_iterations_are_those_of_plain_numpy(name, energy, weights, library, dev
     arap = bend(mesh, handles, weights=weights, energy=energy, device=device)
     assert type(arap._factor) is (linear.LUFactor if library == "scipy" else linear.CholeskyFactor)
     cells = terms(mesh, energy, weights, arap.laplacian)
-    most = {"bunny": 5, "sphere": 30}.get(name, 100)  # the plain one is slow
+    most = {"bunny": 5, "sphere": 15}.get(name, 40)  # the plain one is slow
     plain = list(plain_arap(cells, mesh.points, handles, targets, mesh.points, most))
     size = np.ptp(mesh.points)
     for iterations in (1, most) if name == "bunny" else (1, 10, most):

@@ -79,7 +79,7 @@ def slopes(steps, errors):
 def test_order_on_an_oscillator(name, integrator, device):
     """The error after a time falls like h for Euler and like h² for midpoint and BDF2."""
     omega, end = 2.0, 1.0
-    steps, errors = end / np.array([80, 160]), []
+    steps, errors = end / np.array([40, 80]), []
     for h in steps:
         w = swing(bound(oscillator(omega, h), SOLVERS[name], device, integrator=integrator), round(end / h), omega)
         errors.append(abs(w[-1] - w[0] * np.exp(1j * omega * end)))
@@ -95,7 +95,7 @@ def test_energy_of_an_oscillator(name, integrator, omega_h, device):
 
     (3/2 − z)r² − 2r + 1/2 = 0, from v₋₁ and u₋₁ of two steps of Euler of 2h/3, w₀/(1 − 2z/3)ⁿ.
     """
-    h, steps = 0.1, 40
+    h, steps = 0.1, 20
     omega, z = omega_h / h, 1j * omega_h
     scene = oscillator(omega, h, stretch=0.01, speed=0.02)  # so little that x̃ does not pass the pin
     w = swing(bound(scene, SOLVERS[name], device, integrator=integrator), steps, omega)

@@ -1,7 +1,7 @@
 """Runs that were interrupted go on to the bit of those that were not; all others are refused in one sentence."""
 
+import os
 import signal
-import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +11,9 @@ import pytest
 
 import warpcloth as wc
 from support.command_line import refused, run
+from support.forks import Forks
 from support.rows import slow_but
-from support.setups import SOLVERS
+from support.setups import MAIN, SOLVERS
 from warpcloth.cli import main
 from warpcloth.run import recorders
 from warpcloth.scenes import hanging
@@ -57,7 +58,10 @@ def same(one, other):
     return True
 
 
-CASES = [("explicit", 300.0, "float32"), *((name, 0.0, "float32") for name in SOLVERS), ("newton", 0.0, "float64")]
+# One of each solver, and who has more state than it, or a history within a step that must not be of it.
+STATES = [*MAIN, "newton midpoint", "newton bdf2", "pbd averaged by vertex", "xpbd averaged by constraint"]
+STATES += ["projective dynamics chebyshev", "projective dynamics l-bfgs", "constrained dynamics searching"]
+CASES = [("explicit", 300.0, "float32"), *((name, 0.0, "float32") for name in STATES), ("newton", 0.0, "float64")]
 
 
 @pytest.mark.parametrize(
@@ -127,30 +131,42 @@ def test_frames_go_on_in_the_same_file(ending, single, stops, tmp_path, device):
     assert len(folders) == (0 if single or ending == "usdz" else 2) and len(files) == 3 * len(folders)
 
 
-KILLED = """
+IMPORTS = """
 import os, sys
 from warpcloth.cli import main
-from warpcloth.run import recorders
-
+from warpcloth.run import recorders, simulate
+from warpcloth.scenes import hanging
+"""
+KILLED = """
 append = recorders.File.append
 
-def killed(self, *given, **named):
-    append(self, *given, **named)
+def killed(self, *more, **named):
+    append(self, *more, **named)
     if self.frames == 26:
-        os.kill(os.getpid(), int(sys.argv[1]))
+        os.kill(os.getpid(), int(given[0]))
 
 recorders.File.append = killed
-sys.exit(main(sys.argv[2:]))
+os.chdir(given[1])
+code = main(given[2:])
+sys.stderr.flush()
+os._exit(code)
 """
 
 
+@pytest.fixture(scope="module")
+def forks():
+    with Forks(IMPORTS, PYTHONPATH=os.pathsep.join(sys.path)) as forks:
+        yield forks
+
+
 @pytest.mark.host
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.parametrize("number", slow_but([signal.SIGKILL], [signal.SIGINT, signal.SIGTERM, signal.SIGKILL]))
-def test_the_command_line_resumes_what_a_signal_ended(number, tmp_path, capfd, monkeypatch):
+def test_the_command_line_resumes_what_a_signal_ended(number, forks, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command = ["run", "hanging", "-p", "n=6", "--solver", "xpbd", "-s", "substeps=2", "iterations=2"]
-    ended = subprocess.run([sys.executable, "-c", KILLED, str(int(number)), *command], capture_output=True, timeout=600)
-    assert ended.returncode == (-number if number == signal.SIGKILL else 128 + number), ended.stderr.decode()
+    forks.start(KILLED, tmp_path / "said", int(number), str(tmp_path), *command)
+    assert forks.wait() == (-number if number == signal.SIGKILL else 128 + number), (tmp_path / "said").read_text()
     assert len(FrameSequence("hanging.usdc")) == (20 if number == signal.SIGKILL else 26)
     code, out, err = run(capfd, *command, "--resume")
     assert code == 0 and "60 of 60" in out and err == ""
