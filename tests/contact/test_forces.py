@@ -110,7 +110,7 @@ ORDERS = {
     "newton": (wc.Newton(substeps=1, tolerance=1e-9), 2),
     "newton midpoint": (wc.Newton(substeps=1, integrator="midpoint", tolerance=1e-9), 4),
     "newton bdf2": (wc.Newton(substeps=1, integrator="bdf2", tolerance=1e-9), 4),
-    "xpbd": (wc.XPBD(substeps=1, iterations=60), 2),
+    "xpbd": (wc.XPBD(substeps=1, iterations=30), 2),
 }
 
 

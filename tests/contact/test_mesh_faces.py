@@ -165,7 +165,7 @@ def rails(*at):
 # A spike and a knife below the middle of triangles.
 BOTH = joined((SPIKE[0] + np.array([0.23, 0.0, 0.21]), SPIKE[1]), (KNIFE[0] + np.array([0.12, 0.0, 0.083]), KNIFE[1]))
 EXACT = {
-    "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=1000),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-8, iterations=1000),
     "xpbd": wc.XPBD(substeps=1, iterations=10_000),
     "admm": wc.ADMM(substeps=1, tolerance=1e-10, iterations=20_000),
     "constrained dynamics": wc.ConstrainedDynamics(substeps=1, tolerance=1e-9, iterations=60, linear="factorised"),

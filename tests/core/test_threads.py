@@ -31,13 +31,13 @@ HARD = wc.Spring(stiffness=np.inf)
 # What steps of one cloth are divided by, colours of sweeps or ranges of vertices, and the cloth that they are of.
 DIVIDED = {
     "explicit": (wc.Explicit(substeps=8), [SPRINGS]),
-    "pbd": (wc.PBD(substeps=7, iterations=4), [SPRINGS, wc.DihedralBending(stiffness=1e-3)]),
-    "pbd with clusters": (wc.PBD(substeps=7, iterations=4), [HARD, wc.RigidCluster(vertices=[[0, 1, 2, 7]], stiffness=np.inf)]),
-    "hierarchical pbd": (wc.HierarchicalPBD(substeps=7, iterations=2, coarse_iterations=2), [SPRINGS]),
-    "xpbd": (wc.XPBD(substeps=7, iterations=4), [replace(SPRINGS, damping=0.01), wc.QuadraticBending(stiffness=1e-4)]),
-    "xpbd hard": (wc.XPBD(substeps=7, iterations=4), [HARD]),
-    "xpbd midpoint": (wc.XPBD(substeps=7, iterations=4, integrator="midpoint"), [SPRINGS]),
-    "xpbd bdf2": (wc.XPBD(substeps=7, iterations=4, integrator="bdf2"), [SPRINGS]),
+    "pbd": (wc.PBD(substeps=3, iterations=4), [SPRINGS, wc.DihedralBending(stiffness=1e-3)]),
+    "pbd with clusters": (wc.PBD(substeps=3, iterations=4), [HARD, wc.RigidCluster(vertices=[[0, 1, 2, 7]], stiffness=np.inf)]),
+    "hierarchical pbd": (wc.HierarchicalPBD(substeps=3, iterations=2, coarse_iterations=2), [SPRINGS]),
+    "xpbd": (wc.XPBD(substeps=3, iterations=4), [replace(SPRINGS, damping=0.01), wc.QuadraticBending(stiffness=1e-4)]),
+    "xpbd hard": (wc.XPBD(substeps=3, iterations=4), [HARD]),
+    "xpbd midpoint": (wc.XPBD(substeps=3, iterations=4, integrator="midpoint"), [SPRINGS]),
+    "xpbd bdf2": (wc.XPBD(substeps=3, iterations=4, integrator="bdf2"), [SPRINGS]),
 }
 
 

@@ -2,11 +2,13 @@
 
 import json
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warpcloth as wc
 from support.command_line import refused, run
@@ -14,6 +16,7 @@ from support.outside import write_files
 from warpcloth.base import extensions
 from warpcloth.base.digest import package_digest, source_digest
 from warpcloth.cli.options import solvers
+from warpcloth.lab import benchmarks
 from warpcloth.lab.setups import setups_of_runs, setups_of_steps
 from warpcloth.solvers import SOLVERS, register
 from warpcloth.terms import TERMS
@@ -159,12 +162,14 @@ MEASURES = {
 }
 
 
-# Each starts processes; `bench` compiles all kernels anew.
+# Each starts processes.
 SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "choose" else SLOW) for name in MEASURES])
-def test_processes_that_measure_load_them(name, outside, capfd, tmp_path):
+def test_processes_that_measure_load_them(name, outside, capfd, tmp_path, monkeypatch):
+    # `bench` compiles all kernels anew in test_bench.py.
+    monkeypatch.setattr(benchmarks, "TemporaryDirectory", lambda **_: nullcontext(wp.config.kernel_cache_dir))
     picture = ["-o", tmp_path / "chart.png"] if "chart" in MEASURES[name] else []
     code, out, err = run(capfd, *MEASURES[name], *IMPORTS, *picture, "--json")
     assert code == 0, err
