@@ -75,7 +75,6 @@ MOVED = [
     "springs",
     "springs, the higher vertex first, each of its own stiffness",
     "limits",
-    "orthotropic",
     "quadratic bending",
     "plate bending",
     "dihedral bending",
@@ -376,8 +375,6 @@ SWEPT = [
     *((name, "float64", "multipliers") for name in ("nothing", "limits", "orthotropic", "several")),
     ("limits", "float64", "stiffness per step"),
     ("several", "float64", "averaged by constraint"),
-    ("several", "float64", "scalar constraints"),
-    ("several", "float32", "multipliers"),
 ]
 
 

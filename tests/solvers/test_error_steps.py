@@ -165,7 +165,7 @@ def test_a_step_that_is_not_accurate_enough_is_reported():
 def test_records_of_moving_pins_do_not_change_the_motion_and_others_are_refused():
     scene, record = named("curtain", nx=13, ny=9), wc.Newton(error=1e-3)
     with pytest.raises(ValueError, match="record is 'energies' of a scene with contact or air"):
-        wc.simulate(scene, record, frames=1, record="energies")
+        wc.simulate(scene, record, frames=1, dtype="float64", record="energies")
     scene = replace(scene, colliders=(), contact=None)
     plain, recorded = (wc.simulate(scene, record, frames=6, dtype="float64", record=each) for each in ((), "energies"))
     np.testing.assert_array_equal(plain.points, recorded.points)

@@ -160,6 +160,7 @@ def test_vertices_without_a_free_axis_are_pins(name, device):
 def test_locked_coordinates_stay_to_the_bit(name, device):
     """In float32, in a batch, in another order, along gravity and after a reset to other positions, with a velocity of 0."""
     declared = replace(rails(square(solver=SOLVERS[name], pins=[0])), velocities=np.ones((36, 3)))
+    declared = replace(declared, terms=declared.terms[:2])  # test_pins_hold_their_axes has hinges
     model = declared.build(device=device, copies=2, order=np.arange(36)[::-1], vary={"Spring.stiffness": [50.0, 100.0]})
     stepper = SOLVERS[name].bind(model)
     locked = np.tile(declared.locked, (2, 1))
