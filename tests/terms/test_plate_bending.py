@@ -348,13 +348,13 @@ def swinging(n=6):
 
 MEET = {
     "newton": wc.Newton(substeps=1, tolerance=1e-11),
-    "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-10, iterations=1_000),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-10, iterations=400),
     "constrained dynamics cg": wc.ConstrainedDynamics(substeps=1, tolerance=1e-12, iterations=200),
     "constrained dynamics factorised": wc.ConstrainedDynamics(substeps=1, tolerance=1e-12, iterations=200, linear="factorised"),
-    "admm": wc.ADMM(substeps=1, tolerance=1e-10, iterations=6_000, weight=0.1),
-    "xpbd coloured": wc.XPBD(substeps=1, iterations=8_000),
-    "xpbd sequential": wc.XPBD(substeps=1, iterations=8_000, sweep="sequential"),
-    "xpbd to and fro": wc.XPBD(substeps=1, iterations=8_000, integrator="midpoint"),
+    "admm": wc.ADMM(substeps=1, tolerance=1e-10, iterations=1_500, weight=0.1),
+    "xpbd coloured": wc.XPBD(substeps=1, iterations=2_000),
+    "xpbd sequential": wc.XPBD(substeps=1, iterations=2_000, sweep="sequential"),
+    "xpbd to and fro": wc.XPBD(substeps=1, iterations=2_000, integrator="midpoint"),
 }
 
 
