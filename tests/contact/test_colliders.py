@@ -212,8 +212,10 @@ def test_no_vertex_is_inside(name, what, dtype, device):
     """At 1 and 100 m/s and steps of 1/24 s, in which it moves 4 m; explicit steps are a fortieth of that."""
     for speed in (1.0, 100.0):
         colliders = [replace(each, friction=0.0) for each in MOVING[what]] if "pbd" in name and name != "xpbd" else MOVING[what]
-        scene = falling(colliders, speed)
-        animation = wc.simulate(scene, SOLVERS[name], dtype=dtype, device=device)
+        scene, solver = falling(colliders, speed), SOLVERS[name]
+        if name == "projective dynamics":  # what steps leave to be solved does not matter to the filter
+            solver = replace(solver, iterations=10)
+        animation = wc.simulate(scene, solver, dtype=dtype, device=device)
         for frame, points in enumerate(animation.points.astype(np.float64)):
             for collider in scene.colliders:
                 assert collider.distances(points, frame).min() > 0.0, (speed, frame, collider.label)

@@ -69,11 +69,11 @@ def incline(degrees, friction, duration=1.0, mesh=False):
 @pytest.mark.parametrize(("friction", "mesh"), slow_but([(0.3, False)], [(0.1, False), (0.3, False), (0.3, True)]))
 def test_a_sheet_slides_down_a_slope(name, friction, mesh, device):
     """a = g(sin θ − μ cos θ), of the second half, when anchors are dragged along."""
-    scene, down = incline(30.0, friction, mesh=mesh)
+    scene, down = incline(30.0, friction, duration=0.5, mesh=mesh)
     animation = run(scene, name, 60 if name == "explicit" else 2, device)
     along = (animation.velocities @ down).mean(axis=1)
     expected = G * (0.5 - friction * np.sqrt(0.75))
-    assert (along[-1] - along[30]) / 0.5 == pytest.approx(expected, rel=1e-4)
+    assert (along[-1] - along[15]) / 0.25 == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(("friction", "mesh"), ((0.0, False), (0.02, False), (0.0, True), (0.02, True)))
@@ -120,11 +120,11 @@ def test_what_hits_a_ball_slides_off(friction, mesh, device):
 @pytest.mark.parametrize("mesh", (False, pytest.param(True, marks=pytest.mark.slow)))
 def test_a_sheet_sticks_to_a_slope(name, mesh, device):
     """tan θ = 0.95 μ. Anchored friction does not creep; explicit steps swing about the anchor, and no farther than it holds."""
-    scene, down = incline(np.degrees(np.arctan(0.95 * 0.3)), 0.3, duration=2.0, mesh=mesh)
+    scene, down = incline(np.degrees(np.arctan(0.95 * 0.3)), 0.3, duration=1.0, mesh=mesh)
     animation = run(scene, name, 60 if name == "explicit" else 2, device)
     along = ((animation.points - animation.points[0]) @ down).mean(axis=1)
     held = 0.3 * 1e-4  # ε = μN/(kA) with N = wA and w = k r/10
-    assert abs(along[-1] - along[60]) < (held if name == "explicit" else 1e-9)
+    assert abs(along[-1] - along[30]) < (held if name == "explicit" else 1e-9)
     assert 0.0 < along[-1] < 20.0 * held
 
 

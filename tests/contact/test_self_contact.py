@@ -727,7 +727,7 @@ def test_violent_steps(steps, device):
 @each_solver
 def test_more_pairs_than_there_is_room_for(name, device):
     """A list that overflows in the middle of a run changes no bit, nor does another run."""
-    scene, ends = layers(turn=17.0, speed=1.0), []
+    scene, ends = layers(turn=17.0, speed=1.0, n=4), []
     for capacity in (None, None, 8):
         stepper = SOLVERS[name].bind(scene.build(device=device))
         if capacity is not None:
@@ -743,7 +743,7 @@ def test_more_pairs_than_there_is_room_for(name, device):
 @each_solver
 def test_list_of_a_state(name, device):
     """Steps after a state was taken are the same, to the bit, whatever the stepper that takes them has listed before."""
-    scene = layers(turn=17.0, speed=1.0)
+    scene = layers(turn=17.0, speed=1.0, n=4)
     one, other = (SOLVERS[name].bind(scene.build(device=device)) for _ in range(2))
     for _ in range(2):
         one.frame()

@@ -2,6 +2,7 @@
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,7 @@ NAMES = {
 TERMS = ("kernels/terms/", "kernels/membrane.py", "kernels/fast/quadratic_pair.py")
 
 
+@cache
 def defined():
     """Where each module (no package), and each public class and function of a module is, {name: {path}}."""
     modules, names = defaultdict(set), defaultdict(set)

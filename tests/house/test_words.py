@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -33,8 +34,8 @@ ALLOWED = {"in_place", "correct_in_place", "launch_in_place", "refuse_in_place"}
 ALIASES = {"warpcloth/analysis/analysis.py": {"places"}}
 
 
-def names(tree):
-    for node in ast.walk(tree):
+def names(path):
+    for node in nodes(path):
         if isinstance(node, ast.Name):
             yield node.id
         elif isinstance(node, ast.Attribute):
@@ -49,9 +50,15 @@ def words(name):
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().strip("_").split("_")
 
 
+@cache
+def nodes(path):
+    """All nodes of a file, which both tests of it walk through."""
+    return list(ast.walk(ast.parse((ROOT / path).read_text())))
+
+
 @pytest.mark.parametrize("path", PATHS)
 def test_docstrings_open_with_a_statement(path):
-    for node in ast.walk(ast.parse((ROOT / path).read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
             text = ast.get_docstring(node) or ""
             assert not OPENINGS.match(text), f"{getattr(node, 'name', 'module')}: {text.splitlines()[0]}"
@@ -59,6 +66,6 @@ def test_docstrings_open_with_a_statement(path):
 
 @pytest.mark.parametrize("path", PATHS)
 def test_names_are_words_of_the_field(path):
-    found = {name for name in names(ast.parse((ROOT / path).read_text())) if name.lower().strip("_") not in ALLOWED}
+    found = {name for name in names(path) if name.lower().strip("_") not in ALLOWED}
     wrong = {name for name in found if INSTEAD.keys() & set(words(name))}
     assert wrong == ALIASES.get(path, set()), {word: INSTEAD[word] for name in wrong for word in words(name) if word in INSTEAD}
