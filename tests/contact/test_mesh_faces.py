@@ -251,7 +251,7 @@ def test_an_edge_mesh_is_not_cut(device):
     assert crossing(thick, flat, across) == [0] * len(points)
 
 
-@wp.kernel
+@wp.kernel(module="unique", enable_backward=False)
 def search(
     p: wp.array(dtype=wp.mat33d),
     move: wp.array(dtype=wp.mat33d),

@@ -37,8 +37,11 @@ def between_edges(a, b, c, d):
         return np.where(inside, np.linalg.norm(r + s[..., None] * e - t[..., None] * f, axis=-1), found)
 
 
-def all_pairs(mesh, x):
-    """All pairs that share no vertex: (VT stencils, distances now, at rest), and those of edges."""
+_AT_REST = {}  # by the id of a mesh, which is kept, so that no other has it
+
+
+def _at_rest(mesh):
+    """Of pairs of either kind that share no vertex: stencils, what measures their distance, and it at rest."""
     points, kinds = mesh.points, []
     v, t = (each.ravel() for each in np.meshgrid(np.unique(mesh.triangles), np.arange(len(mesh.triangles)), indexing="ij"))
     e, f = np.triu_indices(len(mesh.edges), 1)
@@ -48,5 +51,13 @@ def all_pairs(mesh, x):
     ):
         apart = (s[:, :1] != s[:, 1:]).all(axis=1) & (s[:, 1] != s[:, 2]) & (s[:, 1] != s[:, 3])
         s = s[apart]
-        kinds.append((s, measure(*x[s.T]), measure(*points[s.T])))
+        kinds.append((s, measure, measure(*points[s.T])))
     return kinds
+
+
+def all_pairs(mesh, x):
+    """All pairs that share no vertex: (VT stencils, distances now, at rest), and those of edges."""
+    if id(mesh) not in _AT_REST:
+        _AT_REST[id(mesh)] = mesh, _at_rest(mesh)
+    _, kinds = _AT_REST[id(mesh)]
+    return [(s, measure(*x[s.T]), rest) for s, measure, rest in kinds]
