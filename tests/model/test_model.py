@@ -847,10 +847,7 @@ print(json.dumps(found))
 # Solver; terms of the scene; which files of energies are found in kernels; names in the report.
 ALL_HOMES = ["attachment", "dihedral_bending", "quadratic_bending", "spring"]
 ALL_NAMES = ["Attachment", "DihedralBending", "QuadraticBending", "Spring"]
-BUILDS = {
-    "XPBD of springs": ("XPBD", "springs", ["spring"], ["Spring"]),
-    "PBD of all, to show that the probe sees them": ("PBD", "all", ALL_HOMES, ALL_NAMES),
-}
+BUILDS = {"PBD of all, to show that the probe sees them": ("PBD", "all", ALL_HOMES, ALL_NAMES)}
 COUNTED = len(BUILDS)  # that many are compiled into an empty cache, the others into that of the tests
 BUILDS |= {
     **{f"{each.__name__} of springs": (each.__name__, "springs", ["spring"], ["Spring"]) for each in SOLVERS.values()},

@@ -176,7 +176,7 @@ def test_nothing_reads_a_device_beside_the_frames(scene, device, monkeypatch):
 
     look_ahead(monkeypatch, 2)
     monkeypatch.setattr(wp.array, "numpy", numpy)
-    wc.simulate(scene, wc.XPBD(substeps=4), frames=4, device=device, record=("energies", "reactions"))
+    wc.simulate(scene, wc.XPBD(substeps=4), frames=4, device=device, dtype="float64", record=("energies", "reactions"))
     assert not apart
 
 

@@ -298,7 +298,7 @@ STRONG = wc.Air(wind=(100.0, 0.0, 0.0))
         (lambda: wc.simulate(sheet(), wc.PBD(substeps=4)), "PBD cannot take Air, whose drag grows .*; Explicit, Newton"),
         (lambda: wc.simulate(sheet(), wc.ConstrainedDynamics(substeps=4)), "cannot take Air, whose energy is no square of"),
         (
-            lambda: wc.simulate(sheet(air=STRONG), wc.Explicit(substeps=8)),
+            lambda: wc.simulate(sheet(air=STRONG), wc.Explicit(substeps=8), dtype="float64"),
             "in this wind the forces of air need steps",
         ),
     ],

@@ -59,7 +59,7 @@ def test_a_scene_takes_density_and_terms_from_it(device):
     scene = wc.Scene(MESH, fabric="denim", pins=[0], duration=0.1)
     assert scene.density == 0.4 and [term.label for term in scene.terms] == ["OrthotropicMembrane", "PlateBending"]
     assert replace(scene, duration=0.2).density == 0.4  # once made it is a scene like others
-    assert wc.simulate(scene, wc.Newton(substeps=2), device=device).status.ok
+    assert wc.simulate(scene, wc.Newton(substeps=2), device=device, dtype="float64").status.ok
 
 
 BALL = wc.Sphere(radius=0.1, position=(0.0, -1.0, 0.0))

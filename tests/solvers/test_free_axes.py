@@ -62,7 +62,7 @@ del ENDED["xpbd"], ENDED["xpbd averaged by constraint"]
 def test_half_a_sheet_moves_as_the_whole(name, device):
     """To 1e-9 m, within which steps end; without the lock the half moves by centimetres from there."""
     whole, kept, half = halves()
-    run = {"device": device, "dtype": "float64", "frames": 2}
+    run = {"device": device, "dtype": "float64", "frames": 2 if name == "newton" else 1}
     ends = [wc.simulate(each, ENDED[name], **run).points[-1] for each in (whole, half)]
     assert np.abs(ends[1] - ends[0][kept]).max() < 1e-9
     if name == "newton":

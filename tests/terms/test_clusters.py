@@ -462,7 +462,7 @@ def test_bad_bodies_are_refused(fields, message):
 @pytest.mark.parametrize(("solver", "stiffness"), [(wc.ADMM, 1.0), (wc.Newton, np.inf), (wc.ProjectiveDynamics, np.inf)])
 def test_who_cannot_take_bodies_says_who_can(solver, stiffness, device):
     """All that are named can."""
-    model = body(BODIES["solid"], stiffness=stiffness).build(device=device)
+    model = body(BODIES["solid"], stiffness=stiffness).build(device=device, dtype="float64")
     with pytest.raises(ValueError, match=f"{solver.__name__} cannot take RigidCluster.*; .*PBD, ") as refused:
         solver(substeps=1).bind(model)
     others = set(re.findall(r"\w+", str(refused.value).partition("; ")[2])) & set(wc.__all__)

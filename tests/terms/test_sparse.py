@@ -154,7 +154,7 @@ def test_newton_finds_the_minimum(options, device):
 
 def test_a_run_with_it_ends_well(device):
     for solver in (wc.Newton(substeps=4), wc.Explicit(substeps=64)):
-        assert wc.simulate(sheet(duration=0.2), solver, device=device).status.ok
+        assert wc.simulate(sheet(duration=0.2), solver, device=device, dtype="float64").status.ok
     rest, motion = step_limits(sheet().build(device=device, dtype="float64"))
     assert 1.0 / 60 / 64 < motion <= rest < 1.0
 
