@@ -385,8 +385,7 @@ def test_time_diagram(device, tmp_path, drawn):
     found["rows"][-1].pop("front", None)
     name = found["rows"][-1]["label"]
     assert (name, "diverged: diverged in frame 3") in without_point(found)
-    for ending in ("png", "svg"):
-        pareto.plot_time(tmp_path / f"chart.{ending}", found)
+    pareto.plot_time(tmp_path / "chart.png", found)
     write_csv(tmp_path / "chart.csv", found)
     lines = table(tmp_path / "chart.csv")
     assert [line["label"] for line in lines] == list(rows) and lines[-1]["error"] == ""
