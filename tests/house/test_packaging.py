@@ -75,8 +75,8 @@ def wheel(archive, tmp_path_factory):
 def environment(wheel, tmp_path_factory):
     """A new environment with the wheel; its dependencies are the ones of this environment, without its warpcloth."""
     folder = tmp_path_factory.mktemp("environment")
-    venv.create(folder, with_pip=True)
-    run(folder / "bin" / "python", "-m", "pip", "install", "--no-index", "--no-deps", wheel)
+    venv.create(folder)
+    run(sys.executable, "-m", "pip", "--python", folder / "bin" / "python", "install", "--no-index", "--no-deps", wheel)
     (packages,) = folder.glob("lib/python*/site-packages")
     # The .pth files there, and so an editable warpcloth, are not read; warpcloth itself comes after the wheel's.
     others = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
