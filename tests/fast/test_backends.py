@@ -77,7 +77,6 @@ MOVED = [
     "limits",
     "quadratic bending",
     "plate bending",
-    "dihedral bending",
     "several",
 ]
 # A kernel of a backend is compiled for its terms, options and precision, which takes most of the time of its tests. In float32
@@ -201,13 +200,10 @@ def test_the_plan_takes_the_fast_backend_of_the_device(device):
     assert record(scene, device, "core") == found._replace(backend="core", lanes=1, pairs=())
 
 
-# One of each way to store incidences, by what a term is: none, pairs that share a stiffness or not, elements, rows of a matrix,
-# and one after another; test_gathering_is_scattering has each energy by itself.
+# Every way to store incidences, by what a term is: none, pairs that share a stiffness, elements, and in "several" these, pairs
+# of their own stiffness and rows of a matrix one after another; test_gathering_is_scattering has each by itself.
 GRADIENTS = [
     *((name, dtype) for name in ("nothing", "springs") for dtype in ("float32", "float64")),
-    ("springs, the higher vertex first, each of its own stiffness", "float64"),
-    ("St. Venant-Kirchhoff", "float64"),
-    ("quadratic bending", "float64"),
     ("plate bending", "float64"),
     ("several", "float64"),
 ]
@@ -352,8 +348,8 @@ SWEEPS = {
 PROJECTED = TERMS | {"corotated": [wc.CorotatedMembrane(stiffness=100.0)]}
 PROJECTED["orthotropic"] = [replace(TERMS["orthotropic"][0], damping=0.0)]
 # All that sweeps do to corrections, for pairs; each kind of correction (to a projection, by a prox, by a Newton step, of a
-# scalar) and each number of vertices and of rows, with and without λ; and all of them one after another. The energy is in none
-# of that: its correction is one function of all backends, which test_terms.py has by itself.
+# scalar) and, one after another in "several", each number of vertices and of rows and damping, with and without λ. The energy
+# is in none of that: its correction is one function of all backends, which test_terms.py has by itself.
 SWEPT = [
     *(("springs", "float64", options) for options in SWEEPS),
     *(("springs", "float32", options) for options in ("plain", "multipliers")),
@@ -362,13 +358,8 @@ SWEPT = [
         for name in (
             "nothing",
             "springs, the higher vertex first, each of its own stiffness",
-            "damped springs",
             "limits",
             "corotated",
-            "quadratic bending",
-            "dihedral bending",
-            "attachments",
-            "clusters",
             "several",
         )
     ),

@@ -68,7 +68,7 @@ def stage(tmp_path_factory):
         fps=24.0,
         duration=(FRAMES - 1) / 24.0,
     )
-    wc.simulate(scene, wc.XPBD(substeps=4), output=path, single_file=True)
+    wc.simulate(scene, wc.XPBD(substeps=4), output=path, single_file=True, dtype="float64")
     return path
 
 
