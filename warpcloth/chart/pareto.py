@@ -22,7 +22,7 @@ def plot_time(path, found):
     Two panels show the error of positions and the 99th percentile of the error of strains. In each panel the settings that no
     other beats by more than the spread of times are joined and numbered, with their names beside the panel. Settings without an
     error are named with the reason. The error of the reference solution is a line; points below it mean nothing. For solvers of
-    other simulators, hollow markers show the error relative to the motion to which the solver itself converges.
+    other simulators, dots show the error relative to the motion to which the solver itself converges.
 
     Args:
         path: The file, .png, .svg or .pdf.
