@@ -11,7 +11,7 @@ import pytest
 from support.rows import slow_but
 from warpcloth.chart.failures import plot_failure
 from warpcloth.cli import main
-from warpcloth.lab import cotangents, crossing, friction, isometry, locking, physics, rank, tunnelling
+from warpcloth.lab import campaign, cotangents, crossing, friction, isometry, locking, physics, rank, tunnelling
 from warpcloth.lab.campaign import Store
 from warpcloth.lab.failures import COLUMNS, FAILURES, failure_chart, write_csv
 from warpcloth.lab.panels import Map, point
@@ -514,6 +514,7 @@ def test_without_libigl_it_says_what_is_missing(device):
 @pytest.mark.slow
 def test_the_command(tmp_path, capfd, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(campaign, "processes", lambda workers: ThreadPoolExecutor(1))
     given = ["chart", "failure", "isometry", "--workers", "1"]
     assert main([*given, "-o", str(tmp_path / "i.png"), "--csv", str(tmp_path / "i.csv")]) == 0
     out = capfd.readouterr().out

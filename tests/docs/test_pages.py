@@ -277,8 +277,8 @@ MODULES = {"libigl": "igl", "pillow": "PIL"}
 # Runs the blocks of a page one after the other, commands by the function behind them. Packages that the page does not say to
 # install are not found. Other commands are left out: .ci/run runs those of the README, a cluster needs several machines, and
 # bench compiles again what it measures, as test_bench.py has it do. What commands measure in two processes is measured here in
-# a thread; test_work_precision.py, test_extending.py and test_chart_failures.py have them start processes. Runs of whole scenes
-# end after 12 frames, their films are small, and the diagram physics has two resolutions.
+# a thread; test_sweep.py and test_extending.py have them start processes. Runs of whole scenes end after 12 frames, their films
+# are small, and the diagram physics has two resolutions.
 # One process imports what all pages need, and forks for each page.
 RUN = """
 import functools, os, shlex, sys

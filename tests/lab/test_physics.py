@@ -1,6 +1,7 @@
 """The physics diagram: bending of nets that are turned, and errors to closed forms that finer meshes cure or do not."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -452,9 +453,11 @@ def test_a_patch_is_exact(pattern, device):
 
 @pytest.mark.slow
 def test_results_are_json_and_run_as_tasks(tmp_path):
+    """A worker finds the function of a task by its name, as processes of it do."""
     tasks = [task(measure, case="chain", resolution=n) for n in (2, 3)]
     found = {
-        each.arguments["resolution"]: result for each, result in sweep(tasks, store=Store(tmp_path / "s.jsonl"), workers=1)
+        each.arguments["resolution"]: result
+        for each, result in sweep(tasks, ThreadPoolExecutor(1), Store(tmp_path / "s.jsonl"))
     }
     assert found[3]["status"] == "ok" and found[3]["elements"] == 3 and found[3]["ms"] > 0.0
     json.dumps(measure("cylinder", 6), allow_nan=False)

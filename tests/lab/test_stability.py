@@ -16,7 +16,7 @@ from support.rows import slow_but
 from warpcloth.chart.maps import _PLAIN, plot_maps, write_csv
 from warpcloth.cli import _parser, main
 from warpcloth.cli.stability import _survey
-from warpcloth.lab import machine, stability
+from warpcloth.lab import campaign, machine, stability
 from warpcloth.lab.axes import AXES, FIXED
 from warpcloth.lab.campaign import Store, sweep
 from warpcloth.lab.cells import applied, record_at, scene_at, vary
@@ -700,6 +700,7 @@ def run(capfd, *words):
 @pytest.mark.slow
 def test_the_command(tmp_path, capfd, monkeypatch):
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(campaign, "processes", lambda workers: ThreadPoolExecutor(1))
     given = ["hanging", "-p", "n=4", "--x", "dt", "--x-range", 1e-3, 1e-1, 3, "--y", "stiffness", "--y-range", 1, 100, 2]
     given += ["--steps", 8, "--duration", 0.1, "--workers", 1, "--solvers", "explicit", "pbd:iterations=4,sweep=sequential"]
     code, out, err = run(capfd, *given, "-o", tmp_path / "m.png", "--csv", tmp_path / "m.csv")

@@ -515,6 +515,7 @@ def test_command(tmp_path, monkeypatch, capsys):
             if done == 2:
                 raise KeyboardInterrupt
 
+    monkeypatch.setattr(campaign, "processes", lambda workers: ThreadPoolExecutor(1))
     monkeypatch.setattr(campaign, "sweep", interrupted)
     assert main(command) == 130
     assert "interrupted after 2 of 4 settings, which are kept" in capsys.readouterr().err
