@@ -34,38 +34,36 @@ ALLOWED = {"in_place", "correct_in_place", "launch_in_place", "refuse_in_place"}
 ALIASES = {"warpcloth/analysis/analysis.py": {"places"}}
 
 
-def names(path):
-    for node in nodes(path):
-        if isinstance(node, ast.Name):
-            yield node.id
-        elif isinstance(node, ast.Attribute):
-            yield node.attr
-        elif isinstance(node, ast.arg):
-            yield node.arg
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            yield node.name
-
-
 def words(name):
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().strip("_").split("_")
 
 
 @cache
-def nodes(path):
-    """All nodes of a file, which both tests of it walk through."""
-    return list(ast.walk(ast.parse((ROOT / path).read_text())))
+def read(path):
+    """Of a file the docstrings, with the names of what they are of, and all names."""
+    docstrings, names = [], set()
+    for node in ast.walk(ast.parse((ROOT / path).read_text())):
+        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
+            docstrings.append((getattr(node, "name", "module"), ast.get_docstring(node) or ""))
+        if isinstance(node, ast.Name):
+            names.add(node.id)
+        elif isinstance(node, ast.Attribute):
+            names.add(node.attr)
+        elif isinstance(node, ast.arg):
+            names.add(node.arg)
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+    return docstrings, names
 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_docstrings_open_with_a_statement(path):
-    for node in nodes(path):
-        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
-            text = ast.get_docstring(node) or ""
-            assert not OPENINGS.match(text), f"{getattr(node, 'name', 'module')}: {text.splitlines()[0]}"
+    for name, text in read(path)[0]:
+        assert not OPENINGS.match(text), f"{name}: {text.splitlines()[0]}"
 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_names_are_words_of_the_field(path):
-    found = {name for name in names(path) if name.lower().strip("_") not in ALLOWED}
+    found = {name for name in read(path)[1] if name.lower().strip("_") not in ALLOWED}
     wrong = {name for name in found if INSTEAD.keys() & set(words(name))}
     assert wrong == ALIASES.get(path, set()), {word: INSTEAD[word] for name in wrong for word in words(name) if word in INSTEAD}
