@@ -200,8 +200,8 @@ def test_the_plan_takes_the_fast_backend_of_the_device(device):
     assert record(scene, device, "core") == found._replace(backend="core", lanes=1, pairs=())
 
 
-# Every way to store incidences, by what a term is: none, pairs that share a stiffness, elements, and in "several" these, pairs
-# of their own stiffness and rows of a matrix one after another; test_gathering_is_scattering has each by itself.
+# Every way in which gradients store incidences, by what a term is: none, pairs that share a stiffness, elements, and in
+# "several" these and pairs of their own stiffness one after another; test_gathering_is_scattering has each by itself.
 GRADIENTS = [
     *((name, dtype) for name in ("nothing", "springs") for dtype in ("float32", "float64")),
     ("plate bending", "float64"),
