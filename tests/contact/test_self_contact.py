@@ -760,7 +760,7 @@ def test_more_pairs_than_there_is_room_for(name, device):
 @each_solver
 def test_list_of_a_state(name, device):
     """Steps after a state was taken are the same, to the bit, whatever the stepper that takes them has listed before."""
-    scene = layers(turn=17.0, speed=1.0, n=4)
+    scene = layers(turn=17.0, speed=1.0)
     one, other = (SOLVERS[name].bind(scene.build(device=device)) for _ in range(2))
     for _ in range(2):
         one.frame()

@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 
 SERVER = """
 import json, os, sys, traceback
@@ -26,8 +28,8 @@ for line in sys.stdin:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
-    print(child, flush=True)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+    print("started", child, flush=True)
+    print("ended", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
 
 
@@ -42,25 +44,40 @@ class Forks:
     def __init__(self, setup, **environment):
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         self._process = subprocess.Popen([sys.executable, "-c", SERVER], env=os.environ | environment, **pipes)
+        self._running = None  # the number of the child
         self._tell(setup)
 
     def __enter__(self):
         return self
 
     def __exit__(self, *_error):
+        if self._running is not None:
+            with suppress(ProcessLookupError):
+                os.kill(self._running, signal.SIGKILL)
         self._process.communicate()
 
     def _tell(self, what):
         print(json.dumps(what), file=self._process.stdin, flush=True)
 
+    def _heard(self, word):
+        """Returns the number that the process says behind a word."""
+        said, number = self._process.stdout.readline().split()
+        assert said == word
+        return int(number)
+
     def start(self, code, said, *given):
         """Starts Python, with the names of the setup and the list ``given``, which prints to a file; the number of the process.
 
-        The child before must have been waited for.
+        A child before it must end by itself.
         """
+        if self._running is not None:
+            self.wait()
         self._tell((code, str(said), given))
-        return int(self._process.stdout.readline())
+        self._running = self._heard("started")
+        return self._running
 
     def wait(self):
         """Waits for the child; its exit code, or the negative number of the signal that ended it."""
-        return int(self._process.stdout.readline())
+        ended = self._heard("ended")
+        self._running = None
+        return ended
