@@ -68,8 +68,9 @@ def backend(request, device, monkeypatch):
     return name
 
 
-# Of each number of vertices and of rows, with and without damping; "several" has what else there is of springs, bending and
-# bodies. The membranes differ in their energies alone, which all backends take from one function, as test_terms.py does.
+# Of each number of vertices and of rows, with and without damping, which hinges have with several rows; "several" has what
+# else there is of springs, bending and bodies. The membranes differ in their energies alone, which all backends take from one
+# function, as test_terms.py does.
 MOVED = [
     "nothing",
     "springs",
@@ -77,6 +78,7 @@ MOVED = [
     "limits",
     "quadratic bending",
     "plate bending",
+    "dihedral bending",
     "several",
 ]
 # A kernel of a backend is compiled for its terms, options and precision, which takes most of the time of its tests. In float32
@@ -360,12 +362,14 @@ SWEPT = [
             "springs, the higher vertex first, each of its own stiffness",
             "limits",
             "corotated",
+            "dihedral bending",
             "several",
         )
     ),
     *((name, "float64", "multipliers") for name in ("nothing", "limits", "orthotropic", "several")),
     ("limits", "float64", "stiffness per step"),
     ("several", "float64", "averaged by constraint"),
+    ("several", "float32", "plain"),  # for CUDA, where the compiler may round it otherwise
 ]
 
 

@@ -742,8 +742,11 @@ def test_any_number_of_a_term_varies(kind, field):
 
 
 @pytest.mark.parametrize("kind", dict(NUMBERS))
-def test_all_numbers_of_a_term_vary_by_element(kind):
-    numbers_vary(kind, [field for each, field in NUMBERS if each == kind], by_element=True)
+def test_numbers_of_a_term_vary_by_element(kind):
+    """One beside others that do not, and all together."""
+    fields = [field for each, field in NUMBERS if each == kind]
+    for varied in [[field] for field in fields] + [fields]:
+        numbers_vary(kind, varied, by_element=True)
 
 
 def test_copies_without_differences_are_alike(device):

@@ -371,11 +371,7 @@ def test_the_same_run_gives_the_same_bits(name, dtype, device):
     ("name", "unlike"),
     slow_but(
         [(name, "masses and start") for name in ("explicit", "newton", "xpbd")],
-        [  # copies of another stiffness and gravity are in test_a_copy_put_back_starts_again too
-            *((name, "density, bending and damping") for name in SOLVERS),
-            *((name, "masses and start") for name in MAIN),
-            *((name, "stiffness and gravity") for name in ("newton", "xpbd")),
-        ],
+        [(name, unlike) for name in SOLVERS for unlike in UNLIKE if name in MAIN or unlike == "density, bending and damping"],
     ),
 )
 def test_copies_run_as_if_alone(name, unlike, device):
