@@ -44,7 +44,7 @@ def measured(*arguments, **options):
 
 
 def unshaken(*arguments, **options):
-    """What :func:`measured` finds, but for the floor, for which each rest shape is moved and solved for again."""
+    """The result of :func:`measured` without the floor, for which each rest shape is moved and solved for again."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(physics, "_moves", lambda scene, size: np.zeros((1, *scene.positions.shape)))
         return measured(*arguments, **options)

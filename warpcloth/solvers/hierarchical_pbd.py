@@ -37,8 +37,8 @@ class HierarchicalPBD(Step):
     It has drawbacks. Soft cloth is stiffer than with PBD, because the corrections of all levels add up: a chain of 80 springs
     whose exact stretch is 40 % stretches by 4.7 % with PBD (4 × 20 sweeps a frame) and by 1.1 % here. Cloth that starts with
     large stretch is flung, because one step corrects all of it. Stiff cloth is flung too if steps are much shorter than it
-    needs: levels add energy, which long steps damp. Vertices that follow a level move unevenly, most of all near pins, and the
-    last sweeps must smooth that. So levels help if large errors extend over many vertices. If x̃ already nearly meets the
+    needs, because the levels then add energy. Vertices that follow a level move unevenly, most of all near pins, and the last
+    sweeps must smooth that. So levels help if large errors extend over many vertices. If x̃ already nearly meets the
     constraints, PBD alone leaves smaller errors. Repeating the levels in a step was no better in the same time.
 
     Attributes:
