@@ -59,6 +59,9 @@ def run(arguments):
             "source": str(source.path),
             "parameters": values,
             "status": status.result.value,
+            "grade": status.grade.value,
+            "usable": status.ok,
+            "distance": status.distance,
             "message": status.message,
             "frames": status.frame,
             "frames_asked": frames,
@@ -80,7 +83,8 @@ def run(arguments):
         print(json_text(facts) if arguments.json else _summary(facts, animation.inside))
         if status.ok:
             return 0
-        return say(f"{status.message}; the last good frame is {status.frame}, in {arguments.output}", 1)
+        where = f"all {frames} frames are" if status.complete else f"the last good frame is {status.frame},"
+        return say(f"{status.message}; {where} in {arguments.output}", 1)
 
 
 def _own_output(scene, resume):

@@ -30,10 +30,15 @@ class Stopped(ValueError):
     """A step cannot be taken, so the run ends before it; the message says why."""
 
 
-UNBALANCED = "largest unbalanced acceleration of a vertex"
+class Grade(Enum):
+    """How far the result of a run can be used, from best to worst; the value is the text that users see."""
 
-# How a result can be used that is neither clearly good nor clearly bad.
-_NEAR = "usable if this is near enough to the solution"
+    CONVERGED = "converged"
+    COMPLETED = "completed"
+    NOT_USABLE = "not usable"
+
+
+UNBALANCED = "largest unbalanced acceleration of a vertex"
 
 
 class Residual(NamedTuple):
@@ -51,16 +56,20 @@ class Residual(NamedTuple):
 
 
 class Status(NamedTuple):
-    """How a run ended.
+    """How a run ended, and whether its result can be used. As a condition it is :attr:`ok`.
 
     Attributes:
-        result: The worst result of any step and copy.
+        result: The worst result of any step and copy; the cause.
         frame: The last frame in which a copy is good.
         residual: The largest residual of any step; with B > 1 copies one per copy, (B,). 0 for methods without a residual.
-        message: How it ended, whether the result can be used, and the residual with its unit and tolerance.
+        message: The grade, the distance, the result, and the residual with its unit and tolerance.
         good: The last good frame of each copy, (B,).
         measure: The quantity that the residual measures, or None for methods without a residual.
         unit: The unit of the residual, that of the worst copy if there are several; or None.
+        grade: The worst :class:`Grade` of any copy.
+        distance: The largest distance of a vertex from the solution of the last step of a frame [m], or a bound of it; with B >
+            1 copies one per copy, (B,). NaN where it is not known.
+        grades: The grade of each copy, a tuple of B.
     """
 
     result: Result
@@ -70,42 +79,57 @@ class Status(NamedTuple):
     good: np.ndarray | None = None
     measure: str | None = None
     unit: str | None = None
+    grade: Grade = Grade.COMPLETED
+    distance: float | np.ndarray = np.nan
+    grades: tuple = ()
 
     @property
     def ok(self):
-        """Whether no copy diverged and the run was not stopped."""
+        """Whether the result can be used, in all copies."""
+        return self.grade is not Grade.NOT_USABLE
+
+    def __bool__(self):
+        return self.ok
+
+    @property
+    def complete(self):
+        """Whether no copy diverged and the run was not stopped, so that every frame was computed."""
         return self.result not in (Result.DIVERGED, Result.STOPPED)
 
 
-def sentence(result, dtype, residual=None, measure=None, unit=None, tolerance=None, copy=None, use=None, held=0.0):
-    """Returns a message: how a run ended, whether its result can be used, and the residual with its unit and tolerance.
+def sentence(result, grade, distance=np.nan, residual=None, measure=None, unit=None, tolerance=None, copy=None, why=""):
+    """Returns a message: whether a result can be used, how it ended, and the residual with its unit and tolerance.
 
     Args:
         result: The worst :class:`Result` of any step.
-        dtype: The precision, ``"float32"`` or ``"float64"``.
+        grade: The worst :class:`Grade`.
+        distance: The largest distance from the solution of a step [m], NaN if it is not known.
         residual: The largest residual.
         measure: The quantity that it measures, or None for methods without a residual.
         unit: Its unit.
         tolerance: The tolerance it was compared with, or None for methods that do not check it.
         copy: The copy whose residual it is, or None if there is one copy.
-        use: How the result can be used; None for what holds for a run over time.
-        held: The largest distance by which cloth held back a pin [m], or 0. The result is then usable only if that may be.
+        why: Why the result is not usable, and what to do.
     """
-    use = use or {
-        Result.COMPLETED: "usable" if measure is None else _NEAR,
-        Result.CONVERGED: "usable",
-        Result.ROUNDED: f"usable, as near to the solution as {dtype} comes",
-    }.get(result, _NEAR)
-    where = " in a step or more" if use is _NEAR and result is not Result.COMPLETED else ""
-    if held > 0.0:
-        rest = use.removeprefix("usable").replace(" if ", " and if ", 1)
-        use = f"usable if cloth may hold pins back from their keyframes by up to {digits(held)} m{rest}"
-    text = f"{result.value}{where}; {use}"
-    if measure is None:
-        return text
-    compared = "this solver has no tolerance" if tolerance is None else f"tolerance {tolerance:g}"
-    whose = "" if copy is None else f", in copy {copy}"
-    return f"{text}: {measure} {digits(residual)} {unit}{whose} ({compared})"
+    ended, figure = result.value + (" in a step or more" if result in _OF_STEPS else ""), ""
+    if measure is not None:
+        compared = "this solver has no tolerance" if tolerance is None else f"tolerance {tolerance:g}"
+        whose = "" if copy is None else f", in copy {copy}"
+        figure = f"{measure} {digits(residual)} {unit}{whose} ({compared})"
+    if grade is Grade.NOT_USABLE:
+        return f"{grade.value}: {why}; {ended}" + (f": {figure}" if figure else "")
+    text = ended if ended.startswith(grade.value) else f"{grade.value}, {ended}"
+    if grade is Grade.COMPLETED and distance > 0.0:
+        text = text.replace(grade.value, f"{grade.value} within {length(distance)} of the solution of each step", 1)
+    return text + (f": {figure}" if figure else "")
+
+
+_OF_STEPS = (Result.ITERATIONS_USED_UP, Result.STALLED, Result.INACCURATE, Result.SADDLE, Result.CONTRADICTED)
+
+
+def length(value):
+    """Formats a length [m] in millimetres with two significant digits."""
+    return f"{digits(1e3 * value)} mm"
 
 
 def digits(value):

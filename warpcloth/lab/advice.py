@@ -142,7 +142,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         return found, 1e3 * mean_time(times[1:] if len(times) > 1 else times)
 
     base, first = run(scene)
-    if not base.status.ok:
+    if not base.status.complete:
         raise ValueError(f"{scene.name} as it is: {base.status.message}; advice needs a run that does not diverge")
     size = float(np.ptp(scene.mesh.points, axis=0).max())
     other = "float64" if dtype == "float32" else "float32"
@@ -227,7 +227,7 @@ def _trial(kind, name, options, run, base, first, scene, size, tolerance, device
     except ValueError as error:
         return Trial(kind, name, np.nan, np.nan, None, str(error), finer)
     cost = milliseconds / first
-    if not found.status.ok:
+    if not found.status.complete:
         if kind not in _LEFT_OUT:
             return Trial(kind, name, np.nan, cost, None, found.status.message, finer)
         # Such as a term that holds the cloth together.

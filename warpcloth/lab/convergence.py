@@ -56,7 +56,7 @@ class OneStep:
         x, v = (array.numpy() for array in (model.positions, model.velocities))
         if frame:
             earlier = simulate(scene, Newton(substeps=substeps), device=device, dtype="float64", frames=frame)
-            if not earlier.status.ok:
+            if not earlier.status.complete:
                 raise ValueError(f"{scene.name} has no frame {frame} to step from: {earlier.status.message}")
             x, v = earlier.points[-1], earlier.velocities[-1]
         self._start = [np.float32(array).astype(np.float64) for array in (x, v)]

@@ -88,7 +88,7 @@ def own_reference(
             ran = run_other(declared, record, device, frames, watch)
         except (TooSlow, ValueError):
             return sum(watch.frames), None
-        return sum(watch.frames), ran.points.astype(np.float64) if ran.status.ok else "diverged"
+        return sum(watch.frames), ran.points.astype(np.float64) if ran.status.complete else "diverged"
 
     runs, moves, spent, substeps = [], [], 0.0, min(each.substeps for each in records)
     started = time.perf_counter()

@@ -64,7 +64,7 @@ def run(scene, record, copies=1, varied=None, device="cpu", dtype="float64", lim
         warnings.simplefilter("ignore")  # about large steps, which are the subject
         stepper = record.bind(model)
     frames, B = scene.frames, copies
-    watch = Watch(model, stepper, stretched=np.inf)
+    watch = Watch(model, stepper, stretched=np.inf, grades=False)
     points = np.full((frames + 1, B, model.per_copy, 3), np.nan)
     points[0] = model.positions.numpy().reshape(B, -1, 3)
     with np.errstate(over="ignore", invalid="ignore"):

@@ -76,18 +76,19 @@ def measure(
             except ValueError as error:
                 return found | {"status": "refused", "reason": str(error)}
             left -= sum(watch.frames)
-            if left <= 0.0 or not runs[-1].status.ok:
+            if left <= 0.0 or not runs[-1].status.complete:
                 break
     if not runs:
         return found
     first = runs[0]
     status, timings = first.status, first.timings
     found |= {"frames": min(int(status.frame), frames), "residual": finite(status.residual)}
+    found |= {"grade": status.grade.value, "distance": finite(status.distance)}
     found["message"] = "; ".join(dict.fromkeys([status.message, *(str(warning.message) for warning in warned)]))
     found |= _times(spent, declared.fps)
     warm_up = timings["frames"][0] - 1e-3 * found["ms"]
     found |= {"compile_s": timings["compile"] - timings["factorise"] + max(warm_up, 0.0), "factorise_s": timings["factorise"]}
-    if not status.ok:
+    if not status.complete:
         return found | {"status": "diverged", "reason": status.message}
     if exact is not None:
         points, others = first.points[1 : frames + 1].astype(np.float64), exact.points[1 : frames + 1]

@@ -31,6 +31,7 @@ class Euler:
         damps: Whether it damps frequencies that its steps do not resolve.
         to_and_fro: Whether Gauss–Seidel sweeps must alternate in direction, because the error of one order is not damped.
         order: Order of its global error.
+        energy_bound: The most that energy can become, over that at the start, see :mod:`warpcloth.run.balance`.
         one_step: Whether a step depends on the present state alone, so that the next one may have another length.
         least_weight: Number of iterations times the smallest automatic weight of ADMM. A small weight needs many iterations.
             The remaining error of a step becomes a velocity in the next one, which midpoint keeps and Euler damps.
@@ -43,6 +44,7 @@ class Euler:
     damps: ClassVar[bool] = True
     to_and_fro: ClassVar[bool] = False
     order: ClassVar[int] = 1
+    energy_bound: ClassVar[float] = 1.0
     one_step: ClassVar[bool] = True
     least_weight: ClassVar[float] = 2.0
     least_factor: ClassVar[float] = -1.0 / 3.0
@@ -88,7 +90,7 @@ class Midpoint(Euler):
     """Euler by h/2 to xₘ, then x₁ = 2xₘ − x₀, v₁ = 2vₘ − v₀. Second order. xₘ has the pins at t + h/2."""
 
     share, parts, hard, damps, to_and_fro, least_weight, least_factor = 0.5, 2, False, False, True, 20.0, 0.0
-    order = 2
+    order, energy_bound = 2, 2.0
 
     @staticmethod
     def growth(q):
@@ -124,7 +126,7 @@ class BDF2(Euler):
     """
 
     share, hard, least_weight, least_factor = 2.0 / 3.0, False, 4.0, -9.0 / 55.0
-    order, one_step = 2, False
+    order, one_step, energy_bound = 2, False, 2.0
 
     @staticmethod
     def growth(q):

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..base.checks import whole
 from ..base.turns import in_turn
-from ..core.status import Result, Status
+from ..core.status import Grade, Result, Status
 from ..run.simulate import Animation
 
 # Strain of an edge at which a run counts as diverged.
@@ -96,7 +96,8 @@ def run_other(scene, record, device="cpu", frames=None, progress=None):
             strain = worst_strain(scene.mesh, x)
             if not strain < _TORN:
                 why = "a coordinate is not finite" if not np.isfinite(x).all() else f"an edge has the strain {strain:.3g}"
-                status = Status(Result.DIVERGED, frame - 1, message=f"diverged in frame {frame}: {why}")
+                message = f"diverged in frame {frame}: {why}"
+                status = Status(Result.DIVERGED, frame - 1, message=message, grade=Grade.NOT_USABLE)
                 break
             worst = max(worst, strain)
             points.append(x)

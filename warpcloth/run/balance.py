@@ -1,8 +1,16 @@
 """Compares the energy of a cloth with the energy that its sources can have added.
 
-A cloth is judged by its kinetic energy and its potential energy of gravity. Elastic energy is left out, because unconverged
-sweeps store a huge ½kx² without diverging; strain is judged separately. Negative elastic energy, such as that of an attraction,
-counts like that of gravity, because the cloth may fall into it.
+Whether a run has diverged is judged by kinetic energy and the potential energy of gravity. Elastic energy is left out, because
+unconverged sweeps store a huge ½kx² without diverging; strain is judged separately. Negative elastic energy, such as that of an
+attraction, counts like that of gravity, because the cloth may fall into it.
+
+Whether a run is usable is judged more strictly, by :meth:`Balance.surplus`: elastic energy and that of contact count too, but
+for the excess that a step leaves because it has not converged. What contact adds by moving vertices at the end of a step counts
+in any case. Euler steps with a semi-definite Hessian never raise the sum, as
+E₁ − E₀ = −½‖v₁ − v₀‖²_M + U(x₁) − U(x₀) − ∇U(x₁)·(x₁ − x₀). BDF2 does not raise ¼(5‖z₁‖² − 4z₁·z₀ + ‖z₀‖²) (Dahlquist 1978),
+with ‖z‖² twice the energy. That is at least ¼‖z₁‖², and ½‖z₀‖² at the start, so that the energy stays below twice that at the
+start. Midpoint conserves the energy where U is quadratic. Contact that begins within a step adds up to what contact then
+stores, for which there is no bound over many steps, and midpoint is held to that of BDF2.
 
 In symplectic Euler, velocities are half a step behind positions. For x″ = −ω²x it conserves v² + ω²x² − hω²xv, which near the
 limit ωh = 2 is far below v², by a factor of up to 200 at ωh = 1.995. With the velocity at the time of the position,
@@ -28,6 +36,8 @@ GAIN = 3.0
 # A run has diverged when an edge has this strain and the energy of the run does not explain it. The fewest sweeps that hold a
 # cloth give up to 6.4 (one vertex-averaged sweep per step of 1/60 s); a cloth that falls as if nothing held it soon passes 10.
 STRETCHED = 10.0
+# Relative error of an energy, which sums hundreds of thousands of roundings of forces and residuals below their tolerance.
+RESOLVED = 1e-3
 
 
 class Elastic:
@@ -107,6 +117,8 @@ class Balance:
         sources: The sources of the scene.
         points: Positions of the frame that is checked, (B·n, 3) [m].
         has, given: Energy of each copy, and the energy that its sources can have added, in the last checked frame, (B,) [J].
+        driven: Whether sources beside the start add energy, of which only estimates are known.
+        whole, allowed: All energy of each copy, and the most that a correct run can have, after :meth:`surplus`, (B,) [J].
     """
 
     carried = ("_lowest", "_fastest", "_rounding", "_rounded_height")  # from frame to frame
@@ -134,6 +146,8 @@ class Balance:
         self._note_farthest(points)
         found = (source_of(part, self, stepper) for part in (stepper, *model.scene.declared))
         self.sources = [source for source in found if source is not None]
+        self.driven = len(self.sources) > 1
+        self._bound = 1.0 if stepper.integrator is None else stepper.integrator.energy_bound
 
     def kinetic(self, velocities):
         """Returns ½Σ m v² of each copy (B,) [J]; for a free cloth, relative to its centre of mass."""
@@ -177,6 +191,38 @@ class Balance:
             self._fastest = np.where(found <= GAIN, np.fmax(self._fastest, root), self._fastest)
         return found
 
+    def surplus(self, frame, error, velocities):
+        """Returns all energy of each copy in the last checked frame, over the most that a correct run can have, (B,).
+
+        Where sources add energy, of which only estimates are known, the most is ``GAIN`` times as much.
+
+        Args:
+            frame: Number of the frame.
+            error: Its :class:`warpcloth.run.step_errors.StepError`.
+            velocities: (B·n, 3) [m/s].
+        """
+        pushed = np.fmax(error.pushed, 0.0)
+        explained = pushed + np.fmax(error.stored - pushed - error.excess, 0.0)
+        explained = np.where(np.isfinite(explained), explained, 0.0)
+        given = self._bound * (1.0 + RESOLVED) * self.given
+        self.whole, self.allowed = self.has + explained, given
+        found = _over(self.whole, given)
+        if (found > 1.0).any():
+            with TURN:
+                if self._staggered:
+                    kinetic = self.kinetic(self._at_positions(self.points, velocities.astype(np.float64, copy=False)))
+                    carried = max(source.speed(frame) for source in self.sources)
+                    self.whole = self._relative(kinetic, carried) + self._height(self.points) - self._lowest
+                    self.whole = self.whole + self._conserved * explained
+                self.allowed = given + self._bound * sum(source.stored(frame) for source in self.sources)
+            found = _over(self.whole, self.allowed)
+        return found / (GAIN if self.driven else 1.0)
+
+    @cached_property
+    def _conserved(self):
+        """The fraction of the elastic energy that symplectic Euler bounds, 1 − ω²h²/4, see the docstring of the module."""
+        return max(0.0, 1.0 - (self._h / min(self._stepper.options.step_limits(self.model))) ** 2)
+
     @property
     def weighs(self):
         """Whether gravity acts on each copy, (B,)."""
@@ -203,9 +249,12 @@ class Balance:
         return energy <= GAIN * self.given[copy] and gaps < 0.5 * stretch**2
 
     def _gain(self, kinetic, height, carried, given):
-        beside = np.maximum(np.sqrt(kinetic) - carried * np.sqrt(0.5 * self.total), 0.0) ** 2
-        self.has, self.given = beside + height - self._lowest, given
-        return np.where(self.has > 0.0, self.has / self.given, np.where(self.has <= 0.0, 0.0, np.nan))
+        self.has, self.given = self._relative(kinetic, carried) + height - self._lowest, given
+        return _over(self.has, given)
+
+    def _relative(self, kinetic, carried):
+        """Returns the kinetic energy relative to a motion at the speed ``carried`` [m/s], (B,) [J]."""
+        return np.maximum(np.sqrt(kinetic) - carried * np.sqrt(0.5 * self.total), 0.0) ** 2
 
     def _note_farthest(self, points):
         """Updates the bounds of kinetic and potential energy that rounding adds, from the largest coordinate."""
@@ -236,3 +285,8 @@ class Balance:
         if self.model.mobility is not None:
             kicks[:, self.model.scene.locked] = 0.0
         return velocities + 0.5 * self._h * kicks.reshape(-1, 3)
+
+
+def _over(has, given):
+    """Returns has/given (B,), 0 where there is no energy, and NaN where ``has`` is."""
+    return np.where(has > 0.0, has / given, np.where(has <= 0.0, 0.0, np.nan))

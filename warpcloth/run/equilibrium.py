@@ -15,7 +15,7 @@ from ..base.types import Precision
 from ..contact.collider_steps import ColliderSteps
 from ..contact.self_steps import SelfSteps
 from ..core.state import State
-from ..core.status import Residual, Result, Status, digits, sentence
+from ..core.status import Grade, Residual, Result, Status, digits, sentence
 from ..kernels.terms.air import AIR
 from ..numerics.minimise import Minimiser
 from ..numerics.multigrid import LEAST
@@ -195,14 +195,15 @@ def equilibrium(
     elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity[0] > 0.0:
         result, began = Result.STALLED, f"rounding hides the equilibrium in {dtype}"
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
-    use = None if result in SETTLED else "not an equilibrium"
-    if result is Result.SADDLE:
-        use = f"not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
     unit = RESIDUAL.unit if minimiser.gravity[0] > 0.0 else RESIDUAL.weightless
-    message = sentence(result, dtype, residual, RESIDUAL.measure, unit, tolerance, use=use)
+    grade = {Result.CONVERGED: Grade.CONVERGED, Result.ROUNDED: Grade.COMPLETED}.get(result, Grade.NOT_USABLE)
+    why = "it is not an equilibrium"
+    if result is Result.SADDLE:
+        why = f"it is not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
+    message = sentence(result, grade, np.nan, residual, RESIDUAL.measure, unit, tolerance, why=why)
     if result is Result.STALLED:
         message = message.replace(result.value, began)
-    status = Status(result, residual=residual, message=message, measure=RESIDUAL.measure, unit=unit)
+    status = Status(result, 0, residual, message, None, RESIDUAL.measure, unit, grade, np.nan, (grade,))
     energies = reactions = forces = None
     if record:
         evaluation = Evaluation(model, forces="reactions" in record, pairs=pairs)

@@ -24,6 +24,7 @@ class Frame(NamedTuple):
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).
         seconds: Time of its computation [s]; on CUDA by events of the device.
+        error: What ``find`` of :func:`frames_of` returned after the frame, or None.
         state: The state of the stepper, see :meth:`warpcloth.core.state.State.to_host`, or None.
     """
 
@@ -32,10 +33,11 @@ class Frame(NamedTuple):
     results: list
     residual: np.ndarray
     seconds: float
+    error: object = None
     state: dict | None = None
 
 
-def frames_of(stepper, count, ahead, keeps=None):
+def frames_of(stepper, count, ahead, keeps=None, find=None):
     """Yields the next frames of a stepper. Close the generator, which then waits for frames that are being computed.
 
     While the caller uses one frame, a thread computes the next ones. The first is computed alone, because it may capture
@@ -46,6 +48,7 @@ def frames_of(stepper, count, ahead, keeps=None):
         count: Number of frames.
         ahead: Largest number of frames computed ahead; 0 computes each on demand, without a thread.
         keeps: Function (number of frames before) → whether the next frame includes the state; or None.
+        find: Function that is called after each frame and returns its ``error``; or None.
     """
     numbers = itertools.count()
     copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
@@ -53,12 +56,13 @@ def frames_of(stepper, count, ahead, keeps=None):
     def compute():
         copy = next(copies)
         copy.frame()
+        error = None if find is None else find()
         state = _state_of(stepper) if keeps is not None and keeps(next(numbers)) else None
-        return copy, list(stepper.results), np.array(stepper.residual), state
+        return copy, list(stepper.results), np.array(stepper.residual), error, state
 
-    def taken(copy, results, residual, state):
+    def taken(copy, results, residual, error, state):
         points, velocities, seconds = copy.take()
-        return Frame(points, velocities, results, residual, seconds, state)
+        return Frame(points, velocities, results, residual, seconds, error, state)
 
     first = taken(*compute())
     if ahead == 0:

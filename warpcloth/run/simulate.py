@@ -296,7 +296,7 @@ def simulate(
                 if progress is not None:
                     progress(number, frames)
         recorder.finish()
-    status = watch.status(solver, _farthest_held(stepper))
+    status = watch.status(solver)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     recorded = {
@@ -305,7 +305,7 @@ def simulate(
         "cut": of_copies(stepper.cut),
         "inside": _inside(stepper),
         "crossings": _crossings(stepper),
-        "self_contact": _self_contact(stepper, status.ok),
+        "self_contact": _self_contact(stepper, status.complete),
         **(history.by_name() if history else {}),
     }
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)

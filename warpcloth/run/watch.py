@@ -1,13 +1,21 @@
-"""Detects runs that have diverged, as opposed to runs that are merely fast, and ends them."""
+"""Detects runs that have diverged, as opposed to runs that are merely fast, and ends them; and grades all others."""
 
 from contextlib import closing
 
 import numpy as np
 
 from ..base.turns import in_turn
-from ..core.status import Result, Status, Stopped, sentence
+from ..core.status import Grade, Result, Status, Stopped, digits, length, sentence
 from .balance import GAIN, STRETCHED, Balance
 from .frames_ahead import Frame, frames_of
+from .step_errors import StepErrors
+
+# A step has converged if no vertex is farther from its solution than NEAR times the edge and the contact distance. It is not
+# usable if one is farther than FAR times the edge, so that the two ends of an edge may have changed places, or if one in contact
+# is farther along its normal than the contact distance, so that the solution has no contact there.
+NEAR, FAR = 1e-3, 0.5
+# Results with which a step may have converged: those of methods that found its solution, or have no tolerance.
+_MAY_CONVERGE = Result.COMPLETED, Result.CONVERGED, Result.ROUNDED
 
 
 def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
@@ -27,7 +35,8 @@ def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
     if first == frames:
         return
     of_number, number = None if keeps is None else lambda before: keeps(first + 1 + before), first
-    with closing(frames_of(stepper, frames - first, ahead, of_number)) as found:
+    find = None if watch.errors is None else watch.errors.find
+    with closing(frames_of(stepper, frames - first, ahead, of_number, find)) as found:
         try:
             for number, frame in enumerate(found, start=first + 1):
                 if not watch.passes(number, frame):
@@ -53,6 +62,7 @@ class Watch:
         model: The :class:`warpcloth.model.model.Model`.
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
         stretched: Strain of an edge above which its energy is checked.
+        grades: Whether to find the errors of steps, from which :meth:`status` grades the run.
 
     Attributes:
         good: The last good frame of each copy (B,).
@@ -63,10 +73,12 @@ class Watch:
         seconds: Time of the computation of each frame [s], a list.
         history: The :class:`warpcloth.run.history.History` of the run, if it has one.
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
+        errors: The :class:`warpcloth.run.step_errors.StepErrors`, or None.
+        distance: The largest distance of a vertex from the solution of a step in a good frame of each copy, (B,) [m].
     """
 
     @in_turn
-    def __init__(self, model, stepper, stretched=STRETCHED):
+    def __init__(self, model, stepper, stretched=STRETCHED, grades=True):
         scene = model.scene
         self._stretched = stretched
         self.model, self.rest = model, scene.mesh.edge_lengths[scene.mesh.edge_lengths > 0.0]
@@ -75,6 +87,14 @@ class Watch:
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.growth, self.balance, self.history = np.zeros(model.copies), Balance(model, stepper), None
         self.last, self.stopped = Frame(None, None, stepper.results, stepper.residual, 0.0), False
+        self._edge, contacts = float(np.median(self.rest)) if len(self.rest) else np.inf, (scene.contact, scene.self_contact)
+        self._resolved = min([self._edge, *(each.distance for each in contacts if each is not None)])
+        self._solves = any(taker.integrator is not None for taker, _first, _end in stepper.takers)
+        self.errors = StepErrors(stepper, NEAR * self._resolved, FAR * self._edge) if grades else None
+        # The first frame, from 1, in which a copy is too far from the solution of its step, and in which it has too much
+        # energy; 0 for none. The energy that it has then, and the most that it may have [J].
+        self.far, self.rich = (np.zeros(model.copies, dtype=int) for _ in range(2))
+        self.distance, self.has, self.most, self.solved, self.ratio, self.gap = (np.zeros(model.copies) for _ in range(6))
 
     def passes(self, number, frame):
         """Checks a frame, and sets copies that diverged to NaN. Returns whether a copy is still good.
@@ -109,11 +129,23 @@ class Watch:
             else:
                 self.messages[copy] = f"{where}: {self.balance.sentence(copy)}"
         self.good[self.alive] = number
+        if frame.error is not None:
+            self._note(number, frame.error, velocities)
         self.growth = np.where(self.alive, np.fmax(self.growth, gains), self.growth)
         self.worst_strain = np.where(self.alive, np.fmax(self.worst_strain, strain), self.worst_strain)
         for array in (points, velocities):
             array.reshape(B, n, 3)[~self.alive] = np.nan
         return bool(self.alive.any())
+
+    def _note(self, number, error, velocities):
+        """Notes the error of the steps in a frame, and the energy there, of copies that are good."""
+        self.solved, self.ratio = error.solved, error.ratio
+        self.distance, self.gap = (np.where(self.alive, new, old) for new, old in zip(error[:1] + error[3:4], (self.distance, self.gap)))
+        far = ~((self.distance <= FAR * self._edge) & (self.gap <= 1.0))
+        self.far = np.where(self.alive & (self.far == 0) & far, number, self.far)
+        rich = self.alive & (self.rich == 0) & (self.balance.surplus(number, error, velocities) > 1.0)
+        self.rich = np.where(rich, number, self.rich)
+        self.has, self.most = np.where(rich, self.balance.whole, self.has), np.where(rich, self.balance.allowed, self.most)
 
     def stops(self, number, why):
         """Notes that frame ``number`` cannot be computed, and why."""
@@ -124,7 +156,7 @@ class Watch:
 
     def _carried(self):
         """Returns pairs (object, names of its attributes that change from frame to frame)."""
-        yield self, ("worst_strain", "good", "alive", "growth", "seconds")
+        yield self, ("worst_strain", "good", "alive", "growth", "seconds", *_OF_GRADES)
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
             yield source, source.carried
@@ -143,6 +175,9 @@ class Watch:
                 found = values[f"{k} {name}"]
                 setattr(part, name, found.tolist() if name == "seconds" else found[()])
         self.last = Frame(None, None, state.results, state.residual, 0.0)
+        if self.errors is not None:
+            for name in ("distance", "solved", "ratio", "gap"):
+                setattr(self.errors, name, getattr(self, name).copy())
 
     def _strain(self, points):
         """Returns the largest |l/L − 1| of an edge of each copy, (B,), for points (B, n, 3); NaN for copies that diverged."""
@@ -155,8 +190,13 @@ class Watch:
             found[self.alive] = np.abs(np.sqrt(squares) / self.rest - 1.0).max(axis=1, initial=0.0)
         return found
 
-    def status(self, solver, held=0.0):
-        """Returns the :class:`Status` of a run from its last frame. Cloth has ``held`` pins back by at most this [m]."""
+    def status(self, solver, faults=()):
+        """Returns the :class:`Status` of a run from its last frame.
+
+        Args:
+            solver: The record of the solver.
+            faults: Further reasons why a copy is not usable, tuples (copy, frame, sentence).
+        """
         results, residual = self.last.results, self.last.residual
         ended = [Result.STOPPED if self.stopped and alive else Result.DIVERGED for alive in self.alive]
         results = [ended[copy] if copy in self.messages else result for copy, result in enumerate(results)]
@@ -165,10 +205,53 @@ class Watch:
         copy = int(np.argmax(residual))  # the first that is NaN, if any
         if kind is not None:
             measure, unit = kind.measure, kind.unit if self.balance.weighs[copy] else kind.weightless
+        faults = self._faults(solver, faults)
+        grades = tuple(self._grade(copy, result, faults) for copy, result in enumerate(results))
+        grade = max(grades, key=list(Grade).index)
         if self.messages:
             message = "; ".join(self.messages[copy] for copy in sorted(self.messages))
         else:
-            dtype, tolerance = self.model.numpy_dtype.__name__, getattr(solver, "tolerance", None)
-            which = copy if len(residual) > 1 else None
-            message = sentence(result, dtype, residual[copy], measure, unit, tolerance, which, held=held)
-        return Status(result, int(self.good.max()), of_copies(residual), message, self.good, measure, unit)
+            which, tolerance = copy if len(residual) > 1 else None, getattr(solver, "tolerance", None)
+            why = min(faults, key=lambda fault: fault[1])[2] if faults else ""
+            message = sentence(result, grade, self.distance.max(), residual[copy], measure, unit, tolerance, which, why)
+        distance = of_copies(self.distance)
+        return Status(
+            result, int(self.good.max()), of_copies(residual), message, self.good, measure, unit, grade, distance, grades
+        )
+
+    def _grade(self, copy, result, faults):
+        """Returns the :class:`Grade` of a copy, of which ``result`` is the worst of any step."""
+        if copy in self.messages or any(fault[0] == copy for fault in faults):
+            return Grade.NOT_USABLE
+        near = self._solves and self.distance[copy] <= NEAR * self._resolved
+        return Grade.CONVERGED if near and result in _MAY_CONVERGE else Grade.COMPLETED
+
+    def _faults(self, solver, faults):
+        """Returns the reasons why copies are not usable: those given, and those that the watch has noted."""
+        remedy = "take shorter steps" + (", more iterations" if hasattr(solver, "iterations") else "") + ", or another solver"
+        found = list(faults)
+        for copy in range(len(self.alive)):
+            of_copy = f" of copy {copy}" if len(self.alive) > 1 else ""
+            if self.far[copy]:
+                where = f"in frame {self.far[copy]}{of_copy}"
+                why = (
+                    f"{where} vertices are up to {length(self.distance[copy])} from the solution of the step, more than half "
+                    f"of an edge ({length(self._edge)}); {remedy}"
+                )
+                if self.distance[copy] <= FAR * self._edge:
+                    why = (
+                        f"{where} vertices in contact are up to {digits(self.gap[copy])} times the contact distance from the "
+                        f"solution of the step; {remedy}"
+                    )
+                found.append((copy, self.far[copy], why))
+            if self.rich[copy]:
+                why = (
+                    f"in frame {self.rich[copy]}{of_copy} cloth has {digits(self.has[copy])} J of motion, height and "
+                    f"stored energy, and can have no more than {digits(self.most[copy])} J; {remedy}"
+                )
+                found.append((copy, self.rich[copy], why))
+        return found
+
+
+# What the grade depends on from frame to frame.
+_OF_GRADES = ("far", "rich", "distance", "has", "most", "solved", "ratio", "gap")

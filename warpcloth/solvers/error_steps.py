@@ -311,6 +311,10 @@ class ErrorStepper(Stepper):
         return self.reported.shares
 
     @property
+    def takers(self):
+        return self._stepper(self._k).shares
+
+    @property
     def colliders(self):
         return getattr(self.reported, "colliders", None)  # a batch that threads share has none of its own
 

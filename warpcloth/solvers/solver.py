@@ -29,6 +29,7 @@ class Stepper:
         state: The :class:`warpcloth.core.state.State`.
         h: Step [s].
         model: The model, whose terms include damping, in the order of the steps.
+        declared: The model as it was bound, without damping and without rest states of its own for contact.
         integrator: The integrator, see :mod:`warpcloth.numerics.integrators`, which computes x̃, and the new state from the
             minimiser; None for solvers without x̃.
         he: Effective step hₑ of the integrator [s], else h.
@@ -37,6 +38,9 @@ class Stepper:
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None if cloth passes through itself.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 for methods that have none.
+        predicted: x̃ of the last step (N,) [m]; None for solvers without x̃.
+        correction: d = x − x̃ of the minimiser in the last step (N,) [m], before contact changed it.
+        unfiltered: Positions at the end of the last step before contact changed them (N,) [m]; None without contact.
         iterations: Number of iterations or sweeps of the last step; 1 for methods that do not iterate.
         even: Whether all steps have the same length.
         factorise_seconds: Time of the factorisation of constant matrices [s]; 0 for methods that have none.
@@ -50,6 +54,7 @@ class Stepper:
     _motion = None  # x and v, if they are views of those of another stepper, see `part_of`
     lead = None  # for a twin without contact, the stepper whose state it shares, see `find_twin`
     clear_steps = None  # the TwinSteps of a stepper with a twin
+    predicted = correction = unfiltered = None
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -57,7 +62,7 @@ class Stepper:
 
     def __init__(self, options, model, integrator=None):
         fps = model.scene.fps
-        self.options, self.model, self._bound_to = options, model, model
+        self.options, self.model, self.declared = options, model, model
         self.steps_per_frame = options.per_frame(fps)
         self.h = 1.0 / (fps * self.steps_per_frame)
         motion = self._motion or (wp.clone(model.positions), wp.clone(model.velocities))
@@ -79,6 +84,9 @@ class Stepper:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he
             self.model = model.with_terms(damped_terms(model, self.he))
+            self.predicted = model.vectors() if self.lead is None else self.lead.predicted
+            if self.colliders is not None or self.pairs is not None:
+                self.unfiltered = model.vectors()
 
     @classmethod
     def part_of(cls, motion, options, model):
@@ -90,7 +98,7 @@ class Stepper:
 
     def find_twin(self):
         """Makes a twin for steps without contact, if there is contact and the residual of the twin has the same meaning."""
-        model = self._bound_to
+        model = self.declared
         if not FarSteps.serve(self) if self.pairs is not None else model.colliders is None:
             return
         if self.options.residual_on(model) != self.options.residual_on(model.without_colliders()):
@@ -174,6 +182,11 @@ class Stepper:
         """The steppers that share the batch, each with its range of copies: (stepper, first, end)."""
         return [(self, 0, self.model.copies)]
 
+    @property
+    def takers(self):
+        """The steppers that took the last step, as :attr:`shares`."""
+        return self.shares
+
     def constraint_forces(self, collider=None):
         """Returns a function (array) that launches array (N,) −= f [N], the forces of hard terms in the last step.
 
@@ -210,7 +223,11 @@ class Stepper:
 
     def launch_finish(self, correction):
         """Launches x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser (N,) [m]."""
+        self.correction = correction
+        wp.copy(self.predicted, self.state.x)
         self.integrator.launch_finish(correction)
+        if self.unfiltered is not None:
+            wp.copy(self.unfiltered, self.state.x)
         if self.colliders is not None:
             self.colliders.correction, self.colliders.he = correction, self.he
             self.colliders.launch_end(*self.state, self.integrator.move)

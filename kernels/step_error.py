@@ -1,0 +1,80 @@
+"""Factories of the kernels that find how far the end of a step is from the minimiser of the step."""
+
+from functools import cache
+
+import warp as wp
+
+from .vectors import types
+
+
+@cache
+def add_moves(dtype):
+    """Kernel over vertices: out = d + part (x − unfiltered), the correction after contact moved vertices at the end of a step."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add(
+        # state in
+        d: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        unfiltered: wp.array(dtype=vec3),
+        # parameters
+        part: dtype,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        out[i] = d[i] + part * (x[i] - unfiltered[i])
+
+    return add
+
+
+@cache
+def finish_residual(dtype):
+    """Kernel over vertices: from ∂U/∂x, r = s m d + ∂U/∂x [N], or 0 for pins, and weighted = r/√m."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def finish(
+        # elements
+        mass: wp.array(dtype=dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        d: wp.array(dtype=vec3),
+        # parameters
+        s: dtype,
+        # in and out
+        r: wp.array(dtype=vec3),
+        # out
+        weighted: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] > dtype(0.0):
+            r[i] = r[i] + (s * mass[i]) * d[i]
+        else:
+            r[i] = vec3()
+        weighted[i] = wp.sqrt(inverse_mass[i]) * r[i]
+
+    return finish
+
+
+@cache
+def normal_moves(dtype):
+    """Kernel over vertices: out = n·move n/r, with n the direction of the contact force, or 0 where there is none."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def project(
+        # state in
+        force: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        # parameters
+        r: dtype,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        n = wp.normalize(force[i])
+        out[i] = (wp.dot(n, move[i]) / r) * n
+
+    return project

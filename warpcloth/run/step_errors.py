@@ -1,0 +1,295 @@
+"""How far the last step of a frame ended from its solution, and the energy that cloth stores there.
+
+An implicit step minimises φ(d) = 1/(2hₑ²)‖d‖²_M + U(x̃ + d), d = x − x̃. With the residual r = ∇φ at the end of the step, a
+length bounds the distance to the minimiser where U is convex: hₑ² max ‖rᵢ‖/mᵢ, because the Hessian of φ is at least M/hₑ².
+Stiff cloth is much nearer, as its Hessian is much larger. Where the bound exceeds what is allowed, one Newton step with the
+Hessian of φ, made semi-definite element by element, tells the distance: ‖H⁻¹r‖ (Nocedal and Wright 2006, *Numerical
+Optimization*, 3.3). In the same way φ is at most ½hₑ² rᵀM⁻¹r above its minimum.
+
+What contact changes after the minimiser counts too: r is taken where the step ends.
+"""
+
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import warp as wp
+
+from ..base.turns import in_turn
+from ..core.capture import Mirror, Segment
+from ..core.energy import Energy
+from ..core.hessian import Hessian
+from ..core.sums import RowSums, Sums
+from ..fast.plan import plan
+from ..kernels import step_error as kernels
+from ..kernels.term import HessianPolicy
+from ..kernels.terms.air import AIR
+from ..kernels.terms.face_friction import FRICTIONS
+from ..numerics.linear import ConjugateGradients
+
+# Relative accuracy of the Newton step, of which only the largest displacement is used, and the growth of the bound after which
+# it is taken again. It takes as long as 30 to 100 sweeps.
+ACCURACY, GROWTH = 0.1, 4.0
+
+
+class StepError(NamedTuple):
+    """The error of the steps of each copy at the end of a frame, (B,) arrays.
+
+    Attributes:
+        distance: The largest distance of a vertex from the solution of the step in this and earlier frames [m].
+        solved: The bound in the last frame with a Newton step [m].
+        ratio: The distance that it found over this bound.
+        gap: The largest distance along its normal of a vertex in contact, of those that Newton steps found, over the contact
+            distance.
+        stored: Elastic and contact energy [J].
+        pushed: The part of it that contact added when it changed positions at the end of the step [J].
+        excess: The bound of φ above its minimum, before contact changed positions [J].
+    """
+
+    distance: np.ndarray
+    solved: np.ndarray
+    ratio: np.ndarray
+    gap: np.ndarray
+    stored: np.ndarray
+    pushed: np.ndarray
+    excess: np.ndarray
+
+
+class StepErrors:
+    """Finds the :class:`StepError` of each frame of a stepper.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+        near: The bound above which a Newton step tells the distance [m].
+        allowed: The distance that a Newton step must confirm when the bound and the last ratio predict more [m].
+
+    Attributes:
+        distance, solved, ratio, gap: See :class:`StepError`, of the frames so far.
+    """
+
+    def __init__(self, stepper, near, allowed):
+        self._stepper, self._near, self._allowed, self._parts = stepper, near, allowed, WeakKeyDictionary()
+        self.distance, self.solved, self.ratio, self.gap = (np.zeros(stepper.model.copies) for _ in range(4))
+
+    @in_turn
+    def find(self):
+        """Returns the :class:`StepError` of the frame that ended with the last step."""
+        stored, pushed, excess = (np.zeros(len(self.distance)) for _ in range(3))
+        for taker, first, end in self._stepper.takers:
+            if taker not in self._parts:
+                self._parts[taker] = _measured(taker)
+            part, copies = self._parts[taker], slice(first, end)
+            bound, stored[copies], pushed[copies], excess[copies] = part.measure()
+            distance, solved, ratio = self.distance[copies], self.solved[copies], self.ratio[copies]
+            known = ~(bound > self._near) | (not part.solves)
+            distance[known] = np.fmax(distance, bound)[known]
+            passes = (ratio * bound > self._allowed) & (distance <= self._allowed)
+            news = np.isfinite(bound) & ~known & ((bound > GROWTH * solved) | passes)
+            if news.any():
+                found, gap = part.solve()
+                found = np.fmin(found, bound)
+                distance[news], solved[news], ratio[news] = np.fmax(distance, found)[news], bound[news], (found / bound)[news]
+                self.gap[copies][news] = np.fmax(self.gap[copies], gap)[news]
+        found = (each.copy() for each in (self.distance, self.solved, self.ratio, self.gap))
+        return StepError(*found, stored, pushed, excess)
+
+
+def _measured(stepper):
+    """Returns what measures the steps of a stepper: an object with ``measure`` and, if ``solves``, ``solve``."""
+    if stepper.integrator is None:
+        return _Stored(stepper)
+    return (_Gaps if any(elements.hard for elements in stepper.model.terms) else _Residuals)(stepper)
+
+
+class _Stored:
+    """The energy that the cloth of a stepper stores, without contact; its steps solve nothing, as those of :class:`Explicit`."""
+
+    solves = False
+
+    def __init__(self, stepper):
+        model = self.model = stepper.model
+        self.stepper, self.sums = stepper, Sums(model)
+        self._bound, self._stored, self._pushed, self._excess = (Mirror(model.scalars()) for _ in range(4))
+        self._mirrors = self._bound, self._stored, self._pushed, self._excess
+        terms = [each for each in stepper.declared.terms if not each.hard and each.collider is None and each.term is not AIR]
+        self._elastic = Energy(model, self.sums, terms=tuple(terms)) if terms else None
+        self._prepare()
+        # The arrays of pairs may be replaced, which a captured graph would not notice.
+        self._measure = Segment(model.device, self._launch) if stepper.pairs is None else self._launch
+
+    def measure(self):
+        """Returns the bound of the distance [m], the energy stored and pushed in, and the excess of φ [J], (B,) each."""
+        self._measure()
+        return tuple(mirror.read().copy() for mirror in self._mirrors)
+
+    def _prepare(self):
+        """Allocates what :meth:`_launch_bound` needs."""
+
+    def _launch(self):
+        for mirror in self._mirrors:
+            mirror.array.zero_()
+        if self._elastic is not None:
+            self._elastic.add(self.stepper.state.x, self._stored.array)
+        self._launch_bound()
+
+    def _launch_bound(self):
+        """Launches the bound, what contact stores, and the excess."""
+
+
+class _Gaps(_Stored):
+    """Steps with constraints of infinite stiffness, which have no residual: the distance is the largest gap of such a one."""
+
+    def _prepare(self):
+        hard = [each for each in self.model.terms if each.hard and each.collider is None]
+        units = [(Energy(self.model, self.sums, terms=(each.with_unit_stiffness(),)), each.per_copy) for each in hard]
+        self._gaps = [(energy, RowSums(self.model, per_copy)) for energy, per_copy in units]
+        self._largest = [self.model.scalars() for _ in hard]
+        self._sum = self.model.scalars()
+
+    def measure(self):
+        _bound, *energies = super().measure()
+        largest = [array.numpy() for array in self._largest]
+        return np.sqrt(2.0 * np.max(largest, axis=0)) if largest else np.zeros(self.model.copies), *energies
+
+    def _launch_bound(self):
+        for (energy, rows), largest in zip(self._gaps, self._largest, strict=True):
+            energy.add(self.stepper.state.x, self._sum)
+            rows.largest(energy.of_elements[0], largest)
+
+
+class _Residuals(_Stored):
+    """Steps whose residual is ∇φ."""
+
+    solves = True
+
+    def _prepare(self):
+        stepper, model = self.stepper, self.model
+        clear = stepper.clear_steps
+        self._far = None if clear is None else _Step(clear.twin, self)
+        self._near, self._is_near = _Step(stepper, self), None if clear is None else Mirror(clear.near)
+        self.residual, self.weighted, self.moved = (model.vectors() for _ in range(3))
+        self.kernels = model.launcher(((kernels.add_moves, kernels.finish_residual), model.dtype))
+        # Midpoint has its unknown at the middle of a step, and the energy stored is that at the end.
+        self._pushes = stepper.unfiltered is not None and stepper.integrator.parts == 1 and self._elastic is not None
+        if self._pushes:
+            self._before = Energy(model, self.sums, corrected=True, terms=self._elastic.terms)
+
+    def measure(self):
+        (bound, stored, before, excess), he = super().measure(), self.stepper.he
+        return he**2 * bound, stored, self._pushes * (stored - before), 0.5 * he**2 * excess
+
+    def _launch_bound(self):
+        if self._far is None:
+            self._near.launch()
+        else:
+            wp.capture_if(self._is_near.array, self._near.launch, self._far.launch)
+
+    @property
+    def stored(self):
+        """The energy stored (B,) [J] on the device."""
+        return self._stored.array
+
+    def launch_sums(self, first):
+        """Launches the largest ‖rᵢ‖/mᵢ; with ``first`` also Σ ‖rᵢ‖²/mᵢ."""
+        self.model.lock(self.residual)
+        self.model.lock(self.weighted)
+        self.sums.largest(self.model.inverse_mass, self.residual, self._bound.array)
+        if first:
+            self.sums.dot(self.weighted, self.weighted, self._excess.array)
+
+    def launch_before(self, step, x, d):
+        """Launches the energy before contact changed positions, at x + d."""
+        if self._pushes:
+            self._before.add(x, self._pushed.array, d)
+            self.launch_contact(step, x, d, self._pushed.array)
+
+    def launch_contact(self, step, x, d, out):
+        """Launches out (B,) += the energy of contact at x + d [J]."""
+        if step.contact is not None:
+            step.contact.add(x, out, d)
+        if step.stepper.pairs is not None:
+            step.stepper.pairs.forces.add_energy(self.sums, out)
+
+    def solve(self):
+        """Returns the distance from the solution of the step by a Newton step, (B,) [m], and :attr:`StepError.gap` there."""
+        near = self._is_near is None or self._is_near.read()[0]
+        return (self._near if near else self._far).solve()
+
+
+class _Step:
+    """φ of the steps of a stepper, or of its twin without contact.
+
+    Args:
+        stepper: The stepper.
+        of: The :class:`_Residuals` that it serves, whose arrays it uses.
+    """
+
+    def __init__(self, stepper, of):
+        self.stepper, self._of, self._newton = stepper, of, None
+        self.model, terms = stepper.model, stepper.model.terms
+        self._gradient = plan(self.model).gradient(corrected=True, terms=terms)
+        touching = tuple(each for each in terms if each.collider is not None)
+        self.contact = Energy(self.model, of.sums, corrected=True, terms=touching) if touching else None
+
+    def launch(self):
+        """Launches ∇φ at the end of the step and its sums, and the energy of contact there."""
+        stepper, of, d = self.stepper, self._of, self.stepper.correction
+        self._launch_residual(d)
+        of.launch_sums(True)
+        of.launch_before(self, stepper.predicted, d)
+        if stepper.unfiltered is not None:
+            part = stepper.he / stepper.h if stepper.integrator.parts > 1 else 1.0
+            of.kernels(kernels.add_moves, self.model.count, [d, stepper.state.x, stepper.unfiltered, part], [of.moved])
+            d = of.moved
+            self._launch_residual(d)
+            of.launch_sums(False)
+        of.launch_contact(self, stepper.predicted, d, of.stored)
+
+    def _launch_residual(self, d):
+        stepper, of, model = self.stepper, self._of, self.model
+        of.residual.zero_()
+        self._gradient.add(stepper.predicted, of.residual, d)
+        if stepper.pairs is not None:
+            stepper.pairs.forces.launch_forces(stepper.predicted, d)
+            stepper.pairs.forces.add_gradient(of.residual)
+        given = [model.mass, model.inverse_mass, d, 1.0 / stepper.he**2]
+        of.kernels(kernels.finish_residual, model.count, given, [of.residual, of.weighted])
+
+    def solve(self):
+        """Returns ‖H⁻¹r‖ of each copy, the largest of a vertex, (B,) [m], and :attr:`StepError.gap`."""
+        model, pairs = self.model, self.stepper.pairs
+        if self._newton is None:
+            self._hessian = Hessian(model, HessianPolicy.CLAMP, corrected=True, pairs=pairs)
+            self._linear = ConjugateGradients(self._hessian, model.per_copy)
+            self._linear.tolerance.fill_(ACCURACY)
+            self._direction, self._force = model.vectors(), model.vectors()
+            self._largest = [Mirror(model.scalars()) for _ in range(3)]
+            self._ones, self._all = model.constant(1.0, model.count), wp.full(model.copies, 1, dtype=wp.int32, device=model.device)
+            touching = tuple(each for each in self.model.terms if each.collider is not None and each.term not in FRICTIONS)
+            self._pushes = plan(model).gradient(corrected=True, terms=touching) if touching else None
+            self._project = model.kernel(kernels.normal_moves, model.dtype)
+            self._newton = Segment(model.device, self._launch_newton) if pairs is None else self._launch_newton
+        self._newton()
+        distance, *gaps = (mirror.read().copy() for mirror in self._largest)
+        return distance, np.max(gaps, axis=0)
+
+    def _launch_newton(self):
+        stepper, of, scene = self.stepper, self._of, self.model.scene
+        x, d = stepper.predicted, stepper.correction if stepper.unfiltered is None else of.moved
+        self._hessian.assemble(x, 1.0 / stepper.he**2, d)
+        self._linear.solve(of.residual, self._direction, self._all)
+        distance, *gaps = (mirror.array for mirror in self._largest)
+        of.sums.largest(self._ones, self._direction, distance)
+        if self._pushes is not None:
+            self._force.zero_()
+            self._pushes.add(x, self._force, d)
+            self._launch_gap(scene.contact.distance, gaps[0])
+        if stepper.pairs is not None:
+            self._force.zero_()
+            stepper.pairs.forces.add_gradient(self._force)
+            self._launch_gap(scene.self_contact.distance, gaps[1])
+
+    def _launch_gap(self, r, out):
+        model, moves = self.model, self._of.weighted
+        model.launch(self._project, model.count, [self._force, self._direction, r], [moves])
+        self._of.sums.largest(self._ones, moves, out)
