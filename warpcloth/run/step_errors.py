@@ -25,6 +25,7 @@ from ..kernels import step_error as kernels
 from ..kernels.term import HessianPolicy
 from ..kernels.terms.air import AIR
 from ..kernels.terms.face_friction import FRICTIONS
+from ..model.host_values import host_values
 from ..numerics.linear import ConjugateGradients
 
 # Relative accuracy of the Newton step, of which only the largest displacement is used, and the growth of the bound after which
@@ -83,7 +84,8 @@ class StepErrors:
             distance, solved, ratio = self.distance[copies], self.solved[copies], self.ratio[copies]
             known = ~(bound > self._near) | (not part.solves)
             distance[known] = np.fmax(distance, bound)[known]
-            passes = (ratio * bound > self._allowed) & (distance <= self._allowed)
+            with np.errstate(invalid="ignore"):
+                passes = (ratio * bound > self._allowed) & (distance <= self._allowed)
             news = np.isfinite(bound) & ~known & ((bound > GROWTH * solved) | passes)
             if news.any():
                 found, gap = part.solve()
@@ -140,7 +142,7 @@ class _Gaps(_Stored):
     """Steps with constraints of infinite stiffness, which have no residual: the distance is the largest gap of such a one."""
 
     def _prepare(self):
-        hard = [each for each in self.model.terms if each.hard and each.collider is None]
+        hard = [each for each in self.stepper.declared.terms if each.hard and each.collider is None]
         units = [(Energy(self.model, self.sums, terms=(each.with_unit_stiffness(),)), each.per_copy) for each in hard]
         self._gaps = [(energy, RowSums(self.model, per_copy)) for energy, per_copy in units]
         self._largest = [self.model.scalars() for _ in hard]
@@ -259,7 +261,7 @@ class _Step:
         """Returns ‖H⁻¹r‖ of each copy, the largest of a vertex, (B,) [m], and :attr:`StepError.gap`."""
         model, pairs = self.model, self.stepper.pairs
         if self._newton is None:
-            self._hessian = Hessian(model, HessianPolicy.CLAMP, corrected=True, pairs=pairs)
+            self._hessian = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=self._copy_by_copy(), pairs=pairs)
             self._linear = ConjugateGradients(self._hessian, model.per_copy)
             self._linear.tolerance.fill_(ACCURACY)
             self._direction, self._force = model.vectors(), model.vectors()
@@ -272,6 +274,14 @@ class _Step:
         self._newton()
         distance, *gaps = (mirror.read().copy() for mirror in self._largest)
         return distance, np.max(gaps, axis=0)
+
+    def _copy_by_copy(self):
+        """Returns the elements in the order of copies, which a Hessian needs; sweeps sort elements by colour."""
+        present, sorted_ones = self.stepper.elements, self.model.terms
+        if self.model.copies == 1:
+            return sorted_ones
+        pairs = zip(sorted_ones, present, strict=True)
+        return tuple(a if np.array_equal(host_values(a.stencil), host_values(b.stencil)) else b for a, b in pairs)
 
     def _launch_newton(self):
         stepper, of, scene = self.stepper, self._of, self.model.scene

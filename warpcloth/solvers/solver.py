@@ -30,6 +30,8 @@ class Stepper:
         h: Step [s].
         model: The model, whose terms include damping, in the order of the steps.
         declared: The model as it was bound, without damping and without rest states of its own for contact.
+        elements: The elements of ``model`` copy by copy, in the order of the scene; sweeps sort those of ``model``. They exist
+            with an integrator.
         integrator: The integrator, see :mod:`warpcloth.numerics.integrators`, which computes x̃, and the new state from the
             minimiser; None for solvers without x̃.
         he: Effective step hₑ of the integrator [s], else h.
@@ -84,6 +86,7 @@ class Stepper:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he
             self.model = model.with_terms(damped_terms(model, self.he))
+            self.elements = self.model.terms
             self.predicted = model.vectors() if self.lead is None else self.lead.predicted
             if self.colliders is not None or self.pairs is not None:
                 self.unfiltered = model.vectors()
