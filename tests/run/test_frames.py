@@ -34,7 +34,7 @@ def threads():
 def look_ahead(monkeypatch, frames):
     """Lets runs compute so many frames ahead, on the CPU too."""
     module = import_module("warpcloth.run.watch")
-    monkeypatch.setattr(module, "frames_of", lambda stepper, count, _ahead, keeps: frames_of(stepper, count, frames, keeps))
+    monkeypatch.setattr(module, "frames_of", lambda stepper, count, _ahead, *more: frames_of(stepper, count, frames, *more))
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_a_thread_needs_a_file_to_write_and_a_core(output, cores, expected, tmp_
     monkeypatch.setattr(
         import_module("warpcloth.run.watch"),
         "frames_of",
-        lambda stepper, count, ahead, keeps: asked.append(ahead) or frames_of(stepper, count, ahead, keeps),
+        lambda stepper, count, ahead, *more: asked.append(ahead) or frames_of(stepper, count, ahead, *more),
     )
     path = None if output is None else str(tmp_path / output)
     wc.simulate(hanging.scene(n=8), SOLVERS["explicit"], output=path, device=device, frames=2)

@@ -118,7 +118,7 @@ def sentence(result, grade, distance=np.nan, residual=None, measure=None, unit=N
         figure = f"{measure} {digits(residual)} {unit}{whose} ({compared})"
     if grade is Grade.NOT_USABLE:
         return f"{grade.value}: {why}; {ended}" + (f": {figure}" if figure else "")
-    text = ended if ended.startswith(grade.value) else f"{grade.value}, {ended}"
+    text = ended if ended.startswith(grade.value) else grade.value + (f", {ended}" if result is not Result.COMPLETED else "")
     if grade is Grade.COMPLETED and distance > 0.0:
         text = text.replace(grade.value, f"{grade.value} within {length(distance)} of the solution of each step", 1)
     return text + (f": {figure}" if figure else "")
