@@ -45,16 +45,15 @@ STALLED, DIVERGED = wp.constant(int(End.STALLED)), wp.constant(int(End.DIVERGED)
 class DescentState:
     """The minimisation of each copy, (B,) arrays, and flags of all, (1,).
 
-    ``residual`` is the largest unbalanced acceleration over ``scale`` [m/s²], ``previous`` its value an iteration before, or 0;
-    ``energy`` is φ [J] and ``end`` an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also iterates before
-    the host looks.
+    ``residual`` is the largest unbalanced acceleration over the scale of :class:`Limits`, ``previous`` its value an iteration
+    before, or 0; ``energy`` is φ [J] and ``end`` an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also
+    iterates before the host looks.
     """
 
     active: wp.array(dtype=wp.int32)
     end: wp.array(dtype=wp.int32)
     iterations: wp.array(dtype=wp.int32)
     residual: wp.array(dtype=wp.float64)
-    scale: wp.array(dtype=wp.float64)
     previous: wp.array(dtype=wp.float64)
     energy: wp.array(dtype=wp.float64)
     proceed: wp.array(dtype=wp.int32)
@@ -63,7 +62,7 @@ class DescentState:
 
 @wp.struct
 class Limits:
-    """The tolerance of the residual, the maximum number of iterations, (1,), and the given scale of each copy, or 0, (B,)."""
+    """The tolerance of the residual, the maximum number of iterations, (1,), and the scale of each copy [m/s²], (B,)."""
 
     tolerance: wp.array(dtype=wp.float64)
     iterations: wp.array(dtype=wp.int32)
@@ -71,8 +70,9 @@ class Limits:
 
 
 @wp.func
-def look(progress: DescentState, limits: Limits, copy: int, residual: wp.float64, end: int):
+def look(progress: DescentState, limits: Limits, copy: int, acceleration: wp.float64, end: int):
     """Notes the residual of an active copy and whether it has ended; ``end`` holds if the residual is finite and too large."""
+    residual = acceleration / limits.scale[copy]
     found = end
     if not wp.isfinite(residual):
         found = DIVERGED
@@ -105,17 +105,10 @@ def begin_descent():
         progress: DescentState,
     ):
         copy = wp.tid()
-        scale = limits.scale[copy]
-        if scale == wp.float64(0.0):
-            scale = acceleration[copy]
-        if scale == wp.float64(0.0):
-            scale = wp.float64(1.0)
-        residual = acceleration[copy] / scale
-        progress.scale[copy] = scale
         progress.previous[copy] = wp.float64(0.0)
         progress.energy[copy] = energy[copy]
         progress.iterations[copy] = 0
-        look(progress, limits, copy, residual, USED_UP)
+        look(progress, limits, copy, acceleration[copy], USED_UP)
 
     return begin
 
@@ -137,7 +130,7 @@ def begin_at_guess():
         copy = wp.tid()
         if progress.active[copy] == 1:
             progress.energy[copy] = energy[copy]
-            look(progress, limits, copy, acceleration[copy] / progress.scale[copy], USED_UP)
+            look(progress, limits, copy, acceleration[copy], USED_UP)
 
     return begin
 
@@ -249,9 +242,66 @@ def end_newton(block: int):
             ended = ROUNDED
         elif stuck and not noisy:
             ended = STALLED
-        look(progress, limits, copy, search.acceleration[copy] / progress.scale[copy], ended)
+        look(progress, limits, copy, search.acceleration[copy], ended)
 
     return end
+
+
+@cache
+def mean_parts(dtype, block: int):
+    """Kernel over (copies, lanes): the parts of Σ mᵢ(dᵢ + pᵢ) along each axis [kg·m]."""
+    vec3, _ = types(dtype)
+    store, _add_up = block_sums(block)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def sum_moments(
+        # elements
+        mass: wp.array(dtype=dtype),
+        # state in
+        correction: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # out
+        parts: wp.array3d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        total = wp.vec3d()
+        for k in range(lane, per_copy, lanes):
+            i = copy * per_copy + k
+            total += wp.float64(mass[i]) * (wp.vec3d(correction[i]) + wp.vec3d(direction[i]))
+        for axis in range(3):
+            store(lane, total[axis], parts[axis], copy)
+
+    return sum_moments
+
+
+@cache
+def take_mean(dtype, block: int):
+    """Kernel over (copies, lanes): p −= Σ m(d + p)/Σ m along the axes of ``inverse``, (B,) vectors 1/Σ m, else 0 [1/kg]."""
+    vec3, _ = types(dtype)
+    _store, add_up = block_sums(block)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def take_mean_of_copies(
+        # elements
+        inverse: wp.array(dtype=wp.vec3d),
+        # state in
+        parts: wp.array3d(dtype=wp.float64),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # in and out
+        direction: wp.array(dtype=vec3),
+    ):
+        copy, lane = wp.tid()
+        total = wp.vec3d(add_up(lane, parts[0], copy), add_up(lane, parts[1], copy), add_up(lane, parts[2], copy))
+        mean = vec3(wp.cw_mul(inverse[copy], total))
+        for k in range(lane, per_copy, lanes):
+            direction[copy * per_copy + k] -= mean
+
+    return take_mean_of_copies
 
 
 @cache

@@ -1,7 +1,5 @@
 """Self-contact forces in the steps of a solver."""
 
-from contextlib import contextmanager
-
 import numpy as np
 import warp as wp
 
@@ -62,15 +60,6 @@ class SelfForces(PairSums):
 
     def _launch(self, factory, dim, inputs, outputs):
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
-
-    @contextmanager
-    def without_psi(self):
-        """Leaves ψ out of the forces that are launched in this context."""
-        least, self.least = self.least, 0.0
-        try:
-            yield
-        finally:
-            self.least = least
 
     def launch_forces(self, x, correction=None):
         """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""

@@ -45,14 +45,10 @@ class Residual(NamedTuple):
     """The quantity that a solver reports as its residual.
 
     Attributes:
-        measure: Name of the quantity. A run reports the largest value of any step.
-        weightless: Its unit in a scene without gravity.
-        unit: Its unit in a scene with gravity.
+        measure: Name of the quantity. A run reports the largest value of any step, divided by an acceleration of the scene.
     """
 
     measure: str
-    weightless: str
-    unit: str = "times gravity"
 
 
 class Status(NamedTuple):

@@ -1,6 +1,5 @@
 """Newton's method with a line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d, shared by motion and equilibrium."""
 
-from contextlib import nullcontext
 from functools import partial
 
 import numpy as np
@@ -13,7 +12,7 @@ from ..core.sums import Sums
 from ..kernels import minimise as kernels
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
-from .iterate import GravityScale
+from ..kernels.terms.air import AIR
 from .linear import ConjugateGradients, Factorised
 from .multigrid import LEAST, Multigrid
 from .search import Search
@@ -36,6 +35,18 @@ def _resembles_the_last_step(model):
     return not touches and all(elements.cells is None for elements in model.terms)
 
 
+def _free_axes(model):
+    """Returns which axes are those of moves of the whole cloth that change no energy, (3,) booleans.
+
+    Terms with stencils of one vertex, contact with colliders and air hold the cloth in space; so do pins and locks, by axes.
+    """
+    held = (
+        elements.collider is not None or elements.term is AIR or (elements.term.vertices == 1 and not elements.cells)
+        for elements in model.terms
+    )
+    return (model.coordinate_mobility().reshape(-1, 3) > 0.0).all(axis=0) & (not any(held))
+
+
 class Minimiser:
     """Minimises φ(d) of each copy; the docstring of the module has the equation.
 
@@ -54,7 +65,7 @@ class Minimiser:
     Attributes:
         correction: d (N,) [m].
         residual: The largest unbalanced acceleration of each copy divided by ``scale``, (B,), after :meth:`minimise`.
-        gravity: Magnitude of gravity of each copy (B,) [m/s²].
+        scale: The acceleration by which the residual of each copy is divided, (B,) [m/s²], as last given.
         iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
 
@@ -80,9 +91,16 @@ class Minimiser:
         self.edge = float(np.median(model.scene.mesh.edge_lengths))
         self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
         self._allocate_progress()
+        self._inverse_total = None
+        axes = _free_axes(model)
+        if axes.any():
+            total = model.mass.numpy().astype(np.float64).reshape(model.copies, -1).sum(axis=1)
+            self._inverse_total = wp.array(axes / total[:, None], dtype=wp.vec3d, device=model.device)
+            self._moments = lanes.parts(3)
+        of_means = (kernels.mean_parts, kernels.take_mean) if axes.any() else ()
         of_copies = kernels.begin_descent, kernels.begin_at_guess, kernels.begin_newton, kernels.find_indefinite
         self._launch = model.launcher(
-            ((rounding,), model.dtype, lanes.block), (of_copies,), ((kernels.end_newton,), lanes.block)
+            ((rounding, *of_means), model.dtype, lanes.block), (of_copies,), ((kernels.end_newton,), lanes.block)
         )
         self.record()
         self.residual, self.iterations = np.zeros(model.copies), 0
@@ -93,17 +111,17 @@ class Minimiser:
         self._progress, self._limits = kernels.DescentState(), kernels.Limits()
         for name in ("active", "end", "iterations"):
             setattr(self._progress, name, model.scalars(wp.int32))
-        for name in ("residual", "scale", "previous", "energy"):
+        for name in ("residual", "previous", "energy"):
             setattr(self._progress, name, model.scalars())
         self._progress.proceed, self._progress.more = flag(), flag()
         self._limits.tolerance, self._limits.scale = wp.zeros(1, dtype=wp.float64, device=model.device), model.scalars()
         self._limits.iterations = flag()
         self.active, self._wanted, self._unsolved = self._progress.active, model.scalars(wp.int32), flag()
-        read = ("end", "iterations", "residual", "scale", "proceed")
+        read = ("end", "iterations", "residual", "proceed")
         self._read = {name: Mirror(getattr(self._progress, name)) for name in read}
         self._given = {name: Mirror(getattr(self._limits, name)) for name in ("tolerance", "iterations", "scale")}
         self._left = Mirror(self._unsolved)
-        self.gravity, self._present = GravityScale(model).gravity, None
+        self.scale, self._present = None, None
 
     def record(self):
         """Captures what :meth:`minimise` launches."""
@@ -121,20 +139,21 @@ class Minimiser:
         self.search.inertia.s, self.search.inertia.load = s, load
         self.record()
 
-    def minimise(self, tolerance, iterations, scale=None):
+    def minimise(self, tolerance, iterations, scale):
         """Iterates until every copy has converged, or rounding allows no further progress.
 
-        A copy has converged if max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a. The acceleration a is ``scale`` (B,) [m/s²], by default gravity,
-        or without gravity the largest acceleration at d = 0. Rounding allows no progress if ‖∇φ‖ is within its rounding,
-        4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) per vertex, and an iteration lowered φ by no more than rounding. The norm
-        alone would not do, because the noise of stiff directions may hide the error of soft ones.
+        A copy has converged if max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a, with the acceleration a = ``scale`` (B,) [m/s²], above 0.
+        Rounding allows no progress if ‖∇φ‖ is within its rounding, 4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) per vertex, and
+        an iteration lowered φ by no more than rounding. The norm alone would not do, because the noise of stiff directions may
+        hide the error of soft ones.
 
         If the linear solver runs on the device, so does the loop: the host waits once in ``AT_ONCE`` iterations.
 
         Returns:
             A :class:`Result` for each copy.
         """
-        self._set_limits(tolerance, iterations, self.gravity if scale is None else scale)
+        self.scale = scale
+        self._set_limits(tolerance, iterations, scale)
         self._start()
         self._go_on()
         while self._read["proceed"].read()[0]:
@@ -181,11 +200,6 @@ class Minimiser:
         gradient = self.search.gradient.numpy().astype(np.float64).reshape(self.model.copies, -1, 3)
         return np.linalg.norm(gradient, axis=2).sum(axis=1)
 
-    @property
-    def scale(self):
-        """The acceleration by which the residual of each copy is divided, (B,) [m/s²], after :meth:`minimise`."""
-        return self._read["scale"].read().copy()
-
     def _assemble_raw(self):
         policy, before = self.hessian.policy, self.hessian.policy.numpy()
         self.clear()
@@ -204,18 +218,13 @@ class Minimiser:
         """Launches the start from d = 0, or from the last d."""
         if self.warm:
             wp.copy(self.right, self.correction)
-        # At a start in touch, ψ would make the largest acceleration, the scale without gravity, a hundred times as large.
-        steep = self.pairs is not None and self.pairs.forces.least > 0.0 and not self.gravity.all()
-        with self.pairs.forces.without_psi() if steep else nullcontext():
-            self.clear()
+        self.clear()
         self._progress.proceed.zero_()
         given = [self.search.acceleration, self.search.energy, self._limits]
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
         if self.warm:
+            self._launch_mean(self.right)
             self.search.launch_guess(self.right, self.active)
-        if steep:
-            self.search.launch_again()
-        if self.warm or steep:
             self._progress.proceed.zero_()
             self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
@@ -267,7 +276,23 @@ class Minimiser:
     def _launch_solve(self, wanted):
         self.linear.solve(self.right, self.search.direction, wanted)
 
+    def _launch_mean(self, direction):
+        """Launches p −= Σ m(d + p)/Σ m for a direction p of steps of free cloth.
+
+        No energy but inertia changes with a move of the whole cloth, so that Σ∇φ = s Σ m d, and Σ m d = 0 at the minimum: the
+        momentum of the cloth. A conjugate gradient solve leaves an error of it. Without that d + p has a lower φ, wherever the
+        solve ended, and shorter steps along p keep Σ m d = 0.
+        """
+        inertia, search, lanes = self.search.inertia, self.search, self.search.lanes
+        if self._inverse_total is None or inertia.s == 0.0 or inertia.load != 0.0:
+            return
+        size = [self.model.per_copy, lanes.count]
+        given = [self.model.mass, search.correction, direction, *size]
+        self._launch(kernels.mean_parts, lanes.dim, given, [self._moments])
+        self._launch(kernels.take_mean, lanes.dim, [self._inverse_total, self._moments, *size], [direction])
+
     def _launch_search(self):
+        self._launch_mean(self.search.direction)
         if self.pairs is not None:
             self.hessian.invert_diagonal(self.preconditioner)
             given = self.search.gradient, self.preconditioner, self.right, self.search.direction, self.active

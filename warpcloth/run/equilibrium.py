@@ -17,6 +17,7 @@ from ..contact.self_steps import SelfSteps
 from ..core.state import State
 from ..core.status import Grade, Residual, Result, Status, digits, sentence
 from ..kernels.terms.air import AIR
+from ..numerics.iterate import ResidualScale
 from ..numerics.minimise import Minimiser
 from ..numerics.multigrid import LEAST
 from ..scene.scene import Scene
@@ -26,7 +27,8 @@ from .history import Evaluation, checked_record, collider_names, last_frame
 from .softened import softened, softening
 
 SETTLED = (Result.CONVERGED, Result.ROUNDED)
-RESIDUAL = Residual("sum of the unbalanced forces", "times that at the start", "times the weight")
+RESIDUAL = Residual("sum of the unbalanced forces")
+WEIGHT = "times the weight"
 # Iterations after which stiff cloth starts from the rest shape of softer cloth, and the residual below which it does not; the
 # tolerance of softer cloth, its most iterations for one stiffness, and for all of them as a share of those that are left.
 PATIENCE, NEARLY, ROUGHLY, MOST_SOFT, SOFT_SHARE = 10, 0.1, 1e-3, 200, 0.5
@@ -40,7 +42,8 @@ class Equilibrium(NamedTuple):
     Attributes:
         points: (n, 3) [m].
         status: How it ended, see :class:`warpcloth.core.status.Result`, with the residual: the sum Σ‖fᵢ‖ of the unbalanced
-            forces of all free vertices, divided by the weight Σmᵢ‖g‖ (without gravity, by its value at the start).
+            forces of all free vertices, divided by the weight Σmᵢ‖g‖; without gravity by the sum of the loads, and without
+            these by its value at the start.
         iterations: Total number of Newton iterations; each round of proximal steps counts as one more.
         lowest_eigenvalue: Lowest eigenvalue of the Hessian of the energy over the free vertices [N/m]; NaN if forces do not
             balance.
@@ -110,9 +113,9 @@ def equilibrium(
     Args:
         scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
         tolerance: Tolerance of the residual, see :class:`Equilibrium`, and of the unbalanced acceleration of each vertex
-            divided by gravity (without gravity, by the largest at the start). If rounding leaves more than this at a vertex,
-            the descent ends when it cannot lower the energy any more, and the residual decides. With gravity, a shape with half
-            of the weight or more unbalanced is no equilibrium.
+            divided by gravity (without gravity by loads over masses, without these by the largest at the start). If rounding
+            leaves more than this at a vertex, the descent ends when it cannot lower the energy any more, and the residual
+            decides. With gravity, a shape with half of the weight or more unbalanced is no equilibrium.
         load_steps: Number of steps in which gravity and loads grow and pins move along their keyframes. Pins that rotate far
             need several.
         iterations: Maximum number of Newton iterations in total.
@@ -192,18 +195,17 @@ def equilibrium(
     if result is Result.ROUNDED and residual <= tolerance:
         result = Result.CONVERGED
     # A sheet that did not move has its whole weight unbalanced. Without gravity, a start at rest has only rounding unbalanced.
-    elif result is Result.ROUNDED and residual > 0.5 and minimiser.gravity[0] > 0.0:
+    elif result is Result.ROUNDED and residual > 0.5 and descent.unit == WEIGHT:
         result, began = Result.STALLED, f"rounding hides the equilibrium in {dtype}"
     lowest = minimiser.lowest_eigenvalue() if result in (*SETTLED, Result.SADDLE) else np.nan
-    unit = RESIDUAL.unit if minimiser.gravity[0] > 0.0 else RESIDUAL.weightless
     grade = {Result.CONVERGED: Grade.CONVERGED, Result.ROUNDED: Grade.COMPLETED}.get(result, Grade.NOT_USABLE)
     why = "it is not an equilibrium"
     if result is Result.SADDLE:
         why = f"it is not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
-    message = sentence(result, grade, np.nan, residual, RESIDUAL.measure, unit, tolerance, why=why)
+    message = sentence(result, grade, np.nan, residual, RESIDUAL.measure, descent.unit, tolerance, why=why)
     if result is Result.STALLED:
         message = message.replace(result.value, began)
-    status = Status(result, 0, residual, message, None, RESIDUAL.measure, unit, grade, np.nan, (grade,))
+    status = Status(result, 0, residual, message, None, RESIDUAL.measure, descent.unit, grade, np.nan, (grade,))
     energies = reactions = forces = None
     if record:
         evaluation = Evaluation(model, forces="reactions" in record, pairs=pairs)
@@ -279,9 +281,12 @@ class _Descent:
         self.wind = wind
         self.used, self.moved, self.pairs = 0, 0.0, minimiser.pairs
         self._apart = wp.clone(base)  # the last positions without crossings
-        self.scale = None  # from the first descent, because without gravity a later one would be scaled by its own rounding
         model = minimiser.model
-        self.load = float(minimiser.gravity[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64))
+        gravity, self.unit = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1), WEIGHT
+        self.scale = gravity
+        if gravity[0] == 0.0:
+            self.scale, self.unit = ResidualScale(model).driven, "times the loads"
+        self.load = float(self.scale[0] * model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum(dtype=np.float64))
         self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
 
     def run(self, load, s):
@@ -325,14 +330,15 @@ class _Descent:
         self._begin()
         if self.load == 0.0:
             self.minimiser.clear()
-            self.load = float(self.minimiser.unbalanced()[0]) or 1.0
+            self.load, self.unit = float(self.minimiser.unbalanced()[0]) or 1.0, "times that at the start"
+            self.scale = self.minimiser.search.acceleration.numpy().copy()
+            self.scale[self.scale == 0.0] = 1.0
         most = min(most, max(self.iterations - self.used, 0))
         (result,) = self.minimiser.minimise(self.tolerance, most, self.scale)
         while self.pairs is not None and self.pairs.overflowed:
             self._grow()
             self._begin()
             (result,) = self.minimiser.minimise(self.tolerance, most, self.scale)
-        self.scale = self.minimiser.scale
         self.unbalanced = float(self.minimiser.unbalanced()[0])
         self.used += self.minimiser.iterations
         correction = self.minimiser.correction.numpy()

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..base.turns import in_turn
 from ..core.status import Grade, Result, Status, Stopped, digits, length, sentence
+from ..numerics.iterate import ResidualScale
 from .balance import GAIN, STRETCHED, Balance
 from .frames_ahead import Frame, frames_of
 from .step_errors import StepErrors
@@ -204,7 +205,7 @@ class Watch:
         kind, measure, unit = solver.residual_on(self.model), None, None
         copy = int(np.argmax(residual))  # the first that is NaN, if any
         if kind is not None:
-            measure, unit = kind.measure, kind.unit if self.balance.weighs[copy] else kind.weightless
+            measure, unit = kind.measure, ResidualScale(self.model).units[copy]
         faults = self._faults(solver, faults)
         grades = tuple(self._grade(copy, result, faults) for copy, result in enumerate(results))
         grade = max(grades, key=list(Grade).index)

@@ -18,7 +18,7 @@ from ..kernels.accelerate import plain_step
 from ..model.model import Model
 from ..numerics.contact_system import PairSystem
 from ..numerics.inertia import Inertia
-from ..numerics.iterate import GravityScale
+from ..numerics.iterate import ResidualScale
 from ..numerics.linear import solve_copies
 from ..numerics.local_weights import best_weights, curvatures
 from ..terms.needs import ELEMENTS, FINITE
@@ -104,7 +104,7 @@ class ADMM(ImplicitStep):
     name = "admm"
     needs, locks = (ELEMENTS, FINITE), True
     touches_itself = True
-    residual = Residual("largest primal or dual residual of a vertex (as an acceleration)", "m/s²")
+    residual = Residual("largest primal or dual residual of a vertex (as an acceleration)")
     facts = Facts(
         method="implicit steps by the alternating direction method of multipliers",
         suits="as projective dynamics, also with strong damping of membranes",
@@ -178,7 +178,7 @@ class ADMMStepper(ImplicitStepper):
         sums = kernels.scatter_admm, kernels.gather_admm
         self._sums_of = [Transpose(model, elements, *sums, elements.term, model.dtype) for elements in self._terms]
         self._plain_step = model.kernel(plain_step, model.dtype)
-        self._scale = GravityScale(model).or_else(1.0)
+        self._scale = ResidualScale(model).acceleration
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
         self._whole_in_balance = bool(self._whole) or self.pairs is not None
         self._pressed = None

@@ -14,7 +14,7 @@ from ..kernels import elementwise as kernels
 from ..kernels.work import add_scaled
 from ..model.model import Model
 from ..numerics.constraints import Constraints
-from ..numerics.iterate import GravityScale
+from ..numerics.iterate import ResidualScale
 from ..numerics.linear import ConjugateGradients, FactorisedRows
 from ..numerics.multigrid import LEAST
 from ..numerics.primal import PrimalSolver
@@ -91,9 +91,7 @@ class ConstrainedDynamics(ImplicitStep):
         ),
         limits=("h² = m/(k(L/l − 1))",),
     )
-    residual = Residual(
-        "largest residual of a vertex or a constraint (as an acceleration)", "times its value at the start of the step"
-    )
+    residual = Residual("largest residual of a vertex or a constraint (as an acceleration)")
 
     iterations: int = 20
     tolerance: float = 1e-3
@@ -158,7 +156,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._unbalanced, self._open, self._rounding, self._carried = (Mirror(model.scalars()) for _ in range(4))
         self._of_vectors = model.launcher(((kernels.mismatch, kernels.add_step), model.dtype), ((kernels.begin_step,),))
         self._of_rows = model.launcher(((kernels.negate,), model.dtype), ((kernels.add_step,), model.dtype, True))
-        self._gravity_scale = GravityScale(model)
+        self._scale = ResidualScale(model).acceleration
         self._start = Segment(device, self._launch_start)
         self._solve = Segment(device, self._launch_solve) if self._linear.capturable else self._launch_solve
         self._move = Segment(device, self._launch_move)
@@ -169,7 +167,6 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
 
     def start(self):
         self._start()
-        self._scale = self._gravity_scale.or_else(self._accelerations())
         self._stuck = np.zeros(self.model.copies, dtype=bool)
 
     def measure(self):

@@ -7,7 +7,7 @@ from ..base.checks import number, whole
 from ..core.capture import Segment
 from ..core.status import UNBALANCED, Residual
 from ..model.model import Model
-from ..numerics.iterate import Ended
+from ..numerics.iterate import Ended, ResidualScale
 from ..numerics.minimise import Minimiser
 from ..terms.needs import FINITE
 from .facts import Benchmark, Facts
@@ -52,7 +52,7 @@ class Newton(ImplicitStep):
 
     name = "newton"
     needs = (FINITE,)
-    residual, locks = Residual(UNBALANCED, "times its value at the start of the step"), True
+    residual, locks = Residual(UNBALANCED), True
     touches_itself = True
     facts = Facts(
         method="implicit steps by Newton's method with a line search",
@@ -106,7 +106,7 @@ class NewtonStepper(ImplicitStepper):
         last = self.state.add("correction", model.vectors())
         given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "last": last}
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, **given)
-        self.correction = self.minimiser.correction
+        self.correction, self._scale = self.minimiser.correction, ResidualScale(model).acceleration
         self._predict = Segment(model.device, self.launch_prediction)
         self.ready()
         self.correction.zero_()  # that of the first steps of BDF2
@@ -118,5 +118,5 @@ class NewtonStepper(ImplicitStepper):
 
     def minimise(self):
         self._predict()
-        results = self.minimiser.minimise(self.options.tolerance, self.options.iterations)
+        results = self.minimiser.minimise(self.options.tolerance, self.options.iterations, self._scale)
         return Ended(results, self.minimiser.residual, self.minimiser.iterations)

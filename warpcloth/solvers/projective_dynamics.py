@@ -19,7 +19,7 @@ from ..numerics.accelerated_step import AcceleratedStep
 from ..numerics.acceleration import accelerated
 from ..numerics.contact_system import ContactSystem
 from ..numerics.inertia import Inertia
-from ..numerics.iterate import GravityScale
+from ..numerics.iterate import ResidualScale
 from ..numerics.linear import DiagonalScaling, solve_copies
 from ..numerics.local_weights import curvatures
 from ..terms.needs import CONSTANT_MATRIX, FINITE
@@ -78,7 +78,7 @@ class ProjectiveDynamics(ImplicitStep):
     name = "projective-dynamics"
     needs, locks = (FINITE, CONSTANT_MATRIX), True
     touches_itself = True
-    residual = Residual(UNBALANCED, "times its value at the start of the step")
+    residual = Residual(UNBALANCED)
     facts = Facts(
         method="implicit steps by local projections and global solves with a constant matrix",
         suits="animation with few iterations; stretches little from the first iteration on",
@@ -153,7 +153,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._gradient_of = plan(model).gradient(corrected=True)
         self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
         self._plain_step = model.kernel(plain_step, model.dtype)
-        self._gravity_scale = GravityScale(model)
+        self._scale = ResidualScale(model).acceleration
         self._accelerated = None
         if options.acceleration != "none" or not bounded:
             method = accelerated(options.acceleration, model, options.window, self.slowest)
@@ -173,7 +173,6 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
 
     def start(self):
         self._start()
-        self._scale = self._gravity_scale.or_else(self._acceleration.read())
         if self._accelerated:
             self._accelerated.start()
             if self._contact:

@@ -16,7 +16,7 @@ from ..kernels.project import add_momentum
 from ..kernels.reduce import keep_largest
 from ..model.model import Model
 from ..numerics.integrators import INTEGRATORS
-from ..numerics.iterate import GravityScale
+from ..numerics.iterate import ResidualScale
 from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
 from ..terms.needs import CLOSED_STEP, LOCAL_STEP, MERGED_DAMPING
 from .facts import Benchmark, Facts, grid
@@ -74,7 +74,7 @@ class XPBD(ImplicitStep):
     name = "xpbd"
     needs, locks = (MERGED_DAMPING, LOCAL_STEP, CLOSED_STEP), True
     touches_itself = True
-    residual, multipliers = Residual(UNBALANCED, "m/s²"), True  # λ adds up over the sweeps of a step
+    residual, multipliers = Residual(UNBALANCED), True  # λ adds up over the sweeps of a step
     facts = Facts(
         method="PBD with compliance; converges to an implicit step with more sweeps",
         suits="stiff cloth and hard constraints by many small steps",
@@ -157,7 +157,7 @@ class XPBDStepper(LaunchedStepper):
         self._acceleration = model.scalars()
         self._largest = Mirror(self.state.add("largest acceleration", model.scalars()))
         self._keep_largest = model.kernel(keep_largest)
-        self._scale = GravityScale(model).or_else(1.0)
+        self._scale = ResidualScale(model).acceleration
         sweeps = self.sweep.parts(options.iterations - (not soft))
         if self.integrator.to_and_fro and options.ordered:
             sweeps = [(self._launch_to_and_fro, options.iterations // 2)]
