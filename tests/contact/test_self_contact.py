@@ -648,30 +648,6 @@ IMPACTS = {
 }
 
 
-def test_the_scale_without_gravity_is_that_of_contact_alone(device):
-    """Sheets that meet start a step at the least gap, where ψ has a hundred times the force of φ. If that were the scale of
-    residuals, the step would end far from its minimum."""
-    scales = []
-    for least in (True, False):
-        stepper = wc.Newton(substeps=1).bind(layers(n=3, turn=5.0, gap=2e-3, speed=1.0).build(device=device, dtype="float64"))
-        if not least:
-            stepper.pairs.forces.least = 0.0
-            stepper.record_again()
-        stepper.step()
-        scales.append(float(stepper.minimiser.scale[0]))
-    assert scales[0] == pytest.approx(scales[1], rel=1e-9) and scales[0] > 100.0
-
-
-def test_an_interrupt_while_forces_are_recorded_without_psi_leaves_psi_in(device):
-    """An interrupt may come between any two launches, and the caller may step on."""
-    forces = wc.Newton(substeps=1).bind(layers(n=3, gap=2e-3, speed=1.0).build(device=device)).pairs.forces
-    before = forces.least
-    with pytest.raises(KeyboardInterrupt), forces.without_psi():
-        assert forces.least == 0.0
-        raise KeyboardInterrupt
-    assert forces.least == before > 0.0
-
-
 @pytest.mark.parametrize("meet", IMPACTS)
 def test_impact_converges(meet, device):
     """Where a step presses sheets flat, pairs of crossing edges have hardly an area. `Newton` used to use up its iterations

@@ -216,7 +216,7 @@ def test_bdf2_gains_no_energy_where_it_starts(name, start, device):
         gravity=(0.0, 0.0, 0.0),
         fps=60.0,
     )
-    # Residuals are relative to the first, and such forces are not found to 1e-11.
+    # Such forces are not found to 1e-11 of the residual's unit.
     loose = {"iterations": 100} if "xpbd" in name else {"iterations": 100, "tolerance": 1e-6}
     stepper = bound(scene, SOLVERS[name], device, integrator="bdf2", **loose)
     pairs, energies = scene.terms[0].stencil(mesh), []

@@ -33,7 +33,7 @@ def descent(scene, device, iterations=1000):
     """By one iteration of conjugate gradients a time, from the positions of a scene, with hardly any inertia."""
     model = scene.build(device=device)
     minimiser = Minimiser(model, model.positions, "raw", "cg", s=1e-6, linear_iterations=1)
-    return minimiser, minimiser.minimise(1e-30, iterations)[0]
+    return minimiser, minimiser.minimise(1e-30, iterations, np.ones(1))[0]
 
 
 def test_a_descent_ends_where_it_gains_what_rounding_loses(device):
@@ -71,7 +71,7 @@ def test_a_quadratic_energy_takes_one_whole_step(apart, device):
     start[:, 0] = apart * random.uniform(-1.0, 1.0, (copies, 3))
     model = scene.build(device=device, copies=copies, vary={"positions": start})
     minimiser = Minimiser(model, model.positions, "raw", "cg", s=0.0)
-    minimiser.minimise(1e-30, 1)
+    minimiser.minimise(1e-30, 1, np.ones(copies))
     assert (minimiser.search.step.numpy() == 1.0).all()
     found = (model.positions.numpy() + minimiser.correction.numpy()).reshape(copies, 2, 3)[:, 0]
     # Each of two forces of 100 N is rounded by ε of it.

@@ -212,7 +212,7 @@ def test_the_residual_has_a_unit(name, weight, device):
     if kind is None:
         assert (status.residual, status.measure, status.unit) == (0.0, None, None)
         return
-    unit = kind.unit if weight else kind.weightless
+    unit = "times gravity" if weight else "times the radius of the cloth over the square of the duration"
     assert status.residual > 0.0 and (status.measure, status.unit) == (kind.measure, unit)
     compared = "tolerance 0.001" if hasattr(solver, "tolerance") else "this solver has no tolerance"
     assert status.message.endswith(f": {kind.measure} {digits(status.residual)} {unit} ({compared})")
@@ -229,7 +229,8 @@ def test_a_hard_constraint_has_another_residual(device):
 
 
 def test_rounding_is_no_failure():
-    said = sentence(Result.ROUNDED, Grade.CONVERGED, 1e-6, 0.037, *wc.Newton.residual[::2], tolerance=0.001)
+    figure = 0.037, wc.Newton.residual.measure, "times gravity"
+    said = sentence(Result.ROUNDED, Grade.CONVERGED, 1e-6, *figure, tolerance=0.001)
     assert said == (
         "converged as far as rounding allows: "
         "largest unbalanced acceleration of a vertex 0.037 times gravity (tolerance 0.001)"

@@ -151,7 +151,7 @@ def test_02_a_line_search_keeps_newton_going_downhill(device):
     points, steps = [base], []
     for iterations in range(1, 12):
         minimiser.correction.zero_()
-        minimiser.minimise(1e-15, iterations)
+        minimiser.minimise(1e-15, iterations, np.ones(1))
         points.append(base + minimiser.correction.numpy())
         steps.append(minimiser.search.step.numpy()[0])
     values = np.array([objective(crumpled, x, device) for x in points])

@@ -153,7 +153,7 @@ def test_newton_converges_quadratically(linear, device):
     residuals = []
     for iterations in range(9):
         stepper.minimiser.correction.zero_()
-        stepper.minimiser.minimise(1e-15, iterations)
+        stepper.minimiser.minimise(1e-15, iterations, np.ones(1))
         residuals.append(stepper.minimiser.residual[0])
     r = np.array(residuals) / residuals[0]
     assert r[-1] <= 1e-12
