@@ -149,6 +149,34 @@ def test_the_gap_under_a_pressure(name, pressure, gap, mesh, device):
     assert animation.cut == 0.0
 
 
+# As users run them, with iterations that suffice.
+PRESSED = {
+    "newton": wc.Newton(substeps=4),
+    "newton bdf2": wc.Newton(substeps=4, integrator="bdf2"),
+    "newton midpoint": wc.Newton(substeps=4, integrator="midpoint"),
+    "projective dynamics": wc.ProjectiveDynamics(substeps=4),
+    "admm": wc.ADMM(substeps=4, iterations=500),
+    "xpbd": wc.XPBD(substeps=4),
+    "constrained dynamics": wc.ConstrainedDynamics(substeps=4),
+}
+
+
+@pytest.mark.parametrize("gravity", (0.0, 1e-3))
+@pytest.mark.parametrize("name", [pytest.param(name, marks=HOST.get(name, ())) for name in PRESSED])
+def test_a_pressure_holds_a_sheet_where_it_balances(name, gravity, device, pressure=14.715, k=1e7, r=1e-3):
+    """The gap r − p/k and the force pA, with hardly any gravity or none: x̃ is 0.7 mm deep in the plane, where contact gives 1e7
+    m/s², but the residual is relative to p/ρ. The stiffness k/ρ is above the inertia 1/h², so that a residual of 1e-3 p/ρ leaves
+    1e-3 p/k at the most, and as much again of velocity from the step before."""
+    fields = {"gravity": (0.0, -gravity, 0.0), "loads": [wc.Pressure(vertices="all", pressure=-pressure)], "duration": 0.2}
+    scene = sheet(r - pressure / k, contact=wc.Contact(distance=r, stiffness=k), **fields)
+    animation = wc.simulate(scene, PRESSED[name], dtype="float64", device=device, record="reactions")
+    whole = pressure + DENSITY * gravity
+    np.testing.assert_allclose(r - animation.points[1:, :, 1], whole / k, rtol=2e-3)
+    (force,) = animation.collider_forces.values()
+    assert force[-1] == pytest.approx([0.0, -whole * 0.01, 0.0], rel=2e-3, abs=1e-12)
+    assert animation.status.ok, animation.status.message
+
+
 RESTITUTION = {0.05: 0.92, 0.3: 0.63, 1.0: 0.25, 10.0: 0.01}
 
 
