@@ -68,10 +68,9 @@ def residuals():
     rows = []
     for record in SOLVERS.values():
         if record.residual is not None:
-            measure, weightless, unit = record.residual
             held = "`tolerance`" if hasattr(record, "tolerance") else "–"
-            rows.append([f"`{record.__name__}`", measure, unit, weightless, held])
-    return table(("Solver", "Measure", "Unit", "Unit without gravity", "Compared with"), rows)
+            rows.append([f"`{record.__name__}`", record.residual.measure, held])
+    return table(("Solver", "Measure", "Compared with"), rows)
 
 
 def refused(record, hard):

@@ -165,8 +165,8 @@ PRESSED = {
 @pytest.mark.parametrize("name", [pytest.param(name, marks=HOST.get(name, ())) for name in PRESSED])
 def test_a_pressure_holds_a_sheet_where_it_balances(name, gravity, device, pressure=14.715, k=1e7, r=1e-3):
     """The gap r − p/k and the force pA, with hardly any gravity or none: x̃ is 0.7 mm deep in the plane, where contact gives 1e7
-    m/s², but the residual is relative to p/ρ. The stiffness k/ρ is above the inertia 1/h², so that a residual of 1e-3 p/ρ leaves
-    1e-3 p/k at the most, and as much again of velocity from the step before."""
+    m/s², but the residual is relative to p/ρ. The stiffness k/ρ is above the inertia 1/h², so that a residual of 1e-3 p/ρ
+    leaves 1e-3 p/k at the most, and as much again of velocity from the step before."""
     fields = {"gravity": (0.0, -gravity, 0.0), "loads": [wc.Pressure(vertices="all", pressure=-pressure)], "duration": 0.2}
     scene = sheet(r - pressure / k, contact=wc.Contact(distance=r, stiffness=k), **fields)
     animation = wc.simulate(scene, PRESSED[name], dtype="float64", device=device, record="reactions")

@@ -80,10 +80,10 @@ class ADMM(ImplicitStep):
     that of hinges is, it may not converge with a small weight.
 
     ``residual`` is the larger of the primal and the dual residual. Each is the largest acceleration of any vertex, relative to
-    gravity (in m/s² without gravity): the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before), divided by the masses. The
-    factor max(1, 1/r) weights the primal residual by at least the stiffness k, by which the forces of U at Dx and at z differ:
-    otherwise a small weight would look like convergence. With energies that are not split, the dual residual is at least the
-    unbalanced acceleration of the last step.
+    that of :class:`warpcloth.numerics.iterate.ResidualScale`: the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before),
+    divided by the masses. The factor max(1, 1/r) weights the primal residual by at least the stiffness k, by which the forces
+    of U at Dx and at z differ: otherwise a small weight would look like convergence. With energies that are not split, the dual
+    residual is at least the unbalanced acceleration of the last step.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.

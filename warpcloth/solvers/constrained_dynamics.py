@@ -55,9 +55,9 @@ class ConstrainedDynamics(ImplicitStep):
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
-        tolerance: Tolerance of the residual, the larger of two accelerations, relative to gravity (or without gravity to its
-            value at the first iterate): the largest unbalanced one of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest one
-            with which a single constraint would reach C + α̃λ = 0 in a step.
+        tolerance: Tolerance of the residual, the larger of two accelerations, relative to that of
+            :class:`warpcloth.numerics.iterate.ResidualScale`: the largest unbalanced one of a vertex,
+            ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest one with which a single constraint would reach C + α̃λ = 0 in a step.
         stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
         linear: ``"cg"`` solves by conjugate gradients over λ; on meshes of 200 vertices and more over positions, with
             multigrid, unless rigid clusters, plates or self-contact have rows. ``"factorised"`` factorises on the host.

@@ -21,13 +21,15 @@ class Newton(ImplicitStep):
     """Implicit Euler: x(t+h) minimises 1/(2h²)‖x − x̃‖²_M + U(x), x̃ = x + h v + h² g (Baraff and Witkin 1998).
 
     It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Each step
-    multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved, angular momentum is not.
-    Without contact and rigid clusters a step starts from the x − x̃ of the last one where this lowers the function, else from x̃.
+    multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved to rounding, whatever the tolerance;
+    angular momentum is not. Without contact and rigid clusters a step starts from the x − x̃ of the last one where this lowers
+    the function, else from x̃.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
         tolerance: Tolerance of the residual, which is the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, divided by
-            gravity (or without gravity by the largest at x̃). If rounding leaves a larger residual, as in stiff cloth in
+            gravity and what loads and wind add to it; without these by the radius of the cloth over the square of the duration,
+            see :class:`warpcloth.numerics.iterate.ResidualScale`. If rounding leaves a larger residual, as in stiff cloth in
             float32, a step ends when no progress is possible, and its result says so.
         iterations: Maximum number of Newton iterations in a step.
         hessian: Treatment of an indefinite Hessian (Choi and Ko 2002 for springs). ``"clamp"`` and ``"absolute"`` make the

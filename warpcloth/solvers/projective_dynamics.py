@@ -54,8 +54,7 @@ class ProjectiveDynamics(ImplicitStep):
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
-        tolerance: Tolerance of the residual, as for :class:`warpcloth.Newton`: the largest unbalanced acceleration of any
-            vertex, divided by gravity (or without gravity by the largest of the first iterate).
+        tolerance: Tolerance of the residual, that of :class:`warpcloth.Newton`.
         acceleration: ``"none"``; ``"chebyshev"`` (Wang 2015); ``"anderson"`` (Peng et al. 2018), in the norm of the matrix;
             ``"l-bfgs"`` (Liu et al. 2017), with the matrix as first Hessian.
         window: Number of iterations that Anderson and L-BFGS use.

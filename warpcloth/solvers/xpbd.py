@@ -45,9 +45,9 @@ class XPBD(ImplicitStep):
     add energy to the motion: ``hanging`` with 32² vertices would diverge in most settings. Alternating sweeps converge more
     slowly, so the integrators that damp keep one order.
 
-    ``residual`` says how far from implicit Euler a step ended: the largest unbalanced acceleration ‖∇ᵢ‖/mᵢ relative to gravity
-    (in m/s² without gravity). With infinite stiffness that force is not defined, and the residual is the largest move of the
-    last sweep, divided by h².
+    ``residual`` says how far from implicit Euler a step ended: the largest unbalanced acceleration ‖∇ᵢ‖/mᵢ relative to that of
+    :class:`warpcloth.numerics.iterate.ResidualScale`. With infinite stiffness that force is not defined, and the residual is
+    the largest move of the last sweep, divided by h².
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
