@@ -14,19 +14,22 @@ from .vectors import types
 
 
 @cache
-def cluster_fit(dtype, corrected: bool):
+def cluster_fit(dtype, corrected: bool, precision=None):
     """Device function that sets t = c + R q − (x + d) of the elements first to last − 1 and returns R.
 
     d counts only if ``corrected``. Positions are relative to the first vertex, so that no digits are lost far from the origin.
+    It is computed in the ``precision``, by default that of x and d.
     """
-    vec3, mat33 = types(dtype)
+    vec3, _ = types(dtype)
+    number = precision or dtype
+    wide, mat33 = types(number)
     rest_type = wp.types.vector(4, dtype)
 
     @wp.func
     def from_first(stencil: wp.array2d(dtype=wp.int32), first: int, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        relative = x[stencil[e, 0]] - x[stencil[first, 0]]
+        relative = wide(x[stencil[e, 0]]) - wide(x[stencil[first, 0]])
         if wp.static(corrected):
-            relative += d[stencil[e, 0]] - d[stencil[first, 0]]
+            relative += wide(d[stencil[e, 0]]) - wide(d[stencil[first, 0]])
         return relative
 
     @wp.func
@@ -39,19 +42,19 @@ def cluster_fit(dtype, corrected: bool):
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
     ):
-        total = dtype(0.0)
+        total = number(0.0)
         for e in range(first, last):
-            total += rest[e][3]
-        centre = vec3()
+            total += number(rest[e][3])
+        centre = wide()
         for e in range(first, last):
-            centre += (rest[e][3] / total) * from_first(stencil, first, e, x, d)
+            centre += (number(rest[e][3]) / total) * from_first(stencil, first, e, x, d)
         S = mat33()
         for e in range(first, last):
-            S += wp.outer((rest[e][3] / total) * (from_first(stencil, first, e, x, d) - centre), shape[e])
+            S += wp.outer((number(rest[e][3]) / total) * (from_first(stencil, first, e, x, d) - centre), wide(shape[e]))
         R = nearest_rotation(S)
         for e in range(first, last):
-            t = centre + R * shape[e] - from_first(stencil, first, e, x, d)
-            rest[e] = rest_type(t[0], t[1], t[2], rest[e][3])
+            t = centre + R * wide(shape[e]) - from_first(stencil, first, e, x, d)
+            rest[e] = rest_type(dtype(t[0]), dtype(t[1]), dtype(t[2]), rest[e][3])
         return R
 
     return fit_cluster
@@ -59,10 +62,10 @@ def cluster_fit(dtype, corrected: bool):
 
 @cache
 def fit_targets(dtype, corrected: bool):
-    """Kernel over clusters: targets t of their elements at x, or at x + d if ``corrected``."""
+    """Kernel over clusters: targets t of their elements at x, or at x + d if ``corrected``, then in double precision."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(4, dtype)
-    fit_cluster = cluster_fit(dtype, corrected)
+    fit_cluster = cluster_fit(dtype, corrected, wp.float64 if corrected else dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def fit_all(

@@ -19,7 +19,7 @@ from typing import Any
 import warp as wp
 
 from .memory import load
-from .reduce import block_sums
+from .reduce import block_largest, block_sums, larger
 from .rotation import epsilon
 from .vectors import types
 
@@ -165,11 +165,16 @@ def rounding(dtype, block: int):
     """Kernel over (copies, lanes): b = −∇φ, and the parts of estimates of the rounding errors of the force and of the energy.
 
     They are Σ(ρ + ε‖A[i, i]‖ edge)² [N²] and Σ½ρ²/‖A[i, i]‖ [J] with ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖). The typical edge
-    length stands for pinned neighbours, which are not in the matrix.
+    length stands for pinned neighbours, which are not in the matrix. In float32, elements are evaluated in double precision, see
+    :func:`.assemble.of_element`, so that the parts with ‖xⱼ − xᵢ‖ and with the edge are 0.
+
+    The third part is max 2ε²‖A[i, i]‖ [N/m]. Times φ it is an estimate of Σ(εF)² for the forces F of elements, of which the
+    sum is rounded: F² ≤ 2‖A‖u for an energy u ≥ 0 of curvature ‖A‖.
     """
     vec3, mat33 = types(dtype)
     column, block_at, vector = load(wp.int32), load(mat33), load(vec3)
-    store, _add_up = block_sums(block)
+    (store, _add_up), (store_largest, _find) = block_sums(block), block_largest(block)
+    apart = dtype(float(dtype is wp.float64))
 
     @wp.kernel(module=f"warpcloth.minimise.{dtype.__name__}", enable_backward=False)
     def rounding_of_rows(
@@ -191,22 +196,24 @@ def rounding(dtype, block: int):
         parts: wp.array3d(dtype=wp.float64),
     ):
         copy, lane = wp.tid()
-        force, energy = wp.float64(0.0), wp.float64(0.0)
+        force, energy, largest = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         for k in range(lane, per_copy, lanes):
             i = copy * per_copy + k
             b[i] = -gradient[i]
             total = dtype(0.0)
             for s in range(offsets[i], offsets[i + 1]):
                 j, each = column(columns, s), block_at(values, s)
-                total += wp.sqrt(wp.ddot(each, each)) * (wp.length(vector(x, j) - x[i]) + wp.length(vector(d, j)))
+                total += wp.sqrt(wp.ddot(each, each)) * (apart * wp.length(vector(x, j) - x[i]) + wp.length(vector(d, j)))
             own = values[diagonal[i]]
             size = wp.sqrt(wp.ddot(own, own))
-            rho = wp.float64(epsilon(edge) * (total + size * edge))
+            rho = wp.float64(epsilon(edge) * (total + apart * size * edge))
             force += rho * rho
             rho = wp.float64(epsilon(edge) * total)
             energy += wp.float64(0.5) * rho * rho / wp.float64(size)
+            largest = larger(largest, wp.float64(dtype(2.0) * epsilon(edge) * epsilon(edge) * size))
         store(lane, force, parts[0], copy)
         store(lane, energy, parts[1], copy)
+        store_largest(lane, largest, parts[2], copy)
 
     return rounding_of_rows
 

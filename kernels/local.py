@@ -28,23 +28,25 @@ def from_corner(term: Term, dtype):
 
 
 @cache
-def local_coordinate(term: Term, dtype, corrected: bool):
+def local_coordinate(term: Term, dtype, corrected: bool, precision=None):
     """Device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ of a term, or if ``corrected`` Σᵢ wᵢ ⊗ (xᵢ + dᵢ).
 
-    In float32 the sum x + d would lose digits of d. The difference of neighbouring x is nearly exact.
+    In float32 the sum x + d would lose digits of d. The difference of neighbouring x is nearly exact. The rest state and y have
+    the ``precision``, by default that of x and d.
     """
     vec3, _ = types(dtype)
-    K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
-    part_of, vector, vertex = from_corner(term, dtype), load(vec3), load(wp.int32, 2)
+    wide = types(precision or dtype)[0]
+    K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, precision or dtype)
+    part_of, vector, vertex = from_corner(term, precision or dtype), load(vec3), load(wp.int32, 2)
 
     @wp.func
     def y_of(stencil: wp.array2d(dtype=wp.int32), e: int, rest: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        y = part_of(rest, 0, vector(x, vertex(stencil, K * e)))
+        y = part_of(rest, 0, wide(vector(x, vertex(stencil, K * e))))
         for i in range(1, K):
-            y += part_of(rest, i, vector(x, vertex(stencil, K * e + i)))
+            y += part_of(rest, i, wide(vector(x, vertex(stencil, K * e + i))))
         if wp.static(corrected):
             for i in range(K):
-                y += part_of(rest, i, vector(d, vertex(stencil, K * e + i)))
+                y += part_of(rest, i, wide(vector(d, vertex(stencil, K * e + i))))
         return y
 
     return y_of

@@ -9,7 +9,7 @@ from functools import cache
 
 import warp as wp
 
-from .reduce import block_sums
+from .reduce import block_largest, block_sums
 from .search import LineSearch
 from .term import HessianPolicy
 from .vectors import types
@@ -46,8 +46,8 @@ class DescentState:
     """The minimisation of each copy, (B,) arrays, and flags of all, (1,).
 
     ``residual`` is the largest unbalanced acceleration over the scale of :class:`Limits`, ``previous`` its value an iteration
-    before, or 0; ``energy`` is φ [J] and ``end`` an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also
-    iterates before the host looks.
+    before, or 0; ``end`` is an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also iterates before the host
+    looks.
     """
 
     active: wp.array(dtype=wp.int32)
@@ -55,7 +55,6 @@ class DescentState:
     iterations: wp.array(dtype=wp.int32)
     residual: wp.array(dtype=wp.float64)
     previous: wp.array(dtype=wp.float64)
-    energy: wp.array(dtype=wp.float64)
     proceed: wp.array(dtype=wp.int32)
     more: wp.array(dtype=wp.int32)
 
@@ -98,7 +97,6 @@ def begin_descent():
     def begin(
         # state in
         acceleration: wp.array(dtype=wp.float64),
-        energy: wp.array(dtype=wp.float64),
         # parameters
         limits: Limits,
         # out
@@ -106,7 +104,6 @@ def begin_descent():
     ):
         copy = wp.tid()
         progress.previous[copy] = wp.float64(0.0)
-        progress.energy[copy] = energy[copy]
         progress.iterations[copy] = 0
         look(progress, limits, copy, acceleration[copy], USED_UP)
 
@@ -121,7 +118,6 @@ def begin_at_guess():
     def begin(
         # state in
         acceleration: wp.array(dtype=wp.float64),
-        energy: wp.array(dtype=wp.float64),
         # parameters
         limits: Limits,
         # in and out
@@ -129,7 +125,6 @@ def begin_at_guess():
     ):
         copy = wp.tid()
         if progress.active[copy] == 1:
-            progress.energy[copy] = energy[copy]
             look(progress, limits, copy, acceleration[copy], USED_UP)
 
     return begin
@@ -212,7 +207,7 @@ def end_newton(block: int):
     its rounding. A copy is stuck if no step was found or the direction does not descend. ``roundings`` has the parts of
     :func:`.linear.rounding`.
     """
-    _store, add_up = block_sums(block)
+    (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def end(
@@ -228,14 +223,14 @@ def end_newton(block: int):
         copy, lane = wp.tid()
         rounding = add_up(lane, roundings[0], copy)
         lost = add_up(lane, roundings[1], copy)
+        of_sums = find(lane, roundings[2], copy)
         if lane > 0 or progress.active[copy] == 0:
             return
         progress.iterations[copy] = progress.iterations[copy] + 1
-        before = progress.energy[copy]
-        energy = search.energy[copy]
-        progress.energy[copy] = energy
+        before = search.before[copy]
+        rounding += of_sums * wp.abs(before)
         noisy = search.square[copy] <= ROUNDINGS * ROUNDINGS * rounding
-        level = before - energy <= resolution * wp.abs(before) + TYPICAL * lost
+        level = before - search.energy[copy] <= resolution * wp.abs(before) + TYPICAL * lost
         stuck = search.step[copy] == wp.float64(0.0) or not (search.slope[copy] < wp.float64(0.0))
         ended = USED_UP
         if noisy and (stuck or level):

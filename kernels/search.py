@@ -20,13 +20,14 @@ WORK, SLOPE, SQUARE, LARGEST, ROWS = 0, 1, 2, 3, 4
 class LineSearch:
     """The line search of each copy, (B,) arrays, and of all, (1,).
 
-    ``energy`` is φ at d [J], ``slope`` its derivative along p and ``step`` the length of the trial step. At the trial they are
+    ``energy`` is φ at d [J], ``before`` that where the search began, ``slope`` its derivative along p and ``step`` the length of the trial step. At the trial they are
     ``trial_energy`` and ``trial_slope``, with ``square``, ‖∇φ‖² [N²], and ``acceleration``, max ‖∇φᵢ‖/mᵢ [m/s²]. ``other`` is
     an energy that is not in the parts. ``searching`` is 1 until a step is found. ``trials`` counts, and ``proceed`` is 1 if
     another is needed.
     """
 
     energy: wp.array(dtype=wp.float64)
+    before: wp.array(dtype=wp.float64)
     slope: wp.array(dtype=wp.float64)
     step: wp.array(dtype=wp.float64)
     trial_energy: wp.array(dtype=wp.float64)
@@ -90,6 +91,7 @@ def begin_search(dtype, block: int):
         if lane == 0:
             search.step[copy] = wp.float64(active[copy])
             search.searching[copy] = active[copy]
+            search.before[copy] = search.energy[copy]
             search.other[copy] = wp.float64(0.0)
             if copy == 0:
                 search.trials[0] = 1

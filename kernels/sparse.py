@@ -44,17 +44,23 @@ def share_hessian(y: Any, rest: Any, policy: int):
 def share(term: Term):
     """The :class:`.term.Term` of one vertex of a cell. Its rest state is A∂u/∂x (3) and Au, which the cell computes.
 
-    The first vertex of a cell has all of the energy. The Hessian couples vertices; :func:`blocks` gives it.
+    The first vertex of a cell has the energy, and the next ones what rounding it to ``dtype`` left. The Hessian couples vertices;
+    :func:`blocks` gives it.
     """
     given = _rest_state, weight, measure, share_energy, share_gradient, share_hessian
     return Term(term.name, 1, 1, 4, *given, cells=True, cell=term)
 
 
 @cache
-def cell_coordinate(term: Term, dtype, corrected: bool):
-    """Device function (first, last, stencil, weights, x, d) → y of a cell at x, or at x + d if ``corrected``."""
+def cell_coordinate(term: Term, dtype, corrected: bool, precision=None):
+    """Device function (first, last, stencil, weights, x, d) → y of a cell at x, or at x + d if ``corrected``.
+
+    y has the ``precision``, by default that of x and d.
+    """
     vec3, _ = types(dtype)
-    M, weights_type, y_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype), wp.types.matrix((term.rows, 3), dtype)
+    number = precision or dtype
+    wide, y_type = types(number)[0], wp.types.matrix((term.rows, 3), number)
+    M, weights_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype)
 
     @wp.func
     def y_of(
@@ -68,11 +74,11 @@ def cell_coordinate(term: Term, dtype, corrected: bool):
         y = y_type()
         for e in range(first, last):
             for m in range(M):
-                y[m] = y[m] + weights[e][m] * x[stencil[e, 0]]
+                y[m] = y[m] + number(weights[e][m]) * wide(x[stencil[e, 0]])
         if wp.static(corrected):
             for e in range(first, last):
                 for m in range(M):
-                    y[m] = y[m] + weights[e][m] * d[stencil[e, 0]]
+                    y[m] = y[m] + number(weights[e][m]) * wide(d[stencil[e, 0]])
         return y
 
     return y_of
@@ -80,11 +86,16 @@ def cell_coordinate(term: Term, dtype, corrected: bool):
 
 @cache
 def evaluate(term: Term, dtype, corrected: bool):
-    """Kernel over cells: rest states of the elements of their vertices, see :func:`share`."""
+    """Kernel over cells: rest states of the elements of their vertices, see :func:`share`.
+
+    If ``corrected``, a cell is evaluated in double precision, see :func:`.assemble.of_element`.
+    """
     vec3, _ = types(dtype)
-    M, weights_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype)
+    precision = wp.float64 if corrected else dtype
+    M, weights_type, wide = wp.constant(term.rows), wp.types.vector(term.rows, dtype), types(precision)[0]
     rest_type, share_type = wp.types.vector(term.parameters, dtype), wp.types.vector(4, dtype)
-    y_of, u, gradient, area = cell_coordinate(term, dtype, corrected), term.energy, term.gradient, term.measure
+    exact_rest = wp.types.vector(term.parameters, precision)
+    y_of, u, gradient, area = cell_coordinate(term, dtype, corrected, precision), term.energy, term.gradient, term.measure
 
     @wp.kernel(module="unique", enable_backward=False)
     def evaluate_cells(
@@ -100,16 +111,16 @@ def evaluate(term: Term, dtype, corrected: bool):
         shares: wp.array(dtype=share_type),
     ):
         c = wp.tid()
-        first, last, r = offsets[c], offsets[c + 1], rest[c]
+        first, last, r = offsets[c], offsets[c + 1], exact_rest(rest[c])
         y = y_of(first, last, stencil, weights, x, d)
         g = area(r) * gradient(y, r)
         left = area(r) * u(y, r)
         for e in range(first, last):
-            force = vec3()
+            force = wide()
             for m in range(M):
-                force += weights[e][m] * g[m]
-            shares[e] = share_type(force[0], force[1], force[2], left)
-            left = dtype(0.0)
+                force += precision(weights[e][m]) * g[m]
+            shares[e] = share_type(dtype(force[0]), dtype(force[1]), dtype(force[2]), dtype(left))
+            left = left - precision(dtype(left))
 
     return evaluate_cells
 

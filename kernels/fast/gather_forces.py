@@ -64,8 +64,11 @@ def gather_term(part: TermFacts, dtype, ahead=None, lanes: int = 1):
     term = part.term
     K, damped, shared, padded = wp.constant(term.vertices), part.damped, part.shared, part.padded
     moved = damped or ahead is not None
-    y_type = wp.types.matrix((term.rows, 3), dtype)
-    part_of, share_of, local = from_corner(term, dtype), to_corner(term, dtype), local_gradient(part, dtype, ahead is not None)
+    precision = part.precision(dtype)
+    wide, y_type = types(precision)[0], wp.types.matrix((term.rows, 3), precision)
+    exact_rest = wp.types.vector(term.parameters, precision)
+    part_of, share_of = from_corner(term, precision), to_corner(term, dtype)
+    local = local_gradient(part, dtype, ahead is not None)
     vector, whole, vertex, number = load(vec3), load(wp.int32), load(wp.int32, 2), load_shared(dtype)
     moves = move_of(dtype, ahead)
     rest_of = load(wp.types.vector(term.parameters, dtype))
@@ -94,19 +97,20 @@ def gather_term(part: TermFacts, dtype, ahead=None, lanes: int = 1):
         while left > 0:
             code = whole(elements.codes, slot)
             e = code // K
-            r = rest_of(elements.rest, e)
+            stored = rest_of(elements.rest, e)
+            r = exact_rest(stored)
             y = y_type()
             dy = y_type()
             for corner in range(K):
                 j = vertex(elements.stencil, K * e + corner)
-                y += part_of(r, corner, vector(x, j))
+                y += part_of(r, corner, wide(vector(x, j)))
                 if wp.static(moved):
-                    dy += part_of(r, corner, moves(v, j, h))
+                    dy += part_of(r, corner, wide(moves(v, j, h)))
             if wp.static(damped):
                 beta = number(elements.damping, e)
             if wp.static(not shared):
                 k = number(elements.stiffness, e)
-            total += share_of(r, code - K * e, local(k, beta, r, y, dy, h))
+            total += share_of(stored, code - K * e, local(k, beta, r, y, dy, h))
             if wp.static(padded):
                 slot += lanes * count
             else:
@@ -131,8 +135,11 @@ def gather_pairs(part: TermFacts, dtype, ahead, lanes: int):
     apart = shared and not damped
     ragged, each, firsts, slots = slots % lanes > 0, wp.constant(-(-slots // lanes)), wp.constant(firsts), wp.constant(slots)
     moved = damped or ahead is not None
-    y_type = wp.types.matrix((term.rows, 3), dtype)
-    part_of, share_of, local = from_corner(term, dtype), to_corner(term, dtype), local_gradient(part, dtype, ahead is not None)
+    precision = part.precision(dtype)
+    wide, y_type = types(precision)[0], wp.types.matrix((term.rows, 3), precision)
+    exact_rest = wp.types.vector(term.parameters, precision)
+    part_of, share_of = from_corner(term, precision), to_corner(term, dtype)
+    local = local_gradient(part, dtype, ahead is not None)
     vector, whole, number, moves = load(vec3), load(wp.int32), load_shared(dtype), move_of(dtype, ahead)
     rest_of = load(wp.types.vector(term.parameters, dtype))
 
@@ -162,16 +169,17 @@ def gather_pairs(part: TermFacts, dtype, ahead, lanes: int):
             code = whole(elements.codes, slot)
             if wp.static(ragged):
                 code = wp.where(n * lanes + lane < slots, code, i)
-            r = rest_of(elements.rest, slot)
-            y = part_of(r, corner, position) + part_of(r, 1 - corner, vector(x, code))
+            stored = rest_of(elements.rest, slot)
+            r = exact_rest(stored)
+            y = part_of(r, corner, wide(position)) + part_of(r, 1 - corner, wide(vector(x, code)))
             dy = y_type()
             if wp.static(moved):
-                dy = part_of(r, corner, move) + part_of(r, 1 - corner, moves(v, code, h))
+                dy = part_of(r, corner, wide(move)) + part_of(r, 1 - corner, wide(moves(v, code, h)))
             if wp.static(damped):
                 beta = number(elements.damping, slot)
             if wp.static(not apart):
                 k = number(elements.stiffness, slot)
-            total += share_of(r, corner, local(k, beta, r, y, dy, h))
+            total += share_of(stored, corner, local(k, beta, r, y, dy, h))
         if wp.static(apart):
             total *= number(elements.stiffness, i)
         return total

@@ -24,6 +24,7 @@ class TermFacts(NamedTuple):
         rows: For the rows of the matrix of a quadratic energy, the number of slots of a vertex. Incidences then store the other
             vertices of the row, slot by slot, and ``stiffness`` its numbers. 0 otherwise.
         padded: Whether incidences that store elements have the same number of slots for each vertex, slot by slot.
+        exact: Whether elements are evaluated in double precision, see :func:`..assemble.of_element`.
     """
 
     term: Term
@@ -32,6 +33,11 @@ class TermFacts(NamedTuple):
     pairs: tuple[int, int] | None = None
     rows: int = 0
     padded: bool = False
+    exact: bool = False
+
+    def precision(self, dtype):
+        """The type of y, and of the rest state from which it is computed."""
+        return wp.float64 if self.exact else dtype
 
 
 @cache
@@ -42,9 +48,10 @@ def local_gradient(part: TermFacts, dtype, corrected: bool = False):
     explicit step with damping is compensated (:func:`warpcloth.fast.compensation.needs_compensation`), and in the gradients of
     other solvers damping is an energy.
     """
-    term = part.term
+    term, precision = part.term, part.precision(dtype)
     assert not (part.damped and corrected), f"{term.name} is damped, and evaluated with a position residual"
-    rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
+    rest_type, y_type = wp.types.vector(term.parameters, precision), wp.types.matrix((term.rows, 3), precision)
+    force_type = wp.types.matrix((term.rows, 3), dtype)
     gradient, measure = term.gradient, term.measure
 
     @wp.func
@@ -53,7 +60,7 @@ def local_gradient(part: TermFacts, dtype, corrected: bool = False):
 
     @wp.func
     def ahead(k: dtype, beta: dtype, r: rest_type, y: y_type, dy: y_type, h: dtype):
-        return (k * measure(r)) * gradient(y + dy, r)
+        return force_type((precision(k) * measure(r)) * gradient(y + dy, r))
 
     if not part.damped:
         return ahead if corrected else elastic

@@ -20,7 +20,7 @@ class GatherGradient:
     def __init__(self, model, corrected=False, terms=None):
         self.model, self.terms, self._lanes = model, model.terms if terms is None else terms, lanes_of(model)
         self._found = [gathered(model, elements, rows=False) for elements in self.terms]  # the struct holds no references
-        parts = tuple(part for part, _arrays in self._found)
+        parts = tuple(part._replace(exact=corrected) for part, _arrays in self._found)
         self._kernel = model.kernel(gather_forces, parts, model.dtype, corrected, self._lanes) if parts else None
         self._chain = chained(parts, [arrays for _part, arrays in self._found], model.dtype)
 

@@ -87,9 +87,9 @@ class Minimiser:
             self.preconditioner = wp.zeros(model.count, dtype=model.mat33, device=model.device)
         self.right = model.vectors()
         lanes = self.search.lanes
-        self._roundings = lanes.parts(2)
+        self._roundings = lanes.parts(3)
         self.edge = float(np.median(model.scene.mesh.edge_lengths))
-        self.resolution = 4.0 * float(np.finfo(model.numpy_dtype).eps)
+        self.resolution = 4.0 * float(np.finfo(np.float64).eps)  # of energies, whatever the precision of the model
         self._allocate_progress()
         self._inverse_total = None
         axes = _free_axes(model)
@@ -111,7 +111,7 @@ class Minimiser:
         self._progress, self._limits = kernels.DescentState(), kernels.Limits()
         for name in ("active", "end", "iterations"):
             setattr(self._progress, name, model.scalars(wp.int32))
-        for name in ("residual", "previous", "energy"):
+        for name in ("residual", "previous"):
             setattr(self._progress, name, model.scalars())
         self._progress.proceed, self._progress.more = flag(), flag()
         self._limits.tolerance, self._limits.scale = wp.zeros(1, dtype=wp.float64, device=model.device), model.scalars()
@@ -143,9 +143,9 @@ class Minimiser:
         """Iterates until every copy has converged, or rounding allows no further progress.
 
         A copy has converged if max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a, with the acceleration a = ``scale`` (B,) [m/s²], above 0.
-        Rounding allows no progress if ‖∇φ‖ is within its rounding, 4ε(Σⱼ‖Hᵢⱼ‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖) + ‖Hᵢᵢ‖·edge) per vertex, and
-        an iteration lowered φ by no more than rounding. The norm alone would not do, because the noise of stiff directions may
-        hide the error of soft ones.
+        Rounding allows no progress if ‖∇φ‖ is within its rounding, four times that of
+        :func:`warpcloth.kernels.linear.rounding`, and an iteration lowered φ by no more than rounding. The norm alone would not
+        do, because the noise of stiff directions may hide the error of soft ones.
 
         If the linear solver runs on the device, so does the loop: the host waits once in ``AT_ONCE`` iterations.
 
@@ -220,7 +220,7 @@ class Minimiser:
             wp.copy(self.right, self.correction)
         self.clear()
         self._progress.proceed.zero_()
-        given = [self.search.acceleration, self.search.energy, self._limits]
+        given = [self.search.acceleration, self._limits]
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
         if self.warm:
             self._launch_mean(self.right)

@@ -48,7 +48,7 @@ class Search:
         self.trial, self.gradient, self.direction = (model.vectors() for _ in range(3))
         self.correction = model.vectors() if correction is None else correction
         self.state = state = kernels.LineSearch()
-        for name in ("energy", "slope", "step", "trial_energy", "trial_slope", "square", "acceleration", "other"):
+        for name in ("energy", "before", "slope", "step", "trial_energy", "trial_slope", "square", "acceleration", "other"):
             setattr(state, name, model.scalars())
         state.searching = model.scalars(wp.int32)
         state.trials, state.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
@@ -60,8 +60,8 @@ class Search:
             ((kernels.measure_start, kernels.check_guess, kernels.check_trial), lanes.block),
         )
         # Relative increase of φ that the approximate Wolfe condition counts as rounding. The energy of a spring of strain e has
-        # a relative error of 2ε/e, so that √ε covers strains down to √ε.
-        self.noise = float(np.sqrt(np.finfo(model.numpy_dtype).eps))
+        # a relative error of 2ε/e, so that √ε covers strains down to √ε; ε is that of float64, in which energies are computed.
+        self.noise = float(np.sqrt(np.finfo(np.float64).eps))
 
     def launch_start(self):
         """Launches d = 0, φ and ∇φ."""
