@@ -23,9 +23,9 @@ def of_element(term: Term, dtype, corrected: bool):
 
     A third one, which also takes a Hessian policy, gives kₑ Aₑ ∂²u/∂y².
 
-    If ``corrected``, the energy and its gradient are evaluated in double precision at the float32 positions x + d. Else a spring
-    would have a rounding error of ε k L, in stiff cloth more than its weight, that bends the cloth; and the rounding of the
-    energy would hide a slow descent.
+    If ``corrected``, the energy and its gradient are computed in double precision, also from x and d in float32. Else the force
+    of a spring would have a rounding error of ε k L, in stiff cloth more than its weight, and the rounding of the energy would
+    hide a slow descent.
     """
     vec3, _ = types(dtype)
     indices, numbers, vectors = wp.array2d(dtype=wp.int32), wp.array(dtype=dtype), wp.array(dtype=vec3)

@@ -165,8 +165,8 @@ def rounding(dtype, block: int):
     """Kernel over (copies, lanes): b = −∇φ, and the parts of estimates of the rounding errors of the force and of the energy.
 
     They are Σ(ρ + ε‖A[i, i]‖ edge)² [N²] and Σ½ρ²/‖A[i, i]‖ [J] with ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖). The typical edge
-    length stands for pinned neighbours, which are not in the matrix. In float32, elements are evaluated in double precision, see
-    :func:`.assemble.of_element`, so that the parts with ‖xⱼ − xᵢ‖ and with the edge are 0.
+    length stands for pinned neighbours, which are not in the matrix. In float32 the parts with ‖xⱼ − xᵢ‖ and with the edge are
+    0, because elements are evaluated in double precision, see :func:`.assemble.of_element`.
 
     The third part is max 2ε²‖A[i, i]‖ [N/m]. Times φ it is an estimate of Σ(εF)² for the forces F of elements, of which the
     sum is rounded: F² ≤ 2‖A‖u for an energy u ≥ 0 of curvature ‖A‖.

@@ -20,10 +20,10 @@ WORK, SLOPE, SQUARE, LARGEST, ROWS = 0, 1, 2, 3, 4
 class LineSearch:
     """The line search of each copy, (B,) arrays, and of all, (1,).
 
-    ``energy`` is φ at d [J], ``before`` that where the search began, ``slope`` its derivative along p and ``step`` the length of the trial step. At the trial they are
-    ``trial_energy`` and ``trial_slope``, with ``square``, ‖∇φ‖² [N²], and ``acceleration``, max ‖∇φᵢ‖/mᵢ [m/s²]. ``other`` is
-    an energy that is not in the parts. ``searching`` is 1 until a step is found. ``trials`` counts, and ``proceed`` is 1 if
-    another is needed.
+    ``energy`` is φ at d [J], ``before`` its value where the search began, ``slope`` its derivative along p and ``step`` the
+    length of the trial step. At the trial they are ``trial_energy`` and ``trial_slope``, with ``square``, ‖∇φ‖² [N²], and
+    ``acceleration``, max ‖∇φᵢ‖/mᵢ [m/s²]. ``other`` is an energy that is not in the parts. ``searching`` is 1 until a step is
+    found. ``trials`` counts, and ``proceed`` is 1 if another is needed.
     """
 
     energy: wp.array(dtype=wp.float64)

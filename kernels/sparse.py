@@ -44,7 +44,7 @@ def share_hessian(y: Any, rest: Any, policy: int):
 def share(term: Term):
     """The :class:`.term.Term` of one vertex of a cell. Its rest state is A∂u/∂x (3) and Au, which the cell computes.
 
-    The first vertex of a cell has the energy, and the next ones what rounding it to ``dtype`` left. The Hessian couples vertices;
+    The first vertex of a cell has the energy, the next ones what its rounding left. The Hessian couples vertices;
     :func:`blocks` gives it.
     """
     given = _rest_state, weight, measure, share_energy, share_gradient, share_hessian
