@@ -144,6 +144,20 @@ def test_still_air_takes_energy(name, device):
     assert total[-1] < 0.9 * (none.energies["kinetic"] + none.energies["Spring"])[-1]
 
 
+@pytest.mark.parametrize("name", ["explicit", "newton", "midpoint"])
+def test_the_work_of_air_is_that_of_the_change_of_momentum(name, device):
+    """Of a sheet that nothing else moves, and that stays rigid: F = mΔv/h in each step, wherever a step takes its forces."""
+    solver = replace(SOLVERS[name], substeps=1)
+    given = {"velocities": np.tile([1.0, 0.5, -2.0], (16, 1)), "terms": [wc.Spring(stiffness=0.3)]}
+    scene = sheet(gravity=(0.0, 0.0, 0.0), air=wc.Air(wind=(-1.0, 2.0, 0.5)), **given)
+    run = wc.simulate(scene, solver, device=device, dtype="float64", record="energies")
+    impulses = scene.vertex_masses[:, None] * np.diff(run.velocities, axis=0)
+    steps = np.einsum("fij,fij->f", impulses, np.diff(run.points, axis=0)) * scene.fps
+    kinetic = run.energies["kinetic"]
+    assert np.ptp(kinetic) > 0.2 * kinetic[0]
+    np.testing.assert_allclose(run.energies["work of air"][1:], np.cumsum(steps), rtol=0.0, atol=1e-7 * kinetic[0])
+
+
 MEET = {
     "admm": wc.ADMM(substeps=1, tolerance=1e-11, iterations=8000),
     "xpbd": wc.XPBD(substeps=1, iterations=4000),

@@ -47,13 +47,23 @@ def pushed(keyframes=PULSE):
 
 @pytest.mark.parametrize("name", TAKEN)
 def test_keyframes_of_forces_are_impulses(name, device):
-    """Linear between keyframes and constant after the last: v = Σ h f(t + c h)/m."""
+    """Linear between keyframes and constant after the last: v = Σ h f(t + c h)/m. Their work is Σ f·Δx.
+
+    Where a step takes its forces at its end, f is the mean of both ends, so that the work is of second order.
+    """
     solver, ahead = TAKEN[name]
-    run = wc.simulate(pushed(), solver, device=device, dtype="float64", frames=5)
-    times = np.arange(20) + ahead
-    forces = np.stack([np.interp(times / 4, np.arange(4), axis) for axis in PULSE.T], axis=1)
-    np.testing.assert_allclose(run.velocities[-1], np.tile(forces.sum(axis=0) / 240.0 / 0.5, (2, 1)), atol=1e-13)
+    run = wc.simulate(pushed(), solver, device=device, dtype="float64", frames=5, record="energies")
+
+    def forces(ahead):
+        return np.stack([np.interp((np.arange(20) + ahead) / 4, np.arange(4), axis) for axis in PULSE.T], axis=1)
+
+    v = np.cumsum(forces(ahead), axis=0) / 240.0 / 0.5
+    np.testing.assert_allclose(run.velocities[-1], np.tile(v[-1], (2, 1)), atol=1e-13)
     assert run.status.ok
+    over = 0.5 * (forces(0.0) + forces(1.0)) if ahead == 1.0 else forces(ahead)
+    moved = (v if ahead != 0.5 else v - 0.5 * np.diff(v, axis=0, prepend=0.0)) / 240.0
+    work = np.append(0.0, 2.0 * np.cumsum((over * moved).sum(axis=1))[3::4])  # of both masses, after each frame
+    np.testing.assert_allclose(run.energies["work of loads"], work, atol=1e-13)
 
 
 def test_bdf2_takes_keyframes_of_forces_to_second_order(device):

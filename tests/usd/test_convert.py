@@ -10,6 +10,7 @@ import warnings
 
 import numpy as np
 import pytest
+from pxr import Usd
 
 import warpcloth as wc
 from warpcloth.base import outputs
@@ -18,6 +19,7 @@ from warpcloth.mesh.mesh import Surface
 from warpcloth.mesh.sequences import open_sequence
 from warpcloth.usd.conversion import convert
 from warpcloth.usd.frames import FrameSequence
+from warpcloth.usd.stage import find_prim
 from warpcloth.usd.writer import AnimationWriter
 
 pytestmark = pytest.mark.host
@@ -214,6 +216,21 @@ def test_formats_are_those_of_others(stage, tmp_path):
     assert [path.name for path in named[:2]] == ["c2.00.ply", "c2.01.ply"]
     assert np.array_equal(open_sequence(tmp_path / "n", fps=FPS).labels, np.arange(COUNT))
     assert paths[0].read_bytes().startswith(b"ply\nformat binary_little_endian")
+
+
+@pytest.mark.parametrize("fps", [24.0, 23.976, 24000 / 1001, 29.97, 59.94])
+@pytest.mark.parametrize("source", ["a.npz", "a.mdd"])
+def test_frames_of_stages_are_at_their_seconds(source, fps, stage, tmp_path):
+    """Also of rates that are nearly whole. Caches have times in float32; a rate that is whole up to these is written so."""
+    shown = open_sequence(stage)
+    points, times = np.array([shown[0]] * 120, dtype=np.float32), np.arange(120) / fps
+    np.savez(tmp_path / "long.npz", points=points, triangles=shown.mesh.triangles, times=times)
+    convert(tmp_path / "long.npz", tmp_path / source)
+    convert(tmp_path / source, tmp_path / "b.usdc")
+    written = Usd.Stage.Open(str(tmp_path / "b.usdc"))
+    codes = find_prim(written, "b.usdc", None).GetAttribute("points").GetTimeSamples()
+    assert np.array(codes) / written.GetTimeCodesPerSecond() == pytest.approx(times, rel=1e-6, abs=1e-12)
+    assert fps != 24.0 or written.GetTimeCodesPerSecond() == 24.0
 
 
 def test_velocities_of_stages_are_kept_and_others_are_differences(stage, tmp_path):
