@@ -172,3 +172,23 @@ def test_records_of_moving_pins_do_not_change_the_motion_and_others_are_refused(
     found = recorded.energies
     gained = sum(found[name] for name in found if not name.startswith("work")) - found["work of pins"]
     assert (np.diff(gained) < 1e-3 * np.abs(found["work of pins"]).max()).all()  # Euler and damping take energy away
+
+
+@pytest.mark.parametrize("error", [1e-3, 1e-4])
+def test_the_share_of_cut_moves_is_one_of_time(error):
+    """Of two sheets that fall, one is stopped 1 mm below: half of the moves are cut from √(2·1 mm/g) on, up to 1/8 frame."""
+    sheet = wc.Mesh.grid(3, 3, size=0.2)
+    mesh = wc.Mesh.join({"stopped": sheet, "free": wc.Mesh(sheet.points + [1.0, 0.0, 0.0], sheet.triangles)})
+    below = wc.Box(size=(1.0, 0.2, 1.0), position=(0.0, -0.101, 0.0))
+    scene = wc.Scene(
+        mesh,
+        density=0.15,
+        terms=[wc.Spring(stiffness=100.0)],
+        colliders=[below],
+        contact=wc.Contact(stiffness=1e-3, distance=1e-4),  # too soft to bear the sheet
+        duration=8 / 60,
+    )
+    stepper = bound(scene, wc.Newton(error=error))
+    steps = [stepper.frame() or stepper.steps_per_frame for _ in range(8)]
+    assert steps[0] > steps[1] and steps[0] >= 8
+    assert stepper.cut[0] == pytest.approx(0.5 * (1.0 - np.sqrt(2e-3 / GRAVITY) / scene.duration), abs=0.5 / 8 / 8)
