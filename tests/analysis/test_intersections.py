@@ -158,6 +158,10 @@ def test_vertices_of_boundaries_at_one_position_are_sewn_while_they_stay_togethe
     apart[9:] += [0.1, 0.0, 0.0]
     found = wc.intersections([both.points, apart], both)  # which are not sewn, as they part
     assert found.frames[1].clean and not found.frames[0].clean
+    slid = both.points.copy()
+    slid[:9] += [0.0, 0.0, np.ptp(mesh.points[:, 2]) / 2.0]
+    found = wc.intersections([both.points, slid], both)  # nor these, which have another partner in each frame
+    assert not found.frames[1].clean and not found.frames[0].clean
     inner = both.points.copy()
     inner[4] = inner[13]  # vertices that are on no boundary
     assert not wc.intersections(inner, both).clean

@@ -178,7 +178,7 @@ def test_records_of_moving_pins_do_not_change_the_motion_and_others_are_refused(
 def test_the_share_of_cut_moves_is_one_of_time(error):
     """Of two sheets that fall, one is stopped 1 mm below: half of the moves are cut from √(2·1 mm/g) on, up to 1/8 frame."""
     sheet = wc.Mesh.grid(3, 3, size=0.2)
-    mesh = wc.Mesh.join({"stopped": sheet, "free": wc.Mesh(sheet.points + [1.0, 0.0, 0.0], sheet.triangles)})
+    mesh = wc.Mesh.join({"stopped": sheet, "free": wc.Mesh(sheet.points + np.array([1.0, 0.0, 0.0]), sheet.triangles)})
     below = wc.Box(size=(1.0, 0.2, 1.0), position=(0.0, -0.101, 0.0))
     scene = wc.Scene(
         mesh,
