@@ -2,9 +2,11 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import Delaunay
 from scipy.stats import binomtest
 
@@ -400,6 +402,36 @@ def test_markers_and_readings_together(device):
     alone = wc.fit(sheet(1.0, 1.0), SOLVER, TRUE, data[:1], device=device)
     assert all(found.errors[name] < alone.errors[name] for name in TRUE), "each datum narrows the interval"
     assert len(found.residuals) == scene.frames and found.freedom == np.inf
+
+
+def test_free_points_are_seen_at_their_distances():
+    """Above the cloth, beside its edges, and on it, as far as trimesh says; and so, to first order, of cloth that has moved."""
+    scene, random = sheet(1.0, 1.0), np.random.default_rng(0)
+    moved = random.normal(size=(2, *scene.positions.shape))
+    points = scene.positions + 0.02 * moved[0]
+    corners = points[scene.mesh.triangles]
+    on = np.einsum("tc,tci->ti", random.dirichlet(np.ones(3), len(corners)), corners)
+    seen = np.concatenate([on, points[scene.mesh.boundary] * [1.004, 1.0, 1.004] - [0.001, 0.0, 0.001], on + [0.0, 0.1, 0.0]])
+    seen[[3, 25]] = np.nan
+    known = np.isfinite(seen).all(axis=1)
+    bound = wc.Markers(positions=seen[None]).bind("measured", scene, 1)
+    runs = [SimpleNamespace(points=np.array([scene.positions, points + size * moved[1]])) for size in (0.0, 1e-6)]
+    for found, run in zip(bound.residuals(runs), runs, strict=True):
+        cloth = trimesh.Trimesh(run.points[1], scene.mesh.triangles, process=False)
+        away = trimesh.proximity.closest_point_naive(cloth, seen[known])[1]
+        assert np.abs(found) == pytest.approx(away, abs=5e-9)  # the square of 1e-6 over a distance of 1 mm
+    assert len(bound.frames) == known.sum()
+
+
+@pytest.mark.parametrize("points", [None, 1, 7, 40, 1000])
+def test_captures_are_thinned_to_at_most_the_points_that_are_asked_for(points):
+    """To every second vertex, third and so on: to no fewer than half of them."""
+    capture, scene = captured(noise=0.0), sheet(1.0, 1.0)
+    every, some = (wc.CapturePoints(capture, points=each).bind("measured", scene, FRAMES).frames for each in (None, points))
+    given = np.bincount(every)
+    steps = np.ceil(given / (points or given.max()))
+    assert np.bincount(some).tolist() == np.ceil(given / steps).tolist()
+    assert points is None or (np.bincount(some) <= points).all()
 
 
 SEEN, K = np.zeros((3, 2, 3)), {"Spring.stiffness": 1.0}
