@@ -411,7 +411,9 @@ def test_free_points_are_seen_at_their_distances():
     points = scene.positions + 0.02 * moved[0]
     corners = points[scene.mesh.triangles]
     on = np.einsum("tc,tci->ti", random.dirichlet(np.ones(3), len(corners)), corners)
-    seen = np.concatenate([on, points[scene.mesh.boundary] * [1.004, 1.0, 1.004] - [0.001, 0.0, 0.001], on + [0.0, 0.1, 0.0]])
+    seen = np.concatenate(
+        [on, points[scene.mesh.boundary] * [1.004, 1.0, 1.004] - [0.001, 0.0, 0.001], on + np.array([0.0, 0.1, 0.0])]
+    )
     seen[[3, 25]] = np.nan
     known = np.isfinite(seen).all(axis=1)
     bound = wc.Markers(positions=seen[None]).bind("measured", scene, 1)
