@@ -149,6 +149,86 @@ def sun_axes(z):
     return np.stack([x, np.cross(z, x), z])
 
 
+def light(normals, camera):
+    """Light on planes with these unit normals (…, 3) that see the sun and the whole sky, as a fraction of that facing the sun.
+
+    A sky, 15 % brighter from above than from the side, gives 42 % of the light there, the sun 58 %.
+    """
+    up = np.array([0.0, 1.0, 0.0])
+    sun = camera.sun(up)
+
+    def of(n):
+        return 0.42 * (1.0 + 0.15 * (n @ up - 1.0)) + 0.58 * np.maximum(n @ sun, 0.0)
+
+    return of(np.asarray(normals)) / of(sun)
+
+
+@pytest.mark.parametrize("elevation", [-60.0, 10.0, 60.0])
+def test_a_plane_has_the_light_of_its_tilt(device, elevation):
+    """From facing the sun to turned away from it, towards the ground or the sky, within one of 255."""
+    camera, colour = Camera.framed([SQUARE], 0.0, elevation, aspect=1.0), 0.6
+    view = np.subtract(camera.position, camera.target)
+    caster = RayCaster([Shape(4, HALVES, colour=(colour,) * 3)], 16, 16, contrast=1.0, device=device)
+    normals = np.random.default_rng(0).normal(size=(12, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    across = normals @ view / np.linalg.norm(view)
+    normals = (normals * np.sign(across)[:, None])[np.abs(across) > 0.2]
+    expected = light(normals, camera)
+    found = [linear(caster.image([SQUARE @ sun_axes(n)], camera)[8, 8, 1]) / colour for n in normals]
+    assert len(normals) > 6 and np.ptp(expected) > 0.3
+    assert found == pytest.approx(expected, abs=0.01)  # 1/255 of sRGB, relative to a light of 0.4 or more
+
+
+@pytest.mark.parametrize("elevation", [-20.0, 30.0])
+def test_a_wall_on_a_tilted_plane_hides_its_part_of_the_sky(device, elevation):
+    """Of rays with the density of cos θ about the normal, those that meet the wall within half the height of the picture.
+
+    They have 0.3 of their light. The sun is behind the plane. Rays are even to one in 100.
+    """
+    away, length, fov = 0.3, 10.0, 40.0
+    view = np.array([0.0, np.sin(np.radians(elevation)), np.cos(np.radians(elevation))])
+    camera = Camera(6.0 * view, (0.0, 0.0, 0.0), fov=fov)
+    sun = camera.sun(np.eye(3)[1])
+    # Seen aslant, from beside the wall, and turned away from the sun.
+    n = view - 1.6 * (sun - (sun @ view) * view) / np.linalg.norm(sun - (sun @ view) * view)
+    n /= np.linalg.norm(n)
+    from_wall = view - (view @ n) * n
+    from_wall /= np.linalg.norm(from_wall)
+    along = np.cross(n, from_wall)
+    assert n @ sun < 0.0 < n @ view
+    edge = np.array([-length, length])[:, None] * along - away * from_wall
+    points = np.concatenate([edge, edge[::-1] + length * from_wall, edge[::-1] + length * n])
+    shape = Shape(6, [[0, 1, 2], [0, 2, 3], [0, 1, 4], [0, 4, 5]], colour=(0.6,) * 3, back=(1.0,) * 3, smooth=False)
+    caster = RayCaster([shape], 32, 32, 64, contrast=1.0, device=device)
+    found = linear(caster.image([points], camera)[15:17, 15:17, 1]).mean() / 0.6
+    u, turn = np.meshgrid((np.arange(400) + 0.5) / 400.0, (np.arange(400) + 0.5) / 400.0 * 2.0 * np.pi)
+    towards_wall = np.sqrt(u) * np.cos(turn)  # of rays at sin²θ = u
+    hidden = (towards_wall * 6.0 * np.tan(np.radians(0.5 * fov)) > away).mean()
+    assert 0.3 < hidden < 0.5
+    assert found == pytest.approx(light(n, camera) * (1.0 - 0.7 * hidden), abs=0.01)
+
+
+@pytest.mark.parametrize("bend", [20.0, 90.0])
+@pytest.mark.parametrize("smooth", [True, False])
+def test_edges_that_bend_by_little_are_round_and_others_sharp(device, bend, smooth):
+    """Of a roof. Its normals turn evenly from one half to the other if it bends by 20°, and are those of the halves at 90°."""
+    half = np.radians(0.5 * bend)
+    roof = np.array([[x, -abs(s) * np.sin(half), s * np.cos(half)] for s in (-1.0, 0.0, 1.0) for x in (-1.0, 1.0)])
+    triangles = [[0, 3, 1], [0, 2, 3], [2, 5, 3], [2, 4, 5]]
+    camera = Camera((0.0, 6.0, 0.0), (0.0, 0.0, 0.0), up=(0.0, 0.0, -1.0), fov=20.0)
+    size, colour = 101, 0.6
+    caster = RayCaster([Shape(6, triangles, colour=(colour,) * 3, smooth=smooth)], size, size, 1, contrast=1.0, device=device)
+    found = linear(caster.image([roof], camera))[:, size // 2, 1] / colour
+    s = np.linspace(-0.9, 0.9, 41)
+    rows = 0.5 * size * (1.0 + s * np.cos(half) / (6.0 + np.abs(s) * np.sin(half)) / np.tan(np.radians(10.0)))
+    sides = np.stack([0.0 * s, np.cos(half) + 0.0 * s, np.sign(s) * np.sin(half)], axis=1)
+    middle = np.array([0.0, 1.0, 0.0])
+    normals = (1.0 - np.abs(s))[:, None] * middle + np.abs(s)[:, None] * sides if smooth and bend < 70.0 else sides
+    expected = light(normals / np.linalg.norm(normals, axis=1, keepdims=True), camera)
+    seen = np.abs(s) > 0.05  # on either side of the ridge
+    assert np.interp(rows[seen], np.arange(size) + 0.5, found) == pytest.approx(expected[seen], abs=0.015)
+
+
 def test_both_sides_of_cloth_are_lit_alike_and_the_back_has_its_own_colour(device):
     camera = Camera.framed([SQUARE], aspect=1.0)
     shape = Shape(4, HALVES, colour=(0.2, 0.4, 0.6), back=(0.5, 1.0, 1.0))
