@@ -228,6 +228,23 @@ def test_friction_on_edges(name, slope):
         assert (v[-1] - v[9]) / 0.15 == pytest.approx(9.81 * (np.sin(down) - 0.3 * np.cos(down)), rel=0.01)
 
 
+def test_triangles_that_were_lifted_off_forget_where_they_were(device):
+    """A sheet that cannot move along rails drags on them by μmg. They leave it, and come back elsewhere: then by nothing.
+
+    Normals of the rails are turned by a few hundredths along x, so that their friction is balanced to that.
+    """
+    along, up = np.array([0.0, 1.0, 2.0, 3.0, 3.0, 13.0, 13.0]), np.array([0.0, 0.0, 0.0, 0.0, -20.0, -20.0, -14.0])
+    at, ground = 1e-3 * np.stack([along, up, 0.0 * up], axis=1), rails(0.05, 0.15, 0.25)
+    below = wc.MeshCollider(*ground, position=at, friction=0.3, name="rails")
+    scene = replace(lying(ground), colliders=[below], pins=wc.Pins("all", axes="xz"), duration=10 / 60)
+    run = wc.simulate(scene, wc.Newton(substeps=4), device=device, dtype="float64", record="reactions")
+    assert run.cut == 0.0
+    weight = 9.81 * scene.vertex_masses.sum()
+    pressed, rubbed = run.collider_forces["rails"][:, 1], run.friction_forces["rails"][:, 0]
+    assert rubbed[3] == pytest.approx(-0.3 * weight, rel=0.02) and pressed[5] == 0.0
+    assert pressed[-1] == pytest.approx(-weight, rel=0.01) and abs(rubbed[-1]) < 0.01 * 0.3 * weight
+
+
 def test_copies_are_independent(device):
     """One of two copies is hit at once, so the rounds of its filter go on where the other has none; to the bit."""
     scene, solver = falling(MESHES["spike"], 1.0), wc.XPBD(substeps=1, iterations=10)
