@@ -1116,3 +1116,24 @@ def test_pins_that_cross_at_the_start_are_free(name, device):
         stepper.frame()
         assert stepper.state.x.numpy() == pytest.approx(keyframes[frame], abs=1e-12)
     assert not stepper.pairs.tangles.left().any()
+
+
+@few_solvers
+def test_forces_wait_until_all_tangles_of_a_pair_are_free(name, device):
+    """Two pinned triangles with a common vertex cross a free one, through which this vertex is led, to 3 mm above it.
+
+    The first is then free, but the second has another corner below until frame 4. Only then does contact push the free one.
+    """
+    large = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    around = [[0.3, -0.003, 0.3], [0.2, 0.1, 0.2], [0.3, 0.1, 0.2], [0.4, 0.1, 0.3], [0.35, -0.1, 0.35]]
+    keyframes = np.tile(around, (7, 1, 1))
+    keyframes[1:, 0, 1] = 0.003
+    keyframes[4:, 4, 1] = 0.1
+    mesh = wc.Mesh(np.concatenate([large, around]), [[0, 1, 2], [3, 4, 5], [3, 6, 7]])
+    contact = wc.SelfContact(distance=5e-3, stiffness=1e4, crossing_start="run")
+    given = {"terms": [wc.Spring(stiffness=1.0)], "pins": wc.Pins(np.arange(3, 8), keyframes), "self_contact": contact}
+    scene = wc.Scene(mesh, density=0.1, fps=24.0, gravity=(0.0, 0.0, 0.0), duration=6 / 24, **given)
+    run = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64")
+    moved = np.abs(run.points[:, :3] - large).max(axis=(1, 2))
+    assert (moved[:4] < 1e-9).all() and moved[-1] > 1e-3
+    assert run.points[3] == pytest.approx(np.concatenate([large, keyframes[3]]), abs=1e-9)
