@@ -233,8 +233,9 @@ def _parser():
     for sub in (runs, benches):
         sub.add_argument("--threads", type=int, default=1, metavar="N", help="number of CPU threads (default: 1)")
     for sub in (runs, infos, deforms, analyzes, chooses, benches, fitted):
-        default = "float64" if sub in (deforms, analyzes, fitted) else "float32"
-        sub.add_argument("--dtype", choices=DTYPES, default=default, help=f"precision (default: {default})")
+        default = "float64" if sub in (deforms, analyzes, fitted) else None
+        text = default or "by device and solver"
+        sub.add_argument("--dtype", choices=DTYPES, default=default, help=f"precision (default: {text})")
     for sub in (runs, deforms, resamples):
         text = "the .usd, .usda, .usdc or .usdz file to write"
         text += (

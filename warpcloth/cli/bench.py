@@ -42,7 +42,7 @@ also has the largest number of near pairs, how often they were listed, the moves
 """
 
 
-_OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": "float32"}
+_OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": None}
 
 
 def add_arguments(parser):

@@ -105,7 +105,8 @@ def _add_work_precision(charts):
         help="frames to simulate (default: half of the scene's); for the diagrams solver and spectrum, frames to simulate "
         "before the step that is measured (default: a third)",
     )
-    sub.add_argument("--dtype", choices=DTYPES, help="precision (default: float32 for the diagram time, else float64)")
+    text = "precision (default: by device and solver for the diagram time, else float64)"
+    sub.add_argument("--dtype", choices=DTYPES, help=text)
     sub.add_argument(
         "--limit",
         type=float,
@@ -132,7 +133,7 @@ def _add_cheapest(charts):
     sub.add_argument(
         "--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)"
     )
-    sub.add_argument("--dtype", choices=DTYPES, default="float32", help="precision (default: float32)")
+    sub.add_argument("--dtype", choices=DTYPES, help="precision (default: by device and solver)")
     sub.add_argument(
         "--limit",
         type=float,

@@ -119,7 +119,7 @@ def command_line(arguments, values, setup):
     words += ["--solver", setup.solver, "-s", *(f"{name}={value}" for name, value in setup.options.items())]
     words += [] if arguments.frames is None else ["--frames", str(arguments.frames)]
     words += [] if arguments.device == "cpu" else ["--device", arguments.device]
-    return shlex.join([*words, "--dtype", arguments.dtype, "-o", "out.usdc"])
+    return shlex.join([*words, "--dtype", setup.precision_on(arguments.device, arguments.dtype), "-o", "out.usdc"])
 
 
 def _scene(arguments, values):

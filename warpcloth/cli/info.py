@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 from ..base.quiet import find_device
 from ..base.texts import fraction, json_text
+from .options import DEFAULT
 from .setup import EPILOG as EPILOG
 from .setup import Chosen, fewest_below, hint_of, named_scene, solver_facts, solver_line, solver_setup
 from .terminal import Progress
@@ -14,6 +15,7 @@ from .terminal import Progress
 
 def info(arguments):
     from ..scene.freedom import freedom
+    from ..solvers import SOLVERS
 
     source, values, scene = named_scene(arguments)
     device = find_device(arguments.device)
@@ -22,8 +24,11 @@ def info(arguments):
     for name in ("tolerance", "frames"):
         if getattr(arguments, name) is not None:
             raise ValueError(f"--{name} is given without --advise, which it is for")
-    setup = solver_setup(arguments, scene, device, limits=True) if arguments.solver or arguments.s else Chosen()
-    model = setup.model or scene.build(device=device, dtype=arguments.dtype)
+    if arguments.solver or arguments.s:
+        setup = solver_setup(arguments, scene, device, limits=True)
+    else:  # in the precision of a run by default
+        setup = Chosen(SOLVERS[DEFAULT].precision_on(device, arguments.dtype))
+    model = setup.model or scene.build(device=device, dtype=setup.dtype)
     facts = {
         "scene": {
             "name": scene.name,
@@ -91,24 +96,26 @@ def advise_on(arguments, source, values, scene, device):
     from ..lab.advice import advise
 
     tolerance = 0.01 if arguments.tolerance is None else fraction("tolerance", arguments.tolerance)
-    solver = solver_setup(arguments, scene, device).checked
+    setup = solver_setup(arguments, scene, device)
     resolutions = _resolutions(source, values, len(scene.mesh.points))
     with contextlib.closing(Progress(None, first="trying")) as progress:
         found = advise(
             scene,
-            solver,
+            setup.checked,
             tolerance,
             arguments.frames,
             resolutions=resolutions,
             device=device,
-            dtype=arguments.dtype,
+            dtype=setup.dtype,
             progress=progress,
         )
     facts = {
         "scene": scene.name,
         "parameters": values,
         "solver": arguments.solver,
-        "options": asdict(solver),
+        "options": asdict(setup.checked),
+        "device": str(device),
+        "dtype": setup.dtype,
         "tolerance": tolerance,
         "frames": found.frames,
         "milliseconds": list(found.milliseconds),

@@ -41,8 +41,9 @@ def run(arguments):
             device=device,
             frames=frames,
             progress=progress,
+            dtype=setup.dtype,
             record=record,
-            **values_of(arguments, "output", "dtype", "single_file", "resume", "threads"),
+            **values_of(arguments, "output", "single_file", "resume", "threads"),
         )
         progress.close()
         status = animation.status
@@ -76,9 +77,10 @@ def run(arguments):
             "residual_unit": status.unit,
             **solver_facts(arguments, setup, scene.fps),
             "device": str(device),
+            "dtype": setup.dtype,
             "file": arguments.output,
             "frames_folder": frames_folder_of(arguments),
-            **values_of(arguments, "dtype", "threads", "film", "csv", "report"),
+            **values_of(arguments, "threads", "film", "csv", "report"),
         }
         print(json_text(facts) if arguments.json else _summary(facts, animation.inside))
         if status.ok:

@@ -40,6 +40,7 @@ class Chosen:
     """A solver, with the model that was built to choose its step.
 
     Attributes:
+        dtype: The precision of the run.
         solver: The solver with its options, as shown.
         checked: The solver to run, without a check of limits that are known to hold.
         chosen: How its step was chosen, or None if it was given.
@@ -48,6 +49,7 @@ class Chosen:
         seconds: Time to build the model and compute the limits [s].
     """
 
+    dtype: str
     solver: object = None
     checked: object = None
     chosen: str | None = None
@@ -76,25 +78,24 @@ def solver_setup(arguments, scene, device, limits=False):
 
     arguments.solver = arguments.solver or DEFAULT
     record = SOLVERS[arguments.solver]
+    dtype = record.precision_on(device, arguments.dtype)
     given = options(record, assignments(arguments.s))
     step_given = not set(record.step_options).isdisjoint(given)
     solver = record(**given, **({} if step_given else {"substeps": 1}))  # checks options before anything is built
     if not record.limited:
         if step_given:
-            return Chosen(solver, solver)
+            return Chosen(dtype, solver, solver)
         solver = replace(solver, substeps=max(1, round(_STEPS_A_SECOND / scene.fps)))
-        return Chosen(solver, solver, "by default about 1/240 s")
+        return Chosen(dtype, solver, solver, "by default about 1/240 s")
     if step_given and not limits:
-        return Chosen(solver, solver)
+        return Chosen(dtype, solver, solver)
     from ..mesh.ordering import order_of_run
     from ..solvers.step import fewest_substeps
 
     began = time.perf_counter()
-    model = scene.build(
-        device=device, dtype=arguments.dtype, order=order_of_run(scene, solver), threads=getattr(arguments, "threads", 1)
-    )
+    model = scene.build(device=device, dtype=dtype, order=order_of_run(scene, solver), threads=getattr(arguments, "threads", 1))
     rest, motion = record.step_limits(model)
-    setup = Chosen(solver, solver, None, model, (rest, motion), time.perf_counter() - began)
+    setup = Chosen(dtype, solver, solver, None, model, (rest, motion), time.perf_counter() - began)
     if not step_given:
         setup.solver = replace(solver, substeps=fewest_substeps(scene.fps, rest, motion))
         setup.chosen = f"by default the fewest stable ones, limits {rest:.3g} and {motion:.3g} s"

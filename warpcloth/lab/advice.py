@@ -110,7 +110,7 @@ class Advice:
         return found
 
 
-def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device="cpu", dtype="float32", progress=None):
+def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device="cpu", dtype=None, progress=None):
     """Leaves out each term, each collider and its friction, and the air in turn, makes terms of fabrics isotropic, and changes
     precision, step and resolution.
 
@@ -123,7 +123,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         frames: Number of frames; by default those of the scene, but at most 30.
         resolutions: The same scene with coarser or finer meshes by name, such as {"n=16": scene}; or None.
         device: A Warp device.
-        dtype: "float32" or "float64"; the other one is a trial.
+        dtype: "float32" or "float64", by default that of a run; the other one is a trial.
         progress: Function called with (trials done, trials) after each; or None.
 
     Returns:
@@ -135,6 +135,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
     number("tolerance", tolerance, above=0.0)
     frames = min(scene.frames, 30) if frames is None else frames
     whole("frames", frames, least=1)
+    dtype = solver.precision_on(device, dtype)
 
     def run(changed, solver=solver, dtype=dtype):
         found = simulate(changed, solver, device=device, dtype=dtype, frames=frames)

@@ -23,7 +23,7 @@ class SolverBenchmark:
         setup: The solver; a limited solver without a step takes the fewest stable substeps of each size.
         sizes: Resolutions of the scene, see :func:`warpcloth.lab.cells.refined`; if empty, the scene as it is.
         device: A Warp device.
-        dtype: ``"float32"`` or ``"float64"``.
+        dtype: ``"float32"`` or ``"float64"``, by default that of a run with the solver.
         frames: Maximum number of frames to time.
         copies: Number of copies of the scene in a batch.
         threads: Number of CPU threads.
@@ -34,7 +34,7 @@ class SolverBenchmark:
     setup: Setup
     sizes: tuple = ()
     device: str = "cpu"
-    dtype: str = "float32"
+    dtype: str | None = None
     frames: int = 20
     copies: int = 1
     threads: int = 1
@@ -149,7 +149,8 @@ class Run:
 
     def _row(self, benchmark, scene, cold, compiles):
         setup = benchmark.setup_of(scene)
-        given = {"device": benchmark.device, "dtype": benchmark.dtype, "copies": benchmark.copies, "threads": benchmark.threads}
+        dtype = SOLVERS[setup.solver].precision_on(benchmark.device, benchmark.dtype)
+        given = {"device": benchmark.device, "dtype": dtype, "copies": benchmark.copies, "threads": benchmark.threads}
 
         def measured(frames):
             return _alone(task(measure, scene=scene, setup=setup, frames=frames, started=time.time(), **given))

@@ -15,7 +15,7 @@ from .choosing import FINER, Measured, climb, ladders, measured, percent
 from .machine import machine
 from .measurements import SceneRef, task
 from .reference import reference
-from .setups import label, setups_of_runs
+from .setups import label, precisions, setups_of_runs
 
 # Settings that take more than this many times the cheapest are not searched, so the second best is known up to this ratio.
 BEYOND = 4.0
@@ -36,7 +36,7 @@ FACTS += ("warp", "warpcloth", "source")
 _compiled = set()
 
 
-def cheapest_map(scene, x, y=None, tolerance=0.01, solvers=None, frames=None, device="cpu", dtype="float32", limit=60.0, **run):
+def cheapest_map(scene, x, y=None, tolerance=0.01, solvers=None, frames=None, device="cpu", dtype=None, limit=60.0, **run):
     """Measures which solver and settings are the cheapest that meet a tolerance, for each pair of values of two parameters.
 
     Args:
@@ -47,7 +47,7 @@ def cheapest_map(scene, x, y=None, tolerance=0.01, solvers=None, frames=None, de
         solvers: Names of solvers, by default all.
         frames: Number of frames, by default those of the scene.
         device: A Warp device, also for the reference solutions.
-        dtype: Precision of the runs; reference solutions have float64.
+        dtype: Precision of the runs, by default that of a run with each solver; reference solutions have float64.
         limit: Time limit of the search in each cell [s].
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`.
 
@@ -66,21 +66,21 @@ def cheapest_map(scene, x, y=None, tolerance=0.01, solvers=None, frames=None, de
     for of, axis in (("x", x), ("y", y)):
         if axis is not None and axis[0] in scene.parameters:
             raise ValueError(f"{axis[0]} is given as a parameter of the scene and as {of}; give it once")
-    tasks = []
+    tasks, setups = [], []
     for below, across in pairs:
         at = SceneRef(scene.name, {**scene.parameters, x[0]: across, **({} if y is None else {y[0]: below})}, scene.pins)
         declared = at.load()
         given = {"scene": at, "digest": scene_digest(declared), "frames": declared.frames if frames is None else frames}
         whole("frames", given["frames"], 1)
         given |= {"tolerance": tolerance, "solvers": solvers, "device": str(device), "dtype": dtype, "limit": limit}
-        setups_of_runs(at, solvers, device, dtype)  # checks names
+        setups += setups_of_runs(at, solvers, device, dtype)  # checks names
         tasks.append(task(measure, **given))
     # One at a time, because parallel runs would slow one another.
     found = collect(tasks, "cheapest", **{"workers": 1, **run})
     cells = [
         {"x": across, "y": below, **cell, "machine": where} for (below, across), (cell, where) in zip(pairs, found, strict=True)
     ]
-    facts = {"scene": str(scene), "device": str(device), "dtype": dtype, "machine": machine(device)}
+    facts = {"scene": str(scene), "device": str(device), "dtype": precisions(setups, device, dtype), "machine": machine(device)}
     return {**facts, "x": x, "y": y, "tolerance": tolerance, "frames": frames, "limit": limit, "cells": cells}
 
 
@@ -98,7 +98,7 @@ def measure(scene, digest, frames, tolerance, solvers, device, dtype, limit):
         tolerance: Largest error.
         solvers: Names, or None for all.
         device: A Warp device.
-        dtype: ``"float32"`` or ``"float64"``.
+        dtype: ``"float32"``, ``"float64"`` or None, as for :func:`cheapest_map`.
         limit: Time limit [s] of all runs and what they bind, without the kernels that each solver compiles first and without
             the reference solution, which may take six times as long.
 
@@ -182,7 +182,7 @@ def cheapest_of_each(found, tolerance, floor):
 
 
 def _facts(each):
-    facts = {"solver": each.setup.solver, "options": each.setup.options, "label": label(each.setup)}
+    facts = {"solver": each.setup.solver, "options": each.setup.options, "label": label(each.setup), "dtype": each.dtype}
     return facts | {"ms": each.milliseconds, "spread": each.spread, "error": each.error, "strain_error": each.strain_error}
 
 

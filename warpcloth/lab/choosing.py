@@ -47,6 +47,7 @@ class Measured:
         own_error: Error relative to the motion to which a solver of another simulator itself converges, or None.
         seconds: Time of its frames [s].
         status: "ok", "diverged", "slow", "refused", or "left" if it was not measured.
+        dtype: The precision of its run, or None if it was not measured.
     """
 
     setup: Setup
@@ -60,6 +61,7 @@ class Measured:
     own_error: float | None = None
     seconds: float = 0.0
     status: str = "ok"
+    dtype: str | None = None
 
 
 @dataclass(frozen=True)
@@ -257,7 +259,7 @@ def choose(
     solvers=None,
     frames=None,
     device="cpu",
-    dtype="float32",
+    dtype=None,
     limit=60.0,
     others=(),
     clock="wall",
@@ -277,7 +279,7 @@ def choose(
         solvers: Names of solvers, by default all.
         frames: Number of frames, by default those of the scene.
         device: A Warp device, also for the reference.
-        dtype: Precision of the runs, "float32" or "float64".
+        dtype: Precision of the runs, "float32" or "float64"; by default that of a run with each solver.
         limit: Time limit of each run [s].
         others: Simulators whose solvers are measured too, such as ``["newton"]``, each until its own cheapest setting is
             found by :func:`climb_others`, within six time limits; its own reference has as much time again.
@@ -390,9 +392,8 @@ def measured(setup, result, machine):
     seconds = 1e-3 * (result["ms"] or 0.0) * result["frames"]
     own = result.get("own_error")
     strain, status = result["strain_error"], result["status"]
-    return Measured(
-        setup, result["error"], result["ms"], spread, result["reason"], machine, final, strain, own, seconds, status
-    )
+    of_run = strain, own, seconds, status, result["dtype"]
+    return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final, *of_run)
 
 
 def as_json(choice, found, exact):

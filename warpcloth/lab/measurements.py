@@ -10,7 +10,7 @@ from functools import cache
 from importlib import import_module
 
 from ..base.digest import source_digest
-from ..others.simulators import other_solvers, shown_name
+from ..others.simulators import other_solvers, shown_name, simulator_of
 from ..run import scene_files
 from ..solvers import SOLVERS
 from . import machine
@@ -78,6 +78,11 @@ class Setup:
             return make(**self.options)
         except TypeError as error:
             raise ValueError(f"{self.solver}: {error}") from None
+
+    def precision_on(self, device, dtype=None):
+        """Returns the precision of its runs on a device; a simulator has its own, whatever ``dtype`` is."""
+        other = simulator_of(self.solver)
+        return SOLVERS[self.solver].precision_on(device, dtype) if other is None else other.dtype
 
     def __str__(self):
         return " ".join([shown_name(self.solver), *(f"{name}={value}" for name, value in self.options.items())])

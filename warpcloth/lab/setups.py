@@ -22,7 +22,7 @@ def setups_of_steps(solvers=None):
     return [Setup(name, options) for name in names for options in SOLVERS[name].facts.one_step]
 
 
-def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32", others=()):
+def setups_of_runs(scene, solvers=None, device="cpu", dtype=None, others=()):
     """Returns the :class:`Setup`\\s of runs of a :class:`SceneRef`, of all solvers or of those named, each once.
 
     Those of ``others``, simulators of :data:`warpcloth.others.simulators.SIMULATORS`, come last.
@@ -57,6 +57,11 @@ def setups_of_runs(scene, solvers=None, device="cpu", dtype="float32", others=()
     return list({str(setup): setup for setup in setups}.values())
 
 
+def precisions(setups, device, dtype=None):
+    """Returns the precisions of the runs of setups, such as "float32 and float64"."""
+    return " and ".join(sorted({setup.precision_on(device, dtype) for setup in setups}))
+
+
 def label(setup):
     """Returns a setup in a few words, such as "xpbd bdf2 80×1", without tolerances that never end a step."""
     options = dict(setup.options)
@@ -88,7 +93,7 @@ def _checked(names, known):
 
 def _fewest(record, scene, device, dtype):
     """Returns the fewest stable substeps of a limited solver; 1 with hard constraints, which it refuses."""
-    declared = scene.load()
+    declared, dtype = scene.load(), record.precision_on(device, dtype)
     try:
         return fewest_substeps(declared.fps, *record.step_limits(declared.build(device=device, dtype=dtype)))
     except ValueError:

@@ -19,6 +19,7 @@ from .setups import label
 from .work_precision import WITHIN, front
 
 _FEWEST = 3  # frames whose times are averaged
+_DTYPE = "float32"  # which most other simulators have
 
 
 def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **given):
@@ -54,7 +55,8 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
         ValueError: As for :func:`warpcloth.lab.choosing.choose`.
     """
     clock = "process" if wp.get_device(device).is_cpu else "wall"
-    choice, measured, exact = choose(scene, tolerance, frames=frames, device=device, others=others, clock=clock, **given)
+    given |= {"device": device, "dtype": _DTYPE, "others": others, "clock": clock}
+    choice, measured, exact = choose(scene, tolerance, frames=frames, **given)
     declared = scene.load()
     rows = [_row(each, declared.fps) for each in measured]
     for i in front(rows, exact.error):
@@ -68,7 +70,7 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
         "diagram": "time",
         "scene": str(scene),
         "device": str(device),
-        "dtype": "float32",
+        "dtype": _DTYPE,
         "machine": machine(device),
         "seed": None,
         "frames": len(exact.points) - 1,
@@ -159,7 +161,7 @@ def _bound(scene, setup, device):
 
         return run
     order = order_of_run(scene, record)
-    stepper = record.bind(scene.build(device=device, order=order))
+    stepper = record.bind(scene.build(device=device, dtype=_DTYPE, order=order))
     points, back = Mirror(stepper.state.x), slice(None) if order is None else np.argsort(order)
 
     def run_own():

@@ -14,9 +14,7 @@ from .measurements import SceneRef, Setup, finite
 from .reference import Reference, position_error, strain_error
 
 
-def measure(
-    scene, setup, frames=None, reference=None, device="cpu", dtype="float32", limit=60.0, repeats=1, own=None, clock="wall"
-):
+def measure(scene, setup, frames=None, reference=None, device="cpu", dtype=None, limit=60.0, repeats=1, own=None, clock="wall"):
     """Runs a scene with a setup. Arguments and results are JSON values.
 
     Args:
@@ -25,7 +23,7 @@ def measure(
         frames: Number of frames, by default that of the reference, or without one that of the scene.
         reference: Path of a :class:`warpcloth.lab.reference.Reference` with at least as many frames, or None.
         device: A Warp device.
-        dtype: ``"float32"`` or ``"float64"``.
+        dtype: ``"float32"`` or ``"float64"``, by default that of a run with the solver.
         limit: Time limit [s] of the frames of all runs, without compilation and factorisation, checked once per frame.
         repeats: Number of runs to time; fewer if the limit is reached after the first.
         own: Path of the :class:`warpcloth.lab.reference.Reference` to which the solver itself converges, or None.
@@ -46,6 +44,7 @@ def measure(
           ``factorise_s``, that of constant matrices [s].
         - ``residual``, ``message``: Those of the :class:`warpcloth.core.status.Status`, with warnings of the solver.
         - ``frames``: Number of good frames.
+        - ``dtype``: The precision of the runs.
 
     Raises:
         ValueError: An argument is not allowed, or the reference is of another scene or too short.
@@ -59,7 +58,7 @@ def measure(
     frames = _checked_frames(frames, declared, exact)
     least = max(frames, 2)  # as the first warms up
     found = dict.fromkeys(("error", "strain_error", "ms", "spread", "ms_per_second", "compile_s", "factorise_s", "residual"))
-    found = {"status": "ok", "reason": "", **found, "message": "", "frames": 0}
+    found = {"status": "ok", "reason": "", **found, "message": "", "frames": 0, "dtype": setup.precision_on(device, dtype)}
     runs, spent, left = [], [], limit
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", UserWarning)

@@ -17,7 +17,7 @@ from .machine import machine
 from .measurements import task
 from .own_reference import SHARE, of_own, own_facts, own_references
 from .reference import reference
-from .setups import label, setups_of_runs, setups_of_steps
+from .setups import label, precisions, setups_of_runs, setups_of_steps
 
 # Divisors of a scene's frames: the frames before the step of "solver" and "spectrum", and the frames of "time". Later motion is
 # chaotic, so that its error says little about a method.
@@ -97,7 +97,7 @@ def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float6
     return {**_facts("solver", scene, device, dtype), **facts, "rows": rows}
 
 
-def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32", limit=20.0, watch=None, others=(), **run):
+def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype=None, limit=20.0, watch=None, others=(), **run):
     """Measures the error of trajectories and their time, over steps and iterations, see :func:`trajectory.measure`.
 
     The rows of solvers of other simulators also have ``own_error``, that relative to the motion to which the solver itself
@@ -108,7 +108,7 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
         solvers: Names as on the command line; None for all.
         frames: Number of frames; by default half of the scene's.
         device: A Warp device, also for the reference solution.
-        dtype: Precision of the runs; the reference solution has float64.
+        dtype: Precision of the runs, by default that of a run with each solver; the reference solution has float64.
         limit: Time limit of each setting [s]; that of the reference solution is six times this, but at least 120 s.
         watch: Function called with the progress of the reference solution, see :func:`reference`, or None.
         others: Simulators whose solvers are measured too, such as ``["newton"]``.
@@ -139,7 +139,7 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float32"
     facts = {"seed": None, "frames": frames, "reference": known}  # nothing is drawn at random
     if own:
         facts["others"] = {name: own_facts(each, exact, mesh, bound) for name, each in own.items()}
-    return {**_facts("time", scene, device, dtype), **facts, "rows": rows}
+    return {**_facts("time", scene, device, precisions(setups, device, dtype)), **facts, "rows": rows}
 
 
 def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from ..base.checks import choice, whole
+from ..base.checks import whole
 from ..base.interrupts import recording
 from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
 from ..base.notebooks import ShownInNotebooks
@@ -19,7 +19,6 @@ from ..base.turns import in_turn
 from ..base.types import FilePath, Precision, Progress
 from ..core.status import Status, Stopped
 from ..mesh.ordering import order_of_run
-from ..model.precision import DTYPES
 from ..scene.scene import Scene
 from ..solvers.step import Step
 from ..usd import FrameSequence
@@ -199,7 +198,7 @@ def simulate(
     solver: Step,
     output: FilePath | None = None,
     device: str = "cpu",
-    dtype: Precision = "float32",
+    dtype: Precision | None = None,
     frames: int | None = None,
     copies: int = 1,
     vary: Mapping[str, ArrayLike] | None = None,
@@ -221,7 +220,8 @@ def simulate(
         output: Path of a USD file (.usd, .usda, .usdc, .usdz) to write, frame by frame, so that memory does not grow. If the
             scene was read from a stage, the animation is a layer over that stage.
         device: A Warp device.
-        dtype: ``"float32"`` or ``"float64"``.
+        dtype: ``"float32"`` or ``"float64"``, in which the run computes and keeps frames in memory; by default that of
+            :meth:`warpcloth.solvers.step.Step.precision_on`. USD files hold float32.
         frames: Number of frames after the first; by default that of the scene.
         copies: See :class:`warpcloth.model.model.Model`; ``output`` takes one copy.
         vary: See :class:`warpcloth.model.model.Model`.
@@ -258,7 +258,7 @@ def simulate(
     frames = scene.frames if frames is None else frames
     whole("frames", frames, 1, MOST_FRAMES)
     whole("copies", copies, 1)
-    choice("dtype", dtype, tuple(DTYPES))
+    dtype = solver.precision_on(device, dtype)
     record = checked_record(record, scene)
     if output is not None and copies != 1:
         raise ValueError(f"copies is {copies}; output takes the animation of one copy")

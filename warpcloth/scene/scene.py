@@ -464,7 +464,11 @@ class Scene:
         order: ArrayLike | None = None,
         threads: int = 1,
     ) -> Model:
-        """Builds the :class:`warpcloth.model.model.Model` of this scene on a device."""
+        """Builds the :class:`warpcloth.model.model.Model` of this scene on a device.
+
+        A model has no solver, so the default of ``dtype`` is float32 on every device. For the precision of
+        :func:`warpcloth.simulate`, pass :meth:`warpcloth.solvers.step.Step.precision_on` of the solver.
+        """
         return Model(self, device=device, dtype=dtype, copies=copies, vary=vary, order=order, threads=threads)
 
     def __str__(self) -> str:

@@ -103,7 +103,7 @@ class ADMM(ImplicitStep):
 
     name = "admm"
     needs, locks = (ELEMENTS, FINITE), True
-    touches_itself = True
+    touches_itself = double_on_cpu = True
     residual = Residual("largest primal or dual residual of a vertex (as an acceleration)")
     facts = Facts(
         method="implicit steps by the alternating direction method of multipliers",

@@ -54,7 +54,7 @@ class HierarchicalPBD(Step):
 
     name = "hierarchical-pbd"
     needs, locks = (MERGED_DAMPING, LOCAL_STEP, CLOSED_STEP, NORMAL_FORCE, NO_AIR), True
-    ordered = closes = touches_itself = True
+    ordered = closes = touches_itself = double_on_cpu = True
     facts = Facts(
         method="PBD that also sweeps over coarser levels of the mesh, so that fine cloth stretches less",
         suits="hard, fine cloth far from rest: one sweep of 6 ms leaves less strain than 2.8 s of `PBD` (n = 256)",

@@ -55,7 +55,7 @@ class Newton(ImplicitStep):
     name = "newton"
     needs = (FINITE,)
     residual, locks = Residual(UNBALANCED), True
-    touches_itself = True
+    touches_itself = double_on_cpu = True
     facts = Facts(
         method="implicit steps by Newton's method with a line search",
         suits="convergence studies, equilibria, small stiff cloth; the reference for the others",

@@ -55,7 +55,7 @@ class PBD(Step):
 
     name = "pbd"
     needs, locks = (MERGED_DAMPING, LOCAL_STEP, CLOSED_STEP, NORMAL_FORCE, NO_AIR), True
-    touches_itself = True
+    touches_itself = double_on_cpu = True
     closes, multipliers = True, False  # λ does not add up over the sweeps of a step
     facts = Facts(
         method="position based dynamics, by Gauss–Seidel or Jacobi sweeps",

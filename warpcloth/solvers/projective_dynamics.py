@@ -76,7 +76,7 @@ class ProjectiveDynamics(ImplicitStep):
 
     name = "projective-dynamics"
     needs, locks = (FINITE, CONSTANT_MATRIX), True
-    touches_itself = True
+    touches_itself = double_on_cpu = True
     residual = Residual(UNBALANCED)
     facts = Facts(
         method="implicit steps by local projections and global solves with a constant matrix",

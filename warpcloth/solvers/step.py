@@ -7,10 +7,13 @@ from typing import ClassVar, Literal
 from ..base.checks import choice, keep_plain, number, shown, whole
 from ..base.extensions import note
 from ..base.limits import MOST
+from ..base.quiet import find_device
 from ..base.texts import words_of
 from ..base.turns import methods_in_turn
+from ..base.types import Precision
 from ..core.status import Residual
 from ..model.model import Model
+from ..model.precision import DTYPES
 from ..numerics.integrators import INTEGRATORS
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, NORMAL_FORCE, Need, listed, refuse_unmet
@@ -65,6 +68,7 @@ class Step:
         locks: Whether it supports locked coordinates, by ``free_axes`` or the axes of pins.
         limited: Whether it refuses steps above a stability limit, see :meth:`step_limits`.
         step_options: Names of the options of which exactly one must be given.
+        double_on_cpu: Whether runs on the CPU are in float64 by default, see :meth:`precision_on`.
 
     Raises:
         ValueError: Both or neither are given, or the given one is not above 0.
@@ -81,6 +85,7 @@ class Step:
     facts: ClassVar[Facts] = Facts()
     limited: ClassVar[bool] = False
     step_options: ClassVar[tuple[str, ...]] = ("dt", "substeps")
+    double_on_cpu: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -88,6 +93,25 @@ class Step:
 
     dt: float | None = None
     substeps: int | None = None
+
+    @classmethod
+    def precision_on(cls, device: str, dtype: Precision | None = None) -> Precision:
+        """Returns the precision of runs: ``dtype``, or if that is None the default of the solver on a device.
+
+        The default is float64 on the CPU if it costs at most 15 % of the time there, see ``benchmarks/precision.py``, and
+        float32 otherwise. All that runs a solver takes its default from here.
+
+        Args:
+            device: A Warp device.
+            dtype: ``"float32"``, ``"float64"`` or None.
+
+        Raises:
+            ValueError: There is no such precision or device.
+        """
+        if dtype is None:
+            return "float64" if cls.double_on_cpu and not find_device(device).is_cuda else "float32"
+        choice("dtype", dtype, tuple(DTYPES))
+        return dtype
 
     def residual_on(self, model: Model) -> Residual | None:
         """Returns the residual that its steps report on a model; it may depend on the terms."""

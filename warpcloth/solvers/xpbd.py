@@ -73,7 +73,7 @@ class XPBD(ImplicitStep):
 
     name = "xpbd"
     needs, locks = (MERGED_DAMPING, LOCAL_STEP, CLOSED_STEP), True
-    touches_itself = True
+    touches_itself = double_on_cpu = True
     residual, multipliers = Residual(UNBALANCED), True  # λ adds up over the sweeps of a step
     facts = Facts(
         method="PBD with compliance; converges to an implicit step with more sweeps",
