@@ -298,6 +298,23 @@ def test_each_solver_runs_with_its_default_step(tmp_path, capfd, solver, step):
     assert FrameSequence(output).shape == (4, 25, 3)
 
 
+PRECISIONS = [
+    ("newton", (), "float64"),
+    ("explicit", (), "float32"),
+    ("newton", ("--dtype", "float32"), "float32"),
+    ("explicit", ("--dtype", "float64"), "float64"),
+]
+
+
+@pytest.mark.parametrize(("solver", "given", "dtype"), PRECISIONS)
+def test_what_precision_was_used_is_said(solver, given, dtype, tmp_path, capfd):
+    words = [*SMALL, "--solver", solver, *given]
+    lines = run(capfd, "run", *words, "--frames", 1, "-o", tmp_path / "a.usdc")[1].splitlines()
+    assert f"  device        cpu, {dtype}" in lines
+    assert json.loads(run(capfd, "run", *words, "--frames", 1, "--json", "-o", tmp_path / "b.usdc")[1])["dtype"] == dtype
+    assert json.loads(run(capfd, "info", *words, "--json")[1])["model"]["dtype"] == dtype
+
+
 def test_json_is_one_object_with_the_facts_of_the_summary(tmp_path, capfd):
     output = tmp_path / "out.usdc"
     options = ["-s", "dt=1/120", "iterations=1", "-s", "tolerance=1e-9"]

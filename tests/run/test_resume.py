@@ -213,7 +213,6 @@ OTHERS = {
     "another scene": ({"scene": replace(moved(), gravity=(0.0, -1.0, 0.0))}, "had another scene; run as then"),
     "another option": ({"solver": wc.XPBD(substeps=1, iterations=3)}, r"had the solver XPBD\(.*iterations=4.*iterations=3"),
     "another solver": ({"solver": wc.Newton(substeps=1)}, r"had the solver XPBD\(.*, and this one has the solver Newton\("),
-    "another precision": ({"dtype": "float64"}, "had dtype float32, and this one has dtype float64"),
     "other values": ({"vary": {"gravity": [[0.0, -1.0, 0.0]]}}, "had other values of vary"),
 }
 
@@ -259,6 +258,16 @@ def test_a_checkpoint_of_another_machine_is_refused(fact, tmp_path, device):
     replace(checkpoint, facts=checkpoint.facts | {fact: 7 if fact == "threads" else "Toaster 3"}).write(path.parent)
     with pytest.raises(ValueError, match=f"the run that was interrupted had {FOREIGN[fact]}"):
         wc.simulate(**given, resume=True)
+
+
+def test_the_precision_is_that_of_the_run_by_default(tmp_path, device):
+    scene, solver, output = moved(), SOLVERS["xpbd"], str(tmp_path / "out.usdc")
+    precisions = ("float64", "float32") if device == "cpu" else ("float32", "float64")
+    interrupted(scene, solver, output, STOP, device=device)
+    with pytest.raises(ValueError, match="had dtype {}, and this one has dtype {}; run as then".format(*precisions)):
+        wc.simulate(scene, solver, output=output, device=device, dtype=precisions[1], resume=True)
+    resumed = wc.simulate(scene, solver, output=output, device=device, dtype=precisions[0], resume=True)
+    assert same(wc.simulate(scene, solver, output=str(tmp_path / "whole.usdc"), device=device), resumed)
 
 
 def test_where_there_is_nothing_to_resume_that_is_said(tmp_path, device):

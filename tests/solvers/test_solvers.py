@@ -634,6 +634,32 @@ def test_moving_pins_follow_their_keyframes(device):
         assert np.allclose(stepper.state.v.numpy()[0], 0.0)
 
 
+# Defaults on the CPU; where float64 takes over 15 % longer, in benchmarks/precision.py, it is float32.
+PRECISIONS = dict.fromkeys(["explicit", "constrained dynamics"], "float32")
+PRECISIONS |= dict.fromkeys(["newton", "projective dynamics", "admm", "pbd", "hierarchical pbd", "xpbd"], "float64")
+
+
+@pytest.mark.parametrize("name", MAIN)
+def test_the_default_precision_follows_from_device_and_solver(name, device):
+    """Of the record and its class; one that is given wins, and what is no precision is refused."""
+    solver = SOLVERS[name]
+    for asked in (solver, type(solver)):
+        assert asked.precision_on(device) == (PRECISIONS[name] if device == "cpu" else "float32")
+        assert [asked.precision_on(device, dtype) for dtype in ("float32", "float64")] == ["float32", "float64"]
+        with pytest.raises(ValueError, match="dtype is 'float16'; it must be one of 'float32', 'float64'"):
+            asked.precision_on(device, "float16")
+
+
+@pytest.mark.parametrize("name", ["explicit", "xpbd"])
+def test_runs_have_the_default_precision_and_models_without_a_solver_float32(name, device):
+    scene, solver = square(solver=SOLVERS[name], fps=600.0), SOLVERS[name]
+    expected = PRECISIONS[name] if device == "cpu" else "float32"
+    for dtype in (None, "float32", "float64"):
+        found = wc.simulate(scene, solver, frames=1, device=device, dtype=dtype)
+        assert found.points.dtype == found.velocities.dtype == (dtype or expected)
+    assert scene.build(device=device).numpy_dtype is np.float32
+
+
 def test_a_host_call_inside_a_captured_segment_raises(device):
     """A recorded host call would read what nothing has computed and be missing from every replay."""
     at = wp.get_device(device)

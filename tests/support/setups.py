@@ -42,7 +42,7 @@ MAIN = (
     "constrained dynamics",
     "admm",
 )
-# What runs of each is tested in float32, which users have; in float64 the kernels are the same.
+# What runs of each is tested in float32, which rounds more and is the default on CUDA; in float64 the kernels are the same.
 RUNS = [(name, "float32") for name in SOLVERS] + [(name, "float64") for name in MAIN]
 
 

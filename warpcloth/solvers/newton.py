@@ -31,7 +31,8 @@ class Newton(ImplicitStep):
             gravity and what loads and wind add to it; without these by the radius of the cloth over the square of the duration,
             see :class:`warpcloth.numerics.iterate.ResidualScale`. If rounding leaves a larger residual, as in stiff cloth in
             float32, a step ends when no progress is possible, and its result says so.
-        iterations: Maximum number of Newton iterations in a step.
+        iterations: Maximum number of Newton iterations in a step. If cloth snaps from one fold to another, a step may take more
+            than 100; in ``flag`` one takes 137.
         hessian: Treatment of an indefinite Hessian (Choi and Ko 2002 for springs). ``"clamp"`` and ``"absolute"`` make the
             block of each element semi-definite in every iteration; ``"adaptive"`` clamps only in iterations whose matrix is
             found to be indefinite; ``"raw"`` changes nothing.
@@ -74,7 +75,7 @@ class Newton(ImplicitStep):
     )
 
     tolerance: float = 1e-3
-    iterations: int = 100
+    iterations: int = 300
     hessian: Literal["adaptive", "raw", "clamp", "absolute"] = "adaptive"
     linear: Literal["cg", "factorised"] = "cg"
 
