@@ -166,6 +166,7 @@ def test_the_command(capsys):
     assert kinds == ["term", "term", "all", "precision", "step", "resolution", "resolution"]  # 2 frames need neither term
     assert [trial["finer"] for trial in facts["trials"]] == [None] * 5 + [False, True]
     assert facts["tolerance"] == 0.01
+    assert facts["dtype"] == "float64" and facts["trials"][3]["name"] == "float32"
 
 
 @pytest.mark.parametrize(

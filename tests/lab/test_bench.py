@@ -297,6 +297,7 @@ def test_the_command_measures_copies(device, capsys, monkeypatch):
     assert main([*command, "--json"]) == 0
     (found,) = json.loads(capsys.readouterr().out)["rows"]
     assert found["copies"] == 3 and found["vertices"] == 3 * 16
+    assert found["dtype"] == ("float64" if device == "cpu" else "float32")  # as in a run
     assert found["cloths_per_s"] == pytest.approx(3e3 / found["ms"])
     assert not ratios(result(found), result({**found, "copies": 1}))
 

@@ -330,6 +330,9 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert main([*command, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["meets"] and facts["chosen"]["error"] <= 0.01 and facts["command"].split() == last
+    default = {"xpbd": "float64", "explicit": "float32"}
+    assert all(each["dtype"] == default[each["setup"]["solver"]] for each in facts["measured"])
+    assert last[last.index("--dtype") + 1] == default[facts["chosen"]["setup"]["solver"]]
     assert (tmp_path / "cache" / "trajectories.jsonl").read_text() == stored
     run = ["run", "hanging", "-p", "n=5", "--frames", "6", "-o", "out.usdc"]
     assert main([*run, "--tolerance", "1%"]) == 0
@@ -357,6 +360,7 @@ def test_the_map_of_the_cheapest(tmp_path, monkeypatch, capsys):
         assert main(MAP + outputs) == 0
         found.append(json.loads(capsys.readouterr().out))
     assert found[0] == found[1] and (tmp_path / "map.png").stat().st_size > 0
+    assert found[0]["dtype"] == "float32 and float64"  # explicit and PBD
     cells = found[0]["cells"]
     assert [(cell["x"], cell["y"]) for cell in cells] == [("4", "100"), ("5", "100"), ("4", "400"), ("5", "400")]
     rows = list(csv.DictReader((tmp_path / "map.csv").open()))
@@ -371,6 +375,7 @@ def test_the_map_of_the_cheapest(tmp_path, monkeypatch, capsys):
         assert explicit in (cell["options"], other["options"]) and cell["solver"] != other.get("solver")
         assert row["second_options"] == (json.dumps(other["options"]) if cell["second"] else "")
         assert (row["x_value"], row["y_value"], row["complete"]) == (cell["x"], cell["y"], "True")
+        assert row["dtype"] == cell["dtype"] == ("float32" if cell["solver"] == "explicit" else "float64")
     steps = [each["setup"]["options"]["substeps"] for cell in cells for each in cell["measured"][:1]]
     assert steps[2] == pytest.approx(2.0 * steps[0], abs=1.0)  # explicit steps grow with the root of the stiffness
 

@@ -391,11 +391,13 @@ def test_time_diagram(device, tmp_path, drawn):
     assert [line["label"] for line in lines] == list(rows) and lines[-1]["error"] == ""
     facts = {
         "scene": "hanging(n=6)",
-        "dtype": "float32",
         "seed": "",
         **{k: "" if v is None else str(v) for k, v in found["machine"].items()},
     }
     assert all(line[name] == value for line in lines for name, value in facts.items())
+    double = ["newton"] if device == "cpu" else []  # by default
+    assert all(line["dtype"] == ("float64" if line["solver"] in double else "float32") for line in lines)
+    assert found["dtype"] == ("float32 and float64" if double else "float32")
     assert float(lines[0]["error"]) == found["rows"][0]["error"] and float(lines[0]["strain_error"]) > 0.0
     drawn[0].draw_without_rendering()  # until then texts have the size that they have in the file, at positions of the figure
     axes, strains, _notes = drawn[0].axes

@@ -98,9 +98,9 @@ class Advice:
             )
         for trial in self.trials:
             if trial.kind == "precision" and trial.matters is False:
-                found.append(f"float32 is enough: float64 changes the result by {trial.change:.2%} alone")
+                found.append(f"float32 is enough: its result and that of float64 differ by {trial.change:.2%} alone")
             elif trial.kind == "precision" and trial.matters:
-                found.append(f"float64 changes the result by {trial.change:.2%}: take it")
+                found.append(f"the results of float32 and float64 differ by {trial.change:.2%}: take float64")
         finer = [trial for trial in self.trials if trial.finer]
         coarser = [trial for trial in self.trials if trial.finer is False]
         found += [f"{trial.name}: {trial.reason}" for trial in finer if trial.matters is None]
