@@ -2,9 +2,9 @@
 
     python benchmarks/random_scenes.py [--seeds 0:1000] [--solver NAME] [--device cpu|cuda:0] [--processes 1] [--json FILE]
 
-Scenes, judges and their tolerances are those of tests/support. Prints each condemned run that is called usable, and then a table
-by solver: runs by their end, runs that are condemned, those of them that are called usable, and runs that are not usable though
-no judge condemns them. Exits with 1 if a condemned run is called usable.
+Scenes, judges and their tolerances are those of tests/support. Prints each condemned run that is called usable. Then prints a
+table by solver: runs by their end, runs that are condemned, those of them that are called usable, and runs that are not usable
+though no judge condemns them. Exits with 1 if a condemned run is called usable.
 """
 
 import argparse

@@ -7,6 +7,8 @@ scene has such frames. Errors below the tolerances pass, and each judge says wha
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 import warpcloth as wc
 
@@ -59,9 +61,10 @@ class Run:
         rounding: 64 units in the last place of the largest coordinate, or of 1 m: what a few operations and the poses of
             colliders lose [m].
         masses: (n,) [kg], a third of each adjacent triangle if the scene has a density.
+        pins: Those of the scene, or None if it has none.
         free: Which vertices have no pin, (n,).
         times: (F+1,) [s].
-        edges: (E, 2).
+        springs: Pairs of vertices (E, 2), the edges of the triangles unless springs have other pairs.
         lengths: Their lengths at rest (E,) [m].
     """
 
@@ -73,12 +76,14 @@ class Run:
         self.vertex_areas = np.bincount(self.triangles.ravel(), np.repeat(self.areas, 3) / 3.0, len(points))
         self.masses = scene.density * self.vertex_areas if scene.masses is None else np.asarray(scene.masses)
         self.free = np.ones(len(points), dtype=bool)
-        if scene.pins is not None:
-            self.free[scene.pins.vertices] = False
+        self.pins = scene.pins if scene.pins is not None and len(scene.pins.vertices) else None
+        if self.pins is not None:
+            self.free[self.pins.vertices] = False
         self.times = np.arange(len(x)) / scene.fps
         self.h = 1.0 / scene.fps
-        self.edges = edges_of(self.triangles)
-        self.lengths = np.linalg.norm(points[self.edges[:, 1]] - points[self.edges[:, 0]], axis=1)
+        other = [term for term in scene.terms if isinstance(term, wc.Spring) and term.pairs != "edges"]
+        self.springs = other[0].stencil(scene.mesh) if other else edges_of(self.triangles)
+        self.lengths = np.linalg.norm(points[self.springs[:, 1]] - points[self.springs[:, 0]], axis=1)
         self.colliders = tuple(scene.colliders or ())
         self.gravity = np.asarray(scene.gravity, np.float64)
         self.loads = tuple(scene.loads or ())
@@ -123,7 +128,7 @@ def pierced(run):
         if not isinstance(collider, wc.MeshCollider) or run.scene.contact.elements != "triangles":
             continue
         sides, margin = edges_of(collider.triangles), 1e-3 * run.scene.contact.distance + run.rounding
-        edges, triangles = (each[run.free[each].all(axis=1)] for each in (run.edges, run.triangles))
+        edges, triangles = (each[run.free[each].all(axis=1)] for each in (edges_of(run.triangles), run.triangles))
         for f, x in enumerate(run.x):
             points = posed(collider, f)
             count = cross(x[edges], points[collider.triangles], margin).sum()
@@ -137,8 +142,8 @@ def pierced(run):
 
 def pins_left(run):
     """Condemns pins that are not where they are declared, by more than rounding."""
-    pins = run.scene.pins
-    if pins is None or not len(pins.vertices):
+    pins = run.pins
+    if pins is None:
         return None
     keyframes = run.x[:1, pins.vertices] if pins.keyframes is None else pins.keyframes
     wanted = keyframes[np.minimum(np.arange(len(run.x)), len(keyframes) - 1)]
@@ -187,7 +192,7 @@ def one_edge(run):
     available, exact = energy_available(run)
     if not stiffness or available is None:
         return None
-    strain = np.abs(_edge_lengths(run) / run.lengths - 1.0)
+    strain = np.abs(_spring_lengths(run) / run.lengths - 1.0)
     alone = 0.5 * stiffness[0] * (np.maximum(strain - 0.05, 0.0) * run.lengths) ** 2
     allowed = available + _residual_work(run)
     if isinstance(run.solver, wc.Explicit):
@@ -203,20 +208,18 @@ def one_edge(run):
 def momentum(run):
     """Condemns a momentum of cloth in free flight that gravity does not explain, by 1 % of what its motion has.
 
-    Cloth has no pins, loads or air and has not yet been within a step of a collider. Residuals of :data:`RESIDUAL` g change
-    the momentum by that fraction of the fall. Self-contact conserves it, its filter need not, so frames that are within reach of
-    other cloth count as contact too where it is declared.
+    Frames count until cloth may touch: no pins, loads or air, and in the next step no vertex can get to a collider and no part
+    of the cloth to another. Residuals of :data:`RESIDUAL` g change the momentum by that fraction of the fall only.
     """
     scene, x, v = run.scene, run.x, run.v
-    if scene.pins is not None or run.loads or scene.air is not None:
+    if run.pins is not None or run.loads or scene.air is not None:
         return None
-    speeds = np.linalg.norm(v, axis=2).max(axis=1) + np.linalg.norm(run.gravity) * run.h
-    gaps = [gap.min(axis=1) - scene.contact.distance for gap in run.distances]
-    gaps += [np.array([_gap_of_sheets(run, f) for f in range(len(x))])] if scene.self_contact is not None else []
-    moving = _obstacle_speed(run)
+    speeds = np.linalg.norm(v, axis=2).max(axis=1) + np.linalg.norm(run.gravity) * run.h + _obstacle_speed(run)
     touched = np.zeros(len(x), dtype=bool)
-    for gap in gaps:
-        touched |= gap < (speeds + moving) * run.h
+    for gaps in run.distances:
+        touched |= gaps.min(axis=1) < scene.contact.distance + speeds * run.h
+    if scene.self_contact is not None:
+        touched |= [_may_touch_itself(run, f) for f in range(len(x))]
     count = int(touched.argmax()) if touched.any() else len(x)
     P = np.einsum("i,fik->fk", run.masses, v)
     wanted = P[0] + run.masses.sum() * run.gravity * run.times[:, None]
@@ -229,23 +232,41 @@ def momentum(run):
     return Condemnation("momentum", f, f"off by {off[f]:.3g} N s of {scale[f]:.3g} N s in free flight")
 
 
+def _may_touch_itself(run, f):
+    """Returns whether parts of the cloth may touch in the next step.
+
+    Pieces are too near if vertices of one are within twice r and the way of a step of triangles of the other. One piece may
+    touch itself if vertices are nearer than 0.7 of their distance at rest: pairs touch within half of that at most.
+    """
+    x, rest = run.x[f], np.asarray(run.scene.mesh.points)
+    way = 2.0 * run.h * np.linalg.norm(run.v[f] - run.v[f].mean(axis=0), axis=1).max()
+    _, labels = connected_components(coo_matrix((np.ones(len(run.springs)), run.springs.T), (len(x), len(x))))
+    same = labels[:, None] == labels
+    np.fill_diagonal(same, False)
+    apart, apart_at_rest = (np.linalg.norm(points[:, None] - points, axis=2)[same] for points in (x, rest))
+    if (apart < 0.7 * apart_at_rest + way).any():
+        return True
+    near = from_triangles(x, x[run.triangles])[labels[:, None] != labels[run.triangles[:, 0]]]
+    return near.size > 0 and near.min() < 2.0 * (run.scene.self_contact.distance + way)
+
+
 def pressed(run):
     """Condemns a plane that presses cloth with more than 3 times the force that the motion of the cloth shows, for 5 steps.
 
     The only collider is a plane that stands still, and nothing else holds the cloth. The normal force N of the declared energy,
     k A φ′ at the distances of the frames, and filters, which only push outwards, give hΣN ≤ MΔv − hΣ(Mg + F). The distances
-    must also be wrong, by more than r/4: the mean distance is compared with that at which the pressure is right.
+    must also be wrong, by more than r/4: the mean distance of touching vertices is compared with that of the right pressure.
     """
     scene, plane = run.scene, run.colliders[0] if len(run.colliders) == 1 else None
     stands = isinstance(plane, wc.Plane) and len(np.atleast_2d(plane.position)) == len(np.atleast_2d(plane.rotation)) == 1
     substeps = getattr(run.solver, "substeps", 1)
-    if not stands or scene.pins is not None or scene.air is not None or substeps != 1 or len(run.x) < 7:
+    if not stands or run.pins is not None or scene.air is not None or substeps != 1 or len(run.x) < 7:
         return None
     if scene.contact.stiffness is None:
         return None
     n, r, k = rotated(plane.rotation, plane.normal), scene.contact.distance, scene.contact.stiffness
     force = k * (run.vertex_areas * barrier_slope(run.distances[0], r)).sum(axis=1)
-    acting = run.masses.sum() * (run.gravity @ n) + sum(np.asarray(load.force) @ n for load in run.loads)
+    acting = _forces(run).sum(axis=0) @ n
     P = np.einsum("i,fik,k->f", run.masses, run.v, n)
     window = 5
     for f in range(1 + window, len(run.x)):
@@ -253,21 +274,24 @@ def pressed(run):
         needed = max((P[f] - P[f - window]) / (window * run.h) - acting, 0.0)
         if pushed.min() <= 3.0 * needed + RESIDUAL * run.masses.sum() * 9.81:
             continue
-        pressure = needed / run.vertex_areas.sum()
+        touching = run.distances[0][f] < r
+        pressure = needed / run.vertex_areas[touching].sum()
         right = r - pressure / k if pressure < 0.5 * k * r else 0.25 * r * r * k / pressure
-        near = float(run.distances[0][f - window + 1 : f + 1].mean())
+        near = float(run.distances[0][f - window + 1 : f + 1, touching].mean())
         if right - near > 0.25 * r:
-            return Condemnation("pressed", f, f"{pushed.min():.3g} N where {needed:.3g} N are right, {near:.2g} m from the plane")
+            return Condemnation(
+                "pressed", f, f"{pushed.min():.3g} N where {needed:.3g} N are right, {near:.2g} m from the plane"
+            )
     return None
 
 
 def energy_available(run):
     """Returns the energy A [J] that K + U cannot exceed in each frame, (F+1,), and whether that is proved, not estimated.
 
-    It is proved in the frame of reference of velocity V in which no collider and no pin moves, see :func:`rest_frame`. There A =
-    K₀ + U₀ + the work of gravity and forces + that of the wind. The force of air in a step is F = c(w − v) along the normal and
-    across, c from the relative speed at its start, so its work h F·v is at most h c w²/4; cloth that only wind touches is
-    judged in the frame of the wind, where air only brakes.
+    It is proved in the frame of reference of velocity V in which no collider and no pin moves, see :func:`rest_frame`. There A
+    is K₀ + U₀ + the energy of contact at the start + the work of gravity and forces + that of the wind. The force of air in a
+    step is F = c(w − v) along the normal and across, c from the relative speed at its start, so its work h F·v is at most h c
+    w²/4; cloth that only wind touches is judged in the frame of the wind, where air only brakes.
 
     Else colliders that move estimate it: one of relative velocity V turns a speed of v into v + 2V at most, and is taken to
     do so :data:`HITS` times. Displacements D of what holds or touches pinned cloth may stretch it, by the energy 2kD².
@@ -277,18 +301,36 @@ def energy_available(run):
     exact = V is not None
     V = _first_velocity(run) if V is None else V
     y = run.x - run.times[:, None, None] * V
-    forces = run.masses[:, None] * run.gravity
-    for load in run.loads:
-        forces[np.asarray(load.vertices)] += load.force
-    A = np.einsum("ik,fik->f", forces, y - y[0]) + elastic_energies(run)[0] + _wind_work(run, V)
+    A = np.einsum("ik,fik->f", _forces(run), y - y[0]) + _wind_work(run, V)
+    A += elastic_energies(run)[0] + contact_energy(run, 0)
     start = 0.5 * np.einsum("i,ik,ik->", run.masses * run.free, run.v[0] - V, run.v[0] - V)
     if exact:
         return A + start, True
     M, relative = run.masses.sum(), _obstacle_speed(run, V)
     A = A + 0.5 * M * (np.sqrt(2.0 * start / M) + 2.0 * HITS * relative) ** 2
-    if run.scene.pins is not None:
+    if run.pins is not None:
         A = A + 2.0 * max(term.stiffness for term in run.scene.terms) * (relative * run.times) ** 2
     return A, False
+
+
+def _forces(run):
+    """Returns the weight of each vertex and the constant forces on it, (n, 3) [N]."""
+    forces = run.masses[:, None] * run.gravity
+    for load in run.loads:
+        forces[np.asarray(load.vertices)] += load.force
+    return forces
+
+
+def contact_energy(run, frame):
+    """Returns Σ kAφ(d) of the free vertices and all colliders in a frame [J]; k is 10 w/r if it is not declared."""
+    total = 0.0
+    for gaps in run.distances:
+        r, k = run.scene.contact.distance, run.scene.contact.stiffness
+        weight = np.linalg.norm(run.gravity) * run.masses.sum() / run.areas.sum()
+        d = np.maximum(gaps[frame], 1e-3 * r)
+        phi = np.where(d < 0.5 * r, 0.125 * r * r + 0.25 * r * r * np.log(0.5 * r / d), 0.5 * np.maximum(r - d, 0.0) ** 2)
+        total += (10.0 * weight / r if k is None else k) * (run.free * run.vertex_areas * phi).sum()
+    return total
 
 
 def rest_frame(run):
@@ -299,8 +341,8 @@ def rest_frame(run):
         if np.ptp(rotation, axis=0).max() > 0.0 or 1 < len(position) < len(run.x):
             return None
         velocities.extend(np.diff(position, axis=0) / run.h if len(position) > 1 else np.zeros((1, 3)))
-    pins = run.scene.pins
-    if pins is not None and len(pins.vertices):
+    pins = run.pins
+    if pins is not None:
         velocities.extend([np.zeros(3)] if pins.keyframes is None else (np.diff(pins.keyframes, axis=0) / run.h).reshape(-1, 3))
     if not velocities:
         air = run.scene.air
@@ -310,7 +352,7 @@ def rest_frame(run):
 
 def _first_velocity(run):
     """Returns the velocity of the pins, or else of the first collider."""
-    pins = run.scene.pins
+    pins = run.pins
     moved = pins.keyframes[:2, 0] if pins is not None and pins.keyframes is not None else None
     if pins is None:
         moved = np.atleast_2d(run.colliders[0].position)[:2]
@@ -328,7 +370,7 @@ def _obstacle_speed(run, V=(0.0, 0.0, 0.0)):
             turned = 2.0 * np.arccos(np.clip(np.abs((rotation[1:] * rotation[:-1]).sum(axis=1)), 0.0, 1.0)) / run.h
             turning = turned.max() * _extent(collider)
         speed = max(speed, np.linalg.norm(ways - V, axis=1).max() + turning)
-    pins = run.scene.pins
+    pins = run.pins
     if pins is not None:
         ways = np.zeros((1, 3)) if pins.keyframes is None else (np.diff(pins.keyframes, axis=0) / run.h).reshape(-1, 3)
         speed = max(speed, np.linalg.norm(ways - V, axis=1).max())
@@ -381,7 +423,7 @@ def elastic_energies(run):
     for term in run.scene.terms:
         k = term.stiffness
         if isinstance(term, wc.Spring):
-            U += 0.5 * k * ((_edge_lengths(run) - run.lengths) ** 2).sum(axis=1)
+            U += 0.5 * k * ((_spring_lengths(run) - run.lengths) ** 2).sum(axis=1)
         elif isinstance(term, wc.CorotatedMembrane):
             stretches = np.sqrt(np.maximum(np.linalg.eigvalsh(_right_cauchy_green(run)), 0.0))
             U += (0.5 * k * run.areas * ((stretches - 1.0) ** 2).sum(axis=2)).sum(axis=1)
@@ -411,8 +453,8 @@ def _lame(term):
     return 0.5 * k / (1.0 + ratio), k * ratio / (1.0 - ratio**2)
 
 
-def _edge_lengths(run):
-    return np.linalg.norm(run.x[:, run.edges[:, 1]] - run.x[:, run.edges[:, 0]], axis=2)
+def _spring_lengths(run):
+    return np.linalg.norm(run.x[:, run.springs[:, 1]] - run.x[:, run.springs[:, 0]], axis=2)
 
 
 def _right_cauchy_green(run):
@@ -430,16 +472,6 @@ def _right_cauchy_green(run):
 def barrier_slope(d, r):
     """Returns −φ′(d) [m] of φ = ½(r − d)² for r/2 ≤ d < r, and ⅛r² + ¼r² ln(r/2d) below."""
     return np.where(d < 0.5 * r, 0.25 * r * r / np.maximum(d, 1e-3 * r), np.maximum(r - d, 0.0))
-
-
-def _gap_of_sheets(run, f):
-    """Returns the smallest distance of vertices beyond 3 edges of one another, less two edges [m]: no farther than any pair."""
-    x = run.x[f]
-    size = _edge_lengths(run)[f].max()
-    apart = np.linalg.norm(x[:, None] - x[None], axis=2)
-    rest = np.asarray(run.scene.mesh.points)
-    far = np.linalg.norm(rest[:, None] - rest[None], axis=2) > 3.0 * run.lengths.max()
-    return (apart[far].min() if far.any() else np.inf) - 2.0 * size - run.scene.self_contact.distance
 
 
 # Shapes

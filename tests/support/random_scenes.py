@@ -267,7 +267,9 @@ def _at_gap(collider, position, direction, cloth, gap):
     Points are the vertices and the middles of edges and triangles, and for meshes also the vertices of the mesh.
     """
     corners = cloth["positions"][cloth["mesh"].triangles]
-    points = np.concatenate([corners, 0.5 * (corners + np.roll(corners, 1, axis=1)), corners.mean(axis=1, keepdims=True)], axis=1)
+    points = np.concatenate(
+        [corners, 0.5 * (corners + np.roll(corners, 1, axis=1)), corners.mean(axis=1, keepdims=True)], axis=1
+    )
     points = np.unique(points.reshape(-1, 3), axis=0)
     for _ in range(100):
         moved = replace(collider, position=position)
