@@ -333,12 +333,13 @@ def _solver(random, name, scene):
     if name == "explicit":  # ωh at most 0.8 about the rest shape
         limit, _motion = wc.Explicit.step_limits(scene.build(dtype="float64"))
         return wc.Explicit(substeps=int(np.ceil(1.0 / (scene.fps * 0.4 * limit))))
+    if name == "constrained-dynamics":
+        return wc.ConstrainedDynamics(substeps=1, iterations=sweeps // 10, linear=random.of("cg", "factorised"))
     solvers = {
         "xpbd": wc.XPBD,
         "pbd": wc.PBD,
         "projective-dynamics": wc.ProjectiveDynamics,
         "admm": wc.ADMM,
-        "constrained-dynamics": wc.ConstrainedDynamics,
         "hierarchical-pbd": wc.HierarchicalPBD,
     }
-    return solvers[name](substeps=1, iterations=sweeps if name != "constrained-dynamics" else sweeps // 10)
+    return solvers[name](substeps=1, iterations=sweeps)
