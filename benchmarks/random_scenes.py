@@ -3,8 +3,8 @@
     python benchmarks/random_scenes.py [--seeds 0:1000] [--solver NAME] [--device cpu|cuda:0] [--processes 1] [--json FILE]
 
 Scenes, judges and their tolerances are those of tests/support. Prints each condemned run that is called usable. Then prints a
-table by solver: runs by their end, runs that are condemned, those of them that are called usable, and runs that are not usable
-though no judge condemns them. Exits with 1 if a condemned run is called usable.
+table by solver: runs by their end (refused if the package takes no such scene), runs that are condemned, those of them that are
+called usable, and runs that are not usable though no judge condemns them. Exits with 1 if a condemned run is called usable.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from warpcloth.core.status import Result
 
-ENDS = ("converged", "completed", "not usable", "diverged")
+ENDS = ("converged", "completed", "not usable", "diverged", "refused")
 COLUMNS = ("runs", *ENDS, "condemned", "condemned, usable", "not usable, not condemned")
 
 
@@ -28,13 +28,13 @@ def run(seed, device):
     from support.random_scenes import random_case, run_case
 
     case, began = random_case(seed), time.perf_counter()
-    animation, found = run_case(case, device)
+    facts = {"seed": seed, "solver": case.solver.name, "dtype": case.dtype, "scene": case.text}
+    try:
+        animation, found = run_case(case, device)
+    except ValueError as error:
+        return facts | {"end": "refused", "usable": False, "message": str(error), "condemned": []}
     status = animation.status
-    return {
-        "seed": seed,
-        "solver": case.solver.name,
-        "dtype": case.dtype,
-        "scene": case.text,
+    return facts | {
         "end": end_of(status),
         "usable": bool(status.ok),
         "message": status.message,
@@ -63,7 +63,7 @@ def table(runs):
             count.update(["runs", each["end"]])
             count["condemned"] += bool(each["condemned"])
             count["condemned, usable"] += bool(each["condemned"]) and each["usable"]
-            count["not usable, not condemned"] += not each["condemned"] and not each["usable"]
+            count["not usable, not condemned"] += each["end"] == "not usable" and not each["condemned"]
     lines = [f"{'solver':22}" + "".join(f"{name:>{len(name) + 3}}" for name in COLUMNS)]
     for name in sorted(counts, key=lambda name: (name == "all", name)):
         lines.append(f"{name:22}" + "".join(f"{counts[name][column]:{len(column) + 3}}" for column in COLUMNS))

@@ -13,8 +13,8 @@ from support.scenes import scene, taken
 
 pytest.importorskip("igl")
 G = 9.81
-# A second each at most; all solvers, precisions, kinds of colliders, energies and motions of colliders and pins are among them.
-SEEDS = (0,)
+# A second each; all solvers, precisions, kinds of colliders, energies and motions of colliders and pins are among them.
+SEEDS = (15, 16, 17, 22, 34, 36, 42, 49, 53, 63, 64, 75, 80, 84, 96, 97, 99, 101)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -137,7 +137,7 @@ def test_a_planted_error_is_condemned(name):
     assert judge_of_it in judged(declared, x, v)
 
 
-# Runs of few sweeps, which look right: unconverged sweeps are no reason to condemn.
+# Unconverged sweeps are no reason to condemn what looks right.
 HARMLESS = [(name, solver) for name in ("hanging", "drape") for solver in ("pbd", "xpbd", "admm", "newton")]
 
 
