@@ -78,3 +78,22 @@ def normal_moves(dtype):
         out[i] = (wp.dot(n, move[i]) / r) * n
 
     return project
+
+
+@cache
+def energy_above():
+    """Kernel over elements: out = (√u − √allowed)² where u is larger, else 0 [J]."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def subtract(
+        # state in
+        u: wp.array(dtype=wp.float64),
+        allowed: wp.array(dtype=wp.float64),
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        e = wp.tid()
+        above = wp.sqrt(wp.max(u[e], wp.float64(0.0))) - wp.sqrt(wp.max(allowed[e], wp.float64(0.0)))
+        out[e] = wp.where(above > wp.float64(0.0), above * above, wp.float64(0.0))
+
+    return subtract

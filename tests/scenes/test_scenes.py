@@ -232,8 +232,7 @@ def test_rounding_is_no_failure():
     figure = 0.037, wc.Newton.residual.measure, "times gravity"
     said = sentence(Result.ROUNDED, Grade.CONVERGED, 1e-6, *figure, tolerance=0.001)
     assert said == (
-        "converged as far as rounding allows: "
-        "largest unbalanced acceleration of a vertex 0.037 times gravity (tolerance 0.001)"
+        "converged as far as rounding allows: largest unbalanced acceleration of a vertex 0.037 times gravity (tolerance 0.001)"
     )
 
 

@@ -5,8 +5,9 @@ unconverged sweeps store a huge ½kx² without diverging; strain is judged separ
 attraction, counts like that of gravity, because the cloth may fall into it.
 
 Whether a run is usable is judged more strictly, by :meth:`Balance.surplus`: elastic energy and that of contact count too, but
-for the excess that a step leaves because it has not converged. What contact adds by moving vertices at the end of a step counts
-in any case. Euler steps with a semi-definite Hessian never raise the sum, as
+for the excess that a step leaves because it has not converged. However large that is, elastic energy counts as far as it is
+beyond that of a uniform strain of 2 %, and that of a single element beyond a strain of 5 %: in the norm √U the state is that
+far from all states that the energy allows. What contact adds by moving vertices at the end of a step counts in any case. Euler steps with a semi-definite Hessian never raise the sum, as
 E₁ − E₀ = −½‖v₁ − v₀‖²_M + U(x₁) − U(x₀) − ∇U(x₁)·(x₁ − x₀). BDF2 does not raise ¼(5‖z₁‖² − 4z₁·z₀ + ‖z₀‖²) (Dahlquist 1978),
 with ‖z‖² twice the energy. That is at least ¼‖z₁‖², and ½‖z₀‖² at the start, so that the energy stays below twice that at the
 start. Midpoint conserves the energy where U is quadratic. Contact that begins within a step adds up to what contact then
@@ -36,6 +37,8 @@ GAIN = 3.0
 # A run has diverged when an edge has this strain and the energy of the run does not explain it. The fewest sweeps that hold a
 # cloth give up to 6.4 (one vertex-averaged sweep per step of 1/60 s); a cloth that falls as if nothing held it soon passes 10.
 STRETCHED = 10.0
+# An error of the strain, RMS over the cloth, for which an unconverged step is not blamed.
+STRAIN = 0.02
 # Relative error of an energy, which sums hundreds of thousands of roundings of forces and residuals below their tolerance.
 RESOLVED = 1e-3
 
@@ -201,8 +204,9 @@ class Balance:
             error: Its :class:`warpcloth.run.step_errors.StepError`.
             velocities: (B·n, 3) [m/s].
         """
-        pushed = np.fmax(error.pushed, 0.0)
-        explained = pushed + np.fmax(error.stored - pushed - error.excess, 0.0)
+        pushed, stored = np.fmax(error.pushed, 0.0), error.elastic + error.contact
+        beyond = np.fmax(np.sqrt(np.fmax(error.elastic, 0.0)) - np.sqrt(self._strained), 0.0) ** 2
+        explained = np.fmax(pushed + np.fmax(stored - pushed - error.excess, 0.0), np.fmax(beyond, error.largest))
         explained = np.where(np.isfinite(explained), explained, 0.0)
         given = self._bound * (1.0 + RESOLVED) * self.given
         self.whole, self.allowed = self.has + explained, given
@@ -217,6 +221,16 @@ class Balance:
                 self.allowed = given + self._bound * sum(source.stored(frame) for source in self.sources)
             found = _over(self.whole, self.allowed)
         return found / (GAIN if self.driven else 1.0)
+
+    @cached_property
+    def _strained(self):
+        """The elastic energy of a uniform strain of :data:`STRAIN`, (B,) [J]."""
+        model, elastic = self.model, self.elastic
+        terms = [each for each in elastic.soft if not each.cells and each.term.vertices > 1 and each.collider is None]
+        if not terms:
+            return np.zeros(model.copies)
+        points = np.tile((1.0 + STRAIN) * model.rest_points, (model.copies, 1))
+        return np.fmax(type(elastic)(model.with_terms(terms)).energy(model.array(points, model.vec3)), 0.0)
 
     @cached_property
     def _conserved(self):

@@ -22,6 +22,7 @@ from ..core.hessian import Hessian
 from ..core.sums import RowSums, Sums
 from ..fast.plan import plan
 from ..kernels import step_error as kernels
+from ..kernels.reduce import keep_largest
 from ..kernels.term import HessianPolicy
 from ..kernels.terms.air import AIR
 from ..kernels.terms.face_friction import FRICTIONS
@@ -31,6 +32,8 @@ from ..numerics.linear import ConjugateGradients
 # Relative accuracy of the Newton step, of which only the largest displacement is used, and the growth of the bound after which
 # it is taken again. It takes as long as 30 to 100 sweeps.
 ACCURACY, GROWTH = 0.1, 4.0
+# The strain of an element that no energy need explain.
+STRAIN = 0.05
 
 
 class StepError(NamedTuple):
@@ -42,8 +45,10 @@ class StepError(NamedTuple):
         ratio: The distance that it found over this bound.
         gap: The largest distance along its normal of a vertex in contact, of those that Newton steps found, over the contact
             distance.
-        stored: Elastic and contact energy [J].
-        pushed: The part of it that contact added when it changed positions at the end of the step [J].
+        elastic: Elastic energy [J].
+        contact: Energy of contact [J].
+        largest: The largest energy of an element above that of the strain :data:`STRAIN` in it, (√u − √u_ε)² [J].
+        pushed: The energy that contact added when it changed positions at the end of the step [J].
         excess: The bound of φ above its minimum, before contact changed positions [J].
     """
 
@@ -51,7 +56,9 @@ class StepError(NamedTuple):
     solved: np.ndarray
     ratio: np.ndarray
     gap: np.ndarray
-    stored: np.ndarray
+    elastic: np.ndarray
+    contact: np.ndarray
+    largest: np.ndarray
     pushed: np.ndarray
     excess: np.ndarray
 
@@ -75,12 +82,12 @@ class StepErrors:
     @in_turn
     def find(self):
         """Returns the :class:`StepError` of the frame that ended with the last step."""
-        stored, pushed, excess = (np.zeros(len(self.distance)) for _ in range(3))
+        energies = np.zeros((5, len(self.distance)))
         for taker, first, end in self._stepper.takers:
             if taker not in self._parts:
                 self._parts[taker] = _measured(taker)
             part, copies = self._parts[taker], slice(first, end)
-            bound, stored[copies], pushed[copies], excess[copies] = part.measure()
+            bound, energies[:, copies] = part.measure()
             distance, solved, ratio = self.distance[copies], self.solved[copies], self.ratio[copies]
             known = ~(bound > self._near) | (not part.solves)
             distance[known] = np.fmax(distance, bound)[known]
@@ -93,7 +100,7 @@ class StepErrors:
                 distance[news], solved[news], ratio[news] = np.fmax(distance, found)[news], bound[news], (found / bound)[news]
                 self.gap[copies][news] = np.fmax(self.gap[copies], gap)[news]
         found = (each.copy() for each in (self.distance, self.solved, self.ratio, self.gap))
-        return StepError(*found, stored, pushed, excess)
+        return StepError(*found, *energies)
 
 
 def _measured(stepper):
@@ -104,38 +111,71 @@ def _measured(stepper):
 
 
 class _Stored:
-    """The energy that the cloth of a stepper stores, without contact; its steps solve nothing, as those of :class:`Explicit`."""
+    """The energy that the cloth of a stepper stores, without contact; its steps solve nothing, as those of :class:`Explicit`.
+
+    Attributes:
+        bound: The largest acceleration ‖rᵢ‖/mᵢ of each copy, (B,) [m/s²].
+        energies: The energies of :class:`StepError` in their order, each (B,) [J]. Before they are read, ``pushed`` is the
+            energy before contact changed positions, and ``excess`` Σ ‖rᵢ‖²/mᵢ.
+    """
 
     solves = False
 
     def __init__(self, stepper):
         model = self.model = stepper.model
         self.stepper, self.sums = stepper, Sums(model)
-        self._bound, self._stored, self._pushed, self._excess = (Mirror(model.scalars()) for _ in range(4))
-        self._mirrors = self._bound, self._stored, self._pushed, self._excess
-        terms = [each for each in stepper.declared.terms if not each.hard and each.collider is None and each.term is not AIR]
-        self._elastic = Energy(model, self.sums, terms=tuple(terms)) if terms else None
+        self._read = [Mirror(model.scalars()) for _ in range(6)]
+        self.bound, *self.energies = (mirror.array for mirror in self._read)
+        soft = [each for each in stepper.declared.terms if not each.hard and each.collider is None and each.term is not AIR]
+        self.soft = tuple(soft)
+        self._elastic = Energy(model, self.sums, terms=self.soft) if soft else None
+        self._peaks = [
+            _Peak(model, self._elastic, k) for k, each in enumerate(soft) if not each.cells and each.term.vertices > 1
+        ]
         self._prepare()
         # The arrays of pairs may be replaced, which a captured graph would not notice.
         self._measure = Segment(model.device, self._launch) if stepper.pairs is None else self._launch
 
     def measure(self):
-        """Returns the bound of the distance [m], the energy stored and pushed in, and the excess of φ [J], (B,) each."""
+        """Returns the bound of the distance (B,) [m], and the energies of :class:`StepError` in their order, (5, B) [J]."""
         self._measure()
-        return tuple(mirror.read().copy() for mirror in self._mirrors)
+        bound, *energies = (mirror.read().copy() for mirror in self._read)
+        return bound, np.array(energies)
 
     def _prepare(self):
         """Allocates what :meth:`_launch_bound` needs."""
 
     def _launch(self):
-        for mirror in self._mirrors:
+        for mirror in self._read:
             mirror.array.zero_()
         if self._elastic is not None:
-            self._elastic.add(self.stepper.state.x, self._stored.array)
+            self._elastic.add(self.stepper.state.x, self.energies[0])
+        for peak in self._peaks:
+            peak.launch(self.energies[2])
         self._launch_bound()
 
     def _launch_bound(self):
-        """Launches the bound, what contact stores, and the excess."""
+        """Launches the bound, the energy of contact, and what :attr:`energies` has of the step."""
+
+
+class _Peak:
+    """The largest energy of an element of a term above that of the strain :data:`STRAIN`, of each copy."""
+
+    def __init__(self, model, energy, k):
+        self._model, self._values = model, energy.of_elements[k]
+        self._rows = RowSums(model, energy.terms[k].per_copy)
+        points = np.tile(model.rest_points, (model.copies, 1))
+        energy.add(model.array((1.0 + STRAIN) * points, model.vec3), model.scalars())
+        self._allowed, self._above = wp.clone(self._values), wp.zeros_like(self._values)
+        self._found = model.scalars()
+        self._subtract, self._keep = model.kernel(kernels.energy_above), model.kernel(keep_largest)
+
+    def launch(self, out):
+        """Launches out (B,) = max(out, the largest) [J], from the energies of elements as they were computed last."""
+        model = self._model
+        model.launch(self._subtract, len(self._values), [self._values, self._allowed], [self._above])
+        self._rows.largest(self._above, self._found)
+        model.launch(self._keep, model.copies, [self._found], [out])
 
 
 class _Gaps(_Stored):
@@ -149,9 +189,8 @@ class _Gaps(_Stored):
         self._sum = self.model.scalars()
 
     def measure(self):
-        _bound, *energies = super().measure()
-        largest = [array.numpy() for array in self._largest]
-        return np.sqrt(2.0 * np.max(largest, axis=0)) if largest else np.zeros(self.model.copies), *energies
+        bound, energies = super().measure()
+        return np.sqrt(2.0 * np.max([bound, *(array.numpy() for array in self._largest)], axis=0)), energies
 
     def _launch_bound(self):
         for (energy, rows), largest in zip(self._gaps, self._largest, strict=True):
@@ -172,13 +211,15 @@ class _Residuals(_Stored):
         self.residual, self.weighted, self.moved = (model.vectors() for _ in range(3))
         self.kernels = model.launcher(((kernels.add_moves, kernels.finish_residual), model.dtype))
         # Midpoint has its unknown at the middle of a step, and the energy stored is that at the end.
-        self._pushes = stepper.unfiltered is not None and stepper.integrator.parts == 1 and self._elastic is not None
+        self._pushes = stepper.unfiltered is not None and stepper.integrator.parts == 1 and bool(self.soft)
         if self._pushes:
-            self._before = Energy(model, self.sums, corrected=True, terms=self._elastic.terms)
+            self._before = Energy(model, self.sums, corrected=True, terms=self.soft)
 
     def measure(self):
-        (bound, stored, before, excess), he = super().measure(), self.stepper.he
-        return he**2 * bound, stored, self._pushes * (stored - before), 0.5 * he**2 * excess
+        (bound, energies), he = super().measure(), self.stepper.he
+        elastic, contact, _largest, before, excess = energies
+        energies[3:] = self._pushes * (elastic + contact - before), 0.5 * he**2 * excess
+        return he**2 * bound, energies
 
     def _launch_bound(self):
         if self._far is None:
@@ -186,24 +227,19 @@ class _Residuals(_Stored):
         else:
             wp.capture_if(self._is_near.array, self._near.launch, self._far.launch)
 
-    @property
-    def stored(self):
-        """The energy stored (B,) [J] on the device."""
-        return self._stored.array
-
     def launch_sums(self, first):
         """Launches the largest ‖rᵢ‖/mᵢ; with ``first`` also Σ ‖rᵢ‖²/mᵢ."""
         self.model.lock(self.residual)
         self.model.lock(self.weighted)
-        self.sums.largest(self.model.inverse_mass, self.residual, self._bound.array)
+        self.sums.largest(self.model.inverse_mass, self.residual, self.bound)
         if first:
-            self.sums.dot(self.weighted, self.weighted, self._excess.array)
+            self.sums.dot(self.weighted, self.weighted, self.energies[4])
 
     def launch_before(self, step, x, d):
         """Launches the energy before contact changed positions, at x + d."""
         if self._pushes:
-            self._before.add(x, self._pushed.array, d)
-            self.launch_contact(step, x, d, self._pushed.array)
+            self._before.add(x, self.energies[3], d)
+            self.launch_contact(step, x, d, self.energies[3])
 
     def launch_contact(self, step, x, d, out):
         """Launches out (B,) += the energy of contact at x + d [J]."""
@@ -245,7 +281,7 @@ class _Step:
             d = of.moved
             self._launch_residual(d)
             of.launch_sums(False)
-        of.launch_contact(self, stepper.predicted, d, of.stored)
+        of.launch_contact(self, stepper.predicted, d, of.energies[1])
 
     def _launch_residual(self, d):
         stepper, of, model = self.stepper, self._of, self.model
@@ -266,7 +302,10 @@ class _Step:
             self._linear.tolerance.fill_(ACCURACY)
             self._direction, self._force = model.vectors(), model.vectors()
             self._largest = [Mirror(model.scalars()) for _ in range(3)]
-            self._ones, self._all = model.constant(1.0, model.count), wp.full(model.copies, 1, dtype=wp.int32, device=model.device)
+            self._ones, self._all = (
+                model.constant(1.0, model.count),
+                wp.full(model.copies, 1, dtype=wp.int32, device=model.device),
+            )
             touching = tuple(each for each in self.model.terms if each.collider is not None and each.term not in FRICTIONS)
             self._pushes = plan(model).gradient(corrected=True, terms=touching) if touching else None
             self._project = model.kernel(kernels.normal_moves, model.dtype)

@@ -141,7 +141,9 @@ class Watch:
     def _note(self, number, error, velocities):
         """Notes the error of the steps in a frame, and the energy there, of copies that are good."""
         self.solved, self.ratio = error.solved, error.ratio
-        self.distance, self.gap = (np.where(self.alive, new, old) for new, old in zip(error[:1] + error[3:4], (self.distance, self.gap)))
+        self.distance, self.gap = (
+            np.where(self.alive, new, old) for new, old in zip(error[:1] + error[3:4], (self.distance, self.gap))
+        )
         far = ~((self.distance <= FAR * self._edge) & (self.gap <= 1.0))
         self.far = np.where(self.alive & (self.far == 0) & far, number, self.far)
         rich = self.alive & (self.rich == 0) & (self.balance.surplus(number, error, velocities) > 1.0)
