@@ -97,3 +97,34 @@ def energy_above():
         out[e] = wp.where(above > wp.float64(0.0), above * above, wp.float64(0.0))
 
     return subtract
+
+
+@cache
+def unresolved_contact(dtype):
+    """Kernel over vertices: out = (1, 0, 0) where half of the force f of contact is unbalanced and f h²/m is beyond r, else 0.
+
+    Such a force would move the vertex out of contact in a single step.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        force: wp.array(dtype=vec3),
+        residual: wp.array(dtype=vec3),
+        # parameters
+        square: dtype,
+        r: dtype,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        f = wp.length(force[i])
+        wrong = wp.abs(wp.dot(wp.normalize(force[i]), residual[i])) > dtype(0.5) * f
+        out[i] = vec3()
+        if wrong and square * inverse_mass[i] * f > r:
+            out[i] = vec3(dtype(1.0), dtype(0.0), dtype(0.0))
+
+    return find

@@ -536,7 +536,7 @@ def test_a_motion_converges_by_two_successive_doublings(moves, substeps, error, 
         if record.substeps not in offsets:
             raise ValueError("as much as was asked for")
         points = np.tile(scene.mesh.points, (frames + 1, 1, 1)) + np.array([offsets[record.substeps], 0.0, 0.0])
-        return SimpleNamespace(points=points, status=SimpleNamespace(ok=True))
+        return SimpleNamespace(points=points, status=SimpleNamespace(complete=True))
 
     monkeypatch.setattr(own_reference_module, "run_other", ran)
     found = own_reference(CHAIN, [Setup("newton-vbd", {"substeps": 2, "iterations": 2})], 2, tolerance=1e-4)
@@ -556,7 +556,7 @@ def test_own_motions_end_at_the_total_time(tmp_path, monkeypatch):
             watch(frame, frames)
         ran.append(record.substeps)
         points = np.tile(scene.mesh.points, (frames + 1, 1, 1))
-        return SimpleNamespace(points=points, status=SimpleNamespace(ok=True))
+        return SimpleNamespace(points=points, status=SimpleNamespace(complete=True))
 
     monkeypatch.setattr(own_reference_module, "run_other", run)
     setups = [Setup(name, {"substeps": 2, "iterations": 2}) for name in ("newton-vbd", "newton-xpbd")]

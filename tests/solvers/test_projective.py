@@ -14,7 +14,7 @@ from support.steps import METHODS, after_one_step, newton_step, objective, swing
 from warpcloth.core.constant_matrix import constant_matrices
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
-from warpcloth.core.status import Result, digits
+from warpcloth.core.status import Result, digits, millimetres
 from warpcloth.core.sums import Lanes
 from warpcloth.kernels import accelerate
 from warpcloth.numerics import linear
@@ -349,7 +349,8 @@ def test_status_of_a_run_that_used_up_its_iterations(device):
     status = wc.simulate(swinging(8), wc.ProjectiveDynamics(substeps=1, iterations=3), device=device, frames=2).status
     assert status.ok and status.result is Result.ITERATIONS_USED_UP
     figure = f"largest unbalanced acceleration of a vertex {digits(status.residual)} times gravity (tolerance 0.001)"
-    assert status.message == f"iterations used up in a step or more; usable if this is near enough to the solution: {figure}"
+    within = f"completed within {millimetres(status.distance)} of the solution of each step"
+    assert status.message == f"{within}, iterations used up in a step or more: {figure}"
     easy = replace(swinging(8), terms=[wc.QuadraticBending(stiffness=1e-5)])
     status = wc.simulate(easy, wc.ProjectiveDynamics(substeps=1), device=device, dtype="float64", frames=2).status
     assert status.result is Result.CONVERGED

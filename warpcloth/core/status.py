@@ -116,14 +116,14 @@ def sentence(result, grade, distance=np.nan, residual=None, measure=None, unit=N
         return f"{grade.value}: {why}; {ended}" + (f": {figure}" if figure else "")
     text = ended if ended.startswith(grade.value) else grade.value + (f", {ended}" if result is not Result.COMPLETED else "")
     if grade is Grade.COMPLETED and distance > 0.0:
-        text = text.replace(grade.value, f"{grade.value} within {length(distance)} of the solution of each step", 1)
+        text = text.replace(grade.value, f"{grade.value} within {millimetres(distance)} of the solution of each step", 1)
     return text + (f": {figure}" if figure else "")
 
 
 _OF_STEPS = (Result.ITERATIONS_USED_UP, Result.STALLED, Result.INACCURATE, Result.SADDLE, Result.CONTRADICTED)
 
 
-def length(value):
+def millimetres(value):
     """Formats a length [m] in millimetres with two significant digits."""
     return f"{digits(1e3 * value)} mm"
 

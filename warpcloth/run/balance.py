@@ -124,7 +124,7 @@ class Balance:
         whole, allowed: All energy of each copy, and the most that a correct run can have, after :meth:`surplus`, (B,) [J].
     """
 
-    carried = ("_lowest", "_fastest", "_rounding", "_rounded_height")  # from frame to frame
+    carried = ("_lowest", "_fastest", "_rounding", "_rounded_height", "_unbalanced")  # from frame to frame
 
     def __init__(self, model, stepper):
         self.model = model
@@ -150,7 +150,9 @@ class Balance:
         found = (source_of(part, self, stepper) for part in (stepper, *model.scene.declared))
         self.sources = [source for source in found if source is not None]
         self.driven = len(self.sources) > 1
-        self._bound = 1.0 if stepper.integrator is None else stepper.integrator.energy_bound
+        integrator = stepper.takers[0][0].integrator
+        self._he, self._unbalanced = stepper.he, np.zeros(model.copies)
+        self._bound = 1.0 if integrator is None else integrator.energy_bound
 
     def kinetic(self, velocities):
         """Returns ½Σ m v² of each copy (B,) [J]; for a free cloth, relative to its centre of mass."""
@@ -194,7 +196,7 @@ class Balance:
             self._fastest = np.where(found <= GAIN, np.fmax(self._fastest, root), self._fastest)
         return found
 
-    def surplus(self, frame, error, velocities):
+    def surplus(self, frame, error, velocities, converged):
         """Returns all energy of each copy in the last checked frame, over the most that a correct run can have, (B,).
 
         Where sources add energy, of which only estimates are known, the most is ``GAIN`` times as much.
@@ -203,14 +205,16 @@ class Balance:
             frame: Number of the frame.
             error: Its :class:`warpcloth.run.step_errors.StepError`.
             velocities: (B·n, 3) [m/s].
+            converged: Whether all steps of a copy have met the tolerance of the solver so far, (B,).
         """
         pushed, stored = np.fmax(error.pushed, 0.0), error.elastic + error.contact
         beyond = np.fmax(np.sqrt(np.fmax(error.elastic, 0.0)) - np.sqrt(self._strained), 0.0) ** 2
         explained = np.fmax(pushed + np.fmax(stored - pushed - error.excess, 0.0), np.fmax(beyond, error.largest))
+        explained = np.where(stored > 0.0, explained, stored)
         explained = np.where(np.isfinite(explained), explained, 0.0)
-        given = self._bound * (1.0 + RESOLVED) * self.given
-        self.whole, self.allowed = self.has + explained, given
-        found = _over(self.whole, given)
+        given = self._bound * (1.0 + RESOLVED) * self.given + self._of_residuals(frame, error, converged)
+        self.whole, self.allowed = self.has + explained, given * (GAIN if self.driven else 1.0)
+        found = _over(self.whole, self.allowed)
         if (found > 1.0).any():
             with TURN:
                 if self._staggered:
@@ -218,9 +222,20 @@ class Balance:
                     carried = max(source.speed(frame) for source in self.sources)
                     self.whole = self._relative(kinetic, carried) + self._height(self.points) - self._lowest
                     self.whole = self.whole + self._conserved * explained
-                self.allowed = given + self._bound * sum(source.stored(frame) for source in self.sources)
+                more = self._bound * sum(source.stored(frame) for source in self.sources)
+                self.allowed = self.allowed + more * (GAIN if self.driven else 1.0)
             found = _over(self.whole, self.allowed)
-        return found / (GAIN if self.driven else 1.0)
+        return found
+
+    def _of_residuals(self, frame, error, converged):
+        """Returns the energy that the residuals of ``converged`` steps (B,) can have added by a frame, (B,) [J].
+
+        Those of one sign in all steps change the RMS speed by δ = t √(Σ‖rᵢ‖²/mᵢ/M), the largest so far.
+        """
+        self._unbalanced = np.fmax(self._unbalanced, np.where(converged, np.sqrt(2.0 * error.excess) / self._he, 0.0))
+        total = np.where(self.total > 0.0, self.total, 1.0)
+        speed = frame / self.model.scene.fps * self._unbalanced / np.sqrt(total)
+        return np.where(converged, total * speed * (np.sqrt(2.0 * np.fmax(self.given, 0.0) / total) + 0.5 * speed), 0.0)
 
     @cached_property
     def _strained(self):

@@ -45,6 +45,8 @@ class StepError(NamedTuple):
         ratio: The distance that it found over this bound.
         gap: The largest distance along its normal of a vertex in contact, of those that Newton steps found, over the contact
             distance.
+        unresolved: Number of frames in a row, up to this one, at whose end a vertex is in contact that is not resolved, see
+            :func:`warpcloth.kernels.step_error.unresolved_contact`.
         elastic: Elastic energy [J].
         contact: Energy of contact [J].
         largest: The largest energy of an element above that of the strain :data:`STRAIN` in it, (√u − √u_ε)² [J].
@@ -56,6 +58,7 @@ class StepError(NamedTuple):
     solved: np.ndarray
     ratio: np.ndarray
     gap: np.ndarray
+    unresolved: np.ndarray
     elastic: np.ndarray
     contact: np.ndarray
     largest: np.ndarray
@@ -72,12 +75,12 @@ class StepErrors:
         allowed: The distance that a Newton step must confirm when the bound and the last ratio predict more [m].
 
     Attributes:
-        distance, solved, ratio, gap: See :class:`StepError`, of the frames so far.
+        distance, solved, ratio, gap, unresolved: See :class:`StepError`, of the frames so far.
     """
 
     def __init__(self, stepper, near, allowed):
         self._stepper, self._near, self._allowed, self._parts = stepper, near, allowed, WeakKeyDictionary()
-        self.distance, self.solved, self.ratio, self.gap = (np.zeros(stepper.model.copies) for _ in range(4))
+        self.distance, self.solved, self.ratio, self.gap, self.unresolved = (np.zeros(stepper.model.copies) for _ in range(5))
 
     @in_turn
     def find(self):
@@ -99,7 +102,9 @@ class StepErrors:
                 found = np.fmin(found, bound)
                 distance[news], solved[news], ratio[news] = np.fmax(distance, found)[news], bound[news], (found / bound)[news]
                 self.gap[copies][news] = np.fmax(self.gap[copies], gap)[news]
-        found = (each.copy() for each in (self.distance, self.solved, self.ratio, self.gap))
+            wrong = part.unresolved(bound) if part.solves else False
+            self.unresolved[copies] = np.where(wrong, self.unresolved[copies] + 1.0, 0.0)
+        found = (each.copy() for each in (self.distance, self.solved, self.ratio, self.gap, self.unresolved))
         return StepError(*found, *energies)
 
 
@@ -210,6 +215,7 @@ class _Residuals(_Stored):
         self._near, self._is_near = _Step(stepper, self), None if clear is None else Mirror(clear.near)
         self.residual, self.weighted, self.moved = (model.vectors() for _ in range(3))
         self.kernels = model.launcher(((kernels.add_moves, kernels.finish_residual), model.dtype))
+        self.keep = model.kernel(keep_largest)
         # Midpoint has its unknown at the middle of a step, and the energy stored is that at the end.
         self._pushes = stepper.unfiltered is not None and stepper.integrator.parts == 1 and bool(self.soft)
         if self._pushes:
@@ -250,8 +256,18 @@ class _Residuals(_Stored):
 
     def solve(self):
         """Returns the distance from the solution of the step by a Newton step, (B,) [m], and :attr:`StepError.gap` there."""
-        near = self._is_near is None or self._is_near.read()[0]
-        return (self._near if near else self._far).solve()
+        return self._taken.solve()
+
+    def unresolved(self, bound):
+        """Returns whether contact of a vertex is not resolved, of each copy, (B,); ``bound`` is that of the distance [m]."""
+        taken = self._taken
+        found = bound > 0.5 * taken.contact_distance  # no smaller residual unbalances half of such a force
+        return found & taken.unresolved() if found.any() else found
+
+    @property
+    def _taken(self):
+        """The :class:`_Step` of the last step."""
+        return self._near if self._is_near is None or self._is_near.read()[0] else self._far
 
 
 class _Step:
@@ -268,6 +284,13 @@ class _Step:
         self._gradient = plan(self.model).gradient(corrected=True, terms=terms)
         touching = tuple(each for each in terms if each.collider is not None)
         self.contact = Energy(self.model, of.sums, corrected=True, terms=touching) if touching else None
+        # The force of contact with colliders without friction and of self-contact, each with its contact distance.
+        scene, pushing = self.model.scene, tuple(each for each in touching if each.term not in FRICTIONS)
+        self._pushes = plan(self.model).gradient(corrected=True, terms=pushing) if pushing else None
+        present = (self._pushes, scene.contact), (stepper.pairs, scene.self_contact)
+        self._distances = [contact.distance for pushes, contact in present if pushes is not None]
+        self.contact_distance, self._find = min(self._distances, default=np.inf), None
+        self._force = self.model.vectors() if self._distances else None
 
     def launch(self):
         """Launches ∇φ at the end of the step and its sums, and the energy of contact there."""
@@ -300,14 +323,12 @@ class _Step:
             self._hessian = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=self._copy_by_copy(), pairs=pairs)
             self._linear = ConjugateGradients(self._hessian, model.per_copy)
             self._linear.tolerance.fill_(ACCURACY)
-            self._direction, self._force = model.vectors(), model.vectors()
+            self._direction = model.vectors()
             self._largest = [Mirror(model.scalars()) for _ in range(3)]
             self._ones, self._all = (
                 model.constant(1.0, model.count),
                 wp.full(model.copies, 1, dtype=wp.int32, device=model.device),
             )
-            touching = tuple(each for each in self.model.terms if each.collider is not None and each.term not in FRICTIONS)
-            self._pushes = plan(model).gradient(corrected=True, terms=touching) if touching else None
             self._project = model.kernel(kernels.normal_moves, model.dtype)
             self._newton = Segment(model.device, self._launch_newton) if pairs is None else self._launch_newton
         self._newton()
@@ -322,23 +343,50 @@ class _Step:
         pairs = zip(sorted_ones, present, strict=True)
         return tuple(a if np.array_equal(host_values(a.stencil), host_values(b.stencil)) else b for a, b in pairs)
 
-    def _launch_newton(self):
-        stepper, of, scene = self.stepper, self._of, self.model.scene
-        x, d = stepper.predicted, stepper.correction if stepper.unfiltered is None else of.moved
-        self._hessian.assemble(x, 1.0 / stepper.he**2, d)
-        self._linear.solve(of.residual, self._direction, self._all)
-        distance, *gaps = (mirror.array for mirror in self._largest)
-        of.sums.largest(self._ones, self._direction, distance)
+    def unresolved(self):
+        """Returns whether contact of a vertex is not resolved, see :class:`StepError`, of each copy, (B,)."""
+        model = self.model
+        if self._find is None:
+            self._kernel = model.kernel(kernels.unresolved_contact, model.dtype)
+            self._wrong, self._each, self._one = Mirror(model.scalars()), model.scalars(), model.constant(1.0, model.count)
+            captured = self.stepper.pairs is None
+            self._find = Segment(model.device, self._launch_unresolved) if captured else self._launch_unresolved
+        self._find()
+        return self._wrong.read() > 0.0
+
+    def _launch_unresolved(self):
+        of, model, square = self._of, self.model, self.stepper.he**2
+        found = of.weighted
+        self._wrong.array.zero_()
+        for r in self._launch_pushes():
+            model.launch(self._kernel, model.count, [model.inverse_mass, self._force, of.residual, square, r], [found])
+            of.sums.largest(self._one, found, self._each)
+            model.launch(of.keep, model.copies, [self._each], [self._wrong.array])
+
+    def _launch_pushes(self):
+        """Yields the contact distance of colliders, then of self-contact, with the force of each in ``_force``."""
+        x, d = self.stepper.predicted, self._moved
+        distances = iter(self._distances)
         if self._pushes is not None:
             self._force.zero_()
             self._pushes.add(x, self._force, d)
-            self._launch_gap(scene.contact.distance, gaps[0])
-        if stepper.pairs is not None:
+            yield next(distances)
+        if self.stepper.pairs is not None:
             self._force.zero_()
-            stepper.pairs.forces.add_gradient(self._force)
-            self._launch_gap(scene.self_contact.distance, gaps[1])
+            self.stepper.pairs.forces.add_gradient(self._force)
+            yield next(distances)
 
-    def _launch_gap(self, r, out):
-        model, moves = self.model, self._of.weighted
-        model.launch(self._project, model.count, [self._force, self._direction, r], [moves])
-        self._of.sums.largest(self._ones, moves, out)
+    @property
+    def _moved(self):
+        """d at the end of the step (N,) [m]."""
+        return self.stepper.correction if self.stepper.unfiltered is None else self._of.moved
+
+    def _launch_newton(self):
+        of, model = self._of, self.model
+        self._hessian.assemble(self.stepper.predicted, 1.0 / self.stepper.he**2, self._moved)
+        self._linear.solve(of.residual, self._direction, self._all)
+        distance, *gaps = (mirror.array for mirror in self._largest)
+        of.sums.largest(self._ones, self._direction, distance)
+        for r, gap in zip(self._launch_pushes(), gaps[: len(self._distances)], strict=True):
+            model.launch(self._project, model.count, [self._force, self._direction, r], [of.weighted])
+            of.sums.largest(self._ones, of.weighted, gap)

@@ -5,7 +5,7 @@ from contextlib import closing
 import numpy as np
 
 from ..base.turns import in_turn
-from ..core.status import Grade, Result, Status, Stopped, digits, length, sentence
+from ..core.status import Grade, Result, Status, Stopped, digits, millimetres, sentence
 from ..numerics.iterate import ResidualScale
 from .balance import GAIN, STRETCHED, Balance
 from .frames_ahead import Frame, frames_of
@@ -95,7 +95,8 @@ class Watch:
         # The first frame, from 1, in which a copy is too far from the solution of its step, and in which it has too much
         # energy; 0 for none. The energy that it has then, and the most that it may have [J].
         self.far, self.rich = (np.zeros(model.copies, dtype=int) for _ in range(2))
-        self.distance, self.has, self.most, self.solved, self.ratio, self.gap = (np.zeros(model.copies) for _ in range(6))
+        self.distance, self.has, self.most = (np.zeros(model.copies) for _ in range(3))
+        self.solved, self.ratio, self.gap, self.unresolved = (np.zeros(model.copies) for _ in range(4))
 
     def passes(self, number, frame):
         """Checks a frame, and sets copies that diverged to NaN. Returns whether a copy is still good.
@@ -140,13 +141,15 @@ class Watch:
 
     def _note(self, number, error, velocities):
         """Notes the error of the steps in a frame, and the energy there, of copies that are good."""
-        self.solved, self.ratio = error.solved, error.ratio
+        self.solved, self.ratio, self.unresolved = error.solved, error.ratio, error.unresolved
         self.distance, self.gap = (
             np.where(self.alive, new, old) for new, old in zip(error[:1] + error[3:4], (self.distance, self.gap))
         )
-        far = ~((self.distance <= FAR * self._edge) & (self.gap <= 1.0))
+        far = ~((self.distance <= FAR * self._edge) & (self.gap <= 1.0) & (self.unresolved < 2))
         self.far = np.where(self.alive & (self.far == 0) & far, number, self.far)
-        rich = self.alive & (self.rich == 0) & (self.balance.surplus(number, error, velocities) > 1.0)
+        converged = np.array([result in (Result.CONVERGED, Result.ROUNDED) for result in self.last.results])
+        surplus = self.balance.surplus(number, error, velocities, converged)
+        rich = self.alive & (self.rich == 0) & (surplus > 1.0)
         self.rich = np.where(rich, number, self.rich)
         self.has, self.most = np.where(rich, self.balance.whole, self.has), np.where(rich, self.balance.allowed, self.most)
 
@@ -179,7 +182,7 @@ class Watch:
                 setattr(part, name, found.tolist() if name == "seconds" else found[()])
         self.last = Frame(None, None, state.results, state.residual, 0.0)
         if self.errors is not None:
-            for name in ("distance", "solved", "ratio", "gap"):
+            for name in ("distance", "solved", "ratio", "gap", "unresolved"):
                 setattr(self.errors, name, getattr(self, name).copy())
 
     def _strain(self, points):
@@ -238,10 +241,12 @@ class Watch:
             if self.far[copy]:
                 where = f"in frame {self.far[copy]}{of_copy}"
                 why = (
-                    f"{where} vertices are up to {length(self.distance[copy])} from the solution of the step, more than half "
-                    f"of an edge ({length(self._edge)}); {remedy}"
+                    f"{where} vertices are up to {millimetres(self.distance[copy])} from the solution of the step, more than half "
+                    f"of an edge ({millimetres(self._edge)}); {remedy}"
                 )
-                if self.distance[copy] <= FAR * self._edge:
+                if self.distance[copy] <= FAR * self._edge and self.gap[copy] <= 1.0:
+                    why = f"{where} and the one before contact presses vertices by more than twice what holds them; {remedy}"
+                elif self.distance[copy] <= FAR * self._edge:
                     why = (
                         f"{where} vertices in contact are up to {digits(self.gap[copy])} times the contact distance from the "
                         f"solution of the step; {remedy}"
@@ -257,4 +262,4 @@ class Watch:
 
 
 # What the grade depends on from frame to frame.
-_OF_GRADES = ("far", "rich", "distance", "has", "most", "solved", "ratio", "gap")
+_OF_GRADES = ("far", "rich", "distance", "has", "most", "solved", "ratio", "gap", "unresolved")
