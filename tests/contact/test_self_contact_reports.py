@@ -215,7 +215,7 @@ def test_no_memory_for_pairs(solver, tmp_path, monkeypatch, device):
         assert 0 < frame < 4 and found.status.result is Result.STOPPED and not found.status.ok
         assert found.status.message.startswith(f"stopped before the end of frame {frame + 1}: the cloth has ")
         assert "pairs that are near one another, which takes" in found.status.message
-        assert (np.asarray(found.points) == np.asarray(whole.points)[: frame + 1]).all()
+        assert (np.float32(found.points) == np.float32(whole.points)[: frame + 1]).all()  # as the file holds them
 
 
 @pytest.mark.parametrize("solver", [SOLVER, wc.Newton(substeps=2), wc.PBD(substeps=2)], ids=["xpbd", "newton", "pbd"])

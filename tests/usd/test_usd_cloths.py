@@ -1,5 +1,7 @@
 """Scenes of several cloths and stages: a prim for each cloth, read as one scene, and animated each with its own topology."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -71,6 +73,7 @@ def test_each_cloth_is_a_prim(single, tmp_path):
     scene, path = joined(), tmp_path / "cloths.usdc"
     solver = wc.XPBD(substeps=4)
     expected = wc.simulate(scene, solver)
+    expected = replace(expected, points=np.float32(expected.points), velocities=np.float32(expected.velocities))
     found = wc.simulate(scene, solver, output=str(path), single_file=single, record="reactions")
     np.testing.assert_array_equal(found.points, expected.points)
     np.testing.assert_array_equal(found.velocities[2:4], expected.velocities[2:4])

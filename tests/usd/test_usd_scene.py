@@ -424,7 +424,7 @@ def test_an_artists_scene_runs_as_a_layer_over_it(tmp_path):
 def test_own_scene_runs_and_its_result_is_the_same_scene(tmp_path):
     path = write_scene(keyframes(), tmp_path / "scene.usdc")
     scene, output = read_scene(path), tmp_path / "result.usdc"
-    expected = wc.simulate(keyframes(), wc.Newton(substeps=4), frames=4).points
+    expected = np.float32(wc.simulate(keyframes(), wc.Newton(substeps=4), frames=4).points)
     points = np.asarray(wc.simulate(scene, wc.Newton(substeps=4), frames=4, output=output).points)
     np.testing.assert_array_equal(points, expected)
     assert validate(output, path) == []
