@@ -303,6 +303,8 @@ def energy_available(run):
     y = run.x - run.times[:, None, None] * V
     A = np.einsum("ik,fik->f", _forces(run), y - y[0]) + _wind_work(run, V)
     A += elastic_energies(run)[0] + contact_energy(run, 0)
+    if isinstance(run.solver, wc.PBD | wc.HierarchicalPBD) and run.colliders:  # whose contact is a constraint d ≥ r
+        A += np.linalg.norm(_forces(run), axis=1).sum() * run.scene.contact.distance
     start = 0.5 * np.einsum("i,ik,ik->", run.masses * run.free, run.v[0] - V, run.v[0] - V)
     if exact:
         return A + start, True

@@ -93,7 +93,7 @@ class Status(NamedTuple):
         return self.result not in (Result.DIVERGED, Result.STOPPED)
 
 
-def sentence(result, grade, distance=np.nan, residual=None, measure=None, unit=None, tolerance=None, copy=None, why=""):
+def sentence(result, grade, distance=np.nan, residual=None, measure=None, unit=None, tolerance=None, copy=None, why="", of="each step"):
     """Returns a message: whether a result can be used, how it ended, and the residual with its unit and tolerance.
 
     Args:
@@ -106,6 +106,7 @@ def sentence(result, grade, distance=np.nan, residual=None, measure=None, unit=N
         tolerance: The tolerance it was compared with, or None for methods that do not check it.
         copy: The copy whose residual it is, or None if there is one copy.
         why: Why the result is not usable, and what to do.
+        of: That of which ``distance`` is from the solution.
     """
     ended, figure = result.value + (" in a step or more" if result in _OF_STEPS else ""), ""
     if measure is not None:
@@ -116,7 +117,7 @@ def sentence(result, grade, distance=np.nan, residual=None, measure=None, unit=N
         return f"{grade.value}: {why}; {ended}" + (f": {figure}" if figure else "")
     text = ended if ended.startswith(grade.value) else grade.value + (f", {ended}" if result is not Result.COMPLETED else "")
     if grade is Grade.COMPLETED and distance > 0.0:
-        text = text.replace(grade.value, f"{grade.value} within {millimetres(distance)} of the solution of each step", 1)
+        text = text.replace(grade.value, f"{grade.value} within {millimetres(distance)} of the solution of {of}", 1)
     return text + (f": {figure}" if figure else "")
 
 

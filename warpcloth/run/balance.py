@@ -28,7 +28,9 @@ from ..base.turns import TURN
 from ..core.energy import Energy
 from ..core.sums import Sums
 from ..fast.plan import plan
-from .sources import source_of
+from ..scene.colliders import Collider
+from ..scene.scene import Pins
+from .sources import common_velocity, source_of
 
 # A run has diverged when it has this many times the energy that its sources can have added. Stable runs reach 1.4 times with
 # unconverged or large steps, and 1.3 times with vertex-averaged sweeps. Single hierarchical sweeps, 16 a frame, reach 1.9 times
@@ -107,7 +109,8 @@ class Balance:
 
     Potential energy counts from the lowest value so far, so that falling is not a source. Negative elastic energy is included;
     it is computed at the start, and in frames that would otherwise count as diverged. A cloth without pins and attachments is
-    judged by its motion relative to its centre of mass, to which gravity adds nothing.
+    judged by its motion relative to its centre of mass, to which gravity adds nothing. If pins and colliders move at one velocity,
+    they add nothing to the energy relative to that motion, and cloth is judged by it.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -141,13 +144,16 @@ class Balance:
         constant = None if model.loads is None or self.free else model.loads.constant
         self._pull = None if constant is None else model.in_scene_order(constant.reshape(-1, 3)).reshape(constant.shape)
         self._start = points.reshape(model.copies, -1, 3)
+        attached = any(each.term.vertices == 1 and each.collider is None and not each.cells for each in model.terms)
+        self._velocity, self._time = np.zeros(3) if attached else common_velocity(model.scene), 0.0
         self._moment, self._fastest = self._moments(points), np.zeros(model.copies)
         self._rounding = np.zeros(model.copies)
         self.elastic = Elastic(model)
         self._lowest = self.elastic.below_0(model.positions)
         # Rounding of positions changes velocities by at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
         self._note_farthest(points)
-        found = (source_of(part, self, stepper) for part in (stepper, *model.scene.declared))
+        parts = [each for each in model.scene.declared if not (self._velocity.any() and isinstance(each, Pins | Collider))]
+        found = (source_of(part, self, stepper) for part in (stepper, *parts))
         self.sources = [source for source in found if source is not None]
         self.driven = len(self.sources) > 1
         integrator = stepper.takers[0][0].integrator
@@ -155,8 +161,8 @@ class Balance:
         self._bound = 1.0 if integrator is None else integrator.energy_bound
 
     def kinetic(self, velocities):
-        """Returns ½Σ m v² of each copy (B,) [J]; for a free cloth, relative to its centre of mass."""
-        velocities = velocities.reshape(*self.mass.shape, 3)
+        """Returns ½Σ m v² of each copy (B,) [J], relative to what moves at one velocity, or to the centre of a free cloth."""
+        velocities = velocities.reshape(*self.mass.shape, 3) - self._velocity
         if self.free:
             velocities = velocities - (self._moments(velocities) / self.total[:, None])[:, None]
         return 0.5 * (self.mass * np.einsum("bij,bij->bi", velocities, velocities)).sum(axis=1)
@@ -171,6 +177,7 @@ class Balance:
         """
         with np.errstate(all="ignore"):
             points, velocities = points.astype(np.float64, copy=False), velocities.astype(np.float64, copy=False)
+            self._time = frame / self.model.scene.fps
             kinetic, height = self.kinetic(velocities), self._height(points)
             self._h = min(self._h, self._stepper.h)
             if self.free:
@@ -245,7 +252,8 @@ class Balance:
         if not terms:
             return np.zeros(model.copies)
         points = np.tile((1.0 + STRAIN) * model.rest_points, (model.copies, 1))
-        return np.fmax(type(elastic)(model.with_terms(terms)).energy(model.array(points, model.vec3)), 0.0)
+        with TURN:
+            return np.fmax(type(elastic)(model.with_terms(terms)).energy(model.array(points, model.vec3)), 0.0)
 
     @cached_property
     def _conserved(self):
@@ -299,9 +307,10 @@ class Balance:
         """Returns the potential energy of gravity and constant loads since the start, (B,) [J]; 0 for a free cloth."""
         if self.free:
             return np.zeros(self.model.copies)
-        height = -((self._moments(points) - self._moment) * self._gravity).sum(axis=1)
+        moved = self._time * self._velocity
+        height = -((self._moments(points) - self._moment - self.total[:, None] * moved) * self._gravity).sum(axis=1)
         if self._pull is not None:
-            height = height - (self._pull * (points.reshape(self._pull.shape) - self._start)).sum(axis=(1, 2))
+            height = height - (self._pull * (points.reshape(self._pull.shape) - self._start - moved)).sum(axis=(1, 2))
         return height
 
     def _at_positions(self, points, velocities):

@@ -202,10 +202,12 @@ def equilibrium(
     why = "it is not an equilibrium"
     if result is Result.SADDLE:
         why = f"it is not stable, because the lowest eigenvalue of the Hessian is {digits(lowest)} N/m"
-    message = sentence(result, grade, np.nan, residual, RESIDUAL.measure, descent.unit, tolerance, why=why)
+    distance = descent.left
+    given = residual, RESIDUAL.measure, descent.unit, tolerance
+    message = sentence(result, grade, distance, *given, why=why, of="the equations of balance")
     if result is Result.STALLED:
         message = message.replace(result.value, began)
-    status = Status(result, 0, residual, message, None, RESIDUAL.measure, descent.unit, grade, np.nan, (grade,))
+    status = Status(result, 0, residual, message, None, RESIDUAL.measure, descent.unit, grade, distance, (grade,))
     energies = reactions = forces = None
     if record:
         evaluation = Evaluation(model, forces="reactions" in record, pairs=pairs)
@@ -280,6 +282,7 @@ class _Descent:
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
         self.wind = wind
         self.used, self.moved, self.pairs = 0, 0.0, minimiser.pairs
+        self.left = 0.0  # length of the last Newton step, which is at least as long as what is left [m]
         self._apart = wp.clone(base)  # the last positions without crossings
         model = minimiser.model
         gravity, self.unit = np.linalg.norm(model.gravity.numpy().astype(np.float64), axis=1), WEIGHT
@@ -341,7 +344,9 @@ class _Descent:
             (result,) = self.minimiser.minimise(self.tolerance, most, self.scale)
         self.unbalanced = float(self.minimiser.unbalanced()[0])
         self.used += self.minimiser.iterations
-        correction = self.minimiser.correction.numpy()
+        direction, correction = (array.numpy() for array in (self.minimiser.search.direction, self.minimiser.correction))
+        if self.minimiser.iterations:
+            self.left = float(np.linalg.norm(direction.astype(np.float64), axis=1).max())
         self.moved = np.abs(correction).max(initial=0.0) / self.size
         self.base.assign(self.base.numpy() + correction)
         wp.copy(self._apart, self.base)

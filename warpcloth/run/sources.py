@@ -255,6 +255,28 @@ def _loaded(loads: Loads, balance, _stepper):
     return DrivenLoads(balance) if loads and not held else None
 
 
+def common_velocity(scene):
+    """Returns the velocity (3,) [m/s] at which all that holds or touches the cloth moves; 0 if it stands, or moves otherwise."""
+    moves, frames = [], scene.frames
+    for collider in scene.colliders:
+        poses = collider.poses
+        if np.ptp(poses[:, 3:], axis=0).any() or collider.deforms.any() or 1 < len(poses) <= frames:
+            return np.zeros(3)
+        moves.append(np.diff(poses[: frames + 1, :3], axis=0) if len(poses) > 1 else np.zeros((1, 3)))
+    if len(scene.pins.vertices):
+        keyframes = scene.pins.keyframes
+        if keyframes is not None and (len(keyframes) <= frames or not scene.pins.held.all()):
+            return np.zeros(3)
+        moves.append(np.zeros((1, 3)) if keyframes is None else np.diff(keyframes[: frames + 1], axis=0).reshape(-1, 3))
+    if not moves or scene.air_terms:
+        return np.zeros(3)
+    velocities = scene.fps * np.concatenate(moves)
+    mean = velocities.mean(axis=0)
+    # Keyframes are sums or products of doubles, and lose some units in the last place of the largest position.
+    lost = 16.0 * np.finfo(np.float64).eps * np.abs(velocities).max() * (frames + 1)
+    return mean if np.abs(velocities - mean).max() <= lost else np.zeros(3)
+
+
 @source_of.register
 def _moving(pins: Pins, balance, _stepper):
     return MovingPins(balance) if pins.moves else None
