@@ -103,7 +103,7 @@ SOLVERS = {
     "projective dynamics": wc.ProjectiveDynamics(substeps=4, tolerance=1e-8, iterations=500),
     "admm": wc.ADMM(substeps=4, tolerance=1e-8, iterations=1000),
     "constrained dynamics": wc.ConstrainedDynamics(substeps=4, tolerance=1e-9, iterations=100),
-    "xpbd": wc.XPBD(substeps=8, iterations=100),
+    "xpbd": wc.XPBD(substeps=8, iterations=150),
     "pbd": wc.PBD(substeps=4, iterations=10),
     "hierarchical pbd": wc.HierarchicalPBD(substeps=4, iterations=4),
 }
@@ -240,12 +240,13 @@ def impact(name, device):
     return int(np.argmax(changed)) if changed.any() else len(found)
 
 
-def bound(name, solver, dtype, device, one, other, change):
+def bound(name, solver, relation, dtype, device, one, other, change):
     """Bound of the difference of two runs in each frame, (F,) [m].
 
     - Each step rounds coordinates X by eps X. Forces K of such moves move an explicit step by h²ω² < 4 of that, where h²ω² is
       below the limit of stability; an implicit step by (M/h² + K)⁻¹K < 1.
-    - It ends with an acceleration a that is not balanced, and ends within (M/h² + K)⁻¹ M a < h² a of where it would.
+    - It leaves an acceleration a that is not balanced, and ends within (M/h² + K)⁻¹ M a < h² a of the solution. Sweeps whose
+      number and order are fixed leave the same one twice.
     - Until a frame, each of its steps has an error as large as this in either run, all in the direction that grows most: a
       random one has 1/√(3n) of that.
     """
@@ -253,6 +254,8 @@ def bound(name, solver, dtype, device, one, other, change):
     largest = max(np.abs(one.points).max(), np.abs(other.points).max() / change.length)
     rounding = 5.0 * np.finfo(dtype).eps * largest
     unbalanced = h**2 * 9.81 * max(np.max(each.status.residual) for each in (one, other))
+    if not hasattr(SOLVERS[solver], "tolerance") and relation not in ("shuffled", "numbered anew"):
+        unbalanced = 0.0
     frames, vertices = np.arange(len(one.points)), one.points.shape[1]
     steps = 2.0 * (1.0 + SOLVERS[solver].substeps * frames)
     return np.sqrt(3.0 * vertices) * amplification(name, solver, device) * steps * (rounding + unbalanced)
@@ -285,7 +288,7 @@ def compare(name, solver, relation, dtype, device):
     error = np.abs(found - expected).max(axis=(1, 2))
     if solver == "explicit":
         error = error[: impact(name, device)]
-    assert (error <= bound(name, solver, dtype, device, one, other, change)[: len(error)]).all(), error
+    assert (error <= bound(name, solver, relation, dtype, device, one, other, change)[: len(error)]).all(), error
 
 
 # By nature, sweeps that do not converge depend on the order of constraints and of pairs. Of the 0.3 m of the sheet, vertices
@@ -314,14 +317,14 @@ FAILING = (
         ["two sheets", "rubbing sheets"],
         ["newton"],
         ["rotated", "boosted", "numbered anew"],
-        "the filter of iterates changes the areas of pairs: 1 mm",
+        "the filter of iterates cuts moves in space, and areas of pairs depend on what it stops: 1 mm",
     ),
     (["two sheets", "rubbing sheets"], MINIMISERS, ["shifted"], "the least gap is six units of float32, 0.7 mm at 2 km: 2 mm"),
     (
         ["rubbing sheets"],
         MINIMISERS,
         ["shuffled", "numbered anew"],
-        "friction of cloth on cloth depends on the order of its pairs: 0.02 mm",
+        "friction of a new pair starts with a mean that its first side weights, and turns with one edge: 0.02 mm",
     ),
 )
 XFAILS = {
