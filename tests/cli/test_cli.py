@@ -439,6 +439,20 @@ def test_a_diverged_run_exits_with_1_and_leaves_its_good_frames(tmp_path, capfd,
     assert np.isfinite(points).all()
 
 
+def test_a_run_that_is_not_usable_exits_with_1_and_keeps_its_frames_and_picture(tmp_path, capfd):
+    """One step and sweep a frame leave vertices farther from the solution than half an edge of 67 mm."""
+    output, film = tmp_path / "out.usdc", tmp_path / "out.png"
+    options = ["--solver", "xpbd", "-s", "substeps=1", "iterations=1", "--frames", 10, "--film", film]
+    code, out, err = run(capfd, "run", "hanging", "-p", "n=16", *options, "--json", "-o", output)
+    facts = json.loads(out)
+    assert (code, facts["grade"], facts["usable"], facts["status"]) == (1, "not usable", False, "completed")
+    assert facts["frames"] == facts["frames_asked"] == 10 and facts["distance"] > 0.5 / 15
+    assert err == f"warpcloth: {facts['message']}; all 10 frames are in {output}\n"
+    assert re.match("not usable: in frame [0-9]+ vertices are up to .* mm from the solution of the step", facts["message"])
+    assert len(FrameSequence(output)) == 11 and np.isfinite(np.asarray(FrameSequence(output))).all()
+    assert film.stat().st_size and facts["film"] == str(film)
+
+
 def test_an_interrupted_run_exits_with_130_and_says_what_is_saved(tmp_path, capfd, monkeypatch):
     class Interrupting(warpcloth.cli.run.Progress):
         def __call__(self, frame, frames):

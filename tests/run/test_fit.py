@@ -144,6 +144,24 @@ def test_what_the_motion_does_not_tell_has_no_error():
     assert all(error == np.inf for error in found.errors.values()) and np.isnan(found.correlation).all()
 
 
+@pytest.mark.parametrize(("true", "start", "usable"), [(100.0, 1000.0, True), (1000.0, 900.0, False)])
+def test_it_has_the_grade_of_the_run_with_the_estimates(true, start, usable, tmp_path, capsys):
+    """One step and sweep a frame end farther than half an edge from the solution if the cloth is stiff, as at both starts."""
+    solver, frames = wc.XPBD(substeps=1, iterations=1), 8
+    starting, seen = (wc.simulate(hanging(n=16, stiffness=k), solver, frames=frames, dtype="float64") for k in (start, true))
+    assert not starting.status.ok and seen.status.ok is usable
+    found = wc.fit(hanging(n=16), solver, {"Spring.stiffness": start}, seen.points[1:])
+    assert found.parameters["Spring.stiffness"] == pytest.approx(true, rel=1e-6) and found.status.ok is usable
+    np.savez(tmp_path / "a.npz", points=seen.points, triangles=hanging(n=16).mesh.triangles, times=seen.times)
+    words = ["fit", "hanging", str(tmp_path / "a.npz"), "-p", "n=16", "--start", f"Spring.stiffness={start}", "--frames", "8"]
+    assert main([*words, "--solver", "xpbd", "-s", "substeps=1", "iterations=1", "--json"]) == (not usable)
+    out, err = capsys.readouterr()
+    facts = json.loads(out)
+    assert facts["usable"] is usable and facts["grade"] == found.status.grade.value
+    said = "the run with the fitted parameters is not usable: in frame "
+    assert facts["parameters"] == pytest.approx(found.parameters) and (said in err) != usable
+
+
 def test_the_command_reads_a_file_by_its_times(tmp_path, capsys):
     """It uses the frames of the file at the times of frames of the scene, here the even ones, and no others."""
     scene = hanging(n=4)

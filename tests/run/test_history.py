@@ -13,6 +13,7 @@ from support.rows import slow_but
 from support.setups import MAIN, square
 from support.usd_validation import validate
 from warpcloth.run.history import Evaluation
+from warpcloth.scenes import hanging
 from warpcloth.usd import read_scene, write_scene
 from warpcloth.usd.stage import find_prim
 
@@ -399,5 +400,17 @@ def test_a_copy_of_a_batch_is_an_animation(device):
     assert one.worst_strain == pytest.approx(alone.worst_strain) and one.cut == alone.cut and one.crossings == 0
     assert one.self_contact.kept == alone.self_contact.kept
     assert (one.status.residual, one.status.frame, one.status.good.tolist()) == (alone.status.residual, 2, [2])
+    assert one.status.distance == pytest.approx(alone.status.distance, rel=1e-6) and one.status.grades == alone.status.grades
     with pytest.raises(ValueError, match="copy is 2; it must be 1 or less"):
         both.of_copy(2)
+
+
+def test_a_copy_of_a_batch_has_its_own_grade(device):
+    """With one step and sweep a frame the stiff one ends farther than half an edge from the solution, the soft one nearer."""
+    solver, run = wc.XPBD(substeps=1, iterations=1), {"device": device, "dtype": "float64", "frames": 8}
+    both = wc.simulate(hanging.scene(n=16), solver, copies=2, vary={"Spring.stiffness": np.array([100.0, 1000.0])}, **run)
+    assert not both.status.ok and both.status.complete
+    for copy, (stiffness, usable) in enumerate([(100.0, True), (1000.0, False)]):
+        found, alone = both.of_copy(copy).status, wc.simulate(hanging.scene(n=16, stiffness=stiffness), solver, **run).status
+        assert found.ok is usable and (found.grade, found.grades) == (alone.grade, alone.grades)
+        assert found.distance == pytest.approx(alone.distance, rel=1e-6)  # of the same steps, but for the order of sums

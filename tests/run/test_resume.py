@@ -1,6 +1,7 @@
 """Runs that were interrupted go on to the bit of those that were not; all others are refused in one sentence."""
 
 import os
+import re
 import signal
 import sys
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from support.forks import Forks
 from support.rows import slow_but
 from support.setups import MAIN, SOLVERS
 from warpcloth.cli import main
+from warpcloth.core.status import Grade
 from warpcloth.run import recorders
 from warpcloth.run.checkpoint import Checkpoint
 from warpcloth.scenes import hanging
@@ -299,6 +301,30 @@ def test_a_run_diverges_where_it_would_have_and_is_over_then(tmp_path, device):
     assert same(whole, wc.simulate(scene, solver, output=output, device=device, resume=True))
     with pytest.raises(ValueError, match="there is nothing to resume"):
         wc.simulate(scene, solver, output=output, device=device, resume=True)
+
+
+# Steps that are far too long, on edges of 67 and 143 mm, and sweeps that gain energy and diverge after LAST.
+LONG, GAINING = wc.XPBD(substeps=1, iterations=1), wc.XPBD(substeps=4, iterations=4, relaxation=1.85)
+
+
+@pytest.mark.parametrize(
+    ("given", "solver", "stop", "before"),
+    [
+        ({"n": 16}, LONG, STOP, True),
+        ({"n": 8}, LONG, STOP, False),
+        ({"n": 8, "stiffness": 1e4}, GAINING, LAST - 1, True),
+        ({"n": 8, "stiffness": 1e4}, GAINING, STOP, False),
+    ],
+)
+def test_a_resumed_run_has_the_same_grade(given, solver, stop, before, tmp_path, device):
+    """With the same frame and figures in its message, whether it was usable at the last checkpoint or not."""
+    scene, outputs = hanging.scene(**given, duration=LAST / 60.0), [str(tmp_path / f"{k}.usdc") for k in range(2)]
+    whole = wc.simulate(scene, solver, output=outputs[0], device=device)
+    assert whole.status.grade is Grade.NOT_USABLE and whole.status.complete and len(whole.points) == LAST + 1
+    first = int(re.match(r"not usable: in frame (\d+) ", whole.status.message)[1])
+    assert (first <= (stop + 1) // 10 * 10 - 1) == before  # frames are written by tens, the first one is the start
+    interrupted(scene, solver, outputs[1], stop, device=device)
+    assert same(whole, wc.simulate(scene, solver, output=outputs[1], device=device, resume=True))
 
 
 @dataclass(frozen=True, kw_only=True)

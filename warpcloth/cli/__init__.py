@@ -1,8 +1,8 @@
 """The command ``warpcloth``: runs, lists and describes scenes, deforms meshes, measures, compares, checks and draws animations,
 charts and benchmarks methods.
 
-Exit codes: 0 success (converged, completed, or iterations used up, as the summary says); 1 diverged (the good frames are
-saved), or `check` found something; 2 wrong use (one line on stderr); 130 interrupted by Ctrl-C and 143 by SIGTERM, as in shells
+Exit codes: 0 success (converged or completed, as the summary says); 1 not usable (all frames are saved) or diverged (the good
+frames are saved), or `check` found something; 2 wrong use (one line on stderr); 130 interrupted by Ctrl-C and 143 by SIGTERM, as in shells
 (a line says what is saved). Any other error also ends with 2 and one line, because most come from a scene file; ``--debug``
 prints the traceback above the line.
 

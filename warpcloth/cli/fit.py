@@ -11,7 +11,7 @@ from ..base.texts import assignments, convert, json_text
 from ..picture.figures import PICTURES, check_path
 from .options import add_scene, add_solver, add_values
 from .setup import named_scene, solver_facts, solver_line, solver_setup
-from .terminal import check_writable
+from .terminal import check_writable, say
 
 EPILOG = """\
 MEASURED is an animation of the scene's vertices, or of those of --vertices, in their order: a USD stage, a folder of .obj, .ply
@@ -111,10 +111,13 @@ def fit(arguments):
     }
     facts |= {"device": str(device), "dtype": arguments.dtype}
     facts |= solver_facts(arguments, setup, scene.fps) if setup else {"solver": None}
-    facts |= {**asdict(found), "intervals": found.intervals}
+    status = found.status
+    facts |= {**asdict(replace(found, status=None)), "intervals": found.intervals}
+    facts |= {"status": status.result.value, "grade": status.grade.value, "usable": status.ok}
+    facts["distance"] = float(np.max(status.distance))
     facts |= {name: np.asarray(facts[name]).tolist() for name in ("correlation", "residuals")}
     print(json_text(facts) if arguments.json else _summary(facts, found))
-    return 0
+    return 0 if status.ok else say(f"the run with the fitted parameters is {status.message}", 1)
 
 
 def _check(arguments):

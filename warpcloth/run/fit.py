@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from ..analysis.compare import to_up_axis
 from ..base.checks import number, shown
 from ..base.types import FilePath, Precision
+from ..core.status import Status
 from ..mesh.captures import Capture
 from ..mesh.selection import distinct_vertices
 from ..mesh.sequences import Sequence, open_sequence
@@ -43,6 +44,8 @@ class Fit:
         residuals: The same in each of the frames 1 … F, (F,), over markers; NaN in frames without any.
         runs: Number of batches that were run, or of sets of equilibria.
         message: How the fit ended.
+        status: The :class:`warpcloth.core.status.Status` of the batch, or of the equilibrium, with the estimates. Only diverged
+            runs end the search for them.
     """
 
     parameters: dict[str, float]
@@ -53,6 +56,7 @@ class Fit:
     residuals: np.ndarray
     runs: int
     message: str
+    status: Status
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
@@ -134,11 +138,11 @@ def fit(
     known_noise = data[0].sigma is not None
     scale = np.concatenate([np.broadcast_to(each.sigma if known_noise else 1.0, len(each.frames)) for each in data])
     options = {"device": device, "dtype": dtype, "record": record}
-    runs: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+    runs: dict[bytes, tuple[np.ndarray, np.ndarray, Status]] = {}
     rest = None
 
     def evaluated(logs):
-        """Returns residuals (m,) and their derivatives (m, P) by the logarithms of the parameters."""
+        """Returns residuals (m,), their derivatives (m, P) by the logarithms of the parameters, and the status of the run."""
         nonlocal rest
         key = logs.tobytes()
         if key not in runs:
@@ -146,16 +150,16 @@ def fit(
             vary = dict(zip(names, np.exp(np.vstack([logs, logs + changes, logs - changes])).T, strict=True))
             if solver is None:
                 found = _rests(scene, vary, rest, options)
-                rest = found[0].points
+                rest, status = found[0].points, found[0].status
             else:
-                found = _motions(scene, solver, vary, frames, options)
+                found, status = _motions(scene, solver, vary, frames, options)
             residuals = np.concatenate([each.residuals(found) for each in data], axis=1) / scale
             more, less = np.split(residuals[1:], 2)
-            runs[key] = residuals[0], (more - less).T / (2.0 * _DIFFERENCE)
+            runs[key] = residuals[0], (more - less).T / (2.0 * _DIFFERENCE), status
         return runs[key]
 
     logs = np.log([start[name] for name in names])
-    residuals, jacobian = evaluated(logs)
+    residuals, jacobian, _ = evaluated(logs)
     with np.errstate(over="ignore"):
         if not np.isfinite(residuals @ residuals):
             raise ValueError(f"measured: a residual is {np.abs(residuals).max():.3g} at the start; its square must be finite")
@@ -169,7 +173,7 @@ def fit(
         ftol=_TOLERANCE,
         gtol=None,
     )
-    residuals, jacobian = evaluated(found.x)
+    residuals, jacobian, status = evaluated(found.x)
     freedom = np.inf if known_noise else float(len(residuals) - len(names))
     with np.errstate(invalid="ignore"):
         variance = 1.0 if known_noise else float(np.divide(residuals @ residuals, freedom)) if freedom else np.nan
@@ -183,6 +187,7 @@ def fit(
         residuals=_of_frames(residuals, of_frames, frames),
         runs=len(runs),
         message=found.message,
+        status=status,
     )
 
 
@@ -269,13 +274,13 @@ def _positions(scene, measured, count):
     return positions
 
 
-def _motions(scene, solver, vary, frames, options) -> list[Animation]:
-    """Runs a scene with each of the values (R,) of parameters, as one batch, and returns the animations."""
+def _motions(scene, solver, vary, frames, options) -> tuple[list[Animation], Status]:
+    """Runs a scene with each of the values (R,) of parameters, as one batch, and returns the animations and their status."""
     count = len(next(iter(vary.values())))
     found = simulate(scene, solver, frames=frames, copies=count, vary=vary, **options)
-    if not found.status.ok:
+    if not found.status.complete:
         raise ValueError(f"a run with {_listed(vary, 0)} failed: {found.status.message}")
-    return [found.of_copy(copy) for copy in range(count)]
+    return [found.of_copy(copy) for copy in range(count)], found.status
 
 
 def _rests(scene, vary, rest, options) -> list[Equilibrium]:

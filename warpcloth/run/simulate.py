@@ -182,8 +182,9 @@ class Animation(ShownInNotebooks):
             )
         inside = tuple(each for each in self.inside if each.copy == copy)
         good = np.asarray(self.status.good)
-        status = self.status._replace(frame=int(good[copy]), good=good[copy : copy + 1])
-        status = status._replace(residual=float(np.broadcast_to(self.status.residual, len(good))[copy]))
+        status, grade = self.status._replace(frame=int(good[copy]), good=good[copy : copy + 1]), self.status.grades[copy]
+        own = {name: float(np.broadcast_to(getattr(self.status, name), len(good))[copy]) for name in ("residual", "distance")}
+        status = status._replace(grade=grade, grades=(grade,), **own)
         return replace(self, inside=inside, self_contact=summary, status=status, **given)
 
     def __repr__(self) -> str:
