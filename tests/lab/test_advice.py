@@ -75,6 +75,34 @@ def test_what_cannot_run_is_said_and_not_called_needless():
         advise(scene, wc.Explicit(substeps=4, above_limit="allow"), frames=3)
 
 
+# One step and sweep a frame, which on `hanging` end farther than half an edge from the solution.
+LONG = wc.XPBD(substeps=1, iterations=1)
+
+
+def test_runs_that_are_not_usable_are_compared_and_marked(capsys):
+    found = advise(hanging.scene(n=16), LONG, frames=10, resolutions={"n=8": hanging.scene(n=8)})
+    assert not found.status.ok and found.sentences[0].startswith("the scene as it is: not usable: in frame 8 ")
+    trials = by_name(found)
+    assert trials["float64"].usable is False and trials["float64"].matters is False
+    assert trials["n=8"].usable and trials["n=8"].reason == ""  # its edges are twice as long
+    words = "info hanging -p n=16 --advise --solver xpbd -s substeps=1 iterations=1 --frames 10".split()
+    assert main(words) == 0
+    assert "does not matter: not usable: in frame 8 " in capsys.readouterr().out
+    assert main([*words, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["usable"] is False and [trial["usable"] for trial in facts["trials"] if trial["name"] == "float64"] == [False]
+
+
+def test_what_keeps_a_run_usable_is_not_called_needless():
+    """Without what holds the cloth it falls, which the steps are too long for, however little that changes."""
+    held = replace(hanging.scene(n=16), terms=[*hanging.scene(n=16).terms, wc.Attachment(vertices="all", stiffness=1e3)])
+    found = advise(held, LONG, tolerance=10.0, frames=10)
+    trial = by_name(found)["without Attachment"]
+    assert found.status.ok and trial.matters is False and trial.usable is False
+    assert any(sentence.startswith("without QuadraticBending changes") for sentence in found.sentences)
+    assert not any(sentence.startswith("without Attachment changes") for sentence in found.sentences)
+
+
 def held_twice(n=5):
     """A cloth whose pins are soft and there twice, either of which would do."""
     pins = [wc.Attachment(vertices=[0, n - 1], stiffness=1e5) for _ in range(2)]

@@ -101,6 +101,15 @@ def test_a_row_of_every_solver(one, device):
     json.dumps(row, allow_nan=False)
 
 
+def test_a_row_has_the_grade_of_the_same_frames_of_a_run(device):
+    """Of the frames that are timed, and 2 before them."""
+    scene, setup = SceneRef("hanging", {"n": 16}), Setup("xpbd", {"substeps": 1, "iterations": 1})
+    row = measure(asdict(scene), asdict(setup), frames=8, device=device, dtype="float32", started=time.time())
+    status = wc.simulate(scene.load(), setup.record(), frames=10, device=device).status
+    assert row["status"] == "ok" and row["grade"] == status.grade.value == "not usable"
+    assert row["distance"] == pytest.approx(status.distance, rel=1e-3)
+
+
 def test_contact_is_measured_touched_and_far_away():
     """All vertices are at the gap of each shape, within the contact distance or farther than a second of falling."""
     listed = contacts(dtype="float64")
@@ -341,11 +350,12 @@ def test_what_ends_early_keeps_the_rows(stop, error, said, code, folder, monkeyp
 
 
 def test_refused_and_diverged_rows(folder, monkeypatch, capsys):
-    """One that diverged gives 1; one that was refused stands in the table; where all are, its sentence is all there is."""
+    """One that diverged gives 1; what was refused or is not usable is marked; where all are refused, that is all there is."""
     refused = row(4, None, status="refused", reason="too large", share=None, cold_start_s=None, start_s=None)
     table = [
         (["ok", "diverged"], 1, "warpcloth: diverged: xpbd hanging n=6\n"),
         (["refused", "ok"], 0, ""),
+        (["refused", "not usable"], 0, ""),
         (["refused", "refused"], 2, "warpcloth: too large\n"),
     ]
     for statuses, code, said in table:
@@ -356,12 +366,14 @@ def test_refused_and_diverged_rows(folder, monkeypatch, capsys):
             if "scene" not in asked.arguments:
                 return found
             status = statuses[[4, 6].index(asked.arguments["scene"]["parameters"]["n"])]
-            return found | (refused | {"bytes_per_s": None} if status == "refused" else {"status": status})
+            more = {"grade": status} if status == "not usable" else {"status": status}
+            return found | (refused | {"bytes_per_s": None} if status == "refused" else more)
 
         monkeypatch.setattr(benchmarks, "_alone", alone)
         assert main(["bench", "hanging", "--solver", "xpbd", "--sizes", "4", "6"]) == code
         out, err = capsys.readouterr()
         assert err == said and ("refused: too large" in out) == (code == 0)
+        assert ("not usable" in out) == ("not usable" in statuses)
 
 
 def test_each_benchmark_begins_with_an_empty_kernel_cache(monkeypatch):

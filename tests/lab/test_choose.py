@@ -204,6 +204,47 @@ def test_rivals_are_those_whose_times_overlap():
     assert pick(ALL, tolerance=0.05).rivals == [] and "nothing else" in pick(ALL, tolerance=0.05).certainty
 
 
+def graded(*doubted):
+    """All measurements, of which those of the settings named are not usable."""
+    return [replace(each, grade="not usable" if str(each.setup) in doubted else "completed") for each in ALL]
+
+
+EXPLICIT, PBD = "explicit substeps=152", "pbd substeps=120"
+
+
+@pytest.mark.parametrize(
+    ("options", "doubted", "chosen", "rivals", "said"),
+    [
+        ({"tolerance": 0.01}, [PBD], EXPLICIT, [PBD], False),
+        ({"tolerance": 0.01}, [EXPLICIT], PBD, [EXPLICIT], False),
+        ({"tolerance": 0.01}, [EXPLICIT, PBD], EXPLICIT, [PBD], True),
+        ({"tolerance": 0.05}, ["xpbd substeps=20"], "xpbd substeps=20", [], True),
+        ({"tolerance": 0.001}, [EXPLICIT], EXPLICIT, [], True),
+        ({"budget": 45.0}, ["xpbd substeps=40"], "xpbd substeps=40", [], True),
+        ({"budget": 45.0, "floor": 0.02}, ["xpbd substeps=40"], "xpbd substeps=20", ["xpbd substeps=40"], False),
+    ],
+)
+def test_a_setting_that_is_not_usable_is_chosen_where_no_other_is_as_good(options, doubted, chosen, rivals, said):
+    """Its error is measured, so it meets a tolerance; one that is usable and as cheap, or as accurate, is taken before it."""
+    choice = pick(graded(*doubted), **options)
+    assert (name(choice), [str(each.setup) for each in choice.rivals]) == (chosen, rivals)
+    assert ("its run is not usable, so 'warpcloth run' ends with exit code 1" in choice.certainty) == said
+    assert pick(ALL, **options) == pick([replace(each, grade=None) for each in graded()], **options)  # stored before grades
+
+
+def test_the_table_marks_settings_that_are_not_usable(tmp_path, monkeypatch, capsys):
+    exact = SimpleNamespace(points=np.zeros((3, 1, 3)), error=0.0, path=tmp_path)
+    found = graded("xpbd substeps=20")
+    monkeypatch.setattr(choosing, "choose", lambda *_, **options: (pick(found, options.get("tolerance") or 0.05), found, exact))
+    assert main(["choose", "hanging", "--tolerance", "5%"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[-3:] for line in lines if "not usable" in line][:1] == [["not", "usable", "chosen"]]
+    assert sum(line.startswith("  ") and "not usable" in line for line in lines) == 1
+    assert main(["choose", "hanging", "--tolerance", "5%", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert [each["label"] for each in facts["measured"] if each["grade"] == "not usable"] == ["xpbd substeps=20"]
+
+
 def test_what_is_refused():
     for options in ({}, {"tolerance": 0.0}, {"budget": -1.0}, {"tolerance": "1%"}):
         with pytest.raises(ValueError, match=r"tolerance|budget"):
@@ -369,6 +410,8 @@ def test_the_map_of_the_cheapest(tmp_path, monkeypatch, capsys):
             each for each in cell["measured"] if each["error"] is not None and each["error"] + cell["reference_error"] <= 0.01
         ]
         assert cell["status"] == "found" and cell["complete"] and 0.0 < cell["reference_error"] < 0.002
+        assert row["grade"] == cell["grade"] != "not usable" and "not usable" not in text_of_cell(cell)
+        assert "not usable" in text_of_cell(cell | {"grade": "not usable"})
         assert cell["ms"] == min(each["milliseconds"] for each in accurate) == float(row["ms"])
         explicit = next(each["setup"]["options"] for each in accurate if each["setup"]["solver"] == "explicit")
         other = cell["second"] or {"options": None}
@@ -392,7 +435,7 @@ def test_cells_without_an_accurate_setting_say_why(more, status, said, tmp_path,
     monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
     assert main([*"chart cheapest hanging --x n 4 --frames 2 --json".split(), *more]) == 0
     (cell,) = json.loads(capsys.readouterr().out)["cells"]
-    assert cell["status"] == status and cell["reason"].startswith(said) and cell["ms"] is None
+    assert cell["status"] == status and cell["reason"].startswith(said) and cell["ms"] is None and cell["grade"] is None
     assert " ".join(text_of_cell(cell)).startswith(said)
 
 

@@ -290,6 +290,29 @@ def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
     assert sum(map(bool, shown)) > 1 and not any(text.get_text() for text in ms.get_xticklabels(minor=True))
 
 
+def test_settings_that_are_not_usable_are_marked(tmp_path, drawn, monkeypatch, capsys):
+    """By a cross over each of their points, and in texts; those of before there were grades are not."""
+    rows = [
+        {"solver": "xpbd", "options": {}, "label": f"xpbd {n}", "status": "ok", "reason": "", "error": error, "ms": n,
+         "strain_error": error, "spread": [n, n], "ms_per_second": 60.0 * n, "machine": "m", **grade}
+        for n, error, grade in ((1, 4e-3, {"grade": "not usable"}), (2, 2e-3, {"grade": "completed"}), (3, 1e-3, {}))
+    ]  # fmt: skip
+    found = {"scene": "hanging", "frames": 2, "dtype": "float32", "machine": machine.machine(), "rows": rows}
+    for i in front(rows):
+        rows[i]["front"] = True
+    found["reference"] = {"error": 1e-5, "strain_error": 1e-5, "substeps": 8}
+    monkeypatch.setattr(work_precision, "time_diagram", lambda *_, **options: found)
+    assert main(["chart", "work-precision", "hanging", "-o", str(tmp_path / "a.png"), "--csv", str(tmp_path / "a.csv")]) == 0
+    out = capsys.readouterr().out
+    assert "3 settings, 3 ok; 1 of the ok are not usable" in out
+    assert [line.split(": ")[1] for line in out.splitlines() if ", not usable: " in line] == ["xpbd 1", "xpbd 1"]
+    assert [line["grade"] for line in table(tmp_path / "a.csv")] == ["not usable", "completed", ""]
+    for panel in drawn[0].axes[:2]:
+        crosses = [line.get_xydata().tolist() for line in panel.lines if line.get_marker() == "x"]
+        assert crosses == [[[60.0, 4e-3]]]
+    assert text_of(drawn[0]).count("xpbd 1, not usable") == 2 and "xpbd 2, not usable" not in text_of(drawn[0])
+
+
 def test_below_the_error_of_the_reference_nothing_is_better():
     """Errors below that of the reference do not rank settings: such settings are ranked by time alone."""
     rows = [
@@ -381,6 +404,8 @@ def test_time_diagram(device, tmp_path, drawn):
     assert rows["newton bdf2 1"]["error"] > 2.0 * rows["newton bdf2 2"]["error"] > floor
     best = [row for row in found["rows"] if row.get("front")]
     assert best and all(row["status"] == "ok" for row in best)
+    doubted = found["rows"][0] | {"grade": "not usable"}
+    found["rows"][0] = doubted
     found["rows"][-1] |= {"status": "diverged", "reason": "diverged in frame 3", "error": None}
     found["rows"][-1].pop("front", None)
     name = found["rows"][-1]["label"]
@@ -407,11 +432,14 @@ def test_time_diagram(device, tmp_path, drawn):
     assert all(f"{i}  {found['rows'][place]['label']}" in text for i, place in enumerate(numbered, 1))
     assert name + ": diverged" in text
     shown = {label for _, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    assert shown == {"error of the reference", "nothing is better in both", "scatter of the times"}
+    assert shown == {"error of the reference", "nothing is better in both", "scatter of the times", "not usable"}
     assert drawn[0].texts[-1].get_text() == machine.in_words(found["machine"])
     good = [row for row in found["rows"] if row["status"] == "ok"]
     for panel, name in ((axes, "error"), (strains, "strain_error")):
-        points = np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() not in ("None", "")])
+        points = np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() not in ("None", "", "x")])
+        crosses = np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() == "x"])
+        assert (doubted["ms_per_second"], doubted[name]) in set(map(tuple, crosses))
+        assert len(crosses) == sum(row["grade"] == "not usable" for row in good)
         assert sorted(map(tuple, points)) == sorted((row["ms_per_second"], row[name]) for row in good)
         assert floor_of(panel, "error of the reference") == found["reference"][name] < min(points[:, 1])
         ends = {each.get_text(): each for each in panel.texts if not each.get_text().isdigit()}

@@ -3,6 +3,7 @@
 import textwrap
 
 from ..lab.choosing import percent
+from ..lab.measurements import usable
 from ..picture.figures import PICTURES, check_path, save
 from .style import LABEL, TICK, dress, headline, small_print, style_of
 
@@ -16,7 +17,7 @@ def plot_cheapest(path, found):
 
     A cell has the colour and the marker of the cheapest solver. It shows its settings, the time of a frame, its error, the
     second best with its ratio of times, and the error of the reference. Cells without an accurate setting are hatched and say
-    why. A question mark after the time means that the search was not complete.
+    why. "not usable" is the grade of a run. A question mark after the time means that the search was not complete.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -71,6 +72,7 @@ def text_of_cell(cell):
     return [
         *textwrap.wrap(cell["label"], _CHARACTERS),
         f"{cell['ms']:.3g} ms{'' if cell['complete'] else '?'}, error {percent(cell['error'])}",
+        *([] if usable(cell) else ["not usable"]),
         *textwrap.wrap(beside, _CHARACTERS),
         f"(reference {percent(cell['reference_error'])})",
     ]

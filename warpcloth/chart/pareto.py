@@ -2,12 +2,14 @@
 
 import textwrap
 
+from ..lab.measurements import usable
 from ..lab.work_precision import WITHIN, cheapest, front, quartiles, without_point
 from ..numerics.integrators import INTEGRATORS
 from ..others.simulators import SIMULATORS, shown_name
 from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
 from .style import DASHES, LABEL, LEGEND, SMALL, dress, headline, name_all_ends, series_style, small_print, style_of
 
+_CROSS = {"marker": "x", "markersize": 8, "color": "black", "markeredgewidth": 0.8}  # over points of runs that are not usable
 _WIDTH, _LINES = 46, 48  # characters and lines of the texts beside a picture
 # Errors of a motion, with the labels of their axes.
 _ERRORS = {
@@ -21,8 +23,9 @@ def plot_time(path, found):
 
     Two panels show the error of positions and the 99th percentile of the error of strains. In each panel the settings that no
     other beats by more than the spread of times are joined and numbered, with their names beside the panel. Settings without an
-    error are named with the reason. The error of the reference solution is a line; points below it mean nothing. For solvers of
-    other simulators, dots show the error relative to the motion to which the solver itself converges.
+    error are named with the reason. Runs that are not usable are crossed. The error of the reference solution is a line; points
+    below it mean nothing. For solvers of other simulators, dots show the error relative to the motion to which the solver
+    itself converges.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -36,11 +39,11 @@ def plot_time(path, found):
     rows, reference = found["rows"], found["reference"]
     curves = {name: front(rows, reference[name], name) for name in _ERRORS}
     best = sorted(set().union(*curves.values()), key=lambda i: rows[i]["ms_per_second"])
-    texts = [f"{number}  {rows[i]['label']}" for number, i in enumerate(best, 1)]
+    texts = [f"{number}  {rows[i]['label']}{_doubt(rows[i])}" for number, i in enumerate(best, 1)]
     texts += [
         "",
         f"cheapest within {100.0 * WITHIN:g} %:",
-        *(row["label"] for row in cheapest(rows, reference["error"])),
+        *(row["label"] + _doubt(row) for row in cheapest(rows, reference["error"])),
     ]
     texts += _missing("not drawn:", found)
     figure, panels, notes = _figure(path, texts)
@@ -60,6 +63,9 @@ def plot_time(path, found):
             axes.plot(x, y, dashes.get(integrator, "-"), color=style.colour, linewidth=0.7, alpha=0.6)
             axes.hlines(y, *zip(*map(quartiles, line), strict=True), color=style.colour, linewidth=2.5, alpha=0.45)
             axes.plot(x, y, linestyle="none", markersize=5, **style.line)
+            crossed = [point for point, row in zip(zip(x, y, strict=True), line, strict=True) if not usable(row)]
+            if crossed:
+                axes.plot(*zip(*crossed, strict=True), linestyle="none", label="not usable", **_CROSS)
             name = shown_name(solver) if integrator == "euler" else f"{solver} {integrator}"
             ends[axes].append((x[-1], y[-1], name, style.colour))
     for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
@@ -147,6 +153,10 @@ def plot_spectrum(path, found):
     title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
     _finish(figure, panels, notes, title, texts, found)
     save(figure, path)
+
+
+def _doubt(row):
+    return "" if usable(row) else ", not usable"
 
 
 def _floor(axes, value, label, colour=GREY):

@@ -2,9 +2,9 @@
 charts and benchmarks methods.
 
 Exit codes: 0 success (converged or completed, as the summary says); 1 not usable (all frames are saved) or diverged (the good
-frames are saved), or `check` found something; 2 wrong use (one line on stderr); 130 interrupted by Ctrl-C and 143 by SIGTERM, as in shells
-(a line says what is saved). Any other error also ends with 2 and one line, because most come from a scene file; ``--debug``
-prints the traceback above the line.
+frames are saved), or `check` found something; 2 wrong use (one line on stderr); 130 interrupted by Ctrl-C and 143 by SIGTERM,
+as in shells (a line says what is saved). Any other error also ends with 2 and one line, because most come from a scene file;
+``--debug`` prints the traceback above the line.
 
 Help and completion do not load Warp: modules of commands import it inside functions, and `main` imports everything before it
 runs a command. No other part of the package defers an import of its own modules.

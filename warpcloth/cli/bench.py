@@ -35,6 +35,7 @@ Columns:
 With colliders or self-contact, the last column compares the time of a frame with that of the same cloth without contact, and
 divides the difference by the numbers of vertices, substeps and colliders, counting self-contact as one. With self-contact it
 also has the largest number of near pairs, how often they were listed, the moves that the filter kept, and the least gap.
+It says if the frames are not usable, as 'warpcloth run' does; they are taken again for that, which is not timed.
 
   warpcloth bench --json > before.json
   warpcloth bench hanging --solver xpbd -s substeps=4 iterations=20 --sizes 32 64 128
@@ -195,6 +196,9 @@ def _text(facts):
 
 def _cells(row):
     """Returns a row as texts."""
+    from ..core.status import Grade
+    from ..lab.measurements import usable
+
     if row["status"] == "refused":
         return (_scene_of(row), row["label"], *[""] * (len(_HEAD) - 1), f"refused: {row['reason']}")
     low, high = row["spread"]
@@ -210,7 +214,7 @@ def _cells(row):
             f"{row['launches']:.4g}",
         ),
         *map(_number, numbers),
-        row["reason"] or _contact(row),
+        row["reason"] or "; ".join(filter(None, ["" if usable(row) else Grade.NOT_USABLE.value, _contact(row)])),
     )
 
 

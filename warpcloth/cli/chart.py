@@ -14,6 +14,7 @@ from .setup import named_scene
 from .terminal import DTYPES, add_dask, check_outputs, measuring
 
 TEXT = "Draw charts of accuracy against time, of stability, and of failures."
+NOT_USABLE = ", not usable"
 DIAGRAMS = ("time", "solver", "physics", "spectrum")
 
 EPILOG = """\
@@ -202,6 +203,7 @@ def _axis(of, words):
 def _cheapest_summary(found):
     """Returns a line for each cell."""
     from ..lab.choosing import percent
+    from ..lab.measurements import usable
 
     lines = [f"{found['scene']}: cheapest within {percent(found['tolerance'])}", f"  device   {found['machine']['device']}"]
     for cell in found["cells"]:
@@ -211,7 +213,9 @@ def _cheapest_summary(found):
             continue
         second, known = cell["second"], percent(cell["reference_error"])
         text = f"{cell['label']}, {cell['ms']:.3g} ms, error {percent(cell['error'])} (reference {known})"
+        text += NOT_USABLE if not usable(cell) else ""
         text += f"; second {second['label']}, {second['ratio']:.3g} times" if second else "; no second within the search"
+        text += NOT_USABLE if second and not usable(second) else ""
         lines.append(f"  {at}: {text}" + ("" if cell["complete"] else "; the search was not complete"))
     lines += [f"  measured on {name}" for name in dict.fromkeys(cell["machine"] for cell in found["cells"])]
     return "\n".join(lines)
@@ -309,11 +313,14 @@ def _physics_lines(found):
 
 
 def _summary(found, lines_of):
+    from ..lab.measurements import usable
     from ..lab.work_precision import without_point
 
     rows, device = found["rows"], found["machine"]["device"]
     counts = {status: sum(row["status"] == status for row in rows) for status in ("ok", "diverged", "slow", "refused")}
     said = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+    doubted = sum(row["status"] == "ok" and not usable(row) for row in rows)
+    said += f"; {doubted} of the ok are not usable" if doubted else ""
     lines = [f"{found['scene']}: {len(rows)} settings, {said}", f"  device        {device}, {found['dtype']}"]
     lines += [f"  measured on   {count} {name}" for name, count in Counter(row["machine"] for row in rows).items()]
     lines += lines_of(found)
@@ -325,6 +332,7 @@ def _summary(found, lines_of):
 
 def _time_lines(found):
     """Returns lines with the Pareto front, and the cheapest setting of each solver."""
+    from ..lab.measurements import usable
     from ..lab.own_reference import words_of_own
     from ..lab.work_precision import WITHIN, cheapest
     from ..others.simulators import shown_name
@@ -338,6 +346,7 @@ def _time_lines(found):
             error, strain = 100.0 * row["error"], 100.0 * row["strain_error"]
             numbers = f"{row['ms_per_second']:.3g} ms a second, {error:.2g} %, strain {strain:.2g} %"
             numbers += f", {100.0 * row['own_error']:.2g} % from its own" if row.get("own_error") is not None else ""
+            numbers += "" if usable(row) else NOT_USABLE
             lines.append(f"  {head:<13} {numbers}: {row['label']}")
     return lines
 

@@ -146,6 +146,7 @@ def _text(facts, choice, found, exact, advise):
             lines.append(
                 f"  {name}  {each.milliseconds:9.3g} ms  {percent(each.error):>9}"
                 + (f"  {percent(each.own_error)} from its own" if each.own_error is not None else "")
+                + ("" if each.usable else "  not usable")
                 + ("  chosen" if each is choice.chosen else "")
             )
     for solver, own in choice.others.items():

@@ -120,6 +120,8 @@ def advise_on(arguments, source, values, scene, device):
         "frames": found.frames,
         "milliseconds": list(found.milliseconds),
         "steady": found.steady,
+        "grade": found.status.grade.value,
+        "usable": found.status.ok,
         "trials": [asdict(trial) for trial in found.trials],
         "advice": found.sentences
         + (

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..base.checks import number, whole
+from ..core.status import Status
 from ..mesh.distances import surface_distances
 from ..run.simulate import simulate
 from ..terms.woven import Woven
@@ -29,8 +30,9 @@ class Trial:
             resolution, the distance between the surfaces, both ways. NaN without a result.
         cost: Time of a frame over that of the unchanged scene.
         matters: Whether the change is above the tolerance; None without a result.
-        reason: Why there is no result, or "".
+        reason: Why there is no result, or it is not usable, or "".
         finer: For another resolution, whether it has more vertices; else None.
+        usable: Whether the run counts as usable, see :class:`warpcloth.core.status.Grade`; None without a run.
     """
 
     kind: str
@@ -40,6 +42,7 @@ class Trial:
     matters: bool | None
     reason: str = ""
     finer: bool | None = None
+    usable: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ class Advice:
         declared: Number of frames of the scene.
         milliseconds: Mean time of a frame of the unchanged scene without the first frame, in its first and its last run [ms].
         tolerance: Tolerance below which a change does not matter.
+        status: The :class:`warpcloth.core.status.Status` of the unchanged scene.
     """
 
     trials: list
@@ -59,6 +63,7 @@ class Advice:
     declared: int
     milliseconds: tuple[float, float]
     tolerance: float
+    status: Status
 
     @property
     def steady(self):
@@ -69,7 +74,7 @@ class Advice:
     @property
     def sentences(self):
         """Returns the advice in sentences."""
-        found = []
+        found = [] if self.status.ok else [f"the scene as it is: {self.status.message}; what follows is of runs like it"]
         step = next(trial for trial in self.trials if trial.kind == "step")
         if step.matters is not False:
             found.append(
@@ -79,6 +84,7 @@ class Advice:
                 else f"half the step: {step.reason}"
             )
         needless = [trial for trial in self.trials if trial.kind in _LEFT_OUT[:-1] and trial.matters is False]
+        needless = [trial for trial in needless if trial.usable or not self.status.ok]
         # A collider is left out with its friction, and a term with its anisotropy.
         inner = {trial.name.replace("the collider", "friction on") for trial in needless if trial.kind == "collider"}
         inner |= {f"without {_anisotropy(trial.name.removeprefix('without '))}" for trial in needless if trial.kind == "term"}
@@ -114,7 +120,8 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
     """Leaves out each term, each collider and its friction, and the air in turn, makes terms of fabrics isotropic, and changes
     precision, step and resolution.
 
-    Each change is compared with the unchanged scene in a short run.
+    Each change is compared with the unchanged scene in a short run. Runs that are not usable are compared too. If that of the
+    scene is usable, and one without a part is not, the part is not called needless.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
@@ -175,7 +182,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
                 *most, last = (parts[part] for part in needless)
                 name = f"without {', '.join(most)} and {last}"
                 trials.append(_trial("all", name, without, run, base, first, scene, size, tolerance, device))
-    return Advice(trials, frames, scene.frames, (first, run(scene)[1]), tolerance)
+    return Advice(trials, frames, scene.frames, (first, run(scene)[1]), tolerance, base.status)
 
 
 def _parts(scene):
@@ -227,20 +234,21 @@ def _trial(kind, name, options, run, base, first, scene, size, tolerance, device
         found, milliseconds = run(**options)
     except ValueError as error:
         return Trial(kind, name, np.nan, np.nan, None, str(error), finer)
-    cost = milliseconds / first
+    cost, usable = milliseconds / first, found.status.ok
     if not found.status.complete:
         if kind not in _LEFT_OUT:
-            return Trial(kind, name, np.nan, cost, None, found.status.message, finer)
+            return Trial(kind, name, np.nan, cost, None, found.status.message, finer, usable)
         # Such as a term that holds the cloth together.
-        return Trial(kind, name, np.inf, cost, True, found.status.message)
+        return Trial(kind, name, np.inf, cost, True, found.status.message, usable=usable)
     if kind == "resolution":
         if not (len(scene.mesh.triangles) and len(options["changed"].mesh.triangles)):
-            return Trial(kind, name, np.nan, cost, None, "the mesh has edges alone, and no surface to compare", finer)
+            return Trial(kind, name, np.nan, cost, None, "the mesh has edges alone, and no surface to compare", finer, usable)
         change = _surface_change(base, scene, found, options["changed"], device)
     else:
         between = np.asarray(found.points, dtype=np.float64) - np.asarray(base.points, dtype=np.float64)
         change = float(np.sqrt((between**2).sum(axis=2).mean()))
-    return Trial(kind, name, change / size, cost, bool(change / size > tolerance), finer=finer)
+    reason = "" if usable else found.status.message
+    return Trial(kind, name, change / size, cost, bool(change / size > tolerance), reason, finer, usable)
 
 
 def _surface_change(one, first, other, second, device):

@@ -24,7 +24,7 @@ _WARM_UP = 2.0
 # Time limit of a reference solution, in limits of a cell.
 _TIMES = 6.0
 # What a CSV says of the cheapest setting, and with "second_" of the second best; unknown values are empty.
-_OF_SETTING = ("label", "options", "ms", "ms_low", "ms_high", "error", "strain_error")
+_OF_SETTING = ("label", "options", "ms", "ms_low", "ms_high", "error", "strain_error", "grade")
 _OF_REFERENCE = ("error", "method", "substeps", "seconds")
 COLUMNS = ("x", "x_value", "y", "y_value", "status", "reason", "solver", *_OF_SETTING)
 COLUMNS += ("second_solver", *(f"second_{name}" for name in _OF_SETTING), "ratio", "complete", "settings", "seconds")
@@ -107,15 +107,15 @@ def measure(scene, digest, frames, tolerance, solvers, device, dtype, limit):
 
         - ``status``: "found", "none" if no setting was accurate within the limit, or "unknown" if the reference solution is
           not accurate enough to tell; ``reason``: a sentence, "" if found.
-        - ``solver``, ``options``, ``label``, ``ms``, ``spread``, ``error``, ``strain_error``: the cheapest setting, the time of
-          a frame and its spread [ms], and its errors.
+        - ``solver``, ``options``, ``label``, ``ms``, ``spread``, ``error``, ``strain_error``, ``grade``: the cheapest setting,
+          the time of a frame and its spread [ms], its errors, and the grade of its run.
         - ``second``: The same of the cheapest setting of another solver, with its ``ratio`` of times, or None.
         - ``complete``: Whether the search ended before the limit.
         - ``reference_error``, ``reference_method``, ``reference_substeps``, ``reference_seconds``: The reference solution.
         - ``seconds``: Time of the search; ``measured``: what was measured, a list.
     """
     at = SceneRef(**scene)
-    names = ("solver", "options", "label", "ms", "spread", "error", "strain_error", "second", "complete", "seconds")
+    names = ("solver", "options", "label", "ms", "spread", "error", "strain_error", "grade", "second", "complete", "seconds")
     cell = {"status": "unknown", "reason": ""} | dict.fromkeys((*names, *(f"reference_{name}" for name in _OF_REFERENCE)))
     cell["measured"] = []
     with warnings.catch_warnings():
@@ -183,7 +183,8 @@ def cheapest_of_each(found, tolerance, floor):
 
 def _facts(each):
     facts = {"solver": each.setup.solver, "options": each.setup.options, "label": label(each.setup), "dtype": each.dtype}
-    return facts | {"ms": each.milliseconds, "spread": each.spread, "error": each.error, "strain_error": each.strain_error}
+    facts |= {"ms": each.milliseconds, "spread": each.spread, "error": each.error, "strain_error": each.strain_error}
+    return facts | {"grade": each.grade}
 
 
 def _why(found, tolerance, floor, limit, complete):

@@ -12,7 +12,7 @@ from ..base.checks import number, whole
 from ..others.simulators import simulator_of
 from ..solvers import SOLVERS
 from . import campaign, trajectory
-from .measurements import Setup, task
+from .measurements import Setup, task, usable
 from .own_reference import SHARE, of_own, own_facts, own_references
 from .reference import reference
 from .setups import setups_of_runs
@@ -48,6 +48,7 @@ class Measured:
         seconds: Time of its frames [s].
         status: "ok", "diverged", "slow", "refused", or "left" if it was not measured.
         dtype: The precision of its run, or None if it was not measured.
+        grade: The value of the :class:`warpcloth.core.status.Grade` of its run, or None.
     """
 
     setup: Setup
@@ -62,6 +63,12 @@ class Measured:
     seconds: float = 0.0
     status: str = "ok"
     dtype: str | None = None
+    grade: str | None = None
+
+    @property
+    def usable(self):
+        """Whether its run counts as usable without a reference."""
+        return usable({"grade": self.grade})
 
 
 @dataclass(frozen=True)
@@ -122,7 +129,8 @@ def pick(measurements, tolerance=None, budget=None, floor=0.0):
     """Chooses among measurements.
 
     With a tolerance, it chooses the cheapest setup that meets it, and the budget, if there is one. If nothing does, or with a
-    budget alone, it chooses the most accurate setup within the budget, if there is one.
+    budget alone, it chooses the most accurate setup within the budget, if there is one. A setup whose run is not usable may be
+    chosen, because the reference judges it better; of setups that are as good, the best that is usable is chosen.
 
     Args:
         measurements: :class:`Measured`\\s.
@@ -147,18 +155,24 @@ def pick(measurements, tolerance=None, budget=None, floor=0.0):
     if accurate:
         chosen = min(accurate, key=lambda each: each.milliseconds)
         rivals = _as_cheap(chosen, accurate)
+        if not chosen.usable:
+            chosen = next((each for each in rivals if each.usable), chosen)
+            rivals = _as_cheap(chosen, accurate)
         return Choice(chosen, True, rivals, _certainty(chosen, rivals, tolerance, floor))
     if not affordable:
         why = "nothing was measured that ended well" if not known else f"the fastest takes {_least(known):.3g} ms a frame"
         return Choice(None, False, [], f"nothing is within the budget: {why}")
     chosen = min(affordable, key=lambda each: (each.error, each.milliseconds))
     if tolerance is None:
+        equal = [each for each in affordable if each.error - chosen.error <= floor]
+        chosen = min(equal, key=lambda each: (not each.usable, each.error, each.milliseconds))
         rivals = [each for each in affordable if each is not chosen and abs(each.error - chosen.error) <= floor]
-        return Choice(chosen, True, rivals, f"its error of {percent(chosen.error)} is known to {percent(floor)} of the size")
+        known = f"its error of {percent(chosen.error)} is known to {percent(floor)} of the size"
+        return Choice(chosen, True, rivals, known + _grade(chosen))
     within = "" if budget is None else " within the budget"
     known = f", and the reference is known to {percent(floor)} only" if chosen.error <= tolerance else ""
     sentence = f"nothing measured{within} meets {percent(tolerance)}; the most accurate comes to {percent(chosen.error)}{known}"
-    return Choice(chosen, False, [], sentence)
+    return Choice(chosen, False, [], sentence + _grade(chosen))
 
 
 def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=None):
@@ -392,7 +406,7 @@ def measured(setup, result, machine):
     seconds = 1e-3 * (result["ms"] or 0.0) * result["frames"]
     own = result.get("own_error")
     strain, status = result["strain_error"], result["status"]
-    of_run = strain, own, seconds, status, result["dtype"]
+    of_run = strain, own, seconds, status, result["dtype"], result.get("grade")
     return Measured(setup, result["error"], result["ms"], spread, result["reason"], machine, final, *of_run)
 
 
@@ -428,9 +442,14 @@ def _certainty(chosen, rivals, tolerance, floor):
     margin = f"its error of {percent(chosen.error)} is {tolerance / max(chosen.error, 1e-30):.3g} times below the tolerance"
     known = f", known to {percent(floor)}" if floor else ""
     if not rivals:
-        return f"{margin}{known}; nothing else that meets it is as cheap"
+        return f"{margin}{known}; nothing else that meets it is as cheap{_grade(chosen)}"
     names = ", ".join(f"{each.setup} ({each.milliseconds:.3g} ms)" for each in rivals[:3])
-    return f"{margin}{known}; within the spread of the times as cheap: {names}"
+    return f"{margin}{known}; within the spread of the times as cheap: {names}{_grade(chosen)}"
+
+
+def _grade(chosen):
+    """Returns what to add to a sentence about a setup whose run is not usable, or ""."""
+    return "" if chosen.usable else "; without the reference its run is not usable, so 'warpcloth run' ends with exit code 1"
 
 
 def _unknown(exact, tolerance):

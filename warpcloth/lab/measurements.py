@@ -10,6 +10,7 @@ from functools import cache
 from importlib import import_module
 
 from ..base.digest import source_digest
+from ..core.status import Grade
 from ..others.simulators import other_solvers, shown_name, simulator_of
 from ..run import scene_files
 from ..solvers import SOLVERS
@@ -122,6 +123,14 @@ def task(function, **arguments):
     """
     plain = {name: asdict(value) if hasattr(value, "__dataclass_fields__") else value for name, value in arguments.items()}
     return Task(f"{function.__module__}:{function.__qualname__}", plain)
+
+
+def usable(row):
+    """Returns whether the run of a row counts as usable without a reference, see :class:`warpcloth.core.status.Grade`.
+
+    Rows without a grade, as of results that were stored before there were grades, do.
+    """
+    return row.get("grade") != Grade.NOT_USABLE.value
 
 
 def finite(value):

@@ -16,6 +16,7 @@ COLUMNS = (
     *("bytes_per_s", "share", "launches"),
     *("start_s", "cold_start_s", "bind_s", "factorise_s", "memory", "triangles", "ms_without", "contact_ns"),
     *("pairs", "lists", "kept", "least_gap", "list_ns", "areas_ns"),
+    *("grade", "distance"),
 )
 
 

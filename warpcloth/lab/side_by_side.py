@@ -100,7 +100,7 @@ def nearest_setting(found):
 def _row(each, fps):
     """Returns the row of a :class:`warpcloth.lab.choosing.Measured` in a diagram."""
     status = each.status if each.error is not None or each.status != "ok" else "diverged"
-    names = ("error", "strain_error", "own_error", "reason", "machine", "spread")
+    names = ("error", "strain_error", "own_error", "reason", "machine", "spread", "grade")
     row = {"solver": each.setup.solver, "options": each.setup.options, "label": label(each.setup), "status": status}
     ms = each.milliseconds
     return row | {name: getattr(each, name) for name in names} | {"ms": ms, "ms_per_second": ms and ms * fps}

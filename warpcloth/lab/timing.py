@@ -13,9 +13,10 @@ import warp as wp
 from ..core.capture import Mirror, Segment
 from ..core.status import Result
 from ..mesh.ordering import order_of_run
+from ..run.watch import Watch, watched_frames
 from ..scene.mesh_collider import MeshCollider
 from .counts import compulsory_bytes, elements_of, launches_of
-from .measurements import SceneRef, Setup
+from .measurements import SceneRef, Setup, finite
 
 # Number of warm-up frames, time after which no further frame begins [s], and minimum number of frames.
 _WARM_UP, _SECONDS, _FEWEST = 2, 10.0, 3
@@ -39,6 +40,8 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
         dict: Unknown values are None.
 
         - ``status``: "ok", "diverged" or "refused"; ``reason``: a sentence, "" if ok.
+        - ``grade``, ``distance``: Those of the :class:`warpcloth.core.status.Status` of the frames; of copies the worst [m].
+          They are found when the frames are taken again, so that times and memory are those of steps alone.
         - ``vertices``, ``elements``: Numbers for all copies and terms. ``substeps``: Steps per frame. ``frames``: Timed frames.
         - ``ms``, ``spread``: Median and quartiles of the time of a frame with its points on the host [ms]; ``cloths_per_s``:
           copies over the median [1/s].
@@ -74,6 +77,8 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
         "ms_without",
         "contact_ns",
         *OF_SELF_CONTACT,
+        "grade",
+        "distance",
     )
     found = {"status": "ok", "reason": "", "frames": 0, **dict.fromkeys((*names, "start_s", "bind_s", "factorise_s", "memory"))}
     declared, device = SceneRef(**scene).load(), wp.get_device(device)
@@ -116,7 +121,18 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
             found |= {"ms_without": ms, "contact_ns": 1e6 * (found["ms"] - ms) / each}
     if not np.isfinite(stepper.state.x.numpy()).all() or Result.DIVERGED in stepper.results:
         return found | {"status": "diverged", "reason": f"diverged within {found['frames'] + _WARM_UP} frames"}
-    return found
+    return found | (_graded(model, stepper, solver, found["frames"] + _WARM_UP) if frames else {})
+
+
+def _graded(model, stepper, solver, frames):
+    """Takes the frames again from the start, and returns their grade and distance; or that they diverged."""
+    stepper.reset()
+    watch = Watch(model, stepper)
+    for _ in watched_frames(stepper, watch, frames):
+        pass
+    status = watch.status(solver)
+    found = {"grade": status.grade.value, "distance": finite(np.max(status.distance))}
+    return found if status.complete else found | {"status": "diverged", "reason": status.message}
 
 
 def _warm(stepper, model, points, frames, elements):

@@ -42,6 +42,8 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype=None,
         - ``ms_per_second``: ``ms`` per second of simulated time.
         - ``compile_s``: Time to build, bind and warm up before the first frame, including compilation, without
           ``factorise_s``, that of constant matrices [s].
+        - ``grade``, ``distance``: Those of the :class:`warpcloth.core.status.Status` [m]. A run that is not usable has an error
+          too, for a reference judges it better.
         - ``residual``, ``message``: Those of the :class:`warpcloth.core.status.Status`, with warnings of the solver.
         - ``frames``: Number of good frames.
         - ``dtype``: The precision of the runs.
@@ -58,6 +60,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype=None,
     frames = _checked_frames(frames, declared, exact)
     least = max(frames, 2)  # as the first warms up
     found = dict.fromkeys(("error", "strain_error", "ms", "spread", "ms_per_second", "compile_s", "factorise_s", "residual"))
+    found |= {"grade": None, "distance": None}
     found = {"status": "ok", "reason": "", **found, "message": "", "frames": 0, "dtype": setup.precision_on(device, dtype)}
     runs, spent, left = [], [], limit
     with warnings.catch_warnings(record=True) as warned:

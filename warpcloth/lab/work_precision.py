@@ -43,7 +43,7 @@ COLUMNS = (
     "ms_high",
 )
 COLUMNS += ("h", "stiffness", "ms_per_second", "iterations", "gap", "predicted", "floor", "compile_s", "factorise_s")
-COLUMNS += ("residual", "frames", "message", "machine")
+COLUMNS += ("residual", "grade", "distance", "frames", "message", "machine")
 # Columns that are equal for all settings.
 FACTS = (
     "scene",
