@@ -9,7 +9,7 @@ from .vectors import types
 
 @cache
 def add_moves(dtype):
-    """Kernel over vertices: out = d + part (x − unfiltered), the correction after contact moved vertices at the end of a step."""
+    """Kernel over vertices: out = d + part (x − unfiltered), the correction after contact moved vertices at the end."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

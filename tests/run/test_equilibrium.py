@@ -296,7 +296,9 @@ def test_stability_of_a_mass_on_a_strut(share, stable, device, monkeypatch):
     assert rest.points[1] == pytest.approx([0.0, length, 0.0], abs=1e-9)
     assert rest.lowest_eigenvalue == pytest.approx(head - m * 9.81 / length, rel=1e-6)
     assert rest.stable is stable and (rest.status.result in SETTLED) is stable
-    said = f"not usable: it is not stable, because the lowest eigenvalue of the Hessian is {digits(rest.lowest_eigenvalue)} N/m; "
+    said = (
+        f"not usable: it is not stable, because the lowest eigenvalue of the Hessian is {digits(rest.lowest_eigenvalue)} N/m; "
+    )
     assert (said in rest.status.message) is not stable
     monkeypatch.undo()
     assert wc.equilibrium(strut, device=device).stable

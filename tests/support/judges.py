@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 import warpcloth as wc
 
-# Errors that pass: of strain (RMS over the cloth), and of velocity, relative to that which all energy of the run gives all mass.
+# Errors that pass: of strain (RMS over the cloth), and of velocity, relative to what all energy of the run gives all mass.
 STRAIN, SPEED = 0.02, 0.1
 # The tolerance of residuals, an acceleration over gravity, that solvers have by default.
 RESIDUAL = 1e-3
@@ -165,8 +165,9 @@ def energy(run):
 
         (√K − √K_ε)₊² + (√U − √U_ε)₊² > A,
 
-    K_ε and U_ε the energies of these two errors, and max A that of all frames. What steps may add: residuals of :data:`RESIDUAL` g along the path, and in
-    symplectic Euler, whose v is half a step early, K + U ≤ A (1 + ½hω)/(1 − ½hω), here ωh ≤ 0.8.
+    K_ε and U_ε the energies of these two errors, and max A that of all frames. What steps may add: residuals of
+    :data:`RESIDUAL` g along the path, and in symplectic Euler, whose v is half a step early, K + U ≤ A (1 + ½hω)/(1 − ½hω),
+    here ωh ≤ 0.8.
     """
     available, exact = energy_available(run)
     if available is None:

@@ -93,7 +93,9 @@ class Status(NamedTuple):
         return self.result not in (Result.DIVERGED, Result.STOPPED)
 
 
-def sentence(result, grade, distance=np.nan, residual=None, measure=None, unit=None, tolerance=None, copy=None, why="", of="each step"):
+def sentence(
+    result, grade, distance=np.nan, residual=None, measure=None, unit=None, tolerance=None, copy=None, why="", of="each step"
+):
     """Returns a message: whether a result can be used, how it ended, and the residual with its unit and tolerance.
 
     Args:

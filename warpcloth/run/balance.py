@@ -7,11 +7,13 @@ attraction, counts like that of gravity, because the cloth may fall into it.
 Whether a run is usable is judged more strictly, by :meth:`Balance.surplus`: elastic energy and that of contact count too, but
 for the excess that a step leaves because it has not converged. However large that is, elastic energy counts as far as it is
 beyond that of a uniform strain of 2 %, and that of a single element beyond a strain of 5 %: in the norm √U the state is that
-far from all states that the energy allows. What contact adds by moving vertices at the end of a step counts in any case. Euler steps with a semi-definite Hessian never raise the sum, as
-E₁ − E₀ = −½‖v₁ − v₀‖²_M + U(x₁) − U(x₀) − ∇U(x₁)·(x₁ − x₀). BDF2 does not raise ¼(5‖z₁‖² − 4z₁·z₀ + ‖z₀‖²) (Dahlquist 1978),
-with ‖z‖² twice the energy. That is at least ¼‖z₁‖², and ½‖z₀‖² at the start, so that the energy stays below twice that at the
-start. Midpoint conserves the energy where U is quadratic. Contact that begins within a step adds up to what contact then
-stores, for which there is no bound over many steps, and midpoint is held to that of BDF2.
+far from all states that the energy allows. What contact adds by moving vertices at the end of a step counts in any case.
+
+Euler steps with a semi-definite Hessian never raise the sum, as E₁ − E₀ = −½‖v₁ − v₀‖²_M + U(x₁) − U(x₀) − ∇U(x₁)·(x₁ − x₀).
+BDF2 does not raise ¼(5‖z₁‖² − 4z₁·z₀ + ‖z₀‖²) (Dahlquist 1978), with ‖z‖² twice the energy. That is at least ¼‖z₁‖², and
+½‖z₀‖² at the start, so that the energy stays below twice that at the start. Midpoint conserves the energy where U is quadratic.
+Contact that begins within a step adds up to what contact then stores, for which there is no bound over many steps, and midpoint
+is held to that of BDF2.
 
 In symplectic Euler, velocities are half a step behind positions. For x″ = −ω²x it conserves v² + ω²x² − hω²xv, which near the
 limit ωh = 2 is far below v², by a factor of up to 200 at ωh = 1.995. With the velocity at the time of the position,
@@ -109,8 +111,8 @@ class Balance:
 
     Potential energy counts from the lowest value so far, so that falling is not a source. Negative elastic energy is included;
     it is computed at the start, and in frames that would otherwise count as diverged. A cloth without pins and attachments is
-    judged by its motion relative to its centre of mass, to which gravity adds nothing. If pins and colliders move at one velocity,
-    they add nothing to the energy relative to that motion, and cloth is judged by it.
+    judged by its motion relative to its centre of mass, to which gravity adds nothing. If pins and colliders move at one
+    velocity, they add nothing to the energy relative to that motion, and cloth is judged by it.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.

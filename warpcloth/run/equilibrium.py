@@ -43,8 +43,8 @@ class Equilibrium(NamedTuple):
         points: (n, 3) [m].
         status: How it ended, see :class:`warpcloth.core.status.Result`, with the residual: the sum Σ‖fᵢ‖ of the unbalanced
             forces of all free vertices, divided by the weight Σmᵢ‖g‖; without gravity by the sum of the loads, and without
-            these by its value at the start. ``distance`` is the length of the last Newton step. ``ok`` is false if the forces do
-            not balance to the tolerance or as far as rounding allows, or the cloth is not stable there.
+            these by its value at the start. ``distance`` is the length of the last Newton step. ``ok`` is false if the forces
+            do not balance to the tolerance or as far as rounding allows, or the cloth is not stable there.
         iterations: Total number of Newton iterations; each round of proximal steps counts as one more.
         lowest_eigenvalue: Lowest eigenvalue of the Hessian of the energy over the free vertices [N/m]; NaN if forces do not
             balance.

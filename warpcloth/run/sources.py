@@ -256,7 +256,7 @@ def _loaded(loads: Loads, balance, _stepper):
 
 
 def common_velocity(scene):
-    """Returns the velocity (3,) [m/s] at which all that holds or touches the cloth moves; 0 if it stands, or moves otherwise."""
+    """Returns the velocity (3,) [m/s] at which pins and colliders all move; 0 if they stand, or move otherwise."""
     moves, frames = [], scene.frames
     for collider in scene.colliders:
         poses = collider.poses

@@ -5,18 +5,11 @@ from contextlib import closing
 import numpy as np
 
 from ..base.turns import in_turn
-from ..core.status import Grade, Result, Status, Stopped, digits, millimetres, sentence
+from ..core.status import Grade, Result, Status, Stopped, sentence
 from ..numerics.iterate import ResidualScale
 from .balance import GAIN, STRETCHED, Balance
 from .frames_ahead import Frame, frames_of
-from .step_errors import StepErrors
-
-# A step has converged if no vertex is farther from its solution than NEAR times the edge and the contact distance. It is not
-# usable if one is farther than FAR times the edge, so that the two ends of an edge may have changed places, or if one in contact
-# is farther along its normal than the contact distance, so that the solution has no contact there.
-NEAR, FAR = 1e-3, 0.5
-# Results with which a step may have converged: those of methods that found its solution, or have no tolerance.
-_MAY_CONVERGE = Result.COMPLETED, Result.CONVERGED, Result.ROUNDED
+from .grades import Grades
 
 
 def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
@@ -36,7 +29,7 @@ def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
     if first == frames:
         return
     of_number, number = None if keeps is None else lambda before: keeps(first + 1 + before), first
-    find = None if watch.errors is None else watch.errors.find
+    find = None if watch.grades is None else watch.grades.errors.find
     with closing(frames_of(stepper, frames - first, ahead, of_number, find)) as found:
         try:
             for number, frame in enumerate(found, start=first + 1):
@@ -74,8 +67,7 @@ class Watch:
         seconds: Time of the computation of each frame [s], a list.
         history: The :class:`warpcloth.run.history.History` of the run, if it has one.
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
-        errors: The :class:`warpcloth.run.step_errors.StepErrors`, or None.
-        distance: The largest distance of a vertex from the solution of a step in a good frame of each copy, (B,) [m].
+        grades: The :class:`warpcloth.run.grades.Grades` of the run, or None.
     """
 
     @in_turn
@@ -88,15 +80,7 @@ class Watch:
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.growth, self.balance, self.history = np.zeros(model.copies), Balance(model, stepper), None
         self.last, self.stopped = Frame(None, None, stepper.results, stepper.residual, 0.0), False
-        self._edge, contacts = float(np.median(self.rest)) if len(self.rest) else np.inf, (scene.contact, scene.self_contact)
-        self._resolved = min([self._edge, *(each.distance for each in contacts if each is not None)])
-        self._solves = any(taker.integrator is not None for taker, _first, _end in stepper.takers)
-        self.errors = StepErrors(stepper, NEAR * self._resolved, FAR * self._edge) if grades else None
-        # The first frame, from 1, in which a copy is too far from the solution of its step, and in which it has too much
-        # energy; 0 for none. The energy that it has then, and the most that it may have [J].
-        self.far, self.rich = (np.zeros(model.copies, dtype=int) for _ in range(2))
-        self.distance, self.has, self.most = (np.zeros(model.copies) for _ in range(3))
-        self.solved, self.ratio, self.gap, self.unresolved = (np.zeros(model.copies) for _ in range(4))
+        self.grades = Grades(stepper, self.balance) if grades else None
 
     def passes(self, number, frame):
         """Checks a frame, and sets copies that diverged to NaN. Returns whether a copy is still good.
@@ -131,27 +115,13 @@ class Watch:
             else:
                 self.messages[copy] = f"{where}: {self.balance.sentence(copy)}"
         self.good[self.alive] = number
-        if frame.error is not None:
-            self._note(number, frame.error, velocities)
+        if self.grades is not None:
+            self.grades.note(number, frame, self.alive)
         self.growth = np.where(self.alive, np.fmax(self.growth, gains), self.growth)
         self.worst_strain = np.where(self.alive, np.fmax(self.worst_strain, strain), self.worst_strain)
         for array in (points, velocities):
             array.reshape(B, n, 3)[~self.alive] = np.nan
         return bool(self.alive.any())
-
-    def _note(self, number, error, velocities):
-        """Notes the error of the steps in a frame, and the energy there, of copies that are good."""
-        self.solved, self.ratio, self.unresolved = error.solved, error.ratio, error.unresolved
-        self.distance, self.gap = (
-            np.where(self.alive, new, old) for new, old in zip(error[:1] + error[3:4], (self.distance, self.gap))
-        )
-        far = ~((self.distance <= FAR * self._edge) & (self.gap <= 1.0) & (self.unresolved < 2))
-        self.far = np.where(self.alive & (self.far == 0) & far, number, self.far)
-        converged = np.array([result in (Result.CONVERGED, Result.ROUNDED) for result in self.last.results])
-        surplus = self.balance.surplus(number, error, velocities, converged)
-        rich = self.alive & (self.rich == 0) & (surplus > 1.0)
-        self.rich = np.where(rich, number, self.rich)
-        self.has, self.most = np.where(rich, self.balance.whole, self.has), np.where(rich, self.balance.allowed, self.most)
 
     def stops(self, number, why):
         """Notes that frame ``number`` cannot be computed, and why."""
@@ -162,10 +132,12 @@ class Watch:
 
     def _carried(self):
         """Returns pairs (object, names of its attributes that change from frame to frame)."""
-        yield self, ("worst_strain", "good", "alive", "growth", "seconds", *_OF_GRADES)
+        yield self, ("worst_strain", "good", "alive", "growth", "seconds")
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
             yield source, source.carried
+        if self.grades is not None:
+            yield self.grades, self.grades.carried
         if self.history is not None:
             yield self.history, self.history.carried
 
@@ -181,9 +153,8 @@ class Watch:
                 found = values[f"{k} {name}"]
                 setattr(part, name, found.tolist() if name == "seconds" else found[()])
         self.last = Frame(None, None, state.results, state.residual, 0.0)
-        if self.errors is not None:
-            for name in ("distance", "solved", "ratio", "gap", "unresolved"):
-                setattr(self.errors, name, getattr(self, name).copy())
+        if self.grades is not None:
+            self.grades.go_on()
 
     def _strain(self, points):
         """Returns the largest |l/L − 1| of an edge of each copy, (B,), for points (B, n, 3); NaN for copies that diverged."""
@@ -211,55 +182,14 @@ class Watch:
         copy = int(np.argmax(residual))  # the first that is NaN, if any
         if kind is not None:
             measure, unit = kind.measure, ResidualScale(self.model).units[copy]
-        faults = self._faults(solver, faults)
-        grades = tuple(self._grade(copy, result, faults) for copy, result in enumerate(results))
-        grade = max(grades, key=list(Grade).index)
+        faults = [*faults, *self.grades.faults(solver, result)]
+        grades = tuple(self.grades.grade(copy, result, faults) for copy, result in enumerate(results))
+        grade, distance = max(grades, key=list(Grade).index), self.grades.distance
         if self.messages:
             message = "; ".join(self.messages[copy] for copy in sorted(self.messages))
         else:
             which, tolerance = copy if len(residual) > 1 else None, getattr(solver, "tolerance", None)
             why = min(faults, key=lambda fault: fault[1])[2] if faults else ""
-            message = sentence(result, grade, self.distance.max(), residual[copy], measure, unit, tolerance, which, why)
-        distance = of_copies(self.distance)
-        return Status(
-            result, int(self.good.max()), of_copies(residual), message, self.good, measure, unit, grade, distance, grades
-        )
-
-    def _grade(self, copy, result, faults):
-        """Returns the :class:`Grade` of a copy, of which ``result`` is the worst of any step."""
-        if copy in self.messages or any(fault[0] == copy for fault in faults):
-            return Grade.NOT_USABLE
-        near = self._solves and self.distance[copy] <= NEAR * self._resolved
-        return Grade.CONVERGED if near and result in _MAY_CONVERGE else Grade.COMPLETED
-
-    def _faults(self, solver, faults):
-        """Returns the reasons why copies are not usable: those given, and those that the watch has noted."""
-        remedy = "take shorter steps" + (", more iterations" if hasattr(solver, "iterations") else "") + ", or another solver"
-        found = list(faults)
-        for copy in range(len(self.alive)):
-            of_copy = f" of copy {copy}" if len(self.alive) > 1 else ""
-            if self.far[copy]:
-                where = f"in frame {self.far[copy]}{of_copy}"
-                why = (
-                    f"{where} vertices are up to {millimetres(self.distance[copy])} from the solution of the step, more than half "
-                    f"of an edge ({millimetres(self._edge)}); {remedy}"
-                )
-                if self.distance[copy] <= FAR * self._edge and self.gap[copy] <= 1.0:
-                    why = f"{where} and the one before contact presses vertices by more than twice what holds them; {remedy}"
-                elif self.distance[copy] <= FAR * self._edge:
-                    why = (
-                        f"{where} vertices in contact are up to {digits(self.gap[copy])} times the contact distance from the "
-                        f"solution of the step; {remedy}"
-                    )
-                found.append((copy, self.far[copy], why))
-            if self.rich[copy]:
-                why = (
-                    f"in frame {self.rich[copy]}{of_copy} cloth has {digits(self.has[copy])} J of motion, height and "
-                    f"stored energy, and can have no more than {digits(self.most[copy])} J; {remedy}"
-                )
-                found.append((copy, self.rich[copy], why))
-        return found
-
-
-# What the grade depends on from frame to frame.
-_OF_GRADES = ("far", "rich", "distance", "has", "most", "solved", "ratio", "gap", "unresolved")
+            message = sentence(result, grade, distance.max(), residual[copy], measure, unit, tolerance, which, why)
+        good, distance = int(self.good.max()), of_copies(distance)
+        return Status(result, good, of_copies(residual), message, self.good, measure, unit, grade, distance, grades)

@@ -1,0 +1,99 @@
+"""Grades a run: whether it converged, completed near its solution, or is not usable, from the errors of its steps."""
+
+import numpy as np
+
+from ..core.status import Grade, Result, digits, millimetres
+from .step_errors import StepErrors
+
+# A step has converged if no vertex is farther from its solution than NEAR times the edge and the contact distance. It is not
+# usable if one is farther than FAR times the edge, so that the two ends of an edge may have changed places.
+NEAR, FAR = 1e-3, 0.5
+# Results with which a step may have converged: those of methods that found its solution, or have no tolerance.
+_MAY_CONVERGE = Result.COMPLETED, Result.CONVERGED, Result.ROUNDED
+# Why a copy is not usable, with the figure of the first frame in which that is so. A vertex in contact that is farther along
+# its normal than the contact distance has no contact in the solution. What is not resolved in one frame alone may be an impact.
+_WHY = (
+    "in frame {frame}{of_copy} vertices are up to {length} from the solution of the step, more than half of an edge ({edge})",
+    "in frame {frame}{of_copy} vertices in contact are {figure} times the contact distance from the solution of the step",
+    "in frame {frame}{of_copy} and the one before contact presses vertices by more than twice what holds them",
+    "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, and can have no more than {most} J",
+)
+
+
+class Grades:
+    """The grades of the copies of a run.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+        balance: The :class:`warpcloth.run.balance.Balance` of the run.
+
+    Attributes:
+        errors: The :class:`warpcloth.run.step_errors.StepErrors` of the stepper.
+        distance: The largest distance of a vertex from the solution of a step in a good frame of each copy, (B,) [m].
+        first: For each reason why a copy is not usable the first frame, from 1, in which that is so, or 0, (4, B).
+        figure: The figure of that frame, (4, B).
+    """
+
+    # What the grade depends on from frame to frame, besides what the errors carry.
+    carried = ("first", "figure", "most", "distance", "gap", "solved", "ratio", "unresolved")
+
+    def __init__(self, stepper, balance):
+        model = self._model = stepper.model
+        scene, self._balance = model.scene, balance
+        lengths, contacts = scene.mesh.edge_lengths, (scene.contact, scene.self_contact)
+        self._edge = float(np.median(lengths[lengths > 0.0])) if (lengths > 0.0).any() else np.inf
+        self._resolved = min([self._edge, *(each.distance for each in contacts if each is not None)])
+        self._solves = any(taker.integrator is not None for taker, _first, _end in stepper.takers)
+        self.errors = StepErrors(stepper, NEAR * self._resolved, FAR * self._edge)
+        self.first, self.figure = np.zeros((len(_WHY), model.copies), dtype=int), np.zeros((len(_WHY), model.copies))
+        self.distance, self.gap, self.most = (np.zeros(model.copies) for _ in range(3))
+        self.solved, self.ratio, self.unresolved = (np.zeros(model.copies) for _ in range(3))
+
+    def note(self, number, frame, alive):
+        """Notes the errors and the energy in a :class:`warpcloth.run.frames_ahead.Frame`, of the copies that are ``alive`` (B,)."""
+        error, balance = frame.error, self._balance
+        self.solved, self.ratio, self.unresolved = error.solved, error.ratio, error.unresolved
+        self.distance, self.gap = np.where(alive, error.distance, self.distance), np.where(alive, error.gap, self.gap)
+        converged = np.array([result in (Result.CONVERGED, Result.ROUNDED) for result in frame.results])
+        surplus = balance.surplus(number, error, frame.velocities, converged)
+        wrong = ~(self.distance <= FAR * self._edge), self.gap > 1.0, error.unresolved > 1.0, surplus > 1.0
+        news = alive & (self.first == 0) & np.array(wrong)
+        self.first = np.where(news, number, self.first)
+        self.figure = np.where(news, np.array([self.distance, self.gap, error.unresolved, balance.whole]), self.figure)
+        self.most = np.where(news[-1], balance.allowed, self.most)
+
+    def go_on(self):
+        """Gives the errors the values of a checkpoint, which were set here."""
+        for name in ("distance", "solved", "ratio", "gap", "unresolved"):
+            setattr(self.errors, name, getattr(self, name).copy())
+
+    def faults(self, solver, result):
+        """Returns the reasons why copies are not usable, a list of (copy, frame, sentence).
+
+        Args:
+            solver: The record of the solver.
+            result: The worst result of any step.
+        """
+        rounded = self._model.numpy_dtype == np.float32 and result in (Result.ROUNDED, Result.STALLED)
+        remedies = ['dtype="float64"'] * rounded + ["shorter steps"] + ["more iterations"] * hasattr(solver, "iterations")
+        remedy, found = f"take {', '.join(remedies)} or another solver", []
+        for (kind, copy), frame in np.ndenumerate(self.first):
+            if frame:
+                figure, of_copy = self.figure[kind, copy], f" of copy {copy}" if len(self.most) > 1 else ""
+                given = {"length": millimetres(figure), "edge": millimetres(self._edge), "most": digits(self.most[copy])}
+                why = _WHY[kind].format(frame=frame, of_copy=of_copy, figure=digits(figure), **given)
+                found.append((copy, int(frame), f"{why}; {remedy}"))
+        return found
+
+    def grade(self, copy, result, faults):
+        """Returns the :class:`warpcloth.core.status.Grade` of a copy.
+
+        Args:
+            copy: Its index.
+            result: The worst result of any of its steps.
+            faults: The reasons why copies are not usable, as of :meth:`faults`.
+        """
+        if result in (Result.DIVERGED, Result.STOPPED) or any(fault[0] == copy for fault in faults):
+            return Grade.NOT_USABLE
+        near = self._solves and self.distance[copy] <= NEAR * self._resolved
+        return Grade.CONVERGED if near and result in _MAY_CONVERGE else Grade.COMPLETED
