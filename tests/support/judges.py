@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 import warpcloth as wc
 
-# Errors that pass: of strain (RMS over the cloth), and of velocity, relative to what all energy of the run gives all mass.
+# Errors that pass: of strain (RMS over the cloth), and of velocity, relative to that which all energy gives all mass.
 STRAIN, SPEED = 0.02, 0.1
 # The tolerance of residuals, an acceleration over gravity, that solvers have by default.
 RESIDUAL = 1e-3
@@ -165,8 +165,8 @@ def energy(run):
 
         (√K − √K_ε)₊² + (√U − √U_ε)₊² > A,
 
-    K_ε and U_ε the energies of these two errors, and max A that of all frames. What steps may add: residuals of
-    :data:`RESIDUAL` g along the path, and in symplectic Euler, whose v is half a step early, K + U ≤ A (1 + ½hω)/(1 − ½hω),
+    K_ε and U_ε the energies of these two errors, and max A that of all frames. Steps may add that of
+    :func:`_residual_work`. Symplectic Euler, whose v is half a step early, keeps K + U below A (1 + ½hω)/(1 − ½hω);
     here ωh ≤ 0.8.
     """
     available, exact = energy_available(run)
@@ -404,10 +404,13 @@ def _wind_work(run, V):
 
 
 def _residual_work(run):
-    """Returns the work of residuals of :data:`RESIDUAL` gravities along the path of each vertex, (F+1,) [J], and rounding."""
-    g = max(np.linalg.norm(run.gravity), 1.0)
+    """Returns the work that steps may add, (F+1,) [J]: residuals of :data:`RESIDUAL` g along the path of each vertex, and the
+    weight and forces over the contact distance, by which cloth may be off where it touches."""
     path = np.linalg.norm(np.diff(run.x, axis=0), axis=2) @ run.masses
-    return RESIDUAL * g * np.concatenate([[0.0], np.cumsum(path)]) + 1e-9
+    work = RESIDUAL * max(np.linalg.norm(run.gravity), 1.0) * np.concatenate([[0.0], np.cumsum(path)]) + 1e-9
+    if run.colliders:
+        work += np.linalg.norm(_forces(run), axis=1).sum() * run.scene.contact.distance
+    return work
 
 
 def kinetic_energies(run):

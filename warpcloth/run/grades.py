@@ -50,7 +50,7 @@ class Grades:
         self.solved, self.ratio, self.unresolved = (np.zeros(model.copies) for _ in range(3))
 
     def note(self, number, frame, alive):
-        """Notes the errors and the energy in a :class:`warpcloth.run.frames_ahead.Frame`, of the copies that are ``alive`` (B,)."""
+        """Notes the errors and the energy in a :class:`warpcloth.run.frames_ahead.Frame` of the copies ``alive`` (B,)."""
         error, balance = frame.error, self._balance
         self.solved, self.ratio, self.unresolved = error.solved, error.ratio, error.unresolved
         self.distance, self.gap = np.where(alive, error.distance, self.distance), np.where(alive, error.gap, self.gap)
