@@ -14,8 +14,8 @@ def scene(n: int = 33, size: float = 0.6, spout: float = 0.06, pull: float = 0.5
     wc.checks.number("friction", friction, least=0.0)
     fps, around, distance = 25.0, 48, 3e-3
     # Radii and heights of the rings of the funnel, from the rim of the cone to the end of the spout.
-    radii = np.array([0.6 * size, spout, spout])
-    heights = np.array([0.0, 0.5 * (spout - 0.6 * size), 0.5 * (spout - 0.6 * size) - 0.2 * size])
+    radii = np.array([0.75 * size, spout, spout])
+    heights = np.array([0.0, 0.5 * (spout - 0.75 * size), 0.5 * (spout - 0.75 * size) - 0.2 * size])
     angle = 2.0 * np.pi * np.arange(around) / around
     rings = [
         np.stack([r * np.cos(angle), y + 0.0 * angle, r * np.sin(angle)], axis=1) for r, y in zip(radii, heights, strict=True)

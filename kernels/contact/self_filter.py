@@ -117,7 +117,9 @@ class HeldPins:
 
 @wp.func
 def note_held(held: HeldPins, steps: wp.array(dtype=wp.int32), per_copy: int, i: int, back: wp.float64):
-    """Notes that the pin i was held back by the distance ``back`` [m]."""
+    """Notes that the pin i was held back by the distance ``back`` [m]; nothing if that is 0, as of a pin that stands."""
+    if back == ZERO:
+        return
     copy = i // per_copy
     key = wp.int64(steps[copy]) * wp.int64(per_copy) + wp.int64(i - copy * per_copy)
     wp.atomic_max(held.first, copy, FIRST - key)

@@ -7,9 +7,9 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.crossings import crossing
 from warpcloth.core.status import Result
 from warpcloth.kernels.contact.mesh_faces import between, first_contact
-from warpcloth.scene.colliders import turned
 
 FRAMES, N, SIZE = 8, 6, 0.5
 SLOW = pytest.mark.slow
@@ -70,16 +70,6 @@ def falling(mesh, speed, fps=24.0, height=0.02, **fields):
         duration=FRAMES / fps,
         **fields,
     )
-
-
-def crossing(points, triangles, mesh):
-    """Pairs of a triangle of the cloth and one of the mesh that cross, by frames (F, n, 3), with exact predicates."""
-    frames = range(len(points))
-    poses, shapes = (each[np.minimum(frames, len(each) - 1)] for each in (mesh.poses, mesh.frames))
-    solid = np.stack([pose[:3] + turned(pose[3:], shape) for pose, shape in zip(poses, shapes, strict=True)])
-    both = np.concatenate([points, solid.astype(np.float32)], axis=1)
-    found = wc.intersections(both, np.concatenate([triangles, mesh.triangles + points.shape[1]])).pairs
-    return [int(((each < len(triangles)).sum(axis=1) == 1).sum()) for each in found]
 
 
 CASES = [

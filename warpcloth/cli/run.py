@@ -70,6 +70,7 @@ def run(arguments):
             "compile_seconds": setup.seconds + animation.timings["compile"],
             "worst_strain": animation.worst_strain,
             **({"cut": animation.cut, "inside": [each._asdict() for each in animation.inside]} if scene.colliders else {}),
+            **({"pierced": [each._asdict() for each in animation.pierced]} if scene.colliders else {}),
             **({"crossings": animation.crossings} if crosses else {}),
             **({"self_contact": _self_contact(animation.self_contact)} if animation.self_contact else {}),
             "residual": status.residual,
@@ -82,7 +83,7 @@ def run(arguments):
             "frames_folder": frames_folder_of(arguments),
             **values_of(arguments, "threads", "film", "csv", "report"),
         }
-        print(json_text(facts) if arguments.json else _summary(facts, animation.inside))
+        print(json_text(facts) if arguments.json else _summary(facts, animation.inside, animation.pierced))
         if status.ok:
             return 0
         where = f"all {frames} frames are" if status.complete else f"the last good frame is {status.frame},"
@@ -119,7 +120,7 @@ def _lines_of(found):
         yield f"  pins          {found['held_pins']}"
 
 
-def _summary(facts, inside):
+def _summary(facts, inside, pierced):
     from ..core.status import digits
 
     threads, measured = facts["threads"], facts["residual_measure"] is not None
@@ -137,6 +138,7 @@ def _summary(facts, inside):
             f"  worst strain  {100.0 * facts['worst_strain']:.3g} %",
             *cut,
             *(f"  inside        {each}" for each in inside),
+            *(f"  pierced       {each}" for each in pierced),
             *crossings,
             *(_lines_of(touching) if touching else ()),
             f"  residual      {residual}",

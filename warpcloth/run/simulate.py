@@ -23,39 +23,15 @@ from ..scene.scene import Scene
 from ..solvers.step import Step
 from ..usd import FrameSequence
 from .checkpoint import facts_of
+from .contact_verdicts import Inside, Pierced, contact_faults, held_pins_of, held_sentence, inside_of, pierced_of
 from .frames_ahead import state_of
-from .history import History, checked_record, collider_names
+from .history import History, checked_record
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
 
 # Limits on the frames that a CUDA device computes ahead: bytes on the host and on the device, fraction of the free memory of
 # the device, and number.
 AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
-
-
-class Inside(NamedTuple):
-    """A vertex that ended a step inside a collider, because it could not move out.
-
-    Attributes:
-        vertex: Its index in the mesh.
-        frame: The frame in or before which it came in.
-        collider: Name of the collider.
-        other: For a free vertex, the obstacle on its other side: the name of a collider, or ``"other cloth"`` with
-            self-contact. None for a vertex that pins or locked axes hold.
-        copy: Index of its copy.
-    """
-
-    vertex: int
-    frame: int
-    collider: str
-    other: str | None = None
-    copy: int = 0
-
-    def __str__(self) -> str:
-        where = f"in frame {self.frame}" + (f" of copy {self.copy}" if self.copy else "")
-        if self.other is None:
-            return f"{self.collider} comes over vertex {self.vertex}, which is not free to move, {where}"
-        return f"vertex {self.vertex} is caught between {self.collider} and {self.other} {where}"
 
 
 class SelfContactSummary(NamedTuple):
@@ -118,6 +94,8 @@ class Animation(ShownInNotebooks):
             per copy, (B,).
         inside: A tuple of :class:`Inside`, the first vertex inside each collider that contained one. It is either not free, and
             the collider moved over it or it into the collider, or it is caught between two obstacles.
+        pierced: A tuple of :class:`Pierced`, the first triangle of the cloth through which a corner or an edge of each mesh
+            has passed, as ``Contact(elements="vertices")`` lets it.
         crossings: Number of pairs of triangles that crossed or touched at the start and still do at the end, see
             ``SelfContact(crossing_start="run")``; with B > 1 copies one value per copy, (B,).
         self_contact: The :class:`SelfContactSummary` of a scene with self-contact, else None.
@@ -138,6 +116,7 @@ class Animation(ShownInNotebooks):
     friction_forces: dict[str, np.ndarray] | None = None
     cuts: np.ndarray | None = None
     inside: tuple[Inside, ...] = ()
+    pierced: tuple[Pierced, ...] = ()
     crossings: int | np.ndarray = 0
     pairs: dict[str, np.ndarray] | None = None
     self_contact: SelfContactSummary | None = None
@@ -180,12 +159,12 @@ class Animation(ShownInNotebooks):
             summary = summary._replace(
                 kept=float(np.asarray(summary.kept)[copy]), least_gap=float(np.asarray(summary.least_gap)[copy])
             )
-        inside = tuple(each for each in self.inside if each.copy == copy)
+        of_copy = {name: tuple(each for each in getattr(self, name) if each.copy == copy) for name in ("inside", "pierced")}
         good = np.asarray(self.status.good)
         status, grade = self.status._replace(frame=int(good[copy]), good=good[copy : copy + 1]), self.status.grades[copy]
         own = {name: float(np.broadcast_to(getattr(self.status, name), len(good))[copy]) for name in ("residual", "distance")}
         status = status._replace(grade=grade, grades=(grade,), **own)
-        return replace(self, inside=inside, self_contact=summary, status=status, **given)
+        return replace(self, **of_copy, self_contact=summary, status=status, **given)
 
     def __repr__(self) -> str:
         frames, *copies, vertices, _ = self.points.shape
@@ -297,16 +276,18 @@ def simulate(
                 if progress is not None:
                     progress(number, frames)
         recorder.finish()
-    status = watch.status(solver)
+    held, inside, pierced = held_pins_of(stepper), inside_of(stepper), pierced_of(watch)
+    status = watch.status(solver, contact_faults(scene, held, inside, pierced, copies))
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     recorded = {
         "output": output,
         "scene": scene,
         "cut": of_copies(stepper.cut),
-        "inside": _inside(stepper),
+        "inside": inside,
+        "pierced": pierced,
         "crossings": _crossings(stepper),
-        "self_contact": _self_contact(stepper, status.complete),
+        "self_contact": _self_contact(stepper, status.complete, held),
         **(history.by_name() if history else {}),
     }
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)
@@ -321,8 +302,11 @@ def _crossings(stepper):
 
 
 @in_turn
-def _self_contact(stepper, ok):
-    """Returns the :class:`SelfContactSummary` of a run that has ended. If it is ok, notes the gaps of the last frame first."""
+def _self_contact(stepper, ok, held):
+    """Returns the :class:`SelfContactSummary` of a run that has ended. If it is ok, notes the gaps of the last frame first.
+
+    ``held`` are the pins that cloth held back.
+    """
     pairs, model = stepper.pairs, stepper.model
     if pairs is None:
         return None
@@ -333,42 +317,16 @@ def _self_contact(stepper, ok):
                 break
             pairs.grow()
 
-    def where(vertex, copy):
-        return int(vertex if model.order is None else model.order[vertex]), f" of copy {copy}" if model.copies > 1 else ""
-
-    gaps, said, held = pairs.least_gap, [], []
+    gaps, near = pairs.least_gap, []
     for copy, frame, vertex in pairs.too_near:
-        vertex, of_copy = where(vertex, copy)
-        said.append(
+        vertex, of_copy = vertex if model.order is None else model.order[vertex], f" of copy {copy}" if model.copies > 1 else ""
+        near.append(
             f"in frame {frame}{of_copy} first, at vertex {vertex}, cloth is nearer to itself than 4 units in the last place of "
             f"float32 coordinates, in which frames are stored; the least gap is {gaps[copy]:.3g} m"
         )
-    for copy, frame, vertex, farthest in pairs.pins_held:
-        vertex, of_copy = where(vertex, copy)
-        held.append(
-            f"from frame {frame}{of_copy} on cloth holds back pins, vertex {vertex} first, by up to {farthest:.3g} m; "
-            "no cloth may pass through cloth"
-        )
-    of_run = of_copies(1.0 - pairs.share), of_copies(gaps), "; ".join(said) or None, "; ".join(held) or None
+    held = [f"{held_sentence(pin, model.copies)}; no cloth may pass through cloth" for pin in held]
+    of_run = of_copies(1.0 - pairs.share), of_copies(gaps), "; ".join(near) or None, "; ".join(held) or None
     return SelfContactSummary(pairs.most, int(pairs.lists.numpy().max()), *of_run)
-
-
-@in_turn
-def _farthest_held(stepper):
-    """Returns the largest distance of a pin from its keyframes to which cloth held it back in a step of any copy [m], or 0."""
-    return 0.0 if stepper.pairs is None else max((pin.farthest for pin in stepper.pairs.pins_held), default=0.0)
-
-
-@in_turn
-def _inside(stepper):
-    """Returns the :class:`Inside` of each collider and copy."""
-    model, found = stepper.model, []
-    for copy, collider, step, vertex, other in stepper.inside:
-        names = collider_names(model.scene)
-        vertex = int(vertex if model.order is None else model.order[vertex])
-        frame = int(step) // stepper.steps_per_frame + 1
-        found.append(Inside(vertex, frame, names[collider], names[other] if isinstance(other, int) else other, copy))
-    return tuple(sorted(found, key=lambda each: each.frame))
 
 
 @in_turn

@@ -5,6 +5,7 @@ from contextlib import closing
 import numpy as np
 
 from ..base.turns import in_turn
+from ..contact.piercings import piercings_of
 from ..core.status import Grade, Result, Status, Stopped, sentence
 from ..numerics.iterate import ResidualScale
 from .balance import GAIN, STRETCHED, Balance
@@ -29,8 +30,7 @@ def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
     if first == frames:
         return
     of_number, number = None if keeps is None else lambda before: keeps(first + 1 + before), first
-    find = None if watch.grades is None else watch.grades.errors.find
-    with closing(frames_of(stepper, frames - first, ahead, of_number, find)) as found:
+    with closing(frames_of(stepper, frames - first, ahead, of_number, watch.found_at_ends(first))) as found:
         try:
             for number, frame in enumerate(found, start=first + 1):
                 if not watch.passes(number, frame):
@@ -66,6 +66,7 @@ class Watch:
         stopped: Whether the run could not go on.
         seconds: Time of the computation of each frame [s], a list.
         history: The :class:`warpcloth.run.history.History` of the run, if it has one.
+        piercings: The :class:`warpcloth.contact.piercings.Piercings` of the run, if its scene can have some.
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
         grades: The :class:`warpcloth.run.grades.Grades` of the run, or None.
     """
@@ -79,6 +80,7 @@ class Watch:
         self.worst_strain, self.messages, self.seconds = np.zeros(model.copies), {}, []
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.growth, self.balance, self.history = np.zeros(model.copies), Balance(model, stepper), None
+        self.piercings = piercings_of(model, stepper.state.x) if grades else None
         self.last, self.stopped = Frame(None, None, stepper.results, stepper.residual, 0.0), False
         self.grades = Grades(stepper, self.balance) if grades else None
 
@@ -123,6 +125,19 @@ class Watch:
             array.reshape(B, n, 3)[~self.alive] = np.nan
         return bool(self.alive.any())
 
+    def found_at_ends(self, first):
+        """Returns the ``find`` of :func:`warpcloth.run.frames_ahead.frames_of` for the frames after ``first``, or None."""
+        if self.grades is None:
+            return None
+        pierce = self.piercings and self.piercings.starts_at(first)
+
+        def find():
+            if pierce is not None:
+                pierce()
+            return self.grades.errors.find()
+
+        return find
+
     def stops(self, number, why):
         """Notes that frame ``number`` cannot be computed, and why."""
         self.stopped = True
@@ -136,10 +151,9 @@ class Watch:
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
             yield source, source.carried
-        if self.grades is not None:
-            yield self.grades, self.grades.carried
-        if self.history is not None:
-            yield self.history, self.history.carried
+        for part in (self.grades, self.history, self.piercings):
+            if part is not None:
+                yield part, part.carried
 
     def to_host(self):
         """Returns everything that depends on earlier frames, as arrays by name."""

@@ -6,7 +6,7 @@ from typing import Literal
 from ..base.checks import choice, keep_plain, number
 from ..base.types import Converted, default
 
-STARTS = ("refuse", "run")
+STARTS, HELD = ("refuse", "run"), ("fail", "allow")
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,8 @@ class SelfContact:
         crossing_start: What to do if cloth crosses or touches cloth at the start: ``"refuse"`` the scene, or ``"run"`` it.
             Triangles that cross or touch at the start then pass through one another until they are apart, and cannot cross
             again after that. No other triangles can cross. ``Animation.crossings`` is the number of crossing pairs left.
+        held_pins: What a run is in which cloth holds pins back from their keyframes: ``"fail"``, it is not usable, because the
+            pins are not where the scene says; or ``"allow"``, it may be usable, for scenes in which cloth is to stop pins.
 
     Raises:
         ValueError: A value is not allowed.
@@ -35,6 +37,7 @@ class SelfContact:
     stiffness: float | None = None
     friction: float = 0.0
     crossing_start: Literal["refuse", "run"] = "refuse"
+    held_pins: Literal["fail", "allow"] = "fail"
 
     def __post_init__(self) -> None:
         keep_plain(self)
@@ -44,3 +47,4 @@ class SelfContact:
             number("self_contact.stiffness", self.stiffness, above=0.0)
         number("self_contact.friction", self.friction, least=0.0)
         choice("self_contact.crossing_start", self.crossing_start, STARTS)
+        choice("self_contact.held_pins", self.held_pins, HELD)
