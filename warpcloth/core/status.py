@@ -133,4 +133,5 @@ def millimetres(value):
 
 def digits(value):
     """Formats a number with two significant digits, below a million without an exponent."""
-    return f"{float(f'{value:.2g}'):.0f}" if 100.0 <= value < 1e6 else f"{value:.2g}"
+    rounded = float(f"{value:.2g}")
+    return f"{rounded:.0f}" if 100.0 <= rounded < 1e6 else f"{rounded:.2g}"

@@ -208,7 +208,8 @@ class Balance:
     def surplus(self, frame, error, velocities, converged):
         """Returns all energy of each copy in the last checked frame, over the most that a correct run can have, (B,).
 
-        Where sources add energy, of which only estimates are known, the most is ``GAIN`` times as much.
+        Where sources add energy, of which only estimates are known, the most is ``GAIN`` times as much, and the energy of
+        contact does not count, as they may press cloth.
 
         Args:
             frame: Number of the frame.
@@ -216,7 +217,8 @@ class Balance:
             velocities: (B·n, 3) [m/s].
             converged: Whether all steps of a copy have met the tolerance of the solver so far, (B,).
         """
-        pushed, stored = np.fmax(error.pushed, 0.0), error.elastic + error.contact
+        contact, pushed = (np.where(self.driven, 0.0, each) for each in (error.contact, np.fmax(error.pushed, 0.0)))
+        stored = error.elastic + contact
         beyond = np.fmax(np.sqrt(np.fmax(error.elastic, 0.0)) - np.sqrt(self._strained), 0.0) ** 2
         explained = np.fmax(pushed + np.fmax(stored - pushed - error.excess, 0.0), np.fmax(beyond, error.largest))
         explained = np.where(stored > 0.0, explained, stored)
@@ -231,10 +233,11 @@ class Balance:
                     carried = max(source.speed(frame) for source in self.sources)
                     self.whole = self._relative(kinetic, carried) + self._height(self.points) - self._lowest
                     self.whole = self.whole + self._conserved * explained
+                    self.allowed = self.allowed + self._kick
                 more = self._bound * sum(source.stored(frame) for source in self.sources)
                 self.allowed = self.allowed + more * (GAIN if self.driven else 1.0)
             found = _over(self.whole, self.allowed)
-        return found
+        return np.where(self.total > 0.0, found, 0.0)
 
     def _of_residuals(self, frame, error, converged):
         """Returns the energy that the residuals of ``converged`` steps (B,) can have added by a frame, (B,) [J].
@@ -256,6 +259,13 @@ class Balance:
         points = np.tile((1.0 + STRAIN) * model.rest_points, (model.copies, 1))
         with TURN:
             return np.fmax(type(elastic)(model.with_terms(terms)).energy(model.array(points, model.vec3)), 0.0)
+
+    @cached_property
+    def _kick(self):
+        """The kinetic energy that half a step adds at the start, whose velocities are those half a step before, (B,) [J]."""
+        points, velocities = self._start.reshape(-1, 3), self.model.in_scene_order(self.model.velocities.numpy())
+        velocities = velocities.astype(np.float64)
+        return np.fmax(self.kinetic(self._at_positions(points, velocities)) - self.kinetic(velocities), 0.0)
 
     @cached_property
     def _conserved(self):

@@ -16,7 +16,7 @@ _WHY = (
     "in frame {frame}{of_copy} vertices are up to {length} from the solution of the step, more than half of an edge ({edge})",
     "in frame {frame}{of_copy} vertices in contact are {figure} times the contact distance from the solution of the step",
     "in frame {frame}{of_copy} and the one before contact presses vertices by more than twice what holds them",
-    "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, and can have no more than {most} J",
+    "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, {ratio:.4g} times the most it can have",
 )
 
 
@@ -80,7 +80,8 @@ class Grades:
         for (kind, copy), frame in np.ndenumerate(self.first):
             if frame:
                 figure, of_copy = self.figure[kind, copy], f" of copy {copy}" if len(self.most) > 1 else ""
-                given = {"length": millimetres(figure), "edge": millimetres(self._edge), "most": digits(self.most[copy])}
+                given = {"length": millimetres(figure), "edge": millimetres(self._edge)}
+                given["ratio"] = figure / self.most[copy] if self.most[copy] > 0.0 else np.inf
                 why = _WHY[kind].format(frame=frame, of_copy=of_copy, figure=digits(figure), **given)
                 found.append((copy, int(frame), f"{why}; {remedy}"))
         return found

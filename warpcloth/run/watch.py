@@ -117,7 +117,7 @@ class Watch:
             else:
                 self.messages[copy] = f"{where}: {self.balance.sentence(copy)}"
         self.good[self.alive] = number
-        if self.grades is not None:
+        if frame.error is not None:
             self.grades.note(number, frame, self.alive)
         self.growth = np.where(self.alive, np.fmax(self.growth, gains), self.growth)
         self.worst_strain = np.where(self.alive, np.fmax(self.worst_strain, strain), self.worst_strain)
@@ -200,7 +200,8 @@ class Watch:
         grades = tuple(self.grades.grade(copy, result, faults) for copy, result in enumerate(results))
         grade, distance = max(grades, key=list(Grade).index), self.grades.distance
         if self.messages:
-            message = "; ".join(self.messages[copy] for copy in sorted(self.messages))
+            others = {copy: f"{Grade.NOT_USABLE.value}: {why}" for copy, _frame, why in faults[::-1]}
+            message = "; ".join(text for _copy, text in sorted((others | self.messages).items()))
         else:
             which, tolerance = copy if len(residual) > 1 else None, getattr(solver, "tolerance", None)
             why = min(faults, key=lambda fault: fault[1])[2] if faults else ""
