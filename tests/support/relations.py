@@ -129,6 +129,7 @@ def renumbered(scene, seed=1):
         mesh=wc.Mesh(scene.mesh.points[order], ranks[scene.mesh.triangles]),
         positions=scene.positions[order],
         velocities=scene.velocities[order],
+        masses=None if scene.masses is None else scene.masses[order],
         pins=wc.Pins(ranks[scene.pins.vertices], scene.pins.keyframes),
         colliders=[of_collider(each) for each in scene.colliders],
     )
