@@ -101,30 +101,46 @@ def energy_above():
 
 @cache
 def unresolved_contact(dtype):
-    """Kernel over vertices: out = (1, 0, 0) where half of the force f of contact is unbalanced and f h²/m is beyond r, else 0.
+    """Kernel over vertices: counts the frames in a row in which half of the force f of contact is unbalanced and f h²/m > r.
 
-    Such a force would move the vertex out of contact in a single step.
+    Such a force would move the vertex out of contact in a single step. ``forces`` are those of colliders, and of self-contact or
+    None, with the contact distances ``r``. out = (1, 0, 0) for vertices with two such frames or more, else 0.
     """
     vec3, _ = types(dtype)
 
+    @wp.func
+    def presses(force: vec3, residual: vec3, mobility: dtype, r: dtype):
+        f = wp.length(force)
+        return wp.abs(wp.dot(wp.normalize(force), residual)) > dtype(0.5) * f and mobility * f > r
+
     @wp.kernel(module="unique", enable_backward=False)
-    def find(
+    def count(
         # elements
         inverse_mass: wp.array(dtype=dtype),
         # state in
-        force: wp.array(dtype=vec3),
+        forces: wp.array(dtype=vec3),
+        forces_of_cloth: wp.array(dtype=vec3),
         residual: wp.array(dtype=vec3),
         # parameters
         square: dtype,
         r: dtype,
+        r_of_cloth: dtype,
+        # in and out
+        frames: wp.array(dtype=wp.int32),
         # out
         out: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        f = wp.length(force[i])
-        wrong = wp.abs(wp.dot(wp.normalize(force[i]), residual[i])) > dtype(0.5) * f
+        mobility = square * inverse_mass[i]
+        wrong = presses(forces[i], residual[i], mobility, r)
+        if forces_of_cloth:
+            wrong = wrong or presses(forces_of_cloth[i], residual[i], mobility, r_of_cloth)
+        if wrong:
+            frames[i] = frames[i] + 1
+        else:
+            frames[i] = 0
         out[i] = vec3()
-        if wrong and square * inverse_mass[i] * f > r:
+        if frames[i] > 1:
             out[i] = vec3(dtype(1.0), dtype(0.0), dtype(0.0))
 
-    return find
+    return count

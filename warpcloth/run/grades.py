@@ -35,7 +35,7 @@ class Grades:
     """
 
     # What the grade depends on from frame to frame, besides what the errors carry.
-    carried = ("first", "figure", "most", "distance", "gap", "solved", "ratio", "unresolved")
+    carried = ("first", "figure", "most", "distance", "gap", "solved", "ratio")
 
     def __init__(self, stepper, balance):
         model = self._model = stepper.model
@@ -47,16 +47,16 @@ class Grades:
         self.errors = StepErrors(stepper, NEAR * self._resolved, FAR * self._edge)
         self.first, self.figure = np.zeros((len(_WHY), model.copies), dtype=int), np.zeros((len(_WHY), model.copies))
         self.distance, self.gap, self.most = (np.zeros(model.copies) for _ in range(3))
-        self.solved, self.ratio, self.unresolved = (np.zeros(model.copies) for _ in range(3))
+        self.solved, self.ratio = np.zeros(model.copies), np.zeros(model.copies)
 
     def note(self, number, frame, alive):
         """Notes the errors and the energy in a :class:`warpcloth.run.frames_ahead.Frame` of the copies ``alive`` (B,)."""
         error, balance = frame.error, self._balance
-        self.solved, self.ratio, self.unresolved = error.solved, error.ratio, error.unresolved
+        self.solved, self.ratio = error.solved, error.ratio
         self.distance, self.gap = np.where(alive, error.distance, self.distance), np.where(alive, error.gap, self.gap)
         converged = np.array([result in (Result.CONVERGED, Result.ROUNDED) for result in frame.results])
         surplus = balance.surplus(number, error, frame.velocities, converged)
-        wrong = ~(self.distance <= FAR * self._edge), self.gap > 1.0, error.unresolved > 1.0, surplus > 1.0
+        wrong = ~(self.distance <= FAR * self._edge), self.gap > 1.0, error.unresolved, surplus > 1.0
         news = alive & (self.first == 0) & np.array(wrong)
         self.first = np.where(news, number, self.first)
         self.figure = np.where(news, np.array([self.distance, self.gap, error.unresolved, balance.whole]), self.figure)
@@ -64,7 +64,7 @@ class Grades:
 
     def go_on(self):
         """Gives the errors the values of a checkpoint, which were set here."""
-        for name in ("distance", "solved", "ratio", "gap", "unresolved"):
+        for name in ("distance", "solved", "ratio", "gap"):
             setattr(self.errors, name, getattr(self, name).copy())
 
     def faults(self, solver, result):

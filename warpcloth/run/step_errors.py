@@ -45,7 +45,7 @@ class StepError(NamedTuple):
         ratio: The distance that it found over this bound.
         gap: The largest distance along its normal of a vertex in contact, of those that Newton steps found, over the contact
             distance.
-        unresolved: Number of frames in a row, up to this one, at whose end a vertex is in contact that is not resolved, see
+        unresolved: Whether contact of a vertex is not resolved at the end of this frame and the one before, see
             :func:`warpcloth.kernels.step_error.unresolved_contact`.
         elastic: Elastic energy [J].
         contact: Energy of contact [J].
@@ -75,17 +75,17 @@ class StepErrors:
         allowed: The distance that a Newton step must confirm when the bound and the last ratio predict more [m].
 
     Attributes:
-        distance, solved, ratio, gap, unresolved: See :class:`StepError`, of the frames so far.
+        distance, solved, ratio, gap: See :class:`StepError`, of the frames so far.
     """
 
     def __init__(self, stepper, near, allowed):
         self._stepper, self._near, self._allowed, self._parts = stepper, near, allowed, WeakKeyDictionary()
-        self.distance, self.solved, self.ratio, self.gap, self.unresolved = (np.zeros(stepper.model.copies) for _ in range(5))
+        self.distance, self.solved, self.ratio, self.gap = (np.zeros(stepper.model.copies) for _ in range(4))
 
     @in_turn
     def find(self):
         """Returns the :class:`StepError` of the frame that ended with the last step."""
-        energies = np.zeros((5, len(self.distance)))
+        energies, unresolved = np.zeros((5, len(self.distance))), np.zeros(len(self.distance), dtype=bool)
         for taker, first, end in self._stepper.takers:
             if taker not in self._parts:
                 self._parts[taker] = _measured(taker)
@@ -102,10 +102,9 @@ class StepErrors:
                 found = np.fmin(found, bound)
                 distance[news], solved[news], ratio[news] = np.fmax(distance, found)[news], bound[news], (found / bound)[news]
                 self.gap[copies][news] = np.fmax(self.gap[copies], gap)[news]
-            wrong = part.unresolved(bound) if part.solves else False
-            self.unresolved[copies] = np.where(wrong, self.unresolved[copies] + 1.0, 0.0)
-        found = (each.copy() for each in (self.distance, self.solved, self.ratio, self.gap, self.unresolved))
-        return StepError(*found, *energies)
+            unresolved[copies] = part.solves and part.unresolved(bound)
+        found = (each.copy() for each in (self.distance, self.solved, self.ratio, self.gap))
+        return StepError(*found, unresolved, *energies)
 
 
 def _measured(stepper):
@@ -260,9 +259,13 @@ class _Residuals(_Stored):
 
     def unresolved(self, bound):
         """Returns whether contact of a vertex is not resolved, of each copy, (B,); ``bound`` is that of the distance [m]."""
+        if self.stepper.unfiltered is None:
+            return False
         taken = self._taken
-        found = bound > 0.5 * taken.contact_distance  # no smaller residual unbalances half of such a force
-        return found & taken.unresolved() if found.any() else found
+        if (bound > 0.5 * taken.contact_distance).any():  # no smaller residual unbalances half of such a force
+            return taken.unresolved()
+        self.stepper.unresolved.zero_()
+        return False
 
     @property
     def _taken(self):
@@ -288,9 +291,10 @@ class _Step:
         scene, pushing = self.model.scene, tuple(each for each in touching if each.term not in FRICTIONS)
         self._pushes = plan(self.model).gradient(corrected=True, terms=pushing) if pushing else None
         present = (self._pushes, scene.contact), (stepper.pairs, scene.self_contact)
-        self._distances = [contact.distance for pushes, contact in present if pushes is not None]
-        self.contact_distance, self._find = min(self._distances, default=np.inf), None
-        self._force = self.model.vectors() if self._distances else None
+        distances = [contact.distance for pushes, contact in present if pushes is not None]
+        self.contact_distance, self._find, self._forces = min(distances, default=np.inf), None, None
+        if distances:
+            self._forces = self.model.vectors(), None if stepper.pairs is None else self.model.vectors()
 
     def launch(self):
         """Launches ∇φ at the end of the step and its sums, and the energy of contact there."""
@@ -347,34 +351,29 @@ class _Step:
         """Returns whether contact of a vertex is not resolved, see :class:`StepError`, of each copy, (B,)."""
         model = self.model
         if self._find is None:
-            self._kernel = model.kernel(kernels.unresolved_contact, model.dtype)
-            self._wrong, self._each, self._one = Mirror(model.scalars()), model.scalars(), model.constant(1.0, model.count)
+            self._count, self._ones = model.kernel(kernels.unresolved_contact, model.dtype), model.constant(1.0, model.count)
+            self._wrong = Mirror(model.scalars())
             captured = self.stepper.pairs is None
             self._find = Segment(model.device, self._launch_unresolved) if captured else self._launch_unresolved
         self._find()
         return self._wrong.read() > 0.0
 
     def _launch_unresolved(self):
-        of, model, square = self._of, self.model, self.stepper.he**2
-        found = of.weighted
-        self._wrong.array.zero_()
-        for r in self._launch_pushes():
-            model.launch(self._kernel, model.count, [model.inverse_mass, self._force, of.residual, square, r], [found])
-            of.sums.largest(self._one, found, self._each)
-            model.launch(of.keep, model.copies, [self._each], [self._wrong.array])
+        of, model, scene = self._of, self.model, self.model.scene
+        given = [model.inverse_mass, *self._launch_pushes(), of.residual, self.stepper.he**2]
+        given += [0.0 if each is None else each.distance for each in (scene.contact, scene.self_contact)]
+        model.launch(self._count, model.count, given, [self.stepper.unresolved, of.weighted])
+        of.sums.largest(self._ones, of.weighted, self._wrong.array)
 
     def _launch_pushes(self):
-        """Yields the contact distance of colliders, then of self-contact, with the force of each in ``_force``."""
-        x, d = self.stepper.predicted, self._moved
-        distances = iter(self._distances)
+        """Launches the forces of colliders without friction, and of self-contact, and returns them, the latter or None."""
+        self._forces[0].zero_()
         if self._pushes is not None:
-            self._force.zero_()
-            self._pushes.add(x, self._force, d)
-            yield next(distances)
+            self._pushes.add(self.stepper.predicted, self._forces[0], self._moved)
         if self.stepper.pairs is not None:
-            self._force.zero_()
-            self.stepper.pairs.forces.add_gradient(self._force)
-            yield next(distances)
+            self._forces[1].zero_()
+            self.stepper.pairs.forces.add_gradient(self._forces[1])
+        return self._forces
 
     @property
     def _moved(self):
@@ -382,11 +381,14 @@ class _Step:
         return self.stepper.correction if self.stepper.unfiltered is None else self._of.moved
 
     def _launch_newton(self):
-        of, model = self._of, self.model
+        of, model, scene = self._of, self.model, self.model.scene
         self._hessian.assemble(self.stepper.predicted, 1.0 / self.stepper.he**2, self._moved)
         self._linear.solve(of.residual, self._direction, self._all)
         distance, *gaps = (mirror.array for mirror in self._largest)
         of.sums.largest(self._ones, self._direction, distance)
-        for r, gap in zip(self._launch_pushes(), gaps[: len(self._distances)], strict=True):
-            model.launch(self._project, model.count, [self._force, self._direction, r], [of.weighted])
-            of.sums.largest(self._ones, of.weighted, gap)
+        if self._forces is None:
+            return
+        for force, contact, gap in zip(self._launch_pushes(), (scene.contact, scene.self_contact), gaps, strict=True):
+            if force is not None and contact is not None:
+                model.launch(self._project, model.count, [force, self._direction, contact.distance], [of.weighted])
+                of.sums.largest(self._ones, of.weighted, gap)

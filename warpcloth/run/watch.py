@@ -131,6 +131,7 @@ class Watch:
             return None
         pierce = self.piercings and self.piercings.starts_at(first)
 
+        @in_turn
         def find():
             if pierce is not None:
                 pierce()
