@@ -5,8 +5,19 @@ import numpy as np
 import warpcloth as wc
 
 
-def scene(n: int = 33, size: float = 0.6, spout: float = 0.06, pull: float = 0.5, friction: float = 0.2, duration: float = 3.0):
-    """Vertices per side, side [m], spout radius [m], displacement of the middle [m], friction of the funnel, duration [s]."""
+def scene(
+    n: int = 33,
+    size: float = 0.6,
+    spout: float = 0.06,
+    pull: float = 0.5,
+    friction: float = 0.2,
+    duration: float = 3.0,
+    elements: str = "triangles",
+):
+    """Vertices per side, side, spout radius, displacement of the middle [m], friction, duration [s], what collides.
+
+    The rims of the funnel are sharp, so with ``elements="vertices"`` they cut into triangles of the cloth.
+    """
     wc.checks.whole("n", n, 3)
     for name, value in {"size": size, "spout": spout, "duration": duration}.items():
         wc.checks.number(name, value, above=0.0)
@@ -14,8 +25,8 @@ def scene(n: int = 33, size: float = 0.6, spout: float = 0.06, pull: float = 0.5
     wc.checks.number("friction", friction, least=0.0)
     fps, around, distance = 25.0, 48, 3e-3
     # Radii and heights of the rings of the funnel, from the rim of the cone to the end of the spout.
-    radii = np.array([0.75 * size, spout, spout])
-    heights = np.array([0.0, 0.5 * (spout - 0.75 * size), 0.5 * (spout - 0.75 * size) - 0.2 * size])
+    radii = np.array([0.6 * size, spout, spout])
+    heights = np.array([0.0, 0.5 * (spout - 0.6 * size), 0.5 * (spout - 0.6 * size) - 0.2 * size])
     angle = 2.0 * np.pi * np.arange(around) / around
     rings = [
         np.stack([r * np.cos(angle), y + 0.0 * angle, r * np.sin(angle)], axis=1) for r, y in zip(radii, heights, strict=True)
@@ -43,7 +54,7 @@ def scene(n: int = 33, size: float = 0.6, spout: float = 0.06, pull: float = 0.5
         colliders=[
             wc.MeshCollider(np.concatenate(rings), np.concatenate([band, band + around]), friction=friction, name="funnel")
         ],
-        contact=wc.Contact(distance=distance),
+        contact=wc.Contact(distance=distance, elements=elements),
         self_contact=wc.SelfContact(distance=distance),
         duration=duration,
         fps=fps,

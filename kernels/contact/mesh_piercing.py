@@ -4,16 +4,16 @@ Vertices of the cloth stay outside a mesh, but their triangles cut into it, as s
 a ball by the sagitta, into what is sharper by up to half of an edge, if that cloth bends in a half circle. None of that has
 passed through. Two things have. L is the longest edge of the triangle, and the prism is all that is above or below it.
 
-- A mesh *stands* in the triangle if in the prism it goes on, from its section with the triangle, by more than L/2 to both sides.
-  A mesh that carries the vertices does not: at an angle of 90° or more, both together are at most the circumradius. But along a
-  side of the triangle a mesh may be high that this side only cuts, as where a fold stands on it. There the section is as wide as
-  its part of the side, and at most half as deep (Thales). So it counts only if it is deeper, or if the mesh stands in the
-  triangle beyond too, and the two are folded by less than 90°.
-- A corner of the mesh, or the point of an edge that is nearest to the middle of the triangle, *went* through this, since it last
-  had no section with the mesh, and no border or fold has cut into that since. The point must be farther away than L/2, or than L
-  if there is a section: the corner of a box is up to 0.82 L from a triangle with a vertex on each of its faces.
+- A mesh *stands* in the triangle if in the prism it goes on, from its section with the triangle, by more than L/2 to both
+  sides. A mesh that carries the vertices does not: at an angle of 90° or more, both together are at most the circumradius.
+  But along a side of the triangle a mesh may be high that this side only cuts, as where a fold stands on it. There the
+  section is as wide as its part of the side, and at most half as deep (Thales). So it counts only if it is deeper, or if the
+  mesh stands in the triangle beyond too, and the two are folded by less than 90°.
+- A corner of the mesh, or the point of an edge that is nearest to the middle of the triangle, *went* through this, since it
+  last had no section with the mesh, and none that a side only cuts has come since. The point must be farther than L/2, or than
+  L if there is a section: the corner of a box is up to 0.82 L from a triangle with a vertex on each of its faces.
 
-A triangle that had no section is tested again when it has moved by L/4, because until then neither can be.
+A triangle that had no section is tested again when it has moved by L/2, because until then neither can be.
 """
 
 from functools import cache
@@ -42,7 +42,7 @@ class ClothTriangles:
 def clear_triangles(dtype):
     """Struct of triangles when they last had no section with a mesh: the ``corners`` of each in its frame, and ``when``.
 
-    That is at the end of the frame ``when``, before the mesh went through; −1 if a border or a fold has cut into it since.
+    That is at the end of the frame ``when``, before the mesh went through; −1 if a side has cut into it since.
     ``cut`` is whether the triangle has had a section since.
     """
     _vec3, mat33 = types(dtype)
@@ -57,27 +57,6 @@ def clear_triangles(dtype):
 
 
 @cache
-def folds(dtype):
-    """Device function (faces, x, f, side) → the triangle beside f if the two are folded by less than 90°, else −1."""
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def normal(faces: ClothTriangles, x: wp.array(dtype=vec3), f: int):
-        v = faces.vertices[f]
-        return wp.cross(x[v[1]] - x[v[0]], x[v[2]] - x[v[0]])
-
-    @wp.func
-    def flat_neighbour(faces: ClothTriangles, x: wp.array(dtype=vec3), f: int, side: int):
-        other = faces.beside[f][side]
-        if other >= 0:
-            if wp.dot(normal(faces, x, f), normal(faces, x, other)) <= dtype(0.0):
-                other = -1
-        return other
-
-    return flat_neighbour
-
-
-@cache
 def prisms(dtype):
     """Device functions on the prism of a triangle p, with the normal n and the inward normals m of its sides, as rows."""
     vec3, mat33 = types(dtype)
@@ -88,20 +67,16 @@ def prisms(dtype):
         return wp.normalize(wp.cross(p[1] - p[0], p[2] - p[0]))
 
     @wp.func
-    def section(n: vec3, p: mat33, q: mat33):
-        """The segment in which the plane of the triangle meets another one, q, and whether there is one."""
+    def section(h: vec3, q: mat33):
+        """The segment of a triangle q, with the heights h of its corners, at the height 0, which is between them."""
         a = vec3()
         b = vec3()
-        count = wp.int32(0)
         for i in range(3):
             j = (i + 1) % 3
-            h = wp.dot(n, q[i] - p[0])
-            e = wp.dot(n, q[j] - p[0])
-            if (h <= zero) != (e <= zero):
+            if (h[i] <= zero) != (h[j] <= zero):
                 b = a
-                a = q[i] + h / (h - e) * (q[j] - q[i])
-                count += 1
-        return a, b, count == 2
+                a = q[i] + h[i] / (h[i] - h[j]) * (q[j] - q[i])
+        return a, b
 
     @wp.func
     def heights_of(n: vec3, p: mat33, q: mat33):
@@ -123,18 +98,19 @@ def prisms(dtype):
         return least >= -beside
 
     @wp.func
-    def passed(was: mat33, p: mat33, before: dtype, after: dtype, y_was: vec3, y: vec3, beside: dtype):
+    def passed(was: mat33, p: mat33, before: dtype, after: dtype, y_was: vec3, y: vec3, beside: dtype, r: dtype):
         """How far a point is above the triangle or below, if it went through on a straight way, else 0.
 
-        Its heights were and are ``before`` and ``after``. It is over the triangle, and was over it or, if it is farther than
-        ``beside``, beside it by less than that. A way is not straight along the triangle rather than towards it.
+        Its heights were and are ``before`` and ``after``. It is over the triangle, as it was when it went through, by ``r``
+        from the sides, as contact is no finer. Before, it was over the triangle or, if it is now farther than ``beside``,
+        beside it by less than that. A way is not straight along the triangle rather than towards it.
         """
         way = y - y_was - (p[0] - was[0] + p[1] - was[1] + p[2] - was[2]) / dtype(3.0)
         if before * after >= zero or dtype(2.0) * (after - before) * (after - before) < wp.dot(way, way):
             return zero
         s = before / (before - after)
         edge = wp.where(wp.abs(after) > beside, beside, zero)
-        if is_over(was, y_was, edge) and is_over(p, y, zero) and is_over(was + s * (p - was), y_was + s * (y - y_was), zero):
+        if is_over(was, y_was, edge) and is_over(p, y, -r) and is_over(was + s * (p - was), y_was + s * (y - y_was), -r):
             return wp.abs(after)
         return zero
 
@@ -204,7 +180,6 @@ def find_pierced(dtype):
     to_local, _to_space = of_pose(dtype)
     corners, _from, _carry = geometry(dtype)
     normal_of, section, heights_of, sides, within, passed, heights = prisms(dtype)
-    flat_neighbour = folds(dtype)
     zero, half, far = dtype(0.0), dtype(0.5), dtype(wp.inf)
 
     @wp.func
@@ -255,13 +230,23 @@ def find_pierced(dtype):
         moved = drift * dtype(frame[0] - before)
         for i in range(3):
             moved = wp.max(moved, wp.length(p[i] - was[i]) + drift * dtype(frame[0] - before))
-        if before >= 0 and clear.cut[f] == 0 and moved <= dtype(0.25) * longest:
+        if before >= 0 and clear.cut[f] == 0 and moved <= half * longest:
             return
         n = normal_of(p)
         m = sides(p)
         margin = wp.vec3(mesh.margin[collider])
         low = low_of(p) - margin
         high = high_of(p) + margin
+        # What went through met the triangle on its way, which else was not straight.
+        n_was = normal_of(was)
+        rise = wp.max(wp.abs(heights_of(n, p, was))) + drift
+        swept = before >= 0 and rise > r and wp.dot(n_was, n) > half
+        first_low = low
+        first_high = high
+        if swept:
+            edge = margin + wp.vec3(wp.float32(drift))
+            first_low = wp.min(low, low_of(was)) - edge
+            first_high = wp.max(high, high_of(was)) + edge
         # What the mesh has in the prism, beginning at its section with the triangle.
         below = far
         above = -far
@@ -269,13 +254,31 @@ def find_pierced(dtype):
         begin = vec3(far, far, far)
         end = -begin
         depth = vec3()
+        deepest = zero
         k = wp.int32(0)
-        query = wp.bvh_query_aabb(mesh.bvh[collider], low, high)
+        query = wp.bvh_query_aabb(mesh.bvh[collider], first_low, first_high)
         while wp.bvh_query_next(query, k):
             q = corners(mesh, collider, k, now, 2)
-            a, b, meets = section(n, p, q)
-            if not meets:
+            h = heights_of(n, p, q)
+            if swept and wp.max(wp.abs(h)) > r:
+                q_was = q
+                if mesh.frames[collider] > 1:
+                    q_was = corners(mesh, collider, k, 2 * before, 2)
+                h_was = heights_of(n_was, was, q_was)
+                if wp.min(wp.cw_mul(h, h_was)) < zero and not (is_point(q) or is_point(q_was)):
+                    for i in range(3):
+                        # The corner, and the point of the edge that is nearest to the middle of the triangle.
+                        j = (i + 1) % 3
+                        e = q[j] - q[i]
+                        t = wp.clamp(wp.dot((p[0] + p[1] + p[2]) / dtype(3.0) - q[i], e) / wp.dot(e, e), zero, dtype(1.0))
+                        deepest = wp.max(deepest, passed(was, p, h_was[i], h[i], q_was[i], q[i], half * longest, r))
+                        y_was = q_was[i] + t * (q_was[j] - q_was[i])
+                        height = h[i] + t * (h[j] - h[i])
+                        height_was = h_was[i] + t * (h_was[j] - h_was[i])
+                        deepest = wp.max(deepest, passed(was, p, height_was, height, y_was, q[i] + t * e, half * longest, r))
+            if wp.min(h) > zero or wp.max(h) <= zero:
                 continue
+            a, b = section(h, q)
             first, last, side, other = within(m, p, a, b)
             if first > last:
                 continue
@@ -296,44 +299,16 @@ def find_pierced(dtype):
         for j in range(3):
             if begin[j] <= end[j] and depth[j] <= end[j] - begin[j]:
                 by_side += 2 << j
-                if flat_neighbour(faces, x, f, j) < 0:
-                    before = -1
+                before = -1
+                deepest = zero
         needed = wp.max(r, half * longest)
-        least = wp.where(cut, wp.max(r, longest), r)
-        deepest = zero
-        if before >= 0 and moved > least and wp.dot(normal_of(was), n) > half:  # else its way was not straight
-            edge = margin + wp.vec3(wp.float32(drift))
-            low_of_way = wp.min(low, low_of(was)) - edge
-            n_was = normal_of(was)
-            query = wp.bvh_query_aabb(mesh.bvh[collider], low_of_way, wp.max(high, high_of(was)) + edge)
-            while wp.bvh_query_next(query, k):
-                q = corners(mesh, collider, k, now, 2)
-                q_was = q
-                if mesh.frames[collider] > 1:
-                    q_was = corners(mesh, collider, k, 2 * before, 2)
-                    if is_point(q) or is_point(q_was):
-                        continue
-                h = heights_of(n, p, q)
-                h_was = heights_of(n_was, was, q_was)
-                if wp.min(wp.cw_mul(h, h_was)) >= zero or wp.max(wp.abs(h)) <= least:
-                    continue
-                for i in range(3):
-                    # The corner, and the point of the edge that is nearest to the middle of the triangle.
-                    j = (i + 1) % 3
-                    e = q[j] - q[i]
-                    t = wp.clamp(wp.dot((p[0] + p[1] + p[2]) / dtype(3.0) - q[i], e) / wp.dot(e, e), zero, dtype(1.0))
-                    deepest = wp.max(deepest, passed(was, p, h_was[i], h[i], q_was[i], q[i], half * longest))
-                    y_was = q_was[i] + t * (q_was[j] - q_was[i])
-                    height = h[i] + t * (h[j] - h[i])
-                    height_was = h_was[i] + t * (h_was[j] - h_was[i])
-                    deepest = wp.max(deepest, passed(was, p, height_was, height, y_was, q[i] + t * e, half * longest))
         clear.when[f] = before
         clear.cut[f] = wp.where(cut, 1, clear.cut[f])
         if not cut and deepest <= r:
             clear.when[f] = frame[0]
             clear.corners[f] = p
             clear.cut[f] = 0
-        if deepest > wp.where(cut, least, needed):
+        if deepest > wp.where(cut, wp.max(r, longest), needed):
             found[f] = 1
             return
         if not cut:
@@ -371,7 +346,11 @@ def find_pierced(dtype):
 def drop_cuts(dtype):
     """Kernel over triangles of the cloth: drops those that may only have cut into the mesh, ``some`` = 1 if there are any."""
     vec3, _ = types(dtype)
-    flat_neighbour = folds(dtype)
+
+    @wp.func
+    def normal(faces: ClothTriangles, x: wp.array(dtype=vec3), f: int):
+        v = faces.vertices[f]
+        return wp.cross(x[v[1]] - x[v[0]], x[v[2]] - x[v[0]])
 
     @wp.kernel(module="unique", enable_backward=False)
     def drop(
@@ -388,10 +367,10 @@ def drop_cuts(dtype):
             return
         for j in range(3):
             if found[f] & (2 << j):
-                other = flat_neighbour(faces, x, f, j)
+                other = faces.beside[f][j]
                 alone = wp.bool(True)
                 if other >= 0:
-                    alone = found[other] == 0
+                    alone = found[other] == 0 or wp.dot(normal(faces, x, f), normal(faces, x, other)) <= dtype(0.0)
                 if alone:
                     found[f] = 0
                     some[0] = 1

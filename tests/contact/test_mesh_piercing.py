@@ -113,6 +113,21 @@ def test_no_triangle_is_named_that_is_not_free_or_kept_out(device):
         assert wc.simulate(scene, SOLVER, device=device).pierced == ()
 
 
+@pytest.mark.parametrize(("angle", "named"), [(90.0, False), (60.0, False), (40.0, True)])
+def test_a_border_beside_a_post(angle, named, device):
+    """The upright edge of a tall post goes 2 cm into a side of the triangle, which its faces cut at 4, 2.3 and 1.5 cm.
+
+    With 4 and 2.3 cm the side cuts off a corner; what is deeper than it is wide has passed through.
+    """
+    half, depth = 0.5 * np.tan(np.radians(0.5 * angle)), 0.02
+    section = np.array([[0.0, 0.0], [half, -0.5], [-half, -0.5]]) + np.array([0.2 * LEG, CORNERS[0, 2] + depth])
+    points = np.concatenate([np.column_stack([section[:, 0], np.full(3, y), section[:, 1]]) for y in (-1.0, 1.0)])
+    sides = [[[i, (i + 1) % 3, i + 3], [(i + 1) % 3, (i + 1) % 3 + 3, i + 3]] for i in range(3)]
+    post = wc.MeshCollider(points, [*np.concatenate(sides), [0, 2, 1], [3, 4, 5]])
+    found = wc.simulate(flying(post, 0.0), SOLVER, device=device, frames=1)
+    assert bool(found.pierced) == named
+
+
 def test_each_copy_has_its_own(device):
     """Three speeds, of which the slowest passes in no frame."""
     speeds = np.array([0.25, 0.05, 0.5])
@@ -183,8 +198,8 @@ def test_cloth_that_only_cuts_into_a_mesh(mesh, speed, device):
 
 @pytest.mark.parametrize(
     "mesh",
-    [box(0.04, 0.3, 0.04), box(1.2, 0.02, 0.02), box(0.004, 0.4, 0.4), ball(0.04)],
-    ids=["post", "rail", "wall", "small ball"],
+    [box(0.04, 0.3, 0.04), box(1.2, 0.02, 0.02), box(0.004, 0.4, 0.4)],
+    ids=["post", "rail", "wall"],
 )
 def test_cloth_that_falls_through(mesh, device):
     """What is narrower than a triangle, so that the sheet ends below it, is named."""

@@ -1095,6 +1095,8 @@ def test_pairs_of_a_start_that_crosses(device):
         steps_of(replace(scene, self_contact=replace(run, crossing_start="refuse")), device)
     with pytest.raises(ValueError, match=r"self_contact\.crossing_start is 'go'"):
         wc.SelfContact(crossing_start="go")
+    with pytest.raises(ValueError, match=r"self_contact\.held_pins is 'run'"):
+        wc.SelfContact(held_pins="run")
     copies = scene.build(device=device, dtype="float64", copies=2)
     found = wc.XPBD(substeps=2).bind(copies)
     assert found.pairs.tangles.left().tolist() == [1, 1]

@@ -1,4 +1,4 @@
-"""Grades of runs: what is wrong is not called usable, what is right is, and the distance is that from the solution of a step."""
+"""Grades of runs: what is wrong is not called usable, what is right is; the distance is that from the solution of a step."""
 
 import re
 from dataclasses import replace
@@ -19,7 +19,7 @@ def two_sheets():
     n, flat = len(grid.points), grid.points - [0.15, 0.0, 0.15]
     (c, s), (d, e) = ((np.cos(angle), np.sin(angle)) for angle in (0.6, 0.25))
     turned = flat @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T @ np.array([[d, -e, 0], [e, d, 0], [0, 0, 1]]).T
-    mesh = wc.Mesh(np.vstack([flat, turned + [0.03, 0.06, 0.02]]), np.vstack([grid.triangles, grid.triangles + n]))
+    mesh = wc.Mesh(np.vstack([flat, turned + np.array([0.03, 0.06, 0.02])]), np.vstack([grid.triangles, grid.triangles + n]))
     velocities = np.zeros((2 * n, 3))
     velocities[n:] = [0.4, -3.0, 0.2]
     terms = [wc.Spring(pairs="edges", stiffness=300.0), wc.QuadraticBending(stiffness=1e-5)]
