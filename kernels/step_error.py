@@ -101,7 +101,7 @@ def energy_above():
 
 @cache
 def unresolved_contact(dtype):
-    """Kernel over vertices: counts frames in a row in which half of the force f of contact is unbalanced and f h²/m > r.
+    """Kernel over vertices: counts frames in a row where half of a contact force f is unbalanced and f h²/m > r.
 
     Such a force would move the vertex out of contact in a single step. ``forces`` are those of colliders, and of self-contact or
     None, with the contact distances ``r``. out = (1, 0, 0) for vertices with two such frames or more, else 0.

@@ -16,7 +16,7 @@ _WHY = (
     "in frame {frame}{of_copy} vertices are up to {length} from the solution of the step, more than half of an edge ({edge})",
     "in frame {frame}{of_copy} vertices in contact are {figure} times the contact distance from the solution of the step",
     "in frame {frame}{of_copy} and the one before contact presses vertices by more than twice what holds them",
-    "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, {ratio:.4g} times the most it can have",
+    "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, {ratio:.4g} times what it can have",
 )
 
 

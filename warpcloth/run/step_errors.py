@@ -29,8 +29,8 @@ from ..kernels.terms.face_friction import FRICTIONS
 from ..model.host_values import host_values
 from ..numerics.linear import ConjugateGradients
 
-# Relative accuracy of the Newton step, of which only the largest displacement is used, and the growth of the bound after which
-# it is taken again. The tolerance is in the norm of the solver; with 0.1 the largest displacement was off by up to 60 %.
+# Relative accuracy of the Newton step, in the norm of the solver; with 0.1 the largest displacement was off by up to 60 %. With
+# contact, whose gaps only a Newton step tells, one is taken again when the bound has grown by this factor.
 ACCURACY, GROWTH = 0.01, 4.0
 # The strain of an element that no energy need explain.
 STRAIN = 0.05
@@ -96,12 +96,15 @@ class StepErrors:
             distance[known] = np.fmax(distance, bound)[known]
             with np.errstate(invalid="ignore"):
                 passes = (ratio * bound > self._allowed) & (distance <= self._allowed)
-            news = np.isfinite(bound) & ~known & ((bound > GROWTH * solved) | passes)
+            grown = (part.stepper.unfiltered is not None) & (bound > GROWTH * solved)
+            news = np.isfinite(bound) & ~known & ((solved == 0.0) | passes | grown)
             if news.any():
                 found, gap = part.solve()
                 found = np.fmin(found, bound)
-                distance[news], solved[news], ratio[news] = np.fmax(distance, found)[news], bound[news], (found / bound)[news]
+                solved[news], ratio[news] = bound[news], (found / bound)[news]
                 self.gap[copies][news] = np.fmax(self.gap[copies], gap)[news]
+            told = np.isfinite(bound) & ~known
+            distance[told] = np.fmax(distance, ratio * bound)[told]
             unresolved[copies] = part.solves and part.unresolved(bound)
         found = (each.copy() for each in (self.distance, self.solved, self.ratio, self.gap))
         return StepError(*found, unresolved, *energies)
