@@ -103,8 +103,8 @@ def energy_above():
 def unresolved_contact(dtype):
     """Kernel over vertices: counts frames in a row where half of a contact force f is unbalanced and f h²/m > r.
 
-    Such a force would move the vertex out of contact in a single step. ``forces`` are those of colliders, and of self-contact or
-    None, with the contact distances ``r``. out = (1, 0, 0) for vertices with two such frames or more, else 0.
+    Such a force would move the vertex out of contact in a single step. ``forces`` are those of colliders, ``forces_of_cloth``
+    those of self-contact or None, with the contact distances ``r``. out = (1, 0, 0) where there are two such frames or more.
     """
     vec3, _ = types(dtype)
 

@@ -83,14 +83,14 @@ def test_runs_that_are_not_usable_are_compared_and_marked(capsys):
     found = advise(hanging.scene(n=16), LONG, frames=10, resolutions={"n=4": hanging.scene(n=4)})
     assert not found.status.ok and found.sentences[0].startswith("the scene as it is: not usable: in frame 6 ")
     trials = by_name(found)
-    assert trials["float64"].usable is False and trials["float64"].matters is False
+    assert trials["float32"].usable is False and trials["float32"].matters is False
     assert trials["n=4"].usable and trials["n=4"].reason == ""  # its edges are four times as long
     words = "info hanging -p n=16 --advise --solver xpbd -s substeps=1 iterations=1 --frames 10".split()
     assert main(words) == 0
     assert "does not matter: not usable: in frame 6 " in capsys.readouterr().out
     assert main([*words, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
-    assert facts["usable"] is False and [trial["usable"] for trial in facts["trials"] if trial["name"] == "float64"] == [False]
+    assert facts["usable"] is False and [trial["usable"] for trial in facts["trials"] if trial["name"] == "float32"] == [False]
 
 
 def test_what_keeps_a_run_usable_is_not_called_needless():
