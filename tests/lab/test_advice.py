@@ -28,7 +28,7 @@ def test_terms_that_do_nothing_do_not_matter_and_others_do():
     assert trials["without Attachment"].change == 0.0 and trials["without Attachment"].matters is False
     assert 0.0 < trials["without QuadraticBending"].change < 1e-4 and trials["without QuadraticBending"].matters is False
     assert trials["without Spring"].matters and trials["without Spring"].change > 0.01
-    assert trials["float64"].matters is False and trials["substeps=16"].matters is False
+    assert trials["float32"].matters is False and trials["substeps=16"].matters is False
     leave_out = [sentence for sentence in found.sentences if "leave it out" in sentence]
     assert len(leave_out) == 2 and not any("Spring " in sentence for sentence in leave_out)
 
