@@ -125,7 +125,8 @@ class Balance:
         sources: The sources of the scene.
         points: Positions of the frame that is checked, (B·n, 3) [m].
         has, given: Energy of each copy, and the energy that its sources can have added, in the last checked frame, (B,) [J].
-        driven: Whether sources beside the start add energy, of which only estimates are known.
+        driven: Whether sources beside the start add energy, of which only estimates are known, or the energy of explicit steps
+            in contact is not known better.
         whole, allowed: All energy of each copy, and the most that a correct run can have, after :meth:`surplus`, (B,) [J].
     """
 
@@ -157,7 +158,9 @@ class Balance:
         parts = [each for each in model.scene.declared if not (self._velocity.any() and isinstance(each, Pins | Collider))]
         found = (source_of(part, self, stepper) for part in (stepper, *parts))
         self.sources = [source for source in found if source is not None]
-        self.driven = len(self.sources) > 1
+        touches = model.colliders is not None or model.scene.self_contact is not None
+        # The velocities of explicit steps are not corrected for contact, see :meth:`_at_positions`.
+        self.driven = len(self.sources) > 1 or (self._staggered and touches)
         integrator = stepper.takers[0][0].integrator
         self._he, self._unbalanced = stepper.he, np.zeros(model.copies)
         self._bound = 1.0 if integrator is None else integrator.energy_bound
