@@ -56,7 +56,8 @@ class Grades:
         self.distance, self.gap = np.where(alive, error.distance, self.distance), np.where(alive, error.gap, self.gap)
         converged = np.array([result in (Result.CONVERGED, Result.ROUNDED) for result in frame.results])
         surplus = balance.surplus(number, error, frame.velocities, converged)
-        wrong = ~(self.distance <= FAR * self._edge), self.gap > 1.0, error.unresolved, surplus > 1.0
+        far = ~((self.distance <= FAR * self._edge) & np.isfinite(self.distance))
+        wrong = far, self.gap > 1.0, error.unresolved, surplus > 1.0
         news = alive & (self.first == 0) & np.array(wrong)
         self.first = np.where(news, number, self.first)
         self.figure = np.where(news, np.array([self.distance, self.gap, error.unresolved, balance.whole]), self.figure)

@@ -159,10 +159,14 @@ class Animation(ShownInNotebooks):
             summary = summary._replace(
                 kept=float(np.asarray(summary.kept)[copy]), least_gap=float(np.asarray(summary.least_gap)[copy])
             )
-        of_copy = {name: tuple(each for each in getattr(self, name) if each.copy == copy) for name in ("inside", "pierced")}
+        of_copy: dict[str, Any] = {
+            name: tuple(each for each in getattr(self, name) if each.copy == copy) for name in ("inside", "pierced")
+        }
         good = np.asarray(self.status.good)
         status, grade = self.status._replace(frame=int(good[copy]), good=good[copy : copy + 1]), self.status.grades[copy]
-        own = {name: float(np.broadcast_to(getattr(self.status, name), len(good))[copy]) for name in ("residual", "distance")}
+        own: dict[str, Any] = {
+            name: float(np.broadcast_to(getattr(self.status, name), len(good))[copy]) for name in ("residual", "distance")
+        }
         status = status._replace(grade=grade, grades=(grade,), **own)
         return replace(self, **of_copy, self_contact=summary, status=status, **given)
 

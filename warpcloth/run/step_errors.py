@@ -94,13 +94,14 @@ class StepErrors:
             distance, solved, ratio = self.distance[copies], self.solved[copies], self.ratio[copies]
             known = ~(bound > self._near) | (not part.solves)
             distance[known] = np.fmax(distance, bound)[known]
+            distance[~np.isfinite(bound)] = np.inf  # forces overflow, although positions are finite
             with np.errstate(invalid="ignore"):
                 passes = (ratio * bound > self._allowed) & (distance <= self._allowed)
             grown = (part.stepper.unfiltered is not None) & (bound > GROWTH * solved)
             news = np.isfinite(bound) & ~known & ((solved == 0.0) | passes | grown)
             if news.any():
                 found, gap = part.solve()
-                found = np.fmin(found, bound)
+                found = np.where(found > 0.0, np.fmin(found, bound), bound)  # where the linear solve fails, the bound stays
                 solved[news], ratio[news] = bound[news], (found / bound)[news]
                 self.gap[copies][news] = np.fmax(self.gap[copies], gap)[news]
             told = np.isfinite(bound) & ~known

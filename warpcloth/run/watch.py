@@ -182,6 +182,7 @@ class Watch:
             found[self.alive] = np.abs(np.sqrt(squares) / self.rest - 1.0).max(axis=1, initial=0.0)
         return found
 
+    @in_turn
     def status(self, solver, faults=()):
         """Returns the :class:`Status` of a run from its last frame.
 
