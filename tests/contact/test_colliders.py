@@ -230,9 +230,12 @@ def test_no_vertex_is_inside(name, what, dtype, device):
 @pytest.mark.parametrize("solver", slow_but(["midpoint"], ["explicit", "euler", "midpoint", "bdf2"]))
 @pytest.mark.parametrize("speed", slow_but([100.0], [10.0, 100.0]))
 def test_an_impact_without_friction_gains_no_energy(solver, speed, device):
-    """Against a plane that is tilted, so that some vertices meet it long before others."""
+    """Against a plane that is tilted, so that some vertices meet it long before others.
+
+    With two steps a frame springs turn by much in a step of midpoint, which then adds energy.
+    """
     scene = falling([SHAPES["plane"]], speed, gravity=(0.0, 0.0, 0.0), contact=wc.Contact(distance=R, stiffness=1.47e4))
-    solver = SOLVERS["explicit"] if solver == "explicit" else wc.Newton(substeps=2, integrator=solver, tolerance=1e-6)
+    solver = SOLVERS["explicit"] if solver == "explicit" else wc.Newton(substeps=4, integrator=solver, tolerance=1e-6)
     animation = wc.simulate(scene, solver, dtype="float64", device=device, record=("energies",))
     energies = sum(animation.energies.values())
     assert animation.status.complete and len(energies) == 9

@@ -5,7 +5,7 @@ unconverged sweeps store a huge ½kx² without diverging; strain is judged separ
 attraction, counts like that of gravity, because the cloth may fall into it.
 
 Whether a run is usable is judged more strictly, by :meth:`Balance.surplus`: elastic energy and that of contact count too, but
-for the excess that a step leaves because it has not converged. However large that is, elastic energy counts as far as it is
+for the excess that a step leaves because it has not converged. After steps that have not, elastic energy counts as far as it is
 beyond that of a uniform strain of 2 %, and that of a single element beyond a strain of 5 %: in the norm √U the state is that
 far from all states that the energy allows. What contact adds by moving vertices at the end of a step counts in any case.
 
@@ -45,8 +45,6 @@ STRETCHED = 10.0
 STRAIN = 0.02
 # Relative error of an energy, which sums hundreds of thousands of roundings of forces and residuals below their tolerance.
 RESOLVED = 1e-3
-# That of steps that do not converge, such as 80 of one sweep a frame, whose energy sways about that of the start by 0.2 %.
-SWAYS = 1e-2
 
 
 class Elastic:
@@ -224,12 +222,12 @@ class Balance:
         """
         contact, pushed = (np.where(self.driven, 0.0, each) for each in (error.contact, np.fmax(error.pushed, 0.0)))
         stored = error.elastic + contact
+        resolved = np.where(converged, stored, contact)
         beyond = np.fmax(np.sqrt(np.fmax(error.elastic, 0.0)) - np.sqrt(self._strained), 0.0) ** 2
-        explained = np.fmax(pushed + np.fmax(stored - pushed - error.excess, 0.0), np.fmax(beyond, error.largest))
+        explained = np.fmax(pushed + np.fmax(resolved - pushed - error.excess, 0.0), np.fmax(beyond, error.largest))
         explained = np.where(stored > 0.0, explained, stored)
         explained = np.where(np.isfinite(explained), explained, 0.0)
-        resolved = np.where(converged, RESOLVED, SWAYS)
-        given = self._bound * (1.0 + resolved) * self.given + self._of_residuals(frame, error, converged)
+        given = self._bound * (1.0 + RESOLVED) * self.given + self._of_residuals(frame, error, converged)
         self.whole, self.allowed = self.has + explained, given * (GAIN if self.driven else 1.0)
         found = _over(self.whole, self.allowed)
         if (found > 1.0).any():

@@ -16,7 +16,7 @@ _WHY = (
     "in frame {frame}{of_copy} vertices are up to {length} from the solution of the step, more than half of an edge ({edge})",
     "in frame {frame}{of_copy} vertices in contact are {figure} times the contact distance from the solution of the step",
     "in frame {frame}{of_copy} and the one before contact presses vertices by more than twice what holds them",
-    "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, {ratio:.4g} times what it can have",
+    "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, {ratio}",
 )
 
 
@@ -82,7 +82,7 @@ class Grades:
             if frame:
                 figure, of_copy = self.figure[kind, copy], f" of copy {copy}" if len(self.most) > 1 else ""
                 given = {"length": millimetres(figure), "edge": millimetres(self._edge)}
-                given["ratio"] = figure / self.most[copy] if self.most[copy] > 0.0 else np.inf
+                given["ratio"] = _compared(figure, self.most[copy])
                 why = _WHY[kind].format(frame=frame, of_copy=of_copy, figure=digits(figure), **given)
                 found.append((copy, int(frame), f"{why}; {remedy}"))
         return found
@@ -99,3 +99,12 @@ class Grades:
             return Grade.NOT_USABLE
         near = self._solves and self.distance[copy] <= NEAR * self._resolved
         return Grade.CONVERGED if near and result in _MAY_CONVERGE else Grade.COMPLETED
+
+
+def _compared(energy, most):
+    """Returns how an energy compares with the most that it can be, which is less."""
+    if most <= 0.0:
+        return "where it can have none"
+    if energy < 2.0 * most:
+        return f"{digits(100.0 * (energy / most - 1.0))} % more than it can have"
+    return f"{digits(energy / most)} times what it can have"
