@@ -112,7 +112,7 @@ def test_pins_that_cloth_holds_back(axes, device):
     back = (found.points[-1] - keyframes[-1])[16:, 1].max()
     assert back > 0.05 and 0.0 <= found.cut <= 1.0
     said = found.self_contact.held_pins
-    assert said.startswith("from frame 1 on cloth holds back pins, vertex ")
+    assert said.startswith("cloth holds back pins from frame 1 on, vertex ")
     farthest = float(said.split("by up to ")[1].split(" m")[0])
     assert farthest == pytest.approx(back, rel=1e-2)
     what = said.split("; ")[0]
@@ -132,7 +132,7 @@ def test_held_pins_catch_up(device):
     )
     assert found.points[-1] == pytest.approx(keyframes[-1], abs=1e-7)
     assert (found.points[2] - keyframes[2])[16:, 1].min() > 0.05
-    assert " on cloth holds back pins, vertex " in found.status.message
+    assert "cloth holds back pins from frame " in found.status.message
     assert " first, by up to 0.06 m; move the pins so that they do not run" in found.status.message  # 0.08 m less the gap
 
 

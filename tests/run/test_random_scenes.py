@@ -24,6 +24,15 @@ def test_what_a_judge_condemns_is_not_called_usable(seed, device):
     assert not (condemned and animation.status.ok), (case.text, animation.status.message, condemned)
 
 
+@pytest.mark.parametrize("seed", [41, 89])
+def test_unbalanced_contact_is_counted_over_steps_of_all_lengths(seed, device):
+    """In some frames more than half of a force is not balanced, in others not; steps become as long as they may."""
+    case = random_case(seed)
+    solver = replace(case.solver, substeps=None, dt=None, error=1e9)
+    said = wc.simulate(case.scene, solver, dtype=case.dtype, device=device).status.message
+    assert "and the one before half of a force of contact or more is not balanced" in said
+
+
 # The judges. What they see is a fall as it is in books, of two sheets over a plane and a cone.
 N, FRAMES, FPS = 5, 12, 240.0
 GRID = wc.Mesh.grid(N, N, size=0.2)

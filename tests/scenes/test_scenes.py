@@ -208,7 +208,7 @@ def test_the_residual_has_a_unit(name, weight, device):
     kind, ended = solver.residual, status.result.value
     assert status.message.startswith(status.grade.value) and (ended in status.message or status.result is Result.COMPLETED)
     if status.grade is Grade.COMPLETED and status.distance > 0.0:
-        assert f" within {1e3 * status.distance:.2g} mm of the solution of each step" in status.message
+        assert f" within {1e3 * status.distance:.2g} mm of the solution of the last step of each frame" in status.message
     if kind is None:
         assert (status.residual, status.measure, status.unit) == (0.0, None, None)
         return

@@ -291,7 +291,7 @@ def test_contradicting_constraints_are_reported(linear, device):
     stepper, x = after(replace(net, gravity=(0.0, -9.81, 0.0)), constrained(linear=linear, iterations=20), device)
     assert stepper.results[0] in (Result.ITERATIONS_USED_UP, Result.CONTRADICTED) and stepper.residual[0] > 1.0
     animation = wc.simulate(two, constrained(linear=linear, iterations=10), device=device, frames=2)
-    assert ", constraints contradict one another in a step or more: " in animation.status.message
+    assert ", constraints contradict one another in one or more steps: " in animation.status.message
 
 
 @each_linear

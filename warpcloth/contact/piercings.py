@@ -3,6 +3,8 @@
 The filter keeps only vertices of the cloth out of meshes, unless ``Contact(elements="triangles")`` keeps triangles out too.
 """
 
+from copy import copy
+
 import numpy as np
 import warp as wp
 
@@ -23,8 +25,6 @@ class Piercings:
         model: The :class:`warpcloth.model.model.Model` of a scene with meshes among its colliders.
         x: The positions that the steps change, (B·n,) vectors [m].
     """
-
-    carried = ("kept",)
 
     @in_turn
     def __init__(self, model, x):
@@ -92,19 +92,27 @@ class Piercings:
         self._some.zero_()
         self._launch(kernels.drop_cuts, self._count, [self._faces, self._x], [self._found, self._some])
 
-    @property
-    @in_turn
-    def kept(self):
-        """All that later frames depend on, as bytes; of one time, as frames are computed ahead."""
-        return np.concatenate([array.numpy().ravel().view(np.uint8) for array in self._kept])
+    # As a part of a state: all that later frames depend on.
 
-    @kept.setter
-    def kept(self, values):
-        for array in self._kept:
-            host = array.numpy()
-            values, rest = values[: host.nbytes], values[host.nbytes :]
-            array.assign(values.view(host.dtype).reshape(host.shape))
-            values = rest
+    def copy(self):
+        """Returns an equal object with arrays of its own for these values."""
+        other = copy(self)
+        other._kept = [wp.clone(array) for array in self._kept]
+        return other
+
+    def assign(self, other):
+        """Copies the values of another object of the same model."""
+        for mine, array in zip(self._kept, other._kept, strict=True):
+            wp.copy(mine, array)
+
+    def to_host(self):
+        """Returns copies of the arrays, by name."""
+        return {str(k): np.array(array.numpy()) for k, array in enumerate(self._kept)}
+
+    def from_host(self, values):
+        """Sets everything to what :meth:`to_host` returned."""
+        for k, array in enumerate(self._kept):
+            array.assign(values[str(k)])
 
     @in_turn
     def _read(self):

@@ -94,7 +94,16 @@ class Status(NamedTuple):
 
 
 def sentence(
-    result, grade, distance=np.nan, residual=None, measure=None, unit=None, tolerance=None, copy=None, why="", of="each step"
+    result,
+    grade,
+    distance=np.nan,
+    residual=None,
+    measure=None,
+    unit=None,
+    tolerance=None,
+    copy=None,
+    why="",
+    of="the last step of each frame",
 ):
     """Returns a message: whether a result can be used, how it ended, and the residual with its unit and tolerance.
 
@@ -110,13 +119,14 @@ def sentence(
         why: Why the result is not usable, and what to do.
         of: That of which ``distance`` is from the solution.
     """
-    ended, figure = result.value + (" in a step or more" if result in _OF_STEPS else ""), ""
+    ended, figure = result.value + (" in one or more steps" if result in _OF_STEPS else ""), ""
     if measure is not None:
         compared = "this solver has no tolerance" if tolerance is None else f"tolerance {tolerance:g}"
         whose = "" if copy is None else f", in copy {copy}"
         figure = f"{measure} {digits(residual)} {unit}{whose} ({compared})"
     if grade is Grade.NOT_USABLE:
-        return f"{grade.value}: {why}; {ended}" + (f": {figure}" if figure else "")
+        ended = "" if result is Result.COMPLETED else ended
+        return "; ".join(filter(None, (f"{grade.value}: {why}", ": ".join(filter(None, (ended, figure))))))
     text = ended if ended.startswith(grade.value) else grade.value + (f", {ended}" if result is not Result.COMPLETED else "")
     if grade is Grade.COMPLETED and distance > 0.0:
         text = text.replace(grade.value, f"{grade.value} within {millimetres(distance)} of the solution of {of}", 1)

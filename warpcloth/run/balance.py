@@ -153,7 +153,10 @@ class Balance:
         self._rounding = np.zeros(model.copies)
         self.elastic = Elastic(model)
         self._lowest = self.elastic.below_0(model.positions)
-        # Rounding of positions changes velocities by at most ω²h ε x, 4 ε x/h for ωh = 2, and adds up like a random walk.
+        lengths = model.scene.mesh.edge_lengths
+        self._edge = np.sqrt(np.mean(lengths**2)) if lengths.any() else np.inf
+        # Rounding of positions by δ = 4 ε x changes velocities by at most ω²h δ/4, δ/h for ωh = 2, and the strain of edges by
+        # δ/L. In both ways it adds energy in each step, like a random walk.
         self._note_farthest(points)
         parts = [each for each in model.scene.declared if not (self._velocity.any() and isinstance(each, Pins | Collider))]
         found = (source_of(part, self, stepper) for part in (stepper, *parts))
@@ -162,7 +165,7 @@ class Balance:
         # The velocities of explicit steps are not corrected for contact, see :meth:`_at_positions`.
         self.driven = len(self.sources) > 1 or (self._staggered and touches)
         integrator = stepper.takers[0][0].integrator
-        self._he, self._unbalanced = stepper.he, np.zeros(model.copies)
+        self._unbalanced = np.zeros(model.copies)
         self._bound = 1.0 if integrator is None else integrator.energy_bound
 
     def kinetic(self, velocities):
@@ -248,10 +251,12 @@ class Balance:
 
         Those of one sign in all steps change the RMS speed by δ = t √(Σ‖rᵢ‖²/mᵢ/M), the largest so far.
         """
-        self._unbalanced = np.fmax(self._unbalanced, np.where(converged, np.sqrt(2.0 * error.excess) / self._he, 0.0))
+        self._unbalanced = np.fmax(self._unbalanced, np.where(converged, np.sqrt(2.0 * error.excess) / error.he, 0.0))
         total = np.where(self.total > 0.0, self.total, 1.0)
-        speed = frame / self.model.scene.fps * self._unbalanced / np.sqrt(total)
-        return np.where(converged, total * speed * (np.sqrt(2.0 * np.fmax(self.given, 0.0) / total) + 0.5 * speed), 0.0)
+        with np.errstate(all="ignore"):
+            speed = frame / self.model.scene.fps * self._unbalanced / np.sqrt(total)
+            added = total * speed * (np.sqrt(2.0 * np.fmax(self.given, 0.0) / total) + 0.5 * speed)
+        return np.where(converged, added, 0.0)
 
     @cached_property
     def _strained(self):
@@ -313,7 +318,8 @@ class Balance:
         """Updates the bounds of kinetic and potential energy that rounding adds, from the largest coordinate."""
         farthest = np.abs(points).reshape(self.model.copies, -1).max(axis=1)
         rounded = 4.0 * np.finfo(self.model.numpy_dtype).eps * farthest
-        self._rounding = np.fmax(0.5 * self.total * (rounded / self._h) ** 2, self._rounding)
+        stored = self._strained * (rounded / (STRAIN * self._edge)) ** 2
+        self._rounding = np.fmax(0.5 * self.total * (rounded / self._h) ** 2 + stored, self._rounding)
         self._rounded_height = self.total * np.linalg.norm(self._gravity, axis=1) * rounded
 
     def _moments(self, points):
@@ -343,4 +349,5 @@ class Balance:
 
 def _over(has, given):
     """Returns has/given (B,), 0 where there is no energy, and NaN where ``has`` is."""
-    return np.where(has > 0.0, has / given, np.where(has <= 0.0, 0.0, np.nan))
+    with np.errstate(all="ignore"):
+        return np.where(has > 0.0, has / given, np.where(has <= 0.0, 0.0, np.nan))

@@ -80,7 +80,7 @@ def held_pins_of(stepper):
 def held_sentence(pin, copies):
     """Returns the sentence about pins that cloth holds back, without its end, in one of several copies."""
     of_copy = f" of copy {pin.copy}" if copies > 1 else ""
-    return f"from frame {pin.frame}{of_copy} on cloth holds back pins, vertex {pin.vertex} first, by up to {pin.farthest:.3g} m"
+    return f"cloth holds back pins from frame {pin.frame}{of_copy} on, vertex {pin.vertex} first, by up to {pin.farthest:.3g} m"
 
 
 def unwanted(scene, held):
@@ -105,7 +105,7 @@ def contact_faults(scene, held, inside, pierced, copies=1):
     for each in inside:
         if each.other is not None:
             found.append((each.copy, each.frame, f"{each}; leave the cloth room between the two"))
-    remedy = 'Contact(elements="triangles") keeps meshes out between vertices too'
+    remedy = 'take Contact(elements="triangles"), which keeps meshes out between vertices too'
     found += [(each.copy, each.frame, f"{each}; {remedy}") for each in pierced]
     return sorted(found, key=lambda fault: fault[1])
 

@@ -11,11 +11,13 @@ NEAR, FAR = 1e-3, 0.5
 # Results with which a step may have converged: those of methods that found its solution, or have no tolerance.
 _MAY_CONVERGE = Result.COMPLETED, Result.CONVERGED, Result.ROUNDED
 # Why a copy is not usable, with the figure of the first frame in which that is so. A vertex in contact that is farther along
-# its normal than the contact distance has no contact in the solution. What is not resolved in one frame alone may be an impact.
+# its normal than the contact distance has no contact in the solution. What is not balanced in one frame alone may be an impact.
 _WHY = (
     "in frame {frame}{of_copy} vertices are up to {length} from the solution of the step, more than half of an edge ({edge})",
-    "in frame {frame}{of_copy} vertices in contact are {figure} times the contact distance from the solution of the step",
-    "in frame {frame}{of_copy} and the one before contact presses vertices by more than twice what holds them",
+    "in frame {frame}{of_copy} a vertex in contact is {times:.3g} contact distances along its normal from the solution of the "
+    "step, of which 1 is allowed",
+    "in frame {frame}{of_copy} and the one before half of a force of contact or more is not balanced, enough to end the "
+    "contact in a step",
     "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, {ratio}",
 )
 
@@ -43,7 +45,6 @@ class Grades:
         lengths, contacts = scene.mesh.edge_lengths, (scene.contact, scene.self_contact)
         self._edge = float(np.median(lengths[lengths > 0.0])) if (lengths > 0.0).any() else np.inf
         self._resolved = min([self._edge, *(each.distance for each in contacts if each is not None)])
-        self._solves = any(taker.integrator is not None for taker, _first, _end in stepper.takers)
         self.errors = StepErrors(stepper, NEAR * self._resolved, FAR * self._edge)
         self.first, self.figure = np.zeros((len(_WHY), model.copies), dtype=int), np.zeros((len(_WHY), model.copies))
         self.distance, self.gap, self.most = (np.zeros(model.copies) for _ in range(3))
@@ -83,7 +84,7 @@ class Grades:
                 figure, of_copy = self.figure[kind, copy], f" of copy {copy}" if len(self.most) > 1 else ""
                 given = {"length": millimetres(figure), "edge": millimetres(self._edge)}
                 given["ratio"] = _compared(figure, self.most[copy])
-                why = _WHY[kind].format(frame=frame, of_copy=of_copy, figure=digits(figure), **given)
+                why = _WHY[kind].format(frame=frame, of_copy=of_copy, figure=digits(figure), times=figure, **given)
                 found.append((copy, int(frame), f"{why}; {remedy}"))
         return found
 
@@ -97,8 +98,9 @@ class Grades:
         """
         if result in (Result.DIVERGED, Result.STOPPED) or any(fault[0] == copy for fault in faults):
             return Grade.NOT_USABLE
-        near = self._solves and self.distance[copy] <= NEAR * self._resolved
-        return Grade.CONVERGED if near and result in _MAY_CONVERGE else Grade.COMPLETED
+        results = _MAY_CONVERGE if self.errors.knows else _MAY_CONVERGE[1:]
+        near = result in results and self.distance[copy] <= NEAR * self._resolved
+        return Grade.CONVERGED if near else Grade.COMPLETED
 
 
 def _compared(energy, most):

@@ -52,6 +52,7 @@ class StepError(NamedTuple):
         largest: The largest energy of an element above that of the strain :data:`STRAIN` in it, (√u − √u_ε)² [J].
         pushed: The energy that contact added when it changed positions at the end of the step [J].
         excess: The bound of φ above its minimum, before contact changed positions [J].
+        he: hₑ of the step [s].
     """
 
     distance: np.ndarray
@@ -64,6 +65,7 @@ class StepError(NamedTuple):
     largest: np.ndarray
     pushed: np.ndarray
     excess: np.ndarray
+    he: np.ndarray
 
 
 class StepErrors:
@@ -76,21 +78,32 @@ class StepErrors:
 
     Attributes:
         distance, solved, ratio, gap: See :class:`StepError`, of the frames so far.
+        knows: Whether ``distance`` is that from the solution; else it is 0, or the largest gap of constraints alone.
     """
 
     def __init__(self, stepper, near, allowed):
         self._stepper, self._near, self._allowed, self._parts = stepper, near, allowed, WeakKeyDictionary()
-        self.distance, self.solved, self.ratio, self.gap = (np.zeros(stepper.model.copies) for _ in range(4))
+        model = stepper.model
+        self.distance, self.solved, self.ratio, self.gap = (np.zeros(model.copies) for _ in range(4))
+        # For each vertex the frames in a row in which its contact was not resolved, which a checkpoint holds.
+        touches = any(taker.unfiltered is not None for taker, _first, _end in stepper.takers)
+        counts = wp.zeros(model.count, dtype=wp.int32, device=model.device) if touches else None
+        self._counts = stepper.state.add("frames of unresolved contact", counts)
+        self.knows = all(
+            taker.integrator is not None and len({elements.hard for elements in taker.model.terms}) < 2
+            for taker, _first, _end in stepper.takers
+        )
 
     @in_turn
     def find(self):
         """Returns the :class:`StepError` of the frame that ended with the last step."""
-        energies, unresolved = np.zeros((5, len(self.distance))), np.zeros(len(self.distance), dtype=bool)
+        copies = len(self.distance)
+        energies, unresolved, he = np.zeros((5, copies)), np.zeros(copies, dtype=bool), np.zeros(copies)
         for taker, first, end in self._stepper.takers:
             if taker not in self._parts:
                 self._parts[taker] = _measured(taker)
             part, copies = self._parts[taker], slice(first, end)
-            bound, energies[:, copies] = part.measure()
+            he[copies], (bound, energies[:, copies]) = taker.he, part.measure()
             distance, solved, ratio = self.distance[copies], self.solved[copies], self.ratio[copies]
             known = ~(bound > self._near) | (not part.solves)
             distance[known] = np.fmax(distance, bound)[known]
@@ -102,13 +115,15 @@ class StepErrors:
             if news.any():
                 found, gap = part.solve()
                 found = np.where(found > 0.0, np.fmin(found, bound), bound)  # where the linear solve fails, the bound stays
-                solved[news], ratio[news] = bound[news], (found / bound)[news]
+                solved[news], ratio[news] = bound[news], found[news] / bound[news]
                 self.gap[copies][news] = np.fmax(self.gap[copies], gap)[news]
             told = np.isfinite(bound) & ~known
             distance[told] = np.fmax(distance, ratio * bound)[told]
-            unresolved[copies] = part.solves and part.unresolved(bound)
+            if part.solves and taker.unfiltered is not None:
+                n = taker.model.per_copy
+                unresolved[copies] = part.unresolved(bound, self._counts[first * n : end * n])
         found = (each.copy() for each in (self.distance, self.solved, self.ratio, self.gap))
-        return StepError(*found, unresolved, *energies)
+        return StepError(*found, unresolved, *energies, he)
 
 
 def _measured(stepper):
@@ -187,7 +202,7 @@ class _Peak:
 
 
 class _Gaps(_Stored):
-    """Steps with constraints of infinite stiffness, which have no residual: the distance is the largest gap of such a one."""
+    """Steps with constraints of infinite stiffness, which have no residual: the bound is the largest gap of such a one."""
 
     def _prepare(self):
         hard = [each for each in self.stepper.declared.terms if each.hard and each.collider is None]
@@ -261,15 +276,18 @@ class _Residuals(_Stored):
         """Returns the distance from the solution of the step by a Newton step, (B,) [m], and :attr:`StepError.gap` there."""
         return self._taken.solve()
 
-    def unresolved(self, bound):
-        """Returns whether contact of a vertex is not resolved, of each copy, (B,); ``bound`` is that of the distance [m]."""
-        if self.stepper.unfiltered is None:
-            return False
+    def unresolved(self, bound, counts):
+        """Returns whether contact of a vertex is not resolved, of each copy, (B,).
+
+        Args:
+            bound: Of the distance, (B,) [m].
+            counts: The frames in a row in which contact of each vertex was not resolved, (N,) int32, to be updated.
+        """
         taken = self._taken
         if (bound > 0.5 * taken.contact_distance).any():  # no smaller residual unbalances half of such a force
-            return taken.unresolved()
-        self.stepper.unresolved.zero_()
-        return False
+            return taken.unresolved(counts)
+        counts.zero_()
+        return np.zeros(len(bound), dtype=bool)
 
     @property
     def _taken(self):
@@ -296,7 +314,7 @@ class _Step:
         self._pushes = plan(self.model).gradient(corrected=True, terms=pushing) if pushing else None
         present = (self._pushes, scene.contact), (stepper.pairs, scene.self_contact)
         distances = [contact.distance for pushes, contact in present if pushes is not None]
-        self.contact_distance, self._find, self._forces = min(distances, default=np.inf), None, None
+        self.contact_distance, self._wrong, self._forces = min(distances, default=np.inf), None, None
         if distances:
             self._forces = self.model.vectors(), None if stepper.pairs is None else self.model.vectors()
 
@@ -351,22 +369,20 @@ class _Step:
         pairs = zip(sorted_ones, present, strict=True)
         return tuple(a if np.array_equal(host_values(a.stencil), host_values(b.stencil)) else b for a, b in pairs)
 
-    def unresolved(self):
-        """Returns whether contact of a vertex is not resolved, see :class:`StepError`, of each copy, (B,)."""
+    def unresolved(self, counts):
+        """See :meth:`_Residuals.unresolved`."""
         model = self.model
-        if self._find is None:
+        if self._wrong is None:
             self._count, self._ones = model.kernel(kernels.unresolved_contact, model.dtype), model.constant(1.0, model.count)
             self._wrong = Mirror(model.scalars())
-            captured = self.stepper.pairs is None
-            self._find = Segment(model.device, self._launch_unresolved) if captured else self._launch_unresolved
-        self._find()
+        self._launch_unresolved(counts)
         return self._wrong.read() > 0.0
 
-    def _launch_unresolved(self):
+    def _launch_unresolved(self, counts):
         of, model, scene = self._of, self.model, self.model.scene
         given = [model.inverse_mass, *self._launch_pushes(), of.residual, self.stepper.he**2]
         given += [0.0 if each is None else each.distance for each in (scene.contact, scene.self_contact)]
-        model.launch(self._count, model.count, given, [self.stepper.unresolved, of.weighted])
+        model.launch(self._count, model.count, given, [counts, of.weighted])
         of.sums.largest(self._ones, of.weighted, self._wrong.array)
 
     def _launch_pushes(self):

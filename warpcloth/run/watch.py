@@ -81,6 +81,8 @@ class Watch:
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.growth, self.balance, self.history = np.zeros(model.copies), Balance(model, stepper), None
         self.piercings = piercings_of(model, stepper.state.x) if grades else None
+        if self.piercings is not None:
+            stepper.state.add_part("piercings", self.piercings)
         self.last, self.stopped = Frame(None, None, stepper.results, stepper.residual, 0.0), False
         self.grades = Grades(stepper, self.balance) if grades else None
 
@@ -152,7 +154,7 @@ class Watch:
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
             yield source, source.carried
-        for part in (self.grades, self.history, self.piercings):
+        for part in (self.grades, self.history):
             if part is not None:
                 yield part, part.carried
 
@@ -200,13 +202,14 @@ class Watch:
             measure, unit = kind.measure, ResidualScale(self.model).units[copy]
         faults = [*faults, *self.grades.faults(solver, result)]
         grades = tuple(self.grades.grade(copy, result, faults) for copy, result in enumerate(results))
-        grade, distance = max(grades, key=list(Grade).index), self.grades.distance
+        grade = max(grades, key=list(Grade).index)
+        distance = np.where(self.grades.errors.knows & (self.good > 0), self.grades.distance, np.nan)
         if self.messages:
             others = {copy: f"{Grade.NOT_USABLE.value}: {why}" for copy, _frame, why in faults[::-1]}
             message = "; ".join(text for _copy, text in sorted((others | self.messages).items()))
         else:
             which, tolerance = copy if len(residual) > 1 else None, getattr(solver, "tolerance", None)
             why = min(faults, key=lambda fault: fault[1])[2] if faults else ""
-            message = sentence(result, grade, distance.max(), residual[copy], measure, unit, tolerance, which, why)
+            message = sentence(result, grade, np.fmax.reduce(distance), residual[copy], measure, unit, tolerance, which, why)
         good, distance = int(self.good.max()), of_copies(distance)
         return Status(result, good, of_copies(residual), message, self.good, measure, unit, grade, distance, grades)

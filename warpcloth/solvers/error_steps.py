@@ -126,8 +126,8 @@ class ErrorStepper(Stepper):
 
         def launch():
             for mine, its in self._states(stepper):
-                for name, array in mine.arrays.items():
-                    self._launch_between(mine.counts.get(name), array, its.arrays[name], unit, take)
+                for name, array in its.arrays.items():
+                    self._launch_between(mine.counts.get(name), mine.arrays[name], array, unit, take)
 
         return Segment(self.model.device, launch)
 

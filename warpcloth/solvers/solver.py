@@ -43,8 +43,6 @@ class Stepper:
         predicted: x̃ of the last step (N,) [m]; None for solvers without x̃.
         correction: d = x − x̃ of the minimiser in the last step (N,) [m], before contact changed it.
         unfiltered: Positions at the end of the last step before contact changed them (N,) [m]; None without contact.
-        unresolved: For each vertex the frames in a row in which its contact was not resolved, (N,) int32; None without contact.
-            :class:`warpcloth.run.step_errors.StepErrors` counts them.
         iterations: Number of iterations or sweeps of the last step; 1 for methods that do not iterate.
         even: Whether all steps have the same length.
         factorise_seconds: Time of the factorisation of constant matrices [s]; 0 for methods that have none.
@@ -58,7 +56,7 @@ class Stepper:
     _motion = None  # x and v, if they are views of those of another stepper, see `part_of`
     lead = None  # for a twin without contact, the stepper whose state it shares, see `find_twin`
     clear_steps = None  # the TwinSteps of a stepper with a twin
-    predicted = correction = unfiltered = unresolved = None
+    predicted = correction = unfiltered = None
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -92,8 +90,6 @@ class Stepper:
             self.predicted = model.vectors() if self.lead is None else self.lead.predicted
             if self.colliders is not None or self.pairs is not None:
                 self.unfiltered = model.vectors()
-                counts = wp.zeros(model.count, dtype=wp.int32, device=model.device)
-                self.unresolved = self.state.add("frames of unresolved contact", counts)
 
     @classmethod
     def part_of(cls, motion, options, model):
