@@ -14,8 +14,8 @@ _MAY_CONVERGE = Result.COMPLETED, Result.CONVERGED, Result.ROUNDED
 # its normal than the contact distance has no contact in the solution. What is not balanced in one frame alone may be an impact.
 _WHY = (
     "in frame {frame}{of_copy} vertices are up to {length} from the solution of the step, more than half of an edge ({edge})",
-    "in frame {frame}{of_copy} a vertex in contact is {times:.3g} contact distances along its normal from the solution of the "
-    "step, of which 1 is allowed",
+    "in frame {frame}{of_copy} a vertex in contact is farther along its normal from the solution of the step than the contact "
+    "distance, {times:.2f} times as far",
     "in frame {frame}{of_copy} and the one before half of a force of contact or more is not balanced, enough to end the "
     "contact in a step",
     "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, {ratio}",
