@@ -75,7 +75,7 @@ def test_what_is_wrong_is_not_usable(name, device):
     status = found.status
     assert status.grade is Grade.NOT_USABLE and not status.ok and not status and status.complete
     assert len(found.points) == make().frames + 1  # all frames are kept
-    assert re.match("not usable: in frame [0-9]+ ", status.message) and re.search(why, status.message), status.message
+    assert re.match("not usable: in frames? [0-9]+ ", status.message) and re.search(why, status.message), status.message
     assert "; take shorter steps" in status.message
 
 

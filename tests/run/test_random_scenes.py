@@ -30,7 +30,7 @@ def test_unbalanced_contact_is_counted_over_steps_of_all_lengths(seed, device):
     case = random_case(seed)
     solver = replace(case.solver, substeps=None, dt=None, error=1e9)
     said = wc.simulate(case.scene, solver, dtype=case.dtype, device=device).status.message
-    assert "and the one before half of a force of contact or more is not balanced" in said
+    assert "at least half of a force of contact is not balanced" in said
 
 
 # The judges. What they see is a fall as it is in books, of two sheets over a plane and a cone.

@@ -128,8 +128,9 @@ def sentence(
         ended = "" if result is Result.COMPLETED else ended
         return "; ".join(filter(None, (f"{grade.value}: {why}", ": ".join(filter(None, (ended, figure))))))
     text = ended if ended.startswith(grade.value) else grade.value + (f", {ended}" if result is not Result.COMPLETED else "")
-    if grade is Grade.COMPLETED and distance > 0.0:
-        text = text.replace(grade.value, f"{grade.value} within {millimetres(distance)} of the solution of {of}", 1)
+    if grade is Grade.COMPLETED:
+        near = "at an unknown distance from" if np.isnan(distance) else f"within {millimetres(distance)} of"
+        text = text.replace(grade.value, f"{grade.value} {near} the solution of {of}", 1)
     return text + (f": {figure}" if figure else "")
 
 

@@ -13,12 +13,10 @@ _MAY_CONVERGE = Result.COMPLETED, Result.CONVERGED, Result.ROUNDED
 # Why a copy is not usable, with the figure of the first frame in which that is so. A vertex in contact that is farther along
 # its normal than the contact distance has no contact in the solution. What is not balanced in one frame alone may be an impact.
 _WHY = (
-    "in frame {frame}{of_copy} vertices are up to {length} from the solution of the step, more than half of an edge ({edge})",
-    "in frame {frame}{of_copy} a vertex in contact is farther along its normal from the solution of the step than the contact "
-    "distance, {times:.2f} times as far",
-    "in frame {frame}{of_copy} and the one before half of a force of contact or more is not balanced, enough to end the "
-    "contact in a step",
-    "in frame {frame}{of_copy} cloth has {figure} J of motion, height and stored energy, {ratio}",
+    "in {frame} vertices are up to {length} from the solution of the step, more than half of an edge ({edge})",
+    "in {frame} a vertex in contact is {times:.4g} contact distances along its normal from the solution of the step (limit 1)",
+    "in {frames} at least half of a force of contact is not balanced, enough to end the contact in a step",
+    "in {frame} cloth has {figure} J of motion, height and stored energy, {ratio}",
 )
 
 
@@ -82,9 +80,10 @@ class Grades:
         for (kind, copy), frame in np.ndenumerate(self.first):
             if frame:
                 figure, of_copy = self.figure[kind, copy], f" of copy {copy}" if len(self.most) > 1 else ""
-                given = {"length": millimetres(figure), "edge": millimetres(self._edge)}
+                given = {"frame": f"frame {frame}{of_copy}", "frames": f"frames {frame - 1} and {frame}{of_copy}"}
+                given |= {"length": millimetres(figure), "edge": millimetres(self._edge), "times": figure}
                 given["ratio"] = _compared(figure, self.most[copy])
-                why = _WHY[kind].format(frame=frame, of_copy=of_copy, figure=digits(figure), times=figure, **given)
+                why = _WHY[kind].format(figure=digits(figure), **given)
                 found.append((copy, int(frame), f"{why}; {remedy}"))
         return found
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..base.turns import in_turn
 from ..contact.piercings import piercings_of
-from ..core.status import Grade, Result, Status, Stopped, sentence
+from ..core.status import Grade, Result, Status, Stopped, digits, sentence
 from ..numerics.iterate import ResidualScale
 from .balance import GAIN, STRETCHED, Balance
 from .frames_ahead import Frame, frames_of
@@ -113,8 +113,8 @@ class Watch:
                 self.messages[copy] = f"{where}: the forces of a step are not finite"
             elif copy in long:
                 self.messages[copy] = (
-                    f"{where}: an edge has a strain of {100.0 * strain[copy]:.3g} %, for which the energy of the run "
-                    "does not suffice"
+                    f"{where}: an edge has a strain of {digits(100.0 * strain[copy])} %, more than the energy of the run can "
+                    "cause"
                 )
             else:
                 self.messages[copy] = f"{where}: {self.balance.sentence(copy)}"
