@@ -101,6 +101,9 @@ def scene():
     "number.py": "def scene():\n    return 3\n",
     "broken.usda": "no stage\n",
     "notes.txt": "no scene\n",
+    "cache.pc2": "",
+    "cache.abc": "",
+    "sheet.obj": "v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 3 2\n",
 }
 
 # argv, with {} for a folder of SCENE_FILES, and a part of the line that it gives.
@@ -110,7 +113,7 @@ WRONG_USES = [
     ("chart work-precision --solvers newton -p n=8 hanging", "are required: SCENE (SCENE must stand before --solvers"),
     ("run {}/good.py -p label=a/b", "the scene is called 'a/b', which cannot be the name of a file; give one with -o"),
     ("run {}/good.py -p label=..", "the scene is called '..', which cannot be the name of a file; give one with -o"),
-    ("run {}/good.py -o {}/o.usdc --prim Cloth", "good.py is not a stage; leave it out"),
+    ("run {}/good.py -o {}/o.usdc --prim Cloth", "good.py has no parameter 'prim'; allowed are n, size"),
     ("run hanging -o {}/o.usdc --pins", "argument --pins: expected one argument"),
     ("info hanging --pins nowhere", "'nowhere'"),
     ("info hanging --pins x==7", "--pins 'x==7' names no vertex; the mesh reaches from (0, 0, 0) to (1, 0, 1)"),
@@ -134,7 +137,14 @@ WRONG_USES = [
     ("info {}/none.usda", "none.usda: there is no such file"),
     ("scenes {}/none", "none: there is no such folder"),
     # scene files
-    ("info {}/notes.txt", "notes.txt: is no scene; it must be a .py file or a USD stage"),
+    ("info {}/notes.txt", "notes.txt: is no scene; it must be a .py file, a USD stage or a mesh (.obj"),
+    ("info {}/cache.pc2", "cache.pc2: is no scene; it must be a .py file, a USD stage or a mesh"),
+    ("info {}/cache.pc2", "cache.usdc' makes a stage of an animation"),
+    ("info {}/cache.abc", "Alembic is not read, export USD or numbered .obj files; 'warpcloth convert' makes"),
+    ("info {}/sheet.obj --fabric denin", "fabric is 'denin'; it must be one of cotton"),
+    ("info {}/sheet.obj --scale 0", "scale is 0.0; it must be a number above 0"),
+    ("info {}/sheet.obj --scale 2 -p scale=3", "scale is given twice"),
+    ("info hanging --scale 2", "hanging.py has no parameter 'scale'"),
     ("info {}/nothing.py", "nothing.py: has no function scene()"),
     ("info {}/syntax.py", "syntax.py, line 2: SyntaxError: "),
     ("info {}/imports.py", "imports.py, line 2: ModuleNotFoundError: No module named 'no_such_module_at_all'"),

@@ -117,7 +117,7 @@ def test_a_prim_is_named_by_an_option(tmp_path, capfd, monkeypatch):
     assert "Left" in both and "Right" in both
     assert main(["run", "two.usda", "--prim", "Right", "--frames", "2", "--json"]) == 0
     facts = json.loads(capfd.readouterr().out)
-    assert (facts["parameters"], facts["file"]) == ({"prim": "Right", "law": "proposal"}, "Right.usdc")
+    assert (facts["parameters"], facts["file"]) == ({"prim": "Right", "law": "proposal", "fabric": None}, "Right.usdc")
     assert FrameSequence("Right.usdc")[0][:, 0].tolist() == [3.0, 4.0, 3.0, 4.0]
     assert main(["info", "two.usda", "--prim", "/World/Left"]) == 0
     assert main(["info", "two.usda", "--prim", "Left", "-p", "prim=Right"]) == 2

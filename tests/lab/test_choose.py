@@ -460,9 +460,10 @@ def test_an_interruption_says_what_is_kept(tmp_path, monkeypatch, capsys):
 
 
 def test_the_command_line_has_the_device():
-    arguments = SimpleNamespace(scene="s.py", p=[], frames=None, device="cuda:1", dtype="float64", imports=["own.py"])
+    given = {"scene": "s.py", "p": [], "pins": "x < 1", "frames": None, "dtype": "float64", "imports": ["own.py"]}
+    arguments = SimpleNamespace(**given, device="cuda:1")
     command = command_line(arguments, {}, Setup("pbd", {"substeps": 2}))
-    assert "s.py --import own.py" in command and "--device cuda:1 --dtype float64" in command
+    assert "s.py --import own.py --pins 'x < 1'" in command and "--device cuda:1 --dtype float64" in command
 
 
 @pytest.mark.parametrize(

@@ -183,10 +183,7 @@ def _parser():
         of_info = "also show the step and the kernels of this solver (default: none, or newton if -s or --advise is given)"
         options.add_solver(sub, of_info if sub is infos else "the solver (default: newton)")
         options.add_values(sub, "-s", "option", "options of the solver")
-        sub.add_argument("--prim", help="path or name of the cloth's prim, if the stage has several meshes")
-        sub.add_argument(
-            "--pins", metavar="SELECTION", help="pin these vertices in place of the scene's pins, such as 'x < 0.1'"
-        )
+        options.add_cloth(sub)
     infos.add_argument(
         "--advise",
         action="store_true",

@@ -6,7 +6,7 @@ from ..base.checks import whole
 from ..base.outputs import check_apart, check_replaceable
 from ..base.quiet import find_device
 from ..base.texts import assignments, json_text, options
-from .options import DEFAULT, add_scene, add_solver, add_values, values_of
+from .options import CLOTH, DEFAULT, add_cloth, add_scene, add_solver, add_values, values_of
 from .setup import named_scene, solver_setup
 from .terminal import Bar, Interrupted, aligned, check_writable, say
 
@@ -50,6 +50,7 @@ def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add_scene(parser, nargs="?")
+    add_cloth(parser)
     add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
     add(
@@ -114,7 +115,7 @@ def _benchmarks(arguments, device):
 
     given = {"device": str(device), **values_of(arguments, "dtype", "frames", "copies", "threads")}
     if arguments.scene is None:
-        _refuse(arguments, ("p", "solver", "s", "sizes"), "without SCENE, which must stand before it")
+        _refuse(arguments, ("p", *CLOTH, "pins", "solver", "s", "sizes"), "without SCENE, which must stand before it")
         return [*standard(**given), *contacts(**given), *self_contacts(**given)]
     _source, values, scene = named_scene(arguments)
     parameters = {name: values[name] for name in assignments(arguments.p)}
@@ -125,7 +126,8 @@ def _benchmarks(arguments, device):
         solver = solver_setup(arguments, scene, device).solver
         chosen |= {} if step_given else {"substeps": solver.substeps}
     sizes = tuple(sorted(set(arguments.sizes)))
-    benchmark = SolverBenchmark(SceneRef(arguments.scene, parameters), Setup(arguments.solver, chosen), sizes, **given)
+    scene_of = SceneRef(arguments.scene, parameters, arguments.pins)
+    benchmark = SolverBenchmark(scene_of, Setup(arguments.solver, chosen), sizes, **given)
     benchmark.scenes()[0].load()  # raises its errors before anything is measured
     return [benchmark]
 

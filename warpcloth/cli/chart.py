@@ -9,8 +9,8 @@ from ..base.texts import assignments, fraction, json_text
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
-from .options import HelpFormatter, add_import, add_scene, add_with, solvers, values_of
-from .setup import named_scene
+from .options import HelpFormatter, add_cloth, add_import, add_scene, add_with, solvers, values_of
+from .setup import named_scene, scene_ref
 from .terminal import DTYPES, add_dask, check_outputs, measuring
 
 TEXT = "Draw charts of accuracy against time, of stability, and of failures."
@@ -94,6 +94,7 @@ def add(charts, name, command, text, epilog):
 def _add_work_precision(charts):
     sub = add(charts, "work-precision", work_precision, "Chart the error of solvers against their compute time.", EPILOG)
     add_scene(sub)
+    add_cloth(sub)
     sub.add_argument("--diagram", choices=DIAGRAMS, default="time", help="diagram to measure (default: time)")
     sub.add_argument(
         "--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure only these solvers (default: all)"
@@ -121,6 +122,7 @@ def _add_cheapest(charts):
     text = "Map which solver and settings are the cheapest that meet a tolerance, over two parameters of a scene."
     sub = add(charts, "cheapest", map_cheapest, text, CHEAPEST_EPILOG)
     add_scene(sub)
+    add_cloth(sub)
     for of, needed in (("x", True), ("y", False)):
         text = f"parameter of the scene on the {of} axis and its values" + ("" if needed else " (default: a map of one row)")
         sub.add_argument(f"--{of}", nargs="+", required=needed, metavar=("PARAMETER", "VALUE"), help=text)
@@ -158,14 +160,13 @@ def _add_failure(charts):
 
 def map_cheapest(arguments):
     from ..lab.cheapest import cheapest_map, write_csv
-    from ..lab.measurements import SceneRef
 
     if arguments.frames is not None:
         whole("frames", arguments.frames, least=1)
     check_outputs(arguments, [arguments.scene])
     device = find_device(arguments.device)
     axes = {of: _axis(of, getattr(arguments, of)) for of in "xy"}
-    scene = SceneRef(arguments.scene, assignments(arguments.p))
+    scene = scene_ref(arguments)
     with measuring(arguments, device) as run:
         run["workers"] = arguments.workers or 1
         found = cheapest_map(
@@ -277,7 +278,7 @@ def work_precision(arguments):
     measure, plot, lines = _parts(arguments.diagram)
     with measuring(arguments, device) as run:
         watch = {"watch": run["progress"].watch} if arguments.diagram == "time" else {}
-        scene = SceneRef(arguments.scene, given)
+        scene = SceneRef(arguments.scene, given, arguments.pins)
         found = measure(scene, device=str(device), limit=arguments.limit, **watch, **run, **options)
     if arguments.output:
         plot(arguments.output, found)

@@ -5,8 +5,8 @@ import sys
 
 from ..base.quiet import find_device
 from ..base.texts import assignments, fraction, json_text, milliseconds
-from .options import add_scene, add_with, values_of
-from .setup import named_scene
+from .options import add_cloth, add_scene, add_with, values_of
+from .setup import named_scene, scene_ref
 from .terminal import Interrupted, Settings, add_dask, executing
 
 EPILOG = """\
@@ -25,6 +25,7 @@ def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add_scene(parser)
+    add_cloth(parser)
     add(
         "--tolerance",
         metavar="SHARE",
@@ -55,7 +56,6 @@ def choose(arguments):
 def choice_for(arguments, device):
     """Returns the choice for the arguments, all measurements, the reference, and the parameters of the scene."""
     from ..lab.choosing import choose
-    from ..lab.measurements import SceneRef
 
     _source, values, _scene = named_scene(arguments)
     tolerance = None if arguments.tolerance is None else fraction("tolerance", arguments.tolerance)
@@ -64,7 +64,7 @@ def choice_for(arguments, device):
     try:
         with executing(arguments) as executor:
             choice, found, exact = choose(
-                SceneRef(arguments.scene, assignments(arguments.p), getattr(arguments, "pins", None)),
+                scene_ref(arguments),
                 tolerance,
                 budget,
                 device=str(device),
@@ -126,7 +126,8 @@ def _scene(arguments, values):
     """Returns the words that name the scene on a command line."""
     given = [f"{name}={value}" for name, value in values.items() if name in assignments(arguments.p)]
     imports = [word for module in arguments.imports for word in ("--import", module)]
-    return [arguments.scene, *imports, *(["-p", *given] if given else [])]
+    pins = [] if arguments.pins is None else ["--pins", arguments.pins]
+    return [arguments.scene, *imports, *pins, *(["-p", *given] if given else [])]
 
 
 def _text(facts, choice, found, exact, advise):

@@ -19,6 +19,7 @@ from .terminal import aligned
 
 _HELP = "help"
 DEFAULT = "newton"  # the default solver
+_MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")  # those of warpcloth.mesh.loading, which loads Warp
 _SIMULATORS = ("newton", "pbd")  # those of warpcloth.others.simulators, which loads Warp
 
 
@@ -152,9 +153,22 @@ def add_with(parser):
 
 def add_scene(parser, **more):
     """Adds the scene and its parameters."""
-    text = "a name that 'warpcloth scenes' lists, a .py file with a function scene(), or a USD stage"
+    text = "a name that 'warpcloth scenes' lists, a .py file with a function scene(), a USD stage, or a mesh file"
     parser.add_argument("scene", metavar="SCENE", help=text, **more)
     add_values(parser, "-p", "parameter", "parameters of the scene")
+
+
+# Parameters of scenes that have options of their own.
+CLOTH = ("prim", "scale", "fabric")
+
+
+def add_cloth(parser):
+    """Adds the options of a cloth that is read from a file."""
+    add = parser.add_argument
+    add("--prim", help="path or name of the cloth's prim, if the stage has several meshes, or of the geometry of a mesh file")
+    add("--scale", metavar="M", help="metres per unit of a mesh file, such as 0.01 for centimetres (default: 1)")
+    add("--fabric", metavar="NAME", help="fabric of the cloth, one of 'warpcloth fabrics' (default for a mesh file: cotton)")
+    add("--pins", metavar="SELECTION", help="pin these vertices in place of the scene's pins, such as 'x < 0.1' or boundary")
 
 
 def add_values(parser, option, of, text):
@@ -196,7 +210,7 @@ def complete(parser):
         return
     import argcomplete
 
-    files = {"scene": argcomplete.FilesCompleter((*STAGE_ENDINGS, ".py")), "mesh": argcomplete.FilesCompleter()}
+    files = {"scene": argcomplete.FilesCompleter((*STAGE_ENDINGS, *_MESHES, ".py")), "mesh": argcomplete.FilesCompleter()}
     files["imports"] = argcomplete.FilesCompleter((".py",))
     _add_completers(parser, files)
     argcomplete.autocomplete(parser)

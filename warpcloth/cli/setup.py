@@ -4,9 +4,8 @@ import math
 import time
 from dataclasses import asdict, dataclass, replace
 
-from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import assignments, options
-from .options import DEFAULT
+from .options import CLOTH, DEFAULT
 
 # Default steps per second of solvers without a stability limit; substeps are chosen nearest to it.
 _STEPS_A_SECOND = 240
@@ -26,13 +25,24 @@ def named_scene(arguments):
     from ..run.scene_files import find_source
 
     source = find_source(arguments.scene, getattr(arguments, "pins", None))
-    prim = getattr(arguments, "prim", None)
-    if prim is not None:  # as a parameter, so that measurements in other processes get it too
-        if source.path.suffix not in STAGE_ENDINGS:
-            raise ValueError(f"--prim is given, but {arguments.scene} is not a stage; leave it out")
-        arguments.p, arguments.prim = [*arguments.p, f"prim={prim}"], None
-    values = source.values(assignments(arguments.p))
+    values = source.values(_parameters(arguments))
     return source, values, source.scene(values)
+
+
+def scene_ref(arguments):
+    """Returns the :class:`warpcloth.lab.measurements.SceneRef` of the arguments."""
+    from ..lab.measurements import SceneRef
+
+    return SceneRef(arguments.scene, _parameters(arguments), arguments.pins)
+
+
+def _parameters(arguments):
+    """Returns the parameters of the scene as texts by name, after moving options that stand for some of them to ``-p``."""
+    for name in CLOTH if hasattr(arguments, "pins") else ():
+        if (value := getattr(arguments, name)) is not None:
+            arguments.p = [*arguments.p, f"{name}={value}"]
+            setattr(arguments, name, None)
+    return assignments(arguments.p)
 
 
 @dataclass

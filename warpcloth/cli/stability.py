@@ -6,7 +6,8 @@ from ..base.checks import number, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, json_text, options
 from ..lab.axes import ACCURACY, AXES, FIXED, SEED
-from .options import add_scene, values_of
+from .options import add_cloth, add_scene, values_of
+from .setup import scene_ref
 from .terminal import DTYPES, check_outputs, measuring
 
 _COUNT = 9
@@ -45,6 +46,7 @@ stored and reused.
 def add_arguments(parser):
     """Adds the arguments of this chart, without those of all charts."""
     add_scene(parser)
+    add_cloth(parser)
     for of in "xy":
         parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"quantity on the {of} axis")
         parser.add_argument(
@@ -126,7 +128,7 @@ def chart(arguments):
 
 def _survey(arguments):
     """Returns the :class:`Survey` of the arguments."""
-    from ..lab.measurements import SceneRef, Setup
+    from ..lab.measurements import Setup
     from ..lab.stability import Survey
     from ..solvers import SOLVERS
 
@@ -145,7 +147,7 @@ def _survey(arguments):
             raise ValueError(f"--at has no axis {name!r}; allowed are {', '.join(AXES)}")
         fixed[name] = convert(name, text, (int,) if AXES[name].whole else (float,))
     values = [_values(of, getattr(arguments, of), getattr(arguments, f"{of}_range")) for of in "xy"]
-    scene = SceneRef(arguments.scene, assignments(arguments.p))
+    scene = scene_ref(arguments)
     return Survey(
         scene, tuple(setups), arguments.x, arguments.y, *map(tuple, values), fixed, arguments.steps, arguments.duration
     )

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.checks import choice, shown
+from ..base.checks import choice, number, shown
 from ..base.limits import refuse_memory
 from ..base.types import Converted, FilePath, UpAxis, default
 from ..kernels.columns import columns_of, cross_length, dot, length
@@ -231,23 +231,31 @@ class Mesh:
         return cls(points, edges=np.stack([np.arange(n - 1), np.arange(1, n)], axis=1))
 
     @classmethod
-    def load(cls: type[Own], path: FilePath, prim: str | None = None) -> Own:
+    def load(cls: type[Own], path: FilePath, prim: str | None = None, scale: float = 1.0, up_axis: UpAxis | None = None) -> Own:
         """Reads the mesh in a file, see `loading.read_file`, or `usd.read_mesh` for USD stages, also for what is raised.
 
         Args:
             path: An .obj, .ply, .stl, .off, .glb or .gltf file, or a .usd, .usda, .usdc or .usdz stage.
             prim: Name of the geometry, or path of the prim, if the file has several.
+            scale: Factor by which to multiply lengths, such as 0.01 for a mesh file in centimetres.
+            up_axis: "Y" or "Z", if the file does not say it.
 
         Returns:
             Mesh: An instance of the class on which it was called, with vertices in the order of the file.
 
         Raises:
-            ValueError: The ending is none of those above.
+            ValueError: The ending is none of those above, or ``scale`` is not above 0.
         """
         read = READERS.get(Path(path).suffix.lower())
         if read is None:
             raise ValueError(f"{path}: the ending must be one of {' '.join(READERS)}")
-        return read(path, prim, cls)
+        number("scale", scale, above=0.0)
+        mesh = read(path, prim, cls)
+        if scale == 1.0 and up_axis is None:
+            return mesh
+        given = {name: getattr(mesh, name) for name in ("texture_coordinates", "grid_shape", "parts")}
+        elements = {"triangles": mesh.triangles} if len(mesh.triangles) else {"edges": mesh.edges}
+        return cls(scale * mesh.points, **elements, **given, up_axis=mesh.up_axis or up_axis)
 
     def select(self, text: str) -> np.ndarray:
         """Returns the vertices of a selection such as "z == 0 and not corners".

@@ -10,17 +10,22 @@ from pathlib import Path
 
 from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import allowed, convert, kinds_of_parameter, parameters_of
+from ..mesh.caches import CACHES
+from ..mesh.loading import ENDINGS
 from ..mesh.selection import some_vertices
+from ..scene.mesh_scene import mesh_scene
 from ..scene.scene import Scene
 from ..usd import read_scene
 from .listing import folders, list_scenes
 
 _number_of_modules = itertools.count()
+_READERS = dict.fromkeys(STAGE_ENDINGS, read_scene) | dict.fromkeys(ENDINGS, mesh_scene)
+_KINDS = f"a .py file, a USD stage or a mesh ({' '.join(ENDINGS)})"
 
 
 @dataclass(frozen=True)
 class SceneSource:
-    """The source of a scene: the ``scene`` function of a Python file, or a USD stage.
+    """The source of a scene: the ``scene`` function of a Python file, a USD stage, or a mesh file.
 
     Attributes:
         path: The file.
@@ -57,7 +62,7 @@ class SceneSource:
             ValueError: The function raises (the message has its file and line) or returns no scene, or ``pins`` selects no
                 vertex.
         """
-        if self.path.suffix in STAGE_ENDINGS:
+        if self.path.suffix != ".py":
             scene = self.function(**values)
         else:
             with _Located(self.path):
@@ -70,7 +75,7 @@ class SceneSource:
 
 
 def find_source(name, pins=None):
-    """Finds a scene: a Python file, a USD stage, or the name of a file in one of :func:`folders`.
+    """Finds a scene: a Python file, a USD stage, a mesh file, or the name of a file in one of :func:`folders`.
 
     Args:
         name: Path or name.
@@ -87,17 +92,27 @@ def find_source(name, pins=None):
         if path is None:
             known = sorted({listed.name for folder in folders() for listed in list_scenes(folder)})
             raise FileNotFoundError(
-                f"there is no scene {name!r}; known by name are {', '.join(known) or 'none'}; or give a .py file or a USD stage"
+                f"there is no scene {name!r}; known by name are {', '.join(known) or 'none'}; or give {_KINDS}"
             )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: {'is a folder, no scene' if path.is_dir() else 'there is no such file'}")
     if path.suffix == ".py":
         return _python_source(path, pins)
-    if path.suffix in STAGE_ENDINGS:
-        parameters = parameters_of(read_scene)
-        del parameters["path"]
-        return SceneSource(path, lambda **values: read_scene(str(path), **values), parameters, pins)
-    raise ValueError(f"{path}: is no scene; it must be a .py file or a USD stage ({', '.join(STAGE_ENDINGS)})")
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        raise ValueError(f"{path}: is no scene; it must be {_KINDS}{_converting(path)}")
+    parameters = parameters_of(read)
+    del parameters["path"]
+    return SceneSource(path, lambda **values: read(str(path), **values), parameters, pins)
+
+
+def _converting(path):
+    """Returns how an animation of another format becomes a stage, for the end of an error."""
+    if path.suffix.lower() == ".abc":
+        return "; Alembic is not read, export USD or numbered .obj files; 'warpcloth convert' makes a stage of the latter"
+    if path.suffix.lower() in (*CACHES, ".npz", ".npy"):
+        return f"; 'warpcloth convert {path} {path.with_suffix('.usdc')}' makes a stage of an animation"
+    return ""
 
 
 def _python_source(path, pins):

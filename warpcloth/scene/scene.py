@@ -25,6 +25,7 @@ from .joining import fields_of_cloths, pins_of_cloths
 from .measured_fabrics import fabrics
 from .mesh_collider import MeshCollider
 from .self_contact import SelfContact
+from .warp import warp_on
 
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
@@ -123,6 +124,8 @@ class Scene:
             prim of its own.
         fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, in place of ``density``, ``terms`` and
             ``thickness``, which it sets.
+        warp: Vector along the warp of ``fabric``, (3,) or (T, 3); each triangle takes the part in its plane. By default along
+            the texture coordinate s, and where there is none along x of the rest shape, which a warning says.
         thickness: Thickness of the cloth [m], from which contact without a distance takes it; None for cloth without one. NaN
             if it is not known, because the fabric has none or the cloths of a scene differ; such contact is then refused.
 
@@ -157,6 +160,7 @@ class Scene:
     air: Air | None = None
     cloths: tuple[str, ...] = ()
     fabric: InitVar[Fabric | str | None] = None
+    warp: InitVar[ArrayLike | None] = None
     thickness: float | None = None
 
     @classmethod
@@ -191,7 +195,7 @@ class Scene:
         """Pins, terms, loads and colliders, all of which may do work on the cloth."""
         return (self.pins, *self.terms, self.loads, *self.colliders, self.air)
 
-    def __post_init__(self, fabric: Fabric | str | None) -> None:
+    def __post_init__(self, fabric: Fabric | str | None, warp: ArrayLike | None) -> None:
         keep_plain(self)
         if not isinstance(self.mesh, Mesh):
             raise ValueError(f"mesh is {shown(self.mesh)}; it must be a Mesh, such as Mesh.grid(32, 32)")
@@ -204,8 +208,10 @@ class Scene:
             self._refuse_with_fabric()
             fabric = fabrics.find(fabric)
             keep("density", fabric.density)
-            keep("terms", fabric.terms())
+            keep("terms", fabric.terms(warp=warp_on(self.mesh) if warp is None else warp))
             keep("thickness", np.nan if fabric.thickness is None else fabric.thickness)
+        elif warp is not None:
+            raise ValueError("warp is given without fabric; give it to the terms that have one")
         elif self.thickness is not None and not _is_nan(self.thickness):
             number("thickness", self.thickness, above=0.0)
         number("fps", self.fps, above=0.0)

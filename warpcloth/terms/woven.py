@@ -58,12 +58,21 @@ class Woven(Declared):
         elif mesh.texture_coordinates is None:
             raise ValueError(f"{self.label}.warp is None on a mesh without texture coordinates; it must be a vector")
         else:
-            x, st = mesh.points[mesh.triangles], mesh.texture_coordinates[mesh.triangles]
-            sides, ((s1, t1), (s2, t2)) = x[:, 1:] - x[:, :1], (st[:, 1:] - st[:, :1]).transpose(1, 2, 0)
-            warp = np.sign(s1 * t2 - s2 * t1)[:, None] * (t2[:, None] * sides[:, 0] - t1[:, None] * sides[:, 1])
+            warp = along_s(mesh.points[mesh.triangles], mesh.texture_coordinates[mesh.triangles])
         along = np.einsum("tai,ti->at", axes, warp)
         size = np.linalg.norm(along, axis=0)
         for t in np.flatnonzero(size <= 1e-6 * np.linalg.norm(warp, axis=1))[:1]:
             raise ValueError(f"{self.label}.warp has no direction in triangle {t}; it must have a part in its plane")
         angle = np.arctan2(along[1], along[0]) + self.of_elements("warp_angle", T)
         return np.cos(angle)[:, None] * axes[:, 0] + np.sin(angle)[:, None] * axes[:, 1]
+
+
+def along_s(x: np.ndarray, st: np.ndarray) -> np.ndarray:
+    """Returns vectors (T, 3) in the direction in which s grows and t does not; 0 where triangles have no area in (s, t).
+
+    Args:
+        x: Corners of triangles (T, 3, 3) [m].
+        st: Their texture coordinates (T, 3, 2).
+    """
+    sides, ((s1, t1), (s2, t2)) = x[:, 1:] - x[:, :1], (st[:, 1:] - st[:, :1]).transpose(1, 2, 0)
+    return np.sign(s1 * t2 - s2 * t1)[:, None] * (t2[:, None] * sides[:, 0] - t1[:, None] * sides[:, 1])

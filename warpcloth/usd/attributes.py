@@ -75,6 +75,7 @@ ATTRIBUTES = (
     Attribute("name", "warpcloth:name", "cloth", ("string",)),
     Attribute("density", "warpcloth:density", "cloth", ("double",)),
     Attribute("fabric", "warpcloth:fabric", "cloth", ("token",)),  # in place of a density, terms and a thickness
+    Attribute("warp", "warpcloth:warp", "cloth", ("double3",)),  # vector along the warp of the fabric
     Attribute("thickness", "warpcloth:thickness", "cloth", ("double",)),
     Attribute("masses", "warpcloth:masses", "cloth", ("double[]",)),
     Attribute("positions", "warpcloth:positions", "cloth", ("double3[]",)),

@@ -13,8 +13,10 @@ from ..mesh.parts import Part
 from ..mesh.selection import distinct_vertices
 from ..scene.air import Air
 from ..scene.colliders import Contact
+from ..scene.mesh_scene import warn_of_unit
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..scene.self_contact import SelfContact
+from ..scene.warp import warp_on
 from ..terms import TERMS
 from ..terms.limit import Limit
 from ..terms.loads import LOADS
@@ -51,13 +53,14 @@ from .stage import (
 from .values import array_of, refuse_unknown, sentences, time_codes_of, value_of
 
 
-def read_scene(path: FilePath, prim: str | None = None, law: str = "proposal") -> Scene:
+def read_scene(path: FilePath, prim: str | None = None, law: str = "proposal", fabric: str | None = None) -> Scene:
     """Reads a scene from a stage; `simulate` then writes its animation as a layer over that stage.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
         prim: Path or name of the prim of the cloth. By default all prims with cloth attributes are cloths of the scene, or
             without any the only mesh.
+        fabric: Name of a fabric for all cloths, in place of density, terms and thickness, which they then must not have.
         law: What the standard names of a material mean: "proposal" or "newton", see :mod:`.deformables`.
 
     Returns:
@@ -88,7 +91,7 @@ def read_scene(path: FilePath, prim: str | None = None, law: str = "proposal") -
         scenes = []
         for cloth, of_cloth, one in zip(cloths, values, each, strict=True):
             with errors_at(f"{path}, prim {one.prim}"):
-                scenes.append(_scene(stage, cloth, of_cloth, one, fps, duration, values, law))
+                scenes.append(_scene(stage, cloth, of_cloth, one, fps, duration, values, law, fabric))
 
         def codes(samples):  # one more frame than the scene has, so that every step has a keyframe after it
             return frame_codes(samples, surroundings, scenes[0].frames + 1, fps)
@@ -98,6 +101,8 @@ def read_scene(path: FilePath, prim: str | None = None, law: str = "proposal") -
             for name, kind in (("contact", Contact), ("self_contact", SelfContact)):
                 whole[name] = _of_fields(kind, name, values)
             whole["air"] = _air(values, surroundings, scenes[0].frames, fps)
+            for scene in scenes:
+                warn_of_unit(where, scene, surroundings.meters_per_unit, "metersPerUnit = {}")
             if len(each) == 1:
                 return replace(scenes[0], **whole) if any(whole.values()) else scenes[0]
             name = _teller("name", values).get("name") or Path(path).stem
@@ -126,13 +131,16 @@ def _names_of(each):
     return names if len(set(names)) == len(names) else [path.replace("/", "_") for path in paths]
 
 
-def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law):
+def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law, fabric):
     """The scene of one cloth without colliders and contact. Any of the cloths may give gravity."""
     refuse_other_rest(cloth)
     rest = surroundings.mesh.points
     surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
     mesh = surroundings.mesh
-    fabric, terms, frames = values.get("fabric"), [_term(values, key) for key in values.terms], round(duration * fps)
+    fabric, terms, frames = fabric or values.get("fabric"), [_term(values, key) for key in values.terms], round(duration * fps)
+    warp = values.get("warp")
+    if fabric is not None and warp is None and surroundings.corner_coordinates is not None:
+        warp = warp_on(mesh, surroundings.corner_coordinates)
     standard = not terms and fabric is None
     masses, own = values.get("masses"), values.get("density")
     masses = masses_of(values, mesh) if masses is None and own is None and fabric is None else masses
@@ -169,6 +177,7 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law):
         name=cloth.GetName() if name is None else name,
         stage=surroundings,
         fabric=fabric,
+        warp=warp,
         thickness=thickness_of(values) if standard and values.get("thickness") is None else values.get("thickness"),
     )
     for term in scene.terms:
@@ -209,7 +218,7 @@ def _refuse_missing(mass, term):
         if not given
     ]
     if missing:
-        raise ValueError(f"has no {' and no '.join(missing)}, must have a mass and a term to be a cloth")
+        raise ValueError(f"has no {' and no '.join(missing)}, must have a mass and a term to be a cloth, or a fabric")
 
 
 def _cloth_prims(stage, path, prim):
