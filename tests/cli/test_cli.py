@@ -25,7 +25,7 @@ from support.command_line import refused, run
 from support.rows import slow_but
 from warpcloth.base.outputs import Lock
 from warpcloth.base.texts import convert
-from warpcloth.cli import main
+from warpcloth.cli import _parser, main
 from warpcloth.run import scene_files
 from warpcloth.scene.scene import Scene
 from warpcloth.solvers import explicit
@@ -111,14 +111,26 @@ WRONG_USES = [
     ("run", "the following arguments are required: SCENE; see warpcloth run --help"),
     ("run -p n=8 hanging", "are required: SCENE (SCENE must stand before -p, which takes all that follows it); see"),
     ("chart work-precision --solvers newton -p n=8 hanging", "are required: SCENE (SCENE must stand before --solvers"),
-    ("run {}/good.py -p label=a/b", "the scene is called 'a/b', which cannot be the name of a file; give one with -o"),
-    ("run {}/good.py -p label=..", "the scene is called '..', which cannot be the name of a file; give one with -o"),
+    ("run {}/good.py -p label=a/b", "the output would be called 'a/b', which cannot be the name of a file; give one with -o"),
+    ("run {}/good.py -p label=..", "the output would be called '..', which cannot be the name of a file; give one with -o"),
     ("run {}/good.py -o {}/o.usdc --prim Cloth", "good.py has no parameter 'prim'; allowed are n, size"),
     ("run hanging -o {}/o.usdc --pins", "argument --pins: expected one argument"),
     ("info hanging --pins nowhere", "'nowhere'"),
     ("info hanging --pins x==7", "--pins 'x==7' names no vertex; the mesh reaches from (0, 0, 0) to (1, 0, 1)"),
     ("bench -p help", "-p help lists the parameters of a scene; give SCENE before it"),
     ("walk hanging", "invalid choice: 'walk'"),
+    ("rum hanging", "did you mean run?; see warpcloth --help"),
+    ("run hanging --sover pbd", "unrecognized arguments: --sover pbd; did you mean --solver?; see warpcloth run --help"),
+    ("chart work-precision hanging --solver pbd", "did you mean --solvers?; see warpcloth chart work-precision --help"),
+    ("run hanging --solver pdb", "did you mean pbd?; see warpcloth run --help"),
+    ("run hanging -s itertions=3", "; did you mean iterations?"),
+    ("run hanging -p stifness=3", "; did you mean stiffness?"),
+    ("run hangin", "; did you mean hanging?"),
+    ("run hanging --fabric denin", "; did you mean denim?"),
+    ("fabrics denin", "; did you mean denim?"),
+    ("run hanging -s linear=cgg", "; did you mean cg?"),
+    ("run hanging -o {}/o.usdc --device cuda", "device is 'cuda'; on this machine there are cpu"),
+    ("view {}/*.obj", "the output would be called '*', which cannot be the name of a file; give one with -o"),
     ("run hanging -o {}/o.usdc --speed 3", "unrecognized arguments: --speed"),
     ("run hanging -o {}/o.usdc --solver simplex", "invalid choice: 'simplex'"),
     ("run hanging -o {}/o.usdc --dtype float16", "invalid choice: 'float16'"),
@@ -524,6 +536,12 @@ def test_no_command_and_help(capfd):
     assert (code, out) == (2, "") and "usage: warpcloth" in err
     code, out, err = run(capfd, "run", "--help")
     assert (code, err) == (0, "") and "1/240 s" in out
+    assert out.count("\n  warpcloth run ") == 2
+    code, out, err = run(capfd, "--help")
+    assert (code, err) == (0, "")
+    listed = re.findall(r"^  (\w+) +[A-Z]", out.partition("\nmake:\n")[2], re.MULTILINE)  # each command once, in a group
+    (commands,) = (action.choices for action in _parser()._actions if isinstance(action.choices, dict))
+    assert sorted(listed) == sorted(commands)
     code, out, _ = run(capfd, "--version")
     assert code == 0 and out.startswith("warpcloth ")
 

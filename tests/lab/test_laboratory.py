@@ -11,7 +11,7 @@ from support.command_line import run
 from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.lab import elastica
-from warpcloth.lab.laboratory import check_sample, drape_coefficient
+from warpcloth.lab.laboratory import check_sample, drape_coefficient, recorded
 from warpcloth.run.equilibrium import Equilibrium
 from warpcloth.scene.measured_fabrics import DRAPES
 
@@ -195,6 +195,27 @@ def test_what_is_no_sample_is_refused():
             check_sample(declared)
 
 
+@pytest.mark.parametrize(
+    ("device", "angle", "values", "why"),
+    [
+        ("strip", 0.0, {"modulus": COTTON.warp}, "finite strain"),
+        ("picture_frame", 0.0, {"shear modulus": COTTON.shear}, "tolerance"),
+        ("cusick", 0.0, {"drape coefficient": DRAPES["cotton"]}, "the mean of eight starts"),
+        ("cantilever", np.pi / 2, {"bending length": 1e3 * COTTON.bending_lengths[1], "D": 1e6 * COTTON.bending_weft}, "width"),
+        (
+            "loop",
+            0.0,
+            {"bending length": 1e3 * COTTON.bending_lengths[0], "D": 1e6 * COTTON.bending_warp},
+            "computed from E·t³",
+        ),
+    ],
+)
+def test_the_record_stands_beside_the_reading(device, angle, values, why):
+    found, reason = recorded(device, COTTON, angle)
+    assert found == pytest.approx(values) and why in reason
+    assert "computed from" not in recorded(device, replace(COTTON, computed=()), angle)[1]
+
+
 def test_the_command_prints_the_reading(capfd, tmp_path):
     shape = tmp_path / "strip.npz"
     code, out, _ = run(capfd, "measure", "strip", "-p", "angle=0", "elements=2", "strain=1e-6", "--json", "-o", str(shape))
@@ -202,7 +223,8 @@ def test_the_command_prints_the_reading(capfd, tmp_path):
     assert code == 0 and found["unit"] == "N/m" and found["value"] == pytest.approx(COTTON.warp, rel=1e-5)
     assert len(wc.open_sequence(str(shape))) == 1
     code, out, _ = run(capfd, "measure", "strip", "-p", "elements=2")
-    assert code == 0 and "modulus  " in out
+    assert code == 0 and "modulus  " in out and f"(record of the fabric: {COTTON.modulus_along(np.pi / 4):.4g})" in out
+    assert "they differ because the reading is at a finite strain" in out
     for given, sentence in (
         (["hanging"], "hanging is no test of a laboratory; it must be one of cantilever"),
         (["strip", "-o", "strip.obj"], "--output is strip.obj; it must end with .npz"),

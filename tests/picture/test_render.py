@@ -534,6 +534,13 @@ def test_an_interrupt_leaves_the_good_pictures_or_nothing(folder, tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["out.gif", "out.mp4"]
 
 
+@pytest.mark.parametrize(("command", "output"), [(("render", *SIZE), "cloth.png"), (("view", "--plain"), "cloth.html")])
+def test_the_default_output_is_named_after_the_file_and_replaces_nothing(folder, command, output, tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(capfd, command[0], folder / "cloth.usdc", *command[1:])[0] == 0 and Path(output).stat().st_size > 100
+    refused(capfd, [command[0], folder / "cloth.usdc", *command[1:]], f"{output} exists already, and without -o nothing is")
+
+
 def test_the_command_draws(folder, tmp_path, capfd):
     path = tmp_path / "out.gif"
     code, out, err = run(capfd, "render", folder / "cloth.usdc", folder / "cloth.npz", "-o", path, *SIZE, "--json", "--time")

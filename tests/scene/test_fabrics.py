@@ -122,6 +122,15 @@ def test_refusals_of_scenes(given, sentence):
         wc.Scene(MESH, **{"fabric": "denim", **given})
 
 
+def test_one_record_is_printed_with_what_is_computed(capfd):
+    code, out, _ = run(capfd, "fabrics", "denim")
+    rows = dict(line.rsplit(maxsplit=1) for line in out.partition("\n\n")[0].splitlines())
+    assert code == 0 and rows["fabric"] == "denim" and rows["E₁t N/m"] == "1673" and rows["D₁ µN·m"] == "114.8*"
+    assert "* computed, not measured: D from E·t³/12" in out and "Penava" not in out
+    code, out, _ = run(capfd, "fabrics", "denim-wang")
+    assert code == 0 and "D₁ µN·m  16\n" in out and "*" not in out
+
+
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
@@ -285,4 +294,4 @@ def test_the_command_lists_them(capfd):
     code, out, _ = run(capfd, "fabrics")
     assert code == 0 and all(name in out for name in wc.fabrics) and "1673" in out and "Clyde" in out
     drapes = {line.split()[0]: line.split()[-2] for line in out.splitlines()[1 : 1 + len(wc.fabrics)]}
-    assert drapes["silk"] == "52.1" and drapes["denim-wang"] == "–"  # which has no ν₁₂
+    assert drapes["silk"] == "52.1*" and drapes["denim-wang"] == "–"  # which has no ν₁₂

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.checks import shown
+from ..base.checks import did_you_mean, shown
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,9 @@ def chosen(names, on, given=("directions", "material", "rate")):
         if not isinstance(name, str) or name not in known:
             other = next((where for where, found in MEASURES.items() if name in found), None) if isinstance(name, str) else None
             hint = f" (it is one of each {other})" if other else ""
-            raise ValueError(f"measures: {shown(name)}{hint} must be one of {', '.join(known)}, or all")
+            raise ValueError(
+                f"measures: {shown(name)}{hint} must be one of {', '.join(known)}, or all{did_you_mean(name, known)}"
+            )
     if not names:
         raise ValueError(f"measures: none; must be one or more of {', '.join(known)}, or all")
     return [known[name] for name in dict.fromkeys(names)]

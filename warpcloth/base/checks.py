@@ -1,8 +1,9 @@
 """Checks of single values that users give. Each error names the parameter, the value and the rule."""
 
+import difflib
 import math
 import reprlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -78,7 +79,15 @@ def choice(name: str, value: object, allowed: Collection[str]) -> None:
         ValueError: It is not.
     """
     if not isinstance(value, str) or value not in allowed:
-        raise ValueError(f"{name} is {shown(value)}; it must be one of {', '.join(map(repr, allowed))}")
+        raise ValueError(
+            f"{name} is {shown(value)}; it must be one of {', '.join(map(repr, allowed))}{did_you_mean(value, allowed)}"
+        )
+
+
+def did_you_mean(given: object, names: Iterable[str]) -> str:
+    """Returns the end of an error that names the closest of the allowed ``names``; an empty text if none is close."""
+    close = difflib.get_close_matches(str(given), list(names), n=1)
+    return f"; did you mean {close[0]}?" if close and close[0] != given else ""
 
 
 def as_array(value: object) -> np.ndarray:

@@ -35,6 +35,8 @@ def find_device(name):
 
     initialise_warp()
     try:
+        if str(name).startswith("cuda") and not wp.is_cuda_available():  # Warp would print an error of its own
+            raise ValueError
         return wp.get_device(name)
     except (TypeError, ValueError, RuntimeError):
         there = ", ".join(device.alias for device in wp.get_devices())

@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-from .checks import number
+from .checks import did_you_mean, number
 from .renamed import new_name
 
 WORDS = {bool: "true or false", int: "a whole number", float: "a number, or a fraction such as 1/240", str: "a text"}
@@ -79,7 +79,7 @@ def options(record, texts):
     texts = {new_name(record, name, stacklevel=1): text for name, text in texts.items()}
     for name in texts:
         if name not in kinds:
-            raise ValueError(f"{record.__name__} has no option {name!r}; {allowed(kinds)}")
+            raise ValueError(f"{record.__name__} has no option {name!r}; {allowed(kinds, name)}")
     return {name: convert(name, text, _kinds(kinds[name])) for name, text in texts.items()}
 
 
@@ -166,9 +166,9 @@ def kinds_of_parameter(parameter):
     return (type(parameter.default),)
 
 
-def allowed(names):
-    """Returns the end of an error message that lists the allowed names."""
-    return f"allowed are {', '.join(names)}" if names else "it takes none"
+def allowed(names, given):
+    """Returns the end of an error message that lists the allowed names, and the one that is closest to the ``given`` name."""
+    return f"allowed are {', '.join(names)}{did_you_mean(given, names)}" if names else "it takes none"
 
 
 def json_text(value, nan="nan", **options):

@@ -20,6 +20,7 @@ import warnings
 
 import numpy as np
 
+from ..base.checks import did_you_mean
 from ..base.interrupts import Interrupts
 from ..base.version import installed_version
 from . import (
@@ -111,6 +112,14 @@ def _sentence(error, debug):
     return type(error).__name__ + (f": {error}" if str(error) else "") + more
 
 
+_GROUPS = {
+    "make": ("run", "deform", "resample", "convert"),
+    "look": ("scenes", "fabrics", "info", "view", "render"),
+    "measure": ("analyze", "compare", "check", "measure", "bench", "chart"),
+    "choose": ("choose", "fit"),
+}
+
+
 class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one line."""
 
@@ -120,10 +129,23 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def parse_known_args(self, args=None, namespace=None):
-        self._given = args or ()
+        self._given = sys.argv[1:] if args is None else args
         return super().parse_known_args(args, namespace)
 
+    def _check_value(self, action, value):
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            error.message += did_you_mean(value, map(str, action.choices))
+            raise
+
     def error(self, message):
+        for action in self._actions:  # the parser of the command leaves unknown options to this one
+            if isinstance(action, argparse._SubParsersAction):
+                for command in (word for word in self._given if word in action.choices):
+                    action.choices[command].error(message)
+        if message.startswith("unrecognized arguments: -"):
+            message += did_you_mean(message.split()[2], self._option_string_actions)
         _said, required, names = message.partition(" are required: ")
         first = {action.metavar for action in self._get_positional_actions()} & set(names.split(", "))
         several = {option for action in self._get_optional_actions() if action.nargs == "+" for option in action.option_strings}
@@ -134,15 +156,16 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser():
-    parser = _Parser(prog="warpcloth", description="Simulate cloth and write it as USD.", allow_abbrev=False)
+    about = {"description": "Simulate cloth and write it as USD.", "usage": "%(prog)s [-h] [--version] COMMAND ..."}
+    parser = _Parser(prog="warpcloth", **about, formatter_class=options.HelpFormatter, allow_abbrev=False)
     version = installed_version() or "(a checkout that is not installed)"
     parser.add_argument("--version", action="version", version=f"warpcloth {version}")
     parser.set_defaults(command=None)
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    commands = parser.add_subparsers(prog=parser.prog, metavar="COMMAND", help=argparse.SUPPRESS)
 
     def add(name, command, text, **more):
         form = {"formatter_class": options.HelpFormatter, "allow_abbrev": False}
-        sub = commands.add_parser(name, help=text, description=text, **form, **more)
+        sub = commands.add_parser(name, description=text, **form, **more)
         sub.set_defaults(command=command)
         sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
         options.add_import(sub)
@@ -170,7 +193,7 @@ def _parser():
     view.add_arguments(views)
     converts = add("convert", convert.convert, "Write an animation in another format.", epilog=convert.EPILOG)
     convert.add_arguments(converts)
-    charts = commands.add_parser("chart", help=chart.TEXT, description=chart.TEXT, allow_abbrev=False)
+    charts = commands.add_parser("chart", description=chart.TEXT, allow_abbrev=False)
     chart.add_arguments(charts)
     chooses = add("choose", choose.choose, "Choose the cheapest solver and settings for a scene.", epilog=choose.EPILOG)
     choose.add_arguments(chooses)
@@ -252,10 +275,13 @@ def _parser():
     for sub in (runs, deforms, resamples, analyzes, checks):
         sub.add_argument("--single-file", action="store_true", help="write one file instead of a file and a folder of frames")
     lists = add("fabrics", fabrics.fabrics, "List measured fabrics, their moduli, bending lengths and sources.")
-    text = "list those of a file instead: .json of ARCSim, or a .csv table of KES-F or FAST measurements"
-    lists.add_argument("file", metavar="FILE", nargs="?", help=text)
+    text = "show one fabric, or list those of a file instead: .json of ARCSim, or a .csv table of KES-F or FAST measurements"
+    lists.add_argument("file", metavar="NAME|FILE", nargs="?", help=text)
     lists = add("scenes", scenes.scenes, "List scenes and their parameters.")
     lists.add_argument(
         "folder", metavar="FOLDER", nargs="?", help="a folder of scene files (default: ./scenes and the included scenes)"
     )
+    about = {name: command.description for name, command in commands.choices.items()}
+    groups = ["\n".join([f"{group}:", *(f"  {name:9} {about[name]}" for name in names)]) for group, names in _GROUPS.items()]
+    parser.epilog = "\n\n".join([*groups, "'warpcloth COMMAND --help' has the options and examples of a command."])
     return parser

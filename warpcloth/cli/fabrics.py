@@ -1,24 +1,33 @@
 """The command ``fabrics``: lists measured fabrics."""
 
+from pathlib import Path
+
+from .terminal import aligned
+
 _DRAPE = """\
-drape % is computed, not measured: the coefficient of 'warpcloth measure cusick -p rows=8', mean of eight starts. The D of these
-records was not measured either, and several drape less than such fabrics do (docs/fabrics.md)."""
+* computed, not measured: D from E·t³/12, and drape % as the coefficient of 'warpcloth measure cusick -p rows=8', mean of eight
+starts. Several of these records drape less than such fabrics do (docs/fabrics.md)."""
 
 
 def fabrics(arguments):
-    if arguments.file:
-        from ..scene.fabric_files import read_fabrics
+    from ..scene.fabric_files import read_fabrics
+    from ..scene.measured_fabrics import fabrics as listed
 
-        listed = read_fabrics(arguments.file)
+    name = arguments.file
+    if name and Path(name).suffix:
+        listed = read_fabrics(name)
+    elif name:
+        listed = {name: listed[name]}
+    if len(listed) == 1:
+        print("\n".join(aligned(list(zip(COLUMNS, *rows(list(listed.values())), strict=True)))))
     else:
-        from ..scene.measured_fabrics import fabrics as listed
-    for line in table_lines(listed.values()):
-        print(line)
+        print("\n".join(aligned([COLUMNS, *rows(list(listed.values()))], right=range(1, len(COLUMNS)))))
     sources = list(dict.fromkeys((fabric.source, fabric.notes) for fabric in listed.values()))
     for number, (source, notes) in enumerate(sources, start=1):
         print(f"\n[{number}] {source}. {notes}")
-    if not arguments.file:
-        print(f"\n{_DRAPE}")
+    if not any(fabric.computed for fabric in listed.values()):
+        return 0
+    print(f"\n{_DRAPE}")
     return 0
 
 
@@ -37,10 +46,16 @@ COLUMNS = (
     "drape %",
     "source",
 )
+# The fields of a fabric from which the columns follow, between the first and the last two.
+_BENDING = ("bending_warp", "bending_weft")
+_NUMBERS = ("density", "thickness", "warp", "weft", "shear", "poisson_ratio", *_BENDING, *_BENDING)
 
 
 def rows(fabrics):
-    """The columns of :data:`COLUMNS` as texts, "–" where a number is not known; l are the bending lengths."""
+    """The columns of :data:`COLUMNS` as texts, with – for numbers that are not known and * behind those that are computed.
+
+    l are the bending lengths.
+    """
     from ..scene.measured_fabrics import computed_drape
 
     sources = list(dict.fromkeys((fabric.source, fabric.notes) for fabric in fabrics))
@@ -51,19 +66,10 @@ def rows(fabrics):
         values += [_times(1e3, length) for length in fabric.bending_lengths] + [computed_drape(fabric)]
         texts = ["–" if value is None or value != value else f"{value:.4g}" for value in values[:7]]
         texts += ["–" if value is None or value != value else f"{value:.3g}" for value in values[7:]]
+        computed = [name in fabric.computed for name in _NUMBERS] + [True]
+        texts = [text + "*" * (mark and text != "–") for text, mark in zip(texts, computed, strict=True)]
         found.append([fabric.name, *texts, f"[{sources.index((fabric.source, fabric.notes)) + 1}]"])
     return found
-
-
-def table_lines(fabrics):
-    """Lines of a table in columns."""
-    cells = [COLUMNS, *rows(list(fabrics))]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
-        first, *others = (
-            text.ljust(width) if k == 0 else text.rjust(width) for k, (text, width) in enumerate(zip(row, widths, strict=True))
-        )
-        yield "  ".join([first, *others])
 
 
 def _times(factor, value):

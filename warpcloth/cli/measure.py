@@ -25,8 +25,9 @@ def add_arguments(parser):
 
 
 def measure(arguments):
-    from ..lab.laboratory import DEVICES, check_sample, laboratory_readings
+    from ..lab.laboratory import DEVICES, check_sample, laboratory_readings, recorded
     from ..run.equilibrium import equilibrium
+    from ..scene.measured_fabrics import fabrics
 
     source, values, scene = named_scene(arguments)
     if scene.name not in DEVICES:
@@ -45,6 +46,9 @@ def measure(arguments):
     if not rest.status.ok:
         return say(f"{scene.name}: {rest.status.message}", 1)
     readings = laboratory_readings(scene, rest)
+    record, why = {}, None
+    if values.get("fabric") is not None:
+        record, why = recorded(scene.name, fabrics.find(values["fabric"]), np.radians(values.get("angle", 0.0)))
     if arguments.output:
         with OutputSet() as outputs, outputs.writing(arguments.output) as file:
             np.savez(file, points=rest.points[None], triangles=scene.mesh.triangles, times=np.zeros(1))
@@ -54,17 +58,25 @@ def measure(arguments):
         "parameters": values,
         "message": rest.status.message,
         "stable": rest.stable,
-        "readings": {quantity: {"value": value, "unit": unit} for quantity, (value, unit) in readings.items()},
+        "readings": {
+            quantity: {"value": value, "unit": unit, "record": record.get(quantity)}
+            for quantity, (value, unit) in readings.items()
+        },
+        "why": why if record else None,
         "iterations": rest.iterations,
         "seconds": seconds,
         "device": str(device),
         "file": arguments.output,
     }
-    print(json_text(facts) if arguments.json else _summary(facts, readings))
+    print(json_text(facts) if arguments.json else _summary(facts))
     return 0
 
 
-def _summary(facts, readings):
-    lines = aligned([(quantity, f"{value:.4g} {unit}".rstrip()) for quantity, (value, unit) in readings.items()])
-    taken = f"{facts['iterations']} iterations, {facts['seconds']:.3g} s"
-    return "\n".join([f"{facts['scene']}: {facts['message']}", *(f"  {line}" for line in lines), f"  {taken}"])
+def _summary(facts):
+    rows = []
+    for quantity, each in facts["readings"].items():
+        record = "" if each["record"] is None else f"(record of the fabric: {each['record']:.4g})"
+        rows.append((quantity, f"{each['value']:.4g} {each['unit']}".rstrip(), record))
+    lines = [*aligned(rows), *([f"they differ because {facts['why']}"] if facts["why"] else [])]
+    lines.append(f"{facts['iterations']} iterations, {facts['seconds']:.3g} s")
+    return "\n".join([f"{facts['scene']}: {facts['message']}", *(f"  {line}" for line in lines)])

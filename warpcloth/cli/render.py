@@ -10,7 +10,7 @@ from ..base.quiet import find_device
 from ..base.texts import json_text
 from .analyze import add_measuring, measuring_of
 from .options import values_of
-from .terminal import Bar, check_writable
+from .terminal import Bar, check_writable, own_output
 
 SIZE = (1280, 720)
 EPILOG = """\
@@ -30,7 +30,8 @@ def add_arguments(parser):
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to draw")
     add("beside", metavar="FILE", nargs="*", help="others to draw beside it")
-    add("-o", "--output", metavar="FILE", required=True, help="the file to write: .png, .gif, .webp or .mp4")
+    text = "the file to write: .png, .gif, .webp or .mp4 (default: a .png named after FILE; no file is then replaced)"
+    add("-o", "--output", metavar="FILE", help=text)
     add("--frame", type=float, metavar="N", help="the frame of a .png, as FILE numbers them (default: the last)")
     add("--frames", type=frames, metavar="A:B", help="the first and the last frame of a film (default: all)")
     add("--every", type=int, default=1, metavar="K", help="draw only every K-th frame")
@@ -83,6 +84,7 @@ def render(arguments):
     from ..mesh.mesh import Surface
 
     files = [arguments.file, *arguments.beside]
+    arguments.output = own_output(Path(arguments.file).stem, ".png") if arguments.output is None else arguments.output
     if arguments.no_ground and arguments.ground is not None:
         raise ValueError("--ground and --no-ground are given; give one of them")
     measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}

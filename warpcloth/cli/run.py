@@ -1,7 +1,6 @@
 """The command ``run``: runs a scene and writes its animation."""
 
 import math
-import os
 import statistics
 
 from ..base.interrupts import Interrupted
@@ -13,9 +12,14 @@ from .options import values_of
 from .render import check_drawing, draw_film
 from .setup import EPILOG as OF_STEPS
 from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
-from .terminal import Progress, check_writable, frames_folder_of, location, say
+from .terminal import Progress, check_writable, frames_folder_of, location, own_output, say
 
-EPILOG = f"{OF_STEPS}\n{OF_HISTORY}"
+EPILOG = f"""\
+  warpcloth run hanging --solver xpbd -s substeps=20 -p n=24 -o xpbd.usdc
+  warpcloth run mine.obj --scale 0.01 --pins boundary --fabric cotton
+
+{OF_STEPS}
+{OF_HISTORY}"""
 
 
 def run(arguments):
@@ -23,7 +27,7 @@ def run(arguments):
 
     source, values, scene = named_scene(arguments)
     frames = scene.frames if arguments.frames is None else arguments.frames
-    arguments.output = _own_output(scene, arguments.resume) if arguments.output is None else arguments.output
+    arguments.output = own_output(scene.name, ".usdc", arguments.resume) if arguments.output is None else arguments.output
     check_writable(arguments.output)
     check_drawing(arguments.film, [arguments.output])
     record = record_of(arguments, scene)
@@ -88,20 +92,6 @@ def run(arguments):
             return 0
         where = f"all {frames} frames are" if status.complete else f"the last good frame is {status.frame},"
         return say(f"{status.message}; {where} in {arguments.output}", 1)
-
-
-def _own_output(scene, resume):
-    """Returns the default output of a run: a file with the scene's name in the current folder.
-
-    Raises:
-        ValueError: The file exists already, or the name cannot be that of a file.
-    """
-    if scene.name != os.path.basename(scene.name) or not scene.name.isprintable() or scene.name.strip(". ") == "":
-        raise ValueError(f"the scene is called {scene.name!r}, which cannot be the name of a file; give one with -o")
-    output = f"{scene.name}.usdc"
-    if os.path.lexists(output) and not resume:
-        raise ValueError(f"{output} exists already, and without -o nothing is replaced; give -o {output} to replace it")
-    return output
 
 
 def _self_contact(found):

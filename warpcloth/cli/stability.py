@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from ..base.checks import number, whole
+from ..base.checks import did_you_mean, number, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, json_text, options
 from ..lab.axes import ACCURACY, AXES, FIXED, SEED
@@ -136,7 +136,7 @@ def _survey(arguments):
     for text in arguments.solvers or SOLVERS:
         name, _, given = text.partition(":")
         if name not in SOLVERS:
-            raise ValueError(f"solver is {name!r}; it must be one of {', '.join(SOLVERS)}")
+            raise ValueError(f"solver is {name!r}; it must be one of {', '.join(SOLVERS)}{did_you_mean(name, SOLVERS)}")
         setups.append(Setup(name, options(SOLVERS[name], assignments(given.split(",") if given else []))))
     if len({str(setup) for setup in setups}) < len(setups):
         raise ValueError("a method stands twice after --solvers; each must be another")

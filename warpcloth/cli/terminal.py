@@ -6,6 +6,7 @@ import shutil
 import sys
 import tempfile
 import unicodedata
+from glob import has_magic
 from pathlib import Path
 
 from ..base.checks import whole
@@ -33,6 +34,20 @@ def location(facts):
         return facts["file"]
     folder, together = facts["frames_folder"], "(they belong together: move both, or make one file with --single-file)"
     return f"{facts['file']}, with its frames in {folder}\n                {together}"
+
+
+def own_output(name, ending, replace=False):
+    """Returns the default output of a command: a file with a name and an ending in the current folder.
+
+    Raises:
+        ValueError: The file exists already and is not to be replaced, or the name cannot be that of a file.
+    """
+    if name != os.path.basename(name) or not name.isprintable() or name.strip(". ") == "" or has_magic(name):
+        raise ValueError(f"the output would be called {name!r}, which cannot be the name of a file; give one with -o")
+    output = f"{name}{ending}"
+    if os.path.lexists(output) and not replace:
+        raise ValueError(f"{output} exists already, and without -o nothing is replaced; give -o {output} to replace it")
+    return output
 
 
 def check_writable(*outputs):

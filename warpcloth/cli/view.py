@@ -10,7 +10,7 @@ from ..base.texts import json_text
 from .analyze import add_measuring, measuring_of
 from .options import values_of
 from .render import add_camera, frames
-from .terminal import Bar, check_writable
+from .terminal import Bar, check_writable, own_output
 
 EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. The page is one file of HTML
@@ -27,7 +27,8 @@ def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to show")
-    add("-o", "--output", metavar="FILE", required=True, help="the .html file to write")
+    text = "the .html file to write (default: named after FILE; no file is then replaced)"
+    add("-o", "--output", metavar="FILE", help=text)
     add("--frames", type=frames, metavar="A:B", help="the first and the last frame (default: all)")
     add("--every", type=int, default=1, metavar="K", help="show only every K-th frame")
     add(
@@ -56,6 +57,7 @@ def view(arguments):
         given = (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else []))
         for name in given:
             raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    arguments.output = own_output(Path(arguments.file).stem, ".html") if arguments.output is None else arguments.output
     check_page(arguments.output)
     check_apart([arguments.output], [arguments.file, arguments.rest])
     check_writable(arguments.output)

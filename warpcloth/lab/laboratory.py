@@ -17,6 +17,8 @@ import numpy as np
 
 from ..base.checks import choice
 from ..run.equilibrium import Equilibrium
+from ..scene.fabric import GRAVITY, Fabric
+from ..scene.measured_fabrics import computed_drape
 from ..scene.scene import Scene
 from ..scenes import cantilever, cusick
 from ..terms.plate_bending import PlateBending
@@ -55,6 +57,29 @@ def laboratory_readings(scene: Scene, rest: Equilibrium) -> Readings:
         if not np.isfinite(value):
             raise ValueError(f"the {quantity} of the scene {scene.name!r} is {value}; a reading must be finite")
     return {quantity: (values[quantity], unit) for quantity, unit in units.items()}
+
+
+def recorded(device: str, fabric: Fabric, angle: float = 0.0) -> tuple[dict[str, float], str]:
+    """Returns what the record of a fabric says of readings, by the name of the quantity, and why a reading differs.
+
+    Args:
+        device: Name of the scene.
+        fabric: The fabric of the sample.
+        angle: Angle of a strip to the warp [rad].
+    """
+    if device == "strip":
+        return {"modulus": fabric.modulus_along(angle)}, "the reading is at a finite strain"
+    if device == "picture_frame":
+        return {"shear modulus": fabric.shear}, "iterations end at a tolerance"
+    if device == "cusick":
+        drape = computed_drape(fabric)
+        found = {} if drape is None else {"drape coefficient": drape}
+        return found, "the reading is of one start; that of the record is computed too, the mean of eight starts with rows=8"
+    D = fabric.bending_along(angle)
+    why = "a strip also curves across its width, which makes it softer than the wide cloth of the record"
+    if "bending_warp" in fabric.computed:
+        why += "; D of the record was not measured but computed from E·t³/12"
+    return {"bending length": 1e3 * (D / (fabric.density * GRAVITY)) ** (1 / 3), "D": 1e6 * D}, why
 
 
 def check_sample(scene: Scene) -> None:

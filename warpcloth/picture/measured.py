@@ -5,7 +5,7 @@ import numpy as np
 from ..analysis.analysis import Analyzer
 from ..analysis.measures import MEASURES, scalars
 from ..analysis.summaries import PERCENTILES, percentiles
-from ..base.checks import shown
+from ..base.checks import did_you_mean, shown
 from .colour import Scale, range_of
 
 
@@ -58,7 +58,7 @@ class MeasuredScalar:
         measures = MEASURES["triangle" if options.get("neighbourhood") is None else "vertex"].values()
         listed = {scalar: measure for measure in measures for scalar in scalar_names(measure)}
         if name not in listed:
-            raise ValueError(f"colour is {shown(name)}; it must be one of {', '.join(listed)}")
+            raise ValueError(f"colour is {shown(name)}; it must be one of {', '.join(listed)}{did_you_mean(name, listed)}")
         self.name, self.measure, self.unit = name, listed[name], listed[name].unit
         chosen = {"measures": self.measure.name, "device": device}
         self.analyzers = [Analyzer(each, rest, **chosen, **options) for each in subject.sequences()]

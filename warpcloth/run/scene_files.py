@@ -8,6 +8,7 @@ import typing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from ..base.checks import did_you_mean
 from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import allowed, convert, kinds_of_parameter, parameters_of
 from ..mesh.caches import CACHES
@@ -48,7 +49,7 @@ class SceneSource:
         values = {name: p.default for name, p in self.parameters.items() if p.default is not p.empty}
         for name, text in texts.items():
             if name not in self.parameters:
-                raise ValueError(f"{self.path} has no parameter {name!r}; {allowed(self.parameters)}")
+                raise ValueError(f"{self.path} has no parameter {name!r}; {allowed(self.parameters, name)}")
             values[name] = convert(name, text, kinds_of_parameter(self.parameters[name]))
         missing = [name for name in self.parameters if name not in values]
         if missing:
@@ -93,6 +94,7 @@ def find_source(name, pins=None):
             known = sorted({listed.name for folder in folders() for listed in list_scenes(folder)})
             raise FileNotFoundError(
                 f"there is no scene {name!r}; known by name are {', '.join(known) or 'none'}; or give {_KINDS}"
+                + did_you_mean(name, known)
             )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: {'is a folder, no scene' if path.is_dir() else 'there is no such file'}")

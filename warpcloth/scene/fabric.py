@@ -10,7 +10,7 @@ from ..terms.declared import Declared
 from ..terms.orthotropic_membrane import OrthotropicMembrane
 from ..terms.plate_bending import PlateBending, isotropic_twist
 
-_GRAVITY = 9.81  # [m/s²]
+GRAVITY = 9.81  # [m/s²]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +26,7 @@ class Fabric:
         bending_warp, bending_weft: D₁ and D₂ [N·m].
         thickness: t [m].
         source: Where the numbers are from.
+        computed: Names of the numbers that were computed from others, not measured.
         notes: How they were measured, what was derived, and how uncertain they are.
 
     Raises:
@@ -49,11 +50,14 @@ class Fabric:
     thickness: float | None = None
     source: str = ""
     notes: str = ""
+    computed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         keep_plain(self)
         for field in fields(self):
             value = getattr(self, field.name)
+            if field.name == "computed":
+                continue
             if field.name in ("name", "source", "notes"):
                 if not isinstance(value, str):
                     raise ValueError(f"Fabric.{field.name} is {shown(value)}; it must be a text")
@@ -127,7 +131,7 @@ class Fabric:
     @property
     def bending_lengths(self) -> tuple[float, float]:
         """(D/ρg)^⅓ [m] of strips cut along warp and weft; NaN where D is None."""
-        found = [np.nan if D is None else (D / (self.density * _GRAVITY)) ** (1 / 3) for D in self._bending]
+        found = [np.nan if D is None else (D / (self.density * GRAVITY)) ** (1 / 3) for D in self._bending]
         return found[0], found[1]
 
     @property

@@ -1,6 +1,6 @@
 """Measured fabrics, by name. Where papers differ, each has records of its own."""
 
-from ..base.checks import shown
+from ..base.checks import did_you_mean, shown
 from .fabric import Fabric
 
 _CLYDE = "Clyde, Teran and Tamstorf 2017, Modeling and data-driven parameter estimation for woven fabrics"
@@ -9,8 +9,8 @@ _PENAVA = (
 )
 _WANG = "Wang, O'Brien and Ramamoorthi 2011, Data-driven elastic models for cloth: modeling and measurement"
 _PLATES = (
-    "Moduli in the plane from a model fitted to measurements. D₁ and D₂ were not measured: they are E₁t³/12(1 − ν₁₂ν₂₁) and "
-    "E₂t³/12(1 − ν₁₂ν₂₁)."
+    "Moduli in the plane from a model fitted to measurements. D₁ and D₂ were not measured: they are computed, "
+    "E₁t³/12(1 − ν₁₂ν₂₁) and E₂t³/12(1 − ν₁₂ν₂₁)."
 )
 _TENSILE = "Moduli and Poisson's ratio by tensile tests in the plane. Shear modulus and bending were not measured."
 _ZERO_STRAIN = (
@@ -28,7 +28,7 @@ class Fabrics(dict[str, Fabric]):
     """
 
     def __missing__(self, name: str) -> Fabric:
-        raise ValueError(f"fabric is {name!r}; it must be one of {', '.join(self)}")
+        raise ValueError(f"fabric is {name!r}; it must be one of {', '.join(self)}{did_you_mean(name, self)}")
 
     def find(self, fabric: Fabric | str) -> Fabric:
         """Returns a fabric by its name, or one that is given itself.
@@ -59,6 +59,7 @@ def _plate(name, density, millimetres, warp, weft, shear, ratio):
         bending_weft=weft * whole,
         source=_CLYDE,
         notes=_PLATES,
+        computed=("bending_warp", "bending_weft"),
     )
 
 

@@ -29,6 +29,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ..base.checks import did_you_mean
 from ..base.texts import camel_case
 from ..terms import TERMS
 from .modules import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdSkel, Vt
@@ -227,7 +228,9 @@ class Values:
             for key in self.terms:  # an unknown type of a term may be the reason
                 kind_of(self, key)
             allowed = ", ".join(row.name for row in rows if row.name.startswith("warpcloth:"))
-            raise ValueError(f"{unknown[0]} is no attribute of a {kind}, must be one of {allowed}")
+            raise ValueError(
+                f"{unknown[0]} is no attribute of a {kind}, must be one of {allowed}{did_you_mean(unknown[0], known)}"
+            )
 
     def authored(self, field, key=None):
         """Returns the authored attributes of a field as (row, Usd.Attribute), in order of precedence.
