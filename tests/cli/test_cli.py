@@ -240,7 +240,7 @@ WRONG_USES = [
     ("run hanging -o {}/o.usdc -s iterations=3.5", "iterations is '3.5'; it must be a whole number"),
     ("run hanging -o {}/o.usdc -s tolerance=0", "tolerance is 0.0; it must be a number above 0"),
     ("run hanging -o {}/o.usdc -s tolerance=inf", "tolerance is inf; it must be a number above 0"),
-    ("run hanging -o {}/o.usdc -s dt=1/240 substeps=4", "exactly one of dt, substeps and error must be given"),
+    ("run hanging -o {}/o.usdc -s dt=1/240 substeps=4", "only one of dt, substeps and error may be given"),
     ("run hanging -o {}/o.usdc -s dt=1/100", "a frame must be a whole number of steps"),
     ("run hanging -o {}/o.usdc -s linear=magic", "linear is 'magic'; it must be one of 'cg', 'factorised'"),
     ("run hanging -p n=5 -o {}/o.usdc --solver explicit -s substeps=1", "symplectic Euler is stable below"),

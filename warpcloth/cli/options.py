@@ -46,9 +46,7 @@ def _of_solver(name):
     record = SOLVERS[name]
     found = _listed(f"-s of {name}", record.__doc__, record, parameters_of(record))
     error = " or error (tolerance [m])" if "error" in record.step_options else ""
-    return found | {
-        "note": f"give dt (the step [s]) or substeps (steps per frame){error}, and no other; if none is given, a step is chosen"
-    }
+    return found | {"note": f"give dt (the step [s]) or substeps (steps per frame){error}, or none, for which a step is chosen"}
 
 
 def _of_scene(name):
@@ -104,16 +102,15 @@ def _allowed(call, name, parameter):
     """Returns the allowed values: from the error for a value that is refused, or else from the type."""
     kinds = kinds_of_parameter(parameter)
     refused = "?" if str in kinds else _Refused()
-    for more in ({}, {"substeps": 1}):  # a record checks its step first
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                call(**{**more, name: refused})
-        except Exception as error:
-            said, _, rule = str(error).partition("; it must be ")
-            if rule and said.startswith(f"{name} is "):
-                break
-    else:
+    rule = ""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            call(**{name: refused})
+    except Exception as error:
+        said, _, rule = str(error).partition("; it must be ")
+        rule = rule if said.startswith(f"{name} is ") else ""
+    if not rule:
         rule = " or ".join(words for kind, words in WORDS.items() if kind in kinds) or "nothing written as text"
     return rule.replace("'", "") + (", or none" if type(None) in kinds else "")
 

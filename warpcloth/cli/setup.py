@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from ..base.texts import assignments, options
 from .options import CLOTH, DEFAULT
 
-# Default steps per second of solvers without a stability limit; substeps are chosen nearest to it.
-_STEPS_A_SECOND = 240
 # With more substeps per frame than this, print a hint at the implicit solver.
 _MANY_SUBSTEPS = 1000
 
@@ -89,15 +87,12 @@ def solver_setup(arguments, scene, device, limits=False):
     arguments.solver = arguments.solver or DEFAULT
     record = SOLVERS[arguments.solver]
     dtype = record.precision_on(device, arguments.dtype)
-    given = options(record, assignments(arguments.s))
-    step_given = not set(record.step_options).isdisjoint(given)
-    solver = record(**given, **({} if step_given else {"substeps": 1}))  # checks options before anything is built
-    if not record.limited:
-        if step_given:
-            return Chosen(dtype, solver, solver)
-        solver = replace(solver, substeps=max(1, round(_STEPS_A_SECOND / scene.fps)))
+    solver = record(**options(record, assignments(arguments.s)))  # checks options before anything is built
+    step_given = solver.step_given
+    if not (record.limited or step_given):
+        solver = replace(solver, substeps=solver.per_frame(scene.fps))
         return Chosen(dtype, solver, solver, "by default about 1/240 s")
-    if step_given and not limits:
+    if step_given and not (record.limited and limits):
         return Chosen(dtype, solver, solver)
     from ..mesh.ordering import order_of_run
     from ..solvers.step import fewest_substeps

@@ -9,9 +9,9 @@ from ..base.types import FilePath, UpAxis
 from ..mesh.mesh import Mesh
 from .scene import Scene
 
-# A cloth above these is probably in another unit [kg], [m]; in the unit that is meant it is at most _COMMON [m].
-_HEAVY, _LARGE, _COMMON = 20.0, 20.0, 5.0
-_UNITS = {0.01: "centimetres", 0.001: "millimetres"}
+# A cloth above these [kg], [m] is probably in another unit: one in which it is no longer than its last number [m].
+_HEAVY, _LARGE = 20.0, 20.0
+_UNITS = (("centimetres", 0.01, 5.0), ("millimetres", 0.001, 20.0))
 
 
 def mesh_scene(
@@ -35,7 +35,7 @@ def mesh_scene(
         fps: Frames per second.
 
     Warns:
-        UserWarning: See :func:`warn_of_unit`.
+        UserWarning: The file is probably in another unit.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -48,21 +48,23 @@ def mesh_scene(
 
 
 def warn_of_unit(path: FilePath, scene: Scene, metres: float, remedy: str) -> None:
-    """Warns if a cloth is so large or heavy that its file is probably in another unit.
+    """Warns if a cloth is above 20 m or 20 kg, and names the likely unit of its file.
 
     Args:
         path: The file.
         scene: Its scene.
         metres: Metres per unit of the file as it was read.
         remedy: How a user sets them, with {} for their number.
-
-    Warns:
-        UserWarning: The cloth is above 20 m or 20 kg.
     """
     size, mass = float(np.ptp(scene.mesh.points, axis=0).max()), float(scene.vertex_masses.sum())
-    if size > _LARGE or mass > _HEAVY:
-        unit = next((unit for unit in _UNITS if unit < metres and unit * size / metres <= _COMMON), min(_UNITS))
-        likely = f"if the file is in {_UNITS[unit]}, {remedy.format(unit)} makes it {unit * size / metres:.3g} m"
-        if size <= _COMMON:
-            likely = "its density must be in kg/m², of which cloth has 0.02 to 1"
-        warnings.warn(f"{path}: the cloth is {size:.4g} m long and has {mass:.4g} kg; {likely}", stacklevel=3)
+    if size <= _LARGE and mass <= _HEAVY:
+        return
+    likely = [
+        f"if the file is in {name}, {remedy.format(unit)} makes it {unit * size / metres:.3g} m"
+        for name, unit, longest in _UNITS
+        if unit < metres and unit * size / metres <= longest
+    ]
+    if size <= _UNITS[0][2]:
+        likely = ["its density must be in kg/m², of which cloth has 0.02 to 1"]
+    for hint in likely[:1]:
+        warnings.warn(f"{path}: the cloth is {size:.4g} m long and has {mass:.4g} kg; {hint}", stacklevel=3)

@@ -20,7 +20,7 @@ from ..terms.needs import FINITE
 from ..terms.refresh import STEP, Moment
 from .facts import Benchmark, Facts
 from .solver import LaunchedStepper, Stepper
-from .step import Step
+from .step import Step, fewest_substeps
 
 # The computed limit at rest of a copy is above this fraction of its limit in motion: its error is below 1 %.
 _SURELY = 0.98
@@ -88,6 +88,8 @@ class Explicit(Step):
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
+        Without a step it takes the fewest substeps that respect both limits of :func:`step_limits`, the first by 10 %.
+
         Warns:
             UserWarning: The step is above the limit in motion, see :func:`step_limits`.
 
@@ -95,6 +97,9 @@ class Explicit(Step):
             ValueError: The step is above the limit about the rest shape and that is not allowed, or a stiffness is infinite.
         """
         self.refuse(model)
+        if not self.step_given:
+            solver = replace(self, substeps=fewest_substeps(model.scene.fps, *step_limits(model)))
+            return (solver if self.scheme == "forward" else solver.without_limits()).bind(model)
         stepper = self._on(ExplicitStepper, model)
         _refuse_strong_air(model, stepper.h)
         if self.above_limit == "refuse":

@@ -22,6 +22,8 @@ from .facts import Facts
 from .solver import Stepper
 from .threaded import ThreadedStepper
 
+# Steps per second by default; substeps are chosen nearest to it.
+_STEPS_A_SECOND = 240
 # The records by name, in the order of lists and charts.
 SOLVERS = {}
 
@@ -52,7 +54,9 @@ def register(record):
 
 @dataclass(frozen=True)
 class Step:
-    """The step of a solver: exactly one of ``dt`` and ``substeps``.
+    """The step of a solver: one of ``dt`` and ``substeps``, or about 1/240 s if neither is given.
+
+    A ``limited`` solver without a step takes the longest that is safe on its model, see :func:`fewest_substeps`.
 
     Attributes:
         dt: Step [s]; 1/(fps·dt) must be a whole number.
@@ -67,11 +71,11 @@ class Step:
         touches_itself: Whether it supports self-contact.
         locks: Whether it supports locked coordinates, by ``free_axes`` or the axes of pins.
         limited: Whether it refuses steps above a stability limit, see :meth:`step_limits`.
-        step_options: Names of the options of which exactly one must be given.
+        step_options: Names of the options that set the step, of which at most one may be given.
         double_on_cpu: Whether runs on the CPU are in float64 by default, see :meth:`precision_on`.
 
     Raises:
-        ValueError: Both or neither are given, or the given one is not above 0.
+        ValueError: Both are given, or the given one is not above 0.
     """
 
     ordered: ClassVar[bool] = False
@@ -218,23 +222,31 @@ class Step:
     def __post_init__(self):
         keep_plain(self)
         given = [name for name in self.step_options if getattr(self, name) is not None]
-        if len(given) != 1:
-            raise ValueError(f"exactly one of {', '.join(self.step_options[:-1])} and {self.step_options[-1]} must be given")
-        if "substeps" in given:
-            whole("substeps", self.substeps, 1)
-        else:
-            number(*given, getattr(self, *given), above=0.0)
+        if len(given) > 1:
+            raise ValueError(f"only one of {', '.join(self.step_options[:-1])} and {self.step_options[-1]} may be given")
+        for name in given:
+            if name == "substeps":
+                whole(name, self.substeps, 1)
+            else:
+                number(name, getattr(self, name), above=0.0)
         for name, words in words_of(type(self)).items():
             choice(name, getattr(self, name), words)
 
+    @property
+    def step_given(self) -> bool:
+        """Whether an option sets the step."""
+        return any(getattr(self, name) is not None for name in self.step_options)
+
     def per_frame(self, fps: float) -> int:
-        """Returns the number of steps per frame at ``fps``.
+        """Returns the number of steps per frame at ``fps``, without a step that nearest to 1/240 s.
 
         Raises:
             ValueError: ``dt`` does not divide a frame, or divides it into too many steps.
         """
         if self.substeps is not None:
             return self.substeps
+        if self.dt is None:
+            return max(1, round(_STEPS_A_SECOND / fps))
         steps = 1.0 / max(float(fps) * self.dt, 1e-300)
         if steps > MOST:
             raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be {MOST:,} steps or less, not {steps:.3g}")
@@ -247,7 +259,7 @@ class Step:
 class ImplicitStep(Step):
     """The step of a solver that minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x); ``integrator`` determines hₑ and x̃.
 
-    Exactly one of ``dt``, ``substeps`` and ``error`` must be given.
+    At most one of ``dt``, ``substeps`` and ``error`` may be given; without one, the step is about 1/240 s.
 
     On x″ = −ω²x implicit Euler, of first order, multiplies the energy by 1/(1 + ω²h²) in each step. Midpoint, of second order,
     conserves the energy, and does not damp the noise of stiff springs. BDF2, of second order, multiplies the energy by about
