@@ -151,8 +151,7 @@ WRONG_USES = [
     # scene files
     ("info {}/notes.txt", "notes.txt: is no scene; it must be a .py file, a USD stage or a mesh (.obj"),
     ("info {}/cache.pc2", "cache.pc2: is no scene; it must be a .py file, a USD stage or a mesh"),
-    ("info {}/cache.pc2", "cache.usdc' makes a stage of an animation"),
-    ("info {}/cache.abc", "Alembic is not read, export USD or numbered .obj files; 'warpcloth convert' makes"),
+    ("info {}/cache.abc", "'warpcloth convert' makes a stage of .pc2, .mdd, .npz and numbered .obj files"),
     ("info {}/sheet.obj --fabric denin", "fabric is 'denin'; it must be one of cotton"),
     ("info {}/sheet.obj --scale 0", "scale is 0.0; it must be a number above 0"),
     ("info {}/sheet.obj --scale 2 -p scale=3", "scale is given twice"),

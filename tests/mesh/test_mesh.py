@@ -6,6 +6,8 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from warpcloth.mesh.mesh import Mesh
 
@@ -282,6 +284,23 @@ SELECTIONS = [  # on the 4 by 3 grid of size (3, 2): vertex i + 4j at x = i, z =
     ("not x == 0 and z == 0", [1, 2, 3]),
     ("not (x == 0 and z == 0) and corners", [3, 8, 11]),
     ("not not index(7)", [7]),
+    ("x*x + z*z < 1.1", [0, 1, 4]),
+    ("x*x + z*z <= 1", [0, 1, 4]),
+    ("x-1.000001 == 0", [1, 5, 9]),  # the tolerance is that of x
+    ("100*x - 100.0001 == 0", [1, 5, 9]),
+    ("x*x == 9.00001", [3, 7, 11]),
+    ("x*x == 9.0001", []),
+    ("x == z", [0, 5, 10]),
+    ("1 < x", [2, 3, 6, 7, 10, 11]),
+    ("x -1 > z", [2, 3, 7]),
+    ("x-1>+1", [3, 7, 11]),
+    ("-x + 2*-1 < -4", [3, 7, 11]),
+    ("(x + z) == 2", [2, 5, 8]),
+    ("(x + z)/2 - 1 == 0 and not (z > 1)", [2, 5]),
+    ("((x - 1)*(x - 2)) == 0 and (x == 1 or (z) > 1)", [1, 5, 9, 10]),
+    ("1/(x + 1) < 0.3", [3, 7, 11]),
+    ("3 - 2 - 1 == x", [0, 4, 8]),
+    ("8/4/2 == x", [1, 5, 9]),
 ]
 
 
@@ -290,6 +309,27 @@ def test_select(text, expected):
     chosen = Mesh.grid(4, 3, size=(3, 2)).select(text)
     assert chosen.dtype == np.int32
     assert chosen.tolist() == list(expected)
+
+
+SUMS = st.recursive(
+    st.sampled_from(["x", "z", "1", "2.5", "-3", "0.5e1"]),
+    lambda inner: (
+        st.builds("{}{}{}".format, inner, st.sampled_from([" + ", "-", "*", " - "]), inner)
+        | st.builds("({})".format, inner)
+        | st.builds("-{}".format, inner.filter(lambda text: text[0] not in "+-"))
+    ),
+    max_leaves=5,
+)
+
+
+@given(SUMS, SUMS)
+def test_sums_are_those_of_python(left, right):
+    """Of whole numbers and halves, whose values are never near π."""
+    mesh = Mesh.grid(4, 3, size=(3, 2))
+    coordinates = dict(zip("xyz", mesh.points.T, strict=True))
+    above = eval(f"{left} - ({right}) + 0*x", {"__builtins__": {}}, coordinates) > np.pi  # the test writes the text
+    assert mesh.select(f"{left} > {right} + {np.pi}").tolist() == np.flatnonzero(above).tolist()
+    assert mesh.select(f"({left} - ({right}) > {np.pi})").tolist() == np.flatnonzero(above).tolist()
 
 
 def test_selections_have_one_scale():
@@ -303,7 +343,17 @@ BAD_SELECTIONS = [
     ("", "column 1: the text ends, expected x, y, z, all, boundary"),
     ("x", "column 2: the text ends, expected < or <= or =="),
     ("x = 1", "column 3: unexpected '='"),
-    ("x < y", "column 5: found 'y', expected a number"),
+    ("x < all", "column 5: found 'all', expected a number"),
+    ("x * < 1", "column 5: found '<', expected a number"),
+    ("(x + 1", "column 7: the text ends, expected"),
+    ("(x + 1)", r"column 7: found .\)., expected < or"),
+    ("1 + 2", "column 6: the text ends, expected < or"),
+    ("x < 1 < 2", "column 7: found '<', expected \"and\""),
+    ("x ** 2 < 1", r"column 4: found '\*', expected a number"),
+    ("1/x < 1", "column 1: is not finite at vertex 0"),
+    ("x*1e300*1e300 < 1", "column 1: is not finite at vertex"),
+    ("x * (y < 1) < 1", "column 8: found '<', expected"),
+    (1000 * "(" + "x" + 1000 * ")" + " < 1", "column 101: is 101 brackets deep"),
     ("x < 1e999", "column 5: found 1e999, expected a finite number"),
     ("x < nan", "column 5: found 'nan', expected a number"),
     ("x < 1 y < 2", 'column 7: found \'y\', expected "and", "or" or the end'),

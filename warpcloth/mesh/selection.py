@@ -13,7 +13,7 @@ _DEEPEST = 100  # nested brackets, each of which takes three Python calls
 _EXCERPT = 60  # characters of a long text that are shown before and after an error
 
 _TOKEN = re.compile(
-    r"(?P<space>\s+)|(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[<>(),:])"
+    r"(?P<space>\s+)|(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<sign><=|>=|==|!=|[-+*/<>(),:])"
 )
 
 
@@ -23,27 +23,31 @@ def select(mesh, text):
         selection = term {"or" term}
         term      = factor {"and" factor}
         factor    = "not" factor | "(" selection ")" | vertices
-        vertices  = ("x" | "y" | "z") ("<" | "<=" | "==" | "!=" | ">=" | ">") number
+        vertices  = sum ("<" | "<=" | "==" | "!=" | ">=" | ">") sum
                   | "all" | "boundary" | "corners"
                   | "nearest" "(" x "," y "," z ["," count] ")"
                   | "index" "(" range {"," range} ")"
                   | "part" "(" name ")"
+        sum       = product {("+" | "-") product}
+        product   = value {("*" | "/") value}
+        value     = "x" | "y" | "z" | number | "-" value | "(" sum ")"
         range     = index | [start] ":" [stop] [":" step]
 
-    Comparisons are of rest points. Coordinates that differ by at most 1e-6 of the bounding box's diagonal are equal. `nearest`
+    Comparisons are of rest points. Coordinates that differ by at most 1e-6 of the bounding box's diagonal are equal, and so are
+    values that differ by no more than such changes of their coordinates cause. `nearest`
     gives the `count` vertices nearest to a point, 1 by default, the lower indices first among equally near ones. Ranges are
     Python's, without negative numbers: `10:20` is 10 to 19. `part` gives the vertices of one part of a joined mesh.
 
     Args:
         mesh: A Mesh.
-        text: For example "z == 0 and not corners", "nearest(0.5, 0, 1)" or "index(0, 3, 10:20)".
+        text: For example "z == 0 and not corners", "x*x + z*z < 0.01", "nearest(0.5, 0, 1)" or "index(0, 3, 10:20)".
 
     Returns:
         np.ndarray: Vertex indices, sorted, each once, int32; empty if nothing fits.
 
     Raises:
-        ValueError: The text does not follow the grammar, an index has no vertex, or `corners` is asked of a closed mesh. The
-            message gives the text, the column and what is allowed there.
+        ValueError: The text does not follow the grammar, an index has no vertex, a value is not finite, or `corners` is
+            asked of a closed mesh. The message gives the text, the column and what is allowed there.
     """
     if not isinstance(text, str):
         raise ValueError(f"selection is {text!r}; it must be a text")
@@ -77,6 +81,7 @@ class _Reader:
 
     def __init__(self, mesh, text):
         self.mesh, self.text, self.position, self.depth = mesh, text, 0, 0
+        self.tolerance = _EQUAL * np.linalg.norm(np.ptp(mesh.points, axis=0))
         self.tokens = []
         column = 0
         while column < len(text):
@@ -142,25 +147,39 @@ class _Reader:
         inverted = False
         while self.accept("not"):
             inverted = not inverted
-        column = self.tokens[self.position][2]
-        if self.accept("("):
-            self.depth += 1
-            if self.depth > _DEEPEST:
-                self.fail(column, f"is {self.depth} brackets deep, must be {_DEEPEST} at most")
-            chosen = self.selection()
-            self.require(")")
-            self.depth -= 1
-        else:
-            chosen = self.vertices()
+        chosen = self.in_brackets(self.selection) if self.opens_selection() else self.vertices()
         return ~chosen if inverted else chosen
 
-    def vertices(self):
+    def in_brackets(self, read):
         column = self.tokens[self.position][2]
-        word = self.accept("x", "y", "z", "all", "boundary", "corners", "nearest", "index", "part")
+        self.require("(")
+        self.depth += 1
+        if self.depth > _DEEPEST:
+            self.fail(column, f"is {self.depth} brackets deep, must be {_DEEPEST} at most")
+        found = read()
+        self.require(")")
+        self.depth -= 1
+        return found
+
+    def opens_selection(self):
+        """Returns whether the next token opens a bracket around a selection, not around a part of a sum."""
+        depth, position = 0, self.position
+        while position < len(self.tokens):
+            word = self.tokens[position][1]
+            depth += (word == "(") - (word == ")")
+            position += 1
+            if not depth:
+                break
+        following = self.tokens[min(position, len(self.tokens) - 1)][1]
+        return self.tokens[self.position][1] == "(" and following[:1] not in tuple("+-*/<>=!")
+
+    def vertices(self):
+        kind, word, column = self.tokens[self.position]
+        if kind == "number" or word in ("x", "y", "z", "-", "("):
+            return self.comparison()
+        word = self.accept("all", "boundary", "corners", "nearest", "index", "part")
         if word is None:
             self.expected("x, y, z, all, boundary, corners, nearest(…), index(…), part(…), not or (")
-        if word in ("x", "y", "z"):
-            return self.comparison("xyz".index(word))
         if word == "nearest":
             return self.nearest()
         if word == "index":
@@ -179,12 +198,44 @@ class _Reader:
         chosen[vertices] = True
         return chosen
 
-    def comparison(self, axis):
-        sign = self.require("<", "<=", "==", "!=", ">=", ">")
-        above = self.mesh.points[:, axis] - self.number()
-        tolerance = _EQUAL * np.linalg.norm(np.ptp(self.mesh.points, axis=0))
-        less, greater = above < -tolerance, above > tolerance
+    def comparison(self):
+        column = self.tokens[self.position][2]
+        with np.errstate(all="ignore"):
+            left, left_error = self.sum()
+            sign = self.require("<", "<=", "==", "!=", ">=", ">")
+            right, right_error = self.sum()
+            above, error = np.broadcast_arrays(left - right, left_error + right_error, self.mesh.points[:, 0])[:2]
+        for vertex in np.flatnonzero(~np.isfinite(above))[:1]:
+            self.fail(column, f"is not finite at vertex {vertex}")
+        less, greater = above < -error, above > error
         return {"<": less, "<=": ~greater, "==": ~(less | greater), "!=": less | greater, ">=": ~less, ">": greater}[sign]
+
+    # The rules of a sum return its values, of the vertices or one for all, and by how much the tolerance may change them.
+    def sum(self):
+        value, error = self.product()
+        while self.tokens[self.position][1][:1] in ("+", "-"):
+            sign = -1.0 if self.accept("+", "-") == "-" else 1.0
+            other, more = self.product()
+            value, error = value + sign * other, error + more
+        return value, error
+
+    def product(self):
+        value, error = self.value()
+        while sign := self.accept("*", "/"):
+            other, more = self.value()
+            if sign == "/":
+                other, more = np.divide(1.0, other), more / np.square(other)
+            value, error = value * other, error * np.abs(other) + np.abs(value) * more
+        return value, error
+
+    def value(self):
+        if self.accept("-"):
+            value, error = self.value()
+            return -value, error
+        if self.tokens[self.position][1] == "(":
+            return self.in_brackets(self.sum)
+        axis = self.accept("x", "y", "z")
+        return (self.number(), 0.0) if axis is None else (self.mesh.points[:, "xyz".index(axis)], self.tolerance)
 
     def part(self):
         self.require("(")

@@ -102,19 +102,12 @@ def find_source(name, pins=None):
         return _python_source(path, pins)
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise ValueError(f"{path}: is no scene; it must be {_KINDS}{_converting(path)}")
+        animation = path.suffix.lower() in (".abc", ".npz", ".npy", *CACHES)
+        hint = "; 'warpcloth convert' makes a stage of .pc2, .mdd, .npz and numbered .obj files" if animation else ""
+        raise ValueError(f"{path}: is no scene; it must be {_KINDS}{hint}")
     parameters = parameters_of(read)
     del parameters["path"]
     return SceneSource(path, lambda **values: read(str(path), **values), parameters, pins)
-
-
-def _converting(path):
-    """Returns how an animation of another format becomes a stage, for the end of an error."""
-    if path.suffix.lower() == ".abc":
-        return "; Alembic is not read, export USD or numbered .obj files; 'warpcloth convert' makes a stage of the latter"
-    if path.suffix.lower() in (*CACHES, ".npz", ".npy"):
-        return f"; 'warpcloth convert {path} {path.with_suffix('.usdc')}' makes a stage of an animation"
-    return ""
 
 
 def _python_source(path, pins):

@@ -25,21 +25,12 @@ def mesh_scene(
 ) -> Scene:
     """Reads a mesh file as a cloth of a fabric: geometry, metres per unit, fabric, up axis, duration [s], frames per second.
 
-    Args:
-        path: A file of :meth:`warpcloth.Mesh.load` that is not a stage.
-        prim: Name of the geometry, if the file has several.
-        scale: Metres per unit of the file, such as 0.01 for centimetres.
-        fabric: Name of a fabric.
-        up_axis: "Y" or "Z".
-        duration: Duration [s].
-        fps: Frames per second.
-
     Warns:
         UserWarning: The file is probably in another unit.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The mesh cannot be read, or a value is not allowed.
+        ValueError: The mesh cannot be read, see :meth:`warpcloth.Mesh.load`, or a value is not allowed.
     """
     mesh = Mesh.load(path, prim, scale, up_axis)
     scene = Scene(mesh, fabric=fabric, duration=duration, fps=fps, name=Path(path).stem)
