@@ -180,6 +180,89 @@ def test_a_stage_shows_its_surroundings_in_metres_and_nothing_hidden(folder):
     assert pinned.balls.tolist() == [0, 3] and pinned.ball_radius > 0.0
 
 
+LOOKS = """#usda 1.0
+(
+    metersPerUnit = 0.01
+    upAxis = "Z"
+    startTimeCode = 0
+    endTimeCode = 1
+)
+def Mesh "Sheet" (prepend apiSchemas = ["MaterialBindingAPI"])
+{
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points.timeSamples = {
+        0: [(-10, 0, -10), (10, 0, -10), (10, 0, 10), (-10, 0, 10)],
+        1: [(-10, 0, -10), (10, 0, -10), (10, 0, 10), (-10, 0, 10)],
+    }
+    SHOWN
+}
+def Material "Red"
+{
+    token outputs:surface.connect = </Red/Surface.outputs:surface>
+    def Shader "Surface"
+    {
+        uniform token info:id = "UsdPreviewSurface"
+        color3f inputs:diffuseColor = (0.8, 0.1, 0)
+        token outputs:surface
+    }
+}
+def Camera "Eye"
+{
+    float focalLength = 50
+    float horizontalAperture = 40
+    float verticalAperture = 20
+    double3 xformOp:translate.timeSamples = {0: (0, -200, 0), 1: (40, -200, 0)}
+    float xformOp:rotateX = 90
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateX"]
+}
+def Camera "Flat"
+{
+    token projection = "orthographic"
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("shown", "colour"),
+    [
+        ("rel material:binding = </Red>", (0.8, 0.1, 0.0)),
+        ("color3f[] primvars:displayColor = [(0.2, 0.9, 1.5)]", (0.2, 0.9, 1.0)),
+        ("rel material:binding = </Red>\n    color3f[] primvars:displayColor = [(0, 1, 0)]", (0.8, 0.1, 0.0)),
+        ("color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)]", CLOTH),  # not of the whole prim
+        ("", CLOTH),
+    ],
+)
+def test_a_stage_is_drawn_in_its_base_colours(shown, colour, tmp_path):
+    path = tmp_path / "looks.usda"
+    path.write_text(LOOKS.replace("SHOWN", shown))
+    (shape,) = subject_of(path).shapes
+    assert tuple(shape.colour) == pytest.approx(colour)
+
+
+def test_a_stage_is_seen_from_its_camera(tmp_path, capfd):
+    """A sheet of 20 cm, 2 m away, is an eighth of the 160 cm that the aperture shows there; the camera moves by a quarter."""
+    path = tmp_path / "looks.usda"
+    path.write_text(LOOKS.replace("SHOWN", "rel material:binding = </Red>"))
+    for name, size, frame, middle, width in (
+        ("Eye", (160, 80), 0, 80, 20),
+        ("/Eye", (160, 80), 1, 40, 20),
+        ("Eye", (80, 80), 0, 40, 10),  # all of the aperture is in a narrower picture
+        ("Eye", (320, 80), 0, 160, 20),
+    ):
+        wc.render(path, tmp_path / "a.png", camera=name, frame=frame, size=size, samples=16, ground=False)
+        image = np.asarray(Image.open(tmp_path / "a.png")).astype(int)
+        columns = np.flatnonzero((image[..., 0] - image[..., 2] > 60).any(axis=0))
+        assert (columns[0], columns[-1] + 1) == pytest.approx((middle - width / 2, middle + width / 2), abs=1)
+    for name, source, message in (
+        ("Ear", path, "camera is 'Ear'; it must be one of its cameras, /Eye, /Flat"),
+        ("Flat", path, "prim /Flat: has no perspective, must have it"),
+        ("Eye", tmp_path / "one.obj", "camera is 'Eye'; one.obj is not a stage and has none"),
+    ):
+        (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+        refused(capfd, ["render", source, "-o", tmp_path / "b.png", "--camera", name], message)
+
+
 def test_every_result_of_python_is_drawn(animation, tmp_path, device):
     scene = animation.scene
     deformed = wc.deform(MESH, wc.Pins([0, 3], [MESH.points[[0, 3]]] * 2))

@@ -40,6 +40,7 @@ def add_arguments(parser):
     add("--samples", type=int, default=4, metavar="N", help="rays through each pixel (default: 4)")
     add("--colour", metavar="NAME", help="show a measured value as colour, such as stretch_1 (default: plain cloth)")
     add_camera(parser)
+    add("--camera", metavar="PRIM", help="look from this Camera of the stage, a path or a name (default: the whole motion)")
     add("--time", action="store_true", help="write the time into a corner")
     add_measuring(parser)
 
@@ -103,7 +104,7 @@ def render(arguments):
         ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
         device=device.alias,
         **values_of(arguments, "prim", "fps", "up_axis", "frame", "frames", "every", "speed", "size", "samples", "time"),
-        **values_of(arguments, "colour", "colour_range", "colormap", "azimuth", "elevation", "zoom"),
+        **values_of(arguments, "colour", "colour_range", "colormap", "azimuth", "elevation", "zoom", "camera"),
     )
     facts = {
         "input": files,

@@ -16,6 +16,7 @@ from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart
 from ..base.types import FilePath, Progress, UpAxis
 from ..mesh.mesh import Mesh
+from .camera import Camera
 from .colour import byte_colour, check_colormap
 from .films import IN_PAGES, SHORTEST, STILL, check_film, check_times, open_film
 from .framing import frame_motion
@@ -48,6 +49,7 @@ def render(
     azimuth: float = -38.0,
     elevation: float = 24.0,
     zoom: float = 1.0,
+    camera: str | None = None,
     ground: bool | float = True,
     time: bool = False,
     device: str = "cpu",
@@ -87,6 +89,8 @@ def render(
         azimuth: Angle of the viewer about the vertical [°], from +z of a y-up world, from −y of a z-up one.
         elevation: Angle of the viewer above the horizontal [°].
         zoom: Factor by which the camera zooms in; 2 shows half of the width and height.
+        camera: Path or name of a Camera prim of the stage, from which to look, in place of ``azimuth``, ``elevation`` and
+            ``zoom``; it may move.
         ground: Whether there is a ground at the lowest point of the motion, or the height of the ground [m]. From below it is
             not drawn.
         time: Whether to write the time into a corner, or the number of the frame if the source has no times.
@@ -129,7 +133,7 @@ def render(
     if colormap is not None:
         check_colormap(colormap)
     sources = list(source) if _are_several(source) else [source]
-    subjects = [subject_of(each, mesh, prim, fps, copy, azimuth) for each in sources]
+    subjects = [subject_of(each, mesh, prim, fps, copy, azimuth, camera) for each in sources]
     subjects = [replace(each, up_axis=each.up_axis or up_axis or "Y") for each in subjects]
     if len({each.up_axis for each in subjects}) > 1:
         raise ValueError("source: one is Y up and another Z up; those that are drawn side by side must have one up axis")
@@ -287,8 +291,8 @@ class _Picture:
         beside = [0] * (columns - 1) + [self._overlay.beside]
         cells = [divmod(k, columns) for k in range(len(subjects))]
         self._cameras = [replace(self._camera, shift=0.5 * beside[column] / heights[row]) for row, column in cells]
-        sizes = [(widths[column] + beside[column], heights[row]) for row, column in cells]
-        self._casters = [RayCaster(each.shapes, *each_size, **options) for each, each_size in zip(subjects, sizes, strict=True)]
+        self._sizes = [(widths[column] + beside[column], heights[row]) for row, column in cells]
+        self._casters = [RayCaster(each.shapes, *size, **options) for each, size in zip(subjects, self._sizes, strict=True)]
 
     def images(self, with_time):
         """Yields the pictures as Pillow images."""
@@ -304,9 +308,18 @@ class _Picture:
                     values = next(rows[k])
                     excluded = excluded or bool(np.isnan(values).any())
                     colours[subject.coloured] = self._painted(subject.shapes[subject.coloured], values)
-                panels.append(caster.image(subject.read(shot.frames[k]), self._cameras[k], colours))
+                camera = self._cameras[k] if subject.camera is None else self._seen(k, shot.frames[k])
+                panels.append(caster.image(subject.read(shot.frames[k]), camera, colours))
                 self.left_out += caster.left_out
             yield self._overlay.draw(panels, shot.text if with_time else None, excluded)
+
+    def _seen(self, k, frame):
+        """Returns the camera of the stage of subject k, whose target is as far away as the middle of the motion."""
+        width, height = self._sizes[k]
+        position, forward, up, fov = self._subjects[k].camera(frame, width / height)
+        forward = forward / np.linalg.norm(forward)
+        away = self._camera.target - position
+        return Camera(position, position + max(away @ forward, 0.1 * np.linalg.norm(away)) * forward, up, fov)
 
     def _painted(self, shape, values):
         """Returns colours of vertices (n, 3), or of corners of triangles (T, 3, 3)."""

@@ -18,7 +18,7 @@ from ..mesh.sequences import Sequence, as_sequence, open_sequence
 from ..run.simulate import Animation
 from ..scene.lines import lines_of
 from ..scene.scene import Scene
-from ..usd.drawn import draw_colliders, read_drawn
+from ..usd.drawn import camera_of, draw_colliders, read_drawn
 from ..usd.layers import CURVE_WIDTH
 from .shape import BACK, CLOTH, Shape
 
@@ -26,7 +26,7 @@ from .shape import BACK, CLOTH, Shape
 SURROUNDINGS, LINES = (0.42, 0.41, 0.39), (0.06, 0.06, 0.065)
 # Largest and smallest radius of pins relative to the size of the cloth, and a limit relative to the edge length, so that
 # neighbours do not touch.
-_PIN, _PIN_LEAST, _PIN_EDGE = 0.009, 0.006, 0.35
+_PIN, _PIN_LEAST, _PIN_EDGE = 0.005, 0.0025, 0.25
 # Smallest radius of the tubes of a net or chain without widths, relative to its size, so that they are visible.
 _THINNEST = 0.003
 # The same for strings and bars beside a cloth.
@@ -54,6 +54,7 @@ class Subject:
         coloured: Index of the shape that is coloured by a measure.
         sequences: Function that returns the :class:`Sequence` of each cloth of the coloured shape, to be measured.
         files: Paths of the files of the source.
+        camera: Function (frame, aspect) of :func:`warpcloth.usd.drawn.camera_of`; None to frame the motion.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Subject:
     sequences: Callable
     coloured: int = 0
     files: tuple = ()
+    camera: Callable | None = None
 
     def __len__(self):
         return len(self.labels)
@@ -103,7 +105,7 @@ class Subject:
         return found
 
 
-def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0):
+def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0, camera=None):
     """Returns the :class:`Subject` of a source.
 
     Args:
@@ -113,13 +115,14 @@ def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0):
         fps: Frames per second, if the source does not give them or to override them.
         copy: Index of the cloth of a batch, or None for all, side by side.
         azimuth: Azimuth of the view in which cloths of a batch are side by side [°].
+        camera: Path or name of a Camera prim of a stage; None to frame the motion.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The source is not supported, or has nothing to draw.
     """
     if isinstance(source, (str, os.PathLike)):
-        found = _of_path(os.fspath(source), mesh, prim, fps)
+        found = _of_path(os.fspath(source), mesh, prim, fps, camera)
     elif isinstance(source, Sequence):
         found = _of_sequence(source, source.mesh)
     elif isinstance(source, Scene):
@@ -139,6 +142,8 @@ def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0):
             rule = "arrays need their mesh" if hasattr(points, "__getitem__") else f"it must be {_SOURCES}"
             raise ValueError(f"source is {given}; {rule}")
         found = _of_frames("frames", mesh, points, getattr(source, "times", None))
+    if camera is not None and found.camera is None:
+        raise ValueError(f"camera is {shown(camera)}; {found.name} is not a stage and has none, so that it must be None")
     if copy is not None:
         raise ValueError(f"copy is {shown(copy)}; the source is one cloth and no batch, so that it must be None")
     if fps is not None and not isinstance(source, (str, os.PathLike)):
@@ -146,11 +151,11 @@ def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0):
     return found
 
 
-def _of_path(path, mesh, prim, fps):
+def _of_path(path, mesh, prim, fps, camera):
     name = Path(path).name or path
     ending = Path(path).suffix.lower()
     if ending in STAGE_ENDINGS and not glob.has_magic(path):
-        return _of_stage(path, name, prim, fps)
+        return _of_stage(path, name, prim, fps, camera)
     if ending in ENDINGS and os.path.isfile(path):
         one = Surface.load(path, prim)
         return replace(_of_frames(name, one, one.points[None], None), files=(path,))
@@ -158,7 +163,7 @@ def _of_path(path, mesh, prim, fps):
     return replace(_of_sequence(sequence, sequence.mesh), name=name)
 
 
-def _of_stage(path, name, prim, fps):
+def _of_stage(path, name, prim, fps, camera=None):
     """Returns all meshes and curves of a stage."""
     stage = read_drawn(path, prim)
     codes = stage.codes
@@ -178,14 +183,16 @@ def _of_stage(path, name, prim, fps):
         return [open_sequence(path, measured, fps)]
 
     files = tuple(layer.realPath for layer in stage.stage.GetUsedLayers() if layer.realPath)
-    return Subject(name, shapes, labels, times, read, stage.up_axis, sequences, cloths[0], files)
+    view = None if camera is None else camera_of(stage.stage, path, camera)
+    seen = None if view is None else lambda frame, aspect: view(codes[frame], aspect)
+    return Subject(name, shapes, labels, times, read, stage.up_axis, sequences, cloths[0], files, seen)
 
 
 def _prim_shape(prim, code, size):
     """Returns the shape of a `DrawnPrim`, beside a cloth of a size."""
     edge = np.linalg.norm(np.diff(prim.points(code)[prim.edges], axis=1), axis=-1).mean() if len(prim.edges) else 0.0
     radius = max(prim.radius, min((_THINNEST if prim.cloth else _THINNEST_LINE) * size, 0.2 * edge))
-    colour = CLOTH if prim.cloth else LINES if len(prim.edges) else SURROUNDINGS
+    colour = prim.colour or (CLOTH if prim.cloth else LINES if len(prim.edges) else SURROUNDINGS)
     return _shape(prim.count, prim.triangles, prim.edges, radius or 0.2 * edge, prim.pins, size, edge, colour)
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from .gprims import define_colliders
-from .layers import CURVE_WIDTH, scene_layer
-from .modules import Usd, UsdGeom, UsdPhysics
+from .layers import COLOUR, CURVE_WIDTH, scene_layer
+from .modules import Usd, UsdGeom, UsdPhysics, UsdShade
 from .solids import SOLIDS
 from .stage import (
     METADATA_KEY,
@@ -40,6 +40,7 @@ class DrawnPrim:
         edges: (E, 2) int32, the segments of curves; empty for a mesh.
         radius: Radius of the curves [m].
         pins: Pinned points (p,).
+        colour: Base colour, linear Rec. 709; None if the stage gives none.
         points: Function that returns the points (n, 3) [m] in world space at a time code.
         codes: Time codes of the samples of its points, or if these are constant, of its transforms.
     """
@@ -51,6 +52,7 @@ class DrawnPrim:
     edges: np.ndarray
     radius: float
     pins: np.ndarray
+    colour: tuple[float, float, float] | None
     points: Callable[[float], np.ndarray]
     codes: list[float]
 
@@ -191,9 +193,48 @@ def _drawn(prim, path, cloth, codes):
         pins = pinned_points(prim, len(start)) if solid is None else np.empty(0, np.int32)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
-    return DrawnPrim(
-        str(prim.GetPath()), cloth, len(start), triangles, edges, radius, pins, partial(points, count=len(start)), codes
-    )
+    drawn = triangles, edges, radius, pins, _base_colour(prim), partial(points, count=len(start)), codes
+    return DrawnPrim(str(prim.GetPath()), cloth, len(start), *drawn)
+
+
+def _base_colour(prim):
+    """Returns the constant base colour of the material of a prim, or else its constant displayColor; None for our own blue."""
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    source = material.ComputeSurfaceSource() if material else ()
+    base = source[0].GetInput("diffuseColor") if source and source[0] else None
+    colours = [base.Get()] if base and not base.HasConnectedSource() else UsdGeom.Gprim(prim).GetDisplayColorAttr().Get() or ()
+    colour = np.array(colours[0] if len(colours) == 1 else np.nan, dtype=float)
+    return None if colour.shape != (3,) or np.allclose(colour, COLOUR) else tuple(colour.clip(0.0, 1.0).tolist())
+
+
+def camera_of(stage, path, name):
+    """Returns a function (time code, aspect) of a Camera prim: its position [m], direction, up direction and field of view [°].
+
+    The vertical field of view is so large that a picture of that width by height shows all of the aperture.
+
+    Args:
+        stage: The stage.
+        path: Its file, for messages.
+        name: Path or name of the prim.
+
+    Raises:
+        ValueError: There is no such prim or there are several, or it has no perspective.
+    """
+    known = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.Camera)]
+    found = [prim for prim in known if name in (str(prim.GetPath()), prim.GetName())]
+    if len(found) != 1:
+        paths = ", ".join(str(prim.GetPath()) for prim in known) or "none"
+        raise ValueError(f"{path}: camera is {name!r}; it must be one of its cameras, {paths}")
+    prim = found[0]
+    if UsdGeom.Camera(prim).GetProjectionAttr().Get() != UsdGeom.Tokens.perspective:
+        raise ValueError(f"{path}, prim {prim.GetPath()}: has no perspective, must have it to be drawn from")
+
+    def view(code, aspect):
+        camera, matrix = UsdGeom.Camera(prim).GetCamera(code), local_to_metres(prim, f"{path}, prim {prim.GetPath()}", code)
+        half = max(camera.verticalAperture, camera.horizontalAperture / aspect) / (2.0 * camera.focalLength)
+        return matrix[3, :3], -matrix[2, :3], matrix[1, :3], 2.0 * np.degrees(np.arctan(half))
+
+    return view
 
 
 def _radius(prim, points, edges, transform):

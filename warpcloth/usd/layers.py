@@ -27,7 +27,7 @@ _BLOCKED = (
     "primvars:skel:jointWeights",
     "skel:blendShapes",
 )
-_COLOUR = (0.17, 0.35, 0.58)
+COLOUR = (0.17, 0.35, 0.58)
 _LINE_COLOUR = (0.05, 0.05, 0.05)
 # Width of drawn curves, relative to the mean edge length.
 CURVE_WIDTH = 0.05
@@ -166,7 +166,7 @@ def _add_primvars(geometry, mesh):
     if mesh.texture_coordinates is not None and len(mesh.triangles):
         st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
         st.Set(Vt.Vec2fArray.FromNumpy(mesh.texture_coordinates.astype(np.float32)))
-    geometry.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*_COLOUR)])
+    geometry.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*COLOUR)])
 
 
 def _add_pins(geometry, target, pins, count):
@@ -198,7 +198,7 @@ def define_material(stage, path):
     reader = UsdShade.Shader.Define(stage, f"{path}/Colour")
     reader.CreateIdAttr("UsdPrimvarReader_float3")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-    reader.CreateInput("fallback", Sdf.ValueTypeNames.Float3).Set(Gf.Vec3f(*_COLOUR))
+    reader.CreateInput("fallback", Sdf.ValueTypeNames.Float3).Set(Gf.Vec3f(*COLOUR))
     result = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(result)
     output = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
