@@ -60,13 +60,7 @@ def laboratory_readings(scene: Scene, rest: Equilibrium) -> Readings:
 
 
 def recorded(device: str, fabric: Fabric, angle: float = 0.0) -> tuple[dict[str, float], str]:
-    """Returns what the record of a fabric says of readings, by the name of the quantity, and why a reading differs.
-
-    Args:
-        device: Name of the scene.
-        fabric: The fabric of the sample.
-        angle: Angle of a strip to the warp [rad].
-    """
+    """Returns readings that follow from the record of a fabric, by name, and why measured ones differ; ``angle`` in rad."""
     if device == "strip":
         return {"modulus": fabric.modulus_along(angle)}, "the reading is at a finite strain"
     if device == "picture_frame":

@@ -92,6 +92,12 @@ class _Reader:
                 self.tokens.append((match.lastgroup, match.group(), column))
             column = match.end()
         self.tokens.append(("end", "", len(text)))
+        opened, self.after = [], {}  # the token after the end of each bracket
+        for k, (_, word, _) in enumerate(self.tokens):
+            if word == "(":
+                opened.append(k)
+            elif word == ")" and opened:
+                self.after[opened.pop()] = k + 1
 
     def fail(self, column, why):
         first, last = max(0, column - _EXCERPT), column + _EXCERPT
@@ -147,7 +153,9 @@ class _Reader:
         inverted = False
         while self.accept("not"):
             inverted = not inverted
-        chosen = self.in_brackets(self.selection) if self.opens_selection() else self.vertices()
+        following = self.tokens[self.after.get(self.position, 0)][1]  # a bracket around a part of a sum is followed by a sign
+        is_selection = self.tokens[self.position][1] == "(" and following[:1] not in tuple("+-*/<>=!")
+        chosen = self.in_brackets(self.selection) if is_selection else self.vertices()
         return ~chosen if inverted else chosen
 
     def in_brackets(self, read):
@@ -160,18 +168,6 @@ class _Reader:
         self.require(")")
         self.depth -= 1
         return found
-
-    def opens_selection(self):
-        """Returns whether the next token opens a bracket around a selection, not around a part of a sum."""
-        depth, position = 0, self.position
-        while position < len(self.tokens):
-            word = self.tokens[position][1]
-            depth += (word == "(") - (word == ")")
-            position += 1
-            if not depth:
-                break
-        following = self.tokens[min(position, len(self.tokens) - 1)][1]
-        return self.tokens[self.position][1] == "(" and following[:1] not in tuple("+-*/<>=!")
 
     def vertices(self):
         kind, word, column = self.tokens[self.position]
@@ -201,41 +197,36 @@ class _Reader:
     def comparison(self):
         column = self.tokens[self.position][2]
         with np.errstate(all="ignore"):
-            left, left_error = self.sum()
-            sign = self.require("<", "<=", "==", "!=", ">=", ">")
-            right, right_error = self.sum()
-            above, error = np.broadcast_arrays(left - right, left_error + right_error, self.mesh.points[:, 0])[:2]
+            left, sign = self.sum(), self.require("<", "<=", "==", "!=", ">=", ">")
+            above, *moved = np.broadcast_to(left - self.sum(), (4, len(self.mesh.points)))
         for vertex in np.flatnonzero(~np.isfinite(above))[:1]:
             self.fail(column, f"is not finite at vertex {vertex}")
-        less, greater = above < -error, above > error
+        tolerance = sum(np.abs(each - above) for each in moved)
+        less, greater = above < -tolerance, above > tolerance
         return {"<": less, "<=": ~greater, "==": ~(less | greater), "!=": less | greater, ">=": ~less, ">": greater}[sign]
 
-    # The rules of a sum return its values, of the vertices or one for all, and by how much the tolerance may change them.
+    # The rules of a sum return numbers, or values (4, n): at all points, and at those moved by the tolerance along x, y and z.
     def sum(self):
-        value, error = self.product()
+        value = self.product()
         while self.tokens[self.position][1][:1] in ("+", "-"):
-            sign = -1.0 if self.accept("+", "-") == "-" else 1.0
-            other, more = self.product()
-            value, error = value + sign * other, error + more
-        return value, error
+            value = value - self.product() if self.accept("+", "-") == "-" else value + self.product()
+        return value
 
     def product(self):
-        value, error = self.value()
+        value = self.value()
         while sign := self.accept("*", "/"):
-            other, more = self.value()
-            if sign == "/":
-                other, more = np.divide(1.0, other), more / np.square(other)
-            value, error = value * other, error * np.abs(other) + np.abs(value) * more
-        return value, error
+            value = value * self.value() if sign == "*" else np.divide(value, self.value())
+        return value
 
     def value(self):
         if self.accept("-"):
-            value, error = self.value()
-            return -value, error
+            return -self.value()
         if self.tokens[self.position][1] == "(":
             return self.in_brackets(self.sum)
-        axis = self.accept("x", "y", "z")
-        return (self.number(), 0.0) if axis is None else (self.mesh.points[:, "xyz".index(axis)], self.tolerance)
+        if (axis := self.accept("x", "y", "z")) is None:
+            return self.number()
+        axis = "xyz".index(axis)
+        return self.mesh.points[:, axis] + self.tolerance * (np.arange(4) == 1 + axis)[:, None]
 
     def part(self):
         self.require("(")

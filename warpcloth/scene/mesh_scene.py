@@ -39,14 +39,7 @@ def mesh_scene(
 
 
 def warn_of_unit(path: FilePath, scene: Scene, metres: float, remedy: str) -> None:
-    """Warns if a cloth is above 20 m or 20 kg, and names the likely unit of its file.
-
-    Args:
-        path: The file.
-        scene: Its scene.
-        metres: Metres per unit of the file as it was read.
-        remedy: How a user sets them, with {} for their number.
-    """
+    """Warns if a cloth is above 20 m or 20 kg, and names the likely unit of its file; ``remedy`` sets the metres per unit."""
     size, mass = float(np.ptp(scene.mesh.points, axis=0).max()), float(scene.vertex_masses.sum())
     if size <= _LARGE and mass <= _HEAVY:
         return

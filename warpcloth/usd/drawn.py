@@ -212,13 +212,8 @@ def camera_of(stage, path, name):
 
     The vertical field of view is so large that a picture of that width by height shows all of the aperture.
 
-    Args:
-        stage: The stage.
-        path: Its file, for messages.
-        name: Path or name of the prim.
-
     Raises:
-        ValueError: There is no such prim or there are several, or it has no perspective.
+        ValueError: No Camera or several have that path or ``name``, or it has no perspective.
     """
     known = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.Camera)]
     found = [prim for prim in known if name in (str(prim.GetPath()), prim.GetName())]
