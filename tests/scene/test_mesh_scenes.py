@@ -55,7 +55,7 @@ def test_options_of_the_command_line_are_those_of_the_mesh(sheet, tmp_path, capf
     given = ("--scale", "0.5", "--pins", "boundary", "--fabric", "silk", "--frames", "2")
     code, out, err = run(capfd, "run", sheet, *given, "-o", tmp_path / "o.usda")
     assert code == 0 and "sheet: converged" in out
-    assert err.count("warning") == 1 and "the warp of the fabric is there along x" in err
+    assert err.count("warning") == 1 and "the warp of the fabric is along x" in err
     code, out, _ = run(capfd, "bench", sheet, *given[:-2], "--frames", "1", "--json")
     assert code == 0 and '"fabric": "silk"' in out
 
@@ -89,12 +89,12 @@ CORNERS = {"st": [*UV["st"], (0, 0)], "indices": GRID.triangles.ravel().tolist()
 @pytest.mark.parametrize(
     ("turned", "given", "warp", "says"),
     [  # axes that take the place of x, y and z, texture coordinates or an attribute of the stage, warp, end of the warning
-        ((0, 1, 2), {}, (1, 0, 0), "is there along x of the rest shape"),
-        ((1, 0, 2), {}, (0, 1, 0), "is there along y of the rest shape"),
+        ((0, 1, 2), {}, (1, 0, 0), "is along x of the rest shape"),
+        ((1, 0, 2), {}, (0, 1, 0), "is along y of the rest shape"),
         ((0, 1, 2), {"warp": (1, 0, 1)}, (0.5**0.5, 0, 0.5**0.5), None),
         ((0, 1, 2), UV, (0, 0, 1), None),
         ((0, 1, 2), CORNERS, (0, 0, 1), None),
-        ((0, 1, 2), {"st": np.zeros((25, 2)).tolist()}, (1, 0, 0), "is there along x of the rest shape"),
+        ((0, 1, 2), {"st": np.zeros((25, 2)).tolist()}, (1, 0, 0), "is along x of the rest shape"),
     ],
     ids=["none", "faces x", "attribute", "vertices", "corners", "no area"],
 )

@@ -30,10 +30,10 @@ def warp_on(mesh: Mesh, corner_coordinates: np.ndarray | None = None) -> np.ndar
     normals = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
     facing = np.abs(normals[:, 0]) > _FACING * np.linalg.norm(normals, axis=1)
     warp = np.where(lacking[:, None], np.where(facing[:, None], (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), given)
-    what = "the mesh has no texture coordinates"
+    what = "the mesh has no texture coordinates;"
     if not lacking.all():
-        what = f"triangle {np.argmax(lacking)} and {lacking.sum() - 1} others have no area in their texture coordinates"
+        what = f"triangle {np.argmax(lacking)} and {lacking.sum() - 1} others have no area in their texture coordinates; there"
     axis = {0: "x", 1: "y"}.get(facing[lacking].mean(), "x, or along y where triangles face x")
     other = "Scene(…, warp=…) or, in a stage, warpcloth:warp sets another"
-    warnings.warn(f"{what}; the warp of the fabric is there along {axis} of the rest shape; {other}", stacklevel=4)
+    warnings.warn(f"{what} the warp of the fabric is along {axis} of the rest shape; {other}", stacklevel=4)
     return warp[0] if np.array_equal(warp[:-1], warp[1:]) else warp

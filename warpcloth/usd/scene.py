@@ -218,7 +218,9 @@ def _refuse_missing(mass, term):
         if not given
     ]
     if missing:
-        raise ValueError(f"has no {' and no '.join(missing)}, must have a mass and a term to be a cloth, or a fabric")
+        raise ValueError(
+            f"has no {' and no '.join(missing)}, must have a mass and a term to be a cloth, or a fabric (--fabric)"
+        )
 
 
 def _cloth_prims(stage, path, prim):
