@@ -278,7 +278,7 @@ def scene(listed, built, able, unable):
 def fabric(found):
     name = found.name
     rows = "".join(
-        f"| {symbol} | {float(f'{getattr(found, field):.4g}'):g} | {unit} |\n"
+        f"| {symbol}{', computed' * (field in found.computed)} | {float(f'{getattr(found, field):.4g}'):g} | {unit} |\n"
         if getattr(found, field) is not None
         else f"| {symbol} | unknown | |\n"
         for field, (symbol, unit) in UNITS.items()
@@ -303,7 +303,7 @@ def fabric(found):
         f"| | | |\n|---|---|---|\n{rows}",
         shown(f"fabric-{name}.webp", f"The numbers of {name} among those of all fabrics"),
         f"*Its numbers among those of all fabrics. {made(f'fabric-{name}')[1:]}",
-        "Bending lengths l = (D/ρg)^⅓, and the drape coefficient, which is computed, not measured:",
+        "Bending lengths l = (D/ρg)^⅓, and the drape coefficient. Numbers with * were computed, not measured:",
         f"| | | |\n|---|---|---|\n{lengths}",
         "## Source",
         f"{found.source}. {found.notes}",
