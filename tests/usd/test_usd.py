@@ -616,7 +616,7 @@ def test_bad_stages_are_refused(tmp_path, make, prim, error, message):
     ("options", "error", "message"),
     [
         ({"output": "nowhere/a.usda"}, FileNotFoundError, "nowhere does not exist"),
-        ({"output": "a.abc"}, ValueError, "must end with one of .usd, .usda, .usdc, .usdz"),
+        ({"output": "a.abc"}, ValueError, "must end with one of .usd, .usda, .usdc, .usdz; 'warpcloth convert' makes .pc2"),
         ({"output": "artist.usda", "source": "artist.usda"}, ValueError, "a file of the source's stage"),
         ({"output": "artist.usda", "source": "shot.usda"}, ValueError, "a file of the source's stage"),
         ({"source": "missing.usda"}, FileNotFoundError, "missing.usda: there is no such file"),

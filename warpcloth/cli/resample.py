@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.outputs import STAGE_ENDINGS, check_apart
+from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
 from .options import add_values, values_of
@@ -102,12 +102,7 @@ def _template(arguments, capture):
     else:
         if arguments.p:
             raise ValueError(f"-p is given, and {arguments.onto} is a mesh, which has no parameters; leave it out")
-        if path.suffix.lower() in STAGE_ENDINGS:
-            from ..usd import read_stage_mesh
-
-            mesh = read_stage_mesh(arguments.onto).mesh
-        else:
-            mesh = Mesh.load(arguments.onto)
+        mesh = Mesh.load(arguments.onto)
         positions, vertices = mesh.points, np.empty(0, dtype=int)
     if arguments.hold is not None:
         held = some_vertices("--hold", arguments.hold, mesh)

@@ -453,7 +453,8 @@ def check_output(path):
     output = Path(os.path.abspath(followed(path)))
     refuse_path(output)
     if output.suffix not in _ENDINGS:
-        raise ValueError(f"output is {output}; it must end with one of {', '.join(_ENDINGS)}")
+        others = "'warpcloth convert' makes .pc2, .mdd, .npz and numbered .obj files of it"
+        raise ValueError(f"output is {output}; it must end with one of {', '.join(_ENDINGS)}; {others}")
     if not output.parent.is_dir():
         raise FileNotFoundError(f"output = {output}: the folder {output.parent} does not exist")
     if output.is_dir():
