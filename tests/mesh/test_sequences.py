@@ -3,12 +3,16 @@
 import re
 import tracemalloc
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 import warpcloth as wc
+from warpcloth.mesh.frame_names import frames_of_names
 from warpcloth.mesh.mesh import Mesh, Surface
 from warpcloth.mesh.sequences import as_sequence, open_sequence
 from warpcloth.scenes import chain, hanging
@@ -262,6 +266,19 @@ NUMBERED = [  # names in the order of their numbers, labels, missing
     (["take7_1", "take3_2", "take5_5"], [1, 2, 5], [3, 4]),
     (["00", "1"], [0, 1], []),
     (["lone3"], [3], []),
+    (["c_-4", "c_-3", "c_-2", "c_-1"], [-4, -3, -2, -1], []),
+    (["-1", "+0", "1"], [-1, 0, 1], []),
+    (["c.-0010", "c.-0008", "c.0000"], [-10, -8, 0], [-6, -4, -2]),
+    (["c−2", "c−1", "c0"], [-2, -1, 0], []),
+    (["c-1", "c0", "c1"], [-1, 0, 1], []),
+    (["cloth-1", "cloth-2", "cloth-3"], [1, 2, 3], []),
+    (["2026-07-08", "2026-07-09"], [8, 9], []),
+    (["c_-0.5", "c_0.0", "c_0.5", "c_1.0"], [-0.5, 0, 0.5, 1], []),
+    (["c_1", "c_1.25", "c_1.5", "c_1.75", "c_2"], [1, 1.25, 1.5, 1.75, 2], []),
+    (["c_0,00", "c_0,33", "c_0,67", "c_1,00"], [0, 0.33, 0.67, 1], []),
+    (["c_1.00", "c_2.00", "c_3.00"], [1, 2, 3], []),
+    (["shirt_v2.0998", "shirt_v2.1008"], [998, 1008], []),
+    (["take_2.0998", "take_2.0999", "take_2.1001"], [998, 999, 1001], [1000]),
 ]
 
 
@@ -275,12 +292,33 @@ def test_files_in_order(tmp_path, ending, names, labels, missing):
     for path in (where, where / f"*.{ending}"):
         sequence = open_sequence(path, fps=25)
         assert sequence.labels.tolist() == labels and sequence.missing == missing
+        assert sequence.labels.dtype == (np.float64 if any(label % 1 for label in labels) else np.int64)
         np.testing.assert_allclose(sequence.times, (np.array(labels) - labels[0]) / 25, rtol=4 * EPS)
         assert isinstance(sequence.mesh, Surface) and not sequence.declared and sequence.stage is None
         assert sequence.mesh.triangles.tolist() == MESH.triangles.tolist() and sequence.path == str(path)
         np.testing.assert_array_equal(sequence.mesh.points, motion(MESH, 0))
         for frame, points in enumerate(sequence):
             np.testing.assert_array_equal(points, motion(MESH, frame))
+
+
+@settings(deadline=None, derandomize=True, database=None)
+@given(
+    st.lists(st.integers(-40, 400), min_size=2, max_size=9, unique=True),
+    st.sampled_from(["c_{}", "c.{}", "{}", "take7_{}_low", "v2.x_{}"]),
+    st.sampled_from(["{:d}", "{:04d}", "{:+04d}"]),
+    st.sampled_from([1, 2, 4]),
+)
+def test_numbers_in_names_come_back_in_order_or_are_refused(ticks, pattern, digits, parts):
+    frames = {tick / parts: Path("frames", pattern.format(digits.format(tick))) for tick in ticks}
+    if parts > 1:
+        frames = {frame: Path("frames", pattern.format(f"{frame:.2f}")) for frame in frames}
+    files = {frame: path.with_name(f"{path.name}.obj") for frame, path in frames.items()}
+    try:
+        found = frames_of_names(files.values())
+    except ValueError as error:
+        assert str(error).startswith("frames/") and len({int(abs(frame)) for frame in files}) < len(files)
+    else:
+        assert [*found.items()] == sorted(files.items())
 
 
 def test_a_pattern_chooses(tmp_path):
@@ -331,6 +369,11 @@ REFUSED_FOLDERS = [  # names of files, what is opened, fps, kind of error, messa
     (["1.glb", "2.glb"], "*.glb", 24, ValueError, ".glb files repeat vertices"),
     (["1.obj", "cloth.obj"], "", 24, ValueError, "cloth.obj: has no number in its name"),
     (["1.obj", "a_01.obj"], "", 24, ValueError, "a_01.obj: has number 1, the last in its name, as .*1.obj has"),
+    (["c_1.00.obj", "c_1.25.obj"], "", 24, ValueError, "c_1.00.obj: may be frame 1.00 or frame 0; rename the files so that"),
+    (["c_1.1.obj", "c_1.2.obj"], "", 24, ValueError, "may be frame 1.1 or frame 1; rename"),
+    (["c_1.0001.obj", "c_2.0002.obj"], "", 24, ValueError, "may be frame 1.0001 or frame 1; rename"),
+    (["c_0.obj", "c_-0.obj"], "", 24, ValueError, "c_0.obj: has number 0, the last in its name, as .*c_-0.obj has"),
+    (["c_" + 16 * "1" + ".obj"], "", 24, ValueError, "has a number of 16 digits in its name, must have 15 at most"),
     (["1.mtl"], "", 24, ValueError, "no mesh files there; they must end with .obj .ply .off"),
     (["1.obj"], "*.ply", 24, ValueError, r"\*.ply: no mesh files there"),
     (["1.obj"], "1.obj", 24, ValueError, r'1.obj: is one mesh; it must be a folder of them, or a pattern such as ".*/\*.obj"'),

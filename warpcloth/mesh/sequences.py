@@ -3,8 +3,8 @@
 `open_sequence` takes
 
 - a USD stage with a Mesh prim whose points are sampled: each time code is a frame, and the stage's rates give the times;
-- a folder of .obj, .ply or .off files, or a pattern such as "frames/cloth_*.obj": the last number in a name is the frame, and a
-  frame takes 1/fps s, so that file 12 is two frames after file 10;
+- a folder of .obj, .ply or .off files, or a pattern such as "frames/cloth_*.obj": the last number in a name is the frame, see
+  `frame_names.frames_of_names`, and a frame takes 1/fps s, so that file 12 is two frames after file 10;
 - an .npz file, as `np.savez` writes it: `points` (F, n, 3) [m], `triangles` (T, 3), and `times` (F,) [s] unless fps is given;
 - an .npy file, (F, n, 3) [m], with a mesh that has the triangles;
 - a point cache, .pc2 or .mdd, with a mesh that has the triangles, by default an .obj file of the same name beside it.
@@ -15,7 +15,6 @@
 import glob
 import operator
 import os
-import re
 import struct
 import tokenize
 import zipfile
@@ -35,6 +34,7 @@ from ..base import checks
 from ..base.notebooks import ShownInNotebooks
 from ..base.types import FilePath, UpAxis
 from .caches import CACHES, open_mdd, open_pc2
+from .frame_names import frames_of_names
 from .loading import ENDINGS, WELDED, read_arrays
 from .mesh import Mesh, Surface
 from .parts import Part
@@ -230,7 +230,7 @@ def numbered_files(path: FilePath, endings: List[str] = FRAME_ENDINGS) -> tuple[
         endings: Endings that frames may have.
 
     Raises:
-        ValueError: There are no such files, they are of several kinds, or a name has no number of its own.
+        ValueError: There are no such files, they are of several kinds, or `frames_of_names` refuses a name.
     """
     path = os.fspath(path)
     if os.path.isdir(path):
@@ -251,20 +251,9 @@ def numbered_files(path: FilePath, endings: List[str] = FRAME_ENDINGS) -> tuple[
             f"{path}: {kinds[0]} files repeat vertices, and which of them are one may change between frames; "
             f"the files must end with {allowed}"
         )
-    numbered: dict[int, Path] = {}
-    for file in paths:
-        digits = re.findall(r"\d+", file.stem)
-        if not digits:
-            raise ValueError(f"{file}: has no number in its name, which must be the number of its frame")
-        if len(digits[-1]) > 15:
-            raise ValueError(f"{file}: has a number of {len(digits[-1])} digits in its name, must have 15 at most")
-        other = numbered.setdefault(int(digits[-1]), file)
-        if other != file:
-            raise ValueError(
-                f"{file}: has number {int(digits[-1])}, the last in its name, as {other} has; each must be used once"
-            )
-    labels = np.array(sorted(numbered), dtype=np.int64)
-    return labels, [numbered[label] for label in labels.tolist()]
+    frames = frames_of_names(paths)
+    labels = np.array(list(frames))
+    return labels.astype(np.int64) if (labels % 1 == 0).all() else labels, list(frames.values())
 
 
 def _open_files(path, labels, paths, prim, fps):

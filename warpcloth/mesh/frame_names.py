@@ -1,0 +1,84 @@
+"""The numbers of frames in the names of files."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+# The last number of a name: perhaps a sign, digits, and perhaps more digits after a point.
+_NAME = re.compile(r"(.*?)([-+−]?)(\d+)(?:[.,](\d+))?\D*$", re.DOTALL)
+_VERSION = re.compile(r"v\d+$", re.IGNORECASE)
+_MAX_DIGITS = 15  # which float64 still tells apart
+_MAX_PARTS = 100  # of a frame
+
+
+class _Name(NamedTuple):
+    before: str
+    sign: str
+    whole: str
+    decimals: str
+
+
+def frames_of_names(files: Iterable[Path]) -> dict[float, Path]:
+    """Returns files by the numbers of their frames, ascending.
+
+    The last number in a name is that of its frame. A hyphen before it is a minus unless a letter or digit precedes it, so
+    "cloth_-4" is frame −4 and "cloth-4" is frame 4; beside "cloth0", however, "cloth-4" is frame −4. Decimals, as in "c_1.25"
+    and "c_2.00", are equal parts of a frame. After a version the point separates, as in "v2.0998", and also after a number
+    that all names have, if frames of three digits or more follow each other, as in "take_2.0998" and "take_2.0999".
+
+    Raises:
+        ValueError: A name has no number, or one of more than 15 digits, two names have one number, or it is not clear whether
+            digits after a point are decimals. The message begins with the file.
+    """
+    names = {file: _parsed(file) for file in files}
+    if any(name.decimals for name in names.values()):
+        names = _without_separators(names)
+    unsigned = {name.before for name in names.values() if not name.sign}
+    frames: dict[float, Path] = {}
+    for file, (before, sign, whole, decimals) in names.items():
+        negative = sign in ("-", "−") and (not before[-1:].isalnum() or before in unsigned)
+        frame = (-1 if negative else 1) * (float(f"{whole}.{decimals}") if decimals else int(whole))
+        other = frames.setdefault(frame, file)
+        if other != file:
+            raise ValueError(f"{file}: has number {frame}, the last in its name, as {other} has; each must be used once")
+    return {frame: frames[frame] for frame in sorted(frames)}
+
+
+def _parsed(file):
+    found = _NAME.match(file.stem)
+    if found is None:
+        raise ValueError(f"{file}: has no number in its name, which must be the number of its frame")
+    before, sign, whole, decimals = (part or "" for part in found.groups())
+    if decimals and _VERSION.search(f"{before}{sign}{whole}"):
+        before, sign, whole, decimals = f"{before}{whole}.", "", decimals, ""
+    digits = max(len(whole), len(decimals))
+    if digits > _MAX_DIGITS:
+        raise ValueError(f"{file}: has a number of {digits} digits in its name, must have {_MAX_DIGITS} at most")
+    return _Name(before, sign, whole, decimals)
+
+
+def _without_separators(names):
+    """Returns names by file, with the digits after a point as whole numbers if the point is a separator.
+
+    Raises:
+        ValueError: It may be either.
+    """
+    digits = max(len(name.decimals) for name in names.values())
+    if len({name[:3] for name in names.values()}) == 1:
+        numbers = sorted(int(name.decimals or 0) for name in names.values())
+        one_width = all(len(name.decimals) == digits >= 3 for name in names.values())
+        if one_width and np.diff(numbers).min(initial=1) == 1:
+            return {file: _Name(f"{name.before}{name.whole}.", "", name.decimals, "") for file, name in names.items()}
+    else:
+        values = np.array([float(f"0.{name.decimals or 0}") for name in names.values()])
+        for parts in range(1, _MAX_PARTS + 1):
+            if np.abs(values * parts - np.rint(values * parts)).max() <= 0.51 * parts * 10.0**-digits:
+                return names
+    file, name = next((file, name) for file, name in names.items() if name.decimals)
+    raise ValueError(
+        f"{file}: may be frame {name.whole}.{name.decimals} or frame {int(name.decimals)}; "
+        'rename the files so that the frame is a whole number, after "_"'
+    )
