@@ -1,5 +1,6 @@
 """Loads: forces on vertices, tractions on edges and pressures on triangles, constant or with keyframes."""
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -8,6 +9,7 @@ import numpy as np
 
 from ..base.checks import keep_plain, numeric, refuse, shown
 from ..mesh.mesh import Mesh
+from ..mesh.orientation import turned_over
 from ..mesh.selection import distinct_vertices
 
 
@@ -137,9 +139,11 @@ class Traction(Load):
 class Pressure(Load):
     """Pressure on triangles along their normals: a force pAn/3 on each corner, with the current area A and normal n.
 
-    The corners turn counter-clockwise about the normal. On cloth with free edges, pressure does not derive from an energy, so
-    its force is evaluated once per step: at x for explicit steps and implicit Euler, at x + ½h v for midpoint, and at
-    2xₙ − xₙ₋₁ for BDF2. Each integrator keeps its order.
+    The corners turn counter-clockwise about the normal. Triangles that wind against their neighbours are turned over, the fewer
+    in each connected piece, with a warning; a surface with one side is refused.
+
+    On cloth with free edges, pressure does not derive from an energy, so its force is evaluated once per step: at x for
+    explicit steps and implicit Euler, at x + ½h v for midpoint, and at 2xₙ − xₙ₋₁ for BDF2. Each integrator keeps its order.
 
     Attributes:
         vertices: A triangle is loaded if all of its corners are among these.
@@ -154,7 +158,21 @@ class Pressure(Load):
     pressure: float | Sequence[float] | np.ndarray | None = None
 
     def elements(self, mesh: Mesh) -> np.ndarray:
-        return mesh.triangles[_within(self, mesh, mesh.triangles)]
+        loaded = np.flatnonzero(_within(self, mesh, mesh.triangles))
+        triangles = mesh.triangles[loaded]
+        if not len(triangles):
+            return triangles
+        try:
+            against = turned_over(triangles)
+        except ValueError as error:
+            raise ValueError(f"{self.label}: {error}; pressure must act on a surface with two sides") from None
+        if against.any():
+            warnings.warn(
+                f"{self.label}: {against.sum()} of {len(loaded)} triangles wind against their neighbours, the first of them "
+                f"triangle {loaded[np.argmax(against)]}; they are pressed from the same side as the others",
+                stacklevel=2,
+            )
+        return np.where(against[:, None], triangles[:, ::-1], triangles)
 
 
 class Loads(tuple[Load, ...]):

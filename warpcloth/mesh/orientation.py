@@ -1,0 +1,38 @@
+"""Orients triangles so that neighbours wind in the same direction."""
+
+import numpy as np
+
+
+def turned_over(triangles):
+    """Returns which triangles must be turned over so that all wind like their neighbours, (T,) booleans.
+
+    In each connected piece the fewer triangles are turned over. Neighbours share an edge that no third triangle has.
+
+    Args:
+        triangles: (T, 3), at least one.
+
+    Raises:
+        ValueError: A piece has one side only, like a Möbius strip. The message names a triangle of it.
+    """
+    from scipy.sparse import coo_array  # loaded late, as importing this package stays light
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(triangles)
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    keys = np.minimum(start, end).astype(np.int64) * (int(triangles.max()) + 1) + np.maximum(start, end)
+    order = np.argsort(keys, kind="stable")
+    _, first, sides = np.unique(keys[order], return_index=True, return_counts=True)
+    one, two = order[first[sides == 2]], order[first[sides == 2] + 1]
+    # Each triangle is two nodes, t as it is and t + T turned over; edges join those that wind in the same direction.
+    opposed = np.where(start[one] == start[two], count, 0)
+    one, two = one // 3, two // 3
+    pairs = np.concatenate([[one, two + opposed], [one + count, (two + opposed + count) % (2 * count)]], axis=1)
+    nodes = coo_array((np.ones(pairs.shape[1], dtype=bool), pairs), shape=(2 * count, 2 * count))
+    piece = connected_components(nodes, directed=False)[1]
+    kept, turned = piece[:count], piece[count:]
+    one_sided = np.flatnonzero(kept == turned)
+    if len(one_sided):
+        raise ValueError(f"triangle {one_sided[0]} belongs to a surface with one side, like a Möbius strip")
+    as_they_are = np.bincount(kept, minlength=2 * count)
+    more = as_they_are[turned] - as_they_are[kept]
+    return (more > 0) | ((more == 0) & (turned < kept))
