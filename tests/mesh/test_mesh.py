@@ -531,7 +531,7 @@ READ = [  # text of an OBJ file, name, number of points, triangles
     ("quad", CLOTH + "f 1 3 4 2\n", None, 4, [[0, 2, 3], [3, 1, 0]]),
     ("pentagon", CLOTH + "v 2 0 .5\nf 1 3 4 5 2\n", None, 5, [[0, 2, 3], [0, 3, 4], [0, 4, 1]]),
     ("materials", CLOTH + "usemtl red\nf 1 3 4\nusemtl blue\nf 1 4 2\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
-    ("seam", CLOTH + TEXTURE + "f 1/1 3/2 4/3\nf 1/4 4/5 2/6\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
+    ("relative", CLOTH + "f -4 -2 -1\nf 1 -1 2\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
     ("normals", CLOTH + "vn 0 1 0\nvn 0 -1 0\nf 1//1 3//1 4//1\nf 1//2 4//2 2//2\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
     ("unused vertex", "v 9 9 9\n" + CLOTH + "f 2 4 5\n", None, 5, [[1, 3, 4]]),
     ("groups", CLOTH + "g a\nf 1 3 4\ng b\nf 1 4 2\n", None, 4, [[0, 2, 3], [0, 3, 1]]),
@@ -550,6 +550,20 @@ def test_obj(tmp_path, text, name, points, triangles):
     assert mesh.texture_coordinates is None
 
 
+@pytest.mark.parametrize("seam", [True, False])
+def test_obj_has_texture_coordinates_at_corners_if_a_vertex_has_several(tmp_path, seam):
+    corners = [[1, 2, 3], [4, 5, 6]] if seam else [[1, 2, 3], [1, 3, 4]]
+    faces = [
+        "f " + " ".join(f"{v}/{t}" for v, t in zip(*row, strict=True))
+        for row in zip([(1, 3, 4), (1, 4, 2)], corners, strict=True)
+    ]
+    (tmp_path / "cloth.obj").write_text(CLOTH + TEXTURE + "\n".join(faces))
+    mesh = Mesh.load(tmp_path / "cloth.obj")
+    assert len(mesh.points) == 4 and mesh.triangles.tolist() == [[0, 2, 3], [0, 3, 1]]
+    np.testing.assert_array_equal(mesh.corner_coordinates, (np.array(corners)[..., None] - 1) / [8, 8])
+    assert mesh.texture_coordinates.shape == ((2, 3, 2) if seam else (4, 2))
+
+
 def test_ply_stays_whole_at_seams(tmp_path):
     elements = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     elements += "element face 2\nproperty list uchar int vertex_indices\nproperty list uchar float texcoord\n"
@@ -561,6 +575,7 @@ def test_ply_stays_whole_at_seams(tmp_path):
         [0, 2, 3],
         [0, 3, 1],
     ]
+    assert mesh.texture_coordinates.tolist() == [[[0, 0], [0, 1], [1, 1]], [[0.5, 0.5], [0, 0.5], [1, 0.5]]]
 
 
 def test_gltf_transforms_and_names(tmp_path):
@@ -588,16 +603,14 @@ def test_gltf_is_welded_at_seams(tmp_path):
     mesh = Mesh.grid(3, 3)
     loose = mesh.points[mesh.triangles].reshape(-1, 3)
     st = np.arange(48).reshape(24, 2) / 48
-    for uv, expected in ((st, None), (loose[:, [0, 2]], mesh.texture_coordinates)):
+    for uv, expected in ((st, st.reshape(8, 3, 2)), (loose[:, [0, 2]], mesh.texture_coordinates)):
         visual = trimesh.visual.TextureVisuals(uv=uv)
         cut = trimesh.Trimesh(loose, np.arange(24).reshape(-1, 3), visual=visual, process=False)
         cut.export(tmp_path / "seams.glb")
         loaded = Mesh.load(tmp_path / "seams.glb")
         assert (len(loaded.points), len(loaded.hinges)) == (9, len(mesh.hinges))
-        if expected is None:
-            assert loaded.texture_coordinates is None
-        else:
-            np.testing.assert_allclose(loaded.texture_coordinates, loaded.points[:, [0, 2]], atol=1e-7)
+        expected = loaded.points[:, [0, 2]] if expected.ndim == 2 else expected
+        np.testing.assert_allclose(loaded.texture_coordinates, expected, atol=1e-7)
 
 
 HEAD = (
@@ -614,13 +627,20 @@ BAD_FILES = [
     ("empty.stl", "", ValueError, "the file is empty"),
     ("noise.ply", "no header\n", ValueError, "cannot be read as .ply"),
     ("noise.glb", "no header, but long enough for one", ValueError, "cannot be read as .glb"),
-    ("noise.obj", "no vertices\n", ValueError, "has no triangles"),
+    ("noise.obj", "no vertices\n", ValueError, "line 1: 'no' is not supported, must be v, vt, f"),
     ("cloud.obj", CLOTH, ValueError, "has no triangles"),
     ("range.obj", CLOTH + "f 1 3 9\n", ValueError, "face 1 names vertex 9; the file has 4$"),
-    ("relative.obj", CLOTH + "f 1/1 2/1 -1/1\n", ValueError, "its faces have relative"),
+    ("relative.obj", CLOTH + "f 1 2 -5\n", ValueError, "line 5: a face names -5, must be 1 or more, or negative"),
+    ("zero.obj", CLOTH + "f 0 1 2\n", ValueError, "line 5: a face names 0, must be 1 or more"),
+    (
+        "texture.obj",
+        CLOTH + "vt 0 0\nf 1/1 2/1 3/2\n",
+        ValueError,
+        "line 6: face 1 names texture coordinate 2; the file has 1$",
+    ),
     ("flat.obj", CLOTH + "f 1 1 3\n", ValueError, r"triangles\[0\] is \[0, 0, 2\]; it must be 3 different"),
     ("nan.obj", CLOTH.replace("1", "nan") + "f 1 3 4\n", ValueError, r"points\[1\] is .*must be finite"),
-    ("range.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", ValueError, "cannot be read as .off"),
+    ("range.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", ValueError, "line 6: face 0 names vertex 3; the file has 3$"),
     ("short.off", "# a square\nOFF\n\n4 3 0\n" + ROWS, ValueError, "line 10: the file ends after 2 of the 3 faces"),
     ("points.off", "OFF 40 2 0\n" + ROWS, ValueError, "line 7: the file ends after 6 of the 40 vertices"),
     ("long.off", "OFF\n4 1 0\n" + ROWS, ValueError, "line 8: the file goes on after all vertices and faces that its header"),

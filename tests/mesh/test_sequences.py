@@ -345,8 +345,8 @@ def other_triangle(path):
 
 BROKEN_FILES = [  # what frame 3 is, message
     (lambda path: export(path, MESH.points[:8], MESH.triangles[:1]), "8 vertices, must be 9 as in .*cloth_1.obj"),
-    (lambda path: export(path, MESH.points, MESH.triangles[:-1]), "7 triangles, must be 8 as in .*cloth_1.obj"),
-    (other_triangle, r"triangle 5 has vertices \[4, 8, 7\], must be \[.*\] as in .*cloth_1.obj"),
+    (lambda path: export(path, MESH.points, MESH.triangles[:-1]), "7 faces, must be 8 as in .*cloth_1.obj"),
+    (other_triangle, r"face 5 has vertices \[4, 8, 7\], must be \[.*\] as in .*cloth_1.obj"),
     (lambda path: path.write_text(""), "the file is empty"),
     (lambda path: path.write_text("v 0 0 0\n"), "has no triangles"),
 ]

@@ -321,7 +321,7 @@ def test_wrong_input_is_refused_in_a_sentence(stage, tmp_path, capfd):
         ("mixed a.pc2", r"f2\.obj: 12 vertices, must be 9 as in"),
         ("mixed a.ply", r"f2\.obj: 12 vertices, must be 9 as in"),
         ("mixed old.obj", r"f2\.obj: 12 vertices, must be 9 as in"),
-        ("far a.npz", r"f0\.obj: face 1 names vertex 100; the file has 3$"),
+        ("far a.npz", r"f0\.obj, line 4: face 1 names vertex 100; the file has 3$"),
         ("zero.usdc a.npz", r"zero\.usdc: the file is empty$"),
         ("chain.usdc a.npz", r"chain\.usdc: has edges and no triangles; a sequence must have triangles$"),
         ("short.pc2 a.npz", "has 132 bytes; 5 frames of 12 points must have 752"),

@@ -509,12 +509,10 @@ def test_corner_texture_coordinates_are_read_where_each_vertex_has_one(tmp_path,
     stage.Save()
     read = read_stage_mesh(tmp_path / "a.usda")
     if seam:
-        assert read.mesh.texture_coordinates is None
         corners = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [5, 6, 7]]  # of the fan, and of the triangle
-        np.testing.assert_allclose(read.corner_coordinates, st[corners], atol=EPS)
+        np.testing.assert_allclose(read.mesh.texture_coordinates, st[corners], atol=EPS)
     else:
         np.testing.assert_allclose(read.mesh.texture_coordinates, np.array(PENTAGON)[:, :2] / 10, atol=EPS)
-        assert read.corner_coordinates is None
 
 
 def test_samples_alone_are_read_with_a_warning(tmp_path):

@@ -141,8 +141,7 @@ class Analyzer:
         if self.on == "triangle":
             if material is not None:
                 check_material(material)
-            seams = self.sequence.stage and self.sequence.stage.corner_coordinates
-            threads = None if directions is None else material_directions(self.mesh, directions, seams)
+            threads = None if directions is None else material_directions(self.mesh, directions)
             self._elements = Triangles(self.mesh, self.measures, threads, material, device, dtype)
         else:
             for name, value in (("directions", directions), ("material", material)):

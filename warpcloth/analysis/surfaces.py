@@ -218,14 +218,13 @@ class Neighbourhoods(_Elements):
         self.launch(neighbourhood_fit.neighbourhood_gradients(self.scalar), inputs, outputs)
 
 
-def material_directions(mesh, chosen, corner_coordinates=None):
+def material_directions(mesh, chosen):
     """Returns two material directions of each triangle, as coefficients α of its edges: α₁(X₁ − X₀) + α₂(X₂ − X₀).
 
     Args:
         mesh: A mesh of triangles.
         chosen: "st", the directions along which one texture coordinate grows and the other is constant; or a vector (3,), whose
             component in the plane of each triangle at rest is the first direction, with the second perpendicular to it.
-        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), if vertices have several.
 
     Returns:
         np.ndarray: (T, 2, 2), warp and weft in columns; NaN if the texture is degenerate or the vector is perpendicular to the
@@ -241,9 +240,7 @@ def material_directions(mesh, chosen, corner_coordinates=None):
         if isinstance(chosen, str):
             if chosen != "st":
                 raise ValueError(f"directions is {shown(chosen)}; it must {rule}")
-            st = corner_coordinates
-            if mesh.texture_coordinates is not None:
-                st = mesh.texture_coordinates[mesh.triangles]
+            st = mesh.corner_coordinates
             if st is None:
                 raise ValueError('directions = "st": the mesh has no texture coordinates that were read; give a vector')
             Ds = np.stack([st[:, 1] - st[:, 0], st[:, 2] - st[:, 0]], axis=2)

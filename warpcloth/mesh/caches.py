@@ -133,12 +133,13 @@ def write_obj(file, points, mesh, digits=17):
     owner = np.searchsorted([first for _, first in parts], mesh.triangles[:, 0], side="right") - 1
     np.savetxt(file, points, fmt="v" + 3 * f" %.{digits}g")
     if coordinates is not None:
-        np.savetxt(file, coordinates, fmt="vt %.9g %.9g")
+        np.savetxt(file, coordinates.reshape(-1, 2), fmt="vt %.9g %.9g")
+        textured = mesh.triangles if coordinates.ndim == 2 else np.arange(mesh.triangles.size).reshape(-1, 3)
     for k, name in enumerate([name for name, _ in parts] or [None]):
         if name is not None:
             file.write(f"g {'_'.join(name.split())}\n".encode())
-        faces = 1 + (mesh.triangles if name is None else mesh.triangles[owner == k])
-        np.savetxt(file, faces if coordinates is None else np.repeat(faces, 2, axis=1), fmt=f"f {corner} {corner} {corner}")
+        faces = mesh.triangles if coordinates is None else np.stack([mesh.triangles, textured], axis=2).reshape(-1, 6)
+        np.savetxt(file, 1 + (faces if name is None else faces[owner == k]), fmt=f"f {corner} {corner} {corner}")
 
 
 def write_ply(file, points, mesh):

@@ -27,7 +27,7 @@ def frames_of_names(files: Iterable[Path]) -> dict[float, Path]:
     The last number in a name is that of its frame. A hyphen before it is a minus unless a letter or digit precedes it, so
     "cloth_-4" is frame −4 and "cloth-4" is frame 4; beside "cloth0", however, "cloth-4" is frame −4. Decimals, as in "c_1.25"
     and "c_2.00", are equal parts of a frame. After a version the point separates, as in "v2.0998", and also after a number
-    that all names have, if frames of three digits or more follow each other, as in "take_2.0998" and "take_2.0999".
+    that all names have, if frames of two digits or more follow each other, as in "take_2.0998" and "take_2.0999".
 
     Raises:
         ValueError: A name has no number, or one of more than 15 digits, two names have one number, or it is not clear whether
@@ -69,8 +69,8 @@ def _without_separators(names):
     digits = max(len(name.decimals) for name in names.values())
     if len({name[:3] for name in names.values()}) == 1:
         numbers = sorted(int(name.decimals or 0) for name in names.values())
-        one_width = all(len(name.decimals) == digits >= 3 for name in names.values())
-        if one_width and np.diff(numbers).min(initial=1) == 1:
+        one_width = all(len(name.decimals) == digits >= 2 for name in names.values())
+        if one_width and min(np.diff(numbers), default=1) == 1:
             return {file: _Name(f"{name.before}{name.whole}.", "", name.decimals, "") for file, name in names.items()}
     else:
         values = np.array([float(f"0.{name.decimals or 0}") for name in names.values()])

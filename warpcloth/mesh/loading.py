@@ -1,39 +1,37 @@
-"""Meshes from files, by trimesh."""
+"""Meshes from files: .obj, .ply and .off by readers of their own, which keep polygons whole, .stl and glTF by trimesh."""
 
+import json
 import logging
 import re
 from pathlib import Path
 
 import numpy as np
 
+from .file_faces import FileFaces
 from .mesh import READERS, Mesh
+from .obj_files import read_obj
+from .off_files import read_off
+from .ply_files import read_ply
 
-# Options of trimesh by file ending. By default it splits vertices at texture seams and makes a mesh of each material.
-ENDINGS = {
-    ".obj": {"split_objects": True, "group_material": False, "skip_materials": True},
-    ".ply": {"fix_texture": False, "skip_materials": True},
-    ".stl": {},
-    ".off": {},
-    ".glb": {},
-    ".gltf": {},
-}
-# trimesh logs the tracebacks of its errors, which Python prints unless a handler is set.
-_QUIET = logging.NullHandler()
+_OWN = {".obj": read_obj, ".ply": read_ply, ".off": read_off}
 # STL shares no vertices. glTF stores a vertex once for every normal and texture coordinate.
 WELDED = (".stl", ".glb", ".gltf")
+ENDINGS = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+# trimesh logs the tracebacks of its errors, which Python prints unless a handler is set.
+_QUIET = logging.NullHandler()
+_COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression"}
 
 
 def read_file(path, name=None, kind=Mesh):
-    """Reads the triangle mesh in a file.
+    """Reads the mesh in a file.
 
-    Vertices keep the order of the file. STL and glTF repeat a vertex wherever triangles differ in normal or texture,
-    which would cut the cloth: there, vertices with exactly equal points are welded into the first of them. glTF node
-    transforms are applied; lengths are taken for metres. Polygons are cut into fans of triangles (x₀, xₖ, xₖ₊₁), which
-    come after the file's own triangles.
+    Vertices keep the order of the file. STL and glTF repeat a vertex wherever triangles differ in normal or texture, which
+    would cut the cloth: there, vertices with exactly equal points are welded into the first of them. In other files, vertices
+    are welded along sides that lie exactly upon each other, as at seams. glTF node transforms are applied; lengths are taken
+    for metres. Polygons are cut into triangles as `polygons.cut` says.
 
-    Texture coordinates are read if there is one pair for each vertex: from PLY (if faces have their own, the last counts), and
-    from glTF unless welding joins vertices with different ones. They are not read from OBJ, which has them for each corner of
-    each face.
+    Texture coordinates are at vertices if each has one pair, else at the corners of triangles. They are read from OBJ, PLY and
+    glTF.
 
     Args:
         path: An .obj, .ply, .stl, .off, .glb or .gltf file.
@@ -46,12 +44,14 @@ def read_file(path, name=None, kind=Mesh):
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The ending is none of those above; the file is empty, cannot be read, has no triangles or (OBJ) has
-            relative indices; an ASCII .ply or an .off file does not have the rows that its header announces; it has several
-            geometries and `name` is none of them; or `kind` refuses the mesh. The message begins with the path.
+        ValueError: The ending is none of those above; the file is empty, cannot be read or has no triangles; it does not have
+            the rows that its header announces; not all faces could be read; a face crosses itself or is far from planar; the
+            file has several geometries and `name` is none of them; or `kind` refuses the mesh. The message begins with the
+            path, and for text the line.
     """
-    points, triangles, st = read_arrays(path, name)
+    faces = read_faces(path, name)
     try:
+        points, triangles, st = welded_seams(faces).triangles()
         return kind(points, triangles, texture_coordinates=st)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -61,166 +61,109 @@ READERS.update(dict.fromkeys(ENDINGS, read_file))
 
 
 def read_arrays(path, name=None):
-    """Reads the arrays of a mesh, as `read_file` describes them.
+    """Returns points, triangles and texture coordinates of a file, see `FileFaces.triangles`; seams are not welded."""
+    faces = read_faces(path, name)
+    try:
+        return faces.triangles()
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
-    Args:
-        path: As for `read_file`.
-        name: As for `read_file`.
 
-    Returns:
-        Points (n, 3) float64, finite or not, triangles (T, 3) int64 and texture coordinates (n, 2) or None.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: As for `read_file`.
-    """
+def read_faces(path, name=None):
+    """Reads the `FileFaces` of a file, see `read_file`; seams are not welded."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         raise ValueError(f"{path}: the ending must be one of {' '.join(ENDINGS)}")
-    if path.stat().st_size == 0:
+    data = path.read_bytes()
+    if not data:
         raise ValueError(f"{path}: the file is empty")
-    # trimesh counts relative indices from the end of the file instead of from their line, and reads wrong triangles.
-    if ending == ".obj" and re.search(rb"^f\s[^\n#]*-\d", path.read_bytes(), re.MULTILINE):
-        raise ValueError(f"{path}: its faces have relative (negative) indices, which are not supported")
-    if ending in _COUNTED:
-        _COUNTED[ending](path, path.read_bytes())
+    if ending in WELDED:
+        return _read_by_trimesh(path, data, ending, name)
+    faces, objects = read_obj(path, data) if ending == ".obj" else (_OWN[ending](path, data), {})
+    if not len(faces.counts):
+        raise ValueError(f"{path}: has no triangles")
+    if not objects and name is None:
+        return faces
+    chosen = _chosen(path, objects or {path.name: None}, name)
+    return faces if len(objects) < 2 else _some_of(faces, objects[chosen])
+
+
+def _chosen(path, geometries, name):
+    """Returns the name of a geometry, which may be None if there is only one."""
+    names = ", ".join(repr(each) for each in sorted(geometries, key=str))
+    if name is None and len(geometries) > 1:
+        raise ValueError(f"{path}: has several geometries, name one of them: {names}")
+    if name is not None and name not in geometries:
+        raise ValueError(f"{path}: has no geometry {name!r}, it has {names}")
+    return next(iter(geometries)) if name is None else name
+
+
+def _some_of(faces, indices):
+    """Returns some faces of a file, without the vertices of the others."""
+    chosen = np.zeros(len(faces.counts), dtype=bool)
+    chosen[indices] = True
+    at_corners = np.repeat(chosen, faces.counts)
+    used, corners = np.unique(faces.corners[at_corners], return_inverse=True)
+    st = None if faces.st is None else faces.st[at_corners]
+    return FileFaces(faces.points[used], faces.counts[chosen], corners, st)
+
+
+def _read_by_trimesh(path, data, ending, name):
     import trimesh
 
     logging.getLogger("trimesh").addHandler(_QUIET)
     try:
-        scene = trimesh.load_scene(path, process=False, maintain_order=True, **ENDINGS[ending])
+        scene = trimesh.load_scene(path, process=False, maintain_order=True)
     except ModuleNotFoundError:  # chardet, which guesses the encoding of text that is not UTF-8
         raise ValueError(f"{path}: cannot be read as {ending}, it is not UTF-8") from None
     except Exception as error:  # a broken file makes trimesh raise errors of many types
-        if ending == ".obj":
-            _refuse_far_corner(path, path.read_bytes())
         raise ValueError(f"{path}: cannot be read as {ending}, {type(error).__name__}: {error}") from error
     found = {node: scene.graph[node] for node in scene.graph.nodes_geometry}
     found = {node: at for node, at in found.items() if len(getattr(scene.geometry[at[1]], "faces", ()))}
+    _check_count(path, data, ending, sum(len(getattr(each, "faces", ())) for each in scene.geometry.values()))
     if not found:
         raise ValueError(f"{path}: has no triangles")
-    names = ", ".join(repr(node) for node in sorted(found, key=str))
-    if name is None and len(found) > 1:
-        raise ValueError(f"{path}: has several geometries, name one of them: {names}")
-    if name is not None and name not in found:
-        raise ValueError(f"{path}: has no geometry {name!r}, it has {names}")
-    transform, geometry = found[next(iter(found)) if name is None else name]
-    return _arrays(path, scene.geometry[geometry], transform, len(found) > 1)
+    transform, geometry = found[_chosen(path, found, name)]
+    return _faces(path, scene.geometry[geometry], transform, len(found) > 1)
 
 
-def _check_ply(path, data):
-    """Raises ValueError if the lines of an ASCII .ply file do not match its header; trimesh would read a wrong mesh."""
-    head, end, body = data.partition(b"end_header")
-    words = [line.split() for line in head.decode("latin-1").splitlines()]
-    if ["format", "ascii"] not in [line[:2] for line in words]:
-        return  # trimesh checks the size of a binary file itself
-    if not end:
-        raise ValueError(f"{path}: its header has no end_header, the file may be cut")
-    elements = []
-    for number, line in enumerate(words, start=1):
-        if line[:1] == ["element"]:
-            if len(line) != 3 or not line[2].isdecimal():
-                raise ValueError(f"{path}, line {number}: must be an element, its name and its count")
-            elements.append((line[1], int(line[2]), []))
-        elif line[:1] == ["property"] and elements:
-            elements[-1][2].append(line[1] == "list" if len(line) > 1 else False)
-    vertices = next((count for name, count, _ in elements if name == "vertex"), 0)
-    lines = body.decode("latin-1").splitlines()[1:]  # the first entry is the rest of the header's last line
-    first, row = len(words) + 2, 0
-    for name, count, lists in elements:
-        for index in range(count):
-            where = f"{path}, line {first + row}"
-            if row >= len(lines):
-                raise ValueError(f"{where}: the file ends before {name} {index} of the {count} that its header says")
-            numbers, needed = lines[row].split(), 0
-            for several in lists:
-                length = numbers[needed] if several and needed < len(numbers) else "0"
-                if not length.isdecimal():
-                    raise ValueError(f"{where}: {name} {index} has a list of {length}, must be a whole number of 0 or more")
-                needed += 1 + int(length)
-            if len(numbers) != needed:
-                raise ValueError(f"{where}: {name} {index} has {len(numbers)} numbers, must have {needed}")
-            row += 1
-        if row == len(lines) and count:
-            _refuse_open_end(f"{path}, line {first + row - 1}", data, lines[-1], vertices if any(lists) else np.inf)
-    _refuse_more(path, next((first + row + index for index, line in enumerate(lines[row:]) if line.strip()), None))
+def _check_count(path, data, ending, loaded):
+    """Raises ValueError if trimesh has not read all triangles of a file."""
+    if ending == ".stl":
+        written = len(re.findall(rb"^\s*facet\b", data, re.MULTILINE | re.IGNORECASE))
+        binary = len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
+        written = loaded if binary else written
+    else:
+        start = 20 if ending == ".glb" else 0
+        header = json.loads(data[start : start + int.from_bytes(data[12:16], "little")] if start else data)
+        if lacking := _COMPRESSED & {*header.get("extensionsRequired", ())}:
+            raise ValueError(f"{path}: is compressed ({', '.join(sorted(lacking))}), must be exported without compression")
+        primitives = [each for mesh in header.get("meshes", ()) for each in mesh["primitives"]]
+        accessors = header.get("accessors", ())
+        counts = {4: lambda count: count // 3, 5: lambda count: count - 2, 6: lambda count: count - 2}
+        written = sum(
+            counts[each.get("mode", 4)](accessors[each.get("indices", each["attributes"]["POSITION"])]["count"])
+            for each in primitives
+            if each.get("mode", 4) in counts
+        )
+    if written != loaded:
+        raise ValueError(
+            f"{path}: has {written} triangles, of which {loaded} could be read; the file is broken or not supported"
+        )
 
 
-def _check_off(path, data):
-    """Raises ValueError if the lines of an .off file do not match its header; trimesh would read a wrong mesh."""
-    lines = enumerate(data.decode("latin-1").splitlines(), start=1)
-    lines = [(number, words) for number, line in lines if (words := line.partition("#")[0].split())]
-    if lines and lines[0][1][0].endswith("OFF"):
-        lines[0][1].pop(0)
-        lines = lines if lines[0][1] else lines[1:]
-    if not lines:
-        raise ValueError(f"{path}: has no line with the numbers of vertices and faces")
-    (number, counts), *rows = lines
-    if len(counts) < 2 or not all(count.isdecimal() for count in counts[:2]):
-        raise ValueError(f"{path}, line {number}: must be the numbers of vertices, faces and edges, each 0 or more")
-    vertices, faces = map(int, counts[:2])
-    for name, count, rows_of in (("vertex", vertices, rows[:vertices]), ("face", faces, rows[vertices : vertices + faces])):
-        for index, (number, words) in enumerate(rows_of):
-            needed = 3
-            if name == "face":
-                if not words[0].isdecimal():
-                    raise ValueError(f"{path}, line {number}: face {index} has {words[0]} corners, must be a whole number")
-                needed = 1 + int(words[0])
-            if len(words) < needed:  # more may be a colour
-                raise ValueError(f"{path}, line {number}: {name} {index} has {len(words)} numbers, must have {needed}")
-        if len(rows_of) < count:
-            last = rows_of[-1][0] if rows_of else number
-            raise ValueError(
-                f"{path}, line {last}: the file ends after {len(rows_of)} of the {count} {_PLURAL[name]} that its header says"
-            )
-    _refuse_more(path, next((number for number, _ in rows[vertices + faces :]), None))
-    if rows and len(rows[-1][1]) <= needed:
-        _refuse_open_end(f"{path}, line {rows[-1][0]}", data, rows[-1][1][-1], vertices if faces else np.inf)
-
-
-def _refuse_far_corner(path, data):
-    """Raises ValueError if a face of an .obj file has a vertex that the file does not have."""
-    vertices = len(re.findall(rb"^v\s", data, re.MULTILINE))
-    for number, corners in enumerate(re.findall(rb"^f\s([^\r\n#]*)", data, re.MULTILINE), start=1):
-        far = [index for index in map(int, re.findall(rb"(?<!\S)\d+", corners)) if index > vertices]
-        if far:
-            raise ValueError(f"{path}: face {number} names vertex {far[0]}; the file has {vertices}")
-
-
-def _refuse_more(path, line):
-    """Raises ValueError if ``line``, the first line after all that the header counts, is not None."""
-    if line is not None:
-        raise ValueError(f"{path}, line {line}: the file goes on after all vertices and faces that its header says")
-
-
-_COUNTED = {".ply": _check_ply, ".off": _check_off}
-_PLURAL = {"vertex": "vertices", "face": "faces"}
-
-
-def _refuse_open_end(where, data, line, most):
-    """Raises ValueError if the last number has no line break after it and may be cut, as more digits would still be valid.
-
-    The last number is an index below ``most``, which is infinite if it is no index.
-    """
-    last = line.split()[-1:] or [""]
-    if data[-1:] not in b"\r\n" and not (last[0].isdecimal() and (int(last[0]) == 0 or 10 * int(last[0]) >= most)):
-        raise ValueError(f"{where}: ends in {last[0]} without a line break, so the file may be cut; end the line with one")
-
-
-def _arrays(path, geometry, transform, drop_unused):
-    """Returns points, triangles and texture coordinates of a trimesh.Trimesh, as for `read_file`."""
-    ending = path.suffix.lower()
+def _faces(path, geometry, transform, drop_unused):
+    """Returns the `FileFaces` of a trimesh.Trimesh, whose vertices with equal points are welded."""
     points = np.asarray(geometry.vertices, dtype=np.float64)
     triangles = np.asarray(geometry.faces, dtype=np.int64)
     if not np.array_equal(transform, np.eye(4)):
         points = points @ transform[:3, :3].T + transform[:3, 3]
         if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # a reflection reverses the orientation of triangles
             triangles = triangles[:, ::-1]
-    # For an OBJ, trimesh averages the *indices* of texture coordinates at a seam, which gives unrelated coordinates.
-    st = None if ending == ".obj" else getattr(geometry.visual, "uv", None)
+    st = getattr(geometry.visual, "uv", None)
     st = None if st is None or len(st) != len(points) else np.asarray(st, dtype=np.float64)
     if triangles.min() < 0 or triangles.max() >= len(points):
         span = f"{triangles.min()} to {triangles.max()}"
@@ -229,12 +172,34 @@ def _arrays(path, geometry, transform, drop_unused):
     if drop_unused:
         kept = np.unique(triangles)
         triangles = np.searchsorted(kept, triangles)
-    if ending in WELDED:
-        first, group = _first_of_equals(points[kept])
-        if st is not None and not np.array_equal(st[kept], st[kept][first][group]):
-            st = None
-        kept, triangles = kept[first], group[triangles]
-    return points[kept], triangles, None if st is None else st[kept]
+    corners = triangles.ravel()
+    st = None if st is None else st[kept][corners]
+    first, group = _first_of_equals(points[kept])
+    return FileFaces(points[kept[first]], np.full(len(triangles), 3), group[corners], st)
+
+
+def welded_seams(faces):
+    """Returns faces whose vertices are welded, each into the first, along sides of one face that lie upon another such side."""
+    first, group = _first_of_equals(faces.points)
+    if len(first) == len(faces.points):
+        return faces
+    start, corners = np.cumsum(faces.counts) - faces.counts, faces.corners
+    following = np.arange(1, len(corners) + 1)
+    following[start + faces.counts - 1] = start
+    sides = np.sort(np.stack([corners, corners[following]], axis=1), axis=1)
+    _, which, times = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    free = sides[times[which.ravel()] == 1]
+    _, which, times = np.unique(np.sort(group[free], axis=1), axis=0, return_inverse=True, return_counts=True)
+    seam = np.zeros(len(faces.points), dtype=bool)
+    seam[free[times[which.ravel()] > 1]] = True
+    on_seam, into = np.flatnonzero(seam), np.arange(len(seam))
+    firsts = np.full(len(first), len(seam))
+    np.minimum.at(firsts, group[on_seam], on_seam)
+    into[on_seam] = firsts[group[on_seam]]
+    kept, renumbered = np.unique(into, return_inverse=True)
+    st = faces.st
+    st = st[corners] if st is not None and len(st) == len(seam) else st
+    return FileFaces(faces.points[kept], faces.counts, renumbered[corners], st)
 
 
 def _first_of_equals(points):

@@ -41,7 +41,8 @@ class Mesh:
         triangles: Vertices of each triangle (T, 3), int32, counter-clockwise from the front; (0, 3) of an edge mesh.
         edges: Vertices of each edge (E, 2), int32. In a triangle mesh, each edge occurs once, with the smaller index first, and
             rows are in lexicographic order. In an edge mesh, edges are as given.
-        texture_coordinates: One st pair for each vertex (n, 2), float64, or None.
+        texture_coordinates: One st pair for each vertex (n, 2), or for each corner of each triangle (T, 3, 2) if a vertex has
+            several, as on seams; float64, or None.
         grid_shape: (nx, ny) if vertex i + nx·j is column i, row j of a grid of four-sided cells, or None.
         up_axis: "Y" or "Z", the up axis of gravity and of files; None if unknown, which counts as "Y".
         parts: For a mesh that :meth:`join` made, (first vertex, number of vertices, grid_shape) of each part by name, else
@@ -93,10 +94,7 @@ class Mesh:
             self._refuse_degenerate()
             self._refuse_repeated_edges()
         if self.texture_coordinates is not None:
-            st = _coordinates("texture_coordinates", self.texture_coordinates, 2)
-            if len(st) != n:
-                raise ValueError(f"texture_coordinates: {len(st)} rows for {n} points, must be one for each point")
-            keep(self, "texture_coordinates", _read_only(st))
+            keep(self, "texture_coordinates", _read_only(self._checked_texture(n)))
         if self.grid_shape is not None:
             if np.shape(self.grid_shape) != (2,):
                 raise ValueError(f"grid_shape is {self.grid_shape}; it must be two counts (nx, ny)")
@@ -190,15 +188,20 @@ class Mesh:
         first, count, grid_shape = found
         chosen = slice(first, first + count)
 
+        def of_part(elements):
+            return (elements[:, 0] >= first) & (elements[:, 0] < first + count)
+
         def own(elements):
-            return elements[(elements[:, 0] >= first) & (elements[:, 0] < first + count)] - first
+            return elements[of_part(elements)] - first
 
         st = self.texture_coordinates
+        if st is not None:
+            st = st[chosen] if st.ndim == 2 else st[of_part(self.triangles)]
         return Mesh(
             self.points[chosen],
             triangles=own(self.triangles) if len(self.triangles) else None,
             edges=None if len(self.triangles) else own(self.edges),
-            texture_coordinates=None if st is None else st[chosen],
+            texture_coordinates=st,
             grid_shape=grid_shape,
             up_axis=self.up_axis,
         )
@@ -381,6 +384,12 @@ class Mesh:
             raise ValueError(f"triangles: {pair} have the same three vertices, must be different triangles")
         return _read_only(hinges)
 
+    @property
+    def corner_coordinates(self) -> np.ndarray | None:
+        """Texture coordinates of the corners of each triangle (T, 3, 2), or None."""
+        st = self.texture_coordinates
+        return st if st is None or st.ndim == 3 else st[self.triangles]
+
     @cached_property
     def boundary_edges(self) -> np.ndarray:
         """Edges of exactly one triangle (B, 2), int32, rows of `edges`; (0, 2) for an edge mesh."""
@@ -454,6 +463,16 @@ class Mesh:
             longest_squared = np.max([dot(side, side) for side in (a - c, b - a, c - b)], axis=0)
             # 2·area/longest² is the height over the longest side, divided by that side.
             return ~(2 * self.triangle_areas > FLATTEST * longest_squared)
+
+    def _checked_texture(self, n):
+        shape = np.shape(self.texture_coordinates)
+        at_corners = len(shape) == 3 and shape[1] == 3
+        given = np.reshape(self.texture_coordinates, (-1, shape[2])) if at_corners else self.texture_coordinates
+        st = _coordinates("texture_coordinates", given, 2)
+        if len(st) != (3 * len(self.triangles) if at_corners else n):
+            rule = "one for each point, or three for each triangle"
+            raise ValueError(f"texture_coordinates: {shape[0]} rows for {n} points, must be {rule}")
+        return st.reshape(shape)
 
     def _refuse_degenerate(self):
         _refuse("points", self.points, ~np.isfinite(self.points).all(axis=1), "must be finite")

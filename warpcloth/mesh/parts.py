@@ -52,12 +52,15 @@ def joined(meshes):
     def shifted(field):
         return np.concatenate([getattr(mesh, field) + first for mesh, first in zip(each, firsts[:-1], strict=True)])
 
-    textured = all(mesh.texture_coordinates is not None for mesh in each)
+    textures = [mesh.texture_coordinates for mesh in each]
+    textured = all(st is not None for st in textures)
+    if textured and any(st.ndim == 3 for st in textures):
+        textures = [mesh.corner_coordinates for mesh in each]
     return {
         "points": np.concatenate([mesh.points for mesh in each]),
         "triangles": shifted("triangles") if all(of_triangles) else None,
         "edges": None if all(of_triangles) else shifted("edges"),
-        "texture_coordinates": np.concatenate([mesh.texture_coordinates for mesh in each]) if textured else None,
+        "texture_coordinates": np.concatenate(textures) if textured else None,
         "up_axis": next(iter(axes), None),
         "parts": {
             name: Part(int(first), len(mesh.points), mesh.grid_shape)

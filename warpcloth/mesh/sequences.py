@@ -35,7 +35,7 @@ from ..base.notebooks import ShownInNotebooks
 from ..base.types import FilePath, UpAxis
 from .caches import CACHES, open_mdd, open_pc2
 from .frame_names import frames_of_names
-from .loading import ENDINGS, WELDED, read_arrays
+from .loading import ENDINGS, WELDED, read_faces
 from .mesh import Mesh, Surface
 from .parts import Part
 from .stage_mesh import StageMesh
@@ -257,29 +257,33 @@ def numbered_files(path: FilePath, endings: List[str] = FRAME_ENDINGS) -> tuple[
 
 
 def _open_files(path, labels, paths, prim, fps):
-    points, triangles, st = read_arrays(paths[0], prim)
+    faces = read_faces(paths[0], prim)
     try:
+        points, triangles, st = faces.triangles()
         mesh = Surface(points, triangles, texture_coordinates=st)
     except ValueError as error:
         raise ValueError(f"{paths[0]}: {error}") from error
-    read = partial(_read_file, paths, prim, mesh.triangles, len(points))
+    read = partial(_read_file, paths, prim, faces.counts, faces.corners, len(points))
     times = None if fps is None else (labels - labels[0]) / fps
     return Sequence(mesh, labels, times, read, path, declared=False, files=tuple(paths))
 
 
-def _read_file(paths, prim, expected, count, frame):
-    """Reads the points (n, 3) of a file, which must have the same triangles as the first file."""
+def _read_file(paths, prim, counts, corners, count, frame):
+    """Reads the points (n, 3) of a file, which must have the same faces as the first file, with these ``counts`` of corners."""
     path = paths[frame]
-    points, triangles, _ = read_arrays(path, prim)
-    for name, here, there in (("vertices", len(points), count), ("triangles", len(triangles), len(expected))):
+    found = read_faces(path, prim)
+    for name, here, there in (("vertices", len(found.points), count), ("faces", len(found.counts), len(counts))):
         if here != there:
             raise ValueError(f"{path}: {here} {name}, must be {there} as in {paths[0]}; {_CHANGES}")
-    differ = (triangles != expected).any(axis=1)
-    if differ.any():
-        row = int(np.argmax(differ))
-        here, there = triangles[row].tolist(), expected[row].tolist()
-        raise ValueError(f"{path}: triangle {row} has vertices {here}, must be {there} as in {paths[0]}; {_CHANGES}")
-    return points
+    ends = np.cumsum(counts)
+    differ = found.counts != counts
+    if not differ.any():
+        differ = np.logical_or.reduceat(found.corners != corners, ends - counts)
+    for face in np.flatnonzero(differ)[:1]:
+        here = np.split(found.corners, np.cumsum(found.counts))[face].tolist()
+        there = corners[ends[face] - counts[face] : ends[face]].tolist()
+        raise ValueError(f"{path}: face {face} has vertices {here}, must be {there} as in {paths[0]}; {_CHANGES}")
+    return found.points
 
 
 def _open_npz(path, fps):

@@ -25,8 +25,6 @@ class StageMesh:
         start: First time code, or None if the stage does not set it.
         pins: Sorted vertex indices (p,) int32 by name, of every GeomSubset of points.
         point_vertices: For curves, the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
-        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), if vertices on seams have several,
-            so that ``mesh`` has none; else None.
         cloths: The `StageMesh` of each cloth if ``mesh`` joins several; else empty.
         rest: Whether the stage has a rest shape, the default points; else the mesh is that of one time code.
     """
@@ -42,6 +40,5 @@ class StageMesh:
     start: float | None
     pins: dict[str, np.ndarray]
     point_vertices: np.ndarray | None = None
-    corner_coordinates: np.ndarray | None = None
     rest: bool = True
     cloths: tuple["StageMesh", ...] = ()

@@ -58,7 +58,7 @@ class Woven(Declared):
         elif mesh.texture_coordinates is None:
             raise ValueError(f"{self.label}.warp is None on a mesh without texture coordinates; it must be a vector")
         else:
-            warp = along_s(mesh.points[mesh.triangles], mesh.texture_coordinates[mesh.triangles])
+            warp = along_s(mesh.points[mesh.triangles], mesh.corner_coordinates)
         along = np.einsum("tai,ti->at", axes, warp)
         size = np.linalg.norm(along, axis=0)
         for t in np.flatnonzero(size <= 1e-6 * np.linalg.norm(warp, axis=1))[:1]:

@@ -284,7 +284,7 @@ class _Reader:
         for code, row in zip(codes, points, strict=True):
             if len(row) != len(points[0]):
                 raise ValueError(f"points has {len(row)} points at time code {code:g}, must keep {len(points[0])}")
-        corners, triangles = face_corners(self.prim, len(points[0]))
+        corners, triangles = face_corners(self.prim, first_extended(np.array(points)))
         return _alone(np.array(points)), corners[triangles]
 
     def _points_at(self, code):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..mesh.polygons import cut
 from .gprims import define_colliders
 from .layers import COLOUR, CURVE_WIDTH, scene_layer
 from .modules import Usd, UsdGeom, UsdPhysics, UsdShade
@@ -182,7 +183,9 @@ def _drawn(prim, path, cloth, codes):
         if solid is not None:
             triangles, edges, radius = np.asarray(solid.faces, np.int32), np.empty((0, 2), np.int32), 0.0
         elif prim.IsA(UsdGeom.Mesh):
-            corners, triangles = face_corners(prim, len(start))
+            rest = start if len(codes) < 2 else array_of(attribute, (3,))
+            shape = start if rest is None or len(rest) != len(start) else rest.astype(np.float64)
+            corners, triangles = face_corners(prim, shape, lambda *faces: cut(*faces)[0])  # other programs draw any face
             triangles, edges, radius = corners[triangles], np.empty((0, 2), np.int32), 0.0
             linear = local_to_metres(prim, where, first)[:3, :3]
             if np.linalg.slogdet(linear)[0] < 0:  # a reflection reverses the orientation of triangles

@@ -163,9 +163,11 @@ def edge_paths(edges, count):
 def _add_primvars(geometry, mesh):
     """Adds texture coordinates, if the mesh has them, and a colour that the material reads."""
     primvars = UsdGeom.PrimvarsAPI(geometry)
-    if mesh.texture_coordinates is not None and len(mesh.triangles):
-        st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
-        st.Set(Vt.Vec2fArray.FromNumpy(mesh.texture_coordinates.astype(np.float32)))
+    coordinates = mesh.texture_coordinates
+    if coordinates is not None and len(mesh.triangles):
+        at = UsdGeom.Tokens.vertex if coordinates.ndim == 2 else UsdGeom.Tokens.faceVarying
+        st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, at)
+        st.Set(Vt.Vec2fArray.FromNumpy(coordinates.reshape(-1, 2).astype(np.float32)))
     geometry.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([Gf.Vec3f(*COLOUR)])
 
 

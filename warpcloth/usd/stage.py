@@ -8,6 +8,7 @@ import numpy as np
 from ..base.checks import shown
 from ..base.types import FilePath
 from ..mesh.mesh import Mesh
+from ..mesh.polygons import triangles_of
 from ..mesh.stage_mesh import StageMesh
 from .modules import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdSkel
 from .values import (
@@ -53,8 +54,8 @@ def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = 
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
     The points at the default time are the rest shape. If points have only time samples, the first is read, with a warning. This
-    is deprecated, for the first frame need not be at rest. Holes are omitted. Polygons are cut into fans of triangles from
-    their first corner. Their winding is reversed if the prim is left-handed or its transform mirrors, so that triangle normals
+    is deprecated, for the first frame need not be at rest. Holes are omitted. Polygons are cut into triangles as
+    `polygons.cut` says. Their winding is reversed if the prim is left-handed or its transform mirrors, so that triangle normals
     point to the front. The up axis is kept.
 
     Args:
@@ -71,8 +72,8 @@ def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file is not a USD stage, has invalid units, rates or times, or has no mesh or several. Or the prim is
-            missing, is not a mesh, or refers to a missing file. Or its transform cannot be inverted, its topology changes, or
-            its points and topology do not make a valid `Mesh`.
+            missing, is not a mesh, or refers to a missing file. Or its transform cannot be inverted, its topology changes, a
+            face crosses itself or is far from planar, or its points and topology do not make a valid `Mesh`.
     """
     with sentences(path):
         return _stage_mesh(open_stage(path), path, prim, kind, time)
@@ -86,19 +87,19 @@ def _stage_mesh(stage, path, prim, kind, time):
     start = stage.GetStartTimeCode() if layer.HasStartTimeCode() else None
     moving = moving_space(found) is not None
     transform = local_to_metres(found, where, (start or 0.0) if time is None and moving else time)
-    point_vertices = corner_coordinates = None
+    point_vertices = None
     up_axis = str(UsdGeom.GetStageUpAxis(stage))
     try:
         points = placed(_rest_points(found, where, time), transform)
         if time is None:
             refuse_moving_topology(found)
         if found.IsA(UsdGeom.Mesh):
-            corners, triangles = face_corners(found, len(points))
+            corners, triangles = face_corners(found, points)
             if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # the sign alone, because the determinant may overflow
                 triangles = triangles[:, ::-1]
             at_vertices, at_corners = _texture_coordinates(found, len(points), corners)
-            corner_coordinates = None if at_corners is None else at_corners[triangles]
-            mesh = kind(points, corners[triangles], texture_coordinates=at_vertices, up_axis=up_axis)
+            st = at_vertices if at_corners is None else at_corners[triangles]
+            mesh = kind(points, corners[triangles], texture_coordinates=st, up_axis=up_axis)
         else:
             point_vertices = curve_vertices(found, len(points))
             edges = point_vertices[curve_edges(found, len(points))]
@@ -120,7 +121,6 @@ def _stage_mesh(stage, path, prim, kind, time):
         start=start,
         pins=pins,
         point_vertices=point_vertices,
-        corner_coordinates=corner_coordinates,
         rest=UsdGeom.PointBased(found).GetPointsAttr().Get() is not None,
     )
 
@@ -440,10 +440,15 @@ def refuse_moving_topology(prim):
             refuse_change(attribute.GetName(), topology(attribute, code), fixed, code)
 
 
-def face_corners(prim, count):
+def face_corners(prim, points, triangles_of=triangles_of):
     """Vertices (C,) int32 of the corners of the faces of a Mesh prim, and the corners of each triangle (T, 3).
 
     Triangles are counter-clockwise seen from the front in the space of the prim.
+
+    Args:
+        prim: The prim.
+        points: Its points (P, 3), in any space.
+        triangles_of: Function that cuts faces, see `polygons.triangles_of`.
     """
     mesh = UsdGeom.Mesh(prim)
     counts, corners = topology(mesh.GetFaceVertexCountsAttr()), topology(mesh.GetFaceVertexIndicesAttr())
@@ -454,14 +459,10 @@ def face_corners(prim, count):
         raise ValueError(f"face {face} has {counts[face]} corners, must have at least 3")
     if counts.sum() != len(corners):
         raise ValueError(f"faceVertexCounts add up to {counts.sum()}, must be the number of indices, {len(corners)}")
-    refuse_outside("faceVertexIndices", corners, count, "vertex")
-    fan = triangles_of_faces(prim)
-    start = np.repeat(np.cumsum(counts) - counts, fan)
-    # Index of each triangle in the fan of its polygon.
-    step = np.arange(len(start)) - np.repeat(np.cumsum(fan) - fan, fan)
-    fans = np.stack([start, start + step + 1, start + step + 2], axis=1)
+    refuse_outside("faceVertexIndices", corners, len(points), "vertex")
+    found = triangles_of(points[corners], counts, np.flatnonzero(triangles_of_faces(prim) == 0))
     sides = (UsdGeom.Tokens.rightHanded, UsdGeom.Tokens.leftHanded)
-    return corners, fans[:, ::-1] if token_of(mesh.GetOrientationAttr(), sides) == UsdGeom.Tokens.leftHanded else fans
+    return corners, found[:, ::-1] if token_of(mesh.GetOrientationAttr(), sides) == UsdGeom.Tokens.leftHanded else found
 
 
 def triangles_of_faces(prim):

@@ -1,0 +1,88 @@
+"""Polygons as files have them, and what their readers share."""
+
+import re
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from .polygons import triangles_of
+
+
+class FileFaces(NamedTuple):
+    """The faces of a file.
+
+    Attributes:
+        points: (n, 3) [m], float64, finite or not.
+        counts: Number of corners of each face (F,), at least 3.
+        corners: Vertices of one face after another (C,), int64.
+        st: Texture coordinates of the vertices (n, 2), or of the corners (C, 2), or None.
+    """
+
+    points: np.ndarray
+    counts: np.ndarray
+    corners: np.ndarray
+    st: np.ndarray | None = None
+
+    def triangles(self):
+        """Returns points (n, 3), triangles (T, 3), and texture coordinates, or None.
+
+        Texture coordinates are (n, 2), or (T, 3, 2) if a vertex has several. The second half of a four-sided fan is (2, 3, 0).
+
+        Raises:
+            ValueError: A face crosses itself or is far from planar.
+        """
+        chosen, st = triangles_of(self.points[self.corners], self.counts), self.st
+        halves = (np.repeat(self.counts, self.counts - 2) == 4) & (chosen[:, 1] - chosen[:, 0] == 2)
+        chosen[halves] = np.roll(chosen[halves], -1, axis=1)
+        if st is not None and len(st) != len(self.points):
+            at_vertices = np.zeros((len(self.points), 2))
+            at_vertices[self.corners] = st
+            st = at_vertices if np.array_equal(at_vertices[self.corners], st) else st[chosen]
+        return self.points, self.corners[chosen], st
+
+
+def faces_of(path, points, rows, st=None, lines=None, first=0):
+    """Returns the `FileFaces` of a file.
+
+    Args:
+        path: The file, for messages.
+        points: (n, 3) [m].
+        rows: Vertices of each face, from 0.
+        st: As in `FileFaces`.
+        lines: The line of each face (F,), if the file is text.
+        first: The number of the first vertex and of the first face in it.
+
+    Raises:
+        ValueError: A face has fewer than three corners, or one that is no vertex.
+    """
+    points, counts = np.asarray(points, dtype=np.float64).reshape(-1, 3), np.fromiter(map(len, rows), np.int64, len(rows))
+    corners = np.fromiter(chain.from_iterable(rows), np.int64, counts.sum())
+    far = (corners < 0) | (corners >= len(points))
+    wrong = np.flatnonzero(
+        (counts < 3) | (np.bincount(np.repeat(np.arange(len(counts)), counts)[far], minlength=len(counts)) > 0)
+    )
+    for face in wrong[:1]:
+        row = np.asarray(rows[face])
+        outside = row[(row < 0) | (row >= len(points))]
+        reason = (
+            f"names vertex {outside[0] + first}; the file has {len(points)}"
+            if len(outside)
+            else f"has {len(row)} corners, must have 3 or more"
+        )
+        raise ValueError(f"{path}{'' if lines is None else f', line {lines[face]}'}: face {face + first} {reason}")
+    return FileFaces(points, counts, corners, st)
+
+
+def lines_of(data):
+    """Returns pairs of the number and the text of each line of a file in bytes."""
+    return enumerate(re.split(r"\r\n|\r|\n", data.decode("utf-8-sig", "replace")), start=1)
+
+
+def refuse_open_end(where, data, last, most):
+    """Raises ValueError if the last number has no line break after it and may be cut, as more digits would still be valid.
+
+    The last number is an index below ``most``, which is infinite if it is no index.
+    """
+    if data[-1:] not in b"\r\n" and not (last.isdecimal() and (int(last) == 0 or 10 * int(last) >= most)):
+        raise ValueError(f"{where}: ends in {last} without a line break, so the file may be cut; end the line with one")
