@@ -74,7 +74,7 @@ def faces_of(path, points, rows, st=None, lines=None, first=0):
     return FileFaces(points, counts, corners, st)
 
 
-def lines_of(data):
+def text_lines(data):
     """Returns pairs of the number and the text of each line of a file in bytes."""
     return enumerate(re.split(r"\r\n|\r|\n", data.decode("utf-8-sig", "replace")), start=1)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .file_faces import faces_of, lines_of
+from .file_faces import faces_of, text_lines
 
 # Keywords without faces.
 _IGNORED = {*"vn vp g s p l usemtl usemap mtllib maplib lod mg bevel c_interp d_interp shadow_obj trace_obj".split()}
@@ -17,7 +17,7 @@ def read_obj(path, data):
     """
     points, texture, rows, st, lines, objects, name = [], [], [], [], [], {}, path.name
     joined = ""
-    for line, text in lines_of(data):
+    for line, text in text_lines(data):
         if text.endswith("\\"):
             joined += text[:-1] + " "
             continue

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from .file_faces import faces_of, lines_of, refuse_open_end
+from .file_faces import faces_of, refuse_open_end, text_lines
 
 
 def read_off(path, data):
@@ -13,7 +13,7 @@ def read_off(path, data):
     Raises:
         ValueError: The lines do not match the header, or one cannot be read. The message has path, line and reason.
     """
-    rows = [(line, words) for line, text in lines_of(data) if (words := text.partition("#")[0].split())]
+    rows = [(line, words) for line, text in text_lines(data) if (words := text.partition("#")[0].split())]
     if rows and rows[0][1][0].endswith("OFF"):
         line, (keyword, *words) = rows.pop(0)
         if not re.fullmatch("(ST)?C?N?OFF", keyword) or words[:1] == ["BINARY"]:

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 
-from .file_faces import faces_of, lines_of, refuse_open_end
+from .file_faces import faces_of, refuse_open_end, text_lines
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
 _TYPES |= {f"{kind}{8 * size}": f"{kind[0]}{size}" for kind in ("int", "uint", "float") for size in (1, 2, 4, 8)}
@@ -70,7 +70,7 @@ def _header(path, data):
     if end is None:
         raise ValueError(f"{path}: its header has no end_header, the file may be cut")
     order, elements = None, []
-    lines = list(lines_of(data[: end.end() - len(line_break)]))
+    lines = list(text_lines(data[: end.end() - len(line_break)]))
     for line, text in lines:
         keyword, *words = text.split() or [""]
         where = f"{path}, line {line}"
@@ -96,7 +96,7 @@ class _Text:
     """Reads rows of text, one for each line, after the ``line`` lines of the header."""
 
     def __init__(self, data, line):
-        self._lines, self.line = [text for _, text in lines_of(data.rstrip())], line
+        self._lines, self.line = [text for _, text in text_lines(data.rstrip())], line
 
     @property
     def where(self):
