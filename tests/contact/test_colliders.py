@@ -767,6 +767,78 @@ def test_distances_to_a_mesh_are_those_to_its_box(weld):
     assert not sheet.closed and sheet.distances(points).min() > 0.0
 
 
+def leaf(height, other_diagonals, thickness=0.0, n=6):
+    """A grid whose height is given by a function, with a back below it."""
+    front = wc.Mesh.grid(n, n, pattern="diagonal")
+    points = np.array(front.points) - [0.5, 0.0, 0.5]
+    points[:, 1] = height(points[:, 0], points[:, 2])
+    back = np.array(front.triangles)[:, ::-1]
+    if other_diagonals:
+        quads = back.reshape(-1, 2, 3)
+        a, c, d, b = quads[:, 0, 2], quads[:, 0, 1], quads[:, 0, 0], quads[:, 1, 0]
+        back = np.stack([a, b, c, b, d, c], axis=1).reshape(-1, 3)
+    return np.concatenate([points, points - [0.0, thickness, 0.0]]), np.concatenate([front.triangles, back + len(points)])
+
+
+def disc(n, first):
+    """A disc of n corners whose front and back are fans, from the corners 0 and ``first``."""
+    angles, around = 2.0 * np.pi * np.arange(n) / n, np.roll(np.arange(n), -first)
+    points = 0.4 * np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1)
+    fan = np.array([(0, k + 1, k) for k in range(1, n - 1)])
+    return np.concatenate([points, points]), np.concatenate([fan, around[fan][:, ::-1] + n])
+
+
+def with_leaf():
+    points, triangles = leaf(lambda x, z: 0.0 * x + 0.2, False)
+    return np.concatenate([0.1 * CUBE.vertices, points]), np.concatenate([CUBE.faces, triangles + len(CUBE.vertices)])
+
+
+DOUBLED = {
+    "square, other diagonal": disc(4, 1),
+    "pentagon": disc(5, 0),
+    "disc": disc(12, 5),
+    "card": leaf(lambda x, z: 0.0 * x, False),
+    "card, other diagonals": leaf(lambda x, z: 0.0 * x, True),
+    "dome": leaf(lambda x, z: 0.4 - x**2 - z**2, False),
+    "dome, other diagonals": leaf(lambda x, z: 0.4 - x**2 - 2.0 * z**2 + x * z**2, True),
+    "leaf": leaf(lambda x, z: 0.5 * x * z, False),
+    "leaf, other diagonals": leaf(lambda x, z: 0.5 * x * z, True),
+    "leaf, other diagonals, turned": leaf(lambda x, z: -0.5 * x * z, True),
+    "cube with a leaf": with_leaf(),
+}
+
+
+@pytest.mark.parametrize("name", DOUBLED)
+def test_front_and_back_that_coincide_are_a_sheet(name):
+    """Nothing is inside, a few points between diagonals of a twisted leaf aside; a cube beside it keeps its inside."""
+    points, triangles = DOUBLED[name]
+    collider = wc.MeshCollider(points, triangles)
+    probes = np.random.default_rng(0).uniform(-0.7, 0.7, size=(2000, 3))
+    inside = collider.distances(probes) < 0.0
+    if name.startswith("cube"):
+        np.testing.assert_array_equal(inside, (np.abs(probes) < 0.1 * np.abs(CUBE.vertices).max()).all(axis=1))
+    else:
+        assert not collider.faces_inwards and not inside[collider.distances(probes) < -0.01].any() and inside.mean() < 0.01
+        assert "diagonal" in name or not collider.closed
+
+
+@pytest.mark.parametrize("name", slow_but(["square, other diagonal", "card"], [*DOUBLED][:-1]))
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_front_and_back_that_coincide_hold_cloth_on_both_sides(name, side):
+    points, triangles = DOUBLED[name]
+    grid = wc.Mesh.grid(7, 7, size=0.3)
+    mesh = wc.Mesh(grid.points + np.array([-0.15, side * 0.45, -0.15]), grid.triangles)
+    scene = wc.Scene(
+        mesh,
+        density=0.2,
+        terms=[wc.Spring(stiffness=500.0)],
+        colliders=[wc.MeshCollider(points - [0.0, points[:, 1].max() * (side > 0), 0.0], triangles)],
+        gravity=(0.0, -9.81 * side, 0.0),
+    )
+    run = wc.simulate(scene, wc.Newton(substeps=4), frames=40)
+    assert run.status.ok and -0.45 < (side * run.points[-1][:, 1]).min() < 0.2  # 1.7 m lower without a collider
+
+
 def test_the_default_stiffness_is_said():
     """10 w/r, and from nothing else; ``print`` and ``info`` say it."""
     scene = falling([wc.Plane()])

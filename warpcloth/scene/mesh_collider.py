@@ -14,17 +14,21 @@ from ..base.types import Converted, default
 from ..kernels import nearest
 from ..kernels.contact.mesh_facets import FACETS, FAR
 from ..mesh.distances import nearest_weights
-from ..mesh.mesh import Mesh
+from ..mesh.mesh import Mesh, areas_of
 from .colliders import Collider, from_y, turned
+
+_FLAT = 1e-6  # volume below which a closed surface is a sheet, relative to the cube of its size
+_THIN = 0.02  # thickness below which fronts that face inwards are those of a sheet, relative to its size
 
 
 @dataclass(frozen=True, eq=False)
 class MeshCollider(Collider):
     """A triangle mesh, rigid or deforming.
 
-    A closed surface is a solid, behind the fronts of its triangles. Any other surface is a sheet without thickness, which
-    collides on both sides. Vertices with the same position at all frames are merged, so that seams do not open a surface. At
-    frames where all of its vertices are at one position, the collider is absent.
+    A closed surface that encloses a volume is a solid, behind the fronts of its triangles; its winding number says where. Any
+    other surface, such as a card with a front and a back, is a sheet without thickness, which collides on both sides. Vertices
+    with the same position at all frames are merged, so that seams do not open a surface. At frames where all of its vertices
+    are at one position, the collider is absent.
 
     Attributes:
         points: Positions of its vertices, (n, 3) [m], or at frames 0 … F−1 of the scene, (F, n, 3), in the frame of
@@ -67,7 +71,7 @@ class MeshCollider(Collider):
         if len(self.frames) == 1 or not self.closed:
             return
         found = np.array([self._filling(vertices) for vertices in self.frames])
-        sides = np.sign(found) * (np.abs(found) > 1e-6)  # flat ones have none
+        sides = np.sign(found) * (np.abs(found) > _FLAT)  # flat ones have none
         first = np.argmax(sides != 0)
         for frame in np.flatnonzero(sides * sides[first] < 0)[:1]:
             raise ValueError(
@@ -142,10 +146,21 @@ class MeshCollider(Collider):
 
     @cached_property
     def closed(self) -> bool:
-        """Whether it has an inside: each side of a triangle is that of as many others in the other direction."""
+        """Whether it has an inside: it encloses a volume, and each side of a triangle is that of as many others reversed."""
         sides = self._welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         forth, back = (np.sort(each @ [sides.max() + 1, 1]) for each in (sides, sides[:, ::-1]))
-        return np.array_equal(forth, back)
+        return np.array_equal(forth, back) and any(abs(self._filling(vertices)) > _FLAT for vertices in self.frames)
+
+    @cached_property
+    def faces_inwards(self) -> bool:
+        """Whether it is closed and its fronts face what it encloses, so that all else is solid.
+
+        Where a front and a back with other diagonals lie upon each other, they enclose some volume too, but thinner than this.
+        """
+        vertices = first_extended(self.frames)
+        size = np.ptp(vertices, axis=0).max()
+        thickness = -2.0 * self._filling(vertices) * size**3 / areas_of(vertices, self.triangles).sum()
+        return bool(self.closed and thickness > _THIN * size)
 
     def distances(self, points: np.ndarray, frame: int = 0) -> np.ndarray:
         """Distances (…,) [m] of points (…, 3) [m] to the surface at a frame, negative inside a closed one.
@@ -157,6 +172,9 @@ class MeshCollider(Collider):
         found = np.linalg.norm(away, axis=1)
         if self.closed:
             behind = np.einsum("ki,ki->k", away, self._normals(vertices, faces, weights)) < 0.0
+            if not self.faces_inwards:  # normals are of no use where a front and a back coincide
+                nearest = np.einsum("kc,kci->ki", weights[behind], vertices[self.triangles[faces[behind]]])
+                behind[behind] = winding_numbers(away[behind] + nearest, vertices[self.triangles]) > 0.5
             found = np.where(behind, -found, found)  # one that has shrunk to a point has no normals, and nothing is behind
         return found.reshape(points.shape[:-1])
 
@@ -205,6 +223,22 @@ def first_extended(points):
     """The first of points (F, n, 3) that are not all at one position, or points (n, 3)."""
     frames = points.reshape(-1, *points.shape[-2:])
     return frames[np.argmax(np.ptp(frames, axis=1).any(axis=1))]
+
+
+def winding_numbers(points, corners):
+    """How often triangles (T, 3, 3) enclose points (k, 3), (k,): the sum of their solid angles over 4π.
+
+    See van Oosterom and Strackee 1983, *The solid angle of a plane triangle*.
+    """
+    found = np.empty(len(points))
+    rows = max(1, 1_000_000 // len(corners))
+    for first in range(0, len(points), rows):
+        a, b, c = (corners - points[first : first + rows, None, None]).transpose(2, 0, 1, 3)
+        la, lb, lc = (np.linalg.norm(each, axis=2) for each in (a, b, c))
+        ab, bc, ca = (np.einsum("kti,kti->kt", *each) for each in ((a, b), (b, c), (c, a)))
+        triple = np.einsum("kti,kti->kt", a, np.cross(b, c))
+        found[first : first + rows] = np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2.0 * np.pi)
+    return found
 
 
 def nearest_points(points, vertices, triangles):

@@ -315,7 +315,7 @@ class _Reader:
             wanted = "none"
         if wanted == "none":
             found = MeshCollider(points=points, triangles=triangles, **given)
-            if found.closed and _volume(found.frames[0][triangles]) < 0.0:
+            if found.faces_inwards:
                 self._warn("its triangles face inwards, so that what they enclose is free and all else is solid")
             return found
         if wanted == "convexHull":
@@ -338,12 +338,6 @@ class _Reader:
 def _alone(values):
     """Returns the values of all frames, or of the only one without its axis."""
     return values[0] if len(values) == 1 else values
-
-
-def _volume(corners):
-    """Returns the volume that triangles (T, 3, 3) enclose, negative if their fronts face inwards."""
-    corners = corners - corners[0, 0]
-    return np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
 
 
 def _hull(points):
