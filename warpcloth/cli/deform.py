@@ -14,7 +14,7 @@ from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
 from ..base.texts import convert, json_text
 from .options import add_values, values_of
-from .setup import named_scene
+from .setup import named_scene, warn_of_seams
 from .terminal import Progress, check_writable, frames_folder_of, location
 
 _FRAMES, _FPS = 24, 24.0
@@ -142,6 +142,7 @@ def deform(arguments):
     from ..deformation.deform import deform
 
     name, values, given = _given(arguments)
+    warn_of_seams(given["mesh"])
     frames = len(given["pins"].keyframes) - 1
     check_writable(arguments.output)
     device = find_device(arguments.device)

@@ -14,6 +14,7 @@ from .terminal import Progress
 
 
 def info(arguments):
+    from ..mesh.seams import coincident, piece_count
     from ..scene.freedom import freedom
     from ..solvers import SOLVERS
 
@@ -36,6 +37,8 @@ def info(arguments):
             "vertices": len(scene.mesh.points),
             "triangles": len(scene.mesh.triangles),
             "edges": len(scene.mesh.edges),
+            "coincident": coincident(scene.mesh.points),
+            "pieces": piece_count(scene.mesh),
             "mass": float(scene.vertex_masses.sum()),
             "gravity": scene.gravity.tolist(),
             "duration": scene.duration,
@@ -68,8 +71,10 @@ def info(arguments):
 
 
 def _info_text(facts):
-    model, solver = facts["model"], facts["solver"]
-    lines = ["parameters: " + (", ".join(f"{k}={v!r}" for k, v in facts["scene"]["parameters"].items()) or "none")]
+    model, solver, scene = facts["model"], facts["solver"], facts["scene"]
+    lines = ["parameters: " + (", ".join(f"{k}={v!r}" for k, v in scene["parameters"].items()) or "none")]
+    if scene["coincident"] or scene["pieces"] > 1:
+        lines.append(f"mesh of {scene['pieces']} pieces; {scene['coincident']} vertices lie exactly upon others")
     lines.append(f"model on {model['device']}, {model['dtype']}: {model['bytes']:,} bytes")
     lines += [f"  {term['term']}: {term['elements']} elements, {term['bytes']:,} bytes" for term in model["terms"]]
     free = facts["freedom"]
@@ -82,7 +87,7 @@ def _info_text(facts):
     if solver:
         lines.append(f"solver: {solver_line(solver)}")
         if "limit_about_rest" in solver:
-            fps = facts["scene"]["fps"]
+            fps = scene["fps"]
             for text, key in (("about the rest shape", "limit_about_rest"), ("in motion", "limit_in_motion")):
                 lines.append(
                     f"  stable {text} below {solver[key]:.4g} s, from {fewest_below(fps, solver[key])} substeps a frame"

@@ -11,7 +11,7 @@ from .history_files import record_of, write_history
 from .options import values_of
 from .render import check_drawing, draw_film
 from .setup import EPILOG as OF_STEPS
-from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup
+from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup, warn_of_seams
 from .terminal import Progress, check_writable, frames_folder_of, location, own_output, say
 
 EPILOG = f"""\
@@ -26,6 +26,7 @@ def run(arguments):
     from ..run.simulate import simulate
 
     source, values, scene = named_scene(arguments)
+    warn_of_seams(scene.mesh, scene)
     frames = scene.frames if arguments.frames is None else arguments.frames
     arguments.output = own_output(scene.name, ".usdc", arguments.resume) if arguments.output is None else arguments.output
     check_writable(arguments.output)

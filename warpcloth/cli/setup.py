@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from dataclasses import asdict, dataclass, replace
 
 from ..base.texts import assignments, options
@@ -41,6 +42,23 @@ def _parameters(arguments):
             arguments.p = [*arguments.p, f"{name}={value}"]
             setattr(arguments, name, None)
     return assignments(arguments.p)
+
+
+def warn_of_seams(mesh, scene=None):
+    """Warns of vertices that lie upon others along seams, unless terms of a scene join them: the cloth is cut there."""
+    from ..mesh.seams import seam_pairs
+
+    pairs = seam_pairs(mesh.points, mesh.triangles)
+    joined = (
+        [pair for term in scene.terms for pair in term.held(mesh, scene.positions)[0].tolist()] if scene and len(pairs) else ()
+    )
+    loose = {*map(frozenset, pairs.tolist())} - {*map(frozenset, joined)}
+    if loose:
+        warnings.warn(
+            f"{len(loose)} vertices lie upon others along seams and nothing joins them, so the cloth is cut there; weld them "
+            "in the program that made the mesh",
+            stacklevel=2,
+        )
 
 
 @dataclass

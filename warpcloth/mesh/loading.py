@@ -12,6 +12,7 @@ from .mesh import READERS, Mesh
 from .obj_files import read_obj
 from .off_files import read_off
 from .ply_files import read_ply
+from .seams import first_of_equals, welded
 
 _OWN = {".obj": read_obj, ".ply": read_ply, ".off": read_off}
 # STL shares no vertices. glTF stores a vertex once for every normal and texture coordinate.
@@ -51,7 +52,7 @@ def read_file(path, name=None, kind=Mesh):
     """
     faces = read_faces(path, name)
     try:
-        points, triangles, st = welded_seams(faces).triangles()
+        points, triangles, st = welded(faces).triangles()
         return kind(points, triangles, texture_coordinates=st)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -174,41 +175,5 @@ def _faces(path, geometry, transform, drop_unused):
         triangles = np.searchsorted(kept, triangles)
     corners = triangles.ravel()
     st = None if st is None else st[kept][corners]
-    first, group = _first_of_equals(points[kept])
+    first, group = first_of_equals(points[kept])
     return FileFaces(points[kept[first]], np.full(len(triangles), 3), group[corners], st)
-
-
-def welded_seams(faces):
-    """Returns faces whose vertices are welded, each into the first, along sides of one face that lie upon another such side."""
-    first, group = _first_of_equals(faces.points)
-    if len(first) == len(faces.points):
-        return faces
-    start, corners = np.cumsum(faces.counts) - faces.counts, faces.corners
-    following = np.arange(1, len(corners) + 1)
-    following[start + faces.counts - 1] = start
-    sides = np.sort(np.stack([corners, corners[following]], axis=1), axis=1)
-    _, which, times = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    free = sides[times[which.ravel()] == 1]
-    _, which, times = np.unique(np.sort(group[free], axis=1), axis=0, return_inverse=True, return_counts=True)
-    seam = np.zeros(len(faces.points), dtype=bool)
-    seam[free[times[which.ravel()] > 1]] = True
-    on_seam, into = np.flatnonzero(seam), np.arange(len(seam))
-    firsts = np.full(len(first), len(seam))
-    np.minimum.at(firsts, group[on_seam], on_seam)
-    into[on_seam] = firsts[group[on_seam]]
-    kept, renumbered = np.unique(into, return_inverse=True)
-    st = faces.st
-    st = st[corners] if st is not None and len(st) == len(seam) else st
-    return FileFaces(faces.points[kept], faces.counts, renumbered[corners], st)
-
-
-def _first_of_equals(points):
-    """Returns the first row of each set of equal rows, in order, and for each row the index of its set."""
-    order = np.lexsort(points.T)  # stable: equal rows stay in order
-    new = np.concatenate([[True], (points[order][1:] != points[order][:-1]).any(axis=1)])
-    first = order[new]
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    group = np.empty(len(points), dtype=np.int64)
-    group[order] = rank[np.cumsum(new) - 1]
-    return np.sort(first), group
