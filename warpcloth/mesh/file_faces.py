@@ -79,6 +79,12 @@ def text_lines(data):
     return enumerate(re.split(r"\r\n|\r|\n", data.decode("utf-8-sig", "replace")), start=1)
 
 
+def plain_reason(error):
+    """Returns why a line could not be read, where Python says only that a word is none of its numbers."""
+    words = re.fullmatch(r"(could not convert|invalid literal).* (float|int)\b.*?: (.*)", str(error))
+    return str(error) if words is None else f"has {words[3]}, must be a {'whole ' * (words[2] == 'int')}number"
+
+
 def refuse_open_end(where, data, last, most):
     """Raises ValueError if the last number has no line break after it and may be cut, as more digits would still be valid.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .file_faces import faces_of, text_lines
+from .file_faces import faces_of, plain_reason, text_lines
 
 # Keywords without faces.
 _IGNORED = {*"vn vp g s p l usemtl usemap mtllib maplib lod mg bevel c_interp d_interp shadow_obj trace_obj".split()}
@@ -41,7 +41,7 @@ def read_obj(path, data):
             elif keyword and keyword not in _IGNORED:
                 raise ValueError(f"{keyword!r} is not supported, must be v, vt, f or another keyword without faces")
         except ValueError as error:
-            raise ValueError(f"{path}, line {line}: {error}") from None
+            raise ValueError(f"{path}, line {line}: {plain_reason(error)}") from None
     found = faces_of(path, points, rows, lines=lines, first=1)
     for corner in np.flatnonzero(np.array(st) >= len(texture))[:1]:
         face = np.searchsorted(np.cumsum(found.counts), corner, side="right")

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from .file_faces import faces_of, refuse_open_end, text_lines
+from .file_faces import faces_of, plain_reason, refuse_open_end, text_lines
 
 
 def read_off(path, data):
@@ -34,7 +34,7 @@ def read_off(path, data):
                 raise ValueError(f"has {len(words)} numbers, must have {needed}")
             found.append([*map(float, words[:3])] if name == "vertex" else [*map(int, words[1:needed])])
         except ValueError as error:
-            raise ValueError(f"{path}, line {line}: {name} {index} {error}") from None
+            raise ValueError(f"{path}, line {line}: {name} {index} {plain_reason(error)}") from None
     for count, most, plural in ((len(found), vertices, "vertices"), (len(found) - vertices, faces, "faces")):
         if count < most:
             raise ValueError(f"{path}, line {line}: the file ends after {count} of the {most} {plural} that its header says")

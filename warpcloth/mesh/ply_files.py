@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 
-from .file_faces import faces_of, refuse_open_end, text_lines
+from .file_faces import faces_of, plain_reason, refuse_open_end, text_lines
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
 _TYPES |= {f"{kind}{8 * size}": f"{kind[0]}{size}" for kind in ("int", "uint", "float") for size in (1, 2, 4, 8)}
@@ -35,7 +35,7 @@ def read_ply(path, data):
                 of = f"{name} {index} of the {count} that its header says"
                 raise ValueError(f"{path}{body.where}: the file ends before {of}") from None
             except ValueError as error:
-                raise ValueError(f"{path}{body.where}: {name} {index} {error}") from None
+                raise ValueError(f"{path}{body.where}: {name} {index} {plain_reason(error)}") from None
             lines[name].append(body.line)
         columns = columns or list(zip(*rows, strict=True)) or [()] * len(properties)
         found[name] = {key: column for (key, _, _), column in zip(properties, columns, strict=True)}
@@ -44,7 +44,7 @@ def read_ply(path, data):
     vertices, faces = found.get("vertex", {}), found.get("face", {})
     if not order and rows:
         is_index = any(length for _, _, length in properties)
-        refuse_open_end(f"{path}{body.where}", data, body.words[-1], len(lines["vertex"]) if is_index else np.inf)
+        refuse_open_end(f"{path}{body.where}", data, body.words[-1], len(lines.get("vertex", ())) if is_index else np.inf)
     if "tristrips" in found or not {*"xyz"} <= vertices.keys():
         raise ValueError(f"{path}: its header must have vertices with x, y and z, and faces instead of tristrips")
 
@@ -55,7 +55,7 @@ def read_ply(path, data):
     rows = faces.get("vertex_indices", faces.get("vertex_index", ()))
     if st is None and [2 * len(row) for row in rows] == [*map(len, faces.get("texcoord", ()))] != []:
         st = np.concatenate([np.reshape(row, (-1, 2)) for row in faces["texcoord"]]).astype(np.float64)
-    return faces_of(path, at_vertices("xyz"), rows, st, None if order else lines["face"])
+    return faces_of(path, at_vertices("xyz"), rows, st, None if order else lines.get("face"))
 
 
 def _header(path, data):
