@@ -58,18 +58,11 @@ def faces_of(path, points, rows, st=None, lines=None, first=0):
     """
     points, counts = np.asarray(points, dtype=np.float64).reshape(-1, 3), np.fromiter(map(len, rows), np.int64, len(rows))
     corners = np.fromiter(chain.from_iterable(rows), np.int64, counts.sum())
-    far = (corners < 0) | (corners >= len(points))
-    wrong = np.flatnonzero(
-        (counts < 3) | (np.bincount(np.repeat(np.arange(len(counts)), counts)[far], minlength=len(counts)) > 0)
-    )
-    for face in wrong[:1]:
-        row = np.asarray(rows[face])
-        outside = row[(row < 0) | (row >= len(points))]
-        reason = (
-            f"names vertex {outside[0] + first}; the file has {len(points)}"
-            if len(outside)
-            else f"has {len(row)} corners, must have 3 or more"
-        )
+    far = np.flatnonzero((corners < 0) | (corners >= len(points)))[:1]
+    names = [(int(np.searchsorted(np.cumsum(counts), at, side="right")), corners[at] + first) for at in far]
+    wrong = [(face, f"names vertex {vertex}; the file has {len(points)}") for face, vertex in names]
+    wrong += [(face, f"has {counts[face]} corners, must have 3 or more") for face in np.flatnonzero(counts < 3)[:1]]
+    for face, reason in sorted(wrong)[:1]:
         raise ValueError(f"{path}{'' if lines is None else f', line {lines[face]}'}: face {face + first} {reason}")
     return FileFaces(points, counts, corners, st)
 

@@ -86,8 +86,6 @@ def read_faces(path, name=None):
     faces, objects = read_obj(path, data) if ending == ".obj" else (_OWN[ending](path, data), {})
     if not len(faces.counts):
         raise ValueError(f"{path}: has no triangles")
-    if not objects and name is None:
-        return faces
     chosen = _chosen(path, objects or {path.name: None}, name)
     return faces if len(objects) < 2 else _some_of(faces, objects[chosen])
 
@@ -134,32 +132,25 @@ def _read_by_trimesh(path, data, ending, name):
 def _check_count(path, data, ending, loaded):
     """Raises ValueError if trimesh has not read all triangles of a file."""
     if ending == ".stl":
-        written = len(re.findall(rb"^\s*facet\b", data, re.MULTILINE | re.IGNORECASE))
         binary = len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
-        written = loaded if binary else written
+        written = loaded if binary else len(re.findall(rb"^\s*facet\b", data, re.MULTILINE | re.IGNORECASE))
     else:
         start = 20 if ending == ".glb" else 0
         header = json.loads(data[start : start + int.from_bytes(data[12:16], "little")] if start else data)
         if lacking := _COMPRESSED & {*header.get("extensionsRequired", ())}:
             raise ValueError(f"{path}: is compressed ({', '.join(sorted(lacking))}), must be exported without compression")
-        primitives = [each for mesh in header.get("meshes", ()) for each in mesh["primitives"]]
-        accessors = header.get("accessors", ())
-        counts = {4: lambda count: count // 3, 5: lambda count: count - 2, 6: lambda count: count - 2}
-        written = sum(
-            counts[each.get("mode", 4)](accessors[each.get("indices", each["attributes"]["POSITION"])]["count"])
-            for each in primitives
-            if each.get("mode", 4) in counts
-        )
+        written = 0
+        for primitive in (each for mesh in header.get("meshes", ()) for each in mesh["primitives"]):
+            count = header["accessors"][primitive.get("indices", primitive["attributes"]["POSITION"])]["count"]
+            mode = primitive.get("mode", 4)  # 4 triangles, 5 a strip, 6 a fan
+            written += count // 3 if mode == 4 else count - 2 if mode in (5, 6) else 0
     if written != loaded:
-        raise ValueError(
-            f"{path}: has {written} triangles, of which {loaded} could be read; the file is broken or not supported"
-        )
+        raise ValueError(f"{path}: {loaded} of its {written} triangles could be read; it is broken or not supported")
 
 
 def _faces(path, geometry, transform, drop_unused):
     """Returns the `FileFaces` of a trimesh.Trimesh, whose vertices with equal points are welded."""
-    points = np.asarray(geometry.vertices, dtype=np.float64)
-    triangles = np.asarray(geometry.faces, dtype=np.int64)
+    points, triangles = np.asarray(geometry.vertices, dtype=np.float64), np.asarray(geometry.faces, dtype=np.int64)
     if not np.array_equal(transform, np.eye(4)):
         points = points @ transform[:3, :3].T + transform[:3, 3]
         if np.linalg.slogdet(transform[:3, :3])[0] < 0:  # a reflection reverses the orientation of triangles
@@ -169,11 +160,7 @@ def _faces(path, geometry, transform, drop_unused):
     if triangles.min() < 0 or triangles.max() >= len(points):
         span = f"{triangles.min()} to {triangles.max()}"
         raise ValueError(f"{path}: triangles refer to vertices {span}, must be 0 to {len(points) - 1}")
-    kept = np.arange(len(points))
-    if drop_unused:
-        kept = np.unique(triangles)
-        triangles = np.searchsorted(kept, triangles)
     corners = triangles.ravel()
-    st = None if st is None else st[kept][corners]
-    first, group = first_of_equals(points[kept])
-    return FileFaces(points[kept[first]], np.full(len(triangles), 3), group[corners], st)
+    first, group = first_of_equals(points)
+    faces = FileFaces(points[first], np.full(len(triangles), 3), group[corners], None if st is None else st[corners])
+    return _some_of(faces, slice(None)) if drop_unused else faces
