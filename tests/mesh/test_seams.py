@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import warpcloth as wc
 from support.mesh_texts import TEXTS
 from warpcloth.cli import main
+from warpcloth.mesh.mesh import Surface
 from warpcloth.mesh.seams import coincident, piece_count, seam_pairs
 
 GRID = wc.Mesh.grid(5, 4)
@@ -47,16 +48,22 @@ def test_meshes_that_were_cut_at_random_are_whole_again(tmp_path_factory, seed, 
 
 @pytest.mark.parametrize("ending", ["obj", "ply", "off"])
 def test_vertices_that_touch_elsewhere_stay_apart(tmp_path, ending):
-    """Two sheets that meet at a corner, and a sheet that is folded so that an inner vertex lies upon another."""
+    """Two sheets that meet at a corner, and two layers that meet at an inner vertex."""
     corner = np.concatenate([GRID.points, GRID.points + np.array([1.0, 0.0, 1.0])])
     mesh = load(tmp_path, ending, corner, np.concatenate([GRID.triangles, GRID.triangles + len(GRID.points)]))
     assert len(mesh.points) == 2 * len(GRID.points) == coincident(mesh.points) + len(np.unique(mesh.points, axis=0))
-    folded = np.array(GRID.points)
-    folded[7] = folded[12]
-    keep = ~(GRID.triangles[:, :, None] == [7, 12]).any(axis=(1, 2)) | (GRID.triangles == 7).any(axis=1)
-    surface = wc.mesh.mesh.Surface
-    (tmp_path / f"b.{ending}").write_text(TEXTS[ending](folded, GRID.triangles[keep].tolist()))
-    assert len(surface.load(tmp_path / f"b.{ending}").points) == len(GRID.points)
+    layers = np.concatenate([GRID.points, GRID.points + np.array([0.0, 0.1, 0.0])])
+    layers[[6, 6 + len(GRID.points)], 1] = 0.05
+    mesh = load(tmp_path, ending, layers, np.concatenate([GRID.triangles, GRID.triangles + len(GRID.points)]))
+    assert len(mesh.points) == 2 * len(GRID.points) and coincident(mesh.points) == 1
+
+
+def test_rest_meshes_of_caches_keep_their_vertices(tmp_path):
+    points, triangles, _ = cut(GRID, np.arange(len(GRID.triangles)) % 2)
+    (tmp_path / "a.obj").write_text(TEXTS["obj"](points, triangles.tolist()))
+    np.savez(tmp_path / "a.npz", points=np.stack([points, points + 1.0]), triangles=triangles)
+    assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "b.pc2"), "--fps", "24"]) == 0
+    assert len(wc.open_sequence(tmp_path / "b.pc2").mesh.points) == len(Surface.load(tmp_path / "a.obj").points) == len(points)
 
 
 @pytest.mark.parametrize("at", ["vertices", "corners"])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from .file_faces import FileFaces
-from .mesh import READERS, Mesh
+from .mesh import READERS, Mesh, Surface
 from .obj_files import read_obj
 from .off_files import read_off
 from .ply_files import read_ply
@@ -28,8 +28,8 @@ def read_file(path, name=None, kind=Mesh):
 
     Vertices keep the order of the file. STL and glTF repeat a vertex wherever triangles differ in normal or texture, which
     would cut the cloth: there, vertices with exactly equal points are welded into the first of them. In other files, vertices
-    are welded along sides that lie exactly upon each other, as at seams. glTF node transforms are applied; lengths are taken
-    for metres. Polygons are cut into triangles as `polygons.cut` says.
+    are welded along sides that lie exactly upon each other, as at seams, but not of a `Surface`, which frames must fit. glTF
+    node transforms are applied; lengths are taken for metres. Polygons are cut into triangles as `polygons.cut` says.
 
     Texture coordinates are at vertices if each has one pair, else at the corners of triangles. They are read from OBJ, PLY and
     glTF.
@@ -52,7 +52,7 @@ def read_file(path, name=None, kind=Mesh):
     """
     faces = read_faces(path, name)
     try:
-        points, triangles, st = welded(faces).triangles()
+        points, triangles, st = (faces if issubclass(kind, Surface) else welded(faces)).triangles()
         return kind(points, triangles, texture_coordinates=st)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
