@@ -94,13 +94,10 @@ def _ears(x, outline):
         return None
     found = ring[mapbox_earcut.triangulate_float64(p[ring], np.array([len(ring)], dtype=np.uint32)).reshape(-1, 3)]
     found = _with_straight(found, count)
-    if (
-        found is None
-        or len(found) != count - 2
-        or (_cross(p[found[:, 1]] - p[found[:, 0]], p[found[:, 2]] - p[found[:, 0]]) < 0).any()
-    ):
+    if found is None or len(found) != count - 2:
         return None
-    return found
+    a, b, c = p[found].swapaxes(0, 1)
+    return None if (_cross(b - a, c - a) < 0.0).any() else found
 
 
 def _cross(a, b):
@@ -121,26 +118,17 @@ def _with_straight(triangles, count):
     used = np.zeros(count, dtype=bool)
     used[triangles] = True
     ring = np.roll(np.arange(count), -int(np.argmax(used)))
-    sides = {(t[k - 2], t[k - 1]): t[k] for t in triangles.tolist() for k in range(3)}
-    found = set(map(tuple, triangles.tolist()))
     before = ring[np.maximum.accumulate(np.where(used[ring], np.arange(count), 0))].tolist()
-    after = int(ring[0])
+    triangles, after = triangles.tolist(), int(ring[0])
     for corner, a in zip(ring[:0:-1].tolist(), before[:0:-1], strict=True):
         if not used[corner]:
-            opposite = sides.get((a, after))
-            if opposite is None:
+            t, k = next(((t, k) for t in triangles for k in range(3) if (t[k - 1], t[k]) == (a, after)), (None, 0))
+            if t is None:
                 return None
-            found -= {(a, after, opposite), (after, opposite, a), (opposite, a, after)}
-            found |= {(a, corner, opposite), (corner, after, opposite)}
-            sides |= {
-                (a, corner): opposite,
-                (corner, opposite): a,
-                (opposite, a): corner,
-                (after, opposite): corner,
-                (opposite, corner): after,
-            }
+            triangles.append([corner, after, t[k - 2]])
+            t[k] = corner
         after = corner
-    return np.array(sorted(found))
+    return np.array(triangles)
 
 
 def _crosses(p):
