@@ -22,22 +22,27 @@ def read_ply(path, data):
     """
     order, elements, line, at = _header(path, data)
     lines = [] if order else [text for _, text in text_lines(data.rstrip())]
-    found, where = {}, path
+    found = {}
+
+    def where():
+        return path if order else f"{path}, line {line}"
+
     for name, count, properties in elements:
         columns, end = _table(data, at, order, count, properties)
         rows, first = [], line + 1
         for index in range(count if columns is None else 0):
             line += 1
-            where = path if order else f"{path}, line {line}"
             try:
                 if order:
                     row, end = _binary_row(data, end, order, properties)
                 else:
                     row = _text_row(lines[line - 1].split(), properties)
             except (IndexError, struct.error):
-                raise ValueError(f"{where}: the file ends before {name} {index} of the {count} that its header says") from None
+                raise ValueError(
+                    f"{where()}: the file ends before {name} {index} of the {count} that its header says"
+                ) from None
             except ValueError as error:
-                raise ValueError(f"{where}: {name} {index} {plain_reason(error)}") from None
+                raise ValueError(f"{where()}: {name} {index} {plain_reason(error)}") from None
             rows.append(row)
         columns, at = columns or zip(*rows, strict=True), end
         found[name] = dict(zip((key for key, _, _ in properties), columns, strict=False))
@@ -51,7 +56,7 @@ def read_ply(path, data):
         raise ValueError(f"{path}: its header must have vertices with x, y and z, and faces instead of tristrips")
     if not order:
         indices = any(length for _, _, length in properties)
-        refuse_open_end(where, data, lines[-1].split()[-1], len(vertices["x"]) if indices else np.inf)
+        refuse_open_end(where(), data, lines[-1].split()[-1], len(vertices["x"]) if indices else np.inf)
 
     def at_vertices(names):
         return np.concatenate([np.asarray(vertices[name], dtype=np.float64).reshape(-1, 1) for name in names], axis=1)
