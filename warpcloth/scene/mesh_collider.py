@@ -147,9 +147,14 @@ class MeshCollider(Collider):
     @cached_property
     def closed(self) -> bool:
         """Whether it has an inside: it encloses a volume, and each side of a triangle is that of as many others reversed."""
-        sides = self._welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        forth, back = (np.sort(each @ [sides.max() + 1, 1]) for each in (sides, sides[:, ::-1]))
+        forth, back = self._directed_sides
         return np.array_equal(forth, back) and any(abs(self._filling(vertices)) > _FLAT for vertices in self.frames)
+
+    @cached_property
+    def _directed_sides(self):
+        """The sides of triangles in their direction and reversed, as sorted numbers (3T,) each."""
+        sides = self._welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        return [np.sort(each @ [sides.max() + 1, 1]) for each in (sides, sides[:, ::-1])]
 
     @cached_property
     def faces_inwards(self) -> bool:
@@ -172,7 +177,8 @@ class MeshCollider(Collider):
         found = np.linalg.norm(away, axis=1)
         if self.closed:
             behind = np.einsum("ki,ki->k", away, self._normals(vertices, faces, weights)) < 0.0
-            if not self.faces_inwards:  # normals are of no use where a front and a back coincide
+            doubled = (np.diff(self._directed_sides[0]) == 0).any()
+            if doubled and not self.faces_inwards:  # normals are of no use where a front and a back coincide
                 nearest = np.einsum("kc,kci->ki", weights[behind], vertices[self.triangles[faces[behind]]])
                 behind[behind] = winding_numbers(away[behind] + nearest, vertices[self.triangles]) > 0.5
             found = np.where(behind, -found, found)  # one that has shrunk to a point has no normals, and nothing is behind
