@@ -11,7 +11,7 @@ _FLAT = 1e-4  # ratio of height to longest side below which a triangle is flippe
 def without_slivers(points, triangles):
     """Returns triangles (T, 3) with area for the same surface.
 
-    A triangle with two corners at one position is removed. A triangle with its corners on a line, as beside a vertex on the side
+    A triangle with two corners at one position is removed. A triangle with its corners on a line, as beside a vertex on a side
     of another triangle, flips its longest side with the triangle across it.
 
     Raises:

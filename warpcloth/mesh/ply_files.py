@@ -94,9 +94,9 @@ def _header(path, data):
                 *length, kind = (_TYPES[word] for word in words[:-1] if word != "list")
                 elements[-1][2].append((words[-1], kind, *(length or [""])))
         except (ValueError, LookupError):
-            rules = {"format": " or ".join(_ORDERS), "element": "an element, its name and its count"}
+            allowed = {"format": " or ".join(_ORDERS), "element": "an element, its name and its count"}
             raise ValueError(
-                f"{path}, line {line}: must be {rules.get(keyword, 'a property, its type and its name')}"
+                f"{path}, line {line}: must be {allowed.get(keyword, 'a property, its type and its name')}"
             ) from None
     if order is None:
         raise ValueError(f"{path}: its header has no format")
