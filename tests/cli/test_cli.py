@@ -23,6 +23,7 @@ import warpcloth.cli.terminal
 import warpcloth.usd
 from support.command_line import refused, run
 from support.rows import slow_but
+from support.stage_texts import STAGE
 from warpcloth.base.outputs import Lock
 from warpcloth.base.texts import convert
 from warpcloth.cli import _parser, main
@@ -436,6 +437,22 @@ def test_a_step_that_is_stable_only_about_rest_warns_in_one_line(capfd):
     code, out, err = run(capfd, "info", *SMALL, "--solver", "explicit", "-s", f"substeps={substeps - 1}")
     assert code == 0 and "in motion below" in out
     assert err.startswith("warpcloth: warning: dt is ") and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", [("run", "-o", "out.usda"), ("info",), ("bench",)])
+def test_warnings_are_shown_once_and_those_of_libraries_never(tmp_path, capfd, monkeypatch, command):
+    """A stage is read for the scene and again below its animation. NumPy warns of arrays that have nothing but NaN."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cloth.usda").write_text(re.sub(r"point3f\[\] points = .*", "", STAGE))
+    (tmp_path / "warns.py").write_text(
+        "import numpy as np\nfrom warpcloth.usd import read_scene\n\ndef scene():\n"
+        "    np.nanmax([np.nan]), np.log(0.0), np.nanmean([])\n"
+        "    return read_scene('cloth.usda')\n"
+    )
+    name, *more = command
+    for source in ("cloth.usda", "warns.py"):
+        code, _, err = run(capfd, name, source, *more, *(["--frames", "1"] if name != "info" else []))
+        assert code == 0 and err.count("no default value") == err.count("warning") == 1
 
 
 @pytest.mark.parametrize(

@@ -255,6 +255,7 @@ def folder(tmp_path, monkeypatch):
         result(*({k: v for k, v in each.items() if k not in ("copies", "threads")} for each in OLD["rows"]))
     )
     files |= {"text": "no result", "list": "[]", "rows": '{"rows": [{}], "machine": {}}', "number": '{"rows": 3}'}
+    files |= {"twice": '{"rows": [], ' + json.dumps(NEW)[1:], "deep": "[" * 100_000, "digits": "1" * 5001}
     for name, text in files.items():
         (tmp_path / f"{name}.json").write_text(text, encoding="utf-8")
     return tmp_path
@@ -448,6 +449,10 @@ def test_scenes_without_sizes_are_taken_as_they_are(monkeypatch, tmp_path):
         ("bench --compare list.json new.json", "list.json: is no result of benchmarks"),
         ("bench --compare rows.json new.json", "rows.json: is no result of benchmarks"),
         ("bench --compare number.json new.json", "number.json: is no result of benchmarks"),
+        *(
+            (f"bench --compare old.json {name}.json", f"{name}.json: is no result of benchmarks")
+            for name in ("twice", "deep", "digits")
+        ),
         ("bench --compare old.json alone.json", "have no row in common that was measured in both"),
     ],
 )

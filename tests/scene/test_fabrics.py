@@ -260,7 +260,11 @@ def test_a_material_of_the_published_code_is_its_record(tmp_path):
     [
         ("a.json", "{", "a.json, line 1: Expecting property name"),
         ("a.json", '{"density": 0.1, "stretching": [1, 2, 3, 4]}', "a.json: has no bending; a material of ARCSim must"),
-        ("a.json", ARCSIM.replace("100,", ""), r"a.json: stretching begins with \[50, 10, 30\]; it must be a row of 4 numbers"),
+        (
+            "a.json",
+            ARCSIM.replace("100,", ""),
+            r"a.json: stretching begins with \[50.0, 10.0, 30.0\]; it must be a row of 4 numbers",
+        ),
         ("a.json", ARCSIM.replace("[1, 1], ", ""), "a.json: bending is .*; it must be rows of numbers"),
         ("a.json", ARCSIM.replace("0.2", "-1"), "a.json: Fabric.density is -1"),
         ("a.json", '{"note": "für"}', "a.json: is no text in UTF-8, 'utf-8' codec can't decode byte 0xfc in position 11"),
@@ -276,10 +280,54 @@ def test_a_material_of_the_published_code_is_its_record(tmp_path):
         ("a.csv", "name,W,LT\nwool,1,1\nwool,1,1\n", "a.csv, line 3: name is 'wool', as before; each fabric must have its own"),
         ("a.csv", "name,W,B1,B warp,LT\nwool,1,1,1,1\n", "a.csv: columns 'B1' and 'B warp' are the same number"),
         ("a.csv", "name,W,LT\nwool,,1\n", "a.csv, line 2: fabric 'wool' has no W, the weight"),
-        ("a.csv", "name,W,LT\nwool,1,-1\n", "a.csv, line 2: LT is -1.0; it must be a finite number above 0"),
-        ("a.csv", "name,W,E5,E20\nwool,1,2,1\n", "a.csv, line 2: E20 of direction 1 is 1, E5 is 2; E20 must be larger"),
-        ("a.csv", "name,W,E5,E20\nwool,1,2,2\n", "a.csv, line 2: E20 of direction 1 is 2, E5 is 2; E20 must be larger"),
-        ("a.json", ARCSIM.replace("10, 100", "80, 20"), r"begins with \[50, 80, 20, 30\], .*; k₁₂² must be below k₁k₂"),
+        ("a.csv", "name,W,LT\nwool,1,-1\n", "a.csv, line 2: LT is -1.0; it must be a number from 0.0001 to 1e"),
+        (
+            "a.csv",
+            "name,W,E5,E20\nwool,1,2,1\n",
+            "a.csv, line 2: E20 of direction 1 is 1.0, E5 is 2.0; E20 must be larger by 0.005 or more",
+        ),
+        (
+            "a.csv",
+            "name,W,E5,E20\nwool,1,2,2\n",
+            "a.csv, line 2: E20 of direction 1 is 2.0, E5 is 2.0; E20 must be larger by 0.005 or more",
+        ),
+        (
+            "a.csv",
+            "name,W,E5,E20\nwool,1,1,1.0000000000000002\n",
+            "E20 of direction 1 is 1.0000000000000002, E5 is 1.0; E20 must",
+        ),
+        *(
+            (
+                "a.csv",
+                f"name,W,{names}\nwool,1,{numbers}\n",
+                r"a.csv, line 2: \w+ is \S+; it must be a number from 0.0001 to 1e",
+            )
+            for names, numbers in (
+                ("EMT,WT", "1e-300,10"),
+                ("EMT,WT", "5,inf"),
+                ("WT,LT", "1e-320,0.6"),
+                ("EMT,LT", "1e300,0.6"),
+                ("E5,E20", "1e-320,2e-320"),
+                ("E100", "nan"),
+                ("E100,C", "1,1e200"),
+                ("LT,G1,G2", "1,1e308,1e308"),
+            )
+        ),
+        ("a.csv", "name,W,EMT,WT\nwool,1,0.001,8\n", "WT of direction 1 is 8; it must be at most 500 gf/cm·EMT, 0.005"),
+        (
+            "a.json",
+            ARCSIM.replace("{", '{"density": 1, ', 1),
+            "a.json: 'density' occurs twice in one JSON object; each name must",
+        ),
+        ("a.json", ARCSIM.replace("{", '{"note": {"a": 1, "a": 1}, ', 1), "a.json: 'a' occurs twice in one JSON object"),
+        ("a.json", ARCSIM.replace("0.2", "1" * 5001), "a.json: Fabric.density is inf; it must be a number above 0, and finite"),
+        (
+            "a.json",
+            ARCSIM.replace("100,", "1" * 400 + ","),
+            r"a.json: stretching begins with \[50.0, 10.0, inf, 30.0\]; it must",
+        ),
+        ("a.json", "[" * 100_000, "a.json: is nested too deeply; it must be a JSON object"),
+        ("a.json", ARCSIM.replace("10, 100", "80, 20"), r"begins with \[50.0, 80.0, 20.0, 30.0\], .*; k₁₂² must be below k₁k₂"),
         ("a.json", ARCSIM.replace("100, 30", "100, 0"), "the fourth number must be above 0"),
         ("a.json", ARCSIM.replace("24e-6", "-24e-6"), "bending begins with -2.4e-05 at 0° and 1.6e-05 at 90°; they must be"),
     ],

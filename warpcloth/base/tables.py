@@ -1,4 +1,4 @@
-"""Reads tables from CSV files."""
+"""Reads tables from CSV files, and checks the names of JSON objects."""
 
 import csv
 
@@ -43,3 +43,17 @@ def number_in(path: FilePath, line: int, name: str, text: str) -> float:
         return float(text)
     except ValueError:
         raise ValueError(f"{path}, line {line}: {name} is {shown(text)}; it must be a number") from None
+
+
+def distinct(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    """Returns a JSON object, for ``object_pairs_hook`` of `json.loads`.
+
+    Raises:
+        ValueError: Two values have one name; `json` would keep the last.
+    """
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{shown(twice)} occurs twice in one JSON object; each name must occur once")
+    return found

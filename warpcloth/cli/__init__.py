@@ -43,7 +43,7 @@ from . import (
     scenes,
     view,
 )
-from .terminal import DTYPES, Printable, say, show_warning
+from .terminal import DTYPES, Printable, say, warnings_once
 
 
 def main(argv=None):
@@ -56,9 +56,7 @@ def main(argv=None):
         int: The exit code.
     """
     with warnings.catch_warnings(), contextlib.redirect_stdout(Printable(sys.stdout)), Interrupts() as interrupts:
-        warnings.showwarning = show_warning
-        # NumPy's warnings about infinite and NaN values, which the code reports itself or expects.
-        warnings.filterwarnings("ignore", ".* encountered in ", RuntimeWarning)
+        warnings.showwarning = warnings_once()
         warnings.filterwarnings("default", category=DeprecationWarning, module=r"warpcloth\.")  # an option has another name now
         debug = False
         try:

@@ -235,8 +235,17 @@ def aligned(rows, right=()):
     return ["  ".join(pad(text, width) for pad, text, width in zip(pads, row, widths, strict=True)).rstrip() for row in rows]
 
 
-def show_warning(message, category, filename, lineno, file=None, line=None):
-    print(f"warpcloth: warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)
+def warnings_once():
+    """Returns a function for `warnings.showwarning` that shows each text once, and no categories that only libraries use."""
+    texts = set()
+
+    def show(message, category, filename, lineno, file=None, line=None):
+        text = printable(" ".join(str(message).split()))
+        if category in (UserWarning, DeprecationWarning) and text not in texts:
+            texts.add(text)
+            print("warpcloth: warning:", text, file=sys.stderr)
+
+    return show
 
 
 def say(message, code):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.outputs import write_table
+from ..base.tables import distinct
 
 # Columns that identify a row in two results.
 _SAME = ("scene", "parameters", "solver", "options", "device", "dtype", "copies", "threads")
@@ -113,12 +114,12 @@ def read(path):
         ValueError: The file has no such result.
     """
     try:
-        found = json.loads(Path(path).read_text(encoding="utf-8"))
+        found = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=distinct)
         found["rows"] = [{"copies": 1, "threads": 1, **row} for row in found["rows"]]  # of before there were more
         known = {*_SAME, "label", "status", "ms", "spread", "launches", "bytes", "start_s", "memory"}
         if all(known <= set(row) for row in found["rows"]) and {"device", "processor"} <= set(found["machine"]):
             return found
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         pass
     raise ValueError(f"{path}: is no result of benchmarks; it must be what warpcloth bench --json prints")
 

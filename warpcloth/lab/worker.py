@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import warnings
 
 from ..base.collector import collector_paused
 from ..base.extensions import load_extension
@@ -12,12 +13,13 @@ from ..base.quiet import initialise_warp
 
 
 def begin(modules):
-    """Starts a process of a campaign: loads Warp and extensions.
+    """Starts a process of a campaign: loads Warp and extensions. It shows no warnings, because the parent process has them.
 
     An interrupt ends the process without a message, because the parent process reports it. It also ends if the parent is
     killed, because otherwise it would wait forever.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    warnings.simplefilter("ignore")
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     with collector_paused():
         initialise_warp()

@@ -6,13 +6,15 @@ import re
 from pathlib import Path
 
 from ..base.checks import shown
-from ..base.tables import number_in, read_table
+from ..base.tables import distinct, number_in, read_table
 from ..base.types import FilePath
 from .fabric import Fabric
 
 _GRAM_FORCE = 9.80665e-3  # [N], exactly
 _PER_CM = 100.0 * _GRAM_FORCE  # gf/cm [N/m]
 _ROUNDED = 0.1  # largest logarithm of the ratio of a linearity to that from EMT and WT; tables round them
+_MIN, _MAX = 1e-4, 1e6  # of a reading, in the unit of the device
+_RESOLVED = 0.005  # smallest difference of two extensions from which a modulus follows [%]
 _ENDS = {"1": 1, "warp": 1, "2": 2, "weft": 2}
 
 _ARCSIM = (
@@ -61,7 +63,7 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
     Raises:
         OSError: The file cannot be read.
         ValueError: It is of another kind, a name occurs twice, a number is not allowed, EMT, WT and LT contradict, or E20 is
-            not above E5.
+            not above E5 by 0.005 %.
     """
     ending = Path(path).suffix.lower()
     if ending == ".json":
@@ -78,11 +80,16 @@ def _arcsim(path):
     """Returns the fabric of a material file, in which // begins a comment."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
-        found = json.loads(re.sub(r'("(?:[^"\\]|\\.)*")|//[^\n]*', lambda match: match[1] or "", text))
+        text = re.sub(r'("(?:[^"\\]|\\.)*")|//[^\n]*', lambda match: match[1] or "", text)
+        found = json.loads(text, parse_int=float, object_pairs_hook=distinct)  # int() refuses very many digits
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}, line {error.lineno}: {error.msg}; it must be JSON") from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is no text in UTF-8, {error}") from None
+    except RecursionError:
+        raise ValueError(f"{path}: is nested too deeply; it must be a JSON object of numbers and rows of numbers") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     if not isinstance(found, dict):
         raise ValueError(f"{path}: is {shown(found)}; it must be a JSON object")
     for name in ("density", "stretching", "bending"):
@@ -129,8 +136,9 @@ def _table(path):
             )
         values = {key: number_in(path, line, names[k], row[k]) for key, k in keys.items() if row[k]}
         for key, value in values.items():
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{path}, line {line}: {names[keys[key]]} is {value}; it must be a finite number above 0")
+            if not _MIN <= value <= _MAX:
+                rule = f"it must be a number from {_MIN:g} to {_MAX:g}, in the unit of the device"
+                raise ValueError(f"{path}, line {line}: {names[keys[key]]} is {value}; {rule}")
         try:
             given = convert(values)
         except ValueError as error:
@@ -189,6 +197,10 @@ def _of_kes(values):
         strain = None if percent is None else percent / 100.0
         work = None if work is None else work * _PER_CM  # gf·cm/cm² is gf/cm
         derived = 2.0 * work / (force * strain) if work and strain else None
+        if derived and derived > 2.0:
+            raise ValueError(
+                f"WT of direction {direction} is {work / _PER_CM:g}; it must be at most 500 gf/cm·EMT, {500.0 * strain:g}"
+            )
         if derived and linearity and abs(math.log(derived / linearity)) > _ROUNDED:
             raise ValueError(
                 f"LT of direction {direction} is {linearity:g}, but 2WT/(500 gf/cm·EMT) is {derived:.3g}; must agree to 10 %"
@@ -218,8 +230,10 @@ def _of_fast(values):
         low, middle, high, D, length = (values.get((name, direction)) for name in ("E5", "E20", "E100", "B", "C"))
         modulus = "E₁t" if direction == 1 else "E₂t"
         if low is not None and middle is not None:
-            if not middle > low:
-                raise ValueError(f"E20 of direction {direction} is {middle:g}, E5 is {low:g}; E20 must be larger")
+            if not middle - low >= _RESOLVED:
+                raise ValueError(
+                    f"E20 of direction {direction} is {middle}, E5 is {low}; E20 must be larger by {_RESOLVED} or more"
+                )
             moduli.append(15.0 * _PER_CM / ((middle - low) / 100.0))
             notes += f" {modulus} is from E20 − E5."
         else:

@@ -12,7 +12,7 @@ from .stage import (
     local_to_metres,
     moving_space,
     open_stage,
-    read_stage_mesh,
+    stage_mesh,
     triangles_of_faces,
 )
 from .targets import SAMPLED, Target
@@ -234,7 +234,7 @@ def over_layer(source, prim, mesh, primvars, history, layer=None):
     Raises:
         ValueError: As for `read_stage_mesh` and `artist_prim`; or a primvar of the artist has another type than float[].
     """
-    surroundings = read_stage_mesh(source, prim)
+    surroundings = stage_mesh(source, prim)
     stage, artist = artist_prim(surroundings, mesh)
     identity = np.array_equal(surroundings.transform, np.eye(4))
     target = artist_target(artist, surroundings, primvars, transform=None if identity else surroundings.transform)

@@ -75,6 +75,18 @@ def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = 
             missing, is not a mesh, or refers to a missing file. Or its transform cannot be inverted, its topology changes, a
             face crosses itself or is far from planar, or its points and topology do not make a valid `Mesh`.
     """
+    found = stage_mesh(path, prim, kind, time)
+    if time is None and not found.rest:
+        warnings.warn(
+            f"{path}, prim {found.prim}: points have no default value; their first sample is taken as the rest shape. "
+            "This is deprecated: author the rest shape as the default",
+            stacklevel=2,
+        )
+    return found
+
+
+def stage_mesh(path, prim=None, kind=Mesh, time=None):
+    """Reads the same as :func:`read_stage_mesh`, without its warning."""
     with sentences(path):
         return _stage_mesh(open_stage(path), path, prim, kind, time)
 
@@ -90,7 +102,7 @@ def _stage_mesh(stage, path, prim, kind, time):
     point_vertices = None
     up_axis = str(UsdGeom.GetStageUpAxis(stage))
     try:
-        points = placed(_rest_points(found, where, time), transform)
+        points = placed(_rest_points(found, time), transform)
         if time is None:
             refuse_moving_topology(found)
         if found.IsA(UsdGeom.Mesh):
@@ -375,10 +387,10 @@ def first_points(point_vertices):
     return np.unique(point_vertices, return_index=True)[1]
 
 
-def _rest_points(prim, where, time=None):
+def _rest_points(prim, time=None):
     """Points (P, 3) float64 in the space of the prim, at the default time.
 
-    Without a default value, those at ``time``, or if that is None the first sample, with a warning.
+    Without a default value, those at ``time``, or if that is None the first sample.
     """
     attribute = UsdGeom.PointBased(prim).GetPointsAttr()
     codes = time_codes_of(attribute)
@@ -386,13 +398,7 @@ def _rest_points(prim, where, time=None):
     if points is None and time is not None:
         points = array_of(attribute, (3,), time=time)
     elif points is None and codes:
-        first = codes[0]
-        warnings.warn(
-            f"{where}: points have no default value; the sample at time code {first:g} is taken as the rest shape. "
-            "This is deprecated: author the rest shape as the default",
-            stacklevel=6,
-        )
-        points = array_of(attribute, (3,), time=first)
+        points = array_of(attribute, (3,), time=codes[0])
     if points is None or len(points) == 0:
         raise ValueError("has no points")
     return points.astype(np.float64)
