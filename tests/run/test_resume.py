@@ -293,6 +293,25 @@ def test_where_there_is_nothing_to_resume_that_is_said(tmp_path, device):
         wc.simulate(scene, solver, output=output, device=device, resume=True)
 
 
+def test_a_checkpoint_with_any_damaged_byte_is_refused_or_whole(tmp_path):
+    facts = {name: name for name in ("code", "scene")}
+    written = Checkpoint(9, facts, [[0.0, "frames_000000.usdc"]], [0.0, 9.0], {"x": np.arange(3.0)}, {"0 seconds": np.ones(2)})
+    written.write(tmp_path)
+    (path,) = tmp_path.iterdir()
+    data, refusals = path.read_bytes(), 0
+    for k in range(len(data)):
+        path.write_bytes(data[:k] + bytes([data[k] ^ 0x41]) + data[k + 1 :])
+        try:
+            read = Checkpoint.read(path)
+        except ValueError as error:
+            refusals += 1
+            assert str(error) == f"{path}: is no checkpoint that can be read; run without resume to begin anew"
+        else:  # dates, and what the central directory of the file repeats
+            assert (read.frame, read.facts, read.chunks, read.span) == (9, facts, written.chunks, written.span)
+            np.testing.assert_equal([read.state, read.watch], [written.state, written.watch])
+    assert refusals > len(data) / 2
+
+
 def test_a_run_diverges_where_it_would_have_and_is_over_then(tmp_path, device):
     scene, solver = hanging.scene(n=8), wc.XPBD(substeps=4, iterations=4, relaxation=1.85)
     whole = wc.simulate(scene, solver, output=str(tmp_path / "whole.usdc"), device=device)

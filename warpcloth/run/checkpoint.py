@@ -5,7 +5,6 @@ A run that writes a file replaces its checkpoint, beside the frames, after each 
 
 import json
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,9 +72,10 @@ class Checkpoint:
         Raises:
             OSError: It cannot be written; the older one stays.
         """
-        about = json.dumps({"frame": self.frame, "facts": self.facts, "chunks": self.chunks, "span": self.span})
         arrays = {f"state {name}": values for name, values in self.state.items()}
         arrays |= {f"watch {name}": values for name, values in self.watch.items()}
+        facts = {"frame": self.frame, "facts": self.facts, "chunks": self.chunks, "span": self.span}
+        about = json.dumps([facts, list(arrays)])
         path = Path(folder) / NAME
         unfinished = path.with_suffix(".unfinished")
         try:
@@ -95,13 +95,12 @@ class Checkpoint:
         """
         try:
             with np.load(path) as file:
-                about, parts = json.loads(str(file["about"])), {"state": {}, "watch": {}}
-                for key in file.files:
+                (facts, keys), parts = json.loads(str(file["about"])), {"state": {}, "watch": {}}
+                for key in keys:
                     part, _, name = key.partition(" ")
-                    if part in parts:
-                        parts[part][name] = file[key]
-                return cls(**about, **parts)
-        except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile):
+                    parts[part][name] = file[key]
+                return cls(**facts, **parts)
+        except Exception:  # zipfile and NumPy raise errors of many types for a damaged file
             raise ValueError(f"{path}: is no checkpoint that can be read; run without resume to begin anew") from None
 
     def refuse_other(self, output, facts):
