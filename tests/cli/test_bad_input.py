@@ -388,6 +388,40 @@ def test_a_full_disk_at_the_last_file_loses_nothing(tmp_path, ending):
     np.testing.assert_array_equal(FrameSequence(writer.path), frames)
 
 
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        *(("convert cloth.usda", f"a.{ending}") for ending in ("npz", "mdd")),
+        *(("render cloth.usda --size 64x48 -o", f"a.{ending}") for ending in ("png", "gif", "webp", "mp4")),
+        ("view cloth.usda -o", "a.html"),
+        ("analyze cloth.usda --csv", "a.csv"),
+        *(("analyze cloth.usda --plot", f"a.{ending}") for ending in ("png", "svg", "pdf")),
+        ("check cloth.usda --csv", "a.csv"),
+        ("compare cloth.usda cloth.usda --csv", "a.csv"),
+    ],
+)
+def test_a_full_disk_is_said_with_the_name_of_the_file(tmp_path, monkeypatch, capfd, command, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cloth.usda").write_text(MOVED)
+    assert main([*command.split(), f"before.{name[2:]}"]) in (0, 1)  # compiles kernels, which need room too
+    files = set(os.listdir())
+    capfd.readouterr()
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40, limit[1]))
+    try:
+        assert main([*command.split(), name]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert capfd.readouterr().err == f"warpcloth: {name}: File too large\n" and set(os.listdir()) == files
+
+
+def test_a_full_disk_behind_the_standard_output_is_said():
+    command = [sys.executable, "-m", "warpcloth", "fabrics"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (2, "warpcloth: the standard output: No space left on device\n")
+
+
 @pytest.mark.parametrize("kept", [0.5, 0.99])
 def test_a_package_that_is_cut_is_not_taken_for_whole(tmp_path, monkeypatch, kept):
     """pxr does not notice that the disk is full while it packs, so the package is read before the frames are removed."""

@@ -102,6 +102,8 @@ class Output:
             self.close()
         else:
             self.discard()
+            if (named := self.named(error)) is not error:
+                raise named from error
 
     def complete(self):
         """Completes the file under its temporary name, so that `close` only renames it. Further calls do nothing."""
@@ -118,9 +120,15 @@ class Output:
                 self.complete()
                 os.replace(self._unfinished, self._target)
                 self.finished = True
-        except BaseException:
+        except BaseException as error:
             self.discard()
-            raise
+            raise self.named(error) from None
+
+    def named(self, error):
+        """Returns an error with the path in place of one of the system that names no path, such as that of a full disk."""
+        if isinstance(error, OSError) and error.errno is not None and error.filename in (None, self._unfinished):
+            return OSError(error.errno, error.strerror, self.path)
+        return error
 
     def discard(self):
         """Removes the temporary file; an older file at the path stays."""
@@ -170,8 +178,11 @@ class OutputSet:
         with deferred():
             output = Output(path, "xb")
             self._outputs.append(output)
-        yield output.file
-        output.complete()
+        try:
+            yield output.file
+            output.complete()
+        except OSError as error:
+            raise output.named(error) from error
 
 
 def write_table(path, columns, rows):

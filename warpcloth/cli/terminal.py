@@ -273,6 +273,9 @@ class Printable:
         except BrokenPipeError:  # Python flushes what is left when it exits
             with open(os.devnull, "wb") as nowhere:
                 os.dup2(nowhere.fileno(), self._stream.fileno())
+        except OSError as error:
+            error.filename = error.filename or "the standard output"
+            raise
         return len(text)
 
     def __getattr__(self, name):

@@ -1,6 +1,7 @@
 """Figures of matplotlib without pyplot, which has global state and needs a window system."""
 
 import importlib.util
+from io import BytesIO
 from pathlib import Path
 
 from ..base.outputs import OutputSet, check_replaceable
@@ -54,4 +55,6 @@ def save(figure, path):
     ending = Path(path).suffix.lower()
     # Ids in an SVG are random without a salt.
     with rc_context({"svg.hashsalt": "warpcloth"}), OutputSet() as outputs, outputs.writing(path) as file:
-        figure.savefig(file, format=ending[1:], dpi=150, facecolor="white", metadata=_METADATA[ending])
+        found = BytesIO()  # after an error of a file, matplotlib raises another, of zlib
+        figure.savefig(found, format=ending[1:], dpi=150, facecolor="white", metadata=_METADATA[ending])
+        file.write(found.getvalue())
