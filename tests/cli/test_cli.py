@@ -439,6 +439,19 @@ def test_a_step_that_is_stable_only_about_rest_warns_in_one_line(capfd):
     assert err.startswith("warpcloth: warning: dt is ") and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "closes", ["sys.stdout.close()", "sys.stderr.close()", "os.close(1)", "os.close(2)", "os.closerange(1, 3)"]
+)
+@pytest.mark.parametrize("ends", ["", "raise ValueError", "sys.exit(0)"])
+def test_a_module_that_closes_the_output_ends_with_a_sentence(tmp_path, closes, ends):
+    (tmp_path / "closes.py").write_text(f"import os, sys\n{closes}\n{ends}\n")
+    command = [sys.executable, "-m", "warpcloth", "scenes", "--import", str(tmp_path / "closes.py")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    *before, line = done.stderr.splitlines()
+    assert line == "warpcloth: a scene or a module closed the standard output or error; it must leave them open"
+    assert done.returncode == 2 and all("cannot be imported" in each for each in before)
+
+
 @pytest.mark.parametrize("command", [("run", "-o", "out.usda"), ("info",), ("bench",)])
 def test_warnings_are_shown_once_and_those_of_libraries_never(tmp_path, capfd, monkeypatch, command):
     """A stage is read for the scene and again below its animation. NumPy warns of arrays that have nothing but NaN."""

@@ -43,7 +43,7 @@ from . import (
     scenes,
     view,
 )
-from .terminal import DTYPES, Printable, say, warnings_once
+from .terminal import DTYPES, Printable, StandardStreams, say, warnings_once
 
 
 def main(argv=None):
@@ -55,6 +55,12 @@ def main(argv=None):
     Returns:
         int: The exit code.
     """
+    with StandardStreams() as streams:
+        streams.code = _run(argv)
+    return streams.code
+
+
+def _run(argv):
     with warnings.catch_warnings(), contextlib.redirect_stdout(Printable(sys.stdout)), Interrupts() as interrupts:
         warnings.showwarning = warnings_once()
         warnings.filterwarnings("default", category=DeprecationWarning, module=r"warpcloth\.")  # an option has another name now

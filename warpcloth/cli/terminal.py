@@ -1,6 +1,7 @@
 """Parts that all commands share: device, outputs, progress and results on a terminal, and where measurements run."""
 
 import contextlib
+import errno
 import os
 import shutil
 import sys
@@ -273,10 +274,47 @@ class Printable:
         except BrokenPipeError:  # Python flushes what is left when it exits
             with open(os.devnull, "wb") as nowhere:
                 os.dup2(nowhere.fileno(), self._stream.fileno())
-        except OSError as error:
-            error.filename = error.filename or "the standard output"
-            raise
+        except (OSError, ValueError) as error:
+            if isinstance(error, OSError) and error.errno != errno.EBADF:
+                error.filename = error.filename or "the standard output"
+                raise
+            # A module closed it, which :class:`StandardStreams` reports.
         return len(text)
 
     def __getattr__(self, name):
         return getattr(self._stream, name)
+
+
+class StandardStreams:
+    """Opens the standard output and error again if a scene or a module closed one during the block, and says so.
+
+    Attributes:
+        code: The exit code; 2 if one was closed.
+    """
+
+    code = 2
+
+    def __enter__(self):
+        self._copies = {}
+        for number in (1, 2):
+            with contextlib.suppress(OSError):  # the process may have started without
+                self._copies[number] = os.dup(number)
+        return self
+
+    def __exit__(self, kind, error, trace):
+        streams, closed = {1: sys.stdout, 2: sys.stderr}, False
+        for number in self._copies:
+            try:
+                os.fstat(number)
+                closed |= streams[number].closed
+            except (AttributeError, OSError):
+                closed = True
+        if closed:
+            for number, copy in self._copies.items():
+                os.dup2(copy, number)
+            sys.stderr = open(2, "w", closefd=False)
+            message = "a scene or a module closed the standard output or error; it must leave them open"
+            self.code = say(message, 2)
+        for copy in self._copies.values():
+            os.close(copy)
+        return closed
