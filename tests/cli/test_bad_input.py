@@ -415,6 +415,36 @@ def test_a_full_disk_is_said_with_the_name_of_the_file(tmp_path, monkeypatch, ca
     assert capfd.readouterr().err == f"warpcloth: {name}: File too large\n" and set(os.listdir()) == files
 
 
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("view cloth.usda -o", "a.html"),
+        *(("render cloth.usda -o", f"a.{ending}") for ending in ("png", "gif", "mp4")),
+        ("convert cloth.usda", "a.npz"),
+        ("analyze cloth.usda --csv", "a.csv"),
+        ("analyze cloth.usda --plot", "a.png"),
+        ("analyze cloth.usda -o", "a.usdc"),
+        ("compare cloth.usda cloth.usda --csv", "a.csv"),
+        ("check cloth.usda --csv", "a.csv"),
+        ("run cloth.usda -o o.usdc --film", "a.gif"),
+        ("run cloth.usda -o o.usdc --csv", "a.csv"),
+        ("run cloth.usda -o o.usdc --report", "a.json"),
+        ("run cloth.usda -o", "a.usdc"),
+    ],
+)
+@pytest.mark.parametrize("there", [True, False], ids=["", "dangling"])
+def test_a_link_to_a_file_of_another_kind_is_not_written_through(tmp_path, monkeypatch, capfd, command, name, there):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cloth.usda").write_text(MOVED)
+    os.symlink("mine.py", name)
+    if there:
+        (tmp_path / "mine.py").write_text("x = 1")
+    before = set(os.listdir())
+    assert main([*command.split(), name]) == 2
+    assert re.search(r"mine\.py; it must end (as that does|with one of .*)\n$", capfd.readouterr().err)
+    assert set(os.listdir()) == before and (not there or (tmp_path / "mine.py").read_text() == "x = 1")
+
+
 def test_a_full_disk_behind_the_standard_output_is_said():
     command = [sys.executable, "-m", "warpcloth", "fabrics"]
     with open("/dev/full", "w") as full:

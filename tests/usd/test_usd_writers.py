@@ -309,19 +309,55 @@ def test_a_run_that_was_cut_short_is_recovered_under_its_own_name(tmp_path, cut)
     np.testing.assert_allclose(again[-1], motion(mesh, 2 * CHUNK - 1)[0], atol=4 * EPS)
 
 
-def test_no_root_is_left_whose_layers_are_gone(tmp_path, monkeypatch):
-    """The process dies while it removes the folder of a package that is finished, in whatever order the files go."""
-    output = tmp_path / "out.usdz"
+@pytest.mark.parametrize("last", ["animation.usdc", "rest.usdc", "frames_000000.usdc"])
+def test_no_root_is_left_whose_layers_are_gone(tmp_path, monkeypatch, last):
+    """The process dies while it removes the folder of a package that is finished; the next one removes what is left of it."""
+    output, remove = tmp_path / "out.usdz", os.remove
 
-    def killed(folder, *_):
-        (folder / "rest.usdc").unlink()
-        raise KeyboardInterrupt
+    def killed(path):
+        remove(path)
+        if Path(path).name == last:
+            raise KeyboardInterrupt
 
-    monkeypatch.setattr(chunks.shutil, "rmtree", killed)
-    with pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(os, "remove", killed)
         write(output, Mesh.grid(5, 4))
     assert len(FrameSequence(output)) == FRAMES
     assert list(tmp_path.rglob("manifest.usda")) and not list(tmp_path.rglob("animation.usdc"))
+    write(output, Mesh.grid(5, 4))
+    assert [path.name for path in tmp_path.iterdir()] == ["out.usdz"]
+
+
+@pytest.mark.parametrize("ending", ["usdc", "usdz"])
+@pytest.mark.parametrize("linked", [False, True], ids=["folder", "linked folder"])
+def test_a_run_removes_no_files_but_those_of_runs(tmp_path, ending, linked):
+    """Folders that are called like those of runs, what users put into those, and all that is behind links."""
+    output, elsewhere = tmp_path / f"out.{ending}", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for name in ("animation.usdc", "rest.usdc", "frames_000000.usdc", "manifest.usda", "mine.txt"):
+        (elsewhere / name).write_text(name)
+    killed = AnimationWriter(output, Mesh.grid(5, 4), 24, chunk=CHUNK)
+    for frame in range(CHUNK):
+        killed.append(*motion(Mesh.grid(5, 4), frame))
+    earlier, folder = killed.run, killed.run.parent
+    del killed
+    gc.collect()
+    (earlier / "mine.txt").write_text("mine")
+    (earlier / "frames_000009.usdc").symlink_to(elsewhere / "frames_000000.usdc")
+    shutil.copytree(elsewhere, folder / f"{ending}-0123abcd")
+    (folder / f"{ending}-4567abcd").symlink_to(elsewhere)
+    (folder / "notes").mkdir()
+    (elsewhere / "manifest.usda").write_text(f'"{ending}-4567abcd"')
+    if linked:
+        folder.rename(tmp_path / "disk")
+        folder.symlink_to(tmp_path / "disk")
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*") if path != output}
+    write(output, Mesh.grid(5, 4))
+    gone = {path for path in before if not os.path.lexists(path)}
+    assert {path.parent for path in gone} <= {earlier} and not (linked and gone)
+    assert linked or {path.name for path in earlier.iterdir()} == {"mine.txt"}
+    assert all(path.read_bytes() == data for path, data in before.items() if data and path not in gone)
+    assert len(FrameSequence(output)) == FRAMES
 
 
 def interrupt_twice(now):

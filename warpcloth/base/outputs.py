@@ -65,6 +65,8 @@ def _file_of(path):
         raise FileNotFoundError(f"{path}: the folder {folder} does not exist")
     if os.path.exists(target) and not os.path.isfile(target):
         raise ValueError(f"{path}: is no regular file; it must be one, or free")
+    if os.path.splitext(target)[1] != os.path.splitext(path)[1]:
+        raise ValueError(f"{path}: is a link to {target}; it must end as that does")
     return target
 
 

@@ -16,12 +16,13 @@ from ..base.interrupts import deferred
 from ..base.outputs import Lock, keep_mode
 from .layers import flattened_layer, named_from, relative_path
 from .modules import Sdf, Usd
-from .packages import Contents
+from .packages import UNPACKED, Contents
 from .stage import METADATA_KEY, followed, identity
 from .values import refuse_path, sentences
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 _ROOT = "animation.usdc"  # root of a .usdz until it is packed, and of frames whose output cannot be written
+_MANIFEST = "manifest.usda"
 _COMPLETE = "complete"  # file that marks the folder of a run whose frames are complete but not packed yet
 
 
@@ -45,7 +46,7 @@ class ChunkWriter:
 
     An interrupt (Ctrl-C) waits until a chunk, or `close`, is finished; a second one does not. A run removes the files of
     earlier runs to the same output from the folder, except files that it reads and the complete frames of a .usdz that was not
-    packed.
+    packed. It removes no other files, none from folders without the manifest of a run, and none behind a link.
 
     Attributes:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
@@ -195,7 +196,8 @@ class ChunkWriter:
     def runs_with(self, name):
         """Returns the folders of runs to this output that have a file of this name, the newest first."""
         found = self._folder.glob(f"{self._output.suffix[1:]}-*/{name}") if self._folder.is_dir() else ()
-        return [path.parent for path in sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)]
+        runs = [path for path in found if _is_run(path.parent)]
+        return [path.parent for path in sorted(runs, key=lambda path: path.stat().st_mtime, reverse=True)]
 
     def written(self):
         """Returns (chunks, span) for :meth:`resume`: time code and file name of each chunk, first and last time code."""
@@ -216,7 +218,7 @@ class ChunkWriter:
             FileNotFoundError: One of the chunks is gone.
         """
         self.run, self._chunks = Path(run), [(time, Path(run) / name) for time, name in chunks]
-        for path in (self.run / "rest.usdc", self.run / "manifest.usda", *(path for _, path in self._chunks)):
+        for path in (self.run / "rest.usdc", self.run / _MANIFEST, *(path for _, path in self._chunks)):
             if not path.is_file():
                 self._chunks = []
                 raise FileNotFoundError(f"{path}: is missing, so that the run cannot be resumed; run without resume")
@@ -330,8 +332,10 @@ class ChunkWriter:
 
     def _start_run(self):
         self.run.mkdir(parents=True, exist_ok=True)
+        manifest = self._declared(Sdf.Layer.CreateAnonymous(".usda"))
+        manifest.customLayerData = {METADATA_KEY: {"manifest": self.run.name}}
+        export(manifest, self.run / _MANIFEST, like=self._output)
         export(self._rest, self.run / "rest.usdc", like=self._output)
-        export(self._declared(Sdf.Layer.CreateAnonymous(".usda")), self.run / "manifest.usda", like=self._output)
 
     def _declared(self, layer):
         """Declares all sampled attributes in a layer, and returns it."""
@@ -348,7 +352,7 @@ class ChunkWriter:
         for target in self._targets:
             clips = Usd.ClipsAPI(stage.OverridePrim(target.prim))
             clips.SetClipAssetPaths(asset_paths, self._clip_set)
-            clips.SetClipManifestAssetPath(Sdf.AssetPath(relative_path(self.run / "manifest.usda", folder)), self._clip_set)
+            clips.SetClipManifestAssetPath(Sdf.AssetPath(relative_path(self.run / _MANIFEST, folder)), self._clip_set)
             clips.SetClipPrimPath(target.prim, self._clip_set)
             clips.SetClipActive([(time, index) for index, (time, _) in enumerate(chunks)], self._clip_set)
             # Clip time is stage time. With one frame listed twice, USD 25.5 reports the frame twice.
@@ -375,17 +379,17 @@ class ChunkWriter:
 
     def _remove_run(self):
         """Removes the chunks of this run, and the folder of runs if it has no others."""
-        _remove(self.run, ignore_errors=True)
         with suppress(OSError):  # it is not empty, or was never made
+            self._remove(self.run)
             self._folder.rmdir()
 
     def _remove_other_runs(self):
         """Removes the files of earlier runs to the same output, to which the output no longer refers."""
         own_kind = re.compile(re.escape(self._output.suffix[1:]) + "-[0-9a-f]{8}")
-        for folder in self._folder.iterdir():
+        for folder in () if self._folder.is_symlink() else self._folder.iterdir():
             inside = os.path.join(os.path.realpath(folder), "")
             read = any(file.startswith(inside) for file in self._files)
-            if read or folder == self.run or not own_kind.fullmatch(folder.name):
+            if read or folder == self.run or not (own_kind.fullmatch(folder.name) and _is_run(folder)):
                 continue
             if (folder / _COMPLETE).exists():
                 warnings.warn(
@@ -394,7 +398,21 @@ class ChunkWriter:
                     stacklevel=5,
                 )
             else:
-                _remove(folder, ignore_errors=True)  # another process may have a file open
+                with suppress(OSError):  # another process may have a file open
+                    self._remove(folder)
+
+    def _remove(self, run):
+        """Removes the files of a run, and its folder if nothing else is in it.
+
+        The root is first, so that a process killed meanwhile leaves no root whose layers are gone, and the manifest last.
+        """
+        ours = rf"{_ROOT}|rest\.usdc|frames_\d+\.usdc|{_COMPLETE}|checkpoint\.\w+|(un)?finished\.usd\w?|{_MANIFEST}"
+        ours = re.compile(f"{ours}|{re.escape(self._output.stem)}\\.usdc")
+        names = filter(ours.fullmatch, os.listdir(run))
+        for name in sorted(names, key=lambda name: (name != _ROOT, name == _MANIFEST)):
+            os.remove(run / name)
+        with suppress(OSError):
+            run.rmdir()
 
     def _write_single_file(self, keep):
         contents = Contents(self.run)
@@ -418,7 +436,8 @@ class ChunkWriter:
         (self.run / _COMPLETE).unlink(missing_ok=True)
         if keep:
             return
-        _remove(self.run)
+        shutil.rmtree(self.run / UNPACKED, ignore_errors=True)
+        self._remove(self.run)
         with suppress(OSError):  # it may be gone, or in use by a run to an output with another ending
             if self._packed:
                 self._remove_other_runs()
@@ -504,15 +523,12 @@ def _rename(finished, path, like=None):
         raise OSError(f"{path}: could not be written: {error.strerror or error}") from None
 
 
-def _remove(run, ignore_errors=False):
-    """Removes the folder of a run, its root first. So a process killed meanwhile leaves no root whose layers are gone."""
+def _is_run(folder):
+    """Returns whether a folder is no link and has the manifest of a run."""
     try:
-        (run / _ROOT).unlink(missing_ok=True)
-    except OSError:  # on Windows, another process has it open
-        if ignore_errors:
-            return
-        raise
-    shutil.rmtree(run, ignore_errors)
+        return not folder.is_symlink() and f'"{folder.name}"' in (folder / _MANIFEST).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def _export(layer, file, meant=None):

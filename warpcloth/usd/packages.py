@@ -9,6 +9,7 @@ from itertools import chain
 from .modules import Ar, Sdf, UsdUtils
 
 _TILES = "<UDIM>"
+UNPACKED = "unpacked"  # folder of files that are extracted from packages
 
 
 class Contents:
@@ -63,7 +64,7 @@ class Contents:
         package, member = Ar.SplitPackageRelativePathOuter(found)
         try:
             with zipfile.ZipFile(package) as archive:
-                return [archive.extract(member, os.path.join(self._folder, "unpacked"))], [package]
+                return [archive.extract(member, os.path.join(self._folder, UNPACKED))], [package]
         except (OSError, KeyError, zipfile.BadZipFile):  # a package in a package
             return [], []
 
