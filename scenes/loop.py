@@ -19,7 +19,7 @@ KINDS = {"pear": (0.5, 1.171066, [1, 0, 0]), "ring": (1.0, 0.0, [0, 1, 0]), "hea
 def scene(
     kind: str = "heart",
     gamma: float = 100.0,
-    elements: int = 64,
+    elements: int = 128,
     length: float = 0.2,
     duration: float = 2.0,
     fabric: str | None = None,
