@@ -3,6 +3,7 @@
     python benchmarks/compared.py                                          # all scenes, on the CPU
     python benchmarks/compared.py --scene drape --device cuda:0 --out gpu  # one of them
     python benchmarks/compared.py --stored cpu/*.json gpu/*.json           # tables and charts of stored results
+    python benchmarks/compared.py --touching                               # how many vertices touch in each frame
 
 For each scene it searches for the cheapest setting of warpcloth with an error of at most 1 %, and for that of each solver of
 the other simulators: it doubles substeps and iterations until a setting has such an error or the limits are reached. These
@@ -17,8 +18,10 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import warp as wp
 
+import warpcloth as wc
 from warpcloth.base.checks import choice, number, whole
 from warpcloth.base.texts import assignments
 from warpcloth.chart.pareto import plot_time
@@ -41,6 +44,21 @@ SCENES = {
 }
 
 
+def touching(name):
+    """Texts by frame: the fraction of vertices nearer to a collider than the contact distance, and pairs of self-contact."""
+    given, frames = SCENES[name]
+    scene = SceneRef(*given).load()
+    record = ("pairs",) if scene.self_contact else ()
+    found = wc.simulate(scene, wc.Newton(substeps=32, integrator="bdf2"), dtype="float64", frames=frames, record=record)
+    near = np.zeros(found.points.shape[:2], dtype=bool)
+    for collider in scene.colliders:
+        near |= np.array([collider.distances(points) < scene.contact.distance for points in found.points])
+    parts = [f"{k}: {100.0 * part:.0f} %" for k, part in enumerate(near.mean(axis=1)) if part]
+    return parts, [
+        f"{k}: {int(count)} pairs" for k, count in enumerate(found.pairs["pairs in contact"]) if count
+    ] if record else []
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", nargs="+", choices=SCENES, default=list(SCENES), help="scenes (default: all)")
@@ -54,7 +72,12 @@ def main():
     parser.add_argument("--total", type=float, default=math.inf, help="time limit of each scene [s] (default: none)")
     parser.add_argument("--out", type=Path, default=Path("compared"), help="folder of results (default: compared)")
     parser.add_argument("--stored", type=Path, nargs="+", metavar="JSON", help="only print and draw stored results")
+    parser.add_argument("--touching", action="store_true", help="print vertices in contact in each frame, by BDF2, and end")
     options = parser.parse_args()
+    if options.touching:
+        for name in options.scene:
+            print(name, *touching(name))
+        return
     if options.stored:
         for path in options.stored:
             show(path, json.loads(path.read_text(encoding="utf-8")))

@@ -84,6 +84,31 @@ def test_rigid_motion_costs_nothing(name, dtype, device):
         assert np.abs(gradient).max() < 16 * eps * 8.0 * 3.0
 
 
+@pytest.mark.parametrize(
+    ("solver", "stiffness"),
+    [
+        (wc.PBD(substeps=20), np.inf),
+        (wc.XPBD(substeps=20), np.inf),
+        (wc.ConstrainedDynamics(substeps=20), np.inf),
+        (wc.Newton(substeps=20, integrator="midpoint", tolerance=1e-8), 1e6),
+        (wc.XPBD(substeps=20, iterations=10, integrator="midpoint"), 1e6),
+    ],
+)
+def test_a_card_that_spins(solver, stiffness, device):
+    """Euler steps turn by θ(1 − θ²) after θ, so that ω = ω₀/√(1 + 2ω₀²ht); midpoint keeps momentum and energy."""
+    mesh, rate = wc.Mesh.grid(5, 3, size=(0.4, 0.2)), 8.5
+    x = mesh.points - mesh.points.mean(axis=0)
+    spin = {"velocities": rate * np.cross([0.0, 1.0, 0.0], x), "gravity": (0.0, 0.0, 0.0), "duration": 1.0, "fps": 60}
+    card = [wc.RigidCluster(vertices="all", stiffness=stiffness)]
+    scene = wc.Scene(wc.Mesh(x, mesh.triangles), density=0.3, terms=card, **spin)
+    found, mass = wc.simulate(scene, solver, dtype="float64", device=device), scene.vertex_masses[:, None]
+    momentum = [np.linalg.norm((mass * np.cross(found.points[k], found.velocities[k])).sum(axis=0)) for k in (0, -1)]
+    energy = [(mass * found.velocities[k] ** 2).sum() for k in (0, -1)]
+    kept = 1.0 / np.sqrt(1.0 + 2.0 * rate**2 / 1200.0) if np.isinf(stiffness) else 1.0
+    assert momentum[1] / momentum[0] == pytest.approx(kept, abs=1e-10 if kept == 1.0 else 5e-3)
+    assert energy[1] / energy[0] == pytest.approx(kept**2, abs=1e-4 if kept == 1.0 else 5e-3)
+
+
 @pytest.mark.parametrize("sweep", SWEEPS)
 @each_body
 def test_one_sweep_makes_a_body_rigid(name, sweep, device):
