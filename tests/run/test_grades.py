@@ -10,7 +10,7 @@ import warpcloth as wc
 from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.core.status import Grade
-from warpcloth.scenes import chain, hanging
+from warpcloth.scenes import capstan, chain, hanging
 
 
 def two_sheets():
@@ -77,6 +77,38 @@ def test_what_is_wrong_is_not_usable(name, device):
     assert len(found.points) == make().frames + 1  # all frames are kept
     assert re.match("not usable: in frames? [0-9]+ ", status.message) and re.search(why, status.message), status.message
     assert "; take shorter steps" in status.message
+
+
+@pytest.mark.host
+@pytest.mark.parametrize(
+    ("solver", "friction", "usable"),
+    [
+        (wc.Explicit(substeps=1400), 0.5, False),
+        pytest.param(wc.Newton(substeps=16, integrator="midpoint", linear="factorised"), 0.5, False, marks=pytest.mark.slow),
+        (wc.Explicit(substeps=1400), 0.1, True),
+        (wc.Newton(substeps=4, integrator="midpoint", linear="factorised"), 0.1, True),
+        (wc.Newton(substeps=1, linear="factorised"), 0.5, True),
+        (wc.Newton(substeps=4, integrator="bdf2", linear="factorised"), 0.5, True),
+    ],
+)
+def test_a_belt_that_flutters_is_not_usable(solver, friction, usable, tmp_path, device):
+    """And a run that is resumed is so in the same words; the others have exp(μπ) to 1 %."""
+    belt, given = capstan.scene(friction=friction, turns=24, duration=0.4), {"device": device, "dtype": "float64"}
+    found = wc.simulate(belt, solver, **given)
+    assert found.status.ok is usable, found.status.message
+    lengths = np.linalg.norm(np.diff(found.points[12:, : len(belt.mesh.points) // 2], axis=1), axis=-1).mean(axis=0)
+    stretch = lengths - belt.mesh.points[1, 0]
+    error = stretch[-1] / stretch[0] / np.exp(np.pi * friction) - 1.0
+    assert abs(error) < 0.01 if usable else "vibrates on its contact" in found.status.message and error < -0.01
+    if not usable:
+
+        def stop(frame, _):
+            if frame == 13:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            wc.simulate(belt, solver, output=str(tmp_path / "a.usdc"), progress=stop, **given)
+        assert wc.simulate(belt, solver, output=str(tmp_path / "a.usdc"), resume=True, **given).status == found.status
 
 
 RIGHT = {

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..core.status import Grade, Result, digits, millimetres
+from .flutter import flutter_of
 from .step_errors import StepErrors
 
 # A step has converged if no vertex is farther from its solution than NEAR times the edge and the contact distance. It is not
@@ -29,6 +30,7 @@ class Grades:
 
     Attributes:
         errors: The :class:`warpcloth.run.step_errors.StepErrors` of the stepper.
+        flutter: The :class:`warpcloth.run.flutter.Flutter` of the run, or None.
         distance: The largest distance of a vertex from the solution of a step in a good frame of each copy, (B,) [m].
         first: For each reason why a copy is not usable the first frame, from 1, in which that is so, or 0, (4, B).
         figure: The figure of that frame, (4, B).
@@ -45,12 +47,15 @@ class Grades:
         self._resolved = min([self._edge, *(each.distance for each in contacts if each is not None)])
         self.errors = StepErrors(stepper, NEAR * self._resolved, FAR * self._edge)
         self.first, self.figure = np.zeros((len(_WHY), model.copies), dtype=int), np.zeros((len(_WHY), model.copies))
+        self.flutter = flutter_of(stepper, balance.mass)
         self.distance, self.gap, self.most = (np.zeros(model.copies) for _ in range(3))
         self.solved, self.ratio = np.zeros(model.copies), np.zeros(model.copies)
 
     def note(self, number, frame, alive):
         """Notes the errors and the energy in a :class:`warpcloth.run.frames_ahead.Frame` of the copies ``alive`` (B,)."""
         error, balance = frame.error, self._balance
+        if self.flutter is not None:
+            self.flutter.note(number, frame.points, frame.velocities, alive)
         self.solved, self.ratio = error.solved, error.ratio
         self.distance, self.gap = np.where(alive, error.distance, self.distance), np.where(alive, error.gap, self.gap)
         converged = np.array([result in (Result.CONVERGED, Result.ROUNDED) for result in frame.results])
@@ -85,7 +90,7 @@ class Grades:
                 given["ratio"] = _compared(figure, self.most[copy])
                 why = _WHY[kind].format(figure=digits(figure), **given)
                 found.append((copy, int(frame), f"{why}; {remedy}"))
-        return found
+        return found + ([] if self.flutter is None else self.flutter.faults())
 
     def grade(self, copy, result, faults):
         """Returns the :class:`warpcloth.core.status.Grade` of a copy.

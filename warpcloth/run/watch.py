@@ -154,7 +154,7 @@ class Watch:
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
             yield source, source.carried
-        for part in (self.grades, self.history):
+        for part in (self.grades, self.grades and self.grades.flutter, self.history):
             if part is not None:
                 yield part, part.carried
 

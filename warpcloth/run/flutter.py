@@ -1,0 +1,76 @@
+"""Tells whether cloth that slides on colliders with friction vibrates on its contact, so that friction acts in both directions.
+
+Contact has no damping of its own, and steps that do not damp leave what friction drives, see `benchmarks/flutter.py`. In a
+frame of length T that moves a vertex by Δx, the velocity of a vertex that slides steadily is Δx/T. What its velocity at the end
+differs by, w, is a vibration, or acceleration: w = ½Δx/T where it starts from rest.
+"""
+
+import numpy as np
+
+from ..scene.mesh_collider import MeshCollider
+
+# Cloth slides if this part of its mass is in contact, and frames in a row move that by this part of the contact distance on
+# average, in one direction. It flutters if it slides and vibrates faster than that in this number of frames in a row:
+# acceleration and impacts last for fewer.
+PART, SLIDES, FRAMES = 0.25, 0.1, 6
+
+
+class Flutter:
+    """Follows the vertices of each copy that touch colliders with friction.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        mass: Masses of the free vertices (B, n) [kg].
+
+    Attributes:
+        first: The first frame in which each copy flutters, from 1, or 0, (B,).
+        figure: The speed of its vibration over that of sliding, RMS, (B,).
+    """
+
+    carried = ("first", "figure", "_rows", "_points", "_near", "_moved")  # from frame to frame
+
+    def __init__(self, model, mass):
+        scene, self._mass, self._fps = model.scene, mass, model.scene.fps
+        self._distance = scene.contact.distance
+        self._colliders = [each for each in scene.colliders if each.friction > 0.0 and not isinstance(each, MeshCollider)]
+        self.first, self.figure, self._rows = np.zeros(len(mass), int), np.zeros(len(mass)), np.zeros(len(mass), int)
+        self._points = model.in_scene_order(model.positions.numpy()).astype(np.float64).reshape(*mass.shape, 3)
+        self._near, self._moved = self._touches(self._points, 0), np.zeros_like(self._points)
+
+    def note(self, number, points, velocities, alive):
+        """Notes the frame ``number`` with points (B·n, 3) [m] and velocities [m/s] of the copies ``alive`` (B,)."""
+        points, velocities = (each.astype(np.float64, copy=False).reshape(self._points.shape) for each in (points, velocities))
+        near, moved = self._touches(points, number), self._fps * (points - self._points)
+        mass = self._mass * (near & self._near)
+        with np.errstate(all="ignore"):
+            shakes, slides = (
+                (mass * np.einsum("bij,bij->bi", *each)).sum(axis=1)
+                for each in ((velocities - moved, velocities - moved), (moved, self._moved))
+            )
+            far = slides > mass.sum(axis=1) * (SLIDES * self._distance * self._fps) ** 2
+            far &= mass.sum(axis=1) > PART * self._mass.sum(axis=1)
+            self._rows = np.where(far & (shakes > slides), self._rows + 1, 0)
+            news = alive & (self.first == 0) & (self._rows >= FRAMES)
+            self.first, self.figure = np.where(news, number, self.first), np.where(news, np.sqrt(shakes / slides), self.figure)
+        self._points, self._near, self._moved = points, near, moved
+
+    def faults(self):
+        """Returns the reasons why copies are not usable, a list of (copy, frame, sentence)."""
+        why = "cloth that slides with friction vibrates on its contact {:.2g} times as fast as it slides"
+        remedy = 'take implicit Euler or integrator="bdf2", which damp it'
+        return [
+            (copy, int(self.first[copy]), f"in frame {self.first[copy]} {why.format(self.figure[copy])}; {remedy}")
+            for copy in np.flatnonzero(self.first)
+        ]
+
+    def _touches(self, points, frame):
+        """Returns which vertices are nearer to a collider than the contact distance, (B, n)."""
+        with np.errstate(all="ignore"):
+            return np.any([each.distances(points, frame) < self._distance for each in self._colliders], axis=0)
+
+
+def flutter_of(stepper, mass):
+    """Returns a :class:`Flutter`, or None if steps damp vibrations, or no collider but meshes has friction."""
+    scene, undamped = stepper.model.scene, stepper.options.staggered or not stepper.options.damps
+    rubs = any(each.friction > 0.0 and not isinstance(each, MeshCollider) for each in scene.colliders)
+    return Flutter(stepper.model, mass) if undamped and rubs else None
