@@ -10,23 +10,18 @@ from ..terms.woven import along_s
 _FACING = 0.99  # cosine of the angle between x and a normal, above which a triangle faces x
 
 
-def warp_on(mesh: Mesh, corner_coordinates: np.ndarray | None = None) -> np.ndarray | None:
+def warp_on(mesh: Mesh) -> np.ndarray | None:
     """Returns vectors along the warp of a fabric, (3,) or (T, 3), of any length; None if the mesh gives them to all triangles.
-
-    Args:
-        mesh: The mesh.
-        corner_coordinates: Texture coordinates of the corners of each triangle (T, 3, 2), if the mesh has none of vertices.
 
     Warns:
         UserWarning: Triangles have no texture coordinates. Their warp is along x of the rest shape, or along y if they face x.
     """
-    x, st = mesh.points[mesh.triangles], corner_coordinates
-    st = st if mesh.texture_coordinates is None else mesh.texture_coordinates[mesh.triangles]
+    x, st = mesh.points[mesh.triangles], mesh.corner_coordinates
     given = np.zeros((len(x), 3)) if st is None else along_s(x, st)
     size = np.linalg.norm(given, axis=1)
     lacking = ~(size > 1e-9 * size.max(initial=0.0))
     if not lacking.any():
-        return given if mesh.texture_coordinates is None else None
+        return None
     normals = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
     facing = np.abs(normals[:, 0]) > _FACING * np.linalg.norm(normals, axis=1)
     warp = np.where(lacking[:, None], np.where(facing[:, None], (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), given)

@@ -524,11 +524,14 @@ def _rename(finished, path, like=None):
 
 
 def _is_run(folder):
-    """Returns whether a folder is no link and has the manifest of a run."""
-    try:
-        return not folder.is_symlink() and f'"{folder.name}"' in (folder / _MANIFEST).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+    """Returns whether a folder is no link and has the manifest of a run, or its unfinished file, as the first of its files."""
+    if folder.is_symlink():
         return False
+    for name in (_MANIFEST, "unfinished.usda"):
+        with suppress(OSError, UnicodeDecodeError):
+            if f'"{folder.name}"' in (folder / name).read_text(encoding="utf-8"):
+                return True
+    return False
 
 
 def _export(layer, file, meant=None):

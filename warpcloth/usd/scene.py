@@ -16,7 +16,6 @@ from ..scene.colliders import Contact
 from ..scene.mesh_scene import warn_of_unit
 from ..scene.scene import DOWN, EARTH, Pins, Scene
 from ..scene.self_contact import SelfContact
-from ..scene.warp import warp_on
 from ..terms import TERMS
 from ..terms.limit import Limit
 from ..terms.loads import LOADS
@@ -139,8 +138,6 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law, fabri
     mesh = surroundings.mesh
     fabric, terms, frames = fabric or values.get("fabric"), [_term(values, key) for key in values.terms], round(duration * fps)
     warp = values.get("warp")
-    if fabric is not None and warp is None and surroundings.corner_coordinates is not None:
-        warp = warp_on(mesh, surroundings.corner_coordinates)
     standard = not terms and fabric is None
     masses, own = values.get("masses"), values.get("density")
     masses = masses_of(values, mesh) if masses is None and own is None and fabric is None else masses
