@@ -733,7 +733,7 @@ def test_what_is_not_installed_is_said(folder, tmp_path, capfd, monkeypatch):
 def test_a_source_is_not_written_over(folder, tmp_path, capfd):
     shutil.copy(folder / "one.obj", tmp_path / "a.obj")
     (tmp_path / "a.png").symlink_to(tmp_path / "a.obj")
-    refused(capfd, ["render", tmp_path / "a.obj", "-o", tmp_path / "a.png", *SIZE], "is a file of the input")
+    refused(capfd, ["render", tmp_path / "a.obj", "-o", tmp_path / "a.png", *SIZE], "is a link to")
 
 
 @pytest.fixture
