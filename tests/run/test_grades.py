@@ -108,7 +108,10 @@ def test_a_belt_that_flutters_is_not_usable(solver, friction, usable, tmp_path, 
 
         with pytest.raises(KeyboardInterrupt):
             wc.simulate(belt, solver, output=str(tmp_path / "a.usdc"), progress=stop, **given)
-        assert wc.simulate(belt, solver, output=str(tmp_path / "a.usdc"), resume=True, **given).status.message == found.status.message
+        assert (
+            wc.simulate(belt, solver, output=str(tmp_path / "a.usdc"), resume=True, **given).status.message
+            == found.status.message
+        )
 
 
 RIGHT = {

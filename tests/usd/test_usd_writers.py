@@ -431,7 +431,7 @@ def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, forks, ending, with_s
             write(output, mesh, source=source or None)
         assert len(FrameSequence(output)) == FRAMES
         left = list(folder.glob("*"))
-        assert left == complete if ending == "usdz" else len(left) == 1
+        assert left == complete if ending == "usdz" else len(left) == 1, (left, [list(p.glob("*")) for p in left])
         assert not list(tmp_path.glob(".*.lock"))
 
 

@@ -197,7 +197,7 @@ def _of_kes(values):
         strain = None if percent is None else percent / 100.0
         work = None if work is None else work * _PER_CM  # gf·cm/cm² is gf/cm
         derived = 2.0 * work / (force * strain) if work and strain else None
-        if derived and derived > 2.0:
+        if work and strain and derived and derived > 2.0:
             raise ValueError(
                 f"WT of direction {direction} is {work / _PER_CM:g}; it must be at most 500 gf/cm·EMT, {500.0 * strain:g}"
             )

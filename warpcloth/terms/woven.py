@@ -55,10 +55,10 @@ class Woven(Declared):
         axes, T = side_axes(mesh.points, mesh.triangles), len(mesh.triangles)
         if self.warp is not None:
             warp = np.broadcast_to(self.of_elements("warp", T), (T, 3))
-        elif mesh.texture_coordinates is None:
+        elif (st := mesh.corner_coordinates) is None:
             raise ValueError(f"{self.label}.warp is None on a mesh without texture coordinates; it must be a vector")
         else:
-            warp = along_s(mesh.points[mesh.triangles], mesh.corner_coordinates)
+            warp = along_s(mesh.points[mesh.triangles], st)
         along = np.einsum("tai,ti->at", axes, warp)
         size = np.linalg.norm(along, axis=0)
         for t in np.flatnonzero(size <= 1e-6 * np.linalg.norm(warp, axis=1))[:1]:

@@ -23,6 +23,7 @@ from .values import refuse_path, sentences
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 _ROOT = "animation.usdc"  # root of a .usdz until it is packed, and of frames whose output cannot be written
 _MANIFEST = "manifest.usda"
+_UNFINISHED = re.compile(r"(un)?finished\.\w+")  # USD writes to a name with six random letters first
 _COMPLETE = "complete"  # file that marks the folder of a run whose frames are complete but not packed yet
 
 
@@ -406,7 +407,7 @@ class ChunkWriter:
 
         The root is first, so that a process killed meanwhile leaves no root whose layers are gone, and the manifest last.
         """
-        ours = rf"{_ROOT}|rest\.usdc|frames_\d+\.usdc|{_COMPLETE}|checkpoint\.\w+|(un)?finished\.usd\w?|{_MANIFEST}"
+        ours = rf"{_ROOT}|rest\.usdc|frames_\d+\.usdc|{_COMPLETE}|checkpoint\.\w+|{_UNFINISHED.pattern}|{_MANIFEST}"
         ours = re.compile(f"{ours}|{re.escape(self._output.stem)}\\.usdc")
         names = filter(ours.fullmatch, os.listdir(run))
         for name in sorted(names, key=lambda name: (name != _ROOT, name == _MANIFEST)):
@@ -524,14 +525,14 @@ def _rename(finished, path, like=None):
 
 
 def _is_run(folder):
-    """Returns whether a folder is no link and has the manifest of a run, or its unfinished file, as the first of its files."""
-    if folder.is_symlink():
+    """Returns whether a folder is no link and has the manifest of a run, or was left by one that was killed before or after."""
+    try:
+        if folder.is_symlink():
+            return False
+        begun = all(_UNFINISHED.fullmatch(name) for name in os.listdir(folder))
+        return begun or f'"{folder.name}"' in (folder / _MANIFEST).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
         return False
-    for name in (_MANIFEST, "unfinished.usda"):
-        with suppress(OSError, UnicodeDecodeError):
-            if f'"{folder.name}"' in (folder / name).read_text(encoding="utf-8"):
-                return True
-    return False
 
 
 def _export(layer, file, meant=None):
