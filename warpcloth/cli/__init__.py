@@ -134,7 +134,10 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args=None, namespace=None):
         self._given = sys.argv[1:] if args is None else args
-        return super().parse_known_args(args, namespace)
+        namespace, unknown = super().parse_known_args(args, namespace)
+        if unknown:  # here, because argparse would leave those of a command to the parser of all commands
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return namespace, unknown
 
     def _check_value(self, action, value):
         try:
@@ -144,10 +147,6 @@ class _Parser(argparse.ArgumentParser):
             raise
 
     def error(self, message):
-        for action in self._actions:  # the parser of the command leaves unknown options to this one
-            if isinstance(action, argparse._SubParsersAction):
-                for command in (word for word in self._given if word in action.choices):
-                    action.choices[command].error(message)
         if message.startswith("unrecognized arguments: -"):
             message += did_you_mean(message.split()[2], self._option_string_actions)
         _said, required, names = message.partition(" are required: ")
