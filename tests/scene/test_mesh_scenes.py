@@ -67,6 +67,7 @@ def test_options_of_the_command_line_are_those_of_the_mesh(sheet, tmp_path, capf
         (20.0, "the cloth is 20 m long and has 41.44 kg; if the file is in centimetres, --scale 0.01 makes it 0.2 m"),
         (150.0, "if the file is in centimetres, --scale 0.01 makes it 1.5 m"),
         (1500.0, "if the file is in millimetres, --scale 0.001 makes it 1.5 m"),
+        (30000.0, "the cloth is 3e+04 m long and has 9.324e+07 kg"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:the mesh has no texture")
@@ -77,7 +78,7 @@ def test_a_cloth_that_is_too_large_is_said_with_the_likely_unit(tmp_path, kind, 
     path.write_text(obj(points) if kind == "mesh" else stage(points))
     source = find_source(path)
     source.scene(source.values({"fabric": "cotton"}))
-    said = [str(warning.message) for warning in recwarn if " kg; " in str(warning.message)]
+    said = [str(warning.message) for warning in recwarn if " m long and has " in str(warning.message)]
     hint = hint if hint is None or kind == "mesh" else hint.replace("--scale", "metersPerUnit =")
     assert len(said) == (hint is not None) and all(text.startswith(str(path)) and text.endswith(hint) for text in said)
 

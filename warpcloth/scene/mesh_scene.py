@@ -39,7 +39,7 @@ def mesh_scene(
 
 
 def warn_of_unit(path: FilePath, scene: Scene, metres: float, remedy: str) -> None:
-    """Warns if a cloth is above 20 m or 20 kg, and names the likely unit of its file; ``remedy`` sets the metres per unit."""
+    """Warns if a cloth is above 20 m or 20 kg, and names the likely unit of its file, if there is one; ``remedy`` sets the metres per unit."""
     size, mass = float(np.ptp(scene.mesh.points, axis=0).max()), float(scene.vertex_masses.sum())
     if size <= _LARGE and mass <= _HEAVY:
         return
@@ -50,5 +50,5 @@ def warn_of_unit(path: FilePath, scene: Scene, metres: float, remedy: str) -> No
     ]
     if size <= _UNITS[0][2]:
         likely = ["its density must be in kg/m², of which cloth has 0.02 to 1"]
-    for hint in likely[:1]:
-        warnings.warn(f"{path}: the cloth is {size:.4g} m long and has {mass:.4g} kg; {hint}", stacklevel=3)
+    hint = "".join(f"; {each}" for each in likely[:1])
+    warnings.warn(f"{path}: the cloth is {size:.4g} m long and has {mass:.4g} kg{hint}", stacklevel=3)
