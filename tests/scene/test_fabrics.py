@@ -42,7 +42,7 @@ def test_terms_have_the_moduli_of_the_record(name):
 def test_a_fabric_without_a_number_is_refused_by_its_name(name):
     fabric = wc.fabrics[name]
     missing = "poisson_ratio" if fabric.poisson_ratio is None else "shear"
-    with pytest.raises(ValueError, match=f"fabric '{name}' has no {missing}, which a membrane needs"):
+    with pytest.raises(ValueError, match=f"fabric '{name}' has no {missing}, which a membrane needs; take another fabric"):
         wc.Scene(MESH, fabric=name)
     if fabric.bending_warp is None:
         with pytest.raises(ValueError, match="has no bending_warp, which bending needs"):

@@ -1,5 +1,7 @@
 """Scenes of mesh files: lengths, fabric and pins are given beside the file, and a file in another unit is noticed."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -45,10 +47,11 @@ def sheet(tmp_path):
 @pytest.mark.filterwarnings("ignore:the mesh has no texture")
 def test_a_mesh_file_is_a_scene_of_a_fabric(sheet):
     source = find_source(sheet, "boundary")
-    scene = source.scene(source.values({"scale": "0.5", "fabric": "denim", "up_axis": "Z", "duration": "0.5"}))
+    scene = source.scene(source.values({"scale": "0.5", "fabric": "denim", "up_axis": "Z", "duration": "0.5", "warp": "0,0,1"}))
     assert np.array_equal(scene.mesh.points, 0.5 * GRID.points) and np.array_equal(scene.mesh.triangles, GRID.triangles)
     assert scene.vertex_masses.sum() == pytest.approx(0.25 * 0.4) and scene.gravity.tolist() == [0.0, 0.0, -9.81]
     assert (len(scene.pins.vertices), scene.frames, scene.name) == (16, 30, "sheet")
+    assert scene.terms[0].warp.tolist() == [0.0, 0.0, 1.0]
 
 
 def test_options_of_the_command_line_are_those_of_the_mesh(sheet, tmp_path, capfd):
@@ -107,6 +110,24 @@ def test_the_warp_of_a_fabric_on_a_stage(tmp_path, turned, given, warp, says, re
         assert np.allclose(term.warp_directions(scene.mesh), warp)
     said = [str(warning.message) for warning in recwarn]
     assert len(said) == (says is not None) and all(says in text and "Membrane" not in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("ending", "warp", "says"),
+    [
+        ("obj", "0,1,0", "warp, in a stage warpcloth:warp, has no direction in triangle 0; it must have a part in its plane"),
+        ("obj", "0,1", "warp has shape (2,); it must be (3,)"),
+        ("obj", "s", "warp is 's'; it must be three numbers, such as 0,0,1"),
+        ("obj", "0,0,nan", "warp[2] is nan; it must be finite"),
+        ("usda", (0, 1, 0), "prim /Cloth: warp, in a stage warpcloth:warp, has no direction in triangle 0"),
+    ],
+)
+def test_a_warp_that_is_none_is_refused_by_the_name_that_was_written(tmp_path, ending, warp, says):
+    path = tmp_path / f"sheet.{ending}"
+    path.write_text(obj(GRID.points.tolist()) if ending == "obj" else stage(GRID.points.tolist(), warp=warp))
+    source = find_source(path)
+    with pytest.raises(ValueError, match=re.escape(says)):
+        source.scene(source.values({"fabric": "denim"} | ({"warp": warp} if ending == "obj" else {})))
 
 
 def test_a_mesh_that_faces_x_in_part_has_a_warp_everywhere():

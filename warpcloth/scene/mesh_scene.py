@@ -19,11 +19,12 @@ def mesh_scene(
     prim: str | None = None,
     scale: float = 1.0,
     fabric: str = "cotton",
+    warp: str | None = None,
     up_axis: UpAxis = "Y",
     duration: float = 2.0,
     fps: float = 60.0,
 ) -> Scene:
-    """Reads a mesh file as a cloth of a fabric: geometry, metres per unit, fabric, up axis, duration [s], frames per second.
+    """Reads a mesh file as a cloth of a fabric: geometry, metres per unit, fabric and its warp, up axis, duration, rate of frames.
 
     Warns:
         UserWarning: The file is probably in another unit.
@@ -33,13 +34,17 @@ def mesh_scene(
         ValueError: The mesh cannot be read, see :meth:`warpcloth.Mesh.load`, or a value is not allowed.
     """
     mesh = Mesh.load(path, prim, scale, up_axis)
-    scene = Scene(mesh, fabric=fabric, duration=duration, fps=fps, name=Path(path).stem)
+    try:
+        direction = None if warp is None else [float(number) for number in warp.split(",")]
+    except ValueError:
+        raise ValueError(f"warp is {warp!r}; it must be three numbers, such as 0,0,1") from None
+    scene = Scene(mesh, fabric=fabric, warp=direction, duration=duration, fps=fps, name=Path(path).stem)
     warn_of_unit(path, scene, scale, "--scale {}")
     return scene
 
 
 def warn_of_unit(path: FilePath, scene: Scene, metres: float, remedy: str) -> None:
-    """Warns if a cloth is above 20 m or 20 kg, and names the likely unit of its file, if there is one; ``remedy`` sets the metres per unit."""
+    """Warns if a cloth is above 20 m or 20 kg, and names a likely unit of its file; ``remedy`` sets the metres per unit."""
     size, mass = float(np.ptp(scene.mesh.points, axis=0).max()), float(scene.vertex_masses.sum())
     if size <= _LARGE and mass <= _HEAVY:
         return

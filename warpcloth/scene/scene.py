@@ -208,10 +208,10 @@ class Scene:
             self._refuse_with_fabric()
             fabric = fabrics.find(fabric)
             keep("density", fabric.density)
-            keep("terms", fabric.terms(warp=warp_on(self.mesh) if warp is None else warp))
+            keep("terms", fabric.terms(warp=warp_on(self.mesh, warp)))
             keep("thickness", np.nan if fabric.thickness is None else fabric.thickness)
         elif warp is not None:
-            raise ValueError("warp is given without fabric; give it to the terms that have one")
+            raise ValueError("warp is given without fabric; give a fabric, or the terms a warp of their own")
         elif self.thickness is not None and not _is_nan(self.thickness):
             number("thickness", self.thickness, above=0.0)
         number("fps", self.fps, above=0.0)
