@@ -73,10 +73,12 @@ def measure(arguments):
 
 
 def _summary(facts):
-    rows = []
+    rows, differ = [], False
     for quantity, each in facts["readings"].items():
-        record = "" if each["record"] is None else f"(record of the fabric: {each['record']:.4g})"
-        rows.append((quantity, f"{each['value']:.4g} {each['unit']}".rstrip(), record))
-    lines = [*aligned(rows), *([f"they differ because {facts['why']}"] if facts["why"] else [])]
+        value, record = (None if number is None else f"{number:.4g}" for number in (each["value"], each["record"]))
+        differ |= record not in (None, value)
+        beside = "" if record is None else f"(record of the fabric: {record})"
+        rows.append((quantity, f"{value} {each['unit']}".rstrip(), beside))
+    lines = [*aligned(rows), *([f"they differ because {facts['why']}"] if differ else [])]
     lines.append(f"{facts['iterations']} iterations, {facts['seconds']:.3g} s")
     return "\n".join([f"{facts['scene']}: {facts['message']}", *(f"  {line}" for line in lines)])

@@ -142,7 +142,6 @@ class Fabric:
         for name in names:
             if getattr(self, name) is None:
                 raise ValueError(
-                    f"fabric {self.name!r} has no {name}, which {purpose} needs; "
-                    f"take another fabric, or give this one a {name}"
+                    f"fabric {self.name!r} has no {name}, which {purpose} needs; take another fabric, or give this one a {name}"
                 )
         return [getattr(self, name) for name in names]

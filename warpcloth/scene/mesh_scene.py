@@ -24,7 +24,7 @@ def mesh_scene(
     duration: float = 2.0,
     fps: float = 60.0,
 ) -> Scene:
-    """Reads a mesh file as a cloth of a fabric: geometry, metres per unit, fabric and its warp, up axis, duration, rate of frames.
+    """Reads a mesh file as a cloth of a fabric: geometry, metres per unit, fabric and its warp, up axis, duration, frame rate.
 
     Warns:
         UserWarning: The file is probably in another unit.
