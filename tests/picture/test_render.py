@@ -216,6 +216,15 @@ def Camera "Eye"
     float xformOp:rotateX = 90
     uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateX"]
 }
+def Camera "Shifted" (references = </Eye>)
+{
+    float horizontalApertureOffset = 5
+    float verticalApertureOffset = 5
+}
+def Camera "Blind" (references = </Eye>)
+{
+    float focalLength = 0
+}
 def Camera "Flat"
 {
     token projection = "orthographic"
@@ -244,19 +253,23 @@ def test_a_stage_is_seen_from_its_camera(tmp_path, capfd):
     """A sheet of 20 cm, 2 m away, is an eighth of the 160 cm that the aperture shows there; the camera moves by a quarter."""
     path = tmp_path / "looks.usda"
     path.write_text(LOOKS.replace("SHOWN", "rel material:binding = </Red>"))
-    for name, size, frame, middle, width in (
-        ("Eye", (160, 80), 0, 80, 20),
-        ("/Eye", (160, 80), 1, 40, 20),
-        ("Eye", (80, 80), 0, 40, 10),  # all of the aperture is in a narrower picture
-        ("Eye", (320, 80), 0, 160, 20),
+    for name, size, frame, middle, width, row in (
+        ("Eye", (160, 80), 0, 80, 20, 40),
+        ("/Eye", (160, 80), 1, 40, 20, 40),
+        ("Eye", (80, 80), 0, 40, 10, 40),  # all of the aperture is in a narrower picture
+        ("Eye", (320, 80), 0, 160, 20, 40),
+        ("Shifted", (160, 80), 0, 60, 20, 60),  # the aperture is an eighth to the right and a quarter above
     ):
         wc.render(path, tmp_path / "a.png", camera=name, frame=frame, size=size, samples=16, ground=False)
         image = np.asarray(Image.open(tmp_path / "a.png")).astype(int)
-        columns = np.flatnonzero((image[..., 0] - image[..., 2] > 60).any(axis=0))
+        red = image[..., 0] - image[..., 2] > 60
+        columns = np.flatnonzero(red.any(axis=0))
+        assert np.argwhere(red)[:, 0].mean() + 0.5 == pytest.approx(row, abs=1)
         assert (columns[0], columns[-1] + 1) == pytest.approx((middle - width / 2, middle + width / 2), abs=1)
     for name, source, message in (
-        ("Ear", path, "camera is 'Ear'; it must be one of its cameras, /Eye, /Flat"),
+        ("Ear", path, "camera is 'Ear'; it must be one of its cameras, /Eye, /Shifted, /Blind, /Flat"),
         ("Flat", path, "prim /Flat: has no perspective, must have it"),
+        ("Blind", path, "prim /Blind: focalLength is 0.0; it must be a number above 0"),
         ("Eye", tmp_path / "one.obj", "camera is 'Eye'; one.obj is not a stage and has none"),
     ):
         (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
@@ -661,6 +674,7 @@ def test_the_command_draws(folder, tmp_path, capfd):
         (("HUGE", "-o", "a.gif"), "huge.npz: no triangle, line or pin has positions that are finite and below 1e100 m"),
         (("CHANGING", "-o", "a.png"), "faceVertexIndices[1] is 2 at time code 1, must stay 1"),
         (("CLOTH", "-o", "a.png", "--zoom", "-1"), "zoom is -1.0"),
+        (("CLOTH", "-o", "a.png", "--zoom", "5", "--camera", "Eye"), "zoom and camera are given; a camera of the stage sets"),
         (("CLOTH", "-o", "a.png", "--samples", "0"), "samples is 0"),
         (("CLOTH", "-o", "a.png", "--colour", "strech_1"), "colour is 'strech_1'; it must be one of"),
         (("CLOTH", "-o", "a.png", "--range", "0", "1"), "--range is given without --colour"),

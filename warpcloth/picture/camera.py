@@ -22,6 +22,7 @@ class Camera:
         up: Up direction in the picture, of any length, not along the view.
         fov: Vertical field of view [°], above 0 and below 180.
         shift: Lens shift: how far the middle of the picture is to the right of the target, in heights of the picture.
+        rise: How far it is above the target, in heights of the picture.
 
     Raises:
         ValueError: A number is not finite or out of range, the target is at the position, or up is along the view.
@@ -32,12 +33,14 @@ class Camera:
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     fov: float = 30.0
     shift: float = 0.0
+    rise: float = 0.0
 
     def __post_init__(self):
         for name in ("position", "target", "up"):
             object.__setattr__(self, name, tuple(array(name, getattr(self, name), (3,)).tolist()))
         number("fov", self.fov, above=0.0)
         number("shift", self.shift)
+        number("rise", self.rise)
         if not self.fov < 180.0:
             raise ValueError(f"fov is {self.fov:g}; it must be below 180")
         view = np.subtract(self.target, self.position)

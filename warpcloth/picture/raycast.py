@@ -180,10 +180,11 @@ class RayCaster:
         right = np.cross(forward, up / np.linalg.norm(up))
         right /= np.linalg.norm(right)
         pixel = 2.0 * tangent / height
-        shift = 2.0 * tangent * camera.shift * right
+        above = np.cross(right, forward)
+        shift = 2.0 * tangent * (camera.shift * right + camera.rise * above)
         viewer = render.Viewer()
         viewer.origin, viewer.forward = wp.vec3(*((position - target) / unit)), wp.vec3(*(forward + shift))
-        viewer.right, viewer.up = wp.vec3(*(pixel * right)), wp.vec3(*(pixel * np.cross(right, forward)))
+        viewer.right, viewer.up = wp.vec3(*(pixel * right)), wp.vec3(*(pixel * above))
         viewer.width, viewer.height, viewer.samples = width, height, self._samples
         return unit, viewer
 

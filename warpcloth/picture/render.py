@@ -119,6 +119,9 @@ def render(
         number(name, value)
     for name, value in (("speed", speed), ("zoom", zoom)):
         number(name, value, above=0.0)
+    for name, value, default in (("azimuth", azimuth, -38.0), ("elevation", elevation, 24.0), ("zoom", zoom, 1.0)):
+        if camera is not None and value != default:
+            raise ValueError(f"{name} and camera are given; a camera of the stage sets what is seen, so leave one of them out")
     if fps is not None:
         number("fps", fps, above=0.0)
     whole("every", every, 1)
@@ -316,10 +319,10 @@ class _Picture:
     def _seen(self, k, frame):
         """Returns the camera of the stage of subject k, whose target is as far away as the middle of the motion."""
         width, height = self._sizes[k]
-        position, forward, up, fov = self._subjects[k].camera(frame, width / height)
+        position, forward, up, *lens = self._subjects[k].camera(frame, width / height)
         forward = forward / np.linalg.norm(forward)
         away = self._camera.target - position
-        return Camera(position, position + max(away @ forward, 0.1 * np.linalg.norm(away)) * forward, up, fov)
+        return Camera(position, position + max(away @ forward, 0.1 * np.linalg.norm(away)) * forward, up, *lens)
 
     def _painted(self, shape, values):
         """Returns colours of vertices (n, 3), or of corners of triangles (T, 3, 3)."""

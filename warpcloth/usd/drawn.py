@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.checks import number
 from ..mesh.polygons import cut
 from .gprims import define_colliders
 from .layers import COLOUR, CURVE_WIDTH, scene_layer
@@ -211,9 +212,10 @@ def _base_colour(prim):
 
 
 def camera_of(stage, path, name):
-    """Returns a function (time code, aspect) of a Camera prim: its position [m], direction, up direction and field of view [°].
+    """Returns a function (time code, aspect) of a Camera prim: its position [m], direction, up direction, and its lens.
 
-    The vertical field of view is so large that a picture of that width by height shows all of the aperture.
+    The lens is the vertical field of view [°], so large that a picture of that width by height shows all of the aperture, and
+    the shift and the rise of :class:`warpcloth.picture.camera.Camera`.
 
     Raises:
         ValueError: No Camera or several have that path or ``name``, or it has no perspective.
@@ -229,8 +231,12 @@ def camera_of(stage, path, name):
 
     def view(code, aspect):
         camera, matrix = UsdGeom.Camera(prim).GetCamera(code), local_to_metres(prim, f"{path}, prim {prim.GetPath()}", code)
-        half = max(camera.verticalAperture, camera.horizontalAperture / aspect) / (2.0 * camera.focalLength)
-        return matrix[3, :3], -matrix[2, :3], matrix[1, :3], 2.0 * np.degrees(np.arctan(half))
+        height = max(camera.verticalAperture, camera.horizontalAperture / aspect)
+        for name, value in (("focalLength", camera.focalLength), ("verticalAperture", height)):
+            number(f"{path}, prim {prim.GetPath()}: {name}", value, above=0.0)
+        offset = np.divide((camera.horizontalApertureOffset, camera.verticalApertureOffset), height)
+        fov = 2.0 * np.degrees(np.arctan(height / (2.0 * camera.focalLength)))
+        return matrix[3, :3], -matrix[2, :3], matrix[1, :3], fov, *offset
 
     return view
 
