@@ -251,7 +251,7 @@ def test_a_stage_is_drawn_in_its_base_colours(shown, colour, tmp_path):
 
 def test_a_stage_is_seen_from_its_camera(tmp_path, capfd):
     """A sheet of 20 cm, 2 m away, is an eighth of the 160 cm that the aperture shows there; the camera moves by a quarter."""
-    path = tmp_path / "looks.usda"
+    path = tmp_path / "looks[1].usda"  # no pattern, because the file exists
     path.write_text(LOOKS.replace("SHOWN", "rel material:binding = </Red>"))
     for name, size, frame, middle, width, row in (
         ("Eye", (160, 80), 0, 80, 20, 40),
@@ -630,11 +630,19 @@ def test_an_interrupt_leaves_the_good_pictures_or_nothing(folder, tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["out.gif", "out.mp4"]
 
 
-@pytest.mark.parametrize(("command", "output"), [(("render", *SIZE), "cloth.png"), (("view", "--plain"), "cloth.html")])
+@pytest.mark.parametrize(
+    ("command", "output"),
+    [(("render", *SIZE), "a[1].png"), (("view", "--plain"), "a[1].html"), (("run", "--frames", "1"), "a[1].usdc")],
+)
 def test_the_default_output_is_named_after_the_file_and_replaces_nothing(folder, command, output, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert run(capfd, command[0], folder / "cloth.usdc", *command[1:])[0] == 0 and Path(output).stat().st_size > 100
-    refused(capfd, [command[0], folder / "cloth.usdc", *command[1:]], f"{output} exists already, and without -o nothing is")
+    path = tmp_path / "in" / ("a[1].obj" if command[0] == "run" else "a[1].npz")
+    path.parent.mkdir()
+    shutil.copy(folder / "cloth.npz", path)
+    if command[0] == "run":
+        path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\n")
+    assert run(capfd, command[0], path, *command[1:])[0] == 0 and Path(output).stat().st_size > 100
+    refused(capfd, [command[0], path, *command[1:]], f"{output} exists already, and without -o nothing is")
 
 
 def test_the_command_draws(folder, tmp_path, capfd):

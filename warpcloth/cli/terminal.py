@@ -7,7 +7,6 @@ import shutil
 import sys
 import tempfile
 import unicodedata
-from glob import has_magic
 from pathlib import Path
 
 from ..base.checks import whole
@@ -43,7 +42,7 @@ def own_output(name, ending, replace=False):
     Raises:
         ValueError: The file exists already and is not to be replaced, or the name cannot be that of a file.
     """
-    if name != os.path.basename(name) or not name.isprintable() or name.strip(". ") == "" or has_magic(name):
+    if name != os.path.basename(name) or not name.isprintable() or name.strip(". ") == "" or {*"*?"} & {*name}:
         raise ValueError(f"the output would be called {name!r}, which cannot be the name of a file; give one with -o")
     output = f"{name}{ending}"
     if os.path.lexists(output) and not replace:

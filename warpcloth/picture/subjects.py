@@ -154,7 +154,7 @@ def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0, c
 def _of_path(path, mesh, prim, fps, camera):
     name = Path(path).name or path
     ending = Path(path).suffix.lower()
-    if ending in STAGE_ENDINGS and not glob.has_magic(path):
+    if ending in STAGE_ENDINGS and (os.path.isfile(path) or not glob.has_magic(path)):
         return _of_stage(path, name, prim, fps, camera)
     if ending in ENDINGS and os.path.isfile(path):
         one = Surface.load(path, prim)
