@@ -301,10 +301,14 @@ SELECTIONS = [  # on the 4 by 3 grid of size (3, 2): vertex i + 4j at x = i, z =
     ("1/(x + 1) < 0.3", [3, 7, 11]),
     ("3 - 2 - 1 == x", [0, 4, 8]),
     ("8/4/2 == x", [1, 5, 9]),
+    ("+x > 2.5", [3, 7, 11]),
+    ("1 - + - x > +(2.5)", [2, 3, 6, 7, 10, 11]),
+    (5000 * "-" + "x < -2.5", []),
+    (5001 * "-" + "x < -2.5", [3, 7, 11]),
 ]
 
 
-@pytest.mark.parametrize("text, expected", SELECTIONS, ids=[text for text, _ in SELECTIONS])
+@pytest.mark.parametrize("text, expected", SELECTIONS, ids=[text[:40] for text, _ in SELECTIONS])
 def test_select(text, expected):
     chosen = Mesh.grid(4, 3, size=(3, 2)).select(text)
     assert chosen.dtype == np.int32
@@ -316,7 +320,7 @@ SUMS = st.recursive(
     lambda inner: (
         st.builds("{}{}{}".format, inner, st.sampled_from([" + ", "-", "*", " - "]), inner)
         | st.builds("({})".format, inner)
-        | st.builds("-{}".format, inner.filter(lambda text: text[0] not in "+-"))
+        | st.builds("{}{}".format, st.sampled_from("+-"), inner.filter(lambda text: text[0] not in "+-"))
     ),
     max_leaves=5,
 )
@@ -342,14 +346,14 @@ def test_selections_have_one_scale():
 BAD_SELECTIONS = [
     ("", "column 1: the text ends, expected x, y, z, all, boundary"),
     ("x", "column 2: the text ends, expected < or <= or =="),
-    ("x = 1", "column 3: unexpected '='"),
+    ("x = 1", "column 3: unexpected '=', expected a number, a name, a comparison or one of \\( \\) , : \\+ - \\* /"),
     ("x < all", "column 5: found 'all', expected a number"),
     ("x * < 1", "column 5: found '<', expected a number"),
     ("(x + 1", "column 7: the text ends, expected"),
     ("(x + 1)", r"column 7: found .\)., expected < or"),
     ("1 + 2", "column 6: the text ends, expected < or"),
     ("x < 1 < 2", "column 7: found '<', expected \"and\""),
-    ("x ** 2 < 1", r"column 4: found '\*', expected a number"),
+    ("x ** 2 < 1", r"column 4: found '\*', expected a number, x, y, z or \("),
     ("1/x < 1", "column 1: is not finite at vertex 0"),
     ("x*1e300*1e300 < 1", "column 1: is not finite at vertex"),
     ("x * (y < 1) < 1", "column 8: found '<', expected"),

@@ -30,7 +30,7 @@ def select(mesh, text):
                   | "part" "(" name ")"
         sum       = product {("+" | "-") product}
         product   = value {("*" | "/") value}
-        value     = "x" | "y" | "z" | number | "-" value | "(" sum ")"
+        value     = "x" | "y" | "z" | number | ("-" | "+") value | "(" sum ")"
         range     = index | [start] ":" [stop] [":" step]
 
     Comparisons are of rest points. Coordinates that differ by at most 1e-6 of the bounding box's diagonal are equal, and so are
@@ -87,7 +87,8 @@ class _Reader:
         while column < len(text):
             match = _TOKEN.match(text, column)
             if not match:
-                self.fail(column, f"unexpected {text[column]!r}, expected a number, a name, a comparison or one of ( ) , :")
+                expected = "a number, a name, a comparison or one of ( ) , : + - * /"
+                self.fail(column, f"unexpected {text[column]!r}, expected {expected}")
             if match.lastgroup != "space":
                 self.tokens.append((match.lastgroup, match.group(), column))
             column = match.end()
@@ -171,7 +172,7 @@ class _Reader:
 
     def vertices(self):
         kind, word, column = self.tokens[self.position]
-        if kind == "number" or word in ("x", "y", "z", "-", "("):
+        if kind == "number" or word in ("x", "y", "z", "-", "+", "("):
             return self.comparison()
         word = self.accept("all", "boundary", "corners", "nearest", "index", "part")
         if word is None:
@@ -219,14 +220,16 @@ class _Reader:
         return value
 
     def value(self):
-        if self.accept("-"):
-            return -self.value()
-        if self.tokens[self.position][1] == "(":
-            return self.in_brackets(self.sum)
-        if (axis := self.accept("x", "y", "z")) is None:
-            return self.number()
-        axis = "xyz".index(axis)
-        return self.mesh.points[:, axis] + self.tolerance * (np.arange(4) == 1 + axis)[:, None]
+        factor = 1.0
+        while sign := self.accept("-", "+"):
+            factor = -factor if sign == "-" else factor
+        kind, word, _ = self.tokens[self.position]
+        if word == "(":
+            return factor * self.in_brackets(self.sum)
+        if kind == "number":
+            return factor * self.number()
+        axis = "xyz".index(self.accept("x", "y", "z") or self.expected("a number, x, y, z or ("))
+        return factor * (self.mesh.points[:, axis] + self.tolerance * (np.arange(4) == 1 + axis)[:, None])
 
     def part(self):
         self.require("(")
