@@ -320,10 +320,17 @@ def test_a_solver_without_a_step_takes_about_a_240th_of_a_second_or_its_limit(re
         assert np.array_equal(*ends)
 
 
-@pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1)])
-def test_hard_terms_are_refused_where_forces_are_needed(solver, device):
-    with pytest.raises(ValueError, match="cannot take Spring with infinite stiffness; PBD"):
-        solver.bind(net("structural", n=4, stiffness=np.inf).build(device=device))
+@pytest.mark.parametrize(
+    ("solver", "stiffness", "message"),
+    [
+        (wc.Newton(substeps=1), np.inf, "cannot take Spring with infinite stiffness; PBD"),
+        (wc.Explicit(substeps=1), np.inf, "cannot take Spring with infinite stiffness; PBD"),
+        (wc.Explicit(), 1e30, "the scene is so stiff that this solver is stable only below .*e-1. s; take an implicit one"),
+    ],
+)
+def test_hard_terms_are_refused_where_forces_are_needed(solver, stiffness, message, device):
+    with pytest.raises(ValueError, match=message):
+        solver.bind(net("structural", n=4, stiffness=stiffness).build(device=device))
 
 
 @pytest.mark.parametrize(

@@ -319,5 +319,12 @@ class ImplicitStep(Step):
 
 
 def fewest_substeps(fps, rest, motion):
-    """Returns the fewest steps per frame with a step 10 % below the limit ``rest`` [s] about rest, and below ``motion`` [s]."""
-    return math.floor(1.0 / (fps * min(rest / 1.1, motion))) + 1
+    """Returns the fewest steps per frame with a step 10 % below the limit ``rest`` [s] about rest, and below ``motion`` [s].
+
+    Raises:
+        ValueError: They would be more than a solver takes.
+    """
+    longest = min(rest / 1.1, motion)
+    if not fps * longest * MOST > 1.0:
+        raise ValueError(f"the scene is so stiff that this solver is stable only below {longest:.3g} s; take an implicit one")
+    return math.floor(1.0 / (fps * longest)) + 1
