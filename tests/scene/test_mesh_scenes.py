@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+import trimesh
 
 import warpcloth as wc
 from support.command_line import run
@@ -84,6 +85,30 @@ def test_a_cloth_that_is_too_large_is_said_with_the_likely_unit(tmp_path, kind, 
     said = [str(warning.message) for warning in recwarn if " m long and has " in str(warning.message)]
     hint = hint if hint is None or kind == "mesh" else hint.replace("--scale", "metersPerUnit =")
     assert len(said) == (hint is not None) and all(text.startswith(str(path)) and text.endswith(hint) for text in said)
+
+
+@pytest.mark.parametrize(
+    ("ending", "given", "axis"),
+    [
+        ("obj", "Z", "Z"),
+        ("glb", "Y", "Y"),
+        ("glb", None, None),
+        ("glb", "Z", "up_axis is 'Z', but in the file it is 'Y'"),
+        ("usda", "Y", "Y"),
+        ("usda", "Z", "up_axis is 'Z', but in the file it is 'Y'"),
+    ],
+)
+def test_an_up_axis_is_given_where_the_file_has_none(tmp_path, ending, given, axis):
+    path = tmp_path / f"sheet.{ending}"
+    if ending == "glb":
+        trimesh.Trimesh(GRID.points, GRID.triangles).export(path)
+    else:
+        path.write_text(obj(GRID.points.tolist()) if ending == "obj" else stage(GRID.points.tolist()))
+    if axis in (None, "Y", "Z"):
+        assert wc.Mesh.load(path, up_axis=given).up_axis == axis
+    else:
+        with pytest.raises(ValueError, match=axis):
+            wc.Mesh.load(path, up_axis=given)
 
 
 UV = {"st": GRID.points[:, [2, 0]].tolist()}

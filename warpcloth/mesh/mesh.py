@@ -241,24 +241,27 @@ class Mesh:
             path: An .obj, .ply, .stl, .off, .glb or .gltf file, or a .usd, .usda, .usdc or .usdz stage.
             prim: Name of the geometry, or path of the prim, if the file has several.
             scale: Factor by which to multiply lengths, such as 0.01 for a mesh file in centimetres.
-            up_axis: "Y" or "Z", if the file does not say it.
+            up_axis: "Y" or "Z", if the file does not say it. Stages do, and in .glb and .gltf files it is Y.
 
         Returns:
             Mesh: An instance of the class on which it was called, with vertices in the order of the file.
 
         Raises:
-            ValueError: The ending is none of those above, or ``scale`` is not above 0.
+            ValueError: The ending is none of those above, ``scale`` is not above 0, or ``up_axis`` is not that of the file.
         """
         read = READERS.get(Path(path).suffix.lower())
         if read is None:
             raise ValueError(f"{path}: the ending must be one of {' '.join(READERS)}")
         number("scale", scale, above=0.0)
         mesh = read(path, prim, cls)
+        own = mesh.up_axis or ("Y" if Path(path).suffix.lower() in (".glb", ".gltf") else None)
+        if up_axis is not None and own not in (None, up_axis):
+            raise ValueError(f"{path}: up_axis is {up_axis!r}, but in the file it is {own!r}; leave it out")
         if scale == 1.0 and up_axis is None:
             return mesh
         given = {name: getattr(mesh, name) for name in ("texture_coordinates", "grid_shape", "parts")}
         elements = {"triangles": mesh.triangles} if len(mesh.triangles) else {"edges": mesh.edges}
-        return cls(scale * mesh.points, **elements, **given, up_axis=mesh.up_axis or up_axis)
+        return cls(scale * mesh.points, **elements, **given, up_axis=own or up_axis)
 
     def select(self, text: str) -> np.ndarray:
         """Returns the vertices of a selection such as "z == 0 and not corners".
