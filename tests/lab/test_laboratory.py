@@ -222,9 +222,10 @@ def test_the_command_prints_the_reading(capfd, tmp_path):
     found = json.loads(out)["readings"]["modulus"]
     assert code == 0 and found["unit"] == "N/m" and found["value"] == pytest.approx(COTTON.warp, rel=1e-5)
     assert len(wc.open_sequence(str(shape))) == 1
-    for given in (["strip", "-p", "elements=2", "strain=1e-6"], ["picture_frame"]):
+    for given in (["strip", "-p", "elements=2", "strain=1e-6"], ["picture_frame", "--fabric", "denim"]):
         code, out, _ = run(capfd, "measure", *given)
         assert code == 0 and "(record of the fabric: " in out and "they differ" not in out
+        assert "--fabric" not in given or "1616 N/m" in out
     code, out, _ = run(capfd, "measure", "strip", "-p", "elements=2")
     assert code == 0 and "modulus  " in out and f"(record of the fabric: {COTTON.modulus_along(np.pi / 4):.4g})" in out
     assert "they differ because the reading is at a finite strain" in out

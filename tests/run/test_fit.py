@@ -90,6 +90,8 @@ def test_it_fits_a_capture_whose_triangles_change(tmp_path, capsys):
         ([*words, "--fps", "24", "--frames", "1"], "none at the time of a frame of the scene"),
         ([*words, "--fps", "60"], "seen: is about 670 m across, and the cloth 1.41 m; lengths must be metres, or, of mesh"),
         ([*words, "--fps", "60", "--scale", "1e-6"], "seen: is about 0.00067 m across, and the cloth 1.41 m"),
+        ([*words, "--pins", "x > 7"], "--pins 'x > 7' names no vertex"),
+        ([*words, "--fabric", "denin"], "fabric is 'denin'; it must be one of"),
         (["fit", "chain", *words[4:], "--fps", "60"], "seen: the mesh has no triangles to compare a capture with"),
         ([*words, "--fps", "60", "--vertices", "corners"], "--vertices is given, and the vertices of --capture are not"),
         (["fit", "hanging", "-p", "n=4", "seen.npz", *words[6:]], "'seen.npz' is not of the form name=value; MEASURED must"),

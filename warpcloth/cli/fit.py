@@ -9,7 +9,7 @@ from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, json_text
 from ..picture.figures import PICTURES, check_path
-from .options import add_scene, add_solver, add_values
+from .options import add_fabric, add_pins, add_scene, add_solver, add_values
 from .setup import named_scene, solver_facts, solver_line, solver_setup
 from .terminal import check_writable, say
 
@@ -30,13 +30,15 @@ measure'. Each of several needs its standard deviation, NAME=VALUE+-DEVIATION; o
   warpcloth fit hanging seen.usdc --start Spring.stiffness=300 QuadraticBending.stiffness=1e-4 --frames 30
   warpcloth fit hanging markers.csv --start QuadraticBending.stiffness=1e-4 --at-rest
   warpcloth fit hanging --capture scan --fps 60 --scale 0.001 --start QuadraticBending.stiffness=1e-4 --frames 30
-  warpcloth fit loop -p fabric=cotton --reading "depth of the loop=19+-0.2" --start PlateBending.stiffness=1e-5
+  warpcloth fit loop --fabric cotton --reading "depth of the loop=19+-0.2" --start PlateBending.stiffness=1e-5
 """
 
 
 def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
     add_scene(parser)
+    add_fabric(parser)
+    add_pins(parser)
     parser.add_argument(
         "measured", nargs="?", metavar="MEASURED", help="the measured animation; without --reading and --capture"
     )

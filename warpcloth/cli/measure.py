@@ -7,20 +7,22 @@ import numpy as np
 from ..base.outputs import OutputSet, check_apart, check_replaceable
 from ..base.quiet import find_device
 from ..base.texts import json_text
+from .options import add_fabric
 from .setup import named_scene
 from .terminal import aligned, check_writable, say
 
 EPILOG = """\
-SCENE is cantilever, loop, cusick, strip or picture_frame, most of them with -p fabric=NAME. The sample is at rest: there is no
+SCENE is cantilever, loop, cusick, strip or picture_frame, all of them with --fabric NAME. The sample is at rest: there is no
 motion. With -o the shape is written as .npz, which 'warpcloth render' draws.
 
-  warpcloth measure cantilever -p fabric=denim gamma=8 angle=45
-  warpcloth measure cusick -p fabric=silk -o drape.npz
+  warpcloth measure cantilever --fabric denim -p gamma=8 angle=45
+  warpcloth measure cusick --fabric silk -o drape.npz
 """
 
 
 def add_arguments(parser):
     """Adds the arguments of this command, without those of all commands."""
+    add_fabric(parser)
     parser.add_argument("-o", "--output", metavar="FILE", help="also write the shape, as .npz")
 
 

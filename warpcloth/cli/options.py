@@ -164,8 +164,22 @@ def add_cloth(parser):
     add = parser.add_argument
     add("--prim", help="path or name of the cloth's prim, if the stage has several meshes, or of the geometry of a mesh file")
     add("--scale", metavar="M", help="metres per unit of a mesh file, such as 0.01 for centimetres (default: 1)")
-    add("--fabric", metavar="NAME", help="fabric of the cloth, one of 'warpcloth fabrics' (default for a mesh file: cotton)")
-    add("--pins", metavar="SELECTION", help="pin these vertices in place of the scene's pins, such as 'x < 0.1' or boundary")
+    add_fabric(parser)
+    add_pins(parser)
+    parser.set_defaults(of_scene=CLOTH)
+
+
+def add_fabric(parser):
+    """Adds the option for the parameter ``fabric`` of a scene."""
+    text = "fabric of the cloth, one of 'warpcloth fabrics' (default for a mesh file: cotton)"
+    parser.add_argument("--fabric", metavar="NAME", help=text)
+    parser.set_defaults(of_scene=("fabric",))
+
+
+def add_pins(parser):
+    """Adds the option that replaces the pins of a scene."""
+    text = "pin these vertices in place of the scene's pins, such as 'x < 0.1' or boundary"
+    parser.add_argument("--pins", metavar="SELECTION", help=text)
 
 
 def add_values(parser, option, of, text):

@@ -6,7 +6,7 @@ import warnings
 from dataclasses import asdict, dataclass, replace
 
 from ..base.texts import assignments, options
-from .options import CLOTH, DEFAULT
+from .options import DEFAULT
 
 # With more substeps per frame than this, print a hint at the implicit solver.
 _MANY_SUBSTEPS = 1000
@@ -37,7 +37,7 @@ def scene_ref(arguments):
 
 def _parameters(arguments):
     """Returns the parameters of the scene as texts by name, after moving options that stand for some of them to ``-p``."""
-    for name in CLOTH if hasattr(arguments, "pins") else ():
+    for name in getattr(arguments, "of_scene", ()):
         if (value := getattr(arguments, name)) is not None:
             arguments.p = [*arguments.p, f"{name}={value}"]
             setattr(arguments, name, None)
