@@ -27,7 +27,7 @@ def scene(
     width: float = 0.025,
 ):
     """pear, ring or heart, Γ, edges along L, L [m], duration [s]; fabric, its angle to the warp [°], width [m]."""
-    wc.checks.choice("kind", kind, tuple(KINDS) if fabric is None else ("heart",))
+    wc.checks.choice(*("kind", kind, tuple(KINDS)) if fabric is None else ("kind with a fabric", kind, ("heart",)))
     wc.checks.number("gamma", gamma, least=0.0)
     wc.checks.whole("elements", elements, 8)
     wc.checks.number("length", length, above=0.0)

@@ -132,6 +132,7 @@ WRONG_USES = [
     ("run hanging -p stifness=3", "; did you mean stiffness?"),
     ("run hangin", "; did you mean hanging?"),
     ("run hanging --fabric denin", "; did you mean denim?"),
+    ("measure loop -p kind=pear fabric=denim", "kind with a fabric is 'pear'; it must be one of 'heart'\n"),
     ("fabrics denin", "; did you mean denim?"),
     ("run hanging -s linear=cgg", "; did you mean cg?"),
     ("run hanging -o {}/o.usdc --device cuda", "device is 'cuda'; on this machine there are cpu"),

@@ -434,7 +434,7 @@ def test_scenes_without_sizes_are_taken_as_they_are(monkeypatch, tmp_path):
         ("bench hanging -s substeps=0", "substeps is 0"),
         ("bench hanging -p m=3", "has no parameter 'm'"),
         ("bench flag --sizes 4 -p m=3", "has no parameter 'm'"),
-        ("bench bunny --sizes 4", "bunny has no resolution to vary; its scene() must take n or links or elements"),
+        ("bench bunny --sizes 4", "bunny has no resolution to vary; none of its parameters is n or links or elements"),
         ("bench hanging --csv none/t.csv", "none does not exist"),
         ("bench --sizes 4", "--sizes is given without SCENE, which must stand before it"),
         ("bench -p n=4", "-p is given without SCENE"),

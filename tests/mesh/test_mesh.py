@@ -346,7 +346,7 @@ def test_selections_have_one_scale():
 BAD_SELECTIONS = [
     ("", "column 1: the text ends, expected x, y, z, all, boundary"),
     ("x", "column 2: the text ends, expected < or <= or =="),
-    ("x = 1", "column 3: unexpected '=', expected a number, a name, a comparison or one of \\( \\) , : \\+ - \\* /"),
+    ("x = 1", "column 3: unexpected '=', expected a number, name, comparison or one of \\( \\) , : \\+ - \\* /"),
     ("x < all", "column 5: found 'all', expected a number"),
     ("x * < 1", "column 5: found '<', expected a number"),
     ("(x + 1", "column 7: the text ends, expected"),

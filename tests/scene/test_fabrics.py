@@ -138,6 +138,9 @@ def test_one_record_is_printed_with_what_is_computed(capfd):
         ({"density": 0.1, "shear": np.nan}, "Fabric.shear is nan"),
         ({"density": None}, "Fabric.density is None"),
         ({"density": 0.1, "source": 3}, "Fabric.source is 3; it must be a text"),
+        ({"density": 0.1, "computed": ("bogus",)}, r"Fabric.computed is \('bogus',\); it must be a tuple of names of density"),
+        ({"density": 0.1, "computed": ("name", [])}, r"Fabric.computed is \('name', \[\]\); it must be a tuple of names"),
+        ({"density": 0.1, "computed": "shear"}, "Fabric.computed is 'shear'; it must be a tuple of names"),
     ],
 )
 def test_refusals_of_records(given, sentence):

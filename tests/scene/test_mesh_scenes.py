@@ -62,6 +62,8 @@ def test_options_of_the_command_line_are_those_of_the_mesh(sheet, tmp_path, capf
     assert err.count("warning") == 1 and "the warp of the fabric is along x" in err
     code, out, _ = run(capfd, "bench", sheet, *given[:-2], "--frames", "1", "--json")
     assert code == 0 and '"fabric": "silk"' in out
+    code, _, err = run(capfd, "bench", sheet, "--sizes", "3")
+    assert code == 2 and "sheet.obj has no resolution to vary; none of its parameters is n or links or elements" in err
 
 
 @pytest.mark.parametrize(
@@ -140,11 +142,11 @@ def test_the_warp_of_a_fabric_on_a_stage(tmp_path, turned, given, warp, says, re
 @pytest.mark.parametrize(
     ("ending", "warp", "says"),
     [
-        ("obj", "0,1,0", "warp, in a stage warpcloth:warp, has no direction in triangle 0; it must have a part in its plane"),
+        ("obj", "0,1,0", "warp (warpcloth:warp) has no direction in triangle 0; it must have a part in its plane"),
         ("obj", "0,1", "warp has shape (2,); it must be (3,)"),
         ("obj", "s", "warp is 's'; it must be three numbers, such as 0,0,1"),
         ("obj", "0,0,nan", "warp[2] is nan; it must be finite"),
-        ("usda", (0, 1, 0), "prim /Cloth: warp, in a stage warpcloth:warp, has no direction in triangle 0"),
+        ("usda", (0, 1, 0), "prim /Cloth: warp (warpcloth:warp) has no direction in triangle 0"),
     ],
 )
 def test_a_warp_that_is_none_is_refused_by_the_name_that_was_written(tmp_path, ending, warp, says):

@@ -85,8 +85,9 @@ def choice(name: str, value: object, allowed: Collection[str]) -> None:
 
 
 def did_you_mean(given: object, names: Iterable[str]) -> str:
-    """Returns the end of an error that names the closest of the allowed ``names``; an empty text if none is close."""
-    close = difflib.get_close_matches(str(given), list(names), n=1)
+    """Returns the end of an error that names the closest of several allowed ``names``; an empty text if none is close."""
+    names = list(names)
+    close = difflib.get_close_matches(str(given), names, n=1) if len(names) > 1 else []
     return f"; did you mean {close[0]}?" if close and close[0] != given else ""
 
 

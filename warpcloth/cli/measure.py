@@ -79,8 +79,7 @@ def _summary(facts):
     for quantity, each in facts["readings"].items():
         value, record = (None if number is None else f"{number:.4g}" for number in (each["value"], each["record"]))
         differ |= record not in (None, value)
-        beside = "" if record is None else f"(record of the fabric: {record})"
-        rows.append((quantity, f"{value} {each['unit']}".rstrip(), beside))
+        rows.append((quantity, f"{value} {each['unit']}".rstrip(), f"(record of the fabric: {record})" if record else ""))
     lines = [*aligned(rows), *([f"they differ because {facts['why']}"] if differ else [])]
     lines.append(f"{facts['iterations']} iterations, {facts['seconds']:.3g} s")
     return "\n".join([f"{facts['scene']}: {facts['message']}", *(f"  {line}" for line in lines)])

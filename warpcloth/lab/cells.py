@@ -70,7 +70,7 @@ def refined(ref, value):
     for name in _RESOLUTIONS:
         if name in known:
             return replace(ref, parameters={**ref.parameters, name: int(value)})
-    raise ValueError(f"{ref.name} has no resolution to vary; its scene() must take {' or '.join(_RESOLUTIONS)}")
+    raise ValueError(f"{ref.name} has no resolution to vary; none of its parameters is {' or '.join(_RESOLUTIONS)}")
 
 
 def applied(scene, name, value):

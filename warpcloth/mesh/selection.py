@@ -87,8 +87,7 @@ class _Reader:
         while column < len(text):
             match = _TOKEN.match(text, column)
             if not match:
-                expected = "a number, a name, a comparison or one of ( ) , : + - * /"
-                self.fail(column, f"unexpected {text[column]!r}, expected {expected}")
+                self.fail(column, f"unexpected {text[column]!r}, expected a number, name, comparison or one of ( ) , : + - * /")
             if match.lastgroup != "space":
                 self.tokens.append((match.lastgroup, match.group(), column))
             column = match.end()

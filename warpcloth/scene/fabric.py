@@ -57,8 +57,10 @@ class Fabric:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "computed":
-                continue
-            if field.name in ("name", "source", "notes"):
+                numbers = [other.name for other in fields(self) if other.name not in ("name", "source", "notes", "computed")]
+                if not isinstance(value, tuple) or any(name not in numbers for name in value):
+                    raise ValueError(f"Fabric.computed is {shown(value)}; it must be a tuple of names of {', '.join(numbers)}")
+            elif field.name in ("name", "source", "notes"):
                 if not isinstance(value, str):
                     raise ValueError(f"Fabric.{field.name} is {shown(value)}; it must be a text")
             elif value is not None or field.name == "density":

@@ -13,11 +13,7 @@ _FACING = 0.99  # cosine of the angle between x and a normal, above which a tria
 
 
 def warp_on(mesh: Mesh, warp: ArrayLike | None = None) -> np.ndarray | None:
-    """Returns vectors along the warp of a fabric, (3,) or (T, 3), of any length; None if the mesh gives them to all triangles.
-
-    Args:
-        mesh: The mesh.
-        warp: Vectors to check and return, (3,) or (T, 3).
+    """Returns ``warp``, or vectors along the warp of a fabric, (3,) or (T, 3); None if the mesh gives them to all triangles.
 
     Raises:
         ValueError: ``warp`` has another shape, or is along the normal of a triangle.
@@ -31,8 +27,7 @@ def warp_on(mesh: Mesh, warp: ArrayLike | None = None) -> np.ndarray | None:
         vectors = array("warp", warp, (3,) if as_array(warp).ndim < 2 else (len(x), 3))
         across = np.linalg.norm(np.cross(normals, vectors), axis=1)
         for t in np.flatnonzero(across <= 1e-6 * np.linalg.norm(normals, axis=1) * np.linalg.norm(vectors, axis=-1))[:1]:
-            rule = "it must have a part in its plane"
-            raise ValueError(f"warp, in a stage warpcloth:warp, has no direction in triangle {t}; {rule}")
+            raise ValueError(f"warp (warpcloth:warp) has no direction in triangle {t}; it must have a part in its plane")
         return vectors
     given = np.zeros((len(x), 3)) if st is None else along_s(x, st)
     size = np.linalg.norm(given, axis=1)

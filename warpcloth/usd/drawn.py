@@ -234,9 +234,9 @@ def camera_of(stage, path, name):
         height = max(camera.verticalAperture, camera.horizontalAperture / aspect)
         for name, value in (("focalLength", camera.focalLength), ("verticalAperture", height)):
             number(f"{path}, prim {prim.GetPath()}: {name}", value, above=0.0)
-        offset = np.divide((camera.horizontalApertureOffset, camera.verticalApertureOffset), height)
-        fov = 2.0 * np.degrees(np.arctan(height / (2.0 * camera.focalLength)))
-        return matrix[3, :3], -matrix[2, :3], matrix[1, :3], fov, *offset
+        fov = np.degrees(2.0 * np.arctan(0.5 * height / camera.focalLength))
+        shift, rise = camera.horizontalApertureOffset / height, camera.verticalApertureOffset / height
+        return matrix[3, :3], -matrix[2, :3], matrix[1, :3], fov, shift, rise
 
     return view
 
