@@ -12,6 +12,7 @@ from support.mesh_texts import TEXTS
 from warpcloth.cli import main
 from warpcloth.mesh.mesh import Surface
 from warpcloth.mesh.seams import coincident, piece_count, seam_pairs
+from warpcloth.scenes import knot
 
 GRID = wc.Mesh.grid(5, 4)
 
@@ -56,6 +57,39 @@ def test_vertices_that_touch_elsewhere_stay_apart(tmp_path, ending):
     layers[[6, 6 + len(GRID.points)], 1] = 0.05
     mesh = load(tmp_path, ending, layers, np.concatenate([GRID.triangles, GRID.triangles + len(GRID.points)]))
     assert len(mesh.points) == 2 * len(GRID.points) and coincident(mesh.points) == 1
+
+
+BACK = GRID.triangles[:, ::-1]
+RIGHT = GRID.points[GRID.triangles].mean(axis=1)[:, 0] > 0.5
+LAYERS = {  # two layers at one place, with the height of the second, and how many vertices are left
+    "wound alike": (GRID.triangles, 0.0, 40),
+    "wound otherwise": (BACK, 0.0, 40),
+    "cut along other diagonals": (wc.Mesh.grid(5, 4, pattern="alternating").triangles, 0.0, 40),
+    "two layers that are joined nowhere": (GRID.triangles, 0.1, 40),
+    "a pillow": (BACK, 0.1, 28),  # two triangles at corners lie upon others
+}
+
+
+@pytest.mark.parametrize("ending", ["obj", "ply", "off"])
+@pytest.mark.parametrize(("triangles", "height", "left"), LAYERS.values(), ids=LAYERS)
+def test_layers_stay_apart(tmp_path, ending, triangles, height, left):
+    second = GRID.points.copy()
+    second[np.setdiff1d(np.arange(20), GRID.boundary_edges), 1] += height
+    both = np.concatenate([GRID.triangles, triangles + 20])
+    assert len(load(tmp_path, ending, np.concatenate([GRID.points, second]), both).points) == left
+
+
+def test_seams_of_charts_that_are_wound_otherwise_and_of_two_layers(tmp_path):
+    points, triangles, _ = cut(GRID, RIGHT.astype(int))
+    mixed = np.where(RIGHT[:, None], triangles[:, ::-1], triangles)
+    assert len(load(tmp_path, "obj", points, mixed).points) == 20
+    twice = np.concatenate([triangles, triangles + len(points)])  # nobody knows which pieces belong together
+    assert len(load(tmp_path, "obj", np.tile(points, (2, 1)), twice).points) == 48
+
+
+def test_scenes_of_strips_that_start_in_one_place_do_not_warn():
+    mesh = knot.scene().mesh
+    assert coincident(mesh.points) == len(mesh.points) // 2 and not len(seam_pairs(mesh.points, mesh.triangles))
 
 
 def test_rest_meshes_of_caches_keep_their_vertices(tmp_path):

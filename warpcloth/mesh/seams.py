@@ -17,7 +17,8 @@ def welded(faces):
 def seam_pairs(points, triangles):
     """Returns pairs of vertices at one position (m, 2): the first on a seam, and each other.
 
-    A seam is a side of one triangle alone where another such side lies.
+    A seam is a side of one triangle alone where another such side lies and the triangles do not lie upon each other, as those
+    of two layers do.
 
     Args:
         points: (n, 3).
@@ -40,6 +41,7 @@ def piece_count(mesh):
     return int(connected_components(coo_array((np.ones(len(mesh.edges)), joined), shape=(n, n)), directed=False)[0])
 
 
+@np.errstate(invalid="ignore", over="ignore")  # points may be infinite
 def _seam_pairs(points, counts, corners):
     """Like :func:`seam_pairs`, for faces of several numbers of corners (F,), with their vertices one after another (C,)."""
     first, group = first_of_equals(points)
@@ -47,18 +49,34 @@ def _seam_pairs(points, counts, corners):
         return np.empty((0, 2), dtype=np.int64)
     following = np.arange(1, len(corners) + 1)
     following[np.cumsum(counts) - 1] -= counts
-    sides = np.sort(np.stack([corners, corners[following]], axis=1), axis=1)
-    free = sides[_times(sides) == 1]
-    seam = np.unique(free[_times(np.sort(group[free], axis=1)) > 1])
+    sides = np.stack([corners, corners[following]], axis=1)
+    free = np.flatnonzero(_equal_rows(np.sort(sides, axis=1))[2] == 1)
+    first, which, times = _equal_rows(np.sort(group[sides[free]], axis=1))
+    normals = np.repeat(_area_vectors(points[corners], points[corners[following]], counts), counts, axis=0)[free]
+    lengths, starts = np.linalg.norm(normals, axis=1), group[sides[free, 0]]
+    # Sides of one surface run in opposite directions, and faces that turn back lie upon each other. Sides in the same direction
+    # may be of a surface that is wound both ways, which goes on there, or of two layers.
+    ahead = starts == starts[first]
+    cosines = np.where(ahead, 1.0, -1.0) * (normals * normals[first]).sum(axis=1)
+    layers = (cosines > np.where(ahead, 0.5, 1.0 - 1e-6) * lengths * lengths[first]) & (first != np.arange(len(free)))
+    seam = np.unique(sides[free[(times > 1) & ~np.isin(which, which[layers])]])
     _, at, which = np.unique(group[seam], return_index=True, return_inverse=True)
     pairs = np.stack([seam[at][which], seam], axis=1)
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
 
-def _times(rows):
-    """Returns how often each row occurs."""
-    _, which, times = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
-    return times[which.ravel()]
+def _equal_rows(rows):
+    """Returns for each row the first one that is equal, the number of their set, and how many there are."""
+    _, first, which, times = np.unique(rows, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    which = which.ravel()
+    return first[which], which, times[which]
+
+
+def _area_vectors(starts, ends, counts):
+    """Returns the area vectors (F, 3) of faces from the two ends of each of their sides (C, 3)."""
+    begins = np.cumsum(counts) - counts
+    origins = np.repeat(starts[begins], counts, axis=0)
+    return np.add.reduceat(np.cross(starts - origins, ends - origins), begins)
 
 
 def first_of_equals(points):
