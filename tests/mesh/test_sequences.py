@@ -279,6 +279,13 @@ NUMBERED = [  # names in the order of their numbers, labels, missing
     (["c_1.00", "c_2.00", "c_3.00"], [1, 2, 3], []),
     (["shirt_v2.0998", "shirt_v2.1008"], [998, 1008], []),
     (["take_2.0998", "take_2.0999", "take_2.1001"], [998, 999, 1001], [1000]),
+    (["shot010.0001", "shot010.0011", "shot010.0021"], [1, 11, 21], []),
+    (["cloth_2.0100", "cloth_2.0102"], [100, 102], []),
+    (["body.1.1001", "body.1.1003"], [1001, 1003], []),
+    (["a_1.2.3", "a_1.2.4", "a_1.2.10"], [3, 4, 10], [5, 6, 7, 8, 9]),
+    (["c_1.0000", "c_1.5000", "c_2.0000"], [1, 1.5, 2], []),
+    (["cloth -1", "cloth -2"], [1, 2], []),
+    (["cloth -1", "cloth 0", "cloth 1"], [-1, 0, 1], []),
 ]
 
 
@@ -372,6 +379,9 @@ REFUSED_FOLDERS = [  # names of files, what is opened, fps, kind of error, messa
     (["c_1.00.obj", "c_1.25.obj"], "", 24, ValueError, "c_1.00.obj: may be frame 1.00 or frame 0; rename the files so that"),
     (["c_1.1.obj", "c_1.2.obj"], "", 24, ValueError, "may be frame 1.1 or frame 1; rename"),
     (["c_1.0001.obj", "c_2.0002.obj"], "", 24, ValueError, "may be frame 1.0001 or frame 1; rename"),
+    (["c_0.0100.obj", "c_0.0200.obj"], "", 24, ValueError, "may be frame 0.0100 or frame 100; rename"),
+    (["c0.obj", "c-1.obj", "c-2.obj"], "", 24, ValueError, "c-1.obj: may be frame -1 or frame 1; rename the files so that"),
+    (["c 0.obj", "c -1.obj"], "", 24, ValueError, "c -1.obj: may be frame -1 or frame 1; rename"),
     (["c_0.obj", "c_-0.obj"], "", 24, ValueError, "c_0.obj: has number 0, the last in its name, as .*c_-0.obj has"),
     (["c_" + 16 * "1" + ".obj"], "", 24, ValueError, "has a number of 16 digits in its name, must have 15 at most"),
     (["1.mtl"], "", 24, ValueError, "no mesh files there; they must end with .obj .ply .off"),

@@ -9,7 +9,7 @@ import numpy as np
 
 # The last number of a name: perhaps a sign, digits, and perhaps more digits after a point.
 _NAME = re.compile(r"(.*?)([-+−]?)(\d+)(?:[.,](\d+))?\D*$", re.DOTALL)
-_VERSION = re.compile(r"v\d+$", re.IGNORECASE)
+_VERSION = re.compile(r"(v|\d[.,])\d+$", re.IGNORECASE)  # or a number of several parts
 _MAX_DIGITS = 15  # which float64 still tells apart
 _MAX_PARTS = 100  # of a frame
 
@@ -24,22 +24,28 @@ class _Name(NamedTuple):
 def frames_of_names(files: Iterable[Path]) -> dict[float, Path]:
     """Returns files by the numbers of their frames, ascending.
 
-    The last number in a name is that of its frame. A hyphen before it is a minus unless a letter or digit precedes it, so
-    "cloth_-4" is frame −4 and "cloth-4" is frame 4; beside "cloth0", however, "cloth-4" is frame −4. Decimals, as in "c_1.25"
+    The last number in a name is that of its frame. A hyphen before it is a minus unless a letter, digit or
+    blank precedes it, so "cloth_-4" is frame −4 and "cloth-4" is frame 4; beside "cloth1", however, "cloth-4" is frame −4.
+    Decimals, as in "c_1.25"
     and "c_2.00", are equal parts of a frame. After a version the point separates, as in "v2.0998", and also after a number
-    that all names have, if frames of two digits or more follow each other, as in "take_2.0998" and "take_2.0999".
+    that all names have, if it is not 0 and four digits or more follow, as in "take_2.0100" and "take_2.0200", or if frames of
+    two digits or more follow each other.
 
     Raises:
         ValueError: A name has no number, or one of more than 15 digits, two names have one number, or it is not clear whether
-            digits after a point are decimals. The message begins with the file.
+            a hyphen is a minus or digits after a point are decimals. The message begins with the file.
     """
     names = {file: _parsed(file) for file in files}
     if any(name.decimals for name in names.values()):
         names = _without_separators(names)
     unsigned = {name.before for name in names.values() if not name.sign}
+    positive = {name.before for name in names.values() if not name.sign and int(name.whole + name.decimals)}
     frames: dict[float, Path] = {}
     for file, (before, sign, whole, decimals) in names.items():
-        negative = sign in ("-", "−") and (not before[-1:].isalnum() or before in unsigned)
+        joins = sign == "-" and (before[-1:].isalnum() or before[-1:].isspace())
+        if joins and before in unsigned - positive:
+            raise _unclear(file, f"-{whole}", whole)
+        negative = sign in ("-", "−") and (not joins or before in positive)
         frame = (-1 if negative else 1) * (float(f"{whole}.{decimals}") if decimals else int(whole))
         other = frames.setdefault(frame, file)
         if other != file:
@@ -70,7 +76,8 @@ def _without_separators(names):
     if len({name[:3] for name in names.values()}) == 1:
         numbers = sorted(int(name.decimals or 0) for name in names.values())
         one_width = all(len(name.decimals) == digits >= 2 for name in names.values())
-        if one_width and min(np.diff(numbers), default=1) == 1:
+        whole = int(next(iter(names.values())).whole)
+        if one_width and (min(np.diff(numbers), default=1) == 1 or (digits >= 4 and whole)):
             return {file: _Name(f"{name.before}{name.whole}.", "", name.decimals, "") for file, name in names.items()}
     else:
         values = np.array([float(f"0.{name.decimals or 0}") for name in names.values()])
@@ -78,7 +85,9 @@ def _without_separators(names):
             if np.abs(values * parts - np.rint(values * parts)).max() <= 0.51 * parts * 10.0**-digits:
                 return names
     file, name = next((file, name) for file, name in names.items() if name.decimals)
-    raise ValueError(
-        f"{file}: may be frame {name.whole}.{name.decimals} or frame {int(name.decimals)}; "
-        'rename the files so that the frame is a whole number, after "_"'
-    )
+    raise _unclear(file, f"{name.whole}.{name.decimals}", int(name.decimals))
+
+
+def _unclear(file, one, other):
+    reason = 'rename the files so that the frame is a whole number, after "_"'
+    return ValueError(f"{file}: may be frame {one} or frame {other}; {reason}")
