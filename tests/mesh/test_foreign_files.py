@@ -38,6 +38,13 @@ OBJ = {
     "lines and points": f"{V}p 1 2\nl 1 2 3\n{F}",
     "empty slashes": f"{V}f 1/ 3/ 2/\nf 2// 3// 4//\n",
     "faces first": F + V,
+    "lines among faces": f"{V}f 1 2\nf\n{F}f 4\n",
+    "texture of a broken exporter": f"{V}vt nan nan\nvt -nan(ind) 0\nvt 1\nf 1/1 3/2 2/3\nf 2/3 3/9 4/0\n",
+    "texture that is not there": f"{V}f 1/1/1 3/3/1 2/2/1\nf 2/99999999999999999999 3/x 4/-7\n",
+    "colours and libraries": f"matlib a\nvc 1 0 0\n{V}{F}",
+    "a mark of the end": f"{V}{F}\x1a",
+    "a zero byte": f"{V}{F}\0",
+    "UTF-16": (V + F).encode("utf-16"),
     "three texture coordinates": f"{V}{VT.replace(chr(10), ' 0' + chr(10))}f 1/1 3/3 2/2\nf 2/2 3/3 4/4\n",
 }
 VERTICES = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
@@ -70,6 +77,18 @@ PLY = {
     "edges after": PLY_HEAD.replace("end_h", "element edge 1\nproperty int vertex1\nproperty int vertex2\nend_h")
     + PLY_ROWS
     + "0 1\n",
+    "normals of a broken exporter": PLY_HEAD.replace("element face", "property float nx\nelement face")
+    + PLY_ROWS.replace("\n", " -nan(ind)\n", 4),
+    "colours with a point": PLY_HEAD.replace("element face", "property uchar red\nelement face")
+    + PLY_ROWS.replace("\n", " 255.0\n", 4),
+    "a blank after ply": PLY_HEAD.replace("ply", "ply ") + PLY_ROWS,
+    "a mark of UTF-8": "\ufeff" + PLY_HEAD + PLY_ROWS,
+    "lines among faces": PLY_HEAD.replace("face 2", "face 4") + f"{ROWS}2 0 1\n3 0 2 1\n0\n3 1 2 3\n",
+    "lengths that are floats": binary("<", [(4, 0, 2, 3, 1)])
+    .replace(b"list uchar", b"list float")
+    .replace(b"\x04" + bytes(4), struct.pack("<fi", 4, 0)),
+    "a list of colours": PLY_HEAD.replace("element face", "property list uchar uchar red\nelement face")
+    + PLY_ROWS.replace("\n", " 1 9\n", 1).replace("\n", " 0\n", 4).replace(" 9 0\n", " 9\n"),
     "faces before vertices": f"ply\nformat ascii 1.0\n{LIST}{VERTICES}end_header\n3 0 2 1\n3 1 2 3\n{ROWS}",
     "texture of wedges": PLY_HEAD.replace("end_h", "property list uchar float texcoord\nproperty int texnumber\nend_h")
     + f"{ROWS}3 0 2 1 6 0 0 0 1 1 0 0\n3 1 2 3 6 1 0 0 1 1 1 0\n",
@@ -87,6 +106,7 @@ STL_BYTES += b"".join(struct.pack("<12fH", 0, 1, 0, *np.ravel(facet), 0) for fac
 STL = {
     "text": STL_TEXT,
     "capitals and blanks": STL_TEXT.upper().replace("\n", "\n\t  "),
+    "two on a line": STL_TEXT.replace("endfacet\nfacet", "endfacet facet"),
     "CRLF": STL_TEXT.replace("\n", "\r\n"),
     "bytes that begin with solid": STL_BYTES,
 }
@@ -97,6 +117,8 @@ OFF = {
     "no keyword": f"4 2 0\n{OFF_ROWS}",
     "no number of edges": f"OFF\n4 2\n{OFF_ROWS}",
     "colours": "COFF\n4 2 0\n" + ROWS.replace("\n", " 255 0 0 255\n") + "3 0 2 1 3 255 0 0\n3 1 2 3 0.5 0.5 0.5\n",
+    "normals and colours": "NCOFF\n4 2 0\n" + ROWS.replace("\n", " 0 1 0 9 9 9\n") + "3 0 2 1\n3 1 2 3\n",
+    "lines among faces": f"OFF\n4 4 0\n{ROWS}2 0 1\n3 0 2 1\n0\n3 1 2 3\n",
     "normals": "NOFF\n4 2 0\n" + ROWS.replace("\n", " 0 1 0\n") + "3 0 2 1\n3 1 2 3\n",
     "comments and blanks": f"# a square\nOFF # of two\n\n 4  2\t0\n\n{OFF_ROWS}",
     "CRLF": f"OFF\n4 2 0\n{OFF_ROWS}".replace("\n", "\r\n"),
@@ -174,18 +196,22 @@ def test_read(tmp_path, name, content, area):
 REFUSED = [  # name, content, where in the file, why
     ("comma.obj", V.replace("v 1 0 0", "v 1,0 0,0 0,0") + F, "line 2", "has '1,0', must be a number"),
     ("short.obj", V.replace("v 1 0 1", "v 1 0") + F, "line 4", "a vertex has 2 numbers, must have 3 or more"),
-    ("pair.obj", V + F + "f 1 2\n", "line 7", "face 3 has 2 corners, must have 3 or more"),
+    ("pair.obj", V + "f 1 2\n", "", "has no triangles"),
+    ("huge.obj", V + "f 1 3 99999999999999999999\n", "line 5", "face 1 names vertex 99999999999999999999; the file has 4"),
     ("far.obj", V + "f 1 3 2\nf 2 3 5\n", "line 6", "face 2 names vertex 5; the file has 4"),
     ("zero.obj", V + "f 0 1 2\n", "line 5", "a face names 0, must be 1 or more"),
     ("fraction.obj", V + "f 1 3 2.5\n", "line 5", "has '2.5', must be a whole number"),
     ("capital.obj", V + "f 1 3 2\nF 2 3 4\n", "line 6", "'F' is not supported"),
-    ("surface.obj", V + "surf 0 1 0 1 1 2 3 4\n" + F, "line 5", "'surf' is not supported"),
+    ("call.obj", V + "call other.obj\n" + F, "line 5", "'call' is not supported"),
     ("pointer.obj", "version https://git-lfs.github.com/spec/v1\n", "line 1", "'version' is not supported"),
     ("page.obj", "<!DOCTYPE html>\n", "line 1", "'<!DOCTYPE' is not supported"),
     ("several.obj", f"o a\n{V}{F}o b\n{V}f 5 7 6\n", "", "has several geometries, name one of them: 'a', 'b'"),
     ("cloud.ply", f"ply\nformat ascii 1.0\n{VERTICES}end_header\n{ROWS}", "", "has no triangles"),
     ("strips.ply", PLY_HEAD.replace("face 2", "tristrips 1") + f"{ROWS}4 0 2 1 3\n", "", "faces instead of tristrips"),
     ("fraction.ply", PLY_HEAD + PLY_ROWS.replace("3 0 2 1", "3 0 2 1.0"), "line 14", "face 0 has '1.0', must be a whole"),
+    ("huge.ply", PLY_HEAD + PLY_ROWS.replace("0 2 1", "0 2 99999999999999999999"), "line 14", "face 0 names vertex 999"),
+    ("lists.ply", PLY_HEAD.replace("float x", "list uchar int x") + "1 " + PLY_ROWS.replace("\n", "\n1 ", 3), "", "with x, y"),
+    ("negative.ply", binary("<").replace(b"uchar", b"char").replace(b"\x03", b"\xfd"), "", "face 0 has a list of -3, must be"),
     ("cut.ply", binary("<")[:-3], "", "the file ends before face 1 of the 2 that its header says"),
     ("longer.ply", binary(">") + b"more", "", "the file goes on after all vertices and faces"),
     ("far.ply", binary("<", [(3, 0, 2, 7)]), "", "face 0 names vertex 7; the file has 4"),
@@ -198,7 +224,8 @@ REFUSED = [  # name, content, where in the file, why
     ("4.off", f"4OFF\n4 2 0\n{OFF_ROWS}", "line 1", "is 4OFF, must be text of three dimensions"),
     ("binary.off", f"OFF BINARY\n{OFF_ROWS}", "line 1", "is OFF BINARY, must be text"),
     ("lower.off", f"off\n4 2 0\n{OFF_ROWS}", "line 1", "must be the numbers of vertices, faces and edges"),
-    ("pair.off", f"OFF\n4 1 0\n{ROWS}2 0 1\n", "line 7", "face 0 has 2 corners, must have 3 or more"),
+    ("pair.off", f"OFF\n4 1 0\n{ROWS}2 0 1\n", "", "has no triangles"),
+    ("huge.off", f"OFF\n4 1 0\n{ROWS}3 0 2 99999999999999999999\n", "line 7", "face 0 names vertex 99999999999999999999"),
     ("negative.off", f"OFF\n4 1 0\n{ROWS}3 0 2 -1\n", "line 7", "face 0 names vertex -1; the file has 4"),
     ("comma.off", "OFF\n4 2 0\n" + OFF_ROWS.replace("1 0 0", "1,0 0 0"), "line 4", "vertex 1 has '1,0', must be a number"),
     ("fan.glb", glb((0, 2, 3, 1), mode=6), "", "0 of its 2 triangles could be read"),
@@ -220,3 +247,30 @@ def test_refused(tmp_path, name, content, where, why):
     with pytest.raises(ValueError, match=f"^{re.escape(str(tmp_path / name))}.*{where}.*{re.escape(why)}") as error:
         wc.Mesh.load(tmp_path / name)
     assert "\n" not in str(error.value)
+
+
+def test_curved_surfaces_beside_polygons_are_left_out_aloud(tmp_path):
+    (tmp_path / "a.obj").write_text(V + "cstype bspline\ndeg 3 3\nsurf 0 1 0 1 1 2 3 4\nparm u 0 1\nend\n" + F)
+    with pytest.warns(UserWarning, match="a.obj, line 7: 'surf' is left out, as only polygons are read"):
+        assert len(wc.Mesh.load(tmp_path / "a.obj").triangles) == 2
+
+
+TEXTURED = f"o a\n{V}{VT}f 1/1 3/3 4/4 2/2\n"
+BARE = f"o b\n{V}f 5 7 8 6\n"
+ST = [[0, 0], [1, 0], [0, 1], [1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "st"),
+    [
+        (TEXTURED, None, ST),  # as many corners as vertices
+        (TEXTURED + BARE, "a", ST),
+        (TEXTURED + BARE, "b", None),
+        (TEXTURED.replace("2/2", "2"), None, None),
+        (TEXTURED.replace("vt 1 1", "vt nan nan"), None, None),
+    ],
+)
+def test_texture_coordinates_of_objects(tmp_path, content, name, st):
+    (tmp_path / "a.obj").write_text(content)
+    found = wc.Mesh.load(tmp_path / "a.obj", name).texture_coordinates
+    assert (None if found is None else found.tolist()) == st

@@ -636,12 +636,6 @@ BAD_FILES = [
     ("range.obj", CLOTH + "f 1 3 9\n", ValueError, "face 1 names vertex 9; the file has 4$"),
     ("relative.obj", CLOTH + "f 1 2 -5\n", ValueError, "line 5: a face names -5, must be 1 or more, or negative"),
     ("zero.obj", CLOTH + "f 0 1 2\n", ValueError, "line 5: a face names 0, must be 1 or more"),
-    (
-        "texture.obj",
-        CLOTH + "vt 0 0\nf 1/1 2/1 3/2\n",
-        ValueError,
-        "line 6: face 1 names texture coordinate 2; the file has 1$",
-    ),
     ("flat.obj", CLOTH + "f 1 1 3\n", ValueError, r"triangles\[0\] is \[0, 0, 2\]; it must be 3 different"),
     ("nan.obj", CLOTH.replace("1", "nan") + "f 1 3 4\n", ValueError, r"points\[1\] is .*must be finite"),
     ("range.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", ValueError, "line 6: face 0 names vertex 3; the file has 3$"),

@@ -16,7 +16,7 @@ class FileFaces(NamedTuple):
         points: (n, 3) [m], float64, finite or not.
         counts: Number of corners of each face (F,), at least 3.
         corners: Vertices of one face after another (C,), int64.
-        st: Texture coordinates of the vertices (n, 2), or of the corners (C, 2), or None.
+        st: Texture coordinates of the corners (C, 2), not finite where there are none, or None.
     """
 
     points: np.ndarray
@@ -27,7 +27,8 @@ class FileFaces(NamedTuple):
     def triangles(self):
         """Returns points (n, 3), triangles (T, 3), and texture coordinates, or None.
 
-        Texture coordinates are (n, 2), or (T, 3, 2) if a vertex has several. The second half of a four-sided fan is (2, 3, 0).
+        Texture coordinates are (n, 2), or (T, 3, 2) if a vertex has several, and None if a corner has none. The second half of
+        a four-sided fan is (2, 3, 0).
 
         Raises:
             ValueError: A face crosses itself or is far from planar.
@@ -35,7 +36,9 @@ class FileFaces(NamedTuple):
         chosen, st = triangles_of(self.points[self.corners], self.counts), self.st
         halves = (np.repeat(self.counts, self.counts - 2) == 4) & (chosen[:, 1] - chosen[:, 0] == 2)
         chosen[halves] = np.roll(chosen[halves], -1, axis=1)
-        if st is not None and len(st) != len(self.points):
+        if st is not None and not np.isfinite(st).all():
+            st = None
+        if st is not None:
             at_vertices = np.zeros((len(self.points), 2))
             at_vertices[self.corners] = st
             st = at_vertices if np.array_equal(at_vertices[self.corners], st) else st[chosen]
@@ -43,7 +46,7 @@ class FileFaces(NamedTuple):
 
 
 def faces_of(path, points, rows, st=None, lines=None, first=0):
-    """Returns the `FileFaces` of a file.
+    """Returns the `FileFaces` of a file. Faces of fewer than three corners, which are lines and points, are left out.
 
     Args:
         path: The file, for messages.
@@ -54,22 +57,34 @@ def faces_of(path, points, rows, st=None, lines=None, first=0):
         first: The number of the first vertex and of the first face in it.
 
     Raises:
-        ValueError: A face has fewer than three corners, or one that is no vertex.
+        ValueError: A face has a corner that is no vertex.
     """
     points, counts = np.asarray(points, dtype=np.float64).reshape(-1, 3), np.fromiter(map(len, rows), np.int64, len(rows))
-    corners = np.fromiter(chain.from_iterable(rows), np.int64, counts.sum())
+    try:
+        corners = np.fromiter(chain.from_iterable(rows), np.int64, counts.sum())
+    except OverflowError:
+        corners = np.array([*chain.from_iterable(rows)], dtype=object)
     far = np.flatnonzero((corners < 0) | (corners >= len(points)))[:1]
-    names = [(int(np.searchsorted(np.cumsum(counts), at, side="right")), corners[at] + first) for at in far]
-    wrong = [(face, f"names vertex {vertex}; the file has {len(points)}") for face, vertex in names]
-    wrong += [(face, f"has {counts[face]} corners, must have 3 or more") for face in np.flatnonzero(counts < 3)[:1]]
-    for face, reason in sorted(wrong)[:1]:
-        raise ValueError(f"{path}{'' if lines is None else f', line {lines[face]}'}: face {face + first} {reason}")
-    return FileFaces(points, counts, corners, st)
+    for at in far:
+        face = int(np.searchsorted(np.cumsum(counts), at, side="right"))
+        where, reason = "" if lines is None else f", line {lines[face]}", f"names vertex {corners[at] + first}"
+        raise ValueError(f"{path}{where}: face {face + first} {reason}; the file has {len(points)}")
+    kept = np.repeat(counts >= 3, counts)
+    return FileFaces(points, counts[counts >= 3], corners[kept], None if st is None else st[kept])
 
 
 def text_lines(data):
-    """Returns pairs of the number and the text of each line of a file in bytes."""
-    return enumerate(re.split(r"\r\n|\r|\n", data.decode("utf-8-sig", "replace")), start=1)
+    """Returns pairs of the number and the text of each line of a file in bytes, which may end with a mark of its end."""
+    text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", "replace")
+    return enumerate(re.split(r"\r\n|\r|\n", text.removesuffix("\0").removesuffix("\x1a")), start=1)
+
+
+def optional_number(word):
+    """Returns a number, or NaN if it is none, as for texture coordinates, which a mesh can do without."""
+    try:
+        return float(word)
+    except ValueError:
+        return np.nan
 
 
 def plain_reason(error):

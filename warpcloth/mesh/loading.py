@@ -133,7 +133,7 @@ def _check_count(path, data, ending, loaded):
     """Raises ValueError if trimesh has not read all triangles of a file."""
     if ending == ".stl":
         binary = len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
-        written = loaded if binary else len(re.findall(rb"^\s*facet\b", data, re.MULTILINE | re.IGNORECASE))
+        written = loaded if binary else len(re.findall(rb"\bfacet\s+normal\b", data, re.IGNORECASE))
     else:
         start = 20 if ending == ".glb" else 0
         header = json.loads(data[start : start + int.from_bytes(data[12:16], "little")] if start else data)

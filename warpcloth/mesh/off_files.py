@@ -16,7 +16,7 @@ def read_off(path, data):
     rows = [(line, words) for line, text in text_lines(data) if (words := text.partition("#")[0].split())]
     if rows and rows[0][1][0].endswith("OFF"):
         line, (keyword, *words) = rows.pop(0)
-        if not re.fullmatch("(ST)?C?N?OFF", keyword) or words[:1] == ["BINARY"]:
+        if not re.fullmatch("(ST)?(C?N?|NC)OFF", keyword) or words[:1] == ["BINARY"]:
             raise ValueError(f"{path}, line {line}: is {' '.join([keyword, *words])}, must be text of three dimensions")
         rows = [(line, words)] * bool(words) + rows
     if not rows:

@@ -5,11 +5,12 @@ import struct
 
 import numpy as np
 
-from .file_faces import faces_of, plain_reason, refuse_open_end, text_lines
+from .file_faces import faces_of, optional_number, plain_reason, refuse_open_end, text_lines
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
 _TYPES |= {f"{kind}{8 * size}": f"{kind[0]}{size}" for kind in ("int", "uint", "float") for size in (1, 2, 4, 8)}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_NEEDED = {*"xyz", "vertex_indices", "vertex_index"}
 _TEXTURES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
 
 
@@ -45,7 +46,8 @@ def read_ply(path, data):
                 raise ValueError(f"{where()}: {name} {index} {plain_reason(error)}") from None
             rows.append(row)
         columns, at = columns or zip(*rows, strict=True), end
-        found[name] = dict(zip((key for key, _, _ in properties), columns, strict=False))
+        single = dict(zip((key for key, _, _ in properties), columns, strict=False))
+        found[name] = {key: single[key] for key, _, length in properties if key in single and not (length and name == "vertex")}
         if name == "face":
             of_faces = None if order else range(first, line + 1)
     more = next((f", line {k}" for k, text in enumerate(lines[line:], start=line + 1) if text.strip()), None)
@@ -61,11 +63,12 @@ def read_ply(path, data):
     def at_vertices(names):
         return np.concatenate([np.asarray(vertices[name], dtype=np.float64).reshape(-1, 1) for name in names], axis=1)
 
-    st = next((at_vertices(names) for names in _TEXTURES if {*names} <= vertices.keys()), None)
-    rows = faces.get("vertex_indices", faces.get("vertex_index", ()))
-    if st is None and [2 * len(row) for row in rows] == [*map(len, faces.get("texcoord", ()))] != []:
+    st, rows = None, faces.get("vertex_indices", faces.get("vertex_index", ()))
+    if [2 * len(row) for row in rows] == [*map(len, faces.get("texcoord", ()))] != []:
         st = np.concatenate([np.reshape(row, (-1, 2)) for row in faces["texcoord"]]).astype(np.float64)
-    return faces_of(path, at_vertices("xyz"), rows, st, of_faces if faces else None)
+    read = faces_of(path, at_vertices("xyz"), rows, st, of_faces if faces else None)
+    textures = (read._replace(st=at_vertices(names)[read.corners]) for names in _TEXTURES if {*names} <= vertices.keys())
+    return next(textures, read)
 
 
 def _header(path, data):
@@ -73,9 +76,10 @@ def _header(path, data):
 
     An element is its name, its count, and of each property the name, the type, and for a list the type of its length.
     """
-    line_break = b"\r\n" if data[3:5] == b"\r\n" else data[3:4]
-    if data[:3] != b"ply" or not line_break.isspace():
+    begin = re.match(rb"(?:\xef\xbb\xbf)?ply[ \t]*(\r\n|\r|\n)", data)
+    if begin is None:
         raise ValueError(f"{path}: cannot be read as .ply, it does not begin with a line ply")
+    line_break = begin[1]
     end = re.search(rb"[\r\n]end_header[ \t]*" + line_break, data)
     if end is None:
         raise ValueError(f"{path}: its header has no end_header, the file may be cut")
@@ -105,12 +109,11 @@ def _header(path, data):
 
 def _text_row(words, properties):
     row, used = [], 0
-    for _, kind, length in properties:
-        several = int(words[used]) if length and used < len(words) else 1
-        if several < 0:
-            raise ValueError(f"has a list of {several}, must be a whole number of 0 or more")
+    for name, kind, length in properties:
+        several = _list_length(int(words[used])) if length and used < len(words) else 1
         start, used = used + bool(length), used + bool(length) + several
-        row.append([*map(float if kind[0] == "f" else int, words[start:used])])
+        convert = optional_number if name not in _NEEDED else int if length and kind[0] != "f" else float
+        row.append([*map(convert, words[start:used])])
     if used != len(words):
         raise ValueError(f"has {len(words)} numbers, must have {used}")
     return row
@@ -120,11 +123,17 @@ def _binary_row(data, at, order, properties):
     """Returns the values of each property of a row, and where the next row begins."""
     row = []
     for _, kind, length in properties:
-        (several,) = struct.unpack_from(order + np.dtype(length).char, data, at) if length else (1,)
+        several = _list_length(*struct.unpack_from(order + np.dtype(length).char, data, at)) if length else 1
         at += np.dtype(length).itemsize if length else 0
         row.append(struct.unpack_from(f"{order}{several}{np.dtype(kind).char}", data, at))
         at += several * np.dtype(kind).itemsize
     return row, at
+
+
+def _list_length(number):
+    if number < 0 or number % 1:
+        raise ValueError(f"has a list of {number}, must be a whole number of 0 or more")
+    return int(number)
 
 
 def _table(data, at, order, count, properties):

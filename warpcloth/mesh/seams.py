@@ -9,9 +9,7 @@ def welded(faces):
     into = np.arange(len(faces.points))
     into[pairs[:, 1]] = pairs[:, 0]
     kept, renumbered = np.unique(into, return_inverse=True)
-    at_vertices = faces.st is not None and len(faces.st) == len(into)
-    st = faces.st[faces.corners] if at_vertices else faces.st
-    return faces._replace(points=faces.points[kept], corners=renumbered[faces.corners], st=st) if len(pairs) else faces
+    return faces._replace(points=faces.points[kept], corners=renumbered[faces.corners]) if len(pairs) else faces
 
 
 def seam_pairs(points, triangles):
