@@ -195,6 +195,9 @@ def test_read(tmp_path, name, content, area):
 
 REFUSED = [  # name, content, where in the file, why
     ("comma.obj", V.replace("v 1 0 0", "v 1,0 0,0 0,0") + F, "line 2", "has '1,0', must be a number"),
+    ("underscore.obj", V.replace("v 1 0 0", "v 1_0 0 0") + F, "line 2", "has '1_0', must be a number"),
+    ("underscore.off", "OFF\n4 2 0\n" + OFF_ROWS.replace("1 0 0", "1_0 0 0"), "line 4", "has '1_0', must be a number"),
+    ("underscore.ply", PLY_HEAD + PLY_ROWS.replace("1 0 0", "1_0 0 0"), "line 11", "has '1_0', must be a number"),
     ("short.obj", V.replace("v 1 0 1", "v 1 0") + F, "line 4", "a vertex has 2 numbers, must have 3 or more"),
     ("pair.obj", V + "f 1 2\n", "", "has no triangles"),
     ("huge.obj", V + "f 1 3 99999999999999999999\n", "line 5", "face 1 names vertex 99999999999999999999; the file has 4"),

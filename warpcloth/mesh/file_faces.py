@@ -33,15 +33,13 @@ class FileFaces(NamedTuple):
         Raises:
             ValueError: A face crosses itself or is far from planar.
         """
-        chosen, st = triangles_of(self.points[self.corners], self.counts), self.st
+        chosen, st = triangles_of(self.points[self.corners], self.counts), None
         halves = (np.repeat(self.counts, self.counts - 2) == 4) & (chosen[:, 1] - chosen[:, 0] == 2)
         chosen[halves] = np.roll(chosen[halves], -1, axis=1)
-        if st is not None and not np.isfinite(st).all():
-            st = None
-        if st is not None:
+        if self.st is not None and np.isfinite(self.st).all():
             at_vertices = np.zeros((len(self.points), 2))
-            at_vertices[self.corners] = st
-            st = at_vertices if np.array_equal(at_vertices[self.corners], st) else st[chosen]
+            at_vertices[self.corners] = self.st
+            st = at_vertices if np.array_equal(at_vertices[self.corners], self.st) else self.st[chosen]
         return self.points, self.corners[chosen], st
 
 
@@ -77,6 +75,13 @@ def text_lines(data):
     """Returns pairs of the number and the text of each line of a file in bytes, which may end with a mark of its end."""
     text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", "replace")
     return enumerate(re.split(r"\r\n|\r|\n", text.removesuffix("\0").removesuffix("\x1a")), start=1)
+
+
+def plain_number(word, kind=float):
+    """Returns the number of a word; underscores, which Python allows, are refused."""
+    if "_" in word:
+        raise ValueError(f"has {word!r}, must be a number")
+    return kind(word)
 
 
 def optional_number(word):

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 
-from .file_faces import faces_of, plain_reason, refuse_open_end, text_lines
+from .file_faces import faces_of, plain_number, plain_reason, refuse_open_end, text_lines
 
 
 def read_off(path, data):
@@ -32,7 +32,8 @@ def read_off(path, data):
             needed = 3 if name == "vertex" else 1 + int(words[0])
             if not 0 < needed <= len(words):  # more may be a colour
                 raise ValueError(f"has {len(words)} numbers, must have {needed}")
-            found.append([*map(float, words[:3])] if name == "vertex" else [*map(int, words[1:needed])])
+            kind, wanted = (float, words[:3]) if name == "vertex" else (int, words[1:needed])
+            found.append([plain_number(word, kind) for word in wanted])
         except ValueError as error:
             raise ValueError(f"{path}, line {line}: {name} {index} {plain_reason(error)}") from None
     for count, most, plural in ((len(found), vertices, "vertices"), (len(found) - vertices, faces, "faces")):

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 
-from .file_faces import faces_of, optional_number, plain_reason, refuse_open_end, text_lines
+from .file_faces import faces_of, optional_number, plain_number, plain_reason, refuse_open_end, text_lines
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
 _TYPES |= {f"{kind}{8 * size}": f"{kind[0]}{size}" for kind in ("int", "uint", "float") for size in (1, 2, 4, 8)}
@@ -46,8 +46,7 @@ def read_ply(path, data):
                 raise ValueError(f"{where()}: {name} {index} {plain_reason(error)}") from None
             rows.append(row)
         columns, at = columns or zip(*rows, strict=True), end
-        single = dict(zip((key for key, _, _ in properties), columns, strict=False))
-        found[name] = {key: single[key] for key, _, length in properties if key in single and not (length and name == "vertex")}
+        found[name] = {p[0]: column for p, column in zip(properties, columns, strict=False) if name != "vertex" or not p[2]}
         if name == "face":
             of_faces = None if order else range(first, line + 1)
     more = next((f", line {k}" for k, text in enumerate(lines[line:], start=line + 1) if text.strip()), None)
@@ -79,12 +78,11 @@ def _header(path, data):
     begin = re.match(rb"(?:\xef\xbb\xbf)?ply[ \t]*(\r\n|\r|\n)", data)
     if begin is None:
         raise ValueError(f"{path}: cannot be read as .ply, it does not begin with a line ply")
-    line_break = begin[1]
-    end = re.search(rb"[\r\n]end_header[ \t]*" + line_break, data)
+    end = re.search(rb"[\r\n]end_header[ \t]*" + begin[1], data)
     if end is None:
         raise ValueError(f"{path}: its header has no end_header, the file may be cut")
     order, elements = None, []
-    lines = list(text_lines(data[: end.end() - len(line_break)]))
+    lines = list(text_lines(data[: end.end() - len(begin[1])]))
     for line, text in lines:
         keyword, *words = text.split() or [""]
         try:
@@ -112,8 +110,8 @@ def _text_row(words, properties):
     for name, kind, length in properties:
         several = _list_length(int(words[used])) if length and used < len(words) else 1
         start, used = used + bool(length), used + bool(length) + several
-        convert = optional_number if name not in _NEEDED else int if length and kind[0] != "f" else float
-        row.append([*map(convert, words[start:used])])
+        kind = int if length and kind[0] != "f" else float
+        row.append([plain_number(word, kind) if name in _NEEDED else optional_number(word) for word in words[start:used]])
     if used != len(words):
         raise ValueError(f"has {len(words)} numbers, must have {used}")
     return row
