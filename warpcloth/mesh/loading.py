@@ -32,7 +32,7 @@ def read_file(path, name=None, kind=Mesh):
     node transforms are applied; lengths are taken for metres. Polygons are cut into triangles as `polygons.cut` says.
 
     Texture coordinates are at vertices if each has one pair, else at the corners of triangles. They are read from OBJ, PLY and
-    glTF.
+    glTF, and left out unless every corner of the mesh has them. Lines and faces of two corners are left out, too.
 
     Args:
         path: An .obj, .ply, .stl, .off, .glb or .gltf file.
