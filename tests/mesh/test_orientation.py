@@ -39,10 +39,30 @@ def test_neighbours_wind_alike_after_the_fewer_are_turned_over(name, seed, share
     triangles, random = SURFACES[name], np.random.default_rng(seed)
     mixed = np.where((random.random(len(triangles)) < share)[:, None], triangles[:, ::-1], triangles)
     mixed = random.permutation(mixed)
-    turned = turned_over(mixed)
+    turned = turned_over(mixed, np.arange(len(mixed)))
     assert not against(np.where(turned[:, None], mixed[:, ::-1], mixed))
     if name != "two pieces":
         assert turned.sum() <= len(turned) / 2
+    some = np.flatnonzero(random.random(len(mixed)) < 0.3)  # these need not be neighbours of each other
+    if name != "two pieces":
+        assert turned_over(mixed, some).tolist() in (turned[some].tolist(), (~turned[some]).tolist())
+        assert turned_over(mixed, some).sum() <= len(some) / 2
+
+
+def test_pressure_on_parts_of_one_sheet_acts_from_one_side():
+    mesh = wc.Mesh.grid(7, 7)
+    halves = mesh.points[mesh.triangles].mean(axis=1)[:, 0] > 0.5
+    mixed = wc.Mesh(mesh.points, np.where(halves[:, None], mesh.triangles[:, ::-1], mesh.triangles))
+    load = wc.Pressure(vertices="x < 0.4 or x > 0.6", pressure=20.0)
+    with pytest.warns(UserWarning, match="Pressure: 24 of 48 triangles wind against their neighbours"):
+        scene = wc.Scene(mixed, loads=[load], **GIVEN)
+        end = wc.simulate(scene, wc.Newton(substeps=2), frames=4).points[-1]
+    assert end[:, 1].min() >= 0.0 and end[:, 1].max() > 1e-3
+
+
+def test_pressure_beside_a_surface_with_one_side_is_taken():
+    both = np.concatenate([MOEBIUS, STRIP + 10])
+    assert not turned_over(both, np.arange(10, 18)).any()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.5])

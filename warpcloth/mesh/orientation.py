@@ -3,16 +3,17 @@
 import numpy as np
 
 
-def turned_over(triangles):
-    """Returns which triangles must be turned over so that all wind like their neighbours, (T,) booleans.
+def turned_over(triangles, chosen):
+    """Returns which of some triangles must be turned over so that all would wind like their neighbours, (t,) booleans.
 
-    In each connected piece the fewer triangles are turned over. Neighbours share an edge that no third triangle has.
+    In each connected piece the fewer of these are turned over. Neighbours share an edge that no third triangle has.
 
     Args:
         triangles: (T, 3), at least one.
+        chosen: The indices of some triangles (t,).
 
     Raises:
-        ValueError: A piece has one side only, like a Möbius strip. The message names a triangle of it.
+        ValueError: One belongs to a piece with one side only, like a Möbius strip. The message names it.
     """
     from scipy.sparse import coo_array  # loaded late, as importing this package stays light
     from scipy.sparse.csgraph import connected_components
@@ -29,8 +30,8 @@ def turned_over(triangles):
     pairs = np.concatenate([[one, two + opposed], [one + count, (two + opposed + count) % (2 * count)]], axis=1)
     nodes = coo_array((np.ones(pairs.shape[1], dtype=bool), pairs), shape=(2 * count, 2 * count))
     piece = connected_components(nodes, directed=False)[1]
-    kept, turned = piece[:count], piece[count:]
-    one_sided = np.flatnonzero(kept == turned)
+    kept, turned = piece[chosen], piece[count + chosen]
+    one_sided = chosen[kept == turned]
     if len(one_sided):
         raise ValueError(f"triangle {one_sided[0]} belongs to a surface with one side, like a Möbius strip")
     as_they_are = np.bincount(kept, minlength=2 * count)

@@ -140,7 +140,7 @@ class Pressure(Load):
     """Pressure on triangles along their normals: a force pAn/3 on each corner, with the current area A and normal n.
 
     The corners turn counter-clockwise about the normal. Triangles that wind against their neighbours are turned over, the fewer
-    in each connected piece, with a warning; a surface with one side is refused.
+    in each piece of the mesh, with a warning; a surface with one side is refused.
 
     On cloth with free edges, pressure does not derive from an energy, so its force is evaluated once per step: at x for
     explicit steps and implicit Euler, at x + ½h v for midpoint, and at 2xₙ − xₙ₋₁ for BDF2. Each integrator keeps its order.
@@ -163,7 +163,7 @@ class Pressure(Load):
         if not len(triangles):
             return triangles
         try:
-            against = turned_over(triangles)
+            against = turned_over(mesh.triangles, loaded)
         except ValueError as error:
             raise ValueError(f"{self.label}: {error}; pressure must act on a surface with two sides") from None
         if against.any():
