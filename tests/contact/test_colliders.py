@@ -822,6 +822,27 @@ def test_front_and_back_that_coincide_are_a_sheet(name):
         assert "diagonal" in name or not collider.closed
 
 
+def test_a_cube_that_is_there_three_times_with_other_first_corners():
+    copies = [np.roll(CUBE.faces, k, axis=1) + 8 * k for k in range(3)]
+    collider = wc.MeshCollider(np.tile(CUBE.vertices, (3, 1)), np.concatenate(copies))
+    probes = np.random.default_rng(0).uniform(-0.3, 0.3, size=(500, 3))
+    inside = (np.abs(probes) < CUBE.vertices.max(axis=0)).all(axis=1)
+    np.testing.assert_array_equal(collider.distances(probes) < 0.0, inside)
+
+
+@pytest.mark.parametrize("size", [(10, 0.1, 10), (10, 3, 10), (20, 0.02, 20)])
+def test_slabs_and_rooms_whose_fronts_face_inwards(size):
+    cube = CUBE.vertices * np.array(size)
+    assert wc.MeshCollider(cube, CUBE.faces[:, ::-1]).faces_inwards and not wc.MeshCollider(cube, CUBE.faces).faces_inwards
+
+
+@pytest.mark.parametrize("lift", [0.1, -0.1])
+def test_a_card_of_two_quads_is_no_room(lift):
+    """A front and a back whose fans have other diagonals, with a corner that is lifted."""
+    points = [[0, 0, 0], [1, 0, 0], [1, lift, 1], [0, 0, 1]]
+    assert not wc.MeshCollider(points, [[0, 1, 2], [0, 2, 3], [3, 2, 1], [3, 1, 0]]).faces_inwards
+
+
 @pytest.mark.parametrize("name", slow_but(["square, other diagonal", "card"], [*DOUBLED][:-1]))
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_front_and_back_that_coincide_hold_cloth_on_both_sides(name, side):

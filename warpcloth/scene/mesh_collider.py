@@ -18,7 +18,7 @@ from ..mesh.mesh import Mesh, areas_of
 from .colliders import Collider, from_y, turned
 
 _FLAT = 1e-6  # volume below which a closed surface is a sheet, relative to the cube of its size
-_THIN = 0.02  # thickness below which fronts that face inwards are those of a sheet, relative to its size
+_THIN = 0.02  # thickness below which fronts that face inwards are those of a sheet, relative to a length of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,15 +157,33 @@ class MeshCollider(Collider):
         return [np.sort(each @ [sides.max() + 1, 1]) for each in (sides, sides[:, ::-1])]
 
     @cached_property
+    def _doubled(self):
+        """Whether triangles share a directed side, as where a front and a back coincide."""
+        return bool((np.diff(self._directed_sides[0]) == 0).any())
+
+    @cached_property
     def faces_inwards(self) -> bool:
         """Whether it is closed and its fronts face what it encloses, so that all else is solid.
 
-        Where a front and a back with other diagonals lie upon each other, they enclose some volume too, but thinner than this.
+        Where a front and a back with other diagonals lie upon each other, they enclose some volume too. It is thin beside the
+        sides of triangles, while that of a slab is as thick as its shortest side.
         """
         vertices = first_extended(self.frames)
-        size = np.ptp(vertices, axis=0).max()
+        size, corners = np.ptp(vertices, axis=0).max(), vertices[self.triangles]
         thickness = -2.0 * self._filling(vertices) * size**3 / areas_of(vertices, self.triangles).sum()
-        return bool(self.closed and thickness > _THIN * size)
+        length = size if self._doubled else np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min()
+        return bool(self.closed and thickness > _THIN * length)
+
+    @cached_property
+    def _uncovered(self):
+        """The triangles, less those that coincide with others reversed, as these enclose nothing together."""
+        at = self._welded.argmin(axis=1)[:, None]
+        second, third = (np.take_along_axis(self._welded, (at + k) % 3, axis=1)[:, 0] for k in (1, 2))
+        turns = np.where(second < third, 1, -1)
+        _, first, which = np.unique(np.sort(self._welded, axis=1), axis=0, return_index=True, return_inverse=True)
+        times = np.bincount(which.ravel(), turns).astype(int) * turns[first]
+        found = np.where((times < 0)[:, None], self.triangles[first, ::-1], self.triangles[first])
+        return np.repeat(found, np.abs(times), axis=0)
 
     def distances(self, points: np.ndarray, frame: int = 0) -> np.ndarray:
         """Distances (…,) [m] of points (…, 3) [m] to the surface at a frame, negative inside a closed one.
@@ -177,10 +195,9 @@ class MeshCollider(Collider):
         found = np.linalg.norm(away, axis=1)
         if self.closed:
             behind = np.einsum("ki,ki->k", away, self._normals(vertices, faces, weights)) < 0.0
-            doubled = (np.diff(self._directed_sides[0]) == 0).any()
-            if doubled and not self.faces_inwards:  # normals are of no use where a front and a back coincide
+            if self._doubled and not self.faces_inwards:  # normals are of no use where a front and a back coincide
                 nearest = np.einsum("kc,kci->ki", weights[behind], vertices[self.triangles[faces[behind]]])
-                behind[behind] = winding_numbers(away[behind] + nearest, vertices[self.triangles]) > 0.5
+                behind[behind] = winding_numbers(away[behind] + nearest, vertices[self._uncovered]) > 0.5
             found = np.where(behind, -found, found)  # one that has shrunk to a point has no normals, and nothing is behind
         return found.reshape(points.shape[:-1])
 
