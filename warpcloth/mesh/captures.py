@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from ..base import checks
 from ..base.types import FilePath, UpAxis
-from .loading import ENDINGS, read_arrays
+from .loading import ENDINGS, read_faces
 from .mesh import Mesh, Surface
+from .polygons import loose_triangles_of
 from .sequences import Sequence, increasing, missing_labels, numbered_files, open_sequence
 
 
@@ -87,8 +88,9 @@ def open_capture(path: FilePath, prim: str | None = None, fps: float | None = No
     labels, paths = files
 
     def read(frame):
-        points, triangles, _ = read_arrays(paths[frame], prim)
+        faces = read_faces(paths[frame], prim)
         try:
+            points, triangles, _ = faces.triangles(loose_triangles_of)
             return Surface(points * scale, triangles)
         except ValueError as error:
             raise ValueError(f"{paths[frame]}: {error}") from error

@@ -24,23 +24,33 @@ class FileFaces(NamedTuple):
     corners: np.ndarray
     st: np.ndarray | None = None
 
-    def triangles(self):
+    def triangles(self, triangles_of=triangles_of):
         """Returns points (n, 3), triangles (T, 3), and texture coordinates, or None.
 
-        Texture coordinates are (n, 2), or (T, 3, 2) if a vertex has several, and None if a corner has none. The second half of
-        a four-sided fan is (2, 3, 0).
+        Corners of polygons that repeat the one before are left out, and polygons that have fewer than three others. Texture coordinates are
+        (n, 2), or (T, 3, 2) if a vertex has several, and None if a corner has none. The second half of a four-sided fan is
+        (2, 3, 0).
+
+        Args:
+            triangles_of: Function that cuts faces, see `polygons.triangles_of`.
 
         Raises:
-            ValueError: A face crosses itself or is far from planar.
+            ValueError: A face crosses or touches itself, or is far from planar; or none has three corners.
         """
-        chosen, st = triangles_of(self.points[self.corners], self.counts), None
-        halves = (np.repeat(self.counts, self.counts - 2) == 4) & (chosen[:, 1] - chosen[:, 0] == 2)
+        begins, ahead = np.cumsum(self.counts) - self.counts, np.append(self.corners[1:], -1)
+        ahead[begins + self.counts - 1] = self.corners[begins]
+        other = (self.corners != ahead) | (np.repeat(self.counts, self.counts) == 3)
+        counts, corners = np.add.reduceat(other, begins, dtype=np.int64), self.corners[other]
+        chosen, st = triangles_of(self.points[corners], counts, np.flatnonzero(counts < 3)), None
+        if not len(chosen):
+            raise ValueError("has no face with three different corners")
+        halves = (np.repeat(counts, np.maximum(counts - 2, 0)) == 4) & (chosen[:, 1] - chosen[:, 0] == 2)
         chosen[halves] = np.roll(chosen[halves], -1, axis=1)
         if self.st is not None and np.isfinite(self.st).all():
             at_vertices = np.zeros((len(self.points), 2))
-            at_vertices[self.corners] = self.st
-            st = at_vertices if np.array_equal(at_vertices[self.corners], self.st) else self.st[chosen]
-        return self.points, self.corners[chosen], st
+            at_vertices[corners] = self.st[other]
+            st = at_vertices if np.array_equal(at_vertices[corners], self.st[other]) else self.st[other][chosen]
+        return self.points, corners[chosen], st
 
 
 def faces_of(path, points, rows, st=None, lines=None, first=0):

@@ -46,8 +46,8 @@ def read_file(path, name=None, kind=Mesh):
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The ending is none of those above; the file is empty, cannot be read or has no triangles; it does not have
-            the rows that its header announces; not all faces could be read; a face crosses itself or is far from planar; the
-            file has several geometries and `name` is none of them; or `kind` refuses the mesh. The message begins with the
+            the rows that its header announces; not all faces could be read; a face crosses or touches itself or is not planar;
+            the file has several geometries and `name` is none of them; or `kind` refuses the mesh. The message begins with the
             path, and for text the line.
     """
     faces = read_faces(path, name)

@@ -6,25 +6,33 @@ from ..kernels.deformation import FLATTEST
 
 # Largest ratio of the area of a face's triangles to that of its outline; a face folded by 90° along a diagonal has it.
 _MAX_FOLD = 2**0.5
+_STRAIGHT = 3e-5  # ratio of height to longest side below which a corner of a fan is straight but for rounding
+_TOUCHING = 1e-5  # how far sides must pass through each other to cross, relative to the size of the face
 
 
 def triangles_of(points, counts, holes=()):
     """Cuts faces into triangles like :func:`cut`, and refuses those that cannot be cut.
 
     Raises:
-        ValueError: A face crosses itself or is far from planar; the message names it by its index.
+        ValueError: A face crosses or touches itself, or is far from planar; the message names it by its index.
     """
     triangles, bad = cut(points, counts, holes)
     for face in bad[:1]:
-        raise ValueError(f"face {face} crosses itself or is far from planar; it must have a simple, nearly flat outline")
+        raise ValueError(f"face {face} crosses or touches itself, or is not planar; its outline must be simple and nearly flat")
     return triangles
+
+
+def loose_triangles_of(points, counts, holes=()):
+    """Cuts faces into triangles like :func:`cut`; those that cannot be cut are fans, as other programs draw them."""
+    return cut(points, counts, holes)[0]
 
 
 def cut(points, counts, holes=()):
     """Cuts faces into triangles, each of k corners into k − 2.
 
     A face becomes a fan of triangles from its first corner if none of them is flat or turned over, as for all convex faces
-    without straight corners. Others are cut by ear clipping (mapbox-earcut) in a coordinate plane.
+    without straight corners. Others are cut by ear clipping (mapbox-earcut) in a coordinate plane. Then diagonals are flipped
+    until all are Delaunay, which leaves no flat triangles beside corners on a line.
 
     Args:
         points: Positions of the corners of one face after another, (C, 3).
@@ -32,8 +40,8 @@ def cut(points, counts, holes=()):
         holes: Faces that are left out.
 
     Returns:
-        Triangles (T, 3), rows of ``points``, in the order of the faces, and a list of the faces that cross themselves or are
-        far from planar. These are fans, like faces without area or with a corner that is not finite.
+        Triangles (T, 3), rows of ``points``, in the order of the faces, and a list of the faces that cross or touch
+        themselves or are far from planar. These are fans, like faces without area or with a corner that is not finite.
     """
     solid = np.ones(len(counts), dtype=bool)
     solid[np.asarray(holes, dtype=np.int64)] = False
@@ -52,91 +60,117 @@ def cut(points, counts, holes=()):
         upwards = np.einsum("ti,ti->t", normals, np.repeat(outlines, sizes, axis=0)) > 0.0
         cosines = np.einsum("ti,ti->t", corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         angles = np.arctan2(np.linalg.norm(normals, axis=1), cosines)
-        fans = np.logical_and.reduceat(upwards & ~_flat(corners, normals), first)
+        heights = _heights(corners, normals)
+        fans = np.logical_and.reduceat(upwards & (heights > FLATTEST), first)
         fans &= np.add.reduceat(angles, first) <= 2.0 * np.pi  # else the fan overlaps itself
-        bad = []
-        for k in np.flatnonzero(~fans & np.isfinite(outlines).all(axis=1)):
-            rows = first[k] + np.arange(sizes[k])
-            ring = start[of_polygons[first[k]]]
-            ears = _ears(points[ring : ring + sizes[k] + 2], outlines[k])
-            if ears is None:
-                bad.append(polygons[k])
-            else:
-                triangles[of_polygons[rows]] = ring + ears
-                normals[rows] = _normals(points[ring + ears])
+        kept = fans & np.logical_and.reduceat(heights > _STRAIGHT, first)
+        solid = np.logical_or.reduceat(heights > FLATTEST, first) & np.isfinite(outlines).all(axis=1)
+        others = np.flatnonzero(solid & ~kept)
+        found, good = _ears(points, start[of_polygons[first[others]]], sizes[others] + 2, outlines[others])
+        rows = np.flatnonzero(np.isin(np.repeat(np.arange(len(sizes)), sizes), others[good]))
+        triangles[of_polygons[rows]] = found
+        normals[rows] = _normals(points[found])
         areas = np.add.reduceat(np.linalg.norm(normals, axis=1), first)
-        folded = areas > _MAX_FOLD * (1.0 + FLATTEST) * np.linalg.norm(outlines, axis=1)
-    return triangles, sorted({*bad, *polygons[folded]})
+        bad = areas > _MAX_FOLD * (1.0 + FLATTEST) * np.linalg.norm(outlines, axis=1)
+        bad[others[~good & ~fans[others]]] = True
+    return triangles, polygons[bad].tolist()
 
 
 def _normals(corners):
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def _flat(corners, normals):
-    """Returns which triangles (T, 3, 3) a `Mesh` refuses as flat."""
+def _heights(corners, normals):
+    """Returns heights of triangles (T, 3, 3) relative to their longest sides; a `Mesh` refuses those not above FLATTEST."""
     sides = corners - np.roll(corners, 1, axis=1)
-    return ~(np.linalg.norm(normals, axis=1) > FLATTEST * np.einsum("tki,tki->tk", sides, sides).max(axis=1))
+    return np.linalg.norm(normals, axis=1) / np.einsum("tki,tki->tk", sides, sides).max(axis=1)
 
 
-def _ears(x, outline):
-    """Returns triangles (k − 2, 3) of a face with corners (k, 3) and area vector (3,), or None if it crosses itself."""
+def _ears(points, starts, counts, outlines):
+    """Cuts faces (F,) with given first corners in points (C, 3), numbers of corners, and area vectors (F, 3).
+
+    Returns:
+        Triangles of those that could be cut, (T, 3), rows of ``points``, and which faces these are (F,).
+    """
     import mapbox_earcut
 
-    count, axis = len(x), int(np.argmax(np.abs(outline)))
-    fan = np.stack([np.zeros(count - 2, dtype=int), np.arange(1, count - 1), np.arange(2, count)], axis=1)
-    if _flat(x[fan], _normals(x[fan])).all():
-        return fan
+    ends, axes = np.cumsum(counts), np.abs(outlines).argmax(axis=1)
+    begins, face = ends - counts, np.repeat(np.arange(len(counts)), counts)
+    corners = np.repeat(starts - begins, counts) + np.arange(len(face))
     # Dropping a coordinate keeps lines straight and orders of corners, without rounding.
-    p = np.ascontiguousarray((x - x[0])[:, [(axis + 1) % 3, (axis + 2) % 3][:: 1 if outline[axis] > 0.0 else -1]])
-    ring = _without_straight(p)
-    if len(ring) < 3 or _crosses(p):
-        return None
-    found = ring[mapbox_earcut.triangulate_float64(p[ring], np.array([len(ring)], dtype=np.uint32)).reshape(-1, 3)]
-    found = _with_straight(found, count)
-    if found is None or len(found) != count - 2:
-        return None
-    a, b, c = p[found].swapaxes(0, 1)
-    return None if (_cross(b - a, c - a) < 0.0).any() else found
+    kept = (axes[:, None] + [1, 2]) % 3
+    kept = np.where((outlines[np.arange(len(axes)), axes] > 0.0)[:, None], kept, kept[:, ::-1])
+    p = np.take_along_axis(points[corners] - points[starts[face]], kept[face], axis=1)
+    if len(face):
+        p /= np.maximum.reduceat(np.abs(p).max(axis=1), begins)[face, None]
+    # Earcut leaves out corners that lie on a line exactly, so lines are bent for it.
+    bent = p + 1e-7 * np.sin(p @ np.array([[7.0, 11.0], [13.0, 5.0]]))
+    found = [
+        begin + mapbox_earcut.triangulate_float64(bent[begin:end], np.array([end - begin], dtype=np.uint32)).reshape(-1, 3)
+        for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)
+    ]
+    good = (np.fromiter(map(len, found), np.int64, len(found)) == counts - 2) & ~_crossing(p, face)
+    chosen = np.concatenate([each for each, whole in zip(found, good, strict=True) if whole] or [np.empty((0, 3), np.int64)])
+    chosen = _delaunay(p, chosen.astype(np.int64))
+    a, b, c = p[chosen].swapaxes(0, 1)
+    x = points[corners[chosen]]
+    wrong = ~((_cross(b - a, c - a) > 0.0) & (_heights(x, _normals(x)) > FLATTEST))
+    good[face[chosen[wrong, 0]]] = False
+    return corners[chosen[good[face[chosen[:, 0]]]]], good
 
 
 def _cross(a, b):
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _without_straight(p):
-    """Returns the corners of a polygon (k, 2) but those that repeat the one before or lie between their neighbours."""
-    ring = np.flatnonzero((p != np.roll(p, 1, axis=0)).any(axis=1))
-    before, after = p[ring] - p[np.roll(ring, 1)], p[np.roll(ring, -1)] - p[ring]
-    longest = np.maximum((before**2).sum(axis=1), (after**2).sum(axis=1))
-    straight = (np.abs(_cross(before, after)) <= FLATTEST * longest) & ((before * after).sum(axis=1) > 0.0)
-    return ring[~straight]
+def _delaunay(p, triangles):
+    """Flips the diagonals of triangles (T, 3) in the plane, with corners in p (k, 2), until none sees more than 180°."""
+    for _ in range(len(p)):
+        start, end, apex = (np.roll(triangles, -k, axis=1).ravel() for k in range(3))
+        keys = np.minimum(start, end) * len(p) + np.maximum(start, end)
+        order = np.argsort(keys, kind="stable")
+        twice = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+        one, two = order[twice], order[twice + 1]
+        to_start, to_end = p[start] - p[apex], p[end] - p[apex]
+        angles = np.arctan2(np.abs(_cross(to_start, to_end)), (to_start * to_end).sum(axis=1))
+        seen = angles[one] + angles[two]
+        a, b, c, d = p[start[one]], p[end[one]], p[apex[one]], p[apex[two]]
+        wrong = np.flatnonzero((seen > np.pi + 1e-9) & (_cross(a - c, d - c) > 0.0) & (_cross(b - d, c - d) > 0.0))
+        if not len(wrong):
+            break
+        wrong = wrong[np.argsort(-seen[wrong], kind="stable")]
+        one, two = one[wrong], two[wrong]
+        # Of the diagonals of one triangle the worst is flipped first.
+        ranks, pairs = np.full(len(triangles), len(wrong)), np.stack([one // 3, two // 3])
+        np.minimum.at(ranks, pairs.ravel(), np.tile(np.arange(len(wrong)), 2))
+        ready = (ranks[pairs] == np.arange(len(wrong))).all(axis=0)
+        one, two = one[ready], two[ready]
+        triangles[one // 3] = np.stack([apex[one], start[one], apex[two]], axis=1)
+        triangles[two // 3] = np.stack([apex[two], end[one], apex[one]], axis=1)
+    return triangles
 
 
-def _with_straight(triangles, count):
-    """Inserts the corners that triangles (T, 3) leave out into the sides along which they lie; None if these are missing."""
-    used = np.zeros(count, dtype=bool)
-    used[triangles] = True
-    ring = np.roll(np.arange(count), -int(np.argmax(used)))
-    before = ring[np.maximum.accumulate(np.where(used[ring], np.arange(count), 0))].tolist()
-    triangles, after = triangles.tolist(), int(ring[0])
-    for corner, a in zip(ring[:0:-1].tolist(), before[:0:-1], strict=True):
-        if not used[corner]:
-            t, k = next(((t, k) for t in triangles for k in range(3) if (t[k - 1], t[k]) == (a, after)), (None, 0))
-            if t is None:
-                return None
-            triangles.append([corner, after, t[k - 2]])
-            t[k] = corner
-        after = corner
-    return np.array(triangles)
+def _crossing(p, face):
+    """Returns which polygons have sides that cross, beyond touching, from the corners (k, 2) of all and the polygon of each."""
+    found, after = np.zeros(face.max(initial=-1) + 1, dtype=bool), np.arange(1, len(p) + 1)
+    last = np.flatnonzero(np.diff(face, append=-1))
+    after[last] = np.searchsorted(face, face[last])
+    ends = np.stack([p[:, 0], p[after, 0]]) + 4.0 * face  # polygons lie beside one another
+    order = np.argsort(ends.min(axis=0), kind="stable")
+    lows, highs = ends[:, order].min(axis=0), ends[:, order].max(axis=0)
+    one, step = np.arange(len(p)), 0
+    while len(one):
+        step += 1
+        one = one[one + step < len(p)]
+        one = one[lows[one + step] <= highs[one]]
+        first, second = order[one], order[one + step]
+        a, b, c, d = p[first], p[after[first]], p[second], p[after[second]]
+        found[face[first[_pass(a, b, c, d) & _pass(c, d, a, b)]]] = True
+    return found
 
 
-def _crosses(p):
-    """Returns whether two sides of a polygon (k, 2) cross, beyond touching."""
-    q = np.roll(p, -1, axis=0)
-    for k in range(len(p) - 2):
-        a, b, c, d = p[k], q[k], p[k + 2 :], q[k + 2 :]
-        apart = (_cross(b - a, c - a) * _cross(b - a, d - a) >= 0.0) | (_cross(d - c, a - c) * _cross(d - c, b - c) >= 0.0)
-        if not apart.all():
-            return True
-    return False
+def _pass(a, b, c, d):
+    """Returns which lines from a to b have c and d on either side."""
+    least = _TOUCHING * np.linalg.norm(b - a, axis=1)
+    left, right = _cross(b - a, c - a), _cross(b - a, d - a)
+    return (np.minimum(left, right) < -least) & (np.maximum(left, right) > least)

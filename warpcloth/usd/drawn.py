@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.checks import number
-from ..mesh.polygons import cut
+from ..mesh.polygons import loose_triangles_of
 from .gprims import define_colliders
 from .layers import COLOUR, CURVE_WIDTH, scene_layer
 from .modules import Usd, UsdGeom, UsdPhysics, UsdShade
@@ -186,7 +186,7 @@ def _drawn(prim, path, cloth, codes):
         elif prim.IsA(UsdGeom.Mesh):
             rest = start if len(codes) < 2 else array_of(attribute, (3,))
             shape = start if rest is None or len(rest) != len(start) else rest.astype(np.float64)
-            corners, triangles = face_corners(prim, shape, lambda *faces: cut(*faces)[0])  # other programs draw any face
+            corners, triangles = face_corners(prim, shape, loose_triangles_of)
             triangles, edges, radius = corners[triangles], np.empty((0, 2), np.int32), 0.0
             linear = local_to_metres(prim, where, first)[:3, :3]
             if np.linalg.slogdet(linear)[0] < 0:  # a reflection reverses the orientation of triangles

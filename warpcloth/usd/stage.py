@@ -73,7 +73,7 @@ def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = 
         FileNotFoundError: There is no such file.
         ValueError: The file is not a USD stage, has invalid units, rates or times, or has no mesh or several. Or the prim is
             missing, is not a mesh, or refers to a missing file. Or its transform cannot be inverted, its topology changes, a
-            face crosses itself or is far from planar, or its points and topology do not make a valid `Mesh`.
+            face crosses or touches itself or is not planar, or its points and topology do not make a valid `Mesh`.
     """
     found = stage_mesh(path, prim, kind, time)
     if time is None and not found.rest:
