@@ -27,9 +27,9 @@ class FileFaces(NamedTuple):
     def triangles(self, triangles_of=triangles_of):
         """Returns points (n, 3), triangles (T, 3), and texture coordinates, or None.
 
-        Corners of polygons that repeat the one before are left out, and polygons that have fewer than three others. Texture coordinates are
-        (n, 2), or (T, 3, 2) if a vertex has several, and None if a corner has none. The second half of a four-sided fan is
-        (2, 3, 0).
+        Corners of polygons that repeat the one before are left out, and polygons that have fewer than three others. Texture
+        coordinates are (n, 2), or (T, 3, 2) if a vertex has several, and None if a corner has none. The second half of a
+        four-sided fan is (2, 3, 0).
 
         Args:
             triangles_of: Function that cuts faces, see `polygons.triangles_of`.

@@ -66,13 +66,15 @@ def cut(points, counts, holes=()):
         kept = fans & np.logical_and.reduceat(heights > _STRAIGHT, first)
         solid = np.logical_or.reduceat(heights > FLATTEST, first) & np.isfinite(outlines).all(axis=1)
         others = np.flatnonzero(solid & ~kept)
-        found, good = _ears(points, start[of_polygons[first[others]]], sizes[others] + 2, outlines[others])
-        rows = np.flatnonzero(np.isin(np.repeat(np.arange(len(sizes)), sizes), others[good]))
-        triangles[of_polygons[rows]] = found
-        normals[rows] = _normals(points[found])
+        bad = np.zeros(len(sizes), dtype=bool)
+        if len(others):
+            found, good = _ears(points, start[of_polygons[first[others]]], sizes[others] + 2, outlines[others])
+            rows = np.flatnonzero(np.isin(np.repeat(np.arange(len(sizes)), sizes), others[good]))
+            triangles[of_polygons[rows]] = found
+            normals[rows] = _normals(points[found])
+            bad[others] = ~good & ~fans[others]
         areas = np.add.reduceat(np.linalg.norm(normals, axis=1), first)
-        bad = areas > _MAX_FOLD * (1.0 + FLATTEST) * np.linalg.norm(outlines, axis=1)
-        bad[others[~good & ~fans[others]]] = True
+        bad |= areas > _MAX_FOLD * (1.0 + FLATTEST) * np.linalg.norm(outlines, axis=1)
     return triangles, polygons[bad].tolist()
 
 
@@ -101,17 +103,16 @@ def _ears(points, starts, counts, outlines):
     kept = (axes[:, None] + [1, 2]) % 3
     kept = np.where((outlines[np.arange(len(axes)), axes] > 0.0)[:, None], kept, kept[:, ::-1])
     p = np.take_along_axis(points[corners] - points[starts[face]], kept[face], axis=1)
-    if len(face):
-        p /= np.maximum.reduceat(np.abs(p).max(axis=1), begins)[face, None]
+    p /= np.maximum.reduceat(np.abs(p).max(axis=1), begins)[face, None]
     # Earcut leaves out corners that lie on a line exactly, so lines are bent for it.
     bent = p + 1e-7 * np.sin(p @ np.array([[7.0, 11.0], [13.0, 5.0]]))
     found = [
         begin + mapbox_earcut.triangulate_float64(bent[begin:end], np.array([end - begin], dtype=np.uint32)).reshape(-1, 3)
         for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)
     ]
-    good = (np.fromiter(map(len, found), np.int64, len(found)) == counts - 2) & ~_crossing(p, face)
-    chosen = np.concatenate([each for each, whole in zip(found, good, strict=True) if whole] or [np.empty((0, 3), np.int64)])
-    chosen = _delaunay(p, chosen.astype(np.int64))
+    good = (np.array([len(each) for each in found]) == counts - 2) & ~_crossing(p, face)
+    found = np.concatenate(found).astype(np.int64)
+    chosen = _delaunay(p, found[good[face[found[:, 0]]]])
     a, b, c = p[chosen].swapaxes(0, 1)
     x = points[corners[chosen]]
     wrong = ~((_cross(b - a, c - a) > 0.0) & (_heights(x, _normals(x)) > FLATTEST))
@@ -152,7 +153,7 @@ def _delaunay(p, triangles):
 
 def _crossing(p, face):
     """Returns which polygons have sides that cross, beyond touching, from the corners (k, 2) of all and the polygon of each."""
-    found, after = np.zeros(face.max(initial=-1) + 1, dtype=bool), np.arange(1, len(p) + 1)
+    found, after = np.zeros(face[-1] + 1, dtype=bool), np.arange(1, len(p) + 1)
     last = np.flatnonzero(np.diff(face, append=-1))
     after[last] = np.searchsorted(face, face[last])
     ends = np.stack([p[:, 0], p[after, 0]]) + 4.0 * face  # polygons lie beside one another
