@@ -254,7 +254,7 @@ class Mesh:
             raise ValueError(f"{path}: the ending must be one of {' '.join(READERS)}")
         number("scale", scale, above=0.0)
         mesh = read(path, prim, cls)
-        own = mesh.up_axis or ("Y" if Path(path).suffix.lower() in (".glb", ".gltf") else None)
+        own: UpAxis | None = "Y" if Path(path).suffix.lower() in (".glb", ".gltf") else mesh.up_axis
         if up_axis is not None and own not in (None, up_axis):
             raise ValueError(f"{path}: up_axis is {up_axis!r}, but in the file it is {own!r}; leave it out")
         if scale == 1.0 and up_axis is None:

@@ -7,8 +7,8 @@ import numpy as np
 from .file_faces import faces_of, optional_number, plain_number, plain_reason, text_lines
 
 # Keywords without faces.
-_IGNORED = "vn vp vc g s p l usemtl usemap mtllib matlib maplib lod mg bevel c_interp d_interp shadow_obj trace_obj"
-_IGNORED = {*f"{_IGNORED} cstype deg bmat step parm trim hole scrv sp end con curv curv2 ctech stech".split()}
+_IGNORED = {*"vn vp vc g s p l usemtl usemap mtllib matlib maplib lod mg bevel c_interp d_interp shadow_obj trace_obj".split()}
+_IGNORED |= {*"cstype deg bmat step parm trim hole scrv sp end con curv curv2 ctech stech".split()}
 _CURVED = {*"surf bzp bsp cdc cdp res".split()}
 
 
