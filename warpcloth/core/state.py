@@ -119,13 +119,16 @@ class State:
         return other
 
     def assign(self, other):
-        """Copies the values of another state of the same solver and model into the arrays of this one."""
+        """Copies the values of another state of the same solver and model into the arrays of this one.
+
+        What was added to this one after the other was copied from it keeps its values.
+        """
         for share, of_other in zip(self.shares, other.shares, strict=True):
             share.assign(of_other)
-        for name, array in self.arrays.items():  # after the shares, whose x and v are parts of these
-            wp.copy(array, other.arrays[name])
-        for name, part in self.parts.items():
-            part.assign(other.parts[name])
+        for name in filter(other.arrays.__contains__, self.arrays):  # after the shares, whose x and v are parts of these
+            wp.copy(self.arrays[name], other.arrays[name])
+        for name in filter(other.parts.__contains__, self.parts):
+            self.parts[name].assign(other.parts[name])
         self.results, self.residual = list(other.results), other.residual.copy()
 
     def __eq__(self, other):

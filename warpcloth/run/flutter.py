@@ -13,6 +13,8 @@ from ..scene.mesh_collider import MeshCollider
 # average, in one direction. It flutters if it slides and vibrates faster than that in this number of frames in a row:
 # acceleration and impacts last for fewer.
 PART, SLIDES, FRAMES = 0.25, 0.1, 6
+# Up to this coefficient of friction vibrations of the belt in `benchmarks/flutter.py` grow by less than 1/s.
+STEADY = 0.2
 
 
 class Flutter:
@@ -32,7 +34,7 @@ class Flutter:
     def __init__(self, model, mass):
         scene, self._mass, self._fps = model.scene, mass, model.scene.fps
         self._distance = scene.contact.distance
-        self._colliders = [each for each in scene.colliders if each.friction > 0.0 and not isinstance(each, MeshCollider)]
+        self._colliders = [each for each in scene.colliders if _rubs(each)]
         self.first, self.figure, self._rows = np.zeros(len(mass), int), np.zeros(len(mass)), np.zeros(len(mass), int)
         self._points = model.in_scene_order(model.positions.numpy()).astype(np.float64).reshape(*mass.shape, 3)
         self._near, self._moved = self._touches(self._points, 0), np.zeros_like(self._points)
@@ -70,7 +72,10 @@ class Flutter:
 
 
 def flutter_of(stepper, mass):
-    """Returns a :class:`Flutter`, or None if steps damp vibrations, or no collider but meshes has friction."""
+    """Returns a :class:`Flutter`, or None if steps damp vibrations, or no collider but meshes has much friction."""
     scene, undamped = stepper.model.scene, stepper.options.staggered or not stepper.options.damps
-    rubs = any(each.friction > 0.0 and not isinstance(each, MeshCollider) for each in scene.colliders)
-    return Flutter(stepper.model, mass) if undamped and rubs else None
+    return Flutter(stepper.model, mass) if undamped and any(map(_rubs, scene.colliders)) else None
+
+
+def _rubs(collider):
+    return collider.friction > STEADY and not isinstance(collider, MeshCollider)
