@@ -129,7 +129,16 @@ def test_frames_go_on_in_the_same_file(ending, single, stops, tmp_path, device):
     for k, stop in enumerate(stops):
         interrupted(scene, solver, output, stop, resume=k > 0, **given)
         assert len(FrameSequence(output)) == stop + 1
+    (run,) = (path.parent for path in tmp_path.rglob("checkpoint.npz"))
+    mine = [run / name for name in ("frames_000000_mine.usdc", "frames_best.usdc")]
+    for path in mine:
+        path.touch()
     assert same(whole, wc.simulate(scene, solver, output=str(output), resume=True, **given))
+    for path in mine:
+        path.unlink()  # raises if it is gone
+    if single or ending == "usdz":
+        run.rmdir()
+        run.parent.rmdir()
     folders = [path for path in tmp_path.iterdir() if path.is_dir()]
     files = sorted(path.name for path in tmp_path.rglob("*") if path.is_file() and path.name.startswith("frames_"))
     assert len(folders) == (0 if single or ending == "usdz" else 2) and len(files) == 3 * len(folders)

@@ -332,6 +332,7 @@ def test_no_root_is_left_whose_layers_are_gone(tmp_path, monkeypatch, last):
 @pytest.mark.parametrize("linked", [False, True], ids=["folder", "linked folder"])
 def test_a_run_removes_no_files_but_those_of_runs(tmp_path, ending, linked):
     """Folders that are called like those of runs, what users put into those, and all that is behind links."""
+    mine = ("mine.txt", "finished.blend", "unfinished.md", "unfinished.backup", "checkpoint.pth", "frames_000000_mine.usdc")
     output, elsewhere = tmp_path / f"out.{ending}", tmp_path / "elsewhere"
     elsewhere.mkdir()
     for name in ("animation.usdc", "rest.usdc", "frames_000000.usdc", "manifest.usda", "mine.txt"):
@@ -342,11 +343,17 @@ def test_a_run_removes_no_files_but_those_of_runs(tmp_path, ending, linked):
     earlier, folder = killed.run, killed.run.parent
     del killed
     gc.collect()
-    (earlier / "mine.txt").write_text("mine")
+    unpacked = earlier / f"unpacked-{earlier.name[-8:]}" / "0"
+    for path in (*(earlier / name for name in mine), unpacked / "texture.png"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("mine")
     (earlier / "frames_000009.usdc").symlink_to(elsewhere / "frames_000000.usdc")
     shutil.copytree(elsewhere, folder / f"{ending}-0123abcd")
     (folder / f"{ending}-4567abcd").symlink_to(elsewhere)
-    (folder / "notes").mkdir()
+    for name in ("notes", f"{ending}-deadbeef"):
+        (folder / name).mkdir()
+    for name in ("finished.blend", "unfinished.md"):
+        (folder / f"{ending}-deadbeef" / name).write_text(name)
     (elsewhere / "manifest.usda").write_text(f'"{ending}-4567abcd"')
     if linked:
         folder.rename(tmp_path / "disk")
@@ -354,8 +361,8 @@ def test_a_run_removes_no_files_but_those_of_runs(tmp_path, ending, linked):
     before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*") if path != output}
     write(output, Mesh.grid(5, 4))
     gone = {path for path in before if not os.path.lexists(path)}
-    assert {path.parent for path in gone} <= {earlier} and not (linked and gone)
-    assert linked or {path.name for path in earlier.iterdir()} == {"mine.txt"}
+    assert {path.parent for path in gone} <= {earlier, unpacked.parent, unpacked} and not (linked and gone)
+    assert linked or {path.name for path in earlier.iterdir()} == {*mine}
     assert all(path.read_bytes() == data for path, data in before.items() if data and path not in gone)
     assert len(FrameSequence(output)) == FRAMES
 

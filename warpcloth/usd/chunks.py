@@ -16,15 +16,16 @@ from ..base.interrupts import deferred
 from ..base.outputs import Lock, keep_mode
 from .layers import flattened_layer, named_from, relative_path
 from .modules import Sdf, Usd
-from .packages import UNPACKED, Contents
+from .packages import Contents
 from .stage import METADATA_KEY, followed, identity
 from .values import refuse_path, sentences
 
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 _ROOT = "animation.usdc"  # root of a .usdz until it is packed, and of frames whose output cannot be written
 _MANIFEST = "manifest.usda"
-_UNFINISHED = re.compile(r"(un)?finished\.\w+")  # USD writes to a name with six random letters first
+_FRAMES = re.compile(r"frames_(\d{6,})\.usdc")
 _COMPLETE = "complete"  # file that marks the folder of a run whose frames are complete but not packed yet
+_NAMES = {_ROOT, "rest.usdc", _COMPLETE, "checkpoint.npz", "checkpoint.unfinished", _MANIFEST}  # the others of a run
 
 
 class ChunkWriter:
@@ -223,9 +224,9 @@ class ChunkWriter:
             if not path.is_file():
                 self._chunks = []
                 raise FileNotFoundError(f"{path}: is missing, so that the run cannot be resumed; run without resume")
-        found = sorted(self.run.glob("frames_*.usdc"))
+        found = {self.run / name: int(match[1]) for name in os.listdir(self.run) if (match := _FRAMES.fullmatch(name))}
         self._stale = set(found) - {path for _, path in self._chunks}
-        self._number = int(found[-1].stem.removeprefix("frames_")) + 1  # a new name, because pxr may hold the old files
+        self._number = max(found.values()) + 1  # a new name, because pxr may hold the old files
         self._span, self.frames, self.kept = tuple(span), frames, frames
         if self._packed:
             self.path = str(self.run / _ROOT)
@@ -407,24 +408,25 @@ class ChunkWriter:
 
         The root is first, so that a process killed meanwhile leaves no root whose layers are gone, and the manifest last.
         """
-        ours = rf"{_ROOT}|rest\.usdc|frames_\d+\.usdc|{_COMPLETE}|checkpoint\.\w+|{_UNFINISHED.pattern}|{_MANIFEST}"
-        ours = re.compile(f"{ours}|{re.escape(self._output.stem)}\\.usdc")
-        names = filter(ours.fullmatch, os.listdir(run))
+        if (unpacked := _temporary(run, "unpacked")).exists():
+            shutil.rmtree(unpacked)
+        fixed = _NAMES | {f"{self._output.stem}.usdc"}
+        names = [name for name in os.listdir(run) if name in fixed or _FRAMES.fullmatch(name) or _is_temporary(name, run)]
         for name in sorted(names, key=lambda name: (name != _ROOT, name == _MANIFEST)):
             os.remove(run / name)
         with suppress(OSError):
             run.rmdir()
 
     def _write_single_file(self, keep):
-        contents = Contents(self.run)
+        contents = Contents(_temporary(self.run, "unpacked"))
         named = contents.named if self._packed else named_from(self._output.parent)
         flat = self._declared(flattened_layer(self._base_paths(), self._describe, named))
         for attribute in self._attributes():
             flat.GetAttributeAtPath(attribute).ClearInfo("timeSamples")
         single = self.run / f"{self._output.stem}.usdc"
-        _export(flat, single)
+        export(flat, single, like=self._output)
         self._copy_frames(single)
-        finished = self.run / f"finished{self._output.suffix}"
+        finished = _temporary(self.run, "finished", self._output.suffix)
         if self._packed:
             with _writing(self._output):
                 contents.write(single, finished, self._output)
@@ -437,9 +439,8 @@ class ChunkWriter:
         (self.run / _COMPLETE).unlink(missing_ok=True)
         if keep:
             return
-        shutil.rmtree(self.run / UNPACKED, ignore_errors=True)
-        self._remove(self.run)
-        with suppress(OSError):  # it may be gone, or in use by a run to an output with another ending
+        with suppress(OSError):  # it may be gone, or in use, also by a run to an output with another ending
+            self._remove(self.run)
             if self._packed:
                 self._remove_other_runs()
             self._folder.rmdir()
@@ -511,7 +512,7 @@ def export(layer, path, unfinished_in=None, like=None):
     It has the permissions of the file ``like``, by default of that at the path, if there is one.
     """
     path = Path(path)
-    unfinished = Path(unfinished_in or path.parent) / f"unfinished{path.suffix}"
+    unfinished = _temporary(Path(unfinished_in or path.parent), "unfinished", path.suffix)
     _export(layer, unfinished, path)
     _rename(unfinished, path, like)
 
@@ -524,12 +525,22 @@ def _rename(finished, path, like=None):
         raise OSError(f"{path}: could not be written: {error.strerror or error}") from None
 
 
+def _temporary(folder, word, suffix=""):
+    """Returns a path in a folder that no file of a user has: with the random end of the folder's name, if it is of a run."""
+    return folder / f"{word}-{folder.name[-8:]}{suffix}"
+
+
+def _is_temporary(name, folder):
+    """Returns whether a file in the folder of a run is unfinished; USD writes first to a name with six random letters."""
+    return re.fullmatch(rf"(un)?finished-{re.escape(folder.name[-8:])}\.\w+", name)
+
+
 def _is_run(folder):
     """Returns whether a folder is no link and has the manifest of a run, or was left by one that was killed before or after."""
     try:
         if folder.is_symlink():
             return False
-        begun = all(_UNFINISHED.fullmatch(name) for name in os.listdir(folder))
+        begun = all(_is_temporary(name, folder) for name in os.listdir(folder))
         return begun or f'"{folder.name}"' in (folder / _MANIFEST).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return False

@@ -9,7 +9,6 @@ from itertools import chain
 from .modules import Ar, Sdf, UsdUtils
 
 _TILES = "<UDIM>"
-UNPACKED = "unpacked"  # folder of files that are extracted from packages
 
 
 class Contents:
@@ -64,7 +63,7 @@ class Contents:
         package, member = Ar.SplitPackageRelativePathOuter(found)
         try:
             with zipfile.ZipFile(package) as archive:
-                return [archive.extract(member, os.path.join(self._folder, UNPACKED))], [package]
+                return [archive.extract(member, self._folder)], [package]
         except (OSError, KeyError, zipfile.BadZipFile):  # a package in a package
             return [], []
 
