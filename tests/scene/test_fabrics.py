@@ -331,6 +331,16 @@ def test_a_material_of_the_published_code_is_its_record(tmp_path):
         ),
         ("a.json", "[" * 100_000, "a.json: is nested too deeply; it must be a JSON object"),
         ("a.json", ARCSIM.replace("10, 100", "80, 20"), r"begins with \[50.0, 80.0, 20.0, 30.0\], .*; k₁₂² must be below k₁k₂"),
+        (
+            "a.json",
+            ARCSIM.replace("50, 10, 100", "1e200, 1e200, 1e200"),
+            "a.json: stretching begins .*; k₁₂² must be below k₁k₂",
+        ),
+        (
+            "a.json",
+            ARCSIM.replace("50, 10, 100", "1e308, 1e160, 1e200"),
+            "a.json: Fabric.warp is inf; it must be a number above 0",
+        ),
         ("a.json", ARCSIM.replace("100, 30", "100, 0"), "the fourth number must be above 0"),
         ("a.json", ARCSIM.replace("24e-6", "-24e-6"), "bending begins with -2.4e-05 at 0° and 1.6e-05 at 90°; they must be"),
     ],

@@ -105,8 +105,9 @@ def _arcsim(path):
     if not (isinstance(stretching, list) and len(stretching) == 4 and all(map(_is_number, stretching))):
         raise ValueError(f"{path}: stretching begins with {shown(stretching)}; it must be a row of 4 numbers [N/m]")
     k1, k12, k2, shear = (2.0 * max(value, 0.0) for value in stretching)
-    if not (k1 * k2 > k12**2 and shear > 0.0):
-        rule = "the fourth number must be above 0" if k1 * k2 > k12**2 else "k₁₂² must be below k₁k₂"
+    definite = k1 > 0.0 and k2 > 0.0 and (k12 / k1) * (k12 / k2) < 1.0  # products may overflow
+    if not (definite and shear > 0.0):
+        rule = "the fourth number must be above 0" if definite else "k₁₂² must be below k₁k₂"
         raise ValueError(f"{path}: stretching begins with {shown(stretching)}, k₁, k₁₂, k₂ and the shear; {rule}")
     if not (along[0] > 0.0 and along[2] > 0.0):
         raise ValueError(f"{path}: bending begins with {along[0]:g} at 0° and {along[2]:g} at 90°; they must be above 0")
