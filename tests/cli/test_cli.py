@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -445,7 +446,11 @@ def test_a_step_that_is_stable_only_about_rest_warns_in_one_line(capfd):
 
 
 @pytest.mark.parametrize(
-    "closes", ["sys.stdout.close()", "sys.stderr.close()", "os.close(1)", "os.close(2)", "os.closerange(1, 3)"]
+    "closes",
+    [
+        *("sys.stdout.close()", "sys.stderr.close()", "os.close(1)", "os.close(2)", "os.closerange(1, 3)"),
+        *("sys.stdout.detach()", "sys.stderr.detach()"),
+    ],
 )
 @pytest.mark.parametrize("ends", ["", "raise ValueError", "sys.exit(0)"])
 def test_a_module_that_closes_the_output_ends_with_a_sentence(tmp_path, closes, ends):
@@ -455,6 +460,33 @@ def test_a_module_that_closes_the_output_ends_with_a_sentence(tmp_path, closes, 
     *before, line = done.stderr.splitlines()
     assert line == "warpcloth: a scene or a module closed the standard output or error; it must leave them open"
     assert done.returncode == 2 and all("cannot be imported" in each for each in before)
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sys.{0} = io.TextIOWrapper(sys.{0}.buffer, encoding='utf-8')",
+        "sys.{0} = io.TextIOWrapper(sys.{0}.detach(), encoding='utf-8')",
+        "sys.{0} = type('Copy', (), dict(write=lambda self, text: sys.__{0}__.write(text), flush=lambda self: None))()",
+    ],
+    ids=["buffer", "detached", "own class"],
+)
+def test_a_module_may_put_another_stream_in_the_place_of_one(tmp_path, text, stream):
+    (tmp_path / "puts.py").write_text(f"import io, sys\n{text.format(stream)}\n")
+    command = [sys.executable, "-m", "warpcloth", "fabrics", "--import", str(tmp_path / "puts.py")]
+    done = subprocess.run(command, capture_output=True, text=True, encoding="utf-8")
+    assert (done.returncode, done.stderr) == (0, "") and "denim" in done.stdout
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a shell of POSIX")
+@pytest.mark.parametrize("without", [">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(("command", "code"), [("scenes", 0), ("run hanging --frames 1 -o a.usdc", 0), ("run nothing", 2)])
+def test_a_command_runs_without_standard_streams(tmp_path, command, code, without):
+    line = f"{shlex.quote(sys.executable)} -m warpcloth {command} {without}"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run(line, shell=True, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == code and "Error" not in done.stderr
 
 
 @pytest.mark.parametrize("command", [("run", "-o", "out.usda"), ("info",), ("bench",)])
@@ -696,7 +728,7 @@ MOMENTS = {
     "the last chunk": (chunks.ChunkWriter, "_write_pending", 3, 25),
     "the source": (chunks.ChunkWriter, "_check_source", 1, 25),
     "one file": (chunks.ChunkWriter, "_copy_frames", 1, 25),
-    "removing": (chunks.shutil, "rmtree", 1, 25),
+    "removing": (chunks.ChunkWriter, "_remove", 1, 25),
     "the summary": (warpcloth.cli.run, "_summary", 1, 25),
 }
 

@@ -11,7 +11,6 @@ runs a command. No other part of the package defers an import of its own modules
 """
 
 import argparse
-import contextlib
 import gc
 import re
 import sys
@@ -43,7 +42,7 @@ from . import (
     scenes,
     view,
 )
-from .terminal import DTYPES, Printable, StandardStreams, say, warnings_once
+from .terminal import DTYPES, StandardStreams, say, warnings_once
 
 
 def main(argv=None):
@@ -61,7 +60,7 @@ def main(argv=None):
 
 
 def _run(argv):
-    with warnings.catch_warnings(), contextlib.redirect_stdout(Printable(sys.stdout)), Interrupts() as interrupts:
+    with warnings.catch_warnings(), Interrupts() as interrupts:
         warnings.showwarning = warnings_once()
         warnings.filterwarnings("default", category=DeprecationWarning, module=r"warpcloth\.")  # an option has another name now
         debug = False

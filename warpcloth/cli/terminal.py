@@ -16,6 +16,7 @@ from ..picture.figures import PICTURES, check_path
 
 # The same as :data:`warpcloth.model.precision.DTYPES`, which loads Warp.
 DTYPES = ("float32", "float64")
+_STREAMS = {1: "stdout", 2: "stderr"}
 # Unicode categories to escape: control, format (which can reverse text), surrogates, line ends.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
@@ -285,7 +286,10 @@ class Printable:
 
 
 class StandardStreams:
-    """Opens the standard output and error again if a scene or a module closed one during the block, and says so.
+    """Makes the standard output `Printable`, and drops what goes to a stream without which the process started.
+
+    It opens both again if a scene or a module closed one during the block, and says so. A stream that one put in the place of
+    another stays there.
 
     Attributes:
         code: The exit code; 2 if one was closed.
@@ -295,23 +299,30 @@ class StandardStreams:
 
     def __enter__(self):
         self._copies = {}
-        for number in (1, 2):
-            with contextlib.suppress(OSError):  # the process may have started without
+        for number, name in _STREAMS.items():
+            if getattr(sys, name) is None:  # the process has started without
+                setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+            with contextlib.suppress(OSError):
                 self._copies[number] = os.dup(number)
+        self._before, self._printable = sys.stdout, Printable(sys.stdout)
+        sys.stdout = self._printable
         return self
 
     def __exit__(self, kind, error, trace):
-        streams, closed = {1: sys.stdout, 2: sys.stderr}, False
+        if sys.stdout is self._printable:
+            sys.stdout = self._before
+        closed = False
         for number in self._copies:
+            stream = getattr(sys, _STREAMS[number])
             try:
                 os.fstat(number)
-                closed |= streams[number].closed
-            except (AttributeError, OSError):
+                closed |= getattr(stream, "closed", stream is None)
+            except (OSError, ValueError):  # ValueError if it was detached
                 closed = True
         if closed:
             for number, copy in self._copies.items():
                 os.dup2(copy, number)
-            sys.stderr = open(2, "w", closefd=False)
+                setattr(sys, _STREAMS[number], open(number, "w", closefd=False))
             message = "a scene or a module closed the standard output or error; it must leave them open"
             self.code = say(message, 2)
         for copy in self._copies.values():
