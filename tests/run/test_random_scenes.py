@@ -24,6 +24,7 @@ def test_what_a_judge_condemns_is_not_called_usable(seed, device):
     assert not (condemned and animation.status.ok), (case.text, animation.status.message, condemned)
 
 
+@pytest.mark.host
 @pytest.mark.parametrize("seed", [41, 89])
 def test_unbalanced_contact_is_counted_over_steps_of_all_lengths(seed, device):
     """In some frames more than half of a force is not balanced, in others not; steps become as long as they may."""
