@@ -206,7 +206,7 @@ def test_what_is_no_sample_is_refused():
             "loop",
             0.0,
             {"bending length": 1e3 * COTTON.bending_lengths[0], "D": 1e6 * COTTON.bending_warp},
-            "computed from E·t³",
+            "computed, as E·t³/12(1 − ν₁₂ν₂₁)",
         ),
     ],
 )

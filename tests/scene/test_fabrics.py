@@ -126,7 +126,7 @@ def test_one_record_is_printed_with_what_is_computed(capfd):
     code, out, _ = run(capfd, "fabrics", "denim")
     rows = dict(line.rsplit(maxsplit=1) for line in out.partition("\n\n")[0].splitlines())
     assert code == 0 and rows["fabric"] == "denim" and rows["E₁t N/m"] == "1673" and rows["D₁ µN·m"] == "114.8*"
-    assert "* computed, not measured: D from E·t³/12" in out and "Penava" not in out
+    assert "* computed, not measured: D as E·t³/12(1 − ν₁₂ν₂₁)" in out and "Penava" not in out
     code, out, _ = run(capfd, "fabrics", "denim-wang")
     assert code == 0 and "D₁ µN·m  16\n" in out and "*" not in out
 

@@ -349,7 +349,8 @@ def test_status_of_a_run_that_used_up_its_iterations(device):
     status = wc.simulate(swinging(8), wc.ProjectiveDynamics(substeps=1, iterations=3), device=device, frames=2).status
     assert status.ok and status.result is Result.ITERATIONS_USED_UP
     figure = f"largest unbalanced acceleration of a vertex {digits(status.residual)} times gravity (tolerance 0.001)"
-    within = f"completed within {millimetres(status.distance)} of the solution of the last step of each frame"
+    of = "of the solution of the last step of each frame (errors of steps add up)"
+    within = f"completed within {millimetres(status.distance)} {of}"
     assert status.message == f"{within}, iterations used up in one or more steps: {figure}"
     easy = replace(swinging(8), terms=[wc.QuadraticBending(stiffness=1e-5)])
     status = wc.simulate(easy, wc.ProjectiveDynamics(substeps=1), device=device, dtype="float64", frames=2).status

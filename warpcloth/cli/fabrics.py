@@ -5,8 +5,8 @@ from pathlib import Path
 from .terminal import aligned
 
 _DRAPE = """\
-* computed, not measured: D from E·t³/12, and drape % as the coefficient of 'warpcloth measure cusick -p rows=8', mean of eight
-starts. Several of these records drape less than such fabrics do (docs/fabrics.md)."""
+* computed, not measured: D as E·t³/12(1 − ν₁₂ν₂₁), and drape % as the coefficient of 'warpcloth measure cusick -p rows=8',
+mean of eight starts. Several of these records drape less than such fabrics do (docs/fabrics.md)."""
 
 
 def fabrics(arguments):

@@ -103,7 +103,7 @@ def sentence(
     tolerance=None,
     copy=None,
     why="",
-    of="the last step of each frame",
+    of="the last step of each frame (errors of steps add up)",
 ):
     """Returns a message: whether a result can be used, how it ended, and the residual with its unit and tolerance.
 

@@ -72,7 +72,7 @@ def recorded(device: str, fabric: Fabric, angle: float = 0.0) -> tuple[dict[str,
     D = fabric.bending_along(angle)
     why = "a strip also curves across its width, which makes it softer than the wide cloth of the record"
     if "bending_warp" in fabric.computed:
-        why += "; D of the record was not measured but computed from E·t³/12"
+        why += "; D of the record was not measured but computed, as E·t³/12(1 − ν₁₂ν₂₁)"
     return {"bending length": 1e3 * (D / (fabric.density * GRAVITY)) ** (1 / 3), "D": 1e6 * D}, why
 
 

@@ -40,6 +40,6 @@ def warp_on(mesh: Mesh, warp: ArrayLike | None = None) -> np.ndarray | None:
     if not lacking.all():
         what = f"triangle {np.argmax(lacking)} and {lacking.sum() - 1} others have no area in their texture coordinates; there"
     axis = {0: "x", 1: "y"}.get(facing[lacking].mean(), "x, or along y where triangles face x")
-    other = "to set another, give warp, which in a stage is warpcloth:warp"
+    other = "to set another, give warp: -p warp=0,0,1 with a mesh file, warpcloth:warp in a stage"
     warnings.warn(f"{what} the warp of the fabric is along {axis} of the rest shape; {other}", stacklevel=4)
     return warp[0] if np.array_equal(warp[:-1], warp[1:]) else warp
