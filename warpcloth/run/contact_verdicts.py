@@ -105,7 +105,7 @@ def contact_faults(scene, held, inside, pierced, copies=1):
     for each in inside:
         if each.other is not None:
             found.append((each.copy, each.frame, f"{each}; leave the cloth room between the two"))
-    remedy = 'take Contact(elements="triangles"), in a stage warpcloth:contact:elements, to keep meshes out between vertices too'
+    remedy = 'take Contact(elements="triangles"), in a stage warpcloth:contact:elements, to keep meshes out of triangles too'
     found += [(each.copy, each.frame, f"{each}; {remedy}") for each in pierced]
     return sorted(found, key=lambda fault: fault[1])
 
