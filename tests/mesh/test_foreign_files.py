@@ -1,4 +1,4 @@
-"""Small files with the quirks of other programs: each is read rightly, or refused with file, place and reason."""
+"""Small files with the quirks of other programs: each is read rightly, or refused with the file, where in it, and why."""
 
 import json
 import re

@@ -61,7 +61,7 @@ def test_vertices_that_touch_elsewhere_stay_apart(tmp_path, ending):
 
 BACK = GRID.triangles[:, ::-1]
 RIGHT = GRID.points[GRID.triangles].mean(axis=1)[:, 0] > 0.5
-LAYERS = {  # two layers at one place, with the height of the second, and how many vertices are left
+LAYERS = {  # two layers that coincide, with the height of the second, and how many vertices are left
     "wound alike": (GRID.triangles, 0.0, 40),
     "wound otherwise": (BACK, 0.0, 40),
     "cut along other diagonals": (wc.Mesh.grid(5, 4, pattern="alternating").triangles, 0.0, 40),

@@ -288,8 +288,8 @@ class Printable:
 class StandardStreams:
     """Makes the standard output `Printable`, and drops what goes to a stream without which the process started.
 
-    It opens both again if a scene or a module closed one during the block, and says so. A stream that one put in the place of
-    another stays there.
+    It opens both again if a scene or a module closed one during the block, and says so. A stream by which one
+    replaced another stays.
 
     Attributes:
         code: The exit code; 2 if one was closed.

@@ -121,7 +121,7 @@ class State:
     def assign(self, other):
         """Copies the values of another state of the same solver and model into the arrays of this one.
 
-        What was added to this one after the other was copied from it keeps its values.
+        Arrays and parts that were added to this one after the other was copied from it keep their values.
         """
         for share, of_other in zip(self.shares, other.shares, strict=True):
             share.assign(of_other)

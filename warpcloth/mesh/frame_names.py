@@ -24,12 +24,11 @@ class _Name(NamedTuple):
 def frames_of_names(files: Iterable[Path]) -> dict[float, Path]:
     """Returns files by the numbers of their frames, ascending.
 
-    The last number in a name is that of its frame. A hyphen before it is a minus unless a letter, digit or
-    blank precedes it, so "cloth_-4" is frame −4 and "cloth-4" is frame 4; beside "cloth1", however, "cloth-4" is frame −4.
-    Decimals, as in "c_1.25"
-    and "c_2.00", are equal parts of a frame. After a version the point separates, as in "v2.0998", and also after a number
-    that all names have, if it is not 0 and four digits or more follow, as in "take_2.0100" and "take_2.0200", or if frames of
-    two digits or more follow each other.
+    The last number in a name is that of its frame. A hyphen before it is a minus unless a letter, digit or blank precedes it,
+    so "cloth_-4" is frame −4 and "cloth-4" is frame 4; beside "cloth1", however, "cloth-4" is frame −4. Decimals, as in
+    "c_1.25" and "c_2.00", are equal parts of a frame. After a version the point separates, as in "v2.0998". It separates also
+    after a number that all names have, in two cases: the number is not 0 and four digits or more follow, as in "take_2.0100"
+    and "take_2.0200"; or two digits or more follow, and two frames follow each other.
 
     Raises:
         ValueError: A name has no number, or one of more than 15 digits, two names have one number, or it is not clear whether

@@ -58,12 +58,12 @@ class Flutter:
 
     def faults(self):
         """Returns the reasons why copies are not usable, a list of (copy, frame, sentence)."""
-        why = "cloth that slides with friction vibrates on its contact {:.2g} times as fast as it slides"
-        remedy = 'take implicit Euler or integrator="bdf2", which damp it'
-        return [
-            (copy, int(self.first[copy]), f"in frame {self.first[copy]} {why.format(self.figure[copy])}; {remedy}")
-            for copy in np.flatnonzero(self.first)
-        ]
+        remedy, found = 'take implicit Euler or integrator="bdf2", which damp it', []
+        for copy in np.flatnonzero(self.first):
+            frame, of_copy = int(self.first[copy]), f" of copy {copy}" if len(self.first) > 1 else ""
+            why = f"cloth that slides with friction vibrates on its contact {self.figure[copy]:.2g} times as fast as it slides"
+            found.append((copy, frame, f"in frame {frame}{of_copy} {why}; {remedy}"))
+        return found
 
     def _touches(self, points, frame):
         """Returns which vertices are nearer to a collider than the contact distance, (B, n)."""

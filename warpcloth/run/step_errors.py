@@ -97,8 +97,8 @@ class StepErrors:
     @in_turn
     def find(self):
         """Returns the :class:`StepError` of the frame that ended with the last step."""
-        copies = len(self.distance)
-        energies, unresolved, he = np.zeros((5, copies)), np.zeros(copies, dtype=bool), np.zeros(copies)
+        B = len(self.distance)
+        energies, unresolved, he = np.zeros((5, B)), np.zeros(B, dtype=bool), np.zeros(B)
         for taker, first, end in self._stepper.takers:
             if taker not in self._parts:
                 self._parts[taker] = _measured(taker)
