@@ -1,8 +1,7 @@
-"""Factories of the constraint rows of self-contact pairs: C = −√(2φ(d)), as for contact with colliders.
+"""Factories of the constraint rows of pairs, for each :class:`.pair_sums.PairTerm`.
 
-Each copy has rows for all pairs of the list. Rows of pairs of other copies, or of pairs beyond the contact distance, are
-inactive, see :mod:`..constraint_rows`. With ``curved``, each pair has a second row, which adds the stiffness −λC″ along n.
-Pairs with friction have two more rows, see :func:`linearise_friction_rows`.
+Each copy has rows for all pairs of the list. Rows of pairs of other copies, or of pairs without a force, are inactive, see
+:mod:`..constraint_rows`. Pairs of a term of rank 1 have a second row with ``curved``, which adds the stiffness −λC″.
 """
 
 from functools import cache
@@ -11,14 +10,10 @@ import warp as wp
 
 from ..constraint_rows import ROUNDINGS, RowLayout, lowest_compliance, row_values
 from ..rotation import epsilon
-from ..terms import contact
 from ..vectors import types
-from .self_friction import RubbedPairs, edge_tangent, stretch_of
-from .self_gaps import nearest, signed_gap, vertex_of
-from .self_pairs import StepPairs, near_pairs
-
-constraint_slope, constraint_bend, potential = contact.constraint_slope, contact.constraint_bend, contact.potential
-ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+from .pair_sums import PairTerm
+from .self_gaps import ONE, ZERO, vertex_of
+from .self_pairs import near_pairs
 
 
 @wp.struct
@@ -36,11 +31,11 @@ def row_of_pair(copy: int, e: int, layout: RowLayout, rows: int):
 
 
 @cache
-def linearise_pair_rows(dtype, curved: bool):
+def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
     """Kernel over copies and pairs at x̃ + d: rows as in :func:`..constraint_rows.linearise`."""
     vec3, _ = types(dtype)
-    at, exact = vertex_of(dtype)
-    Q = wp.constant(2 if curved else 1)
+    (_at, exact), row_of = vertex_of(dtype), term.row(dtype)
+    Q = wp.constant(2 if curved else term.rank)
 
     @wp.kernel(module="unique", enable_backward=False)
     def linearise_each_pair(
@@ -48,98 +43,7 @@ def linearise_pair_rows(dtype, curved: bool):
         pairs: near_pairs(dtype),
         inverse_mass: wp.array(dtype=dtype),
         # state in
-        step: StepPairs,
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        # parameters
-        h: wp.float64,
-        least: wp.float64,
-        per_copy: int,
-        layout: RowLayout,
-        # out, and the multipliers in and out
-        slopes: PairSlopes,
-        rows: row_values(dtype),
-    ):
-        copy, e = wp.tid()
-        count = pairs.counts[0] + pairs.counts[1]
-        own = False
-        if e < count:
-            own = pairs.stencils[e][0] // per_copy == copy
-        row = row_of_pair(copy, e, layout, Q)
-        held = wp.max(wp.float64(rows.multipliers[row]), ZERO)
-        for j in range(Q):
-            rows.multipliers[row + j] = dtype(0.0)
-            rows.gap[row + j] = dtype(0.0)
-            rows.compliance[row + j] = dtype(1.0)
-            rows.inverse[row + j] = dtype(1.0)
-            rows.residual[row + j] = ZERO
-            rows.rounding[row + j] = ZERO
-            rows.carried[row + j] = ZERO
-        if not own:
-            return
-        slopes.first[e] = wp.vec3d()
-        slopes.second[e] = wp.vec3d()
-        k = step.stiffness[e]
-        if k == ZERO:
-            return
-        s = pairs.stencils[e]
-        r = wp.float64(pairs.distances[e])
-        w, y, inside = nearest(e < pairs.counts[0], at(x, d, s[0]), at(x, d, s[1]), at(x, d, s[2]), at(x, d, s[3]))
-        gap, n = signed_gap(y, step.normal[e], inside)
-        steep = constraint_slope(gap, r)
-        if steep == ZERO:
-            return
-        C = -wp.sqrt(wp.float64(2.0) * potential(gap, r))
-        moved = ZERO
-        most = ZERO
-        size = ZERO
-        for i in range(4):
-            free = wp.float64(inverse_mass[s[i]])
-            moved += free * w[i] * w[i]
-            most = wp.max(most, free * wp.abs(w[i]))
-            size += wp.abs(w[i]) * (wp.length(at(x, d, s[i]) - at(x, d, s[0])) + wp.length(exact(d[s[i]])))
-        if moved == ZERO:
-            return
-        alpha = ONE / (k * h * h)
-        total = steep * steep * moved
-        excess = wp.max(lowest_compliance(alpha, least) * total - alpha, ZERO)
-        alpha += excess
-        slopes.weights[e] = w
-        slopes.first[e] = steep * n
-        rows.multipliers[row] = dtype(held)
-        rows.gap[row] = dtype(C + alpha * held)
-        rows.compliance[row] = dtype(alpha)
-        inverse = ONE / (total + alpha)
-        rows.inverse[row] = dtype(inverse)
-        if wp.static(curved):
-            stiffening = wp.sqrt(wp.max(-held * constraint_bend(gap, r), ZERO))
-            slopes.second[e] = stiffening * n
-            rows.inverse[row + 1] = dtype(ONE / (stiffening * stiffening * moved + ONE))
-        rows.carried[row] = most * steep * excess * held * inverse
-        rows.residual[row] = most * steep * wp.abs(C + alpha * held) * inverse
-        lost = most * steep * (steep * size * inverse + held)
-        rows.rounding[row] = wp.float64(dtype(ROUNDINGS) * epsilon(dtype(lost)) * dtype(lost))
-
-    return linearise_each_pair
-
-
-@cache
-def linearise_friction_rows(dtype):
-    """Kernel over copies and pairs at x̃ + d: the rows of friction, C = (u·t, u·(n × t)), t along the edge of the pair.
-
-    For a sliding pair, they are those of a softer spring with the same force.
-    """
-    vec3, _ = types(dtype)
-    stretch, (at, exact) = stretch_of(dtype), vertex_of(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def linearise_friction_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        inverse_mass: wp.array(dtype=dtype),
-        # state in
-        rubbed: RubbedPairs,
-        start: wp.array(dtype=vec3),
+        data: term.data,
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         # parameters
@@ -155,60 +59,63 @@ def linearise_friction_rows(dtype):
         own = False
         if e < pairs.counts[0] + pairs.counts[1]:
             own = pairs.stencils[e][0] // per_copy == copy
-        row = row_of_pair(copy, e, layout, 2)
-        held = wp.vec2d(wp.float64(rows.multipliers[row]), wp.float64(rows.multipliers[row + 1]))
-        for j in range(2):
-            rows.multipliers[row + j] = dtype(0.0)
-            rows.gap[row + j] = dtype(0.0)
-            rows.compliance[row + j] = dtype(1.0)
-            rows.inverse[row + j] = dtype(1.0)
-            rows.residual[row + j] = ZERO
-            rows.rounding[row + j] = ZERO
-            rows.carried[row + j] = ZERO
+        start = row_of_pair(copy, e, layout, Q)
+        held = wp.vec2d()
+        for j in range(Q):
+            held[j] = wp.float64(rows.multipliers[start + j])
+            rows.multipliers[start + j] = dtype(0.0)
+            rows.gap[start + j] = dtype(0.0)
+            rows.compliance[start + j] = dtype(1.0)
+            rows.inverse[start + j] = dtype(1.0)
+            rows.residual[start + j] = ZERO
+            rows.rounding[start + j] = ZERO
+            rows.carried[start + j] = ZERO
         if not own:
             return
         slopes.first[e] = wp.vec3d()
         slopes.second[e] = wp.vec3d()
-        limit = rubbed.limit[e]
-        if limit == ZERO:
-            return
+        found = row_of(pairs, data, e, x, d, held)
         s = pairs.stencils[e]
-        w = rubbed.weights[e]
-        n = rubbed.normal[e]
         moved = ZERO
         most = ZERO
-        size = ZERO
+        size = found.size
         for i in range(4):
+            w = found.weights[i]
             free = wp.float64(inverse_mass[s[i]])
-            moved += free * w[i] * w[i]
-            most = wp.max(most, free * wp.abs(w[i]))
-            size += wp.abs(w[i]) * (wp.length(at(x, d, s[i]) - exact(start[s[i]])) + wp.length(exact(d[s[i]])))
-        t = edge_tangent(exact(start[s[3]]) - exact(start[s[2]]), n)
-        if moved == ZERO or wp.length_sq(t) == ZERO:
+            moved += free * w * w
+            most = wp.max(most, free * wp.abs(w))
+            size += wp.abs(w) * wp.length(exact(d[s[i]]))
+        if moved == ZERO or wp.length_sq(found.first) == ZERO:
             return
-        u = stretch(s, w, n, rubbed.stretch[e], start, x, d)
-        k = wp.min(rubbed.stiffness[e], limit / wp.max(wp.length(u), wp.float64(1e-300)))
-        alpha = ONE / (k * h * h)
-        excess = wp.max(lowest_compliance(alpha, least) * moved - alpha, ZERO)
-        alpha += excess
-        inverse = ONE / (moved + alpha)
-        slopes.weights[e] = w
-        slopes.first[e] = t
-        slopes.second[e] = wp.cross(n, t)
-        for j in range(2):
-            C = wp.dot(u, t)
+        slopes.weights[e] = found.weights
+        slopes.first[e] = found.first
+        slopes.second[e] = found.second
+        for j in range(Q):
+            row = start + j
+            square = wp.length_sq(found.first)
             if j == 1:
-                C = wp.dot(u, wp.cross(n, t))
-            rows.multipliers[row + j] = dtype(held[j])
-            rows.gap[row + j] = dtype(C + alpha * held[j])
-            rows.compliance[row + j] = dtype(alpha)
-            rows.inverse[row + j] = dtype(inverse)
-            rows.carried[row + j] = most * excess * wp.abs(held[j]) * inverse
-            rows.residual[row + j] = most * wp.abs(C + alpha * held[j]) * inverse
-            lost = most * (size * inverse + wp.abs(held[j]))
-            rows.rounding[row + j] = wp.float64(dtype(ROUNDINGS) * epsilon(dtype(lost)) * dtype(lost))
+                square = wp.length_sq(found.second)
+            total = square * moved
+            if wp.static(curved) and j == 1:
+                rows.inverse[row] = dtype(ONE / (total + ONE))
+            else:
+                steep = wp.sqrt(square)
+                alpha = ONE / (found.stiffness * h * h)
+                excess = wp.max(lowest_compliance(alpha, least) * total - alpha, ZERO)
+                alpha += excess
+                own_held = found.held[j]
+                C = found.C[j] + alpha * own_held
+                inverse = ONE / (total + alpha)
+                rows.multipliers[row] = dtype(own_held)
+                rows.gap[row] = dtype(C)
+                rows.compliance[row] = dtype(alpha)
+                rows.inverse[row] = dtype(inverse)
+                rows.carried[row] = most * steep * excess * wp.abs(own_held) * inverse
+                rows.residual[row] = most * steep * wp.abs(C) * inverse
+                lost = most * steep * (steep * size * inverse + wp.abs(own_held))
+                rows.rounding[row] = wp.float64(dtype(ROUNDINGS) * epsilon(dtype(lost)) * dtype(lost))
 
-    return linearise_friction_of_pairs
+    return linearise_each_pair
 
 
 @cache

@@ -11,32 +11,18 @@ from functools import cache
 
 import warp as wp
 
+from ..memory import load
 from ..terms import contact
 from ..vectors import types
-from .pair_sums import PairSource
+from .pair_sums import PairForces, PairRow, PairTerm
 from .self_gaps import SIDE, ZERO, gap_along, nearest, signed_gap, vertex_of
 from .self_pairs import MODULE, StepPairs, module_of, near_pairs
 from .self_planes import margin_of
 
-potential, slope, bend = contact.potential, contact.slope, contact.bend
+potential, slope, bend, gap_after = contact.potential, contact.slope, contact.bend, contact.gap_after
+constraint_slope, constraint_bend = contact.constraint_slope, contact.constraint_bend
 # The force of ψ at the least gap, divided by that of φ there.
 STEEP = wp.constant(wp.float64(100.0))
-
-
-@wp.struct
-class PairForces:
-    """n, w, kAφ [J], kAφ′ [N] and, in ``acting``, kAφ″ [N/m] of each pair at some positions.
-
-    On the CPU ``pressing`` lists the ``count`` (1,) pairs with a force, in order.
-    """
-
-    normal: wp.array(dtype=wp.vec3d)
-    weights: wp.array(dtype=wp.vec4d)
-    energy: wp.array(dtype=wp.float64)
-    slope: wp.array(dtype=wp.float64)
-    acting: wp.array(dtype=wp.float64)
-    pressing: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
 
 
 @cache
@@ -93,7 +79,7 @@ def least_gap(dtype):
 
 @cache
 def find_forces(dtype, bounded: bool):
-    """Kernel over acting pairs: kAφ, kAφ′, kAφ″, w and n at x, or x + correction; φ = ½(r − d)² if ``bounded``.
+    """Kernel over acting pairs: the forces at x, or x + correction; φ = ½(r − d)² if ``bounded``.
 
     With ``apart`` no pair passes through, so that d is never negative: where cloth slides over an edge, y may turn far from its
     normal at the start of the step. If ``least`` [m], the least gap of the filter, is above 0, ψ is added to φ.
@@ -120,9 +106,7 @@ def find_forces(dtype, bounded: bool):
         if t >= pairs.number[0]:
             return
         e = pairs.acting[t]
-        forces.energy[e] = ZERO
-        forces.slope[e] = ZERO
-        forces.acting[e] = ZERO
+        forces.bend[e] = wp.vec2d()
         touches, gap, n, w = gap_of(pairs, step, e, x, correction, False)
         if touches:
             if apart and gap < ZERO:
@@ -130,66 +114,155 @@ def find_forces(dtype, bounded: bool):
                 n = -n
             k = step.stiffness[e]
             r = wp.float64(pairs.distances[e])
-            forces.normal[e] = n
-            forces.weights[e] = w
-            if wp.static(bounded):
-                forces.energy[e] = SIDE * k * (r - gap) * (r - gap)
-                forces.slope[e] = k * (gap - r)
-                forces.acting[e] = k
-            else:
-                forces.energy[e] = k * potential(gap, r)
-                forces.slope[e] = k * slope(gap, r)
-                forces.acting[e] = k * bend(gap, r)
+            energy = SIDE * k * (r - gap) * (r - gap)
+            pull = k * (gap - r)
+            curvature = k
+            if wp.static(not bounded):
+                energy = k * potential(gap, r)
+                pull = k * slope(gap, r)
+                curvature = k * bend(gap, r)
                 if least > ZERO:
                     f = least_gap_of(pairs.stencils[e], x, least)
                     below = wp.float64(2.0) - gap / f
                     if below > ZERO and wp.float64(2.0) * f <= r:
                         more = STEEP * SIDE * SIDE * k * r * r * below
-                        forces.energy[e] = forces.energy[e] + more * below * below / wp.float64(3.0)
-                        forces.slope[e] = forces.slope[e] - more * below / f
-                        forces.acting[e] = forces.acting[e] + wp.float64(2.0) * more / (f * f)
+                        energy += more * below * below / wp.float64(3.0)
+                        pull -= more * below / f
+                        curvature += wp.float64(2.0) * more / (f * f)
+            forces.weights[e] = w
+            forces.energy[e] = energy
+            forces.force[e] = pull * n
+            forces.bend[e] = wp.vec2d(curvature, ZERO)
+            forces.along[e] = n
             if forces.pressing:
                 forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
 
     return find_forces_of_pairs
 
 
-@wp.struct
-class PressingPair:
-    """n, kAφ′ and kAφ″ of a pair."""
+@cache
+def find_clearances(dtype):
+    """Kernel over acting pairs: clearance = gap at x along n of the start of the step, minus the contact distance."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
 
-    normal: wp.vec3d
-    slope: wp.float64
-    bend: wp.float64
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_each_clearance(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        # in and out
+        step: StepPairs,
+    ):
+        t = wp.tid()
+        if t >= pairs.number[0]:
+            return
+        e = pairs.acting[t]
+        s = pairs.stencils[e]
+        gap = gap_along(e < pairs.counts[0], step.normal[e], exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        step.clearance[t] = gap - wp.float64(pairs.distances[e])
 
-
-@wp.func
-def _pair(found: PairForces, e: int):
-    own = PressingPair()
-    own.normal = found.normal[e]
-    own.slope = found.slope[e]
-    own.bend = found.acting[e]
-    return own
-
-
-@wp.func
-def _force(own: PressingPair):
-    return own.slope * own.normal
-
-
-@wp.func
-def _curvature(own: PressingPair):
-    return own.bend * wp.outer(own.normal, own.normal)
+    return find_each_clearance
 
 
-@wp.func
-def _part(own: PressingPair, w: wp.float64, p: wp.vec3d):
-    return w * wp.dot(own.normal, p)
+@cache
+def near_contact(dtype):
+    """The ``near`` of contact. A pair is skipped quickly while corrections are below its ``clearance``, if it has one."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+    gap_of, vector = gap_in_step(dtype), load(vec3)
+    value, normal, stencil = (load(each) for each in (wp.float64, wp.vec3d, wp.vec4i))
+
+    @wp.func
+    def near_of(
+        pairs: near_pairs(dtype),
+        step: StepPairs,
+        turn: int,
+        e: int,
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        always: bool,
+    ):
+        touches = wp.bool(True)
+        gap = ZERO
+        n = wp.vec3d()
+        w = wp.vec4d()
+        if step.clearance and not always:
+            s = stencil(pairs.stencils, e)
+            p0 = exact(vector(correction, s[0]))
+            p1 = exact(vector(correction, s[1]))
+            p2 = exact(vector(correction, s[2]))
+            p3 = exact(vector(correction, s[3]))
+            left = value(step.clearance, turn) + gap_along(e < pairs.counts[0], normal(step.normal, e), p0, p1, p2, p3)
+            touches = not left > ZERO
+        if touches:
+            touches, gap, n, w = gap_of(pairs, step, e, x, correction, always)
+        return touches, gap * n, n, w
+
+    return near_of
 
 
-@wp.func
-def _product(own: PressingPair, w: wp.float64, along: wp.float64):
-    return own.bend * w * along * own.normal
+@cache
+def push_contact(dtype):
+    """The ``push`` of contact: λ = (d* − d)/D of the gap d = v·n, with D at least ``least`` if the pair is ``hard``."""
+
+    @wp.func
+    def push_of(
+        pairs: near_pairs(dtype),
+        step: StepPairs,
+        e: int,
+        v: wp.vec3d,
+        n: wp.vec3d,
+        D: wp.float64,
+        least: wp.float64,
+        h: wp.float64,
+        hard: bool,
+    ):
+        r = wp.float64(pairs.distances[e])
+        gap = wp.dot(v, n)
+        found = ZERO
+        if D > ZERO and gap < r:
+            part = D
+            compliance = wp.float64(wp.inf)
+            if hard:
+                part = wp.max(D, least)
+            else:
+                compliance = D * step.stiffness[e] * h * h
+            found = (gap_after(gap, r, compliance) - gap) / part
+        return found * n
+
+    return push_of
 
 
-CONTACT_OF_PAIRS = PairSource("self-contact", MODULE, PairForces, _pair, _force, _curvature, _part, _product)
+@cache
+def row_of_contact(dtype):
+    """The ``row`` of contact: C = −√(2φ(d)), as for contact with colliders. The second has the stiffness −λC″ along n."""
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+
+    @wp.func
+    def row_of(
+        pairs: near_pairs(dtype), step: StepPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3), held: wp.vec2d
+    ):
+        found = PairRow()
+        found.stiffness = step.stiffness[e]
+        if found.stiffness > ZERO:
+            s = pairs.stencils[e]
+            r = wp.float64(pairs.distances[e])
+            a = at(x, d, s[0])
+            w, y, inside = nearest(e < pairs.counts[0], a, at(x, d, s[1]), at(x, d, s[2]), at(x, d, s[3]))
+            gap, n = signed_gap(y, step.normal[e], inside)
+            found.weights = w
+            found.held[0] = wp.max(held[0], ZERO)
+            found.C[0] = -wp.sqrt(wp.float64(2.0) * potential(gap, r))
+            found.first = constraint_slope(gap, r) * n
+            found.second = wp.sqrt(wp.max(-found.held[0] * constraint_bend(gap, r), ZERO)) * n
+            for i in range(1, 4):
+                found.size += wp.abs(w[i]) * wp.length(at(x, d, s[i]) - a)
+        return found
+
+    return row_of
+
+
+CONTACT_OF_PAIRS = PairTerm("self-contact", MODULE, 1, StepPairs, near_contact, push_contact, row_of_contact, isotropic=False)

@@ -1,9 +1,9 @@
-"""Factories of the kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)).
+"""Factories of the kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(Σ wᵢxᵢ − a), a = Σ wᵢxᵢⁿ − ξ.
 
 H is the Huber function of :mod:`..terms.friction` with ε = μN/(kA): a spring with the stiffness of contact and a force of at
 most μN. Pairs, w, n, N and kA are those at the start of the step, at the positions xⁿ. ξ is the elongation of the spring there.
-A step updates it, ξ ← (I − nnᵀ)(ξ + Σ wᵢ(xᵢ − xᵢⁿ)), and the next one shortens it to at most ε. So a sticking pair does not
-creep, and the spring of a sliding pair slides along.
+A step updates it, ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of a
+sliding pair slides along.
 
 ξ is stored relative to the edge between the last two vertices of a pair, so that it rotates with the cloth. A new pair starts
 with the mean ξ of the touching pairs between the same parts, which have a common vertex with it on each side.
@@ -15,7 +15,7 @@ import warp as wp
 
 from ..terms import contact
 from ..vectors import types
-from .pair_sums import PairSource
+from .pair_sums import PairForces, PairRow, PairTerm
 from .self_gaps import ONE, SIDE, ZERO, vertex_of
 from .self_pairs import StepPairs, near_pairs
 
@@ -24,31 +24,18 @@ slope = contact.slope
 
 @wp.struct
 class RubbedPairs:
-    """Values of pairs at the start of the step: n, w, kA [N/m], μN [N] (0 without contact), ξ [m], and kA of contact [N/m]."""
+    """Values of pairs at the start of the step: n, w, kA [N/m], μN [N] (0 without contact), and kA of contact [N/m].
+
+    Of pairs with friction also the anchor a [m], and the direction t of the edge of the pair in the plane normal to n.
+    """
 
     normal: wp.array(dtype=wp.vec3d)
     weights: wp.array(dtype=wp.vec4d)
     stiffness: wp.array(dtype=wp.float64)
     limit: wp.array(dtype=wp.float64)
     contact: wp.array(dtype=wp.float64)
-    stretch: wp.array(dtype=wp.vec3d)
-
-
-@wp.struct
-class RubForces:
-    """Values of pairs at given positions: kAH [J], ∂U/∂u [N], u/‖u‖, and the second derivatives along and across u [N/m].
-
-    The first three are n, w and μN of :class:`RubbedPairs`.
-    """
-
-    normal: wp.array(dtype=wp.vec3d)
-    weights: wp.array(dtype=wp.vec4d)
-    acting: wp.array(dtype=wp.float64)
-    energy: wp.array(dtype=wp.float64)
-    pull: wp.array(dtype=wp.vec3d)
-    direction: wp.array(dtype=wp.vec3d)
-    along: wp.array(dtype=wp.float64)
-    across: wp.array(dtype=wp.float64)
+    anchor: wp.array(dtype=wp.vec3d)
+    tangent: wp.array(dtype=wp.vec3d)
 
 
 MODULE = "warpcloth.self_friction"
@@ -62,6 +49,15 @@ def friction_module(dtype):
 def edge_tangent(edge: wp.vec3d, n: wp.vec3d):
     """Direction of an edge in the plane normal to n; 0 for an edge along n."""
     t = edge - wp.dot(n, edge) * n
+    return t / wp.max(wp.length(t), wp.float64(1e-300))
+
+
+@wp.func
+def perpendicular(n: wp.vec3d):
+    """A unit vector normal to n."""
+    axis = wp.vec3d()
+    axis[wp.int32(wp.argmin(wp.abs(n)))] = ONE
+    t = wp.cross(n, axis)
     return t / wp.max(wp.length(t), wp.float64(1e-300))
 
 
@@ -87,6 +83,46 @@ def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_la
         if has(q, s[i], q_first, q_last):
             found = True
     return found
+
+
+@cache
+def difference_of(dtype):
+    """Device function (stencil, w, x) → Σ wᵢxᵢ, computed relative to the first vertex."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.func
+    def difference(s: wp.vec4i, w: wp.vec4d, x: wp.array(dtype=vec3)):
+        y = wp.vec3d()
+        for i in range(1, 4):
+            y += w[i] * (exact(x[s[i]]) - exact(x[s[0]]))
+        return y
+
+    return difference
+
+
+@wp.func
+def slip_from(rubbed: RubbedPairs, e: int, y: wp.vec3d):
+    """Returns u of a pair."""
+    u = y - rubbed.anchor[e]
+    return u - wp.dot(rubbed.normal[e], u) * rubbed.normal[e]
+
+
+@cache
+def slip_at(dtype):
+    """Device function (pairs, rubbed, e, x, d) → u at x, or at x + d."""
+    vec3, _ = types(dtype)
+    y_of = difference_of(dtype)
+
+    @wp.func
+    def slip_of(pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
+        s = pairs.stencils[e]
+        y = y_of(s, rubbed.weights[e], x)
+        if d:
+            y += y_of(s, rubbed.weights[e], d)
+        return slip_from(rubbed, e, y)
+
+    return slip_of
 
 
 @cache
@@ -162,13 +198,13 @@ def note_relisted(
 
 
 @cache
-def set_stretch(dtype):
-    """Kernel over acting pairs at the start of a step: ξ, from ``kept`` of the last step, if the copy has made ``steps``."""
+def set_anchors(dtype):
+    """Kernel over acting pairs at the start of a step: a and t; ξ is from ``kept`` of the last step, if there are ``steps``."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
+    (_at, exact), y_of = vertex_of(dtype), difference_of(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
-    def set_stretch_of_pairs(
+    def set_anchor_of_pairs(
         # elements
         pairs: near_pairs(dtype),
         # state in
@@ -187,19 +223,20 @@ def set_stretch(dtype):
         e = pairs.acting[turn]
         limit = rubbed.limit[e]
         s = pairs.stencils[e]
-        rubbed.stretch[e] = wp.vec3d()
-        if limit == ZERO or steps[s[0] // per_copy] == 0:
+        if limit == ZERO:
             return
         n = rubbed.normal[e]
         sides = wp.where(e < pairs.counts[0], 1, 2)
         total = wp.vec3d()
         weight = ZERO
         own = wp.bool(False)
+        if steps[s[0] // per_copy] == 0:
+            sides = 0
         for side in range(sides):
             for j in range(kept.first[s[side]], kept.first[s[side] + 1]):
                 e_kept = kept.corners[j] // 4
-                slip = slips[e_kept]
-                if slip[2] > ZERO and not own:
+                kept_slip = slips[e_kept]
+                if kept_slip[2] > ZERO and not own:
                     q = kept.stencils[e_kept]
                     kept_sides = wp.where(e_kept < kept.counts[0], 1, 2)
                     # Some of the other pairs have their sides in the opposite order.
@@ -211,21 +248,22 @@ def set_stretch(dtype):
                     if way != ZERO:
                         m = way * n
                         t = edge_tangent(exact(x[q[3]]) - exact(x[q[2]]), m)
-                        stretch = way * (slip[0] * t + slip[1] * wp.cross(m, t))
+                        stretch = way * (kept_slip[0] * t + kept_slip[1] * wp.cross(m, t))
                         if kept_sides == sides and equal(s, q):
                             own = True
                             total = stretch
                         else:
-                            weight += slip[2]
-                            total += slip[2] * stretch
+                            weight += kept_slip[2]
+                            total += kept_slip[2] * stretch
         if not own and weight > ZERO:
             total = total / weight
         pull = rubbed.stiffness[e] * wp.length(total)
         if pull > limit:
             total = limit / pull * total
-        rubbed.stretch[e] = total
+        rubbed.anchor[e] = y_of(s, rubbed.weights[e], x) - total
+        rubbed.tangent[e] = edge_tangent(exact(x[s[3]]) - exact(x[s[2]]), n)
 
-    return set_stretch_of_pairs
+    return set_anchor_of_pairs
 
 
 @cache
@@ -259,34 +297,10 @@ def set_contact(dtype):
 
 
 @cache
-def stretch_of(dtype):
-    """Device function (stencil, w, n, ξ, start, x, correction) → u."""
-    vec3, _ = types(dtype)
-    at, exact = vertex_of(dtype)
-
-    @wp.func
-    def stretch(
-        s: wp.vec4i,
-        w: wp.vec4d,
-        n: wp.vec3d,
-        before: wp.vec3d,
-        start: wp.array(dtype=vec3),
-        x: wp.array(dtype=vec3),
-        correction: wp.array(dtype=vec3),
-    ):
-        u = before
-        for i in range(4):
-            u += w[i] * (at(x, correction, s[i]) - exact(start[s[i]]))
-        return u - wp.dot(n, u) * n
-
-    return stretch
-
-
-@cache
 def find_friction(dtype):
-    """Kernel over acting pairs: energy, force and second derivatives at x, or x + correction."""
+    """Kernel over acting pairs: the forces at x, or x + correction."""
     vec3, _ = types(dtype)
-    stretch = stretch_of(dtype)
+    slip_of = slip_at(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def find_friction_of_pairs(
@@ -294,33 +308,41 @@ def find_friction(dtype):
         pairs: near_pairs(dtype),
         # state in
         rubbed: RubbedPairs,
-        start: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         correction: wp.array(dtype=vec3),
         # out
-        forces: RubForces,
+        forces: PairForces,
     ):
         turn = wp.tid()
         if turn >= pairs.number[0]:
             return
         e = pairs.acting[turn]
         limit = rubbed.limit[e]
+        forces.bend[e] = wp.vec2d()
         if limit == ZERO:
             return
+        n = rubbed.normal[e]
+        w = rubbed.weights[e]
         k = rubbed.stiffness[e]
-        u = stretch(pairs.stencils[e], rubbed.weights[e], rubbed.normal[e], rubbed.stretch[e], start, x, correction)
+        u = slip_of(pairs, rubbed, e, x, correction)
         l = wp.length(u)
         least = wp.min(l, limit / k)
-        forces.energy[e] = k * least * (l - SIDE * least)
-        forces.direction[e] = u / wp.max(l, wp.float64(1e-300))
+        along = perpendicular(n)
+        if l > ZERO:
+            along = u / l
+        pull = k
+        bend = wp.vec2d(k, k)
         if k * l > limit:
-            forces.pull[e] = limit / l * u
-            forces.along[e] = ZERO
-            forces.across[e] = limit / l
-        else:
-            forces.pull[e] = k * u
-            forces.along[e] = k
-            forces.across[e] = k
+            pull = limit / l
+            bend = wp.vec2d(ZERO, pull)
+        forces.weights[e] = w
+        forces.energy[e] = k * least * (l - SIDE * least)
+        forces.force[e] = pull * u
+        forces.bend[e] = bend
+        forces.along[e] = along
+        forces.across[e] = wp.cross(n, along)
+        if forces.pressing:
+            forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
 
     return find_friction_of_pairs
 
@@ -329,11 +351,10 @@ def find_friction(dtype):
 def end_friction(dtype):
     """Kernel over acting pairs at the end x of a step: values for the next step.
 
-    These are the components of ξ along t, the edge of the pair in the plane normal to n, and along n × t; kA of friction, 0
-    without friction; and kA of contact.
+    These are the components of ξ along t and n × t; kA of friction, 0 without friction; and kA of contact.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
+    y_of = difference_of(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def end_friction_of_pairs(
@@ -341,7 +362,6 @@ def end_friction(dtype):
         pairs: near_pairs(dtype),
         # state in
         rubbed: RubbedPairs,
-        start: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         # out
         slips: wp.array(dtype=wp.vec4d),
@@ -353,63 +373,90 @@ def end_friction(dtype):
         slips[e] = wp.vec4d(ZERO, ZERO, ZERO, rubbed.contact[e])
         if rubbed.limit[e] == ZERO:
             return
-        s = pairs.stencils[e]
-        w = rubbed.weights[e]
-        n = rubbed.normal[e]
-        u = rubbed.stretch[e]
-        for i in range(4):
-            u += w[i] * (exact(x[s[i]]) - exact(start[s[i]]))
-        u -= wp.dot(n, u) * n
-        t = edge_tangent(exact(start[s[3]]) - exact(start[s[2]]), n)
-        slips[e] = wp.vec4d(wp.dot(u, t), wp.dot(u, wp.cross(n, t)), rubbed.stiffness[e], rubbed.contact[e])
+        u = slip_from(rubbed, e, y_of(pairs.stencils[e], rubbed.weights[e], x))
+        t = rubbed.tangent[e]
+        slips[e] = wp.vec4d(wp.dot(u, t), wp.dot(u, wp.cross(rubbed.normal[e], t)), rubbed.stiffness[e], rubbed.contact[e])
 
     return end_friction_of_pairs
 
 
-@wp.struct
-class RubbingPair:
-    """Those of :class:`RubForces` and n of a pair."""
+@cache
+def near_friction(dtype):
+    """The ``near`` of friction, with v = u."""
+    vec3, _ = types(dtype)
+    slip_of = slip_at(dtype)
 
-    normal: wp.vec3d
-    pull: wp.vec3d
-    direction: wp.vec3d
-    along: wp.float64
-    across: wp.float64
+    @wp.func
+    def near_of(
+        pairs: near_pairs(dtype),
+        rubbed: RubbedPairs,
+        turn: int,
+        e: int,
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        always: bool,
+    ):
+        u = wp.vec3d()
+        rubs = rubbed.limit[e] > ZERO
+        if rubs:
+            u = slip_of(pairs, rubbed, e, x, correction)
+        return rubs, u, rubbed.normal[e], rubbed.weights[e]
 
-
-@wp.func
-def _pair(found: RubForces, e: int):
-    own = RubbingPair()
-    own.normal = found.normal[e]
-    own.pull = found.pull[e]
-    own.direction = found.direction[e]
-    own.along = found.along[e]
-    own.across = found.across[e]
-    return own
-
-
-@wp.func
-def _force(own: RubbingPair):
-    return own.pull
+    return near_of
 
 
-@wp.func
-def _curvature(own: RubbingPair):
-    n = own.normal
-    flat = wp.identity(n=3, dtype=wp.float64) - wp.outer(n, n)
-    return own.across * flat + (own.along - own.across) * wp.outer(own.direction, own.direction)
+@cache
+def push_friction(dtype):
+    """The ``push`` of friction, in the closed form of :func:`..terms.friction.prox`."""
+
+    @wp.func
+    def push_of(
+        pairs: near_pairs(dtype),
+        rubbed: RubbedPairs,
+        e: int,
+        u: wp.vec3d,
+        n: wp.vec3d,
+        D: wp.float64,
+        least: wp.float64,
+        h: wp.float64,
+        hard: bool,
+    ):
+        found = wp.vec3d()
+        k = rubbed.stiffness[e]
+        l = wp.length(u)
+        if D > ZERO and l > ZERO:
+            most = wp.min(k * h * h * l / (ONE + D * k * h * h), rubbed.limit[e] * h * h)
+            found = -most / l * u
+        return found
+
+    return push_of
 
 
-@wp.func
-def _part(own: RubbingPair, w: wp.float64, p: wp.vec3d):
-    return w * p
+@cache
+def row_of_friction(dtype):
+    """The ``row`` of friction: C = (u·t, u·(n × t)). Those of a sliding pair are of a softer spring with the same force."""
+    vec3, _ = types(dtype)
+    slip_of = slip_at(dtype)
+
+    @wp.func
+    def row_of(
+        pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3), held: wp.vec2d
+    ):
+        found = PairRow()
+        if rubbed.limit[e] > ZERO:
+            u = slip_of(pairs, rubbed, e, x, d)
+            found.weights = rubbed.weights[e]
+            found.first = rubbed.tangent[e]
+            found.second = wp.cross(rubbed.normal[e], rubbed.tangent[e])
+            found.C = wp.vec2d(wp.dot(u, found.first), wp.dot(u, found.second))
+            found.held = held
+            found.size = wp.length(u)
+            found.stiffness = wp.min(rubbed.stiffness[e], rubbed.limit[e] / wp.max(found.size, wp.float64(1e-300)))
+        return found
+
+    return row_of
 
 
-@wp.func
-def _product(own: RubbingPair, w: wp.float64, move: wp.vec3d):
-    change = own.across * (move - wp.dot(own.normal, move) * own.normal)
-    change += (own.along - own.across) * wp.dot(own.direction, move) * own.direction
-    return w * change
-
-
-FRICTION_OF_PAIRS = PairSource("self-friction", MODULE, RubForces, _pair, _force, _curvature, _part, _product)
+FRICTION_OF_PAIRS = PairTerm(
+    "self-friction", MODULE, 2, RubbedPairs, near_friction, push_friction, row_of_friction, isotropic=True
+)

@@ -53,7 +53,8 @@ def near_pairs(dtype):
 class StepPairs:
     """Normal n, gap d [m], weights w and stiffness kA [N/m] of each pair at the start of a step.
 
-    ``nearest`` is the vertex–triangle pair of each vertex with the smallest gap, or −1.
+    ``nearest`` is the vertex–triangle pair of each vertex with the smallest gap, or −1. Gauss–Seidel sweeps have the
+    ``clearance`` of acting pairs, see :func:`.self_contact.find_clearances`.
     """
 
     normal: wp.array(dtype=wp.vec3d)
@@ -61,6 +62,7 @@ class StepPairs:
     weights: wp.array(dtype=wp.vec4d)
     stiffness: wp.array(dtype=wp.float64)
     nearest: wp.array(dtype=wp.int32)
+    clearance: wp.array(dtype=wp.float64)
 
 
 MODULE = "warpcloth.self_contact"

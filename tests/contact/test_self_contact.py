@@ -126,35 +126,37 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
     """
     scene = layers(turn=17.0, gap=gap)
     pairs, model = steps_of(scene, device, bounded)
-    pairs.forces.least = least
+    pairs.contact.least = least
     rng, sums = np.random.default_rng(1), Sums(model)
     x = scene.positions + 2e-4 * rng.normal(size=scene.positions.shape)
     pairs.launch_begin(model.array(x, model.vec3))
 
     def energy(x):
         out = model.scalars()
-        pairs.forces.launch_forces(model.array(x, model.vec3))
+        pairs.forces.launch(model.array(x, model.vec3))
         pairs.forces.add_energy(sums, out)
         return out.numpy()[0]
 
     def gradient(x):
         out = model.vectors()
-        pairs.forces.launch_forces(model.array(x, model.vec3))
+        pairs.forces.launch(model.array(x, model.vec3))
         pairs.forces.add_gradient(out)
         return out.numpy()
 
     def of_pairs(x, *names):
-        pairs.forces.launch_forces(model.array(x, model.vec3))
-        return [getattr(pairs.forces.found, name).numpy()[acting] for name in names]
+        pairs.forces.launch(model.array(x, model.vec3))
+        return [getattr(pairs.contact.forces, name).numpy()[acting] for name in names]
 
     force, size, eta = gradient(x), np.abs(gradient(x)).sum(), 1e-7
     assert size > 1.0
-    acting = pairs.forces.pairs.acting.numpy()[: pairs.forces.pairs.number.numpy()[0]]
-    stencils = pairs.forces.pairs.stencils.numpy()[acting]
+    acting = pairs.pairs.acting.numpy()[: pairs.pairs.number.numpy()[0]]
+    stencils = pairs.pairs.stencils.numpy()[acting]
     for _ in range(3):
         direction = rng.normal(size=x.shape)
-        bend, n, w = of_pairs(x, "acting", "normal", "weights")
-        after, before = (of_pairs(x + sign * eta * direction, "slope")[0] for sign in (1.0, -1.0))
+        bend, n, w = of_pairs(x, "bend", "along", "weights")
+        bend = bend[:, 0]
+        forces = (of_pairs(x + sign * eta * direction, "force", "along", "bend") for sign in (1.0, -1.0))
+        after, before = (np.where(c.any(axis=1), (force * n).sum(axis=1), 0.0) for force, n, c in forces)
         growth = np.where(bend > 0.0, bend * np.einsum("ei,ej,eij->e", w, n, direction[stencils]), 0.0)
         assert (after - before) / (2.0 * eta) == pytest.approx(growth, abs=1e-4 * bend.max())
         slope = (energy(x + eta * direction) - energy(x - eta * direction)) / (2.0 * eta)
@@ -170,7 +172,7 @@ def test_pressure_of_a_stack(count, device):
     pairs, model = steps_of(layers(count, gap=d, distance=r, stiffness=k), device)
     pairs.launch_begin(model.positions)
     out = model.vectors()
-    pairs.forces.launch_forces(model.positions)
+    pairs.forces.launch(model.positions)
     pairs.forces.add_gradient(out)
     top = -out.numpy()[-36:, 1].sum() / 0.25
 
@@ -788,7 +790,7 @@ def test_areas_do_not_depend_on_the_age_of_a_list(ratio, device):
                 pairs.grow()
                 pairs.launch_begin(points)
             assert ((pairs.proximity.found.numpy() == points.numpy()).all()) == (len(forces) % 3 != 1)
-            pairs.forces.launch_forces(points)
+            pairs.forces.launch(points)
             pairs.forces.add_gradient(out)
             forces.append(out.numpy())
         assert np.abs(forces[-1]).max() > 0.0

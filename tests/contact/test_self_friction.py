@@ -9,11 +9,9 @@ import warp as wp
 
 import warpcloth as wc
 from support.rows import slow_but
-from warpcloth.contact.pair_sums import PairSums
 from warpcloth.contact.self_steps import SelfSteps
 from warpcloth.core.hessian import Hessian
 from warpcloth.core.sums import Sums
-from warpcloth.kernels.contact.self_contact import CONTACT_OF_PAIRS
 from warpcloth.scenes import cards
 
 SLOW = pytest.mark.slow
@@ -93,27 +91,28 @@ def rubbing(gap=2.2e-3, speed=0.05, friction=0.3, n=4, **fields):
 @pytest.mark.host
 @pytest.mark.parametrize("dtype", slow_but(["float32"], ["float64", "float32"]))
 def test_contact_that_is_gathered_is_what_is_scattered(dtype, device):
-    """As on a GPU, which gathers: each of the four sums, up to the rounding of some ten terms."""
+    """As on a GPU, which gathers: each of the four sums of contact and of friction, up to the rounding of some ten terms."""
     model = rubbing().build(device=device, dtype=dtype)
     pairs = SelfSteps(model, wc.Newton(substeps=10).bind(model).state, 0.01, 1, False, None)
     pairs.launch_begin(model.positions)
-    pairs.forces.launch_forces(model.positions)
-    p = model.array(np.random.default_rng(4).normal(size=(model.count, 3)), model.vec3)
+    move, p = np.random.default_rng(4).normal(size=(2, model.count, 3))
+    pairs.forces.launch(model.array(model.positions.numpy() + 1e-4 * move, model.vec3))
+    p = model.array(p, model.vec3)
     diagonal, active = (wp.array(np.arange(each), dtype=wp.int32, device=device) for each in (model.count, 2))
 
-    def sums(scatters):
-        own = PairSums(model, CONTACT_OF_PAIRS, scatters)
-        own.pairs, own.found = pairs.forces.pairs, pairs.forces.found
+    def sums(term, scatters):
+        term.set_sums(scatters)
         found = [wp.zeros(model.count, dtype=kind, device=device) for kind in (model.vec3, wp.float64, model.mat33, model.vec3)]
-        own.add_gradient(found[0])
-        own.add_energies(found[1])
-        own.add_diagonal(diagonal, found[2])
-        own.add_products(p, found[3], active[1:])
+        term.add_gradient(found[0])
+        term.add_energies(found[1])
+        term.add_diagonal(diagonal, found[2])
+        term.add_products(p, found[3], active[1:])
         return [array.numpy() for array in found]
 
-    for one, other in zip(sums(True), sums(False), strict=True):
-        size = np.abs(one).max()
-        assert size > 0.0 and np.abs(one - other).max() < 32.0 * np.finfo(model.numpy_dtype).eps * size
+    for term in pairs.forces.terms:
+        for one, other in zip(sums(term, True), sums(term, False), strict=True):
+            size = np.abs(one).max()
+            assert size > 0.0 and np.abs(one - other).max() < 32.0 * np.finfo(model.numpy_dtype).eps * size
 
 
 @pytest.mark.parametrize("size", [1e-5, 1e-3], ids=["sticks", "slides"])
@@ -124,20 +123,18 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
     pairs = SelfSteps(model, wc.Newton(substeps=10).bind(model).state, 0.01, 1, False, None)
     sums, hessian = Sums(model), Hessian(model, terms=[], pairs=pairs)
     pairs.launch_begin(model.positions)
-    assert (pairs.friction.rubbed.limit.numpy() > 0.0).sum() > 10
+    assert (pairs.friction.data.limit.numpy() > 0.0).sum() > 10
     x = scene.positions + size * rng.normal(size=scene.positions.shape) * [1.0, 0.0, 1.0]
 
     def energy(x):
         out = model.scalars()
-        pairs.friction.launch_forces(model.array(x, model.vec3), None)
-        pairs.forces.energies.zero_()
-        pairs.friction.add_energies(pairs.forces.energies)
-        sums.sum(pairs.forces.energies, model.per_copy, out)
+        pairs.friction.launch(model.array(x, model.vec3))
+        pairs.forces.add_energy(sums, out, stored=True)
         return out.numpy()[0]
 
     def gradient(x):
         out = model.vectors()
-        pairs.friction.launch_forces(model.array(x, model.vec3), None)
+        pairs.friction.launch(model.array(x, model.vec3))
         pairs.friction.add_gradient(out)
         return out.numpy()
 
@@ -148,7 +145,7 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
     hessian.assemble(model.array(x, model.vec3), 0.0)
     H = (hessian.matrix() + hessian.coupling()).toarray()
     J, D = pairs.forces.rows()
-    of_contact = J.shape[0] - 2 * int((pairs.friction.rubbed.limit.numpy() > 0.0).sum())
+    of_contact = J.shape[0] - 2 * int((pairs.friction.data.limit.numpy() > 0.0).sum())
     friction = (J[of_contact:].T @ D.tocsr()[of_contact:, of_contact:] @ J[of_contact:]).toarray()
     assert H == pytest.approx((J.T @ D @ J).toarray(), abs=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(friction).min() > -1e-12 * np.abs(friction).max()
@@ -289,7 +286,7 @@ def test_bits(name, device):
     for stepper in (one, again, small, both):
         for _ in range(2):
             stepper.frame()
-    assert one.pairs.friction.rubbed.limit.numpy().any()
+    assert one.pairs.friction.data.limit.numpy().any()
     assert one.state == again.state
     assert one.state == small.state
     x = np.array(one.state.x.numpy())
@@ -334,7 +331,7 @@ def test_turns_with_the_cloth(device):
     for x in (moved, moved @ turn.T):
         x, out = model.array(x, model.vec3), model.vectors()
         pairs.launch_begin(x)
-        pairs.friction.launch_forces(x, None)
+        pairs.friction.launch(x)
         pairs.friction.add_gradient(out)
         found.append(out.numpy())
     assert np.abs(found[0]).max() > 1e-3

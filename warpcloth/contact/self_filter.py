@@ -233,9 +233,9 @@ class SelfFilter:
 
     def iterates(self):
         """Prepares the methods below for a solver whose iterates stay apart."""
-        self._iterates, self._contact.forces.apart, model = True, True, self.model
+        self._iterates, self._contact.contact.apart, model = True, True, self.model
         if self._contact.tangles is None:  # else pairs that cross at the start may pass
-            self._contact.forces.least = FLOOR * self._contact.declared.distance
+            self._contact.contact.least = FLOOR * self._contact.declared.distance
         self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)
         self._kernels[self_planes.cut_as_a_whole] = model.kernel(self_planes.cut_as_a_whole, model.dtype)
         self.stopped, self._stopping = (wp.zeros(model.count, dtype=wp.int32, device=model.device) for _ in range(2))

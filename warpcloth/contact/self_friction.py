@@ -3,11 +3,10 @@
 import numpy as np
 import warp as wp
 
+from ..core.dynamic import DynamicElements
 from ..core.scan import Scan
-from ..kernels.contact import friction_sweeps
 from ..kernels.contact import self_friction as kernels
 from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
-from .pair_sums import PairSums
 
 # Rows of each array of a list, per pair of its capacity.
 ROWS = {"stencils": 1, "corners": 4, "slips": 1}
@@ -91,8 +90,10 @@ class Slips:
             array.assign(whole)
 
 
-class SelfFriction(PairSums):
+class SelfFriction(DynamicElements):
     """Friction between parts of cloth in contact, and the stretch of its springs, in the steps of one solver.
+
+    Its ``pairs`` are those of the step, without distances.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -102,48 +103,37 @@ class SelfFriction(PairSums):
         bounded: Whether contact has no logarithm, as in explicit steps.
 
     Attributes:
-        pairs: The pairs of the step, a :func:`warpcloth.kernels.contact.self_pairs.near_pairs` without distances.
-        rubbed: :class:`warpcloth.kernels.contact.self_friction.RubbedPairs`.
         start: Positions at the start of the step, (N,) [m].
     """
 
+    stored = True
+
     def __init__(self, model, slips, steps, friction, bounded):
-        super().__init__(model, kernels.FRICTION_OF_PAIRS, scatters=False)
+        super().__init__(model, kernels.FRICTION_OF_PAIRS)
         self._kept, self._steps, self._friction = slips, steps, friction
         self._bounded = bounded
-        self.start, self._step, self._rubbing = model.vectors(), Slips(model, slips.room), None
+        self.start, self._step = model.vectors(), Slips(model, slips.room)
         self._vertices = Scan(model, model.count)
-        made = kernels.set_stretch, kernels.find_friction, kernels.end_friction, kernels.set_contact
-        made += fill_corners, sort_corners
-        self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
-        self._begin = model.kernel(kernels.begin_friction, model.dtype, bounded)
+        made = kernels.set_anchors, kernels.find_friction, kernels.end_friction, kernels.set_contact
+        self._launch = model.launcher(
+            ((*made, fill_corners, sort_corners), model.dtype), ((kernels.begin_friction,), model.dtype, bounded)
+        )
         self.hold(slips.room)
 
     def hold(self, room):
         """Allocates arrays for ``room`` pairs. The slips of the last step are kept."""
         self._kept.hold(room)
         self._step.hold(room)
-        self.pairs = self._step.pairs
+        pairs = self._step.pairs
         for name in ("acting", "number", "corner_counts"):
             size = acting_sizes(self.model, room)[name]
-            setattr(self.pairs, name, wp.zeros(size, dtype=wp.int32, device=self.model.device))
-
-        def zeros(dtype):
-            return wp.zeros(room, dtype=dtype, device=self.model.device)
-
-        self.rubbed, self.found = kernels.RubbedPairs(), kernels.RubForces()
-        self.rubbed.normal, self.rubbed.weights, self.rubbed.stretch = zeros(wp.vec3d), zeros(wp.vec4d), zeros(wp.vec3d)
-        self.rubbed.stiffness, self.rubbed.limit, self.rubbed.contact = (zeros(wp.float64) for _ in range(3))
-        self.found.normal, self.found.weights = self.rubbed.normal, self.rubbed.weights
-        self.found.acting = self.rubbed.limit
-        self.found.energy, self.found.along, self.found.across = (zeros(wp.float64) for _ in range(3))
-        self.found.pull, self.found.direction = zeros(wp.vec3d), zeros(wp.vec3d)
-        self.multipliers = zeros(wp.vec3d)
-        if self._rubbing is not None:
-            self._changes = zeros(wp.vec3d)
-
-    def _launch(self, factory, dim, inputs, outputs):
-        self.model.launch(self._kernels[factory], dim, inputs, outputs)
+            setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=self.model.device))
+        self.hold_pairs(pairs, kernels.RubbedPairs())
+        for name in ("normal", "anchor", "tangent"):
+            setattr(self.data, name, self.room(wp.vec3d))
+        for name in ("stiffness", "limit", "contact"):
+            setattr(self.data, name, self.room(wp.float64))
+        self.data.weights = self.room(wp.vec4d)
 
     def launch_begin(self, pairs, begun, x):
         """At the start of a step, at x: takes the listed pairs, their n, w and kA, and the slips of the last step."""
@@ -153,14 +143,12 @@ class SelfFriction(PairSums):
         self.pairs.number.zero_()
         self._step.relisted.zero_()
         given = [self.pairs, pairs, begun, kept.pairs, kept.slips, self._steps, kept.relisted, model.per_copy, self._friction]
-        model.launch(self._begin, kept.room, given, [self.rubbed])
+        self._launch(kernels.begin_friction, kept.room, given, [self.data])
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
         self._launch(fill_corners, kept.room, [], [self.pairs])
         self._launch(sort_corners, model.count, [], [self.pairs])
         given = [self.pairs, x, kept.pairs, kept.slips, self._steps, model.per_copy]
-        self._launch(kernels.set_stretch, kept.room, given, [self.rubbed])
-        if self._rubbing is not None:
-            self._launch(friction_sweeps.count_rubbing, model.count, [self.pairs, self.rubbed], [self._rubbing])
+        self._launch(kernels.set_anchors, kept.room, given, [self.data])
 
     def launch_release(self):
         """Launches the removal of all slips, for a step without pairs."""
@@ -173,63 +161,19 @@ class SelfFriction(PairSums):
     def launch_contact(self, pairs, begun):
         """Takes kA from another list of pairs, which may have been made within the step."""
         wp.copy(self._kept.relisted, self._step.relisted)
-        self._launch(kernels.set_contact, self._kept.room, [self.pairs, pairs, begun], [self.rubbed])
+        self._launch(kernels.set_contact, self._kept.room, [self.pairs, pairs, begun], [self.data])
 
     def launch_forces(self, x, correction):
-        """Finds the forces of each pair at x, or at x + correction. The methods below add them up."""
-        given = [self.pairs, self.rubbed, self.start, x, correction]
-        self._launch(kernels.find_friction, self._kept.room, given, [self.found])
+        self._launch(kernels.find_friction, self._kept.room, [self.pairs, self.data, x, correction], [self.forces])
 
     def launch_acting(self, x, out):
         """Sets out (N,) to ∂U/∂x where the step evaluated its forces: at its start if it is explicit, else at its end x."""
-        self.launch_forces(self.start if self._bounded else x, None)
+        self.launch(self.start if self._bounded else x)
         out.zero_()
         self.add_gradient(out)
 
     def launch_end(self, x):
         """Stores the pairs of the step and the stretch of their springs at x, for the next step."""
         self._kept.slips.zero_()
-        given = [self.pairs, self.rubbed, self.start, x]
-        self._launch(kernels.end_friction, self._kept.room, given, [self._kept.slips])
+        self._launch(kernels.end_friction, self._kept.room, [self.pairs, self.data, x], [self._kept.slips])
         self._kept.launch_lists(self.pairs, LISTS)
-
-    def rows(self):
-        """Returns stencils, w, directions and second derivatives of the rows of all pairs with friction, two rows a pair."""
-        count = min(int(self.pairs.counts.numpy().sum()), self._kept.room)
-        rubs = np.flatnonzero(self.rubbed.limit.numpy()[:count])
-        found = self.pairs.stencils, self.rubbed.weights, self.rubbed.normal, self.found.direction
-        stencils, w, n, u = (array.numpy()[rubs] for array in found)
-        still = ~u.any(axis=1)  # without stretch, any direction in the plane will do
-        axis = np.eye(3)[np.abs(n).argmin(axis=1)]
-        u = np.where(still[:, None], np.cross(n, axis), u)
-        u /= np.linalg.norm(u, axis=1)[:, None]
-        along, across = (array.numpy()[rubs] for array in (self.found.along, self.found.across))
-        return (
-            np.concatenate([stencils, stencils]),
-            np.concatenate([w, w]),
-            np.concatenate([u, np.cross(n, u)]),
-            np.concatenate([along, across]),
-        )
-
-    def sweeps(self, in_turn):
-        """Prepares sweeps for :meth:`launch_sweep`, as :meth:`warpcloth.contact.self_forces.SelfForces.sweeps` does."""
-        model, key = self.model, (self.model.dtype, self.model.mobility is not None)
-        if in_turn and model.device.is_cpu:
-            self._sweep = model.kernel(friction_sweeps.sweep_friction, *key)
-            return
-        self._rubbing = wp.zeros(model.count, dtype=wp.float64, device=model.device)
-        self._rub, self._move = (
-            model.kernel(factory, *key) for factory in (friction_sweeps.rub_pairs, friction_sweeps.move_by_friction)
-        )
-        self._kernels[friction_sweeps.count_rubbing] = model.kernel(friction_sweeps.count_rubbing, model.dtype)
-        self.hold(self._kept.room)
-
-    def launch_sweep(self, x, correction, h, backward):
-        model, mobility = self.model, self.model.local_mobility
-        if self._rubbing is None:
-            given = [self.pairs, mobility, self.rubbed, self.start, x, h, backward]
-            model.launch(self._sweep, 1, given, [self.multipliers, correction])
-            return
-        given = [self.pairs, mobility, self.rubbed, self.start, x, correction, self._rubbing, h]
-        model.launch(self._rub, self._kept.room, given, [self.multipliers, self._changes])
-        model.launch(self._move, model.count, [self.pairs, mobility, self.rubbed, self._changes], [correction])

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror
+from ..core.dynamic import Dynamic
 from ..core.scan import Scan
 from ..core.state import Count
 from ..core.status import Stopped
@@ -15,9 +16,9 @@ from ..kernels.contact import gap_notes, pair_blocks, self_pairs
 from ..kernels.contact.far_step import far_limits
 from ..kernels.contact.piece_motion import take_moved
 from ..kernels.contact.self_filter import HeldPins
+from .pair_contact import PairContact
 from .proximity import Proximity
 from .self_filter import WAY, SelfFilter
-from .self_forces import SelfForces
 from .self_friction import SelfFriction, Slips, acting_sizes
 from .self_start import check_reset, check_start
 
@@ -77,7 +78,8 @@ class SelfSteps:
 
     Attributes:
         proximity: :class:`warpcloth.contact.proximity.Proximity`.
-        forces: :class:`warpcloth.contact.self_forces.SelfForces`.
+        forces: The :class:`warpcloth.core.dynamic.Dynamic` of contact and friction.
+        contact: :class:`warpcloth.contact.pair_contact.PairContact`.
         filter: :class:`warpcloth.contact.self_filter.SelfFilter`.
         pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
         begun: Normals, gaps, weights and areas of the pairs, :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
@@ -127,7 +129,7 @@ class SelfSteps:
         size = pair_blocks.NUMBERS * pair_blocks.BLOCK
         self._block = wp.zeros(size, dtype=wp.float64, device=device) if device.is_cpu else None
         self._corners = model.device.is_cuda or declared.friction > 0.0
-        self.forces, self.filter = SelfForces(model, bounded), SelfFilter(self, colliders)
+        self.contact, self.filter = PairContact(model, bounded), SelfFilter(self, colliders)
         self.friction, self.tangles, self.stale = None, None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)
@@ -136,7 +138,7 @@ class SelfSteps:
             slips = state.add_part("friction", Slips(model, self.proximity.capacity))
             slips.grow = self._grow_outside
             self.friction = SelfFriction(model, slips, self.steps, declared.friction, bounded)
-            self.forces.friction = self.friction
+        self.forces = Dynamic(model, [self.contact, *([self.friction] if self.friction else [])])
         self.tangles = check_start(self, state)
         self.start_again()
 
@@ -167,7 +169,7 @@ class SelfSteps:
         x, energy = self.model.positions, self.model.scalars()
         with self.looking():
             self.launch_begin(x)
-        self.forces.launch_forces(x)
+        self.forces.launch(x)
         self.forces.add_energy(Sums(self.model), energy)
         copies = self.pairs.stencils.numpy()[: self.pairs.counts.numpy().sum(), 0] // self.model.per_copy
         given = self.pairs.distances, self.begun.gap, self.begun.stiffness
@@ -203,7 +205,7 @@ class SelfSteps:
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
         self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
         self.begun.nearest = wp.zeros(self.model.count, dtype=wp.int32, device=device)
-        self.forces.hold(self.pairs, self.begun)
+        self.contact.hold_pairs(self.pairs, self.begun)
         self.filter.hold(capacity)
 
     def list_corners(self):

@@ -198,7 +198,7 @@ class Hessian(BlockMatrix):
         for one in self._varying:
             one.add(self.values, x, correction, self.policy)
         if self.pairs is not None:
-            self.pairs.forces.launch_forces(x, correction)
+            self.pairs.forces.launch(x, correction)
             self.pairs.forces.add_diagonal(self.diagonal, self.values)
         self.launch_locks()
 

@@ -54,7 +54,7 @@ class QuietSteps:
     def _launch_full(self, end):
         pairs, (x, _v) = self._pairs, self._plain.state
         pairs.launch_begin(x)
-        pairs.forces.launch_forces(x)
+        pairs.forces.launch(x)
         pairs.forces.add_gradient(self._plain.gradient)
         self._plain.launch(1, end)
 

@@ -134,7 +134,7 @@ def without_filter(stepper):
     kept = stepper.pairs.filter
     kept.launch_end = kept.launch_relist = kept.launch_limit = lambda *given: None
     kept.launch_first = lambda base, d: d.zero_()
-    stepper.pairs.forces.apart, stepper.pairs.forces.least = False, 0.0
+    stepper.pairs.contact.apart, stepper.pairs.contact.least = False, 0.0
     stepper.record_again()
 
 

@@ -10,7 +10,7 @@ import warp as wp
 from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
-from ..kernels.contact.pair_sums import PairSource
+from ..kernels.contact.pair_sums import PairTerm
 from ..kernels.copy import repeat_indices
 from ..kernels.step import lock
 from ..kernels.term import Term
@@ -275,7 +275,7 @@ class Model:
     def kernel(self, factory, *key):
         """Returns the kernel of ``factory(*key)``, and notes its name for :meth:`report`, as factory(variant).Term."""
         kernel = factory(*key)
-        terms = [part.name for part in key if isinstance(part, Term | PairSource)]
+        terms = [part.name for part in key if isinstance(part, Term | PairTerm)]
         terms += [part.term.name for parts in key if isinstance(parts, tuple) for part in parts]
         variants = [name for name, part in zip(inspect.signature(factory).parameters, key, strict=False) if part is True]
         variant = f"({', '.join(variants)})" if variants else ""

@@ -116,5 +116,5 @@ class AcceleratedStep:
         stepper.sums.sum(stepper.inertia.work, model.per_copy, out)
         self.energy_of.add(stepper.state.x, out, d)
         if stepper.pairs is not None:
-            stepper.pairs.forces.launch_forces(stepper.state.x, d)
+            stepper.pairs.forces.launch(stepper.state.x, d)
             stepper.pairs.forces.add_energy(stepper.sums, out)

@@ -17,7 +17,7 @@ from ..kernels.elementwise import scale
 from ..model.host_values import host_values
 from ..terms.refresh import EVALUATION, Moment
 from .cluster_rows import ClusterRows
-from .pair_rows import FrictionRows, PairRows
+from .pair_rows import PairRows
 from .sparse_rows import SparseRows
 
 
@@ -128,9 +128,7 @@ class Constraints:
         sizes = [elements.cells.per_copy if elements.term.cell else elements.per_copy for elements in model.terms]
         if pairs is not None:
             pairs.list_corners()
-            self.parts.append(PairRows(model, pairs, curved))
-            if pairs.friction is not None:
-                self.parts.append(FrictionRows(model, pairs.friction))
+            self.parts += [PairRows(model, each, curved) for each in pairs.forces.terms]
             sizes += [part.per_copy for part in self.parts[len(sizes) :]]
         self._fresh = [elements for elements in model.terms if not elements.cells]  # rows of cells update themselves
         self.per_copy = sum(part.count for part in self.parts)

@@ -182,7 +182,7 @@ class ContactSystem(CorrectedSystem):
         for faces in self._faces:
             faces.launch(self.x, self._search.correction)
         if self._pairs is not None:
-            self._pairs.forces.launch_forces(self.x, self._search.correction)
+            self._pairs.forces.launch(self.x, self._search.correction)
 
     def start(self):
         """Makes no copy careful, before the first iteration of a step whose iterates stay if φ would rise."""
@@ -259,7 +259,7 @@ class PairSystem(CorrectedSystem):
     def _launch_press(self):
         """Launches U and ∂U/∂x at the trial."""
         pairs = self._pairs
-        pairs.forces.launch_forces(self._x, self._trial.array)
+        pairs.forces.launch(self._x, self._trial.array)
         self._energy.array.zero_()
         pairs.forces.add_energy(self._sums, self._energy.array)
         self._pull.array.zero_()

@@ -1,4 +1,4 @@
-"""The constraint rows of pairs of self-contact in :class:`warpcloth.numerics.constraints.Constraints`."""
+"""The constraint rows of dynamic elements in :class:`warpcloth.numerics.constraints.Constraints`."""
 
 import numpy as np
 import warp as wp
@@ -7,34 +7,32 @@ from ..kernels.contact import pair_rows as kernels
 
 
 class PairRows:
-    """The rows of pairs, see :mod:`warpcloth.kernels.contact.pair_rows`, with the methods of :class:`.constraints.TermRows`.
+    """The rows of dynamic elements, with the methods of :class:`.constraints.TermRows`.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`.
+        of: The :class:`warpcloth.core.dynamic.DynamicElements`.
         curved: Whether to add geometric stiffness.
 
     Attributes:
-        elements: None, because the rows belong to no term.
+        elements: None, because the number of the elements changes.
         per_copy: Number of pairs with rows in each copy, the capacity.
         count: Number of rows of one copy.
     """
 
     elements = None
 
-    def __init__(self, model, pairs, curved):
-        self._hold(model, pairs, 2 if curved else 1)
-        self._linearise = model.kernel(kernels.linearise_pair_rows, model.dtype, curved)
-
-    def _hold(self, model, pairs, rows):
-        self.model, self._pairs, self._rows = model, pairs, rows
-        self.per_copy = capacity = len(pairs.pairs.stencils)
-        self.count = rows * capacity
+    def __init__(self, model, of, curved):
+        curved = curved and of.term.rank == 1
+        self.model, self._of, self._rows = model, of, 2 if curved else of.term.rank
+        self._linearise = model.kernel(kernels.linearise_pair_rows, of.term, model.dtype, curved)
+        self.per_copy = capacity = of.capacity
+        self.count = self._rows * capacity
         self._slopes = kernels.PairSlopes()
         for name, kind in (("weights", wp.vec4d), ("first", wp.vec3d), ("second", wp.vec3d)):
             setattr(self._slopes, name, wp.zeros(capacity, dtype=kind, device=model.device))
         factories = kernels.apply_pair_rows, kernels.gather_pair_rows
-        self._apply, self._gather = (model.kernel(factory, model.dtype, rows == 2) for factory in factories)
+        self._apply, self._gather = (model.kernel(factory, model.dtype, self._rows == 2) for factory in factories)
 
     def set_layout(self, layout):
         """Sets the layout of its rows, a :class:`warpcloth.kernels.constraint_rows.RowLayout`."""
@@ -42,50 +40,31 @@ class PairRows:
 
     def launch_linearise(self, x, d, h, least, values):
         """As of the rows of a term."""
-        model, of = self.model, self._pairs
-        given = [of.pairs, model.inverse_mass, of.begun, x, d, h, least, model.per_copy, self._layout]
+        model, of = self.model, self._of
+        given = [of.pairs, model.inverse_mass, of.data, x, d, h, least, model.per_copy, self._layout]
         model.launch(self._linearise, (model.copies, self.per_copy), given, [self._slopes, values])
 
     def launch_apply(self, v, out, active=None):
         """Launches out += J v, of all copies."""
-        given = [self._pairs.pairs, self._slopes, v, self.model.per_copy, self._layout]
+        given = [self._of.pairs, self._slopes, v, self.model.per_copy, self._layout]
         self.model.launch(self._apply, self.per_copy, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
         """Launches out += Jᵀ rows, of all copies."""
-        given = [self._pairs.pairs, self._slopes, rows, self.model.per_copy, self._layout]
+        given = [self._of.pairs, self._slopes, rows, self.model.per_copy, self._layout]
         self.model.launch(self._gather, self.model.count, given, [out])
 
     def entries(self):
         """Returns J on the host: values, rows and columns."""
-        count = min(int(self._pairs.pairs.counts.numpy().sum()), self.per_copy)
+        count = min(int(self._of.pairs.counts.numpy().sum()), self.per_copy)
         binds = np.flatnonzero(self._slopes.first.numpy()[:count].any(axis=1))
         names = ("first", "second")[: self._rows]
         slopes = np.stack([getattr(self._slopes, name).numpy()[binds] for name in names], axis=1)
         w = self._slopes.weights.numpy()[binds]
-        stencils = self._pairs.pairs.stencils.numpy()[binds].astype(np.int64)
+        stencils = self._of.pairs.stencils.numpy()[binds].astype(np.int64)
         layout, copy = self._layout, stencils[:, 0] // self.model.per_copy
         first = copy * layout.rows_per_copy + layout.first + self._rows * binds
         values = slopes[:, :, None, :] * w[:, None, :, None]
         rows = np.broadcast_to((first[:, None] + np.arange(self._rows))[:, :, None, None], values.shape)
         columns = np.broadcast_to((3 * stencils[:, :, None] + np.arange(3))[:, None], values.shape)
         return values.ravel(), rows.ravel(), columns.ravel()
-
-
-class FrictionRows(PairRows):
-    """The rows of friction between pairs, see :func:`warpcloth.kernels.contact.pair_rows.linearise_friction_rows`.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        friction: :class:`warpcloth.contact.self_friction.SelfFriction`.
-    """
-
-    def __init__(self, model, friction):
-        self._hold(model, friction, 2)
-        self._linearise = model.kernel(kernels.linearise_friction_rows, model.dtype)
-
-    def launch_linearise(self, x, d, h, least, values):
-        """As of the rows of a term."""
-        model, of = self.model, self._pairs
-        given = [of.pairs, model.inverse_mass, of.rubbed, of.start, x, d, h, least, model.per_copy, self._layout]
-        model.launch(self._linearise, (model.copies, self.per_copy), given, [self._slopes, values])

@@ -123,7 +123,7 @@ class Search:
         model, lanes = self.model, self.lanes
         self.gradient_of.add(self.base, self.gradient, self.trial)
         if self.pairs is not None:
-            self.pairs.forces.launch_forces(self.base, self.trial)
+            self.pairs.forces.launch(self.base, self.trial)
             self.pairs.forces.add_gradient(self.gradient)
         given = [self.inertia, self.trial, self.direction, model.per_copy, lanes.count]
         self._launch(kernels.finish_gradient, lanes.dim, given, [self.gradient, self._parts])

@@ -156,7 +156,7 @@ class Evaluation:
             self._dissipative.add(self._before, self.gradient, self._move)
         if self._pairs is not None:
             self._pairs.launch_begin(x)
-            self._pairs.forces.launch_forces(x)
+            self._pairs.forces.launch(x)
             self._pairs.forces.add_gradient(self.gradient)
         if self._pull:
             self._pull(self.gradient)
@@ -186,9 +186,9 @@ class Evaluation:
         if self._pairs is not None:
             total, stored, sums = model.scalars(), model.scalars(), Sums(model)
             self._pairs.launch_begin(x)
-            self._pairs.forces.launch_forces(x)
+            self._pairs.forces.launch(x)
             self._pairs.forces.add_energy(sums, total)
-            self._pairs.forces.add_stored(sums, stored)
+            self._pairs.forces.add_energy(sums, stored, stored=True)
             found["self-contact"], self.stored = total.numpy(), stored.numpy()
         moved = self._host(x) - self._start
         if v is not None:

@@ -337,7 +337,7 @@ class _Step:
         of.residual.zero_()
         self._gradient.add(stepper.predicted, of.residual, d)
         if stepper.pairs is not None:
-            stepper.pairs.forces.launch_forces(stepper.predicted, d)
+            stepper.pairs.forces.launch(stepper.predicted, d)
             stepper.pairs.forces.add_gradient(of.residual)
         given = [model.mass, model.inverse_mass, d, 1.0 / stepper.he**2]
         of.kernels(kernels.finish_residual, model.count, given, [of.residual, of.weighted])

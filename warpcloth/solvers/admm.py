@@ -259,7 +259,7 @@ class ADMMStepper(ImplicitStepper):
         if self._gradient is not None:
             self._gradient.add(self.state.x, self._force, self.correction)
         if self.pairs is not None:
-            self.pairs.forces.launch_forces(self.state.x, self.correction)
+            self.pairs.forces.launch(self.state.x, self.correction)
             self.pairs.forces.add_gradient(self._force)
         self._inertia.add(self.correction, self._force)
         if self._whole_in_balance:

@@ -228,7 +228,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self.gradient.zero_()
         self._gradient_of.add(self.state.x, self.gradient, self.correction)
         if self.pairs is not None:
-            self.pairs.forces.launch_forces(self.state.x, self.correction)
+            self.pairs.forces.launch(self.state.x, self.correction)
             self.pairs.forces.add_gradient(self.gradient)
         self.inertia.add(self.correction, self.gradient)
         self.sums.largest(self.model.inverse_mass, self.gradient, self._acceleration.array)

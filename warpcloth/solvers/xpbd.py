@@ -186,7 +186,7 @@ class XPBDStepper(LaunchedStepper):
             self._force.zero_()
             self._gradient.add(self.state.x, self._force, d)
             if self.pairs is not None:
-                self.pairs.forces.launch_forces(self.state.x, d)
+                self.pairs.forces.launch(self.state.x, d)
                 self.pairs.forces.add_gradient(self._force)
         self._launch_momentum(1.0)
         model.lock(self._force)

@@ -1,0 +1,244 @@
+"""Dynamic elements: those of four vertices and one row whose number and stencils change on the device, as pairs in contact."""
+
+import numpy as np
+import warp as wp
+
+from ..kernels.contact import pair_sums, pair_sweeps
+
+GATHERS = (
+    pair_sums.gather_pair_forces,
+    pair_sums.gather_pair_energies,
+    pair_sums.gather_pair_diagonal,
+    pair_sums.gather_pair_products,
+)
+SCATTERS = (
+    pair_sums.scatter_pair_forces,
+    pair_sums.scatter_pair_energies,
+    pair_sums.scatter_pair_diagonal,
+    pair_sums.scatter_pair_products,
+)
+
+
+class DynamicElements:
+    """The base class of an energy of pairs. Sums are gathered by vertices, or scattered by one thread on the CPU.
+
+    A subclass has a method ``launch_forces(x, correction)``, which finds ``forces`` at x or x + correction, and calls
+    :meth:`hold_pairs`.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        term: The :class:`warpcloth.kernels.contact.pair_sums.PairTerm`.
+
+    Attributes:
+        pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
+        data: The ``data`` of the term.
+        forces: :class:`warpcloth.kernels.contact.pair_sums.PairForces`.
+        multipliers: λ of sweeps [kg·m].
+        stored: Whether its energy is not a function of positions alone, but stored in the state.
+    """
+
+    stored = False
+
+    def __init__(self, model, term):
+        self.model, self.term, self._swept, self._in_turn = model, term, None, None
+        self.set_sums(model.device.is_cpu)
+
+    def set_sums(self, scatters):
+        """Sets whether sums are scattered."""
+        model, made = self.model, SCATTERS if scatters else GATHERS
+        self._sums_over = 1 if scatters else model.count
+        self._forces, self._energies, self._diagonal, self._products = (
+            model.kernel(factory, self.term, model.dtype) for factory in made
+        )
+
+    def hold_pairs(self, pairs, data):
+        """Takes the arrays of pairs, and allocates arrays for their forces and sweeps."""
+        self.pairs, self.data = pairs, data
+        model, room = self.model, self.room
+        self.forces = pair_sums.PairForces()
+        kinds = {"weights": wp.vec4d, "energy": wp.float64, "force": wp.vec3d, "bend": wp.vec2d, "along": wp.vec3d}
+        if self.term.rank == 2:
+            kinds["across"] = wp.vec3d
+        if model.device.is_cpu:
+            kinds["pressing"], self.forces.count = wp.int32, wp.zeros(1, dtype=wp.int32, device=model.device)
+        for name, kind in kinds.items():
+            setattr(self.forces, name, room(kind))
+        if self._in_turn is not None:
+            self.multipliers = room(wp.vec3d)
+        if self._in_turn is False:
+            self._swept = pair_sweeps.SweptPairs()
+            self._swept.touches, self._swept.v, self._swept.normal = room(wp.int32), room(wp.vec3d), room(wp.vec3d)
+            self._swept.weights = room(wp.vec4d)
+            corners = len(pairs.corners)
+            self._swept.slots = wp.zeros(corners, dtype=wp.int32, device=model.device)
+            self._swept.moves = wp.zeros(corners, dtype=wp.vec3d, device=model.device)
+            self._swept.touching = wp.zeros(model.count, dtype=wp.int32, device=model.device)
+
+    @property
+    def capacity(self):
+        """The number of pairs that fit."""
+        return len(self.pairs.stencils)
+
+    def room(self, dtype):
+        """Returns an array of zeros, one for each pair that fits."""
+        return wp.zeros(self.capacity, dtype=dtype, device=self.model.device)
+
+    def launch(self, x, correction=None):
+        """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""
+        if self.model.device.is_cpu:
+            self.forces.count.zero_()
+        self.launch_forces(x, correction)
+
+    def add_gradient(self, out):
+        """out (N,) += ∂U/∂x."""
+        self.model.launch(self._forces, self._sums_over, [self.pairs, self.forces], [out])
+
+    def add_energies(self, out):
+        """Adds the energies of the pairs to those of their first vertices, (N,) [J]."""
+        self.model.launch(self._energies, self._sums_over, [self.pairs, self.forces], [out])
+
+    def add_diagonal(self, diagonal, values):
+        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
+        given = [self.pairs, self.model.inverse_mass, diagonal, self.forces]
+        self.model.launch(self._diagonal, self._sums_over, given, [values])
+
+    def add_products(self, p, q, active):
+        """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
+        given = [self.pairs, self.model.inverse_mass, self.forces, p, active, self.model.per_copy]
+        self.model.launch(self._products, self._sums_over, given, [q])
+
+    def on_host(self):
+        """Returns stencils (m, 4), w (m, 4), directions (m, 3) and bends (m,) [N/m] of all pairs with a force.
+
+        Those of rank 2 have two rows each, first all of ``along``, then all of ``across``.
+        """
+        acting = np.sort(self.pairs.acting.numpy()[: self.pairs.number.numpy()[0]])
+        bend = self.forces.bend.numpy()
+        acting = acting[bend[acting].any(axis=1)]
+        directions = [self.forces.along, self.forces.across][: self.term.rank]
+        stencils, w = (array.numpy()[acting] for array in (self.pairs.stencils, self.forces.weights))
+        rows = [(stencils, w, array.numpy()[acting], bend[acting, k]) for k, array in enumerate(directions)]
+        return [np.concatenate(each) for each in zip(*rows, strict=True)]
+
+    # Sweeps, see :mod:`warpcloth.kernels.contact.pair_sweeps`.
+
+    def sweeps(self, in_turn):
+        """Prepares sweeps: Gauss–Seidel (``in_turn``), or Jacobi for devices with many threads."""
+        model, axes = self.model, self.model.mobility is not None
+        self._in_turn = in_turn and model.device.is_cpu
+        if self._in_turn:
+            self._sweep = model.kernel(pair_sweeps.sweep_pairs, self.term, model.dtype, axes)
+        else:
+            self._number = model.kernel(pair_sweeps.number_corners, model.dtype)
+            self._touch = model.kernel(pair_sweeps.touch_pairs, self.term, model.dtype)
+            self._press = model.kernel(pair_sweeps.press_pairs, self.term, model.dtype, axes)
+            self._move = model.kernel(pair_sweeps.move_by_pairs, model.dtype, axes)
+        self.hold_pairs(self.pairs, self.data)
+
+    def launch_sweep_start(self, x):
+        """Launches λ = 0 for all pairs before the first sweep, at x̃ (N,)."""
+        self.multipliers.zero_()
+        if not self._in_turn:
+            self.model.launch(self._number, len(self.pairs.corners), [self.pairs], [self._swept.slots])
+
+    def launch_sweep(self, x, correction, h, adds, backward):
+        """See :meth:`Dynamic.launch_sweep`."""
+        model, mobility, multipliers = self.model, self.model.local_mobility, self.multipliers if adds else None
+        if self._in_turn:
+            given = [self.pairs, mobility, self.data, x, h, not adds, backward]
+            model.launch(self._sweep, 1, given, [multipliers, self.forces, correction])
+            return
+        swept = self._swept
+        model.launch(self._touch, self.capacity, [self.pairs, self.data, multipliers, x, correction], [swept])
+        model.launch(
+            self._press, self.capacity, [self.pairs, mobility, self.data, h, not adds], [swept, multipliers, self.forces]
+        )
+        model.launch(self._move, model.count, [self.pairs, mobility], [swept, correction])
+
+
+class Dynamic:
+    """All dynamic elements of a model, in the order of sweeps.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model`.
+        terms: :class:`DynamicElements`.
+
+    Attributes:
+        terms: As given.
+    """
+
+    def __init__(self, model, terms):
+        self.model, self.terms, self._energies = (
+            model,
+            tuple(terms),
+            wp.zeros(model.count, dtype=wp.float64, device=model.device),
+        )
+
+    def launch(self, x, correction=None):
+        """Launches the forces at x, or at x + correction. The methods below sum them."""
+        for each in self.terms:
+            each.launch(x, correction)
+
+    def add_gradient(self, out):
+        """out (N,) += ∂U/∂x."""
+        for each in self.terms:
+            each.add_gradient(out)
+
+    def add_energy(self, sums, out, stored=False):
+        """out (B,) += U, or the part of it that is ``stored`` in the state."""
+        terms = [each for each in self.terms if each.stored or not stored]
+        if terms:
+            self._energies.zero_()
+            for each in terms:
+                each.add_energies(self._energies)
+            sums.sum(self._energies, self.model.per_copy, out, accumulate=1)
+
+    def add_diagonal(self, diagonal, values):
+        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
+        for each in self.terms:
+            each.add_diagonal(diagonal, values)
+
+    def add_products(self, p, q, active):
+        """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
+        for each in self.terms:
+            each.add_products(p, q, active)
+        self.model.lock(q)
+
+    def rows(self):
+        """The Hessian ∂²U/∂x² = JᵀDJ at the last :meth:`launch`; waits for the device.
+
+        Returns:
+            J, scipy (rows, 3N), with columns of 0 for pinned coordinates, and D, scipy diagonal (rows, rows) [N/m].
+        """
+        from scipy.sparse import csr_matrix, diags
+
+        model, of_terms = self.model, zip(*(each.on_host() for each in self.terms), strict=True)
+        stencils, w, direction, bend = (np.concatenate(each) for each in of_terms)
+        columns = 3 * stencils.astype(np.int64)[:, :, None] + np.arange(3)
+        values = w[:, :, None] * direction[:, None, :] * (model.coordinate_mobility() > 0.0)[columns]
+        starts = 12 * np.arange(len(bend) + 1)
+        J = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(bend), 3 * model.count))
+        return J, diags(bend)
+
+    def sweeps(self, in_turn):
+        """Prepares sweeps: Gauss–Seidel (``in_turn``), or Jacobi for devices with many threads."""
+        for each in self.terms:
+            each.sweeps(in_turn)
+
+    def launch_sweep_start(self, x):
+        """Launches λ = 0 before the first sweep, at x̃ (N,)."""
+        for each in self.terms:
+            each.launch_sweep_start(x)
+
+    def launch_sweep(self, x, correction, h, adds, backward=False):
+        """Launches a sweep over all elements.
+
+        Args:
+            x: x̃ (N,) [m].
+            correction: d (N,) [m].
+            h: Step [s].
+            adds: Whether multipliers accumulate over sweeps; else elements are hard.
+            backward: Whether a Gauss–Seidel sweep goes from the last element to the first.
+        """
+        for each in reversed(self.terms) if backward else self.terms:
+            each.launch_sweep(x, correction, h, adds, backward)
