@@ -168,11 +168,8 @@ class Dynamic:
     """
 
     def __init__(self, model, terms):
-        self.model, self.terms, self._energies = (
-            model,
-            tuple(terms),
-            wp.zeros(model.count, dtype=wp.float64, device=model.device),
-        )
+        self.model, self.terms = model, tuple(terms)
+        self._energies = wp.zeros(model.count, dtype=wp.float64, device=model.device)
 
     def launch(self, x, correction=None):
         """Launches the forces at x, or at x + correction. The methods below sum them."""
