@@ -121,7 +121,7 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
     scene, eta, rng = rubbing(), 1e-8, np.random.default_rng(1)
     model = scene.build(device=device, dtype="float64")
     pairs = SelfSteps(model, wc.Newton(substeps=10).bind(model).state, 0.01, 1, False, None)
-    sums, hessian = Sums(model), Hessian(model, terms=[], pairs=pairs)
+    sums, hessian = Sums(model), Hessian(model, terms=[], dynamic=pairs.forces.terms)
     pairs.launch_begin(model.positions)
     assert (pairs.friction.data.limit.numpy() > 0.0).sum() > 10
     x = scene.positions + size * rng.normal(size=scene.positions.shape) * [1.0, 0.0, 1.0]

@@ -12,14 +12,16 @@ class PairContact(DynamicElements):
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         bounded: Whether contact is that of explicit steps, without the logarithm.
+        list_corners: See :meth:`warpcloth.core.dynamic.DynamicElements.list_corners`.
 
     Attributes:
         apart: Whether pairs never pass through one another where forces are computed.
         least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
     """
 
-    def __init__(self, model, bounded):
+    def __init__(self, model, bounded, list_corners):
         super().__init__(model, kernels.CONTACT_OF_PAIRS)
+        self.list_corners = list_corners
         self.apart, self.least = False, 0.0
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
 

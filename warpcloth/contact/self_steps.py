@@ -129,7 +129,7 @@ class SelfSteps:
         size = pair_blocks.NUMBERS * pair_blocks.BLOCK
         self._block = wp.zeros(size, dtype=wp.float64, device=device) if device.is_cpu else None
         self._corners = model.device.is_cuda or declared.friction > 0.0
-        self.contact, self.filter = PairContact(model, bounded), SelfFilter(self, colliders)
+        self.contact, self.filter = PairContact(model, bounded, self.list_corners), SelfFilter(self, colliders)
         self.friction, self.tangles, self.stale = None, None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)

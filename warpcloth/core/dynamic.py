@@ -83,6 +83,9 @@ class DynamicElements:
         """Returns an array of zeros, one for each pair that fits."""
         return wp.zeros(self.capacity, dtype=dtype, device=self.model.device)
 
+    def list_corners(self):
+        """Prepares the lists of the corners of pairs at each vertex, which sweeps and rows need, if they are not there."""
+
     def launch(self, x, correction=None):
         """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""
         if self.model.device.is_cpu:
@@ -126,6 +129,8 @@ class DynamicElements:
         """Prepares sweeps: Gauss–Seidel (``in_turn``), or Jacobi for devices with many threads."""
         model, axes = self.model, self.model.mobility is not None
         self._in_turn = in_turn and model.device.is_cpu
+        if not self._in_turn:
+            self.list_corners()
         if self._in_turn:
             self._sweep = model.kernel(pair_sweeps.sweep_pairs, self.term, model.dtype, axes)
         else:
@@ -157,7 +162,7 @@ class DynamicElements:
 
 
 class Dynamic:
-    """All dynamic elements of a model, in the order of sweeps.
+    """Some dynamic elements of a model, in the order of sweeps; or none, with which methods launch nothing.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -169,7 +174,10 @@ class Dynamic:
 
     def __init__(self, model, terms):
         self.model, self.terms = model, tuple(terms)
-        self._energies = wp.zeros(model.count, dtype=wp.float64, device=model.device)
+        self._energies = wp.zeros(model.count if terms else 0, dtype=wp.float64, device=model.device)
+
+    def __len__(self):
+        return len(self.terms)
 
     def launch(self, x, correction=None):
         """Launches the forces at x, or at x + correction. The methods below sum them."""
@@ -199,7 +207,8 @@ class Dynamic:
         """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
         for each in self.terms:
             each.add_products(p, q, active)
-        self.model.lock(q)
+        if self.terms:
+            self.model.lock(q)
 
     def rows(self):
         """The Hessian ∂²U/∂x² = JᵀDJ at the last :meth:`launch`; waits for the device.
@@ -239,3 +248,8 @@ class Dynamic:
         """
         for each in reversed(self.terms) if backward else self.terms:
             each.launch_sweep(x, correction, h, adds, backward)
+
+
+def dynamic_of(model, terms=None, dynamic=()):
+    """Returns the :class:`Dynamic` elements of a model, or those given with ``terms``."""
+    return Dynamic(model, model.dynamic if terms is None else dynamic)

@@ -7,6 +7,7 @@ from ..base.turns import in_turn
 from ..kernels import assemble, linear, sparse
 from ..model.host_values import host_values
 from .block_pattern import TermCorners, find_pattern, slots_of
+from .dynamic import dynamic_of
 
 CHUNK = 1 << 16  # number of elements whose blocks `norms` computes at once
 
@@ -114,7 +115,7 @@ class BlockMatrix:
         vector, block: Warp types of an unknown and of a block.
     """
 
-    pairs = None
+    dynamic = ()
 
     def __init__(self, model, found, contact):
         self.model, self._ill_conditioned = model, contact
@@ -145,8 +146,8 @@ class BlockMatrix:
 
     @property
     def block_rows(self):
-        """The offsets, columns and values of the rows, without pairs; else None, because values are not all of the matrix."""
-        return None if self.pairs is not None else (self.offsets, self.columns, self.values)
+        """The offsets, columns and values of the rows; None with dynamic elements, whose blocks are not all there."""
+        return None if self.dynamic else (self.offsets, self.columns, self.values)
 
     def invert_diagonal(self, out):
         """Launches out (N,) = the inverse diagonal blocks."""
@@ -159,21 +160,22 @@ class Hessian(BlockMatrix):
     The row and column of a locked coordinate are 0 but for the diagonal, which keeps its value, or is 1 if that is not above 0
     (Baraff and Witkin 1998). So the coordinate does not move, and does not affect the others.
 
-    ``values`` has only the diagonal blocks of ``pairs``, a :class:`warpcloth.contact.self_steps.SelfSteps`; :meth:`multiply`
-    uses all of their blocks.
+    It includes the dynamic elements of the model, or with ``terms`` those given. ``values`` has only their diagonal blocks;
+    :meth:`multiply` uses all of their blocks.
 
     Attributes:
+        dynamic: A :class:`warpcloth.core.dynamic.Dynamic`.
         values: The blocks [N/m]. Others are those of :class:`BlockMatrix`.
         policy: (B,) int32, a :class:`HessianPolicy` for each copy.
     """
 
     @in_turn
-    def __init__(self, model, policy=0, corrected=False, terms=None, pairs=None):
-        self.pairs = pairs
+    def __init__(self, model, policy=0, corrected=False, terms=None, dynamic=()):
+        self.dynamic = dynamic_of(model, terms, dynamic)
         self.terms = model.terms if terms is None else terms
         self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=model.device)
         found = pattern_of(model, self.terms)
-        touches = pairs is not None or any(elements.collider is not None for elements in self.terms)
+        touches = len(self.dynamic) > 0 or any(elements.collider is not None for elements in self.terms)
         super().__init__(model, found, touches)
         self._varying, self._constant = [], None
         for elements, sums in zip(self.terms, found.sums, strict=True):
@@ -197,17 +199,15 @@ class Hessian(BlockMatrix):
         self.launch_masses(scale)
         for one in self._varying:
             one.add(self.values, x, correction, self.policy)
-        if self.pairs is not None:
-            self.pairs.forces.launch(x, correction)
-            self.pairs.forces.add_diagonal(self.diagonal, self.values)
+        self.dynamic.launch(x, correction)
+        self.dynamic.add_diagonal(self.diagonal, self.values)
         self.launch_locks()
 
     def multiply(self, p, q, active):
         """Launches q = A p for the copies that are ``active`` (B,)."""
         given = [self.offsets, self.columns, self.values, p, active, self.per_copy]
         self.model.launch(self._multiply, self.count, given, [q])
-        if self.pairs is not None:
-            self.pairs.forces.add_products(p, q, active)
+        self.dynamic.add_products(p, q, active)
 
     def matrices(self):
         """Returns the present values of each copy as a scipy BSR matrix (3n, 3n) in float64."""
@@ -224,10 +224,10 @@ class Hessian(BlockMatrix):
         return found
 
     def coupling(self):
-        """Returns the off-diagonal blocks of pairs at the last :meth:`assemble`, scipy (3N, 3N); None without pairs."""
-        if self.pairs is None:
+        """Returns the off-diagonal blocks of dynamic elements at the last :meth:`assemble`, scipy (3N, 3N); None without."""
+        if not self.dynamic:
             return None
-        J, D = self.pairs.forces.rows()
+        J, D = self.dynamic.rows()
         whole = (J.T @ D @ J).tocoo()
         off = whole.row // 3 != whole.col // 3
         whole.data[~off] = 0.0

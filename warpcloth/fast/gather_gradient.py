@@ -1,6 +1,7 @@
 """The gradient of all terms in one launch, which gathers over the elements of each vertex."""
 
 from ..base.turns import in_turn
+from ..core.dynamic import dynamic_of
 from ..kernels.fast.gather_forces import gather_forces
 from ..terms.refresh import EVALUATION, Moment
 from .gather_layout import gathered, lanes_of
@@ -14,11 +15,13 @@ class GatherGradient:
         model: The :class:`warpcloth.model.model.Model`.
         corrected: Whether it is evaluated at x + correction.
         terms: :class:`warpcloth.model.elements.DeviceElements`, by default all of the model.
+        dynamic: The dynamic elements if ``terms`` are given, else those of the model.
     """
 
     @in_turn
-    def __init__(self, model, corrected=False, terms=None):
+    def __init__(self, model, corrected=False, terms=None, dynamic=()):
         self.model, self.terms, self._lanes = model, model.terms if terms is None else terms, lanes_of(model)
+        self.dynamic = dynamic_of(model, terms, dynamic)
         self._found = [gathered(model, elements, rows=False) for elements in self.terms]  # the struct holds no references
         parts = tuple(part._replace(exact=corrected) for part, _arrays in self._found)
         self._kernel = model.kernel(gather_forces, parts, model.dtype, corrected, self._lanes) if parts else None
@@ -30,3 +33,5 @@ class GatherGradient:
         model.refresh(EVALUATION, Moment(x, correction), self.terms)
         if self._kernel:
             model.launch(self._kernel, model.count * self._lanes, [self._chain, x, correction], [out])
+        self.dynamic.launch(x, correction)
+        self.dynamic.add_gradient(out)

@@ -42,10 +42,10 @@ class Plan:
     def __init__(self, model, backend):
         self.model, self.backend, self.record, self.guard = model, backend, None, None
 
-    def gradient(self, corrected=False, terms=None):
+    def gradient(self, corrected=False, terms=None, dynamic=()):
         """Returns a :class:`warpcloth.core.gradient.Gradient`, or a faster class with the same methods."""
         of_backend = {"core": Gradient, "blocks": Gradient, "gather": GatherGradient}
-        return of_backend[self.backend](self.model, corrected, terms)
+        return of_backend[self.backend](self.model, corrected, terms, dynamic)
 
     def explicit_step(self, state, h, symplectic, count, pool, colliders=None, pairs=None):
         """Returns a :class:`warpcloth.core.explicit_step.ExplicitStep`, or a faster class with the same methods.
@@ -66,7 +66,8 @@ class Plan:
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
         if pairs is not None:
             blocks = self.backend == "blocks" and self.model.uniform and colliders is None
-            steps = QuietSteps((BlockStep if blocks else ExplicitStep)(*given[:-1]), pairs, count)
+            plain = (BlockStep if blocks else ExplicitStep)(self.model.with_dynamic(()), *given[1:-1])
+            steps = QuietSteps(plain, pairs, count)
         elif pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
             steps = SubdomainSteps(*given, pool)

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..core.gradient import Gradient
 from ..kernels.contact.far_step import find_far
 from ..kernels.loop import count_down
 from ..kernels.step import count_step
@@ -27,6 +28,7 @@ class QuietSteps:
 
     def __init__(self, steps, pairs, count):
         self._plain, self._pairs, self.record, model = steps, pairs, steps.record, pairs.model
+        self._dynamic = Gradient(model, terms=(), dynamic=pairs.forces.terms)
         one = len(pairs.proximity.drift) == model.copies
         self._quiet = one and count is None and not model.scene.colliders and pairs.tangles is None
         self._v_before = model.vectors()
@@ -54,8 +56,7 @@ class QuietSteps:
     def _launch_full(self, end):
         pairs, (x, _v) = self._pairs, self._plain.state
         pairs.launch_begin(x)
-        pairs.forces.launch(x)
-        pairs.forces.add_gradient(self._plain.gradient)
+        self._dynamic.add(x, self._plain.gradient)
         self._plain.launch(1, end)
 
     def _launch_plain(self, end):

@@ -55,6 +55,7 @@ class Model:
         loads: The :class:`warpcloth.model.loads.DeviceLoads`, or None.
         terms: One :class:`warpcloth.model.elements.DeviceElements` for each declared term, then for contact with each collider
             and friction on it.
+        dynamic: The :class:`warpcloth.core.dynamic.DynamicElements` of a solver, as self-contact has them; at first none.
         colliders: :class:`warpcloth.model.device_colliders.DeviceColliders`, or None.
         rest_points: Rest shape of one copy, (n, 3) [m].
         order: As given, int32, or None.
@@ -83,6 +84,7 @@ class Model:
         self.per_copy = len(scene.mesh.points)
         self.count = copies * self.per_copy
         self.kernels, self.launches = set(), [0]
+        self.dynamic = ()
         self.order = self.indices = None
         self.rest_points = scene.mesh.points
         if order is not None:
@@ -198,9 +200,15 @@ class Model:
         other.terms = tuple(terms)
         return other
 
+    def with_dynamic(self, dynamic):
+        """Returns a model with other dynamic elements that shares all else."""
+        other = shallow_copy(self)
+        other.dynamic = tuple(dynamic)
+        return other
+
     def without_colliders(self):
         """Returns a model without colliders and contact that shares all else."""
-        other = self.with_terms(elements for elements in self.terms if elements.collider is None)
+        other = self.with_terms(elements for elements in self.terms if elements.collider is None).with_dynamic(())
         other.colliders = None
         return other
 

@@ -115,6 +115,3 @@ class AcceleratedStep:
         stepper.inertia.add(d, self.unused)
         stepper.sums.sum(stepper.inertia.work, model.per_copy, out)
         self.energy_of.add(stepper.state.x, out, d)
-        if stepper.pairs is not None:
-            stepper.pairs.forces.launch(stepper.state.x, d)
-            stepper.pairs.forces.add_energy(stepper.sums, out)

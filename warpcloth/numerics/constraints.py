@@ -111,10 +111,9 @@ class Constraints:
         model: The :class:`warpcloth.model.model.Model`.
         h: Step [s].
         curved: Whether to add geometric stiffness.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None.
 
     Attributes:
-        parts: The rows of each term, and then of pairs.
+        parts: The rows of each term, and then of dynamic elements.
         count, per_copy: Number of rows of all copies and of one.
         multipliers: λ (count,) [J·s² over the unit of the constraint].
         gap: C + α̃λ (count,).
@@ -122,14 +121,12 @@ class Constraints:
         residual, rounding, carried: (count,) [m], see :func:`warpcloth.kernels.constraint_rows.linearise`.
     """
 
-    def __init__(self, model, h, curved, pairs=None):
+    def __init__(self, model, h, curved):
         self.model, self.h = model, h
         self.parts = [_rows_of(model, elements, curved) for elements in model.terms]
         sizes = [elements.cells.per_copy if elements.term.cell else elements.per_copy for elements in model.terms]
-        if pairs is not None:
-            pairs.list_corners()
-            self.parts += [PairRows(model, each, curved) for each in pairs.forces.terms]
-            sizes += [part.per_copy for part in self.parts[len(sizes) :]]
+        self.parts += [PairRows(model, each, curved) for each in model.dynamic]
+        sizes += [each.capacity for each in model.dynamic]
         self._fresh = [elements for elements in model.terms if not elements.cells]  # rows of cells update themselves
         self.per_copy = sum(part.count for part in self.parts)
         self.count = self.per_copy * model.copies

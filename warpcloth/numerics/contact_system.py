@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..core.capture import Mirror, Segment
+from ..core.dynamic import dynamic_of
 from ..kernels.contact.clear_elements import add_hessian, add_secants, find_hessians
 from ..kernels.terms.contact import CONTACT
 from ..model.host_values import host_values
@@ -135,7 +136,7 @@ class ContactSystem(CorrectedSystem):
         linear: Solves with A, ``solve(b, x)``.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia [1/s²].
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter gives the start of a line search; or None.
 
     Attributes:
         careful: Which copies are careful, (B,) booleans.
@@ -143,7 +144,7 @@ class ContactSystem(CorrectedSystem):
 
     def __init__(self, model, x, gradient, linear, sums, s, pairs=None):
         super().__init__(model, linear)
-        self.x, self._pairs = x, pairs
+        self.x, self._dynamic = x, dynamic_of(model)
         free = model.coordinate_mobility().reshape(-1, 3) > 0.0
         touching = [elements for elements in model.terms if elements.collider is not None and not elements.on_faces]
         self._touching = [(elements, self._kernel_of(elements.term)) for elements in touching]
@@ -181,8 +182,7 @@ class ContactSystem(CorrectedSystem):
             self.model.launch(kernel, elements.count, given, [self._blocks.array])
         for faces in self._faces:
             faces.launch(self.x, self._search.correction)
-        if self._pairs is not None:
-            self._pairs.forces.launch(self.x, self._search.correction)
+        self._dynamic.launch(self.x, self._search.correction)
 
     def start(self):
         """Makes no copy careful, before the first iteration of a step whose iterates stay if φ would rise."""
@@ -205,7 +205,7 @@ class ContactSystem(CorrectedSystem):
         blocks[self._held] = np.where(self._moves, blocks[self._held], 0.0)
         trace = blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2]
         touching = np.flatnonzero(trace != 0.0)  # a semi-definite block with trace 0 is 0
-        J, D = (None, None) if self._pairs is None else self._pairs.forces.rows()
+        J, D = self._dynamic.rows() if self._dynamic else (None, None)
         faces = [each for each in self._faces if each.read()]
         pressing = len(touching) or faces or (J is not None and J.shape[0])
         if not (pressing or self.careful.any()):
@@ -236,18 +236,17 @@ class ContactSystem(CorrectedSystem):
 
 
 class PairSystem(CorrectedSystem):
-    """Lowers ψ(d) = ½(d − c)ᵀA(d − c) + U(d), U the energy of self-contact, by Newton's method with a line search.
+    """Lowers ψ(d) = ½(d − c)ᵀA(d − c) + U(d), U the energy of dynamic elements, by Newton's method with a line search.
 
     Args:
         model, linear: See :class:`CorrectedSystem`.
         x: x̃ (N,) [m].
         sums: :class:`warpcloth.core.sums.Sums`.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`.
     """
 
-    def __init__(self, model, x, linear, sums, pairs):
+    def __init__(self, model, x, linear, sums):
         super().__init__(model, linear)
-        self._x, self._sums, self._pairs = x, sums, pairs
+        self._x, self._sums, self._dynamic = x, sums, dynamic_of(model)
         trial, pull = model.vectors(), model.vectors()
         self._trial, self._pull, self._energy = Mirror(trial), Mirror(pull), Mirror(model.scalars())
         self.record()
@@ -258,12 +257,11 @@ class PairSystem(CorrectedSystem):
 
     def _launch_press(self):
         """Launches U and ∂U/∂x at the trial."""
-        pairs = self._pairs
-        pairs.forces.launch(self._x, self._trial.array)
+        self._dynamic.launch(self._x, self._trial.array)
         self._energy.array.zero_()
-        pairs.forces.add_energy(self._sums, self._energy.array)
+        self._dynamic.add_energy(self._sums, self._energy.array)
         self._pull.array.zero_()
-        pairs.forces.add_gradient(self._pull.array)
+        self._dynamic.add_gradient(self._pull.array)
         self.model.lock(self._pull.array)
 
     def _pressed(self, d):
@@ -275,7 +273,7 @@ class PairSystem(CorrectedSystem):
         """Replaces w = A⁻¹ ∇ψ by t (A + JᵀDJ)⁻¹ ∇ψ at d, 0 < t ≤ 1."""
         d, b, found = (array.numpy().astype(np.float64) for array in (d, gradient, w))
         energy, pull = self._pressed(d)
-        J, D = self._pairs.forces.rows()
+        J, D = self._dynamic.rows()
         Aw = b
         if J.shape[0]:
 

@@ -58,7 +58,7 @@ class Minimiser:
         linear: ``"cg"`` or ``"factorised"``.
         s: Weight of the inertia, 1/h² [1/s²].
         linear_iterations: Maximum number of iterations of a conjugate gradient solve.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter bounds steps; or None.
         last: The array for d (N,) [m], which holds that of the last step. Without pairs a descent starts there if φ is lower
             than at d = 0. None: every descent starts from d = 0.
 
@@ -76,7 +76,7 @@ class Minimiser:
         self.sums = Sums(model)
         self.search = Search(model, base, self.sums, s, pairs, last)
         self.correction = self.search.correction
-        self.hessian = Hessian(model, POLICIES[hessian], corrected=True, pairs=pairs)
+        self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
         if linear == "cg":
             multigrid = Multigrid(self.hessian, linear_iterations) if model.per_copy >= LEAST else None
             self.linear = ConjugateGradients(self.hessian, linear_iterations, multigrid)

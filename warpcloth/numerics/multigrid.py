@@ -163,7 +163,7 @@ class Multigrid:
             self._other = wp.zeros_like(self._levels[-1].values)
         self.sweep = self._levels[0].sweep
         self._factor = wp.zeros(model.count, dtype=model.mat33, device=model.device)
-        self._further = None if hessian.pairs is None else model.vectors()
+        self._further = model.vectors() if hessian.dynamic else None
         self._choice, self._iterations = kernels.PreconditionerChoice(), iterations
         choice = self._choice
         choice.used, choice.outdated, choice.fresh = (wp.ones(1, dtype=wp.int32, device=model.device) for _ in range(3))
@@ -181,7 +181,7 @@ class Multigrid:
         choices = kernels.find_slots, kernels.measure_progress, kernels.choose, kernels.limit_iterations
         self._launch = model.launcher((of_matrix + products + of_vectors, model.dtype), ((multiply,), model.dtype), (choices,))
         self._launch_finest = self._launch
-        if self.hessian.pairs is not None:
+        if self.hessian.dynamic:
             self._launch_finest = model.launcher((products, model.dtype, True))
 
     def update(self):
@@ -210,7 +210,7 @@ class Multigrid:
         B, last = self.model.copies, self._levels[-1]
         right, x = r, z
         for finer, level, transfer in zip(self._levels, self._levels[1:], self._transfers, strict=False):
-            launch, further = self._with_pairs(finer, x, active)
+            launch, further = self._with_dynamic(finer, x, active)
             given = [finer.offsets, finer.columns, finer.values, x, further, right, active, finer.n]
             launch(kernels.subtract_product, B * finer.n, given, [finer.r])
             given = [*transfer.columns, finer.r, level.sweep, active, finer.n, level.n]
@@ -225,16 +225,16 @@ class Multigrid:
             self._launch(kernels.prolong, (B, level.n), given, [level.d])
             if k == 0:
                 self.model.lock(level.d)
-            launch, further = self._with_pairs(level, level.d, active)
+            launch, further = self._with_dynamic(level, level.d, active)
             given = [level.offsets, level.columns, level.values, level.sweep, level.d, further, level.r, active, level.n]
             launch(kernels.sweep_after, B * level.n, given, [level.x if k else z])
 
-    def _with_pairs(self, level, x, active):
-        """Returns the function that launches kernels of a level, and its further product with x, that of pairs."""
+    def _with_dynamic(self, level, x, active):
+        """Returns the function that launches kernels of a level, and its further product with x, that of dynamic elements."""
         if self._further is None or level is not self._levels[0]:
             return self._launch, None
         self._further.zero_()
-        self.hessian.pairs.forces.add_products(x, self._further, active)
+        self.hessian.dynamic.add_products(x, self._further, active)
         return self._launch_finest, self._further
 
     def _update_coarse(self):

@@ -23,6 +23,7 @@ class PairRows:
     elements = None
 
     def __init__(self, model, of, curved):
+        of.list_corners()
         curved = curved and of.term.rank == 1
         self.model, self._of, self._rows = model, of, 2 if curved else of.term.rank
         self._linearise = model.kernel(kernels.linearise_pair_rows, of.term, model.dtype, curved)

@@ -21,7 +21,7 @@ class Search:
         base: The positions at d = 0, (N,) vectors [m]; the caller's array, read only.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia, 1/h² [1/s²].
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose energy is added; or None.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter gives the start; or None.
         correction: The array for d (N,) [m], by default its own.
 
     Attributes:
@@ -38,7 +38,7 @@ class Search:
     def __init__(self, model, base, sums, s, pairs=None, correction=None):
         self.model, self.base, self.sums, self.pairs = model, base, sums, pairs
         self.lanes = lanes = Lanes(model, model.per_copy)
-        self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), EnergyParts(model, lanes)
+        self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), EnergyParts(model, lanes, sums)
         self.inertia = kernels.inertia_struct(model.dtype)()
         self.inertia.mass, self.inertia.inverse_mass = model.mass, model.inverse_mass
         self.inertia.gravity, self.inertia.shared = model.free_gravity
@@ -122,14 +122,9 @@ class Search:
         """Launches ∇φ at the trial, and the parts of what a trial sums."""
         model, lanes = self.model, self.lanes
         self.gradient_of.add(self.base, self.gradient, self.trial)
-        if self.pairs is not None:
-            self.pairs.forces.launch(self.base, self.trial)
-            self.pairs.forces.add_gradient(self.gradient)
         given = [self.inertia, self.trial, self.direction, model.per_copy, lanes.count]
         self._launch(kernels.finish_gradient, lanes.dim, given, [self.gradient, self._parts])
         self.energy_of.launch(self.base, self.trial, self.state.other)
-        if self.pairs is not None:
-            self.pairs.forces.add_energy(self.sums, self.state.other)
 
     def _launch_sums(self, kernel):
         self._launch(kernel, self.lanes.of_block, [self._parts, self.energy_of.parts], [self.state])

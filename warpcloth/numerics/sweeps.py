@@ -7,6 +7,7 @@ they run in parallel. The order of colours and terms is fixed, and affects the r
 import numpy as np
 import warp as wp
 
+from ..core.dynamic import dynamic_of
 from ..core.thread_pool import ThreadPool
 from ..fast.plan import plan
 from ..kernels import project as kernels
@@ -52,6 +53,8 @@ def colours(constraints, free):
 class _Sweep:
     """The base class of sweeps over all constraints of a model, term by term as declared, which update d = x − x̃.
 
+    Dynamic elements are swept after the others.
+
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         x: x̃, (N,) vectors [m]; read only.
@@ -70,7 +73,7 @@ class _Sweep:
     def __init__(self, model, x, h, relaxation, scalar, multipliers, correction):
         self.model, self.x, self.h, self.relaxation = model, x, h, relaxation
         self.correction, self.elements = model.vectors() if correction is None else correction, list(model.terms)
-        self._keys = []
+        self._keys, self._dynamic = [], dynamic_of(model)
         for elements in model.terms:
             term = elements.term.whole
             only = term.project is None and term.prox is None
@@ -96,7 +99,6 @@ class JacobiSweep(_Sweep):
         alpha: α of ``"vertex-averaged"``.
         spread: Number of sweeps over which the correction of finite stiffness is spread, or None.
         backend: See :func:`warpcloth.fast.plan.plan`.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs are swept after the elements; or None.
     """
 
     def __init__(
@@ -111,7 +113,6 @@ class JacobiSweep(_Sweep):
         multipliers=False,
         spread=None,
         backend="auto",
-        pairs=None,
     ):
         super().__init__(model, x, h, relaxation, scalar, multipliers, None)
         for elements in model.terms:
@@ -123,24 +124,23 @@ class JacobiSweep(_Sweep):
         given = x, h, self.correction, self.multipliers, self._keys, *self._weights(kind, alpha), spread
         sweeps = plan(model, backend).jacobi_sweeps(*given)
         self.launch_start, self.launch, self.parts = sweeps.launch_start, sweeps.launch, sweeps.parts
-        if pairs is not None:
-            self._elements, self.pairs, self._adds = sweeps, pairs, multipliers
-            pairs.list_corners()
-            pairs.forces.sweeps(in_turn=False)
+        if self._dynamic:
+            self._elements, self._adds = sweeps, multipliers
+            self._dynamic.sweeps(in_turn=False)
             self.launch_start, self.launch, self.parts = self._launch_start, self._launch, self._parts
 
     def _launch_start(self):
-        self.pairs.forces.launch_sweep_start(self.x)
+        self._dynamic.launch_sweep_start(self.x)
         self._elements.launch_start()
 
     def _launch(self, sweeps=1):
-        self._elements.launch(sweeps, self._sweep_pairs)
+        self._elements.launch(sweeps, self._sweep_dynamic)
 
     def _parts(self, sweeps):
-        return self._elements.parts(sweeps, self._sweep_pairs)
+        return self._elements.parts(sweeps, self._sweep_dynamic)
 
-    def _sweep_pairs(self, correction):
-        self.pairs.forces.launch_sweep(self.x, correction, self.h, self._adds)
+    def _sweep_dynamic(self, correction):
+        self._dynamic.launch_sweep(self.x, correction, self.h, self._adds)
 
     def _weights(self, kind, alpha):
         """Returns the factors of elements and of vertices."""
@@ -179,7 +179,6 @@ class GaussSeidelSweep(_Sweep):
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool` whose threads share coloured sweeps; None for one thread.
         before: Positions at the start of the step (N,) [m], from which one CPU thread lists the elements of terms with
             ``clear`` that may have a force; or None.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose pairs are swept last; or None.
 
     Attributes:
         ranges: For each term, the ranges (first, count) of elements of its launches.
@@ -198,13 +197,10 @@ class GaussSeidelSweep(_Sweep):
         correction=None,
         pool=None,
         before=None,
-        pairs=None,
     ):
-        self.pairs = pairs
         super().__init__(model, x, h, relaxation, scalar, multipliers, correction)
         self.multipliers_add = multipliers
-        if pairs is not None:
-            pairs.forces.sweeps(in_turn=True)
+        self._dynamic.sweeps(in_turn=True)
         self.pool, self.spread, self.ordered = pool or ThreadPool(1), spread or 1, kind == "sequential"
         self.ranges = [[(0, (elements.cells or elements).count)] for elements in model.terms]
         if kind == "coloured" and model.terms:
@@ -243,8 +239,7 @@ class GaussSeidelSweep(_Sweep):
 
     def launch_start(self):
         """Launches d = 0, λ = 0; x must be x̃ already."""
-        if self.pairs is not None:
-            self.pairs.forces.launch_sweep_start(self.x)
+        self._dynamic.launch_sweep_start(self.x)
         counters = [each[2] for each in self._lists if each]
         for array in (self.correction, *self.multipliers, *counters):
             if array is not None:
@@ -261,7 +256,7 @@ class GaussSeidelSweep(_Sweep):
             pool.launch_alone(model, lambda: model.refresh(EVALUATION, Moment(self.x, self.correction), self._refreshed))
         way = -1 if backward else 1
         if backward:
-            self._sweep_pairs(backward)
+            self._sweep_dynamic(backward)
         for i in range(len(self.elements))[::way]:
             elements = self.elements[i]
             cells = elements.cells
@@ -288,8 +283,7 @@ class GaussSeidelSweep(_Sweep):
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
                 pool.launch_barrier(model)
         if not backward:
-            self._sweep_pairs(backward)
+            self._sweep_dynamic(backward)
 
-    def _sweep_pairs(self, backward):
-        if self.pairs is not None:
-            self.pairs.forces.launch_sweep(self.x, self.correction, self.h, self.multipliers_add, backward)
+    def _sweep_dynamic(self, backward):
+        self._dynamic.launch_sweep(self.x, self.correction, self.h, self.multipliers_add, backward)

@@ -168,7 +168,8 @@ def equilibrium(
         pairs.filter.iterates()
     if linear == "auto":
         linear = "cg" if model.per_copy >= LEAST else "factorised"
-    minimiser = Minimiser(model, base, "adaptive", linear, s=0.0, pairs=pairs)
+    touching = model if pairs is None else model.with_dynamic(pairs.forces.terms)
+    minimiser = Minimiser(touching, base, "adaptive", linear, s=0.0, pairs=pairs)
     wind = _Wind(model, base) if scene.air_terms else None
     descent = _Descent(minimiser, base, tolerance, iterations, wind)
     if start is None and load_steps == 1 and _only_hangs(scene) and _is_at_rest(model, base):

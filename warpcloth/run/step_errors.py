@@ -157,7 +157,7 @@ class _Stored:
         ]
         self._prepare()
         # The arrays of pairs may be replaced, which a captured graph would not notice.
-        self._measure = Segment(model.device, self._launch) if stepper.pairs is None else self._launch
+        self._measure = self._launch if stepper.model.dynamic else Segment(model.device, self._launch)
 
     def measure(self):
         """Returns the bound of the distance (B,) [m], and the energies of :class:`StepError` in their order, (5, B) [J]."""
@@ -269,8 +269,6 @@ class _Residuals(_Stored):
         """Launches out (B,) += the energy of contact at x + d [J]."""
         if step.contact is not None:
             step.contact.add(x, out, d)
-        if step.stepper.pairs is not None:
-            step.stepper.pairs.forces.add_energy(self.sums, out)
 
     def solve(self):
         """Returns the distance from the solution of the step by a Newton step, (B,) [m], and :attr:`StepError.gap` there."""
@@ -306,17 +304,20 @@ class _Step:
     def __init__(self, stepper, of):
         self.stepper, self._of, self._newton = stepper, of, None
         self.model, terms = stepper.model, stepper.model.terms
-        self._gradient = plan(self.model).gradient(corrected=True, terms=terms)
+        self._gradient, dynamic = plan(self.model).gradient(corrected=True), self.model.dynamic
         touching = tuple(each for each in terms if each.collider is not None)
-        self.contact = Energy(self.model, of.sums, corrected=True, terms=touching) if touching else None
+        self.contact = None
+        if touching or dynamic:
+            self.contact = Energy(self.model, of.sums, corrected=True, terms=touching, dynamic=dynamic)
         # The force of contact with colliders without friction and of self-contact, each with its contact distance.
         scene, pushing = self.model.scene, tuple(each for each in touching if each.term not in FRICTIONS)
-        self._pushes = plan(self.model).gradient(corrected=True, terms=pushing) if pushing else None
-        present = (self._pushes, scene.contact), (stepper.pairs, scene.self_contact)
+        kinds = (pushing, ()), ((), dynamic)
+        self._pushes = [plan(self.model).gradient(True, *kind) if any(kind) else None for kind in kinds]
+        present = zip(self._pushes, (scene.contact, scene.self_contact), strict=True)
         distances = [contact.distance for pushes, contact in present if pushes is not None]
         self.contact_distance, self._wrong, self._forces = min(distances, default=np.inf), None, None
         if distances:
-            self._forces = self.model.vectors(), None if stepper.pairs is None else self.model.vectors()
+            self._forces = self.model.vectors(), self.model.vectors() if dynamic else None
 
     def launch(self):
         """Launches ∇φ at the end of the step and its sums, and the energy of contact there."""
@@ -336,17 +337,15 @@ class _Step:
         stepper, of, model = self.stepper, self._of, self.model
         of.residual.zero_()
         self._gradient.add(stepper.predicted, of.residual, d)
-        if stepper.pairs is not None:
-            stepper.pairs.forces.launch(stepper.predicted, d)
-            stepper.pairs.forces.add_gradient(of.residual)
         given = [model.mass, model.inverse_mass, d, 1.0 / stepper.he**2]
         of.kernels(kernels.finish_residual, model.count, given, [of.residual, of.weighted])
 
     def solve(self):
         """Returns ‖H⁻¹r‖ of each copy, the largest of a vertex, (B,) [m], and :attr:`StepError.gap`."""
-        model, pairs = self.model, self.stepper.pairs
+        model = self.model
         if self._newton is None:
-            self._hessian = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=self._copy_by_copy(), pairs=pairs)
+            terms, dynamic = self._copy_by_copy(), model.dynamic
+            self._hessian = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=terms, dynamic=dynamic)
             self._linear = ConjugateGradients(self._hessian, model.per_copy)
             self._linear.tolerance.fill_(ACCURACY)
             self._direction = model.vectors()
@@ -356,7 +355,7 @@ class _Step:
                 wp.full(model.copies, 1, dtype=wp.int32, device=model.device),
             )
             self._project = model.kernel(kernels.normal_moves, model.dtype)
-            self._newton = Segment(model.device, self._launch_newton) if pairs is None else self._launch_newton
+            self._newton = self._launch_newton if dynamic else Segment(model.device, self._launch_newton)
         self._newton()
         distance, *gaps = (mirror.read().copy() for mirror in self._largest)
         return distance, np.max(gaps, axis=0)
@@ -387,12 +386,10 @@ class _Step:
 
     def _launch_pushes(self):
         """Launches the forces of colliders without friction, and of self-contact, and returns them, the latter or None."""
-        self._forces[0].zero_()
-        if self._pushes is not None:
-            self._pushes.add(self.stepper.predicted, self._forces[0], self._moved)
-        if self.stepper.pairs is not None:
-            self._forces[1].zero_()
-            self.stepper.pairs.forces.add_gradient(self._forces[1])
+        for pushes, force in zip(self._pushes, self._forces, strict=True):
+            if pushes is not None:
+                force.zero_()
+                pushes.add(self.stepper.predicted, force, self._moved)
         return self._forces
 
     @property

@@ -165,7 +165,9 @@ class ADMMStepper(ImplicitStepper):
             for elements in self._whole
         ]
         self._factors = solve_copies(model, constant_matrices(model.with_terms(weighed + whole), self._inertia.s))
-        self._gradient = Gradient(model, corrected=True, terms=self._whole) if self._whole else None
+        self._gradient = None
+        if self._whole or model.dynamic:
+            self._gradient = Gradient(model, corrected=True, terms=self._whole, dynamic=model.dynamic)
         self.factorise_seconds = self._factors.seconds
         self.correction, self._force, self._w, self._gaps, self._changes = (model.vectors() for _ in range(5))
         self._primal, self._dual, self._unbalanced = (Mirror(model.scalars()) for _ in range(3))
@@ -180,10 +182,7 @@ class ADMMStepper(ImplicitStepper):
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._scale = ResidualScale(model).acceleration
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
-        self._whole_in_balance = bool(self._whole) or self.pairs is not None
-        self._pressed = None
-        if self.pairs is not None:
-            self._pressed = PairSystem(model, self.state.x, self._factors, self._sums, self.pairs)
+        self._pressed = PairSystem(model, self.state.x, self._factors, self._sums) if model.dynamic else None
         self._record()
         self.ready()
 
@@ -206,7 +205,7 @@ class ADMMStepper(ImplicitStepper):
         self._local()
         self.primal = np.where(self._iterating, self._primal.read() / self._scale, self.primal)
         dual = self._dual.read()
-        if self._whole_in_balance:
+        if self._gradient is not None:
             dual = np.maximum(dual, self._unbalanced.read())
         self.dual = np.where(self._iterating, dual / self._scale, self.dual)
         return np.maximum(self.primal, self.dual), {}  # keeps NaN
@@ -258,11 +257,8 @@ class ADMMStepper(ImplicitStepper):
             transpose.add(of, *sums)
         if self._gradient is not None:
             self._gradient.add(self.state.x, self._force, self.correction)
-        if self.pairs is not None:
-            self.pairs.forces.launch(self.state.x, self.correction)
-            self.pairs.forces.add_gradient(self._force)
         self._inertia.add(self.correction, self._force)
-        if self._whole_in_balance:
+        if self._gradient is not None:
             self._sums.largest(model.inverse_mass, self._force, self._unbalanced.array)
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
             model.lock(forces)

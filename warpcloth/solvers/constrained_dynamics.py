@@ -133,7 +133,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
     def _build(self):
         """Allocates and captures everything for the present number of rows."""
         options, model, device = self.options, self.model, self.model.device
-        self.constraints = Constraints(model, self.he, options.stabilisation == "geometric-stiffness", self.pairs)
+        self.constraints = Constraints(model, self.he, options.stabilisation == "geometric-stiffness")
         self._sums, self._row_sums = Sums(model), RowSums(model, self.constraints.per_copy)
         self._search = None
         if options.stabilisation == "line-search":

@@ -124,9 +124,9 @@ class PBDStepper(LaunchedStepper):
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         given = model, self.state.x, self.h, options.sweep, options.relaxation
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool, before=self.x_before, pairs=self.pairs)
+            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool, before=self.x_before)
         else:
-            self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread, pairs=self.pairs)
+            self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread)
         self.model = model.with_terms(self.sweep.elements)
         self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
 

@@ -146,7 +146,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self.factorise_seconds = self._linear.seconds
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
         self._contact = None
-        if model.colliders is not None or self.pairs is not None:
+        if model.colliders is not None or model.dynamic:
             given = model, self.state.x, self.gradient, self._linear, self.sums, self.inertia.s, self.pairs
             self._contact = ContactSystem(*given)
         self._gradient_of = plan(model).gradient(corrected=True)
@@ -227,8 +227,5 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         """Launches ∇φ at d, and the largest unbalanced acceleration."""
         self.gradient.zero_()
         self._gradient_of.add(self.state.x, self.gradient, self.correction)
-        if self.pairs is not None:
-            self.pairs.forces.launch(self.state.x, self.correction)
-            self.pairs.forces.add_gradient(self.gradient)
         self.inertia.add(self.correction, self.gradient)
         self.sums.largest(self.model.inverse_mass, self.gradient, self._acceleration.array)

@@ -82,6 +82,7 @@ class Stepper:
         self.pairs, self._kept = None, None
         if model.scene.self_contact is not None and self.lead is None:
             self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
+            self.model = model = model.with_dynamic(self.pairs.forces.terms)
         if integrator is not None:
             self.integrator = INTEGRATORS[integrator](self)
             self.he = self.integrator.he

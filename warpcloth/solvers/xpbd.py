@@ -146,13 +146,13 @@ class XPBDStepper(LaunchedStepper):
         given = model, self.state.x, self.he, options.sweep, options.relaxation
         more = {"scalar": options.form == "scalar", "multipliers": True}
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool, before=self.x_before, pairs=self.pairs)
+            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool, before=self.x_before)
         else:
-            self.sweep = JacobiSweep(*given, **more, pairs=self.pairs)
+            self.sweep = JacobiSweep(*given, **more)
         self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
-        self._gradient = plan(model).gradient(corrected=True, terms=self.sweep.elements) if soft else None
+        self._gradient = plan(self.model).gradient(corrected=True) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
         self._acceleration = model.scalars()
         self._largest = Mirror(self.state.add("largest acceleration", model.scalars()))
@@ -185,9 +185,6 @@ class XPBDStepper(LaunchedStepper):
         if self._gradient is not None:
             self._force.zero_()
             self._gradient.add(self.state.x, self._force, d)
-            if self.pairs is not None:
-                self.pairs.forces.launch(self.state.x, d)
-                self.pairs.forces.add_gradient(self._force)
         self._launch_momentum(1.0)
         model.lock(self._force)
         self._sums.largest(model.inverse_mass, self._force, self._acceleration)
