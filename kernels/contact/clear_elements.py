@@ -113,12 +113,13 @@ LEAP, LIFT = wp.constant(10.0), wp.constant(0.04)
 
 @cache
 def add_secants(dtype):
-    """Kernel over contact elements: out[vertex] += kA c nnᵀ [N/m], with c = φ″, or the slope of a secant of φ′ from d outwards.
+    """Kernel over contact elements: values[diagonal[vertex]] += kA c nnᵀ [N/m], c = φ″ or the slope of a secant of φ′.
 
-    For small d, φ″ is so large that Newton's method at most doubles d. The secant ends at the distance that the vertex would
-    have with its own ``inertia`` m/h² [N/m] and the present force of everything else, or before. At the minimum that distance
-    is d, and c is φ″. A secant is no upper bound, so ``careful`` copies have φ″. ``gradient`` is ∇φ of the whole objective
-    [N]. It works on any device, for no two elements share a vertex. ``clear`` may be None.
+    The secant goes from d outwards. For small d, φ″ is so large that Newton's method at most doubles d. The secant ends at the
+    distance that the vertex would have with its own ``inertia`` m/h² [N/m] and the present force of everything else, or before.
+    At the minimum that distance is d, and c is φ″. A secant is no upper bound, so ``careful`` copies have φ″. ``gradient`` is
+    ∇φ of the whole objective [N]. ``diagonal`` is negative for pins. It works on any device, for no two elements share a
+    vertex. ``clear`` may be None.
     """
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(contact.PARAMETERS, dtype)
@@ -133,6 +134,7 @@ def add_secants(dtype):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         clear: wp.array(dtype=dtype),
+        diagonal: wp.array(dtype=wp.int32),
         # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
@@ -142,10 +144,13 @@ def add_secants(dtype):
         careful: wp.array(dtype=wp.int32),
         per_copy: int,
         # in and out
-        out: wp.array(dtype=mat33),
+        values: wp.array(dtype=mat33),
     ):
         e = wp.tid()
         i = stencil[e, 0]
+        slot = diagonal[i]
+        if slot < 0:
+            return
         if clear.shape[0] > 0:
             if is_clear(clear[e], d[i]):
                 return
@@ -161,16 +166,16 @@ def add_secants(dtype):
                 after = wp.min(after, wp.max(dtype(LEAP) * now, dtype(LIFT) * distance))
                 if after > dtype(1.001) * now:
                     curvature = mean_bend(now, after, distance)
-            out[i] = out[i] + (k * curvature) * wp.outer(n, n)
+            values[slot] = values[slot] + (k * curvature) * wp.outer(n, n)
 
     return add
 
 
 @cache
 def add_hessian(term: Term, dtype):
-    """Kernel over elements: out[vertex] += kₑ Aₑ ∂²u/∂y² [N/m], projected to semi-definite.
+    """Kernel over elements: values[diagonal[vertex]] += kₑ Aₑ ∂²u/∂y² [N/m], projected to semi-definite.
 
-    It works on any device, for no two elements share a vertex. ``clear`` may be None.
+    ``diagonal`` is negative for pins. It works on any device, for no two elements share a vertex. ``clear`` may be None.
     """
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
@@ -183,48 +188,21 @@ def add_hessian(term: Term, dtype):
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
         clear: wp.array(dtype=dtype),
+        diagonal: wp.array(dtype=wp.int32),
         # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
         # in and out
-        out: wp.array(dtype=mat33),
+        values: wp.array(dtype=mat33),
     ):
         e = wp.tid()
         i = stencil[e, 0]
+        slot = diagonal[i]
+        if slot < 0:
+            return
         if clear.shape[0] > 0:
             if is_clear(clear[e], d[i]):
                 return
-        out[i] = out[i] + hessian_of(stencil, stiffness, e, rest_of(rest, e), x, d, CLAMP)
+        values[slot] = values[slot] + hessian_of(stencil, stiffness, e, rest_of(rest, e), x, d, CLAMP)
 
     return add
-
-
-@cache
-def find_hessians(term: Term, dtype):
-    """Kernel over elements of three vertices, with one row: kₑ Aₑ ∂²u/∂y² [N/m], semi-definite, and the weights of y."""
-    vec3, mat33 = types(dtype)
-    rest_type, weight = wp.types.vector(term.parameters, dtype), term.weight
-    (_energy, _gradient, hessian_of), rest_of = of_element(term, dtype, True), load(rest_type)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def find(
-        # elements
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
-        rest: wp.array(dtype=rest_type),
-        # state in
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        # out
-        weights: wp.array(dtype=vec3),
-        out: wp.array(dtype=mat33),
-    ):
-        e = wp.tid()
-        r = rest_of(rest, e)
-        w = vec3()
-        for i in range(3):
-            w[i] = weight(r, i)[0]
-        weights[e] = w
-        out[e] = hessian_of(stencil, stiffness, e, r, x, d, CLAMP)
-
-    return find

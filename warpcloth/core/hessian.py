@@ -187,10 +187,11 @@ class Hessian(BlockMatrix):
                 self._constant, zero = wp.zeros_like(self.values), model.vectors()
             one.add(self._constant, zero, zero, self.policy)
 
-    def assemble(self, x, scale, correction=None):
+    def assemble(self, x, scale, correction=None, further=None):
         """Launches the assembly of ``values`` at x, or x + correction, with ``scale`` times the masses on the diagonal.
 
-        The sum of the terms whose Hessian is constant is computed once, and copied.
+        The sum of the terms whose Hessian is constant is computed once, and copied. A function ``further``(values) may add to
+        the blocks.
         """
         if self._constant is None:
             self.values.zero_()
@@ -201,6 +202,8 @@ class Hessian(BlockMatrix):
             one.add(self.values, x, correction, self.policy)
         self.dynamic.launch(x, correction)
         self.dynamic.add_diagonal(self.diagonal, self.values)
+        if further is not None:
+            further(self.values)
         self.launch_locks()
 
     def multiply(self, p, q, active):

@@ -5,7 +5,9 @@ import warp as wp
 
 from ..core.capture import Mirror, Segment
 from ..core.dynamic import dynamic_of
-from ..kernels.contact.clear_elements import add_hessian, add_secants, find_hessians
+from ..core.hessian import Hessian
+from ..kernels.contact.clear_elements import add_hessian, add_secants
+from ..kernels.term import HessianPolicy
 from ..kernels.terms.contact import CONTACT
 from ..model.host_values import host_values
 from .search import HALVINGS, Search
@@ -30,13 +32,33 @@ class CorrectedSystem:
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
+        x: x̃ (N,) [m].
         linear: Solves with A, ``solve(b, x)``.
+        terms: The elements in D besides the dynamic ones.
+
+    Attributes:
+        matrix: D, a :class:`warpcloth.core.hessian.Hessian`.
     """
 
-    def __init__(self, model, linear):
-        self.model, self._linear = model, linear
+    def __init__(self, model, x, linear, terms=()):
+        self.model, self.x, self._linear = model, x, linear
         right, self._result = model.vectors(), model.vectors()
         self._right, self._found = Mirror(right), Mirror(self._result)
+        self.matrix = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=terms, dynamic=model.dynamic)
+        self.matrix.prepare()
+        self._p, self._q = Mirror(model.vectors()), Mirror(model.vectors())
+        self._all = wp.full(model.copies, 1, dtype=wp.int32, device=model.device)
+        self._free = model.coordinate_mobility().reshape(-1, 3) > 0.0
+
+    def record(self):
+        """Captures the launches of an iteration."""
+        self._multiply = Segment(self.model.device, lambda: self.matrix.multiply(self._p.array, self._q.array, self._all))
+
+    def _product(self, p):
+        """Returns D p for p (N, 3)."""
+        self._p.write(np.where(self._free, p, 0.0))
+        self._multiply()
+        return self._q.read().astype(np.float64)
 
     def _scaled(self, factors, array):
         """Returns the vectors (N, 3) of each copy times the factor of the copy, (B,)."""
@@ -46,21 +68,20 @@ class CorrectedSystem:
         B = self.model.copies
         return np.einsum("bi,bi->b", one.reshape(B, -1), other.reshape(B, -1))
 
-    def _solve(self, add_product, b, z, going, closely):
+    def _solve(self, b, z, Dz, going, closely):
         """Returns w = (A + D)⁻¹ b and A w of the copies that are ``going`` (B,).
 
         Args:
-            add_product: Function (p, q) that does q += D p.
             b: Right-hand side.
             z: A⁻¹ b.
+            Dz: D z.
             going: Which copies to solve for, (B,).
             closely: Which copies to solve accurately, (B,).
         """
         p, Ap, r, w, Aw, fall = z, b, b, 0.0, 0.0, 0.0
         rz = first = self._dot(r, z)
         for iteration in range(ITERATIONS):
-            q = Ap.copy()
-            add_product(p, q)
+            q = Ap + (Dz if iteration == 0 else self._product(p))
             step = self._over(rz, self._dot(p, q), going)
             w, Aw = w + self._scaled(step, p), Aw + self._scaled(step, Ap)
             fall = fall + step * rz
@@ -84,49 +105,12 @@ class CorrectedSystem:
         return np.divide(one, other, out=np.zeros(self.model.copies), where=where & (other > 0.0))
 
 
-class _FaceMatrix:
-    """Σ kA w wᵀ ⊗ ∂²u/∂y² of the contact or the friction of triangles with a mesh, y = Σ wᵢxᵢ.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        elements: The :class:`warpcloth.model.elements.DeviceElements` of the term.
-        free: Which coordinates move, (N, 3) booleans.
-    """
-
-    def __init__(self, model, elements, free):
-        self._model, self._elements, self._free = model, elements, free
-        self._kernel, self._stencil = model.kernel(find_hessians, elements.term, model.dtype), host_values(elements.stencil)
-        weights = wp.zeros(elements.count, dtype=model.vec3, device=model.device)
-        blocks = wp.zeros(elements.count, dtype=model.mat33, device=model.device)
-        self._weights, self._blocks = Mirror(weights), Mirror(blocks)
-
-    def launch(self, x, d):
-        """Launches the matrix at x + d."""
-        elements, out = self._elements, [self._weights.array, self._blocks.array]
-        self._model.launch(self._kernel, elements.count, [*elements.arguments, x, d], out)
-
-    def read(self):
-        """Reads the matrix, and returns whether it is not 0."""
-        blocks = self._blocks.read()
-        acting = np.flatnonzero(blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2])
-        self._now = self._stencil[acting], blocks[acting].astype(np.float64)
-        self._now += ((self._weights.read()[acting, :, None] * self._free[self._now[0]]).astype(np.float64),)
-        return len(acting) > 0
-
-    def add_product(self, p, q):
-        """Adds the product with p (N, 3) to q (N, 3)."""
-        stencil, blocks, weights = self._now
-        pressed = np.einsum("eij,ej->ei", blocks, (weights * p[stencil]).sum(axis=1))
-        np.add.at(q, stencil, weights * pressed[:, None])
-
-
 class ContactSystem(CorrectedSystem):
     """Solves (A + D) w = ∇φ, D the semi-definite Hessian of contact: accurately if φ rose or is near its minimum, else roughly.
 
-    The curvature of contact has no bound, so no constant matrix is an upper bound of the Hessian. D is the sum of the blocks of
-    vertices near colliders, of the matrix of pairs of triangles and meshes, and of that of pairs of self-contact. A copy where
-    φ rose is ``careful`` in the next 4 iterations, after a second rise in 16, and so on: w is then also shortened until φ
-    falls. In other copies the blocks of contact are those of :func:`warpcloth.kernels.contact.clear_elements.add_secants`.
+    The curvature of contact has no bound, so no constant matrix is an upper bound of the Hessian. A copy where φ rose is
+    ``careful`` in the next 4 iterations, after a second rise in 16, and so on: w is then also shortened until φ falls. In other
+    copies the blocks of vertices near colliders are those of :func:`warpcloth.kernels.contact.clear_elements.add_secants`.
     Without :meth:`start`, all copies always are careful.
 
     Args:
@@ -143,17 +127,13 @@ class ContactSystem(CorrectedSystem):
     """
 
     def __init__(self, model, x, gradient, linear, sums, s, pairs=None):
-        super().__init__(model, linear)
-        self.x, self._dynamic = x, dynamic_of(model)
-        free = model.coordinate_mobility().reshape(-1, 3) > 0.0
+        super().__init__(model, x, linear, [elements for elements in model.terms if elements.on_faces])
         touching = [elements for elements in model.terms if elements.collider is not None and not elements.on_faces]
         self._touching = [(elements, self._kernel_of(elements.term)) for elements in touching]
-        self._faces = [_FaceMatrix(model, elements, free) for elements in model.terms if elements.on_faces]
+        held = model.inverse_mass.numpy() == 0.0
+        self._diagonal = wp.array(np.where(held, -1, self.matrix.diagonal.numpy()), dtype=wp.int32, device=model.device)
         self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
         self._search = Search(model, x, sums, s, pairs)
-        self._held = np.flatnonzero(~free.all(axis=1))
-        self._moves = (free[:, :, None] & free[:, None, :])[self._held]
-        self._blocks = Mirror(wp.zeros(model.count, dtype=model.mat33, device=model.device))
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
         self._active = Mirror(model.scalars(wp.int32))
         self.careful, self._marked = np.ones(model.copies, dtype=bool), np.zeros(model.copies, dtype=bool)
@@ -163,7 +143,7 @@ class ContactSystem(CorrectedSystem):
         self._start = np.zeros(model.copies)
 
     def record(self):
-        """Captures the launches of an iteration."""
+        super().record()
         device, search = self.model.device, self._search
         self._assemble = Segment(device, self._launch_assemble)
         self._begin = Segment(device, search.launch_again)
@@ -174,15 +154,15 @@ class ContactSystem(CorrectedSystem):
         return self.model.kernel(*((add_secants,) if term is CONTACT else (add_hessian, term)), self.model.dtype)
 
     def _launch_assemble(self):
-        self._blocks.array.zero_()
+        self.matrix.assemble(self.x, 0.0, self._search.correction, self._launch_touching)
+
+    def _launch_touching(self, values):
+        """Adds the blocks of vertices near colliders."""
         for elements, kernel in self._touching:
-            given = [*elements.arguments, elements.clear, self.x, self._search.correction]
+            given = [*elements.arguments, elements.clear, self._diagonal, self.x, self._search.correction]
             if elements.term is CONTACT:
                 given += [self._gradient, self._inertia, self._marks.array, self.model.per_copy]
-            self.model.launch(kernel, elements.count, given, [self._blocks.array])
-        for faces in self._faces:
-            faces.launch(self.x, self._search.correction)
-        self._dynamic.launch(self.x, self._search.correction)
+            self.model.launch(kernel, elements.count, given, [values])
 
     def start(self):
         """Makes no copy careful, before the first iteration of a step whose iterates stay if φ would rise."""
@@ -201,30 +181,15 @@ class ContactSystem(CorrectedSystem):
             self._marked[:] = self.careful
             self._marks.write(self.careful)
         self._assemble()
-        blocks = self._blocks.read()
-        blocks[self._held] = np.where(self._moves, blocks[self._held], 0.0)
-        trace = blocks[:, 0, 0] + blocks[:, 1, 1] + blocks[:, 2, 2]
-        touching = np.flatnonzero(trace != 0.0)  # a semi-definite block with trace 0 is 0
-        J, D = self._dynamic.rows() if self._dynamic else (None, None)
-        faces = [each for each in self._faces if each.read()]
-        pressing = len(touching) or faces or (J is not None and J.shape[0])
-        if not (pressing or self.careful.any()):
-            return
         found = w.numpy().astype(np.float64)
-        if pressing:
-            blocks = blocks[touching].astype(np.float64)
-
-            def add_product(p, q):
-                q[touching] += np.einsum("nij,nj->ni", blocks, p[touching])
-                for each in faces:
-                    each.add_product(p, q)
-                if J is not None:
-                    q += (J.T @ (D @ (J @ p.ravel()))).reshape(-1, 3)
-
+        pressed = self._product(found)
+        if pressed.any():
             b = self._gradient.numpy().astype(np.float64)
             first = self._dot(b, found)
             self._start = np.maximum(self._start, first)
-            found, _ = self._solve(add_product, b, found, active, self.careful | (first <= NEAR**2 * self._start))
+            found, _ = self._solve(b, found, pressed, active, self.careful | (first <= NEAR**2 * self._start))
+        elif not self.careful.any():
+            return
         if self.careful.any():
             self._begin()
             self._direction.write(-found)
@@ -239,25 +204,26 @@ class PairSystem(CorrectedSystem):
     """Lowers ψ(d) = ½(d − c)ᵀA(d − c) + U(d), U the energy of dynamic elements, by Newton's method with a line search.
 
     Args:
-        model, linear: See :class:`CorrectedSystem`.
-        x: x̃ (N,) [m].
+        model, x, linear: See :class:`CorrectedSystem`.
         sums: :class:`warpcloth.core.sums.Sums`.
     """
 
     def __init__(self, model, x, linear, sums):
-        super().__init__(model, linear)
-        self._x, self._sums, self._dynamic = x, sums, dynamic_of(model)
+        super().__init__(model, x, linear)
+        self._sums, self._dynamic = sums, dynamic_of(model)
         trial, pull = model.vectors(), model.vectors()
         self._trial, self._pull, self._energy = Mirror(trial), Mirror(pull), Mirror(model.scalars())
         self.record()
 
     def record(self):
-        """Captures the launches of an iteration."""
-        self._press = Segment(self.model.device, self._launch_press)
+        super().record()
+        device, trial = self.model.device, self._trial.array
+        self._press = Segment(device, self._launch_press)
+        self._assemble = Segment(device, lambda: self.matrix.assemble(self.x, 0.0, trial))
 
     def _launch_press(self):
         """Launches U and ∂U/∂x at the trial."""
-        self._dynamic.launch(self._x, self._trial.array)
+        self._dynamic.launch(self.x, self._trial.array)
         self._energy.array.zero_()
         self._dynamic.add_energy(self._sums, self._energy.array)
         self._pull.array.zero_()
@@ -270,17 +236,13 @@ class PairSystem(CorrectedSystem):
         return self._energy.read().copy(), self._pull.read().astype(np.float64)
 
     def correct(self, d, gradient, w, active):
-        """Replaces w = A⁻¹ ∇ψ by t (A + JᵀDJ)⁻¹ ∇ψ at d, 0 < t ≤ 1."""
+        """Replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1."""
         d, b, found = (array.numpy().astype(np.float64) for array in (d, gradient, w))
         energy, pull = self._pressed(d)
-        J, D = self._dynamic.rows()
-        Aw = b
-        if J.shape[0]:
-
-            def add_product(p, q):
-                q += (J.T @ (D @ (J @ p.ravel()))).reshape(-1, 3)
-
-            found, Aw = self._solve(add_product, b, found, active, True)
+        self._assemble()
+        Aw, pressed = b, self._product(found)
+        if pressed.any():
+            found, Aw = self._solve(b, found, pressed, active, True)
         slope, linear, square = (self._dot(one, found) for one in (b, b - pull, Aw))
         step, wanted = np.ones(self.model.copies), active & (slope > 0.0)
         for _ in range(HALVINGS):
