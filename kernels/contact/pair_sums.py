@@ -1,10 +1,9 @@
 """Factories of the kernels that sum energies, forces and Hessians of pairs: those of contact, and those of friction.
 
 The energy of a pair is a function of y = Σ wᵢxᵢ, so vertex i gets wᵢ ∂U/∂y, and wᵢwⱼ ∂²U/∂y² joins vertices i and j. A
-:class:`PairTerm` finds these in :class:`PairForces`. Kernels named *gather* have a thread per vertex, which takes its pairs in
-order. Those named *scatter*, for the CPU, have one thread, which takes the pairs with a force in order and adds to the vertices
-of each. They need no list of the pairs of a vertex, and products with the Hessian take each pair once. Both agree up to
-rounding.
+:class:`PairTerm` finds these in :class:`PairForces`. Kernels gather, with a thread for each vertex, which takes its pairs in
+order. For the CPU they scatter: one thread takes the pairs with a force in order and adds to the vertices of each. So they need
+no list of the pairs of a vertex, and products with the Hessian find Σ wⱼpⱼ of each pair once. Both agree up to rounding.
 """
 
 from collections.abc import Callable
@@ -64,9 +63,9 @@ class PairTerm:
     row: Callable
     isotropic: bool
 
-    def of(self, dtype):
-        """Returns the name of the module that has the kernels that scatter, for a precision."""
-        return f"{self.module}.{dtype.__name__}"
+    def of(self, dtype, scatters):
+        """Returns the name of the module of its sums. Those that gather are in one of their own, for the CPU needs none."""
+        return f"{self.module}.{dtype.__name__}" + ("" if scatters else ".gather")
 
 
 @wp.struct
@@ -85,44 +84,48 @@ class PairRow:
     size: wp.float64
 
 
-@wp.func
-def presses(forces: PairForces, e: int):
-    """Whether a pair has a force."""
-    return wp.max(forces.bend[e]) > ZERO
-
-
 @cache
-def gather_pair_forces(term: PairTerm, dtype):
-    """Kernel over vertices: out += ∂U/∂x."""
-    vec3, _ = types(dtype)
+def taken_by(dtype, scatters: bool):
+    """Device functions (pairs, forces, thread) → its range, and (pairs, forces, k) → pair e, and the range of its corners.
 
-    @wp.kernel(module=f"{term.of(dtype)}.gather", enable_backward=False)
-    def gather_forces_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        forces: PairForces,
-        # in and out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        total = wp.vec3d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
+    Without a force, the range of corners is empty.
+    """
+
+    @wp.func
+    def range_of(pairs: near_pairs(dtype), forces: PairForces, thread: int):
+        first = wp.int32(0)
+        end = wp.int32(0)
+        if wp.static(scatters):
+            end = forces.count[0]
+        else:
+            first = pairs.first[thread]
+            end = pairs.first[thread + 1]
+        return first, end
+
+    @wp.func
+    def corners_at(pairs: near_pairs(dtype), forces: PairForces, k: int):
+        e = wp.int32(0)
+        i = wp.int32(0)
+        end = wp.int32(4)
+        if wp.static(scatters):
+            e = forces.pressing[k]
+        else:
             e = pairs.corners[k] // 4
-            if presses(forces, e):
-                total += forces.weights[e][pairs.corners[k] - 4 * e] * forces.force[e]
-        out[i] = out[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+            i = pairs.corners[k] - 4 * e
+            end = i + wp.where(wp.max(forces.bend[e]) > ZERO, 1, 0)
+        return e, i, end
 
-    return gather_forces_of_pairs
+    return range_of, corners_at
 
 
 @cache
-def scatter_pair_forces(term: PairTerm, dtype):
-    """Kernel of one thread: the sums of :func:`gather_pair_forces`."""
+def pair_forces(term: PairTerm, dtype, scatters: bool):
+    """Kernel over threads: out += ∂U/∂x."""
     vec3, _ = types(dtype)
+    range_of, corners_at = taken_by(dtype, scatters)
 
-    @wp.kernel(module=term.of(dtype), enable_backward=False)
-    def scatter_forces_of_pairs(
+    @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
+    def add_forces_of_pairs(
         # elements
         pairs: near_pairs(dtype),
         # state in
@@ -130,22 +133,26 @@ def scatter_pair_forces(term: PairTerm, dtype):
         # in and out
         out: wp.array(dtype=vec3),
     ):
-        for t in range(forces.count[0]):
-            e = forces.pressing[t]
+        first, end = range_of(pairs, forces, wp.tid())
+        for k in range(first, end):
+            e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
-            for i in range(4):
-                own = forces.weights[e][i] * forces.force[e]
-                out[s[i]] = out[s[i]] + vec3(dtype(own[0]), dtype(own[1]), dtype(own[2]))
+            w = forces.weights[e]
+            whole = forces.force[e]
+            for i in range(corner, end_corner):
+                force = w[i] * whole
+                out[s[i]] = out[s[i]] + vec3(dtype(force[0]), dtype(force[1]), dtype(force[2]))
 
-    return scatter_forces_of_pairs
+    return add_forces_of_pairs
 
 
 @cache
-def gather_pair_energies(term: PairTerm, dtype):
-    """Kernel over vertices: adds the energies [J] of the pairs whose first vertex it is."""
+def pair_energies(term: PairTerm, dtype, scatters: bool):
+    """Kernel over threads: adds the energies [J] of the pairs to those of their first vertices."""
+    range_of, corners_at = taken_by(dtype, scatters)
 
-    @wp.kernel(module=f"{term.of(dtype)}.gather", enable_backward=False)
-    def gather_energies_of_pairs(
+    @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
+    def add_energies_of_pairs(
         # elements
         pairs: near_pairs(dtype),
         # state in
@@ -153,75 +160,24 @@ def gather_pair_energies(term: PairTerm, dtype):
         # in and out
         energies: wp.array(dtype=wp.float64),
     ):
-        i = wp.tid()
-        total = ZERO
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if pairs.corners[k] == 4 * e and presses(forces, e):
-                total += forces.energy[e]
-        energies[i] = energies[i] + total
+        first, end = range_of(pairs, forces, wp.tid())
+        for k in range(first, end):
+            e, corner, end_corner = corners_at(pairs, forces, k)
+            if corner == 0 and end_corner > 0:
+                v = pairs.stencils[e][0]
+                energies[v] = energies[v] + forces.energy[e]
 
-    return gather_energies_of_pairs
-
-
-@cache
-def scatter_pair_energies(term: PairTerm, dtype):
-    """Kernel of one thread: the sums of :func:`gather_pair_energies`."""
-
-    @wp.kernel(module=term.of(dtype), enable_backward=False)
-    def scatter_energies_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        forces: PairForces,
-        # in and out
-        energies: wp.array(dtype=wp.float64),
-    ):
-        for t in range(forces.count[0]):
-            e = forces.pressing[t]
-            first = pairs.stencils[e][0]
-            energies[first] = energies[first] + forces.energy[e]
-
-    return scatter_energies_of_pairs
+    return add_energies_of_pairs
 
 
 @cache
-def curvature_of(rank: int):
-    """Device functions (forces, e) → ∂²U/∂y², (forces, e, p) → c, the components of p along its directions, and (forces, e, c)
-    → ∂²U/∂y² p."""
-
-    @wp.func
-    def curvature(forces: PairForces, e: int):
-        block = forces.bend[e][0] * wp.outer(forces.along[e], forces.along[e])
-        if wp.static(rank == 2):
-            block += forces.bend[e][1] * wp.outer(forces.across[e], forces.across[e])
-        return block
-
-    @wp.func
-    def components(forces: PairForces, e: int, p: wp.vec3d):
-        found = wp.vec2d(wp.dot(forces.along[e], p), ZERO)
-        if wp.static(rank == 2):
-            found[1] = wp.dot(forces.across[e], p)
-        return found
-
-    @wp.func
-    def product(forces: PairForces, e: int, c: wp.vec2d):
-        pull = forces.bend[e][0] * c[0] * forces.along[e]
-        if wp.static(rank == 2):
-            pull += forces.bend[e][1] * c[1] * forces.across[e]
-        return pull
-
-    return curvature, components, product
-
-
-@cache
-def gather_pair_diagonal(term: PairTerm, dtype):
-    """Kernel over vertices: adds Σ wᵢ² ∂²U/∂y² to the diagonal blocks of a Hessian, except those of pins."""
+def pair_diagonal(term: PairTerm, dtype, scatters: bool):
+    """Kernel over threads: adds Σ wᵢ² ∂²U/∂y² to the diagonal blocks of a Hessian, except those of pins."""
     _, mat33 = types(dtype)
-    curvature, _components, _product = curvature_of(term.rank)
+    (range_of, corners_at), two = taken_by(dtype, scatters), term.rank == 2
 
-    @wp.kernel(module=f"{term.of(dtype)}.gather", enable_backward=False)
-    def gather_diagonal_of_pairs(
+    @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
+    def add_diagonal_of_pairs(
         # elements
         pairs: near_pairs(dtype),
         inverse_mass: wp.array(dtype=dtype),
@@ -231,58 +187,30 @@ def gather_pair_diagonal(term: PairTerm, dtype):
         # in and out
         values: wp.array(dtype=mat33),
     ):
-        i = wp.tid()
-        if inverse_mass[i] == dtype(0.0):
-            return
-        total = wp.mat33d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if presses(forces, e):
-                w = forces.weights[e][pairs.corners[k] - 4 * e]
-                total += w * w * curvature(forces, e)
-        values[diagonal[i]] = values[diagonal[i]] + mat33(total)
-
-    return gather_diagonal_of_pairs
-
-
-@cache
-def scatter_pair_diagonal(term: PairTerm, dtype):
-    """Kernel of one thread: the sums of :func:`gather_pair_diagonal`."""
-    _, mat33 = types(dtype)
-    curvature, _components, _product = curvature_of(term.rank)
-
-    @wp.kernel(module=term.of(dtype), enable_backward=False)
-    def scatter_diagonal_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        inverse_mass: wp.array(dtype=dtype),
-        diagonal: wp.array(dtype=wp.int32),
-        # state in
-        forces: PairForces,
-        # in and out
-        values: wp.array(dtype=mat33),
-    ):
-        for t in range(forces.count[0]):
-            e = forces.pressing[t]
+        first, end = range_of(pairs, forces, wp.tid())
+        for k in range(first, end):
+            e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
-            block = curvature(forces, e)
-            for i in range(4):
-                if inverse_mass[s[i]] != dtype(0.0):
-                    w = forces.weights[e][i]
-                    values[diagonal[s[i]]] = values[diagonal[s[i]]] + mat33(w * w * block)
+            w = forces.weights[e]
+            block = forces.bend[e][0] * wp.outer(forces.along[e], forces.along[e])
+            if wp.static(two):
+                block += forces.bend[e][1] * wp.outer(forces.across[e], forces.across[e])
+            for i in range(corner, end_corner):
+                if inverse_mass[s[i]] > dtype(0.0):
+                    values[diagonal[s[i]]] = values[diagonal[s[i]]] + mat33(w[i] * w[i] * block)
 
-    return scatter_diagonal_of_pairs
+    return add_diagonal_of_pairs
 
 
 @cache
-def gather_pair_products(term: PairTerm, dtype):
-    """Kernel over vertices: q += wᵢ ∂²U/∂y² Σⱼ wⱼpⱼ over the other vertices j of its pairs, in active copies."""
+def pair_products(term: PairTerm, dtype, scatters: bool):
+    """Kernel over threads: q += wᵢ ∂²U/∂y² Σⱼ wⱼpⱼ over the other vertices j of each pair, in active copies."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
-    _curvature, components, product = curvature_of(term.rank)
+    (_at, exact), two = vertex_of(dtype), term.rank == 2
+    range_of, corners_at = taken_by(dtype, scatters)
 
-    @wp.kernel(module=f"{term.of(dtype)}.gather", enable_backward=False)
-    def gather_products_of_pairs(
+    @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
+    def add_products_of_pairs(
         # elements
         pairs: near_pairs(dtype),
         inverse_mass: wp.array(dtype=dtype),
@@ -295,59 +223,31 @@ def gather_pair_products(term: PairTerm, dtype):
         # in and out
         q: wp.array(dtype=vec3),
     ):
-        i = wp.tid()
-        if inverse_mass[i] == dtype(0.0) or active[i // per_copy] == 0:
-            return
-        total = wp.vec3d()
-        for k in range(pairs.first[i], pairs.first[i + 1]):
-            e = pairs.corners[k] // 4
-            if presses(forces, e):
-                corner = pairs.corners[k] - 4 * e
-                s = pairs.stencils[e]
-                w = forces.weights[e]
-                others = wp.vec2d()
-                for j in range(4):
-                    if j != corner and inverse_mass[s[j]] > dtype(0.0):
-                        others += w[j] * components(forces, e, exact(p[s[j]]))
-                total += w[corner] * product(forces, e, others)
-        q[i] = q[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
-
-    return gather_products_of_pairs
-
-
-@cache
-def scatter_pair_products(term: PairTerm, dtype):
-    """Kernel of one thread: the sums of :func:`gather_pair_products`."""
-    vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
-    _curvature, components, product = curvature_of(term.rank)
-
-    @wp.kernel(module=term.of(dtype), enable_backward=False)
-    def scatter_products_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        inverse_mass: wp.array(dtype=dtype),
-        # state in
-        forces: PairForces,
-        p: wp.array(dtype=vec3),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        # in and out
-        q: wp.array(dtype=vec3),
-    ):
-        for t in range(forces.count[0]):
-            e = forces.pressing[t]
+        first, end = range_of(pairs, forces, wp.tid())
+        for k in range(first, end):
+            e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
-            if active[s[0] // per_copy] != 0:
+            if end_corner > 0 and active[s[0] // per_copy] != 0:
                 w = forces.weights[e]
-                whole = wp.vec2d()
+                bend = forces.bend[e]
+                t = forces.along[e]
+                along = wp.vec4d()
+                u = wp.vec3d()
+                across = wp.vec4d()
+                if wp.static(two):
+                    u = forces.across[e]
                 for i in range(4):
                     if inverse_mass[s[i]] > dtype(0.0):
-                        whole += w[i] * components(forces, e, exact(p[s[i]]))
-                for i in range(4):
+                        along[i] = w[i] * wp.dot(t, exact(p[s[i]]))
+                        if wp.static(two):
+                            across[i] = w[i] * wp.dot(u, exact(p[s[i]]))
+                whole = along[0] + along[1] + along[2] + along[3]
+                whole_across = across[0] + across[1] + across[2] + across[3]
+                for i in range(corner, end_corner):
                     if inverse_mass[s[i]] > dtype(0.0):
-                        more = w[i] * product(forces, e, whole - w[i] * components(forces, e, exact(p[s[i]])))
-                        q[s[i]] = q[s[i]] + vec3(dtype(more[0]), dtype(more[1]), dtype(more[2]))
+                        pull = w[i] * bend[0] * (whole - along[i]) * t
+                        if wp.static(two):
+                            pull += w[i] * bend[1] * (whole_across - across[i]) * u
+                        q[s[i]] = q[s[i]] + vec3(dtype(pull[0]), dtype(pull[1]), dtype(pull[2]))
 
-    return scatter_products_of_pairs
+    return add_products_of_pairs

@@ -5,18 +5,7 @@ import warp as wp
 
 from ..kernels.contact import pair_sums, pair_sweeps
 
-GATHERS = (
-    pair_sums.gather_pair_forces,
-    pair_sums.gather_pair_energies,
-    pair_sums.gather_pair_diagonal,
-    pair_sums.gather_pair_products,
-)
-SCATTERS = (
-    pair_sums.scatter_pair_forces,
-    pair_sums.scatter_pair_energies,
-    pair_sums.scatter_pair_diagonal,
-    pair_sums.scatter_pair_products,
-)
+SUMS = pair_sums.pair_forces, pair_sums.pair_energies, pair_sums.pair_diagonal, pair_sums.pair_products
 
 
 class DynamicElements:
@@ -45,10 +34,10 @@ class DynamicElements:
 
     def set_sums(self, scatters):
         """Sets whether sums are scattered."""
-        model, made = self.model, SCATTERS if scatters else GATHERS
+        model = self.model
         self._sums_over = 1 if scatters else model.count
         self._forces, self._energies, self._diagonal, self._products = (
-            model.kernel(factory, self.term, model.dtype) for factory in made
+            model.kernel(factory, self.term, model.dtype, scatters) for factory in SUMS
         )
 
     def hold_pairs(self, pairs, data):
