@@ -6,7 +6,7 @@ import warp as wp
 
 from .contact.clear_elements import is_clear
 from .local import local_coordinate
-from .local_minimiser import CLAMP, local_minimiser
+from .local_minimiser import local_minimiser
 from .memory import load, load_shared, store
 from .term import Term
 from .transpose import to_corner
@@ -32,7 +32,7 @@ def stiffness_scale(term: Term, dtype):
         out: wp.array(dtype=dtype),
     ):
         e = wp.tid()
-        h = hessian(y_of(stencil, e, rest[e], x, x), rest[e], CLAMP)
+        h = hessian(y_of(stencil, e, rest[e], x, x), rest[e], dtype(0.0))
         out[e] = wp.sqrt(wp.ddot(h, h))
 
     return scale

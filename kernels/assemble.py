@@ -21,7 +21,7 @@ AHEAD = wp.constant(4)  # elements for whose blocks memory is asked ahead
 def of_element(term: Term, dtype, corrected: bool):
     """Device functions (stencil, stiffness, e, rest, x, d) → kₑ Aₑ u(yₑ) [J] in double precision, and kₑ Aₑ ∂u/∂y.
 
-    A third one, which also takes a Hessian policy, gives kₑ Aₑ ∂²u/∂y².
+    A third one, which also takes the factor of the negative part, gives kₑ Aₑ ∂²u/∂y².
 
     If ``corrected``, the energy and its gradient are computed in double precision, also from x and d in float32. Else the force
     of a spring would have a rounding error of ε k L, in stiff cloth more than its weight, and the rounding of the energy would
@@ -48,8 +48,8 @@ def of_element(term: Term, dtype, corrected: bool):
         return y_type(g)
 
     @wp.func
-    def hessian_of(stencil: indices, stiffness: numbers, e: int, r: rest_type, x: vectors, d: vectors, policy: int):
-        return (number(stiffness, e) * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, policy)
+    def hessian_of(stencil: indices, stiffness: numbers, e: int, r: rest_type, x: vectors, d: vectors, negative: dtype):
+        return (number(stiffness, e) * measure(r)) * hessian(y_of(stencil, e, r, x, d), r, negative)
 
     return energy_of, gradient_of, hessian_of
 
@@ -152,7 +152,7 @@ def gather_gradient(term: Term, dtype, corrected: bool = False):
 
 @cache
 def hessian_blocks(term: Term, dtype, corrected: bool = False):
-    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], with the Hessian policy of the element's copy."""
+    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], with the ``policy`` of the element's copy."""
     vec3, mat33 = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     weight, block_of, (_energy, _gradient, hessian_of) = (
@@ -172,14 +172,14 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
         d: wp.array(dtype=vec3),
         # parameters
         elements_per_copy: int,
-        policy: wp.array(dtype=wp.int32),
+        policy: wp.array(dtype=wp.float64),
         # out
         out: wp.array2d(dtype=mat33),
     ):
         e = wp.tid()
         r = rest[e]
         corners = out.shape[1] // K  # K, but not a constant: the compiler would take seconds to unroll the loops
-        h = hessian_of(stencil, stiffness, e, r, x, d, policy[e // elements_per_copy])
+        h = hessian_of(stencil, stiffness, e, r, x, d, dtype(policy[e // elements_per_copy]))
         for i in range(corners):
             wi = weight(r, i)
             for j in range(corners):
@@ -211,14 +211,14 @@ def scatter_hessian(term: Term, dtype, corrected: bool = False):
         d: wp.array(dtype=vec3),
         # parameters
         elements_per_copy: int,
-        policy: wp.array(dtype=wp.int32),
+        policy: wp.array(dtype=wp.float64),
         # in and out
         values: wp.array(dtype=mat33),
     ):
         e = wp.tid()
         fetch(values, slots, K * K * (e + AHEAD), K * K * (e + AHEAD + 1))
         r = rest_of(rest, e)
-        h = hessian_of(stencil, stiffness, e, r, x, d, policy[e // elements_per_copy])
+        h = hessian_of(stencil, stiffness, e, r, x, d, dtype(policy[e // elements_per_copy]))
         first = K * K * e
         if wp.static(short):
             for i in range(K):

@@ -6,9 +6,8 @@ from typing import Any
 import warp as wp
 
 from .rotation import epsilon
-from .term import HessianPolicy, Term
+from .term import Term
 
-CLAMP = wp.constant(int(HessianPolicy.CLAMP))
 # Maximum number of halvings of a Newton step.
 HALVINGS = wp.constant(30)
 
@@ -87,7 +86,7 @@ def local_minimiser(term: Term, dtype):
             right = flat()
             for i in range(n):
                 right[i] = -g[i // 3, i % 3]
-            H = hessian(z, rest, CLAMP)
+            H = hessian(z, rest, dtype(0.0))
             for i in range(n):
                 H[i, i] = H[i, i] + r
             p = solve_definite(H, right, n)

@@ -19,10 +19,6 @@ import numpy as np
 import warp as wp
 
 from .rotation import svd3x2
-from .term import HessianPolicy
-
-RAW = wp.constant(int(HessianPolicy.RAW))
-ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
 
 
 def side_axes(points, triangles):
@@ -114,19 +110,16 @@ def dyad(u: Any, v: Any):
 
 
 @wp.func
-def mended(value: Any, policy: int):
-    """An eigenvalue after the Hessian policy: negative ones become 0 or positive, or stay."""
-    if policy != RAW and value < type(value)(0.0):
-        if policy == ABSOLUTE:
-            value = -value
-        else:
-            value = type(value)(0.0)
+def scaled_if_negative(value: Any, negative: Any):
+    """An eigenvalue, times ``negative`` if it is below 0."""
+    if value < type(value)(0.0):
+        value = negative * value
     return value
 
 
 @wp.func
-def kept2(B: Any, policy: int):
-    """A symmetric 2×2 matrix after the Hessian policy, computed without eigenvectors."""
+def scaled_negative_part(B: Any, negative: Any):
+    """A symmetric 2×2 matrix with its negative eigenvalues times ``negative``, computed without eigenvectors."""
     half = B.dtype(0.5)
     mean = half * (B[0, 0] + B[1, 1])
     difference = half * (B[0, 0] - B[1, 1])
@@ -134,38 +127,34 @@ def kept2(B: Any, policy: int):
     high = mean + radius
     low = mean - radius
     K = B
-    if policy != RAW and low < B.dtype(0.0):
-        # Eigenvalues of opposite signs are distinct.
-        if policy == ABSOLUTE:
-            K = -B
-            if high > B.dtype(0.0):
-                K = ((high + low) * B - B.dtype(2.0) * high * low * wp.identity(n=2, dtype=B.dtype)) / (high - low)
-        else:
-            K = B * B.dtype(0.0)
-            if high > B.dtype(0.0):
-                K = (high / (high - low)) * (B - low * wp.identity(n=2, dtype=B.dtype))
+    if negative != B.dtype(1.0) and low < B.dtype(0.0):
+        K = negative * B
+        if high > B.dtype(0.0):  # eigenvalues of opposite signs are distinct
+            K += ((B.dtype(1.0) - negative) * high / (high - low)) * (B - low * wp.identity(n=2, dtype=B.dtype))
     return K
 
 
 @wp.func
-def isotropic_hessian(U: Any, V: Any, stretch: Any, twist: Any, flip: Any, out1: Any, out2: Any, policy: int):
+def isotropic_hessian(U: Any, V: Any, stretch: Any, twist: Any, flip: Any, out1: Any, out2: Any, negative: Any):
     """∂²ψ/∂y² (6×6) of the 2×2 matrix and the four eigenvalues of the module's table."""
     u1 = wp.vector(U[0, 0], U[1, 0], U[2, 0])
     u2 = wp.vector(U[0, 1], U[1, 1], U[2, 1])
     u3 = wp.cross(u1, u2)
     v1 = wp.vector(V[0, 0], V[1, 0])
     v2 = wp.vector(V[0, 1], V[1, 1])
-    B = kept2(stretch, policy)
+    B = scaled_negative_part(stretch, negative)
     half = U.dtype(0.5)
     a = dyad(u1, v1)
     b = dyad(u2, v2)
     c = dyad(u2, v1)
     d = dyad(u1, v2)
     H = wp.outer(a, B[0, 0] * a + B[0, 1] * b) + wp.outer(b, B[0, 1] * a + B[1, 1] * b)
-    H += wp.outer((half * mended(twist, policy)) * (c - d), c - d) + wp.outer((half * mended(flip, policy)) * (c + d), c + d)
+    H += wp.outer((half * scaled_if_negative(twist, negative)) * (c - d), c - d)
+    H += wp.outer((half * scaled_if_negative(flip, negative)) * (c + d), c + d)
     a = dyad(u3, v1)
     b = dyad(u3, v2)
-    return H + wp.outer(mended(out1, policy) * a, a) + wp.outer(mended(out2, policy) * b, b)
+    H += wp.outer(scaled_if_negative(out1, negative) * a, a)
+    return H + wp.outer(scaled_if_negative(out2, negative) * b, b)
 
 
 # --- the distance to the F whose singular values lie in a range, u = ½‖F − p‖² = ½Σ(σᵢ − cᵢ)², cᵢ = σᵢ clamped to it
@@ -212,7 +201,7 @@ def tangent(size: Any, sigma_min: Any, sigma_max: Any):
 
 
 @wp.func
-def range_hessian(y: Any, sigma_min: Any, sigma_max: Any, policy: int):
+def range_hessian(y: Any, sigma_min: Any, sigma_max: Any, negative: Any):
     """∂²u/∂y²; at a bound of the range, its limit from outside. Only twist and the last two eigenvalues can be negative."""
     U, S, V = decompose(y)
     c = clamped(S, sigma_min, sigma_max)
@@ -226,4 +215,4 @@ def range_hessian(y: Any, sigma_min: Any, sigma_max: Any, policy: int):
     twist = secant(excess[0] + excess[1], S[0] + S[1], c[0] + c[1])
     out1 = secant(excess[0], S[0], c[0])
     out2 = secant(excess[1], S[1], c[1])
-    return isotropic_hessian(U, V, stretch, twist, flip, out1, out2, policy)
+    return isotropic_hessian(U, V, stretch, twist, flip, out1, out2, negative)

@@ -24,7 +24,10 @@ TYPICAL = wp.constant(wp.float64(0.1))
 LOOSEST, LEFT = wp.constant(wp.float64(0.03)), wp.constant(wp.float64(0.5))
 # Iterations after which the loop on the device returns to the host, which can then be interrupted.
 AT_ONCE = wp.constant(8)
-RAW, CLAMP = wp.constant(int(HessianPolicy.RAW)), wp.constant(int(HessianPolicy.CLAMP))
+RAW = wp.constant(wp.float64(HessianPolicy.RAW))
+# The factor of the negative part falls by this where the matrix is found to be indefinite. Of one step of 1/60 s of a folding
+# cloth of 48² vertices, quarters take 46 iterations, halves 51, and 0 at once 63.
+FALL = wp.constant(wp.float64(0.25))
 
 
 class End(IntEnum):
@@ -148,7 +151,7 @@ def begin_newton():
         # in and out
         progress: DescentState,
         # out
-        policy: wp.array(dtype=wp.int32),
+        policy: wp.array(dtype=wp.float64),
         tolerance: wp.array(dtype=wp.float64),
         wanted: wp.array(dtype=wp.int32),
         unsolved: wp.array(dtype=wp.int32),
@@ -174,9 +177,9 @@ def begin_newton():
 
 @cache
 def find_indefinite():
-    """Kernel over copies: those of which the raw Hessian has a negative curvature are to be solved with ``CLAMP``.
+    """Kernel over copies: those whose matrix is indefinite are to be solved again, with a lower factor in ``policy``.
 
-    ``unsolved`` is 0 before, and then 1 if there are any.
+    ``unsolved`` is 0 before, and then 1 if there are any. With the factor 0 a matrix is definite.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -184,16 +187,16 @@ def find_indefinite():
         # state in
         negative: wp.array(dtype=wp.int32),
         # in and out
-        policy: wp.array(dtype=wp.int32),
+        policy: wp.array(dtype=wp.float64),
         # out
         wanted: wp.array(dtype=wp.int32),
         unsolved: wp.array(dtype=wp.int32),
     ):
         copy = wp.tid()
         wanted[copy] = 0
-        if negative[copy] == 1 and policy[copy] != CLAMP:
+        if negative[copy] == 1 and policy[copy] > wp.float64(0.0):
             wanted[copy] = 1
-            policy[copy] = CLAMP
+            policy[copy] = wp.max(policy[copy] - FALL, wp.float64(0.0))
             unsolved[0] = 1
 
     return find

@@ -36,7 +36,7 @@ def share_gradient(y: Any, rest: Any):
 
 
 @wp.func
-def share_hessian(y: Any, rest: Any, policy: int):
+def share_hessian(y: Any, rest: Any, negative: Any):
     return wp.matrix(shape=(3, 3), dtype=rest.dtype)
 
 
@@ -127,7 +127,7 @@ def evaluate(term: Term, dtype, corrected: bool):
 
 @cache
 def _hessian_of_cell(term: Term, dtype, corrected: bool):
-    """Device function (c, first, last, stencil, weights, stiffness, rest, x, d, policy) → k A ∂²u/∂y² of cell c."""
+    """Device function (c, first, last, stencil, weights, stiffness, rest, x, d, negative) → k A ∂²u/∂y² of cell c."""
     vec3, _ = types(dtype)
     weights_type, rest_type = wp.types.vector(term.rows, dtype), wp.types.vector(term.parameters, dtype)
     y_of, hessian, area = cell_coordinate(term, dtype, corrected), term.hessian, term.measure
@@ -143,18 +143,18 @@ def _hessian_of_cell(term: Term, dtype, corrected: bool):
         rest: wp.array(dtype=rest_type),
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
-        policy: int,
+        negative: dtype,
     ):
         r = rest[c]
         y = y_of(first, last, stencil, weights, x, d)
-        return (stiffness[first] * area(r)) * hessian(y, r, policy)
+        return (stiffness[first] * area(r)) * hessian(y, r, negative)
 
     return hessian_of
 
 
 @cache
 def blocks(term: Term, dtype, corrected: bool):
-    """Kernel over cells: out[starts[c] + n·i + j] = k A ∂²u/∂xᵢ∂xⱼ [N/m] for n vertices, with the copy's Hessian policy."""
+    """Kernel over cells: out[starts[c] + n·i + j] = k A ∂²u/∂xᵢ∂xⱼ [N/m] for n vertices, with the copy's policy."""
     vec3, mat33 = types(dtype)
     weights_type, rest_type = wp.types.vector(term.rows, dtype), wp.types.vector(term.parameters, dtype)
     hessian_of, block_of = _hessian_of_cell(term, dtype, corrected), to_block(term.rows, dtype)
@@ -173,13 +173,13 @@ def blocks(term: Term, dtype, corrected: bool):
         d: wp.array(dtype=vec3),
         # parameters
         cells_per_copy: int,
-        policy: wp.array(dtype=wp.int32),
+        policy: wp.array(dtype=wp.float64),
         # out
         out: wp.array(dtype=mat33),
     ):
         c = wp.tid()
         first, last, start = offsets[c], offsets[c + 1], starts[c]
-        h = hessian_of(c, first, last, stencil, weights, stiffness, rest, x, d, policy[c // cells_per_copy])
+        h = hessian_of(c, first, last, stencil, weights, stiffness, rest, x, d, dtype(policy[c // cells_per_copy]))
         for i in range(first, last):
             for j in range(first, last):
                 out[start + (last - first) * (i - first) + j - first] = block_of(weights[i], weights[j], h)
@@ -209,13 +209,13 @@ def scatter_blocks(term: Term, dtype, corrected: bool):
         d: wp.array(dtype=vec3),
         # parameters
         cells_per_copy: int,
-        policy: wp.array(dtype=wp.int32),
+        policy: wp.array(dtype=wp.float64),
         # in and out
         values: wp.array(dtype=mat33),
     ):
         c = wp.tid()
         first, last, start = offsets[c], offsets[c + 1], starts[c]
-        h = hessian_of(c, first, last, stencil, weights, stiffness, rest, x, d, policy[c // cells_per_copy])
+        h = hessian_of(c, first, last, stencil, weights, stiffness, rest, x, d, dtype(policy[c // cells_per_copy]))
         n = last - first
         for i in range(n):
             for j in range(i, n):

@@ -7,15 +7,15 @@ from typing import Any
 
 
 class HessianPolicy(IntEnum):
-    """How ``hessian`` treats the negative curvature of an energy.
+    """The factor of the negative part of ∂²u/∂y² in ``hessian``; numbers between these are allowed too.
 
-    ``RAW`` returns ∂²u/∂y². ``CLAMP`` drops its negative part, ``ABSOLUTE`` flips the sign of that part. Both are positive
+    ``RAW`` gives ∂²u/∂y². ``CLAMP`` drops its negative part, ``ABSOLUTE`` flips the sign of that part. Both are positive
     semi-definite, in closed form, and equal to ``RAW`` where that is semi-definite.
     """
 
-    RAW = 0
-    CLAMP = 1
-    ABSOLUTE = 2
+    RAW = 1
+    CLAMP = 0
+    ABSOLUTE = -1
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,8 @@ class Term:
         measure: (rest) → Aₑ.
         energy: (y, rest) → u.
         gradient: (y, rest) → ∂u/∂y (M, 3).
-        hessian: (y, rest, policy) → ∂²u/∂y² (3M, 3M), y row by row, see :class:`HessianPolicy`.
+        hessian: (y, rest, negative) → ∂²u/∂y² (3M, 3M), y row by row, with its negative part times ``negative``, see
+            :class:`HessianPolicy`.
         dead_zone: Whether the energy is 0 in a range about the rest shape; ``rest_state`` then takes the ratios ``least`` and
             ``most`` of its ends.
         max_lengths: NumPy function (points (n, 3) [m], stencil (E, K), rest (E, P)) → (pairs (E·m, 2), lengths (E·m,) [m],

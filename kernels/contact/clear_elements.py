@@ -12,11 +12,9 @@ import warp as wp
 from ..assemble import of_element
 from ..local import local_coordinate
 from ..memory import load, load_shared
-from ..term import HessianPolicy, Term
+from ..term import Term
 from ..terms import contact
 from ..vectors import types
-
-CLAMP = wp.constant(int(HessianPolicy.CLAMP))
 
 
 @wp.func
@@ -203,6 +201,6 @@ def add_hessian(term: Term, dtype):
         if clear.shape[0] > 0:
             if is_clear(clear[e], d[i]):
                 return
-        values[slot] = values[slot] + hessian_of(stencil, stiffness, e, rest_of(rest, e), x, d, CLAMP)
+        values[slot] = values[slot] + hessian_of(stencil, stiffness, e, rest_of(rest, e), x, d, dtype(0.0))
 
     return add

@@ -61,7 +61,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     n = wp.vector(rest[3], rest[4], rest[5])
     return rest[7] * wp.identity(n=3, dtype=y.dtype) + (rest[6] - rest[7]) * wp.outer(n, n)
 

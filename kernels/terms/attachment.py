@@ -42,7 +42,7 @@ def energy(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     return wp.identity(n=3, dtype=y.dtype)
 
 

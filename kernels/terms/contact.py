@@ -18,11 +18,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..term import HessianPolicy, Term
+from ..term import Term
 from .attachment import weight
 
-RAW = wp.constant(int(HessianPolicy.RAW))
-CLAMP = wp.constant(int(HessianPolicy.CLAMP))
 # δ/r: below δ φ is a parabola, and no vertex ends a step below δ.
 FLOOR = 1e-3
 DELTA = wp.constant(FLOOR)
@@ -216,14 +214,11 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     d, n = gap(y, rest)
     H = bend(d, rest[11]) * wp.outer(n, n)
-    if policy != CLAMP and d < rest[11]:
-        transverse = slope(d, rest[11])
-        if policy != RAW:
-            transverse = -transverse
-        H += transverse * curvature(y, rest, n)
+    if negative != y.dtype(0.0) and d < rest[11]:
+        H += negative * slope(d, rest[11]) * curvature(y, rest, n)
     return H
 
 
@@ -328,7 +323,7 @@ def bounded_gradient(y: Any, rest: Any):
 
 
 @wp.func
-def bounded_hessian(y: Any, rest: Any, policy: int):
+def bounded_hessian(y: Any, rest: Any, negative: Any):
     """I: the Hessian of contact with friction at any distance, and a bound of that of contact alone."""
     return wp.identity(n=3, dtype=y.dtype)
 

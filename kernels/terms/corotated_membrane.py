@@ -38,8 +38,8 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
-    return range_hessian(y, y.dtype(1.0), y.dtype(1.0), policy)
+def hessian(y: Any, rest: Any, negative: Any):
+    return range_hessian(y, y.dtype(1.0), y.dtype(1.0), negative)
 
 
 @wp.func

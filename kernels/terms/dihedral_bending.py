@@ -24,10 +24,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..term import Dissipation, HessianPolicy, Term
-
-RAW = wp.constant(int(HessianPolicy.RAW))
-CLAMP = wp.constant(int(HessianPolicy.CLAMP))
+from ..term import Dissipation, Term
 
 
 def rest_state(points, stencil):
@@ -142,16 +139,13 @@ def positive_half(g: Any, h: Any, ratio: Any, scale: Any):
 
 
 @wp.func
-def product(g: Any, h: Any, ratio: Any, scale: Any, policy: int):
-    """Returns scale·(g hᵀ + h gᵀ), or its positive half or absolute value; g ⟂ h, and ratio is |h|/|g|."""
-    if policy == CLAMP:
-        w = positive_half(g, h, ratio, scale)
-        return wp.outer(w, w)
-    u = flatten(g) * wp.sqrt(ratio)
-    v = flatten(h) / wp.sqrt(ratio)
-    if policy == RAW:
-        return scale * (wp.outer(u, v) + wp.outer(v, u))
-    return wp.abs(scale) * (wp.outer(u, u) + wp.outer(v, v))
+def product(g: Any, h: Any, ratio: Any, scale: Any, negative: Any):
+    """Returns scale·(g hᵀ + h gᵀ) with its negative half times ``negative``; g ⟂ h, and ratio is |h|/|g|."""
+    w = positive_half(g, h, ratio, scale)
+    half = (scale.dtype(1.0) - negative) * wp.outer(w, w)
+    if negative == scale.dtype(0.0):
+        return half
+    return half + (negative * scale) * (wp.outer(flatten(g), flatten(h)) + wp.outer(flatten(h), flatten(g)))
 
 
 @wp.func
@@ -183,15 +177,15 @@ def factors(y: Any, corner: int):
 
 
 @wp.func
-def curvature(y: Any, scale: Any, policy: int):
-    """Returns scale·∂²θ, with ``policy`` applied to each of its four products."""
+def curvature(y: Any, scale: Any, negative: Any):
+    """Returns scale·∂²θ, with the negative half of each of its four products times ``negative``."""
     h = wp.matrix(shape=(9, 9), dtype=y.dtype)
     if has_no_angle(y):
         return h
     for corner in range(1, 3):
         g, around, turn, sigma, ratio = factors(y, corner)
-        h += product(g, around, y.dtype(1.0), scale, policy)
-        h += product(turn, sigma, ratio, scale, policy)
+        h += product(g, around, y.dtype(1.0), scale, negative)
+        h += product(turn, sigma, ratio, scale, negative)
     return h
 
 
@@ -208,7 +202,7 @@ def stiffening(y: Any, rest: Any, tension: Any):
 
 @wp.func
 def constraint_hessian(y: Any, rest: Any):
-    return curvature(y, y.dtype(1.0), RAW)
+    return curvature(y, y.dtype(1.0), y.dtype(1.0))
 
 
 @wp.func
@@ -223,9 +217,9 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     g = flatten(constraint_gradient(y, rest))
-    return wp.outer(g, g) + curvature(y, constraint(y, rest), policy)
+    return wp.outer(g, g) + curvature(y, constraint(y, rest), negative)
 
 
 @wp.func

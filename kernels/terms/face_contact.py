@@ -49,7 +49,7 @@ def any_weight(rest: Any, i: int):
 
 
 @wp.func
-def bounded_hessian(y: Any, rest: Any, policy: int):
+def bounded_hessian(y: Any, rest: Any, negative: Any):
     return y.dtype(STEEPEST) * wp.identity(n=3, dtype=y.dtype)
 
 

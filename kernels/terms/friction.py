@@ -66,7 +66,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     n = wp.vector(rest[3], rest[4], rest[5])
     u = slip(y, rest)
     l = wp.length(u)
@@ -108,7 +108,7 @@ def prox(v: Any, rest: Any, compliance: Any):
 
 
 @wp.func
-def bounded_hessian(y: Any, rest: Any, policy: int):
+def bounded_hessian(y: Any, rest: Any, negative: Any):
     """0, as the bounded Hessian of contact includes that of friction."""
     return wp.matrix(shape=(3, 3), dtype=y.dtype)
 

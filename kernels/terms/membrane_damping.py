@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..membrane import covector, green_strain, inverse_edges, kept2, measure, weight
+from ..membrane import covector, green_strain, inverse_edges, measure, scaled_negative_part, weight
 from ..term import Dissipation, Term
 
 
@@ -43,14 +43,14 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     """Returns ∂E∂Eᵀ + (E − Ẽ)∂²E; only the second part can be negative."""
     zero = y[0] * y.dtype(0.0)
     a = covector(y[0], zero)
     b = covector(zero, y[1])
     c = covector(y[1], y[0])
     h = wp.outer(a, a) + wp.outer(b, b) + wp.outer(y.dtype(0.5) * c, c)
-    S = kept2(change(y, rest), policy)
+    S = scaled_negative_part(change(y, rest), negative)
     for m in range(2):
         for n in range(2):
             for row in range(3):

@@ -56,7 +56,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     U, S, V = decompose(y)
     mu = rest[3]
     J = wp.length(wp.cross(y[0], y[1]))
@@ -76,7 +76,7 @@ def hessian(y: Any, rest: Any, policy: int):
         flip -= s
         out1 += s * (S[1] / S[0])
         out2 += s * (S[0] / S[1])
-    return isotropic_hessian(U, V, stretch, twist, flip, out1, out2, policy)
+    return isotropic_hessian(U, V, stretch, twist, flip, out1, out2, negative)
 
 
 NEO_HOOKEAN_MEMBRANE = Term(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..membrane import covector, green_strain, inverse_edges, kept2, measure, side_axes, weight
+from ..membrane import covector, green_strain, inverse_edges, measure, scaled_negative_part, side_axes, weight
 from ..term import Term
 from .membrane_damping import DISSIPATION
 
@@ -61,7 +61,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     zero = y[0] * y.dtype(0.0)
     a = covector(y[0], zero)
     b = covector(zero, y[1])
@@ -75,7 +75,7 @@ def hessian(y: Any, rest: Any, policy: int):
     both[1, 1] = S[1]
     both[0, 1] = S[2]
     both[1, 0] = S[2]
-    both = kept2(both, policy)
+    both = scaled_negative_part(both, negative)
     for m in range(2):
         for n in range(2):
             for row in range(3):

@@ -27,7 +27,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     return wp.identity(n=9, dtype=y.dtype)
 
 

@@ -59,7 +59,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     return wp.identity(n=3, dtype=y.dtype)
 
 
@@ -91,8 +91,8 @@ def damped_gradient(y: Any, rest: Any):
 
 
 @wp.func
-def damped_hessian(y: Any, rest: Any, policy: int):
-    return spring_hessian(y, length_of(rest), policy)
+def damped_hessian(y: Any, rest: Any, negative: Any):
+    return spring_hessian(y, length_of(rest), negative)
 
 
 @wp.func

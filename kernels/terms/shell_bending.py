@@ -14,10 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from ..term import HessianPolicy, Term
-
-RAW = wp.constant(int(HessianPolicy.RAW))
-ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
+from ..term import Term
 
 
 @wp.func
@@ -52,7 +49,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     h = wp.identity(n=15, dtype=y.dtype)
     g = pull(bent(y, rest), rest)
     B1 = -wp.skew(y[4])
@@ -64,13 +61,10 @@ def hessian(y: Any, rest: Any, policy: int):
     # The second part [[0, −[g]×], [[g]×, 0]] has the absolute value ‖g‖(I − ggᵀ/‖g‖²) in both diagonal blocks.
     turn = -wp.skew(g)
     size = wp.length(g)
-    if policy != RAW and size > y.dtype(0.0):
-        both = size * wp.identity(n=3, dtype=y.dtype) - wp.outer(g / size, g)
-        if policy != ABSOLUTE:
-            both = y.dtype(0.5) * both
-            turn = y.dtype(0.5) * turn
-        else:
-            turn = y.dtype(0.0) * turn
+    if negative != y.dtype(1.0) and size > y.dtype(0.0):
+        half = y.dtype(0.5)
+        both = (half - half * negative) * (size * wp.identity(n=3, dtype=y.dtype) - wp.outer(g / size, g))
+        turn = (half + half * negative) * turn
         H11 += both
         H22 += both
     H12 += turn

@@ -12,10 +12,7 @@ import numpy as np
 import warp as wp
 
 from ..columns import columns_of, length
-from ..term import Dissipation, HessianPolicy, Term
-
-CLAMP = wp.constant(int(HessianPolicy.CLAMP))
-ABSOLUTE = wp.constant(int(HessianPolicy.ABSOLUTE))
+from ..term import Dissipation, Term
 
 
 def rest_state(points, stencil):
@@ -79,7 +76,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     length = wp.length(y[0])
     eye = wp.identity(n=3, dtype=y.dtype)
     if collapsed(length, rest[0]):
@@ -87,10 +84,7 @@ def hessian(y: Any, rest: Any, policy: int):
     direction = y[0] / length
     transverse = y.dtype(1.0) - rest[0] / length
     if transverse < y.dtype(0.0):
-        if policy == CLAMP:
-            transverse = y.dtype(0.0)
-        if policy == ABSOLUTE:
-            transverse = -transverse
+        transverse *= negative
     along = wp.outer(direction, direction)
     return along + transverse * (eye - along)
 

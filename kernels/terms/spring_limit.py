@@ -41,9 +41,9 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     """Exactly on a limit, this is the Hessian beyond it."""
-    h = spring_hessian(y, nearest_length(y, rest), policy)
+    h = spring_hessian(y, nearest_length(y, rest), negative)
     length = wp.length(y[0])
     if length > rest[0] and length < rest[1]:
         h *= y.dtype(0.0)

@@ -37,8 +37,8 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
-    return range_hessian(y, rest[3], rest[4], policy)
+def hessian(y: Any, rest: Any, negative: Any):
+    return range_hessian(y, rest[3], rest[4], negative)
 
 
 @wp.func

@@ -35,7 +35,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     U, S, V = decompose(y)
     mu = rest[3]
     lam = rest[4]
@@ -51,7 +51,7 @@ def hessian(y: Any, rest: Any, policy: int):
     stretch[1, 1] = s2 + (y.dtype(2.0) * mu + lam) * b
     stretch[0, 1] = lam * ab
     stretch[1, 0] = lam * ab
-    return isotropic_hessian(U, V, stretch, level + mu * (a - ab + b), level + mu * (a + ab + b), s1, s2, policy)
+    return isotropic_hessian(U, V, stretch, level + mu * (a - ab + b), level + mu * (a + ab + b), s1, s2, negative)
 
 
 STVK_MEMBRANE = Term(

@@ -36,7 +36,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     h = wp.matrix(shape=(3, 3), dtype=y.dtype)
     h[1, 1] = rest[1] * rest[1] / ((y[0, 1] - rest[0]) * (y[0, 1] - rest[0]))
     return h

@@ -35,7 +35,7 @@ def gradient(y: Any, rest: Any):
 
 
 @wp.func
-def hessian(y: Any, rest: Any, policy: int):
+def hessian(y: Any, rest: Any, negative: Any):
     q = wp.sqrt(rest[1] * rest[1] + wp.dot(y[0], y[0]))
     unit = y[0] / q
     return (wp.identity(n=3, dtype=y.dtype) - wp.outer(unit, unit)) / q

@@ -162,7 +162,7 @@ class Stencils(NamedTuple):
         """(E, 3K, 3K) [N/m]."""
         E, K = self.x.shape[:2]
         out = wp.zeros((E, K * K), dtype=types(self.scalar)[1], device=self.device)
-        policies = wp.array([int(policy)], dtype=wp.int32, device=self.device)
+        policies = wp.array([float(policy)], dtype=wp.float64, device=self.device)
         self.launch(*self.state(assemble.hessian_blocks, correction), E, policies, out)
         return out.numpy().reshape(E, K, K, 3, 3).transpose(0, 1, 3, 2, 4).reshape(E, 3 * K, 3 * K)
 
@@ -201,7 +201,7 @@ class Stencils(NamedTuple):
         y_type, square = wp.types.matrix((M, 3), self.scalar), wp.types.matrix((3 * M, 3 * M), self.scalar)
         out = wp.zeros(E, dtype=square, device=self.device)
         kernel = second_derivative_of(self.term, self.scalar)
-        self.launch(kernel, self.array(y, y_type), self.elements[2], int(policy), out)
+        self.launch(kernel, self.array(y, y_type), self.elements[2], self.scalar(policy), out)
         return out.numpy()
 
     def constraint(self, y):
@@ -251,7 +251,7 @@ def second_derivative_of(term, dtype):
     square, second = wp.types.matrix((3 * term.rows, 3 * term.rows), dtype), term.hessian
 
     @wp.kernel(module="unique", enable_backward=False)
-    def evaluate(y: wp.array(dtype=y_type), rest: wp.array(dtype=rest_type), policy: int, out: wp.array(dtype=square)):
+    def evaluate(y: wp.array(dtype=y_type), rest: wp.array(dtype=rest_type), policy: dtype, out: wp.array(dtype=square)):
         e = wp.tid()
         out[e] = second(y[e], rest[e], policy)
 
@@ -758,6 +758,7 @@ def test_policies_are_semidefinite(term, state, dtype, device):
     assert (norms(clamp - raw)[semidefinite] <= error[semidefinite]).all()
     assert (norms(absolute - raw)[semidefinite] <= error[semidefinite]).all()
     assert (norms(clamp - raw)[~semidefinite] > error[~semidefinite]).all()
+    assert (norms(elements.hessian(0.25) - 0.25 * raw - 0.75 * clamp) <= error).all()
     if term.name == "Spring" and state == "random":
         assert semidefinite.any() and not semidefinite.all(), "both kinds are tested"
 
@@ -1289,7 +1290,7 @@ def test_each_copy_has_its_policy(device):
 
     def blocks(policy):
         hessian = Hessian(model)
-        hessian.policy.assign(np.array(policy, dtype=np.int32))
+        hessian.policy.assign(np.array(policy, dtype=np.float64))
         hessian.assemble(model.positions, 0.0)
         matrix = hessian.matrix().toarray()
         return [matrix[i : i + len(matrix) // 3, i : i + len(matrix) // 3] for i in range(0, len(matrix), len(matrix) // 3)]

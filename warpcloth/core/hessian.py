@@ -5,6 +5,7 @@ import warp as wp
 
 from ..base.turns import in_turn
 from ..kernels import assemble, linear, sparse
+from ..kernels.term import HessianPolicy
 from ..model.host_values import host_values
 from .block_pattern import TermCorners, find_pattern, slots_of
 from .dynamic import dynamic_of
@@ -166,14 +167,14 @@ class Hessian(BlockMatrix):
     Attributes:
         dynamic: A :class:`warpcloth.core.dynamic.Dynamic`.
         values: The blocks [N/m]. Others are those of :class:`BlockMatrix`.
-        policy: (B,) int32, a :class:`HessianPolicy` for each copy.
+        policy: (B,) float64, a :class:`HessianPolicy` or a factor between for each copy.
     """
 
     @in_turn
-    def __init__(self, model, policy=0, corrected=False, terms=None, dynamic=()):
+    def __init__(self, model, policy=HessianPolicy.RAW, corrected=False, terms=None, dynamic=()):
         self.dynamic = dynamic_of(model, terms, dynamic)
         self.terms = model.terms if terms is None else terms
-        self.policy = wp.full(model.copies, int(policy), dtype=wp.int32, device=model.device)
+        self.policy = wp.full(model.copies, float(policy), dtype=wp.float64, device=model.device)
         found = pattern_of(model, self.terms)
         touches = len(self.dynamic) > 0 or any(elements.collider is not None for elements in self.terms)
         super().__init__(model, found, touches)
@@ -256,7 +257,7 @@ def norms(model, terms, x):
 
     The norms are upper bounds, see :func:`warpcloth.kernels.assemble.row_norms`. Nothing is assembled.
     """
-    rows, policy = np.zeros(model.count), wp.zeros(model.copies, dtype=wp.int32, device=model.device)
+    rows, policy = np.zeros(model.count), wp.full(model.copies, float(HessianPolicy.RAW), dtype=wp.float64, device=model.device)
     row_norms = model.kernel(assemble.row_norms, model.dtype)
 
     def add(blocks, vertices):

@@ -53,7 +53,7 @@ class Minimiser:
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         base: The positions at d = 0, (N,) vectors [m]; the caller's array, read only.
-        hessian: ``"adaptive"`` (raw, but clamped in iterations whose matrix has a negative curvature), ``"raw"``, ``"clamp"``
+        hessian: ``"adaptive"`` (raw, but reduced in iterations whose matrix is indefinite), ``"raw"``, ``"clamp"``
             or ``"absolute"``.
         linear: ``"cg"`` or ``"factorised"``.
         s: Weight of the inertia, 1/h² [1/s²].
@@ -203,7 +203,7 @@ class Minimiser:
     def _assemble_raw(self):
         policy, before = self.hessian.policy, self.hessian.policy.numpy()
         self.clear()
-        policy.fill_(int(HessianPolicy.RAW))
+        policy.fill_(float(HessianPolicy.RAW))
         self.active.fill_(1)
         self._launch_assemble()
         policy.assign(before)

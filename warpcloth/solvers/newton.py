@@ -34,8 +34,8 @@ class Newton(ImplicitStep):
         iterations: Maximum number of Newton iterations in a step. If cloth snaps from one fold to another, a step may take more
             than 100; in ``flag`` one takes 137.
         hessian: Treatment of an indefinite Hessian (Choi and Ko 2002 for springs). ``"clamp"`` and ``"absolute"`` make the
-            block of each element semi-definite in every iteration; ``"adaptive"`` clamps only in iterations whose matrix is
-            found to be indefinite; ``"raw"`` changes nothing.
+            block of each element semi-definite in every iteration; ``"adaptive"`` reduces its negative part by quarters, only
+            as far as the matrix needs to be definite; ``"raw"`` changes nothing.
         linear: ``"cg"`` solves by conjugate gradients, to the accuracy that the Newton iteration needs, and meshes of 200
             vertices and more with a multigrid cycle as preconditioner where this takes less time. ``"factorised"``
             factorises on the host, which is 3 to 6 times slower for ``hanging`` with 32² and 64² vertices, but takes any
