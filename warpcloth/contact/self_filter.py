@@ -224,11 +224,9 @@ class SelfFilter:
     # For methods whose iterates base + d stay apart too.
 
     def launch_first(self, base, d):
-        """Sets d so that base + d lies between the start of the step and base, as far along as pairs stay apart."""
+        """Sets d so that base + d is the start of the step, where all pairs are apart."""
         self._blocked.zero_()
         self._renewed.zero_()
-        wp.copy(self._target, base)
-        self._walk(self._contact.x_before)
         self._add(self._contact.x_before, base, -1.0, d)
 
     def iterates(self):
