@@ -79,6 +79,7 @@ class Term:
             for terms with K = 1; or None.
         clearance: (y, rest) → a radius about y within which there is surely no force, 0 or less if there may be a force at y;
             for terms with ``idle``; or None.
+        gap: Of contact with a collider, (y, rest) → the distance and its gradient; or None.
         secant: (y, rest) → s, 0 to 1. If p moves with y, y − p is s times the distance to a point that moves less. Constraint
             rows hold p fixed in an iteration, so they use that point and s k instead; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices. The Hessian is then constant: it is
@@ -116,6 +117,7 @@ class Term:
     prox_from: Any = None
     idle: Any = None
     clearance: Any = None
+    gap: Any = None
     secant: Any = None
     linear: bool = False
     quadratic: bool = False

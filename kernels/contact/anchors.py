@@ -5,14 +5,14 @@ from functools import cache
 import warp as wp
 
 from ..terms import contact
-from ..terms.contact import local_gap, turned
+from ..terms.contact import turned
 from ..vectors import types
-from .colliders import of_pose, pose_types, shapes, step_poses, surely_apart
+from .colliders import gap_of, of_pose, pose_types, shapes, step_poses
 from .mesh_facets import BEYOND
 from .mesh_geometry import geometry, meshes, motions
 from .mesh_queries import near_lists, queries
 
-local_gap_of, turned_by, slope_of = local_gap, turned, contact.slope
+turned_by, slope_of = turned, contact.slope
 
 
 @cache
@@ -35,7 +35,7 @@ def slip_of(dtype):
 
 
 @cache
-def anchor_vertices(dtype, bounded: bool):
+def anchor_vertices(dtype, solids, bounded: bool):
     """Kernel over friction elements of one collider at the start of a step: anchors, and the rest states of the step.
 
     ε = μN/(kA), with N = −kAφ′(d) at the state, or kA(r − d) if ``bounded``. The anchor of a vertex that comes into contact is
@@ -45,7 +45,7 @@ def anchor_vertices(dtype, bounded: bool):
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
-    rest_type, surely_out, slip = wp.types.vector(8, dtype), surely_apart(dtype), slip_of(dtype)
+    rest_type, gap, slip = wp.types.vector(8, dtype), gap_of(dtype, solids), slip_of(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -68,29 +68,27 @@ def anchor_vertices(dtype, bounded: bool):
         i = stencil[e, 0]
         copy = e // per_copy
         pose = poses.before[copy, collider]
-        if surely_out(pose, shape.core[collider], shape.radius[collider], distance, x[i]):
-            if rest[e][6] != dtype(0.0) or anchors[i][3] != dtype(0.0):
-                rest[e][6] = dtype(0.0)
-                anchors[i] = anchor_type()
-            return
         X = to_local(pose, x[i])
-        d, n = local_gap_of(X, shape.core[collider], shape.radius[collider])
+        d, n = gap(shape, collider, X)
         depth = -slope_of(d, distance)
         if wp.static(bounded):
             depth = wp.max(distance - d, dtype(0.0))
-        r = rest[e]
-        a = X
         if depth > dtype(0.0):
             a = X - slip(anchors[i], X, n)
             now = poses.at[copy, collider]
             target = to_space(now, a)
             normal = turned_by(vec3(now[3], now[4], now[5]), now[6], n)
+            r = rest_type()
             for k in range(3):
                 r[k] = target[k]
                 r[3 + k] = normal[k]
-        r[6] = friction * depth
-        rest[e] = r
-        anchors[i] = anchor_type(a[0], a[1], a[2], friction * depth)
+            r[6] = friction * depth
+            r[7] = rest[e][7]
+            rest[e] = r
+            anchors[i] = anchor_type(a[0], a[1], a[2], friction * depth)
+        elif rest[e][6] != dtype(0.0) or anchors[i][3] != dtype(0.0):
+            rest[e][6] = dtype(0.0)
+            anchors[i] = anchor_type()
 
     return anchor
 

@@ -110,7 +110,7 @@ LEAP, LIFT = wp.constant(10.0), wp.constant(0.04)
 
 
 @cache
-def add_secants(dtype):
+def add_secants(term: Term, dtype):
     """Kernel over contact elements: values[diagonal[vertex]] += kA c nnᵀ [N/m], c = φ″ or the slope of a secant of φ′.
 
     The secant goes from d outwards. For small d, φ″ is so large that Newton's method at most doubles d. The secant ends at the
@@ -120,9 +120,9 @@ def add_secants(dtype):
     vertex. ``clear`` may be None.
     """
     vec3, mat33 = types(dtype)
-    rest_type = wp.types.vector(contact.PARAMETERS, dtype)
-    y_of, rest_of, number = local_coordinate(contact.CONTACT, dtype, True), load(rest_type), load_shared(dtype)
-    measure, gap, slope = contact.measure, contact.gap, contact.slope
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
+    measure, gap, slope = term.measure, term.gap, contact.slope
     bend, mean_bend, gap_after = contact.bend, contact.mean_bend, contact.gap_after
 
     @wp.kernel(module="unique", enable_backward=False)

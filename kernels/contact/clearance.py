@@ -5,8 +5,9 @@ from functools import cache
 import warp as wp
 
 from ..rotation import epsilon
+from ..terms.contact import ROUNDED_BOX
 from ..vectors import types
-from .colliders import local_gap_of, of_pose, shapes, step_poses
+from .colliders import gap_of, of_pose, shapes, step_poses
 
 
 @cache
@@ -40,7 +41,7 @@ def near_colliders(dtype, ended: bool):
     """
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)
-    ball_type = wp.types.vector(4, dtype)
+    gap, ball_type = gap_of(dtype, (ROUNDED_BOX,)), wp.types.vector(4, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def find(
@@ -82,7 +83,7 @@ def near_colliders(dtype, ended: bool):
         if not (off + way <= ball[3]):
             radius = dtype(wp.inf)
             for c in range(shape.radius.shape[0]):
-                d, _n = local_gap_of(to_local(poses.before[copy, c], x0), shape.core[c], shape.radius[c])
+                d, _n = gap(shape, c, to_local(poses.before[copy, c], x0))
                 radius = wp.min(radius, d)
             radius -= clear.distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(x0))
             clear.balls[i] = ball_type(x0[0], x0[1], x0[2], radius)

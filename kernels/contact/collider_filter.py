@@ -6,11 +6,11 @@ from typing import Any
 import warp as wp
 
 from ..rotation import epsilon
-from ..terms.contact import local_gap, turned
+from ..terms.contact import turned
 from ..vectors import types
-from .colliders import kept_part, of_pose, shapes, step_poses, surely_apart
+from .colliders import gap_of, kept_part, of_pose, shapes, step_poses
 
-local_gap_of, turned_by = local_gap, turned
+turned_by = turned
 ROUNDS = wp.constant(6)  # maximum number of tests of a vertex that colliders stop
 SLIDING = wp.constant(2)  # in so many of these it slides; then its move is only shortened, which terminates
 FIRST = wp.constant(wp.int64(2**62))
@@ -87,40 +87,31 @@ def sliding(dtype):
 
 
 @cache
-def stopped_by_shape(dtype):
-    """Device function (X, move, …) → the end of a move from X in the frame of a convex collider, its change, push, and stop.
+def stopped_by_shape(dtype, solids):
+    """Device function (shapes, c, X, move, …) → the end of a move from X in its frame, its change, push, and stop.
 
     A move that would come nearer than ``least`` stops before, at a distance of at most ``landing`` more. With ``slides``, it
-    continues along the plane through that point, which has the whole collider behind it, raised to twice ``least`` so that
+    continues along the plane through that point, which has a convex collider behind it, raised to twice ``least`` so that
     rounding does not stop it. The fourth value is whether the move was stopped.
     """
     vec3, _ = types(dtype)
-    kept = kept_part(dtype)
+    gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
     along, _velocity = sliding(dtype)
 
     @wp.func
-    def stopped(
-        X: vec3,
-        move: vec3,
-        core: vec3,
-        radius: dtype,
-        friction: dtype,
-        least: dtype,
-        landing: dtype,
-        slides: bool,
-    ):
+    def stopped(shape: shapes(dtype), c: int, X: vec3, move: vec3, least: dtype, landing: dtype, slides: bool):
         end = X + move
         change = vec3()
         push = vec3()
-        hit = kept(X, move, core, radius, least) < dtype(1.0)
+        hit = kept(shape, c, X, move, least) < dtype(1.0)
         if hit:
-            t = kept(X, move, core, radius, least + landing)
+            t = kept(shape, c, X, move, least + landing)
             end = X + t * move
             change = (t - dtype(1.0)) * move
             push = change
             if slides:
-                d, n = local_gap_of(end, core, radius)
-                left, push = along(-change, n, friction)
+                d, n = gap(shape, c, end)
+                left, push = along(-change, n, shape.friction[c])
                 end += left + wp.max(dtype(2.0) * least - d, dtype(0.0)) * n
                 change += left
         return end, change, push, hit
@@ -129,7 +120,7 @@ def stopped_by_shape(dtype):
 
 
 @cache
-def outside(dtype):
+def outside(dtype, solids):
     """Device function (x, end, v, …) → final position and velocity of a free vertex that moves from x to ``end``.
 
     In the frame of a collider it moves along a segment, or, if that comes too near, as in :func:`stopped_by_shape`. The third
@@ -137,7 +128,7 @@ def outside(dtype):
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
-    stopped, surely_out = stopped_by_shape(dtype), surely_apart(dtype)
+    gap, stopped = gap_of(dtype, solids), stopped_by_shape(dtype, solids)
     _along, velocity = sliding(dtype)
 
     @wp.func
@@ -167,34 +158,21 @@ def outside(dtype):
             rounds += 1
             for c in range(shape.radius.shape[0]):
                 pose = poses.after[copy, c]
-                began = poses.before[copy, c]
-                # For a collider at rest, the relative move is the move.
-                margin = wp.length(end - x) + rounded
-                if not (began == pose and surely_out(pose, shape.core[c], shape.radius[c], margin, x)):
-                    X = to_local(began, x)
-                    X, less, by, hit = stopped(
-                        X,
-                        to_local(pose, end) - X,
-                        shape.core[c],
-                        shape.radius[c],
-                        shape.friction[c],
-                        rounded,
-                        landing,
-                        rounds <= SLIDING,
-                    )
-                    if hit:
-                        end = to_space(pose, X)
-                        change += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], less)
-                        push += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], by)
-                        cuts = rounds
-                        last = c
+                X = to_local(poses.before[copy, c], x)
+                X, less, by, hit = stopped(shape, c, X, to_local(pose, end) - X, rounded, landing, rounds <= SLIDING)
+                if hit:
+                    end = to_space(pose, X)
+                    change += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], less)
+                    push += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], by)
+                    cuts = rounds
+                    last = c
         if cuts > 0:
             after = velocity(v, move, change, push, h)
             note_cut(notes, copy, i, end - x - move, after - v)
             v = after
         if cuts == ROUNDS:
             for c in range(shape.radius.shape[0]):
-                d, _n = local_gap_of(to_local(poses.after[copy, c], end), shape.core[c], shape.radius[c])
+                d, _n = gap(shape, c, to_local(poses.after[copy, c], end))
                 if d <= dtype(0.0):
                     note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, last)
         return end, v, cuts > 0
@@ -203,11 +181,11 @@ def outside(dtype):
 
 
 @cache
-def entry(dtype):
+def entry(dtype, solids):
     """Device function (x, end, …) that notes a vertex that is not free if it enters a collider between x and ``end``."""
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)
-    kept = kept_part(dtype)
+    gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
 
     @wp.func
     def note_entry(
@@ -226,22 +204,22 @@ def entry(dtype):
         for c in range(shape.radius.shape[0]):
             X = to_local(poses.before[copy, c], x)
             way = to_local(poses.after[copy, c], end) - X
-            d, _n = local_gap_of(X, shape.core[c], shape.radius[c])
+            d, _n = gap(shape, c, X)
             deep = -rounding * wp.max(wp.max(wp.abs(end)), wp.max(wp.abs(X)))  # a vertex that moves along may touch
-            if d > deep and kept(X, way, shape.core[c], shape.radius[c], deep) < dtype(1.0):
+            if d > deep and kept(shape, c, X, way, deep) < dtype(1.0):
                 note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, shape.radius.shape[0])
 
     return note_entry
 
 
 @cache
-def filter_step(dtype):
+def filter_step(dtype, solids):
     """Kernel over vertices at the end of a step: keeps free vertices outside colliders, also on their way.
 
     Free vertices, and their ``move``, which may be None, end as in :func:`outside`. :func:`entry` notes others.
     """
     vec3, _ = types(dtype)
-    end_outside, note_entry = outside(dtype), entry(dtype)
+    end_outside, note_entry = outside(dtype, solids), entry(dtype, solids)
 
     @wp.kernel(module="unique", enable_backward=False)
     def filter_vertices(
@@ -310,10 +288,10 @@ def hold_locked(dtype):
 
 
 @cache
-def note_fixed(dtype):
+def note_fixed(dtype, solids):
     """Kernel over the vertices of all copies that are not free: :func:`entry`, from the start of the step."""
     vec3, _ = types(dtype)
-    note_entry = entry(dtype)
+    note_entry = entry(dtype, solids)
 
     @wp.kernel(module="unique", enable_backward=False)
     def note(

@@ -10,11 +10,12 @@ from functools import cache
 import warp as wp
 
 from ..terms import contact
-from ..terms.contact import local_gap, turned
+from ..terms.contact import gap_to, turned
 from ..vectors import types
 
-local_gap_of, turned_by, beyond_of = local_gap, turned, contact.beyond
-MARCHES = wp.constant(32)  # maximum number of separating planes of a move past a collider
+turned_by = turned
+MARCHES = wp.constant(32)  # maximum number of separating planes of a move past a convex collider
+TRACES = wp.constant(512)  # maximum number of empty balls of a move past another collider
 
 
 @cache
@@ -25,11 +26,12 @@ def pose_types(dtype):
 
 @cache
 def shapes(dtype):
-    """Struct of the shapes of C colliders, see :mod:`..terms.contact`: half sizes of the core, radius, and friction μ."""
+    """Struct of C colliders: ``kind``, see :func:`gap_of`, half sizes of the core, radius, and friction μ."""
     vec3, _ = types(dtype)
 
     @wp.struct
     class Shapes:
+        kind: wp.array(dtype=wp.int32)
         core: wp.array(dtype=vec3)
         radius: wp.array(dtype=dtype)
         friction: wp.array(dtype=dtype)
@@ -66,19 +68,6 @@ def of_pose(dtype):
         return turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], X) + vec3(pose[0], pose[1], pose[2])
 
     return to_local, to_space
-
-
-@cache
-def surely_apart(dtype):
-    """Device function (pose, core, radius, margin, x) → whether a collider is surely farther than ``margin`` from x."""
-    vec3, _ = types(dtype)
-    pose_type, _anchor = pose_types(dtype)
-
-    @wp.func
-    def surely(pose: pose_type, core: vec3, radius: dtype, margin: dtype, x: vec3):
-        return beyond_of(x, vec3(pose[0], pose[1], pose[2]), vec3(pose[3], pose[4], pose[5]), pose[6], core, radius, margin)
-
-    return surely
 
 
 @cache
@@ -152,41 +141,101 @@ def move_colliders(dtype):
 
 
 @cache
-def kept_part(dtype):
-    """Device function (X, move, core, radius, least) → the fraction of a move from X that is kept, in the collider's frame.
+def gap_of(dtype, solids):
+    """Device function (shapes, collider, X) → the signed distance and its gradient, in the frame of the collider.
 
-    Colliders are convex, so the plane through the nearest point, normal to the distance, has the whole collider behind it. The
-    move is kept until it is nearer to that plane than ``least``, or than its start if that is nearer. From there the next plane
-    decides.
+    ``solids`` are the :class:`..terms.contact.Solid` of the scene, the convex ones first. The ``kind`` of a collider is the
+    number of those after its own.
     """
     vec3, _ = types(dtype)
+    kind, first = len(solids) - 1, gap_to(solids[0])
+    others = gap_of(dtype, solids[1:]) if kind else None
 
     @wp.func
-    def kept(X: vec3, move: vec3, core: vec3, radius: dtype, least: dtype):
-        d, n = local_gap_of(X, core, radius)
+    def gap(shape: shapes(dtype), c: int, X: vec3):
+        d = X[1]
+        n = X
+        if wp.static(kind == 0):
+            d, n = first(X, shape.core[c], shape.radius[c])
+        else:
+            if shape.kind[c] == wp.static(kind):
+                d, n = first(X, shape.core[c], shape.radius[c])
+            else:
+                d, n = others(shape, c, X)
+        return d, n
+
+    return gap
+
+
+@cache
+def find_distances(solid):
+    """Kernel over points in the frame of a shape: their signed distances [m], in double precision."""
+    gap = gap_to(solid)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find(
+        # state in
+        points: wp.array(dtype=wp.vec3d),
+        # parameters
+        half: wp.vec3d,
+        radius: wp.float64,
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        d, _n = gap(points[i], half, radius)
+        out[i] = d
+
+    return find
+
+
+@cache
+def kept_part(dtype, solids):
+    """Device function (shapes, collider, X, move, least) → the fraction of a move from X that is kept, in the collider's frame.
+
+    The plane through the nearest point of a convex collider, normal to the distance, has the whole collider behind it. The move
+    is kept until it is nearer to that plane than ``least``, or than its start if that is nearer. From there the next plane
+    decides. Of a collider that is not convex, nothing is within the ball of radius d about a point at the distance d; the move
+    is kept as far as it leads in this ball, less ``least``, or less half of its start if that is nearer (Hart 1996, *Sphere
+    tracing*).
+    """
+    vec3, _ = types(dtype)
+    gap, concave = gap_of(dtype, solids), sum(not each.convex for each in solids)
+
+    @wp.func
+    def kept(shape: shapes(dtype), c: int, X: vec3, move: vec3, least: dtype):
+        d, n = gap(shape, c, X)
         t = dtype(0.0)
         if d > wp.length(move) + least:
             t = dtype(1.0)
         lowest = wp.min(least, d)
+        most = MARCHES
+        if wp.static(concave > 0):
+            if shape.kind[c] < wp.static(concave) and d > dtype(0.0):
+                lowest = wp.min(least, dtype(0.5) * d)
+                most = TRACES
         k = wp.int32(0)
-        while t < dtype(1.0) and k < MARCHES:
+        while t < dtype(1.0) and k < most:
             k += 1
             approach = -wp.dot(move, n)
+            if wp.static(concave > 0):
+                if most == TRACES:
+                    approach = wp.length(move)
             further = d - lowest
             if approach * (dtype(1.0) - t) <= further:
                 t = dtype(1.0)
             elif further > dtype(0.01) * least:
                 t += further / approach
-                d, n = local_gap_of(X + t * move, core, radius)
+                d, n = gap(shape, c, X + t * move)
             else:
-                k = MARCHES
+                k = most
         return t
 
     return kept
 
 
 @cache
-def pose_collider(dtype):
+def pose_collider(dtype, solids):
     """Kernel over contact elements of one collider at the start of a step: rest states with its pose, or with a half-space.
 
     If the prediction x + h v + h² g of a vertex crosses the collider, it has contact with the half-space behind the tangent
@@ -195,8 +244,8 @@ def pose_collider(dtype):
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
-    kept, behind, rest_type = kept_part(dtype), half_space(dtype), wp.types.vector(contact.PARAMETERS, dtype)
-    surely_out = surely_apart(dtype)
+    gap, kept, behind = gap_of(dtype, solids), kept_part(dtype, solids), half_space(dtype)
+    rest_type = wp.types.vector(contact.PARAMETERS, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_pose(
@@ -227,17 +276,12 @@ def pose_collider(dtype):
             way = h * (v[i] + h * gravity[i // per_gravity])
             before = poses.before[copy, collider]
             after = poses.after[copy, collider]
-            t = dtype(1.0)
-            X = x[i]
-            # For a collider at rest, the relative move is the move.
-            if not (before == after and surely_out(before, core, radius, wp.length(way) + least, X)):
-                ahead = X + way
-                X = to_local(before, X)
-                way = to_local(after, ahead) - X
-                t = kept(X, way, core, radius, least)
+            X = to_local(before, x[i])
+            way = to_local(after, x[i] + way) - X
+            t = kept(shape, collider, X, way, least)
             if t < dtype(1.0):
                 X = X + t * way
-                d, n = local_gap_of(X, core, radius)
+                d, n = gap(shape, collider, X)
                 position = to_space(pose, X - d * n)
                 pose = behind(position, turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], n))
                 core = vec3(dtype(wp.inf), dtype(wp.inf), dtype(wp.inf))

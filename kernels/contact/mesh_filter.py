@@ -5,20 +5,20 @@ from functools import cache
 import warp as wp
 
 from ..rotation import epsilon
-from ..terms.contact import local_gap, turned
+from ..terms.contact import turned
 from ..vectors import types
 from .collider_filter import ROUNDS, SLIDING, FilterNotes, note_cut, note_inside, sliding, stopped_by_shape
-from .colliders import kept_part, of_pose, shapes
+from .colliders import gap_of, kept_part, of_pose, shapes
 from .mesh_facets import SLIDES
 from .mesh_geometry import geometry, meshes, motions
 from .mesh_queries import near_lists, queries
 
-local_gap_of, turned_by = local_gap, turned
+turned_by = turned
 CARRIES = wp.constant(16)  # how often moving triangles may carry a vertex along in a step
 
 
 @cache
-def filter_meshes(dtype):
+def filter_meshes(dtype, solids):
     """Kernel over vertices at the end of a step: :func:`.collider_filter.filter_step` for colliders that include meshes.
 
     A vertex that a mesh stops moves with the triangle that stopped it, and slides along it until another one stops it. Each
@@ -26,7 +26,7 @@ def filter_meshes(dtype):
     """
     vec3, _mat33 = types(dtype)
     to_local, to_space = of_pose(dtype)
-    kept_of, stopped_by = kept_part(dtype), stopped_by_shape(dtype)
+    gap, kept_of, stopped_by = gap_of(dtype, solids), kept_part(dtype, solids), stopped_by_shape(dtype, solids)
     along, velocity = sliding(dtype)
     corners, from_triangle, carry = geometry(dtype)
     _nearest, sweep, has_list, is_alone, _listed = queries(dtype)
@@ -160,21 +160,13 @@ def filter_meshes(dtype):
                     if hit > free:
                         note_inside(notes, copy, c, step, vertex, per_copy, wp.where(free > 0, c, count))
                 elif free > 0:
-                    found, less, by, short = stopped_by(
-                        p,
-                        way,
-                        shape.core[c],
-                        shape.radius[c],
-                        shape.friction[c],
-                        motion.least + rounding,
-                        motion.landing,
-                        rounds <= SLIDING,
-                    )
+                    least = motion.least + rounding
+                    found, less, by, short = stopped_by(shape, c, p, way, least, motion.landing, rounds <= SLIDING)
                     hit = wp.where(short, 1, 0)
                 else:
-                    d, _n = local_gap_of(p, shape.core[c], shape.radius[c])
+                    d, _n = gap(shape, c, p)
                     deep = -wp.max(rounding, dtype(8.0) * epsilon(motion.least) * wp.max(wp.abs(p)))
-                    if d > deep and kept_of(p, way, shape.core[c], shape.radius[c], deep) < one:
+                    if d > deep and kept_of(shape, c, p, way, deep) < one:
                         note_inside(notes, copy, c, step, vertex, per_copy, count)
                 if hit > 0 and free > 0:
                     end = to_space(pose, found)
@@ -200,7 +192,7 @@ def filter_meshes(dtype):
                     )
                     through = face >= 0
                 else:
-                    d, _n = local_gap_of(p + way, shape.core[c], shape.radius[c])
+                    d, _n = gap(shape, c, p + way)
                     through = d <= zero
                 if through:
                     note_inside(notes, copy, c, step, vertex, per_copy, last)

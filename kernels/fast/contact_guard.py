@@ -10,10 +10,11 @@ import warp as wp
 
 from ..contact.anchors import slip_of
 from ..contact.collider_filter import FilterNotes, outside
-from ..contact.colliders import local_gap_of, of_pose, pose_types, shapes, step_poses, turned_by
+from ..contact.colliders import gap_of, of_pose, pose_types, shapes, step_poses, turned_by
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..rotation import epsilon
+from ..terms.contact import ROUNDED_BOX
 from ..vectors import types
 
 
@@ -88,7 +89,8 @@ def touching_step(dtype, symplectic: bool):
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
     to_local, _to_space = of_pose(dtype)
-    end_outside, step, ball_type = outside(dtype), kick_and_drift(dtype, symplectic), wp.types.vector(4, dtype)
+    gap, end_outside = gap_of(dtype, (ROUNDED_BOX,)), outside(dtype, (ROUNDED_BOX,))
+    step, ball_type = kick_and_drift(dtype, symplectic), wp.types.vector(4, dtype)
     put, slip_along = store(ball_type), slip_of(dtype)
 
     @wp.func
@@ -99,7 +101,7 @@ def touching_step(dtype, symplectic: bool):
         for c in range(guard.shape.radius.shape[0]):
             pose = guard.poses.before[copy, c]
             X = to_local(pose, x)
-            d, n = local_gap_of(X, guard.shape.core[c], guard.shape.radius[c])
+            d, n = gap(guard.shape, c, X)
             depth = wp.max(guard.distance - d, dtype(0.0))
             most = guard.shape.friction[c] * depth
             slip = vec3()
@@ -126,8 +128,7 @@ def touching_step(dtype, symplectic: bool):
         if held == 0:
             radius = dtype(wp.inf)
             for c in range(guard.shape.radius.shape[0]):
-                X = to_local(guard.poses.after[copy, c], end)
-                d, _n = local_gap_of(X, guard.shape.core[c], guard.shape.radius[c])
+                d, _n = gap(guard.shape, c, to_local(guard.poses.after[copy, c], end))
                 radius = wp.min(radius, d)
             radius -= guard.distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(end))
         put(guard.balls, i, ball_type(end[0], end[1], end[2], radius))

@@ -7,17 +7,18 @@ With the contact distance r and τ = r/2 (the two stages of Chen et al. 2025, *O
 φ is C² at τ and C¹ at r. The force is a pressure: under a load p the gap is r − p/k, or τ²k/p if that is below τ. Below δ =
 r/1000 φ is its Taylor polynomial of second degree, so that a vertex that starts inside a collider is pushed out.
 
-Stencil (x₀), y = x₀, measure A. Rest state: the pose of the collider (position, quaternion x, y, z, w), the half sizes of its
-core box, its radius, r and A. A collider is the set of points at most its radius from its core. The core of a sphere is a
-point, that of a capsule a segment; a box has radius 0. An infinite core is the half-space below y = 0. Colliders are convex, so
-∂²d ⪰ 0 and φ′∂²d ⪯ 0; clamping drops this part.
+Stencil (x₀), y = x₀, measure A. Rest state: the pose of the collider (position, quaternion x, y, z, w), the half sizes and the
+radius of its :class:`Solid`, r and A. Infinite half sizes are the half-space below y = 0. If the shape is convex, ∂²d ⪰ 0 and
+φ′∂²d ⪯ 0; clamping drops this part, also of other shapes.
 """
 
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
+from ..rotation import epsilon
 from ..term import Term
 from .attachment import weight
 
@@ -50,65 +51,71 @@ def turned(u: Any, w: Any, v: Any):
 
 
 @wp.func
-def from_core(X: Any, half: Any):
-    """The vector to X from the nearest point of a core, a box with half sizes, in its frame; 0 inside."""
-    return X - wp.min(wp.max(X, -half), half)
-
-
-@wp.func
-def local_gap(X: Any, half: Any, radius: Any):
-    """Signed distance d of X to the surface of a collider and the outward normal ∇d, in the frame of the collider."""
+def rounded_box(X: Any, half: Any, radius: Any):
+    """The points at most a radius from a box; the box of a sphere is a point, that of a capsule a segment."""
     zero = type(radius)(0.0)
-    d = X[1]
-    n = wp.vector(zero, type(radius)(1.0), zero)
-    if wp.isfinite(half[0]):
-        away = from_core(X, half)
-        l = wp.length(away)
-        if l > zero:
-            d = l - radius
-            n = away / l
-        else:
-            axis = wp.int32(0)
-            for i in range(1, 3):
-                if half[i] - wp.abs(X[i]) < half[axis] - wp.abs(X[axis]):
-                    axis = i
-            d = wp.abs(X[axis]) - half[axis] - radius
-            n[1] = zero
-            n[axis] = wp.where(X[axis] < zero, type(radius)(-1.0), type(radius)(1.0))
+    away = X - wp.min(wp.max(X, -half), half)
+    l = wp.length(away)
+    d = l - radius
+    n = wp.vector(zero, zero, zero)
+    if l > zero:
+        n = away / l
+    else:
+        axis = wp.int32(0)
+        for i in range(1, 3):
+            if half[i] - wp.abs(X[i]) < half[axis] - wp.abs(X[axis]):
+                axis = i
+        d = wp.abs(X[axis]) - half[axis] - radius
+        n[axis] = wp.where(X[axis] < zero, type(radius)(-1.0), type(radius)(1.0))
     return d, n
 
 
 @wp.func
-def gap(y: Any, rest: Any):
-    """Signed distance of a vertex, and the outward normal, in world space."""
-    u = wp.vector(rest[3], rest[4], rest[5])
-    half = wp.vector(rest[7], rest[8], rest[9])
-    away = y[0] - wp.vector(rest[0], rest[1], rest[2])
+def rounded_box_curvature(X: Any, half: Any, radius: Any):
+    """That of the distance to a point, a line or a plane, according to the region of X."""
+    H = wp.matrix(shape=(3, 3), dtype=X.dtype)
+    away = X - wp.min(wp.max(X, -half), half)
     l = wp.length(away)
-    if wp.max(half) == y.dtype(0.0) and l > y.dtype(0.0):  # a sphere, which no rotation changes
-        return l - rest[10], away / l
-    d, n = local_gap(turned(-u, rest[6], away), half, rest[10])
-    return d, turned(u, rest[6], n)
-
-
-@wp.func
-def curvature(y: Any, rest: Any, n: Any):
-    """∂²d: that of the distance to a point, a line or a plane, according to the region of the vertex."""
-    u = wp.vector(rest[3], rest[4], rest[5])
-    H = wp.matrix(shape=(3, 3), dtype=y.dtype)
-    if wp.isfinite(rest[7]):
-        X = turned(-u, rest[6], y[0] - wp.vector(rest[0], rest[1], rest[2]))
-        away = from_core(X, wp.vector(rest[7], rest[8], rest[9]))
-        l = wp.length(away)
-        if l > y.dtype(0.0):
-            H -= wp.outer(n, n) / l
-            for i in range(3):
-                if away[i] != y.dtype(0.0):
-                    axis = wp.vector(y.dtype(0.0), y.dtype(0.0), y.dtype(0.0))
-                    axis[i] = y.dtype(1.0)
-                    axis = turned(u, rest[6], axis)
-                    H += wp.outer(axis, axis) / l
+    if l > X.dtype(0.0):
+        H -= wp.outer(away / l, away / l) / l
+        for i in range(3):
+            if away[i] != X.dtype(0.0):
+                H[i, i] += X.dtype(1.0) / l
     return H
+
+
+class Solid(NamedTuple):
+    """A shape of colliders: all points with d ≤ 0.
+
+    Attributes:
+        gap: Device function (X, half, radius) → the signed distance d of a point X and ∇d, in the frame of the collider. half
+            and radius are the ``core`` of the collider: the shape is within ``radius`` of the box with half sizes ``half``.
+        convex: Whether the shape is convex.
+        curvature: Device function (X, half, radius) → ∂²d; None to find it by differences of ∇d.
+    """
+
+    gap: Any
+    convex: bool = True
+    curvature: Any = None
+
+
+ROUNDED_BOX = Solid(rounded_box, curvature=rounded_box_curvature)
+
+
+@cache
+def gap_to(solid: Solid):
+    """Device function (X, half, radius) → d and ∇d to a shape, or to the half-space below y = 0 if ``half`` is infinite."""
+    gap_of_solid = solid.gap
+
+    @wp.func
+    def gap(X: Any, half: Any, radius: Any):
+        d = X[1]
+        n = wp.vector(type(radius)(0.0), type(radius)(1.0), type(radius)(0.0))
+        if wp.isfinite(half[0]):
+            d, n = gap_of_solid(X, half, radius)
+        return d, n
+
+    return gap
 
 
 @wp.func
@@ -189,40 +196,6 @@ def idle(y: Any, rest: Any, margin: Any):
 
 
 @wp.func
-def clearance(y: Any, rest: Any):
-    """d − r, minus a bound of rounding."""
-    d, _n = gap(y, rest)
-    return y.dtype(0.999) * (d - rest[11])
-
-
-@wp.func
-def energy(y: Any, rest: Any):
-    u = y.dtype(0.0)
-    if idle(y, rest, y.dtype(0.0)) == 0:
-        d, _n = gap(y, rest)
-        u = potential(d, rest[11])
-    return u
-
-
-@wp.func
-def gradient(y: Any, rest: Any):
-    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    if idle(y, rest, y.dtype(0.0)) == 0:
-        d, n = gap(y, rest)
-        g[0] = slope(d, rest[11]) * n
-    return g
-
-
-@wp.func
-def hessian(y: Any, rest: Any, negative: Any):
-    d, n = gap(y, rest)
-    H = bend(d, rest[11]) * wp.outer(n, n)
-    if negative != y.dtype(0.0) and d < rest[11]:
-        H += negative * slope(d, rest[11]) * curvature(y, rest, n)
-    return H
-
-
-@wp.func
 def gap_after(d: Any, r: Any, compliance: Any):
     """The distance d* with (d* − d)/c = −φ′(d*), in closed form in each stage; r for an infinite compliance c."""
     half = type(r)(0.5)
@@ -241,32 +214,6 @@ def gap_after(d: Any, r: Any, compliance: Any):
             if after < delta:
                 after = (d + type(r)(2.0) * c / delta) / (type(r)(1.0) + c / (delta * delta))
     return after
-
-
-@wp.func
-def prox(v: Any, rest: Any, compliance: Any):
-    """The prox, along n."""
-    d, n = gap(v, rest)
-    p = v
-    p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
-    return p
-
-
-@wp.func
-def prox_from(y: Any, v: Any, rest: Any, compliance: Any):
-    """The prox of the half-space tangent to the collider nearest to y, for v may be nearer to another side."""
-    d, n = gap(y, rest)
-    d += wp.dot(n, v[0] - y[0])
-    p = v
-    p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
-    return p
-
-
-@wp.func
-def constraint(y: Any, rest: Any):
-    """C = −√(2φ), which is d − r for d ≥ τ."""
-    d, _n = gap(y, rest)
-    return -wp.sqrt(y.dtype(2.0) * potential(d, rest[11]))
 
 
 @wp.func
@@ -291,75 +238,155 @@ def constraint_bend(d: Any, r: Any):
 
 
 @wp.func
-def constraint_gradient(y: Any, rest: Any):
-    d, n = gap(y, rest)
-    return wp.matrix_from_rows(constraint_slope(d, rest[11]) * n)
-
-
-@wp.func
-def constraint_hessian(y: Any, rest: Any):
-    d, n = gap(y, rest)
-    return constraint_bend(d, rest[11]) * wp.outer(n, n) + constraint_slope(d, rest[11]) * curvature(y, rest, n)
-
-
-@wp.func
-def stiffening(y: Any, rest: Any, tension: Any):
-    """For tension < 0, a pressure, the stiffness along n. The part from the curvature of the collider is omitted."""
-    d, n = gap(y, rest)
-    return wp.matrix_from_rows(wp.sqrt(wp.max(tension * constraint_bend(d, rest[11]), y.dtype(0.0))) * n)
-
-
-@wp.func
-def bounded_energy(y: Any, rest: Any):
-    d, _n = gap(y, rest)
-    depth = wp.max(rest[11] - d, y.dtype(0.0))
-    return y.dtype(0.5) * depth * depth
-
-
-@wp.func
-def bounded_gradient(y: Any, rest: Any):
-    d, n = gap(y, rest)
-    return wp.matrix_from_rows(-wp.max(rest[11] - d, y.dtype(0.0)) * n)
-
-
-@wp.func
 def bounded_hessian(y: Any, rest: Any, negative: Any):
     """I: the Hessian of contact with friction at any distance, and a bound of that of contact alone."""
     return wp.identity(n=3, dtype=y.dtype)
 
 
-BOUNDED_CONTACT = Term(
-    name="Contact",
-    vertices=1,
-    rows=1,
-    parameters=PARAMETERS,
-    rest_state=rest_state,
-    weight=weight,
-    measure=measure,
-    energy=bounded_energy,
-    gradient=bounded_gradient,
-    hessian=bounded_hessian,
-)
+@cache
+def contact(solid: Solid):
+    """The :class:`..term.Term` of contact with colliders of a shape."""
+    local_gap, curvature_of = gap_to(solid), solid.curvature
 
-CONTACT = Term(
-    name="Contact",
-    vertices=1,
-    rows=1,
-    parameters=PARAMETERS,
-    rest_state=rest_state,
-    weight=weight,
-    measure=measure,
-    energy=energy,
-    gradient=gradient,
-    hessian=hessian,
-    prox=prox,
-    prox_from=prox_from,
-    idle=idle,
-    clearance=clearance,
-    constraint=constraint,
-    constraint_gradient=constraint_gradient,
-    constraint_hessian=constraint_hessian,
-    stiffening=stiffening,
-    stiffening_rows=1,
-    bounded=BOUNDED_CONTACT,
-)
+    @wp.func
+    def gap(y: Any, rest: Any):
+        """Signed distance of a vertex, and the outward normal, in world space."""
+        u = wp.vector(rest[3], rest[4], rest[5])
+        X = turned(-u, rest[6], y[0] - wp.vector(rest[0], rest[1], rest[2]))
+        d, n = local_gap(X, wp.vector(rest[7], rest[8], rest[9]), rest[10])
+        return d, turned(u, rest[6], n)
+
+    @wp.func
+    def curvature(y: Any, rest: Any):
+        """∂²d, by central differences of ∇d if the shape has no function for it."""
+        u = wp.vector(rest[3], rest[4], rest[5])
+        half = wp.vector(rest[7], rest[8], rest[9])
+        H = wp.matrix(shape=(3, 3), dtype=y.dtype)
+        if wp.isfinite(rest[7]):
+            X = turned(-u, rest[6], y[0] - wp.vector(rest[0], rest[1], rest[2]))
+            if wp.static(solid.curvature is not None):
+                H = curvature_of(X, half, rest[10])
+            else:
+                e = wp.cbrt(epsilon(rest[11])) * rest[11]
+                for i in range(3):
+                    step = wp.vector(y.dtype(0.0), y.dtype(0.0), y.dtype(0.0))
+                    step[i] = e
+                    _ahead, n_ahead = local_gap(X + step, half, rest[10])
+                    _behind, n_behind = local_gap(X - step, half, rest[10])
+                    H[i] = (n_ahead - n_behind) / (e + e)
+            for _side in range(2):  # to R H Rᵀ
+                for i in range(3):
+                    H[i] = turned(u, rest[6], H[i])
+                H = wp.transpose(H)
+        return H
+
+    @wp.func
+    def clearance(y: Any, rest: Any):
+        """d − r, minus a bound of rounding."""
+        d, _n = gap(y, rest)
+        return y.dtype(0.999) * (d - rest[11])
+
+    @wp.func
+    def energy(y: Any, rest: Any):
+        u = y.dtype(0.0)
+        if idle(y, rest, y.dtype(0.0)) == 0:
+            d, _n = gap(y, rest)
+            u = potential(d, rest[11])
+        return u
+
+    @wp.func
+    def gradient(y: Any, rest: Any):
+        g = wp.matrix(shape=(1, 3), dtype=y.dtype)
+        if idle(y, rest, y.dtype(0.0)) == 0:
+            d, n = gap(y, rest)
+            g[0] = slope(d, rest[11]) * n
+        return g
+
+    @wp.func
+    def hessian(y: Any, rest: Any, negative: Any):
+        d, n = gap(y, rest)
+        H = bend(d, rest[11]) * wp.outer(n, n)
+        factor = negative
+        if wp.static(not solid.convex):  # the part may have both signs
+            factor = wp.max(negative, y.dtype(0.0))
+        if factor != y.dtype(0.0) and d < rest[11]:
+            H += factor * slope(d, rest[11]) * curvature(y, rest)
+        return H
+
+    @wp.func
+    def prox(v: Any, rest: Any, compliance: Any):
+        """The prox, along n."""
+        d, n = gap(v, rest)
+        p = v
+        p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
+        return p
+
+    @wp.func
+    def prox_from(y: Any, v: Any, rest: Any, compliance: Any):
+        """The prox of the half-space tangent to the collider nearest to y, for v may be nearer to another side."""
+        d, n = gap(y, rest)
+        d += wp.dot(n, v[0] - y[0])
+        p = v
+        p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
+        return p
+
+    @wp.func
+    def constraint(y: Any, rest: Any):
+        """C = −√(2φ), which is d − r for d ≥ τ."""
+        d, _n = gap(y, rest)
+        return -wp.sqrt(y.dtype(2.0) * potential(d, rest[11]))
+
+    @wp.func
+    def constraint_gradient(y: Any, rest: Any):
+        d, n = gap(y, rest)
+        return wp.matrix_from_rows(constraint_slope(d, rest[11]) * n)
+
+    @wp.func
+    def constraint_hessian(y: Any, rest: Any):
+        d, n = gap(y, rest)
+        return constraint_bend(d, rest[11]) * wp.outer(n, n) + constraint_slope(d, rest[11]) * curvature(y, rest)
+
+    @wp.func
+    def stiffening(y: Any, rest: Any, tension: Any):
+        """For tension < 0, a pressure, the stiffness along n. The part from the curvature of the collider is omitted."""
+        d, n = gap(y, rest)
+        return wp.matrix_from_rows(wp.sqrt(wp.max(tension * constraint_bend(d, rest[11]), y.dtype(0.0))) * n)
+
+    @wp.func
+    def bounded_energy(y: Any, rest: Any):
+        d, _n = gap(y, rest)
+        depth = wp.max(rest[11] - d, y.dtype(0.0))
+        return y.dtype(0.5) * depth * depth
+
+    @wp.func
+    def bounded_gradient(y: Any, rest: Any):
+        d, n = gap(y, rest)
+        return wp.matrix_from_rows(-wp.max(rest[11] - d, y.dtype(0.0)) * n)
+
+    bounded = Term("Contact", 1, 1, PARAMETERS, rest_state, weight, measure, bounded_energy, bounded_gradient, bounded_hessian)
+    return Term(
+        name="Contact",
+        vertices=1,
+        rows=1,
+        parameters=PARAMETERS,
+        rest_state=rest_state,
+        weight=weight,
+        measure=measure,
+        energy=energy,
+        gradient=gradient,
+        hessian=hessian,
+        prox=prox,
+        prox_from=prox_from,
+        idle=idle,
+        clearance=clearance,
+        gap=gap,
+        constraint=constraint,
+        constraint_gradient=constraint_gradient,
+        constraint_hessian=constraint_hessian,
+        stiffening=stiffening,
+        stiffening_rows=1,
+        bounded=bounded,
+    )
+
+
+CONTACT = contact(ROUNDED_BOX)

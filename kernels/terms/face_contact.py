@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..term import Term
-from .contact import AREA, CONTACT, bounded_energy, bounded_gradient
+from .contact import AREA, CONTACT
 from .contact import rest_state as of_vertices
 
 WEIGHTS, PARAMETERS = AREA, AREA + 4
@@ -54,28 +53,22 @@ def bounded_hessian(y: Any, rest: Any, negative: Any):
 
 
 _OF_TRIANGLES: dict[str, Any] = {
+    "name": "FaceContact",
     "vertices": 3,
     "parameters": PARAMETERS,
     "rest_state": rest_state,
     "weight": weight,
     "measure": measure,
 }
-BOUNDED_FACE_CONTACT = Term(
-    name="FaceContact",
-    rows=1,
-    energy=bounded_energy,
-    gradient=bounded_gradient,
-    hessian=bounded_hessian,
-    **_OF_TRIANGLES,
-)
+BOUNDED_FACE_CONTACT = replace(CONTACT.bounded, hessian=bounded_hessian, **_OF_TRIANGLES)
 
 FACE_CONTACT = replace(
     CONTACT,
-    name="FaceContact",
     **_OF_TRIANGLES,
     any_weight=any_weight,
     prox_from=None,
     idle=None,
     clearance=None,
+    gap=None,
     bounded=BOUNDED_FACE_CONTACT,
 )

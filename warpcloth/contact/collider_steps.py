@@ -71,7 +71,8 @@ class ColliderSteps:
         pose_type, self._anchor_type = kernels.pose_types(model.dtype)
         self.shapes = kernels.shapes(model.dtype)()
         self._friction = model.array(declared.friction, model.dtype)  # the struct does not keep it alive
-        self.shapes.core, self.shapes.radius, self.shapes.friction = declared.core, declared.radius, self._friction
+        self.shapes.kind, self.shapes.core, self.shapes.radius = declared.kind, declared.core, declared.radius
+        self.shapes.friction = self._friction
         self._dim, self.poses = (model.copies, len(declared.radius)), kernels.step_poses(model.dtype)()
         for name in ("before", "at", "after"):
             setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
@@ -103,7 +104,7 @@ class ColliderSteps:
                 self.faces = MeshFaces(model, self.meshes, h)
                 if any(elements.on_faces for elements in model.terms):
                     self.face_steps = FaceSteps(model, self.meshes, self.bounded)
-        self._filter = model.kernel(filter_step if self.meshes is None else filter_meshes, model.dtype)
+        self._filter = model.kernel(filter_step if self.meshes is None else filter_meshes, model.dtype, declared.solids)
         if model.mobility is not None:
             self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(hold_locked, model.dtype)
             self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
@@ -130,10 +131,10 @@ class ColliderSteps:
                 of_mesh = self.meshes.contact(elements)
             launch = partial(self._on_mesh, of_mesh, anchors, state.v)
         elif elements.term is FRICTION:
-            kernel = model.kernel(anchor_vertices, model.dtype, self.bounded)
+            kernel = model.kernel(anchor_vertices, model.dtype, declared.solids, self.bounded)
             launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
         elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
-            launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype), c, state.v)
+            launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype, declared.solids), c, state.v)
         else:
             launch = None
         refresh = Refresh(STEP, partial(self._refresh, first, launch))

@@ -70,10 +70,12 @@ class PresentContact:
                 on_mesh = self._meshes.contact(elements)
             self._launches.append(partial(on_mesh, own))
         elif elements.term is FRICTION:
-            kernel = model.kernel(anchor_vertices, model.dtype, steps.bounded)
+            kernel = model.kernel(anchor_vertices, model.dtype, model.colliders.solids, steps.bounded)
             self._launches.append(partial(self._anchor, kernel, own, anchors))
         elif model.colliders.moves[c]:
-            self._launches.append(partial(self._pose, model.kernel(kernels.pose_collider, model.dtype), own))
+            self._launches.append(
+                partial(self._pose, model.kernel(kernels.pose_collider, model.dtype, model.colliders.solids), own)
+            )
         return own
 
     def _launch_of_faces(self, elements):

@@ -33,7 +33,7 @@ class ContactGuard:
         fixed = np.flatnonzero(model.inverse_mass.numpy() == 0.0) if self.moving else []
         self._fixed, self._numbers = (int32_array(each, model.device) for each in (fixed, np.arange(len(fixed))))
         self._fixed_before = wp.zeros(len(fixed), dtype=model.vec3, device=model.device)
-        self._copy, self._note = model.kernel(copy_chosen, model.dtype), model.kernel(note_fixed, model.dtype)
+        self._copy, self._note = model.kernel(copy_chosen, model.dtype), model.kernel(note_fixed, model.dtype, declared.solids)
         self._contact = [elements for elements in model.terms if elements.collider is not None]
         stiffness = np.zeros((len(declared.moves), model.count))
         for elements in self._contact:

@@ -16,7 +16,9 @@ class DeviceColliders(NamedTuple):
     Attributes:
         keyframes: Poses of all colliders, one collider after another: position [m] and quaternion (x, y, z, w).
         firsts: Index of the first pose of each, (C + 1,) int32.
-        core, radius: Shapes, (C,) vectors and (C,) numbers [m], see :mod:`warpcloth.kernels.terms.contact`.
+        solids: The :class:`warpcloth.kernels.terms.contact.Solid` of all, the convex ones first.
+        kind: Of each, the number of the shapes after its own, (C,) int32.
+        core, radius: Sizes of shapes, (C,) vectors and (C,) numbers [m], see :mod:`warpcloth.kernels.terms.contact`.
         distance: Contact distance [m].
         friction: μ of each, (C,) on the host.
         moves, half_space: Whether each has more than one pose, and whether it is a half-space, lists of C.
@@ -26,6 +28,8 @@ class DeviceColliders(NamedTuple):
 
     keyframes: wp.array
     firsts: wp.array
+    solids: tuple
+    kind: wp.array
     core: wp.array
     radius: wp.array
     distance: float
@@ -37,7 +41,7 @@ class DeviceColliders(NamedTuple):
 
     @property
     def arrays(self):
-        found = [self.keyframes, self.firsts, self.core, self.radius]
+        found = [self.keyframes, self.firsts, self.kind, self.core, self.radius]
         return found if self.meshes is None else found + self.meshes.arrays
 
 
@@ -48,11 +52,15 @@ def colliders_on(model, scene):
     centred = [collider.centred() for collider in scene.colliders]
     poses = [collider.poses for collider in centred]
     cores, radii = zip(*(collider.core for collider in scene.colliders), strict=True)
+    solids = tuple(sorted(dict.fromkeys(each.solid for each in scene.colliders), key=lambda solid: not solid.convex))
+    kinds = [len(solids) - 1 - solids.index(each.solid) for each in scene.colliders]
     refuse_large(scene, model.numpy_dtype)
     firsts = np.cumsum([0, *map(len, poses)])
     return DeviceColliders(
         keyframes=model.array(np.concatenate(poses), pose_types(model.dtype)[0]),
         firsts=wp.array(firsts.astype(np.int32), dtype=wp.int32, device=model.device),
+        solids=solids,
+        kind=model.array(kinds, wp.int32),
         core=model.array(np.array(cores), model.vec3),
         radius=model.array(np.array(radii), model.dtype),
         distance=float(scene.contact.distance),

@@ -15,6 +15,7 @@ from ..kernels.copy import repeat_indices
 from ..kernels.step import lock
 from ..kernels.term import Term
 from ..kernels.terms.air import AIR
+from ..kernels.terms.contact import Solid
 from ..kernels.vectors import types
 from ..mesh.selection import distinct_vertices
 from ..terms.refresh import STEP, Moment
@@ -284,7 +285,7 @@ class Model:
         """Returns the kernel of ``factory(*key)``, and notes its name for :meth:`report`, as factory(variant).Term."""
         kernel = factory(*key)
         terms = [part.name for part in key if isinstance(part, Term | PairTerm)]
-        terms += [part.term.name for parts in key if isinstance(parts, tuple) for part in parts]
+        terms += [part.term.name for parts in key if isinstance(parts, tuple) for part in parts if not isinstance(part, Solid)]
         variants = [name for name, part in zip(inspect.signature(factory).parameters, key, strict=False) if part is True]
         variant = f"({', '.join(variants)})" if variants else ""
         self.kernels.add(".".join([f"{factory.__name__}{variant}", *terms]))

@@ -8,7 +8,6 @@ from ..core.dynamic import dynamic_of
 from ..core.hessian import Hessian
 from ..kernels.contact.clear_elements import add_hessian, add_secants
 from ..kernels.term import HessianPolicy
-from ..kernels.terms.contact import CONTACT
 from ..model.host_values import host_values
 from .search import HALVINGS, Search
 
@@ -151,7 +150,7 @@ class ContactSystem(CorrectedSystem):
 
     def _kernel_of(self, term):
         """Returns the kernel that adds the blocks of a term."""
-        return self.model.kernel(*((add_secants,) if term is CONTACT else (add_hessian, term)), self.model.dtype)
+        return self.model.kernel(add_secants if term.gap else add_hessian, term, self.model.dtype)
 
     def _launch_assemble(self):
         self.matrix.assemble(self.x, 0.0, self._search.correction, self._launch_touching)
@@ -160,7 +159,7 @@ class ContactSystem(CorrectedSystem):
         """Adds the blocks of vertices near colliders."""
         for elements, kernel in self._touching:
             given = [*elements.arguments, elements.clear, self._diagonal, self.x, self._search.correction]
-            if elements.term is CONTACT:
+            if elements.term.gap:
                 given += [self._gradient, self._inertia, self._marks.array, self.model.per_copy]
             self.model.launch(kernel, elements.count, given, [values])
 

@@ -2,12 +2,17 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
+import warp as wp
 
 from ..base.checks import array, as_array, choice, keep_plain, number, shown
+from ..base.quiet import find_device
+from ..base.turns import in_turn
 from ..base.types import Converted, default
+from ..kernels.contact.colliders import find_distances
+from ..kernels.terms.contact import ROUNDED_BOX, Solid
 
 # With the default stiffness, the weight of one layer compresses the contact distance by this fraction.
 _SAG = 0.1
@@ -48,7 +53,10 @@ class Contact:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Collider:
-    """The base class of colliders.
+    """The base class of colliders: a frame that moves by keyframes, and a shape in it.
+
+    Another shape is a subclass with a ``solid``, a :class:`warpcloth.kernels.terms.contact.Solid`, whose device function gives
+    the signed distance d of a point and ∇d from the numbers in ``core``.
 
     Attributes:
         position: Position of its centre, (3,) [m], or positions at frames 0 … F−1 of the scene, (F, 3).
@@ -60,6 +68,8 @@ class Collider:
     Raises:
         ValueError: A value is not allowed.
     """
+
+    solid: ClassVar[Solid] = ROUNDED_BOX
 
     position: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 0.0, 0.0))
     rotation: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 0.0, 0.0, 1.0))
@@ -93,7 +103,7 @@ class Collider:
 
     @property
     def core(self) -> tuple[np.ndarray, float]:
-        """Half sizes of a box (3,), and the radius by which it is inflated [m], see :mod:`warpcloth.kernels.terms.contact`."""
+        """Half sizes of a box (3,), and the radius by which it is inflated [m] to contain the shape, whose sizes these are."""
         raise NotImplementedError  # each shape has its own
 
     @property
@@ -162,10 +172,7 @@ class Collider:
         """Returns signed distances (…,) [m] of points (…, 3) [m] to the surface at a frame, negative inside."""
         pose, (half, radius) = self.poses[min(frame, len(self.poses) - 1)], self.core
         local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
-        if np.isinf(half[0]):
-            return local[..., 1]
-        away = np.abs(local) - half
-        return np.linalg.norm(np.maximum(away, 0.0), axis=-1) + np.minimum(away.max(axis=-1), 0.0) - radius
+        return _distances(self.solid, local.reshape(-1, 3), half, radius).reshape(local.shape[:-1])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -260,6 +267,16 @@ class Box(Collider):
     @property
     def core(self) -> tuple[np.ndarray, float]:
         return 0.5 * self.size, 0.0
+
+
+@in_turn
+def _distances(solid, points, half, radius):
+    """Signed distances (k,) of points (k, 3) in the frame of a shape, by its device function."""
+    with wp.ScopedDevice(find_device("cpu")):
+        out = wp.zeros(len(points), dtype=wp.float64)
+        given = [wp.array(points, dtype=wp.vec3d), wp.vec3d(half), float(radius)]
+        wp.launch(find_distances(solid), len(points), inputs=given, outputs=[out])
+        return out.numpy()
 
 
 def _direction(name, given):

@@ -346,7 +346,7 @@ class Scene:
         found: list[VertexContact | FaceContact] = []
         for c, collider in enumerate(self.colliders):
             core, radius = collider.core
-            given |= {"collider": c, "pose": collider.poses[0], "core": core, "radius": radius}
+            given |= {"collider": c, "pose": collider.poses[0], "core": core, "radius": radius, "solid": collider.solid}
             for facet in range(max(collider.facets, 1)):
                 shape = {}
                 if isinstance(collider, MeshCollider) and facet == 0:  # steps set the other facets

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms.contact import CONTACT
+from ..kernels.terms.contact import ROUNDED_BOX, Solid, contact, rest_state
 from ..kernels.terms.face_contact import FACE_CONTACT
 from ..kernels.terms.face_contact import PAIRS as PAIRS
 from ..kernels.terms.face_friction import FACE_FRICTION
@@ -26,26 +26,31 @@ class VertexContact(Declared):
         stiffness: k [Pa/m].
         areas: A (E,) [m²].
         distance: r [m].
-        pose, core, radius: Pose and shape of the collider at the start, see :mod:`warpcloth.kernels.terms.contact`.
+        pose, solid, core, radius: Pose and shape of the collider at the start, see :mod:`warpcloth.kernels.terms.contact`.
         collider: Index of the collider in the scene.
         facet: For a mesh, index of the half-space, of those that approximate it near a vertex.
     """
 
-    term: ClassVar[Term] = CONTACT
     vertices: np.ndarray = field(default_factory=lambda: np.empty(0, np.int32))
     areas: np.ndarray = field(default_factory=lambda: np.empty(0))
     distance: float = 1e-3
     pose: np.ndarray = field(default_factory=lambda: np.zeros(7))
+    solid: Solid = ROUNDED_BOX
     core: np.ndarray = field(default_factory=lambda: np.zeros(3))
     radius: float = 0.0
     collider: int = 0
     facet: int = 0
 
+    @property
+    def term(self) -> Term:
+        """That of contact with this shape."""
+        return contact(self.solid)
+
     def stencil(self, mesh: Mesh) -> np.ndarray:
         return own_stencil(self.label, "vertices", self.vertices, 1, len(mesh.points))
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
-        return CONTACT.rest_state(mesh.points, stencil, self.pose, self.core, self.radius, self.distance, self.areas)
+        return rest_state(mesh.points, stencil, self.pose, self.core, self.radius, self.distance, self.areas)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
