@@ -1,4 +1,4 @@
-"""A square cloth of 1 m that falls onto a ball over a floor."""
+"""A square cloth of 1 m that falls onto a ball over a floor; it can also touch itself."""
 
 import numpy as np
 
@@ -12,8 +12,9 @@ def scene(
     stiffness: float = 300.0,
     duration: float = 2.0,
     fabric: str | None = None,
+    self_contact: bool = False,
 ):
-    """Vertices per side, ball [m], coefficient of friction, springs [N/m], duration [s]; or one of 'warpcloth fabrics'."""
+    """Vertices per side, ball [m], friction, springs [N/m], duration [s]; one of 'warpcloth fabrics'; touches itself or not."""
     wc.checks.number("radius", radius, above=0.0)
     wc.checks.whole("n", n, 2)
     grid = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")
@@ -21,6 +22,7 @@ def scene(
     cloth = {"density": 0.15, "terms": springs} if fabric is None else {"fabric": fabric}
     density = 0.15 if fabric is None else wc.fabrics.find(fabric).density
     distance = max(0.75 / (n - 1) ** 2 / radius, 1e-3)  # also keeps edges of triangles out of the ball
+    touches = {"self_contact": wc.SelfContact(distance=min(2e-3, 0.4 / (n - 1)), friction=friction)} if self_contact else {}
     height = max(2.2 * radius, 2.0 * radius + 1.1 * distance)  # above the ball, without contact
     return wc.Scene(
         grid,
@@ -31,6 +33,7 @@ def scene(
             wc.Plane(friction=friction, name="floor"),
         ],
         contact=wc.Contact(distance=distance, stiffness=40.0 * 9.81 * density / distance),
+        **touches,
         duration=duration,
         name="drape",
     )

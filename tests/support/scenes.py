@@ -79,6 +79,7 @@ TOUCHING = {
 }
 FOLDING = {
     "cards": {"n": 3, "friction": 0.1},
+    "drape": {"n": 12, "self_contact": True},
     "loop": {"elements": 16},
     "stack": {"sheets": 3, "n": 5, "duration": 0.6},
     "fold": {"nx": 3, "ny": 13, "folds": 2},
