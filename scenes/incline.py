@@ -12,12 +12,13 @@ def scene(angle: float = 30.0, friction: float = 0.3, n: int = 9, size: float = 
     """Slope θ [degrees], coefficient of friction μ, vertices per side, side [m], duration [s]."""
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    contact = wc.Contact(distance=1e-3)
+    density, distance = 0.15, 1e-3
+    contact = wc.Contact(distance=distance, stiffness=10.0 * 9.81 * density / distance)
     grid = wc.Mesh.grid(n, n, size=size, pattern="alternating")
-    above = contact.distance * (1.0 - 0.1 * c)  # the gap at which contact with the default stiffness carries the weight
+    above = distance * (1.0 - 0.1 * c)  # the gap at which contact carries the weight
     return wc.Scene(
         wc.Mesh((grid.points + np.array([0.0, above, 0.0])) @ turn.T, grid.triangles),
-        density=0.15,
+        density=density,
         terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)],
         colliders=[wc.Plane(normal=turn[:, 1], friction=friction, name="slope")],
         contact=contact,

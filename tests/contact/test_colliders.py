@@ -57,12 +57,15 @@ def falling(colliders, speed=1.0, fps=24.0, n=6, stiffness=100.0, height=0.05, *
     return wc.Scene(
         grid,
         density=0.15,
-        terms=[wc.Spring(stiffness=stiffness), wc.QuadraticBending(stiffness=1e-5)],
         positions=grid.points + np.array([0.0, height, 0.0]),
         velocities=np.tile([0.3 * speed, -speed, 0.0], (n * n, 1)),
         colliders=colliders,
         fps=fps,
-        **{"duration": 8.0 / fps, **fields},
+        **{
+            "terms": [wc.Spring(stiffness=stiffness), wc.QuadraticBending(stiffness=1e-5)],
+            "duration": 8.0 / fps,
+            **fields,
+        },
     )
 
 
@@ -608,7 +611,8 @@ def test_copies_resets_and_states(name):
         wc.Sphere(radius=0.1, position=[(0.25, -0.08 + 0.02 * k, 0.25) for k in range(9)], friction=friction),
         wc.MeshCollider(BREATHING, BALL.faces, position=(0.0, -0.12, 0.0), friction=friction),
     ]
-    scene, solver = falling(colliders, n=4), SOLVERS[name]
+    contact = wc.Contact(distance=R, stiffness=1.5e4)  # which coarse explicit steps bear
+    scene, solver = falling(colliders, n=4, contact=contact), SOLVERS[name]
     single = solver.bind(scene.build(dtype="float64"))
     batch = solver.bind(scene.build(dtype="float64", copies=2))
     for stepper in (single, batch):
@@ -660,7 +664,7 @@ def test_an_equilibrium_rests_on_a_plane():
     scene = falling([wc.Plane()], n=3, height=0.9e-3)
     rest = wc.equilibrium(scene)
     assert rest.status.ok
-    np.testing.assert_allclose(rest.points[:, 1], 0.9e-3, rtol=1e-6)
+    np.testing.assert_allclose(rest.points[:, 1], R - 0.15 * 9.81 / scene.contact.stiffness, rtol=1e-6)
 
 
 def meshed(shape):
@@ -737,7 +741,10 @@ REFUSED = {
         lambda: falling([wc.Sphere(radius=1e6, position=(0, -1e6, 0))]).build(),
         "the surface of the collider Sphere is 1e+06 m from its centre, where float32 resolves 0.12 m",
     ),
-    "weightless": (lambda: falling([wc.Plane()], gravity=(0, 0, 0)), "contact.stiffness has no default without gravity"),
+    "weightless": (
+        lambda: falling([wc.Plane()], gravity=(0, 0, 0), terms=[]),
+        "contact.stiffness has no default without gravity and a spring or membrane of finite stiffness",
+    ),
     "all pinned": (
         lambda: wc.simulate(falling([wc.Plane()], pins=range(36)), wc.XPBD(substeps=1)),
         "pins hold every vertex; colliders need one that is free",
@@ -894,10 +901,20 @@ def test_front_and_back_that_coincide_hold_cloth_on_both_sides(name, side):
 
 
 def test_the_default_stiffness_is_said():
-    """10 w/r, and from nothing else; ``print`` and ``info`` say it."""
-    scene = falling([wc.Plane()])
-    assert scene.contact.stiffness == pytest.approx(10.0 * 0.15 * 9.81 / R)
-    assert "contact: distance 0.001 m, stiffness 1.472e+04 Pa/m" in str(scene)
+    """(2/r)(wL/r + Y/L) on any mesh, Y of the stiffest term; ``print`` and ``info`` say it."""
+    for n, given in (
+        (6, {"terms": [wc.CorotatedMembrane(stiffness=300.0), wc.Spring(stiffness=100.0)]}),
+        (9, {"stiffness": 150.0 * np.sqrt(3.0)}),
+    ):
+        scene = falling([wc.Plane()], n=n, **given)
+        assert scene.contact.stiffness == pytest.approx(2.0 / R * (0.15 * 9.81 * 0.5 / R + 300.0 / 0.5))
+        assert "contact: distance 0.001 m, stiffness 2.67" in str(scene)
+    hard = falling([wc.Plane()], terms=[wc.Spring(stiffness=np.inf)])
+    assert hard.contact.stiffness == pytest.approx(2.0 / R * 0.15 * 9.81 * 0.5 / R)
+    chain = wc.Scene(
+        wc.Mesh.chain(11, length=2.0), density=0.1, terms=[wc.Spring(stiffness=1e3)], colliders=[wc.Plane(position=(0, -3, 0))]
+    )
+    assert chain.contact.stiffness == pytest.approx(2.0 / R * 0.1 * 9.81 / (2.0 * R) * 2.0 / R)  # as a strip of width 2 R
 
 
 def test_an_animation_has_colliders_as_primitives(tmp_path):

@@ -12,6 +12,7 @@ from warpcloth.cli import main
 
 BOTH = ("energies", "reactions")
 G, DENSITY, R = 9.81, 0.15, 1e-3
+SOFT = wc.Contact(distance=R, stiffness=10.0 * DENSITY * G / R)  # the weight of the sheet compresses a tenth of R
 SOLVERS = {
     "explicit": wc.Explicit(substeps=80),
     "newton": wc.Newton(substeps=2, tolerance=1e-11),
@@ -34,8 +35,8 @@ def slope(degrees, friction, **fields):
     grid = wc.Mesh.grid(3, 3, size=0.1)
     mesh = wc.Mesh((grid.points + np.array([0.0, R * (1.0 - 0.1 * c), 0.0])) @ turn.T, grid.triangles)
     plane = wc.Plane(normal=turn[:, 1], friction=friction, name="slope")
-    terms = [wc.Spring(stiffness=1000.0)]
-    scene = wc.Scene(mesh, density=DENSITY, terms=terms, colliders=[plane], **{"duration": 0.1, **fields})
+    fields = {"terms": [wc.Spring(stiffness=1000.0)], "contact": SOFT, "duration": 0.1, **fields}
+    scene = wc.Scene(mesh, density=DENSITY, colliders=[plane], **fields)
     return scene, turn[:, 1], turn[:, 0]
 
 
@@ -197,7 +198,7 @@ def jumping(shape, friction=0.0):
         density=DENSITY,
         terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)],
         colliders=[collider],
-        contact=wc.Contact(distance=R),
+        contact=SOFT,
         pins="corners",
     )
 

@@ -62,7 +62,9 @@ def incline(degrees, friction, duration=1.0, mesh=False):
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     plane = wc.Plane(normal=turn[:, 1], friction=friction)
-    return sheet(1e-3 - 1e-4 * c, of_triangles(plane) if mesh else plane, turn=turn, duration=duration), turn[:, 0]
+    contact = wc.Contact(distance=1e-3, stiffness=10.0 * DENSITY * G / 1e-3)
+    plane = of_triangles(plane) if mesh else plane
+    return sheet(1e-3 - 1e-4 * c, plane, turn=turn, contact=contact, duration=duration), turn[:, 0]
 
 
 @sticky

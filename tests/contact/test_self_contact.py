@@ -72,12 +72,11 @@ def layers(count=2, n=6, gap=0.02, speed=0.0, turn=0.0, distance=5e-3, stiffness
     triangles = np.concatenate([grid.triangles + layer * n * n for layer in range(count)])
     velocities = np.zeros((count * n * n, 3))
     velocities[:, 1] = np.where(np.arange(count * n * n) < n * n, speed, -speed)
-    fields = {"gravity": np.zeros(3), "fps": 24.0, "duration": 1.0, **fields}
     terms = [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)]
+    fields = {"gravity": np.zeros(3), "fps": 24.0, "duration": 1.0, "terms": terms, **fields}
     return wc.Scene(
         wc.Mesh(np.concatenate(parts), triangles),
         density=0.15,
-        terms=terms,
         velocities=velocities,
         self_contact=wc.SelfContact(distance=distance, stiffness=stiffness),
         **fields,
@@ -238,10 +237,13 @@ def test_a_stack_rests(dtype, mesh, device):
     if mesh:
         corners = [[-1.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]]
         floor = wc.MeshCollider(points=corners, triangles=[[0, 2, 1], [0, 3, 2]], name="floor")
-    stack = replace(stack, colliders=[floor], free_axes=np.tile([False, True, False], (12 * 16, 1)))
+    r = stack.self_contact.distance
+    k = 10.0 * 0.15 * 9.81 / r
+    soft = {"contact": replace(stack.contact, stiffness=k), "self_contact": replace(stack.self_contact, stiffness=k)}
+    stack = replace(stack, colliders=[floor], free_axes=np.tile([False, True, False], (12 * 16, 1)), **soft)
     rest = wc.equilibrium(stack, device=device, dtype=dtype, record=("energies", "reactions"))
     assert rest.status.ok and rest.stable, rest.status
-    high, r, k = rest.points[:, 1].reshape(12, 16), stack.self_contact.distance, stack.self_contact.stiffness
+    high = rest.points[:, 1].reshape(12, 16)
 
     def f(d):
         return np.where(d < 0.5 * r, 0.25 * k * r * r / d, k * np.maximum(r - d, 0.0))
@@ -981,15 +983,18 @@ def test_solvers_that_refuse(device):
 
 
 def test_what_is_refused(device):
-    with pytest.raises(ValueError, match=r"self_contact\.stiffness has no default without gravity"):
-        layers(stiffness=None)
+    with pytest.raises(ValueError, match=r"self_contact\.stiffness has no default without gravity and a spring or membrane"):
+        layers(stiffness=None, terms=[])
     with pytest.raises(ValueError, match="mesh without triangles"):
         wc.Scene(wc.Mesh.chain(3), density=1.0, self_contact=wc.SelfContact())
     with pytest.raises(ValueError, match="self_contact is 1; it must be a SelfContact or None"):
         wc.Scene(wc.Mesh.grid(3, 3), density=1.0, self_contact=1)
     with pytest.raises(ValueError, match="symplectic Euler is stable below"):
         wc.Explicit(substeps=1).bind(layers(stiffness=1e7).build(device=device))
-    assert layers(stiffness=None, gravity=None).self_contact.stiffness == pytest.approx(10.0 * 0.15 * 9.81 / 5e-3)
+    weightless, K, L = layers(stiffness=None).self_contact.stiffness, 200.0 / np.sqrt(3.0), np.sqrt(0.5)  # of both sheets
+    assert weightless == pytest.approx(2.0 / 5e-3 * K / L)
+    heavy = layers(stiffness=None, gravity=None).self_contact.stiffness
+    assert heavy == pytest.approx(weightless + 2.0 / 5e-3**2 * 0.15 * 9.81 * L)
 
 
 @pytest.mark.filterwarnings("error")

@@ -75,11 +75,12 @@ BALL = wc.Sphere(radius=0.1, position=(0.0, -1.0, 0.0))
     ids=["fabric", "given", "none"],
 )
 def test_a_fabric_gives_contact_its_thickness(fabric, given, distances):
-    """And the stiffness follows from it, 10 w/r."""
+    """And the stiffness follows from it, (2/r)(wL/r + Y/L)."""
     scene = wc.Scene(MESH, **fabric, contact=wc.Contact(**given), self_contact=wc.SelfContact(**given), colliders=[BALL])
     for contact, distance in zip((scene.contact, scene.self_contact), distances, strict=True):
         assert contact.distance == pytest.approx(distance)
-        assert contact.stiffness == pytest.approx(10.0 * scene.density * 9.81 / distance)
+        w, Y = scene.density * 9.81, scene.terms[0].held(MESH, MESH.points)[1].mean()  # of 1 m
+        assert contact.stiffness == pytest.approx(2.0 / distance * (w / distance + Y))
     bare = wc.Scene(MESH, **fabric)
     if given:
         return

@@ -325,14 +325,13 @@ def _forces(run):
 
 
 def contact_energy(run, frame):
-    """Returns Σ kAφ(d) of the free vertices and all colliders in a frame [J]; k is 10 w/r if it is not declared."""
+    """Returns Σ kAφ(d) of the free vertices and all colliders in a frame [J]."""
     total = 0.0
     for gaps in run.distances:
         r, k = run.scene.contact.distance, run.scene.contact.stiffness
-        weight = np.linalg.norm(run.gravity) * run.masses.sum() / run.areas.sum()
         d = np.maximum(gaps[frame], 1e-3 * r)
         phi = np.where(d < 0.5 * r, 0.125 * r * r + 0.25 * r * r * np.log(0.5 * r / d), 0.5 * np.maximum(r - d, 0.0) ** 2)
-        total += (10.0 * weight / r if k is None else k) * (run.free * run.vertex_areas * phi).sum()
+        total += k * (run.free * run.vertex_areas * phi).sum()
     return total
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from .panels import Map, point
 
 DISTANCE, DENSITY = 1e-3, 0.15  # r [m], areal density ρ [kg/m²]
-STIFFNESS = 10.0 * 9.81 * DENSITY / DISTANCE  # the default of a contact, under gravity [Pa/m]
+STIFFNESS = 10.0 * 9.81 * DENSITY / DISTANCE  # the weight of the sheet compresses a tenth of r [Pa/m]
 RATE = np.sqrt(STIFFNESS / DENSITY)  # ω [1/s]
 LAWS = {"v h = r": lambda h: DISTANCE / h, "v h = 2r": lambda h: 2.0 * DISTANCE / h}
 

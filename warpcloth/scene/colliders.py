@@ -14,9 +14,6 @@ from ..base.types import Converted, default
 from ..kernels.contact.colliders import find_distances
 from ..kernels.terms.contact import ROUNDED_BOX, Solid
 
-# With the default stiffness, the weight of one layer compresses the contact distance by this fraction.
-_SAG = 0.1
-
 
 @dataclass(frozen=True, eq=False)
 class Contact:
@@ -29,8 +26,9 @@ class Contact:
 
     Attributes:
         distance: Contact distance r [m]. None lets the scene set it: to half of its thickness, or to 1 mm without one.
-        stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default 10 w/r, where w is the weight of the
-            cloth per area, so that one layer rests at a gap of 0.9 r.
+        stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default
+            (2/r)(wL/r + Y/L) with the weight w of the cloth per area [Pa], its stiffness Y, force per width and strain [N/m],
+            and its size L, the root of its area [m]; see :func:`warpcloth.scene.colliders.default_stiffness`.
         elements: What touches meshes: ``"vertices"`` of the cloth, or also its ``"triangles"``, which spikes and edges of a
             mesh can otherwise pierce between the vertices. On a plane of triangles both give the same pressure.
 
@@ -309,9 +307,22 @@ def turned(q, vectors):
     return vectors + q[3] * t + np.cross(q[:3], t)
 
 
-def default_stiffness(weight: float, distance: float) -> float:
-    """Returns the stiffness k [Pa/m] at which a weight per area [Pa] compresses a tenth of the contact distance [m]."""
-    return weight / (_SAG * distance)
+def default_stiffness(distance: float, weight: float, stiffness: float, size: float) -> float:
+    """Returns k = (2/r)(wL/r + Y/L) [Pa/m], at which a gap of r/2 carries the pressures kr/2 that hold or pull a whole cloth.
+
+    A tension T [N/m] presses on an edge of radius R by T/R. The smallest radius that contact resolves is r. The first pressure
+    is that of T = wL, when the cloth hangs over such an edge; pads of a height of r/2μ, pressed to a gap of r/2, therefore hold
+    a sheet by friction. The second is that of T = Yr/L, when the cloth is pulled over it until it is longer by r. k depends
+    neither on the step nor on the mesh. It adds less to the highest frequency of a mesh than its membrane does if edges are
+    shorter than about 2√(rL), and weight strains the cloth by less than r/L.
+
+    Args:
+        distance: Contact distance r [m].
+        weight: Weight per area w [Pa].
+        stiffness: Stiffness Y of the cloth, force per width and strain [N/m].
+        size: Size L of the cloth [m].
+    """
+    return 2.0 / distance * (weight * size / distance + stiffness / size)
 
 
 def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:

@@ -279,12 +279,7 @@ class Scene:
                 f"{collider.label} has friction {collider.friction:g} and contact.stiffness is infinite, which leaves no gap "
                 "that says how large the normal force is; give a finite stiffness, or leave friction at 0"
             )
-        if contact.stiffness is not None:
-            return contact
-        weight = self._areal_mass * float(np.linalg.norm(self.gravity))
-        if not weight > 0.0:
-            raise ValueError("contact.stiffness has no default without gravity; give one [Pa/m]")
-        return replace(contact, stiffness=default_stiffness(weight, contact.distance))
+        return self._with_stiffness(contact, "contact")
 
     def _checked_self_contact(self):
         declared = self.self_contact
@@ -294,13 +289,28 @@ class Scene:
             raise ValueError(f"self_contact is {shown(declared)}; it must be a SelfContact or None")
         if not len(self.mesh.triangles):
             raise ValueError("self_contact is given for a mesh without triangles; it must be None")
-        declared = self._with_distance(declared, "self_contact", 1.0)
-        if declared.stiffness is not None:
-            return declared
+        return self._with_stiffness(self._with_distance(declared, "self_contact", 1.0), "self_contact")
+
+    def _with_stiffness(self, contact, name):
+        """Returns contact with a stiffness: its own, or :func:`default_stiffness` for this cloth."""
+        if contact.stiffness is not None:
+            return contact
         weight = self._areal_mass * float(np.linalg.norm(self.gravity))
-        if not weight > 0.0:
-            raise ValueError("self_contact.stiffness has no default without gravity; give one [Pa/m]")
-        return replace(declared, stiffness=default_stiffness(weight, declared.distance))
+        if len(self.mesh.triangles):
+            held = [term.held(self.mesh, self.positions)[1] for term in self.terms]
+            finite = [K[np.isfinite(K)] for K in held]
+            stretching, size = (
+                max((float(K.mean()) for K in finite if len(K)), default=0.0),
+                float(np.sqrt(self._touching_areas.sum())),
+            )
+        else:  # a line of edges has no width, so no force per width
+            stretching, size = 0.0, float(self.mesh.vertex_lengths.sum())
+        found = default_stiffness(contact.distance, weight, stretching, size)
+        if not found > 0.0:
+            raise ValueError(
+                f"{name}.stiffness has no default without gravity and a spring or membrane of finite stiffness; give one [Pa/m]"
+            )
+        return replace(contact, stiffness=found)
 
     def _with_distance(self, contact, name, thicknesses):
         """Returns contact with a distance: its own, or that number of thicknesses, or `DISTANCE` for cloth without one."""

@@ -20,8 +20,7 @@ class SelfContact:
 
     Attributes:
         distance: Contact distance r [m]. None lets the scene set it: to its thickness, or to 1 mm without one.
-        stiffness: k [Pa/m]. By default 10 w/r, where w is the weight of the cloth per area, so that one layer rests at a gap of
-            0.9 r.
+        stiffness: k [Pa/m], by default by the rule of :class:`warpcloth.Contact`.
         friction: Coefficient μ of friction.
         crossing_start: What to do if cloth crosses or touches cloth at the start: ``"refuse"`` the scene, or ``"run"`` it.
             Triangles that cross or touch at the start then pass through one another until they are apart, and cannot cross
