@@ -29,11 +29,13 @@ def scene(collider: str = "plane", gap: float = 0.9e-3, n: int = 64, friction: f
             "capsule": lambda: wc.Capsule(length=4.0, axis=(1.0, 0.0, 0.0), **round_),
             "box": lambda: wc.Box(size=(2.0, 1.0, 2.0), position=(0.0, -0.5, 0.0), friction=friction),
         }[collider]()
+    density, distance = 0.15, 1e-3
     return wc.Scene(
         grid,
-        density=0.15,
+        density=density,
         terms=[wc.Spring(pairs=("structural", "shear"), stiffness=300.0), wc.QuadraticBending(stiffness=1e-5)],
         positions=np.stack([x, height, z], axis=1),
         colliders=[shape],
+        contact=wc.Contact(distance=distance, stiffness=10.0 * 9.81 * density / distance),  # rests at 0.9 mm
         name="resting",
     )

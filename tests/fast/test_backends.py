@@ -133,7 +133,7 @@ def draped(moving):
     other = box if moving else wc.Plane(position=(0.0, -0.05, 0.0))
     terms = [replace(SPRINGS, damping=0.01)]
     scene = wc.Scene(mesh, density=0.15, terms=terms, velocities=[0.3, -1.0, 0.0] + 0.0 * mesh.points, fps=24.0, duration=1.0)
-    return replace(scene, colliders=[ball, other])
+    return replace(scene, colliders=[ball, other], contact=wc.Contact(distance=1e-3, stiffness=1.5e4))
 
 
 @pytest.mark.parametrize("moving", slow_but([True], [False, True]))
