@@ -17,7 +17,7 @@ from ..vectors import types
 from .pair_sums import PairForces, PairRow, PairTerm
 from .self_gaps import SIDE, ZERO, gap_along, nearest, signed_gap, vertex_of
 from .self_pairs import MODULE, StepPairs, module_of, near_pairs
-from .self_planes import margin_of
+from .self_planes import margin_of, ulp_of
 
 potential, slope, bend, gap_after = contact.potential, contact.slope, contact.bend, contact.gap_after
 constraint_slope, constraint_bend = contact.constraint_slope, contact.constraint_bend
@@ -66,13 +66,14 @@ def least_gap(dtype):
     """Device function (stencil, x, least) → the least gap f [m] that the filter leaves a pair at x: twice its margin."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
+    ulp = ulp_of(dtype)
 
     @wp.func
     def least_gap_of(s: wp.vec4i, x: wp.array(dtype=vec3), least: wp.float64):
         far = ZERO
         for i in range(4):
             far = wp.max(far, wp.max(wp.abs(exact(x[s[i]]))))
-        return wp.float64(2.0) * margin_of(least, far)
+        return wp.float64(2.0) * margin_of(least, ulp * far)
 
     return least_gap_of
 

@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from ..memory import load
@@ -15,13 +16,18 @@ CLAMPED = wp.constant(wp.float64(0.05))  # smallest distance of each side from t
 # A pair needs no plane if its sides approach by less than this fraction of the gap. It is below 0.9²: along y the sides are at
 # least 0.9 of the gap apart, and the fraction KEPT of this may be closed.
 WIDE = wp.constant(wp.float64(0.75))
-ULP = wp.constant(wp.float64(1.1920929e-07))  # largest relative unit in the last place of float32
 # A search direction is shortened as a whole if pairs allow this fraction of it, else at each vertex. To shorten it at single
 # vertices stretches stiff cloth and tears apart what is pressed together, so that the line search makes hardly any step.
 WHOLE = wp.constant(wp.float64(0.1))
 # The advances of a pair along a direction end after this number, or when no more than NEAR of the way to its floor is left.
 ADVANCES = wp.constant(64)
 NEAR = wp.constant(wp.float64(0.05))
+
+
+@cache
+def ulp_of(dtype):
+    """The largest relative unit in the last place of a scalar type, as a constant of kernels in double precision."""
+    return wp.constant(wp.float64(np.finfo(wp.dtype_to_numpy(dtype)).eps))
 
 
 @cache
@@ -108,12 +114,8 @@ def find_ways(dtype):
 
 
 @wp.func
-def margin_of(least: wp.float64, far: wp.float64):
-    """Half the smallest distance of two sides with coordinates up to ``far``.
-
-    It keeps the sides 4 units in the last place of float32 apart, because frames are stored in float32.
-    """
-    ulp = ULP * far
+def margin_of(least: wp.float64, ulp: wp.float64):
+    """Half the smallest distance of two sides whose largest coordinate has the unit ``ulp`` in the last place."""
     return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
 
 
@@ -162,7 +164,7 @@ def cut_by_planes(dtype):
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    wanted = wanted_move(dtype)
+    wanted, ulp = wanted_move(dtype), ulp_of(dtype)
     stencil = load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -191,7 +193,7 @@ def cut_by_planes(dtype):
         of_vertex = e < pairs.counts[0]
         sides = wp.where(of_vertex, 1, 2)
         way, far = ways_of_sides(ways, s, sides)
-        margin = margin_of(least, far)
+        margin = margin_of(least, ulp * far)
         if needs_no_cut(e, way, margin, gap, open):
             return
         origin = exact(x[s[0]])
@@ -233,7 +235,7 @@ def cut_by_planes(dtype):
                 if t < share[s[i]]:
                     wp.atomic_min(share, s[i], t)
             elif room <= ZERO:
-                wp.atomic_max(least_share, s[i], ULP * far / wp.max(-approaches[i], wp.float64(1e-300)))
+                wp.atomic_max(least_share, s[i], ulp * far / wp.max(-approaches[i], wp.float64(1e-300)))
 
     return cut_by_each_plane
 
@@ -252,7 +254,7 @@ def cut_as_a_whole(dtype):
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    stencil = load(wp.vec4i)
+    stencil, ulp = load(wp.vec4i), ulp_of(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def cut_each_as_a_whole(
@@ -278,7 +280,7 @@ def cut_as_a_whole(dtype):
         of_vertex = e < pairs.counts[0]
         sides = wp.where(of_vertex, 1, 2)
         way, far = ways_of_sides(ways, s, sides)
-        margin = margin_of(least, far)
+        margin = margin_of(least, ulp * far)
         if needs_no_cut(e, way, margin, gap, open):
             return
         a = exact(x[s[0]])

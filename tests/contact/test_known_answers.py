@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 import warpcloth as wc
 from support.rows import slow_but
 from support.scenes import scene
-from warpcloth.core.status import Result
+from warpcloth.core.status import Grade, Result
 from warpcloth.scenes import ring
 
 G, DENSITY = 9.81, 0.15
@@ -474,3 +474,30 @@ def test_a_ring_is_pressed_by_a_plate(solver, device):
     found, high = borne(declared, wc.simulate(declared, solver, dtype="float64", device=device).points[-1])
     assert found == pytest.approx(2.0, rel=0.03)
     assert high == pytest.approx(ring.height(2.0), rel=2e-3)
+
+
+@pytest.mark.parametrize(("soft", "gap", "held"), [(True, 1e-3, False), (False, 3e-3, True), (False, 1e-3, True)])
+def test_pads_hold_what_they_pinch(soft, gap, held, device):
+    """A sheet of 0.3 m that hangs between two pads, on three vertices, with the default k; 10 w/r lets it fall.
+
+    Gaps of a quarter of r are named, and do not make the run less usable.
+    """
+    grid, r = wc.Mesh.grid(17, 17, size=0.3), 2e-3
+    mesh = wc.Mesh(np.stack([grid.points[:, 0], -grid.points[:, 2], 0.0 * grid.points[:, 0]], axis=1), grid.triangles)
+    pads = [
+        wc.Box(size=(0.06, 0.03, 0.02), position=(0.15, -0.02, side * (0.01 + 0.5 * gap)), friction=0.3, name=name)
+        for name, side in (("front", 1.0), ("back", -1.0))
+    ]
+    scene = wc.Scene(
+        mesh,
+        density=DENSITY,
+        terms=[wc.Spring(stiffness=300.0), wc.QuadraticBending(stiffness=2e-5)],
+        colliders=pads,
+        contact=wc.Contact(distance=r, stiffness=10.0 * DENSITY * G / r if soft else None),
+    )
+    run = wc.simulate(scene, wc.Newton(substeps=4), frames=30, dtype="float64", device=device)
+    assert run.status.grade is Grade.CONVERGED, run.status
+    assert ("in frame 1 the gap to front falls below half the contact distance" in run.status.message) == (gap < r)
+    pinched = (np.abs(mesh.points - [0.15, -0.02, 0.0]) < [0.03, 0.015, 1.0]).all(axis=1)
+    slipped = np.abs(run.points[-1] - mesh.points)[pinched].max()
+    assert pinched.sum() == 3 and (slipped < 1e-4 if held else slipped > 0.1)

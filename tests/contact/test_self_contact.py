@@ -262,16 +262,26 @@ def test_a_stack_rests(dtype, mesh, device):
 
 
 @pytest.mark.host
-def test_a_sheet_rests_far_from_the_origin(device):
-    """At 50 m ψ begins at 2f = 0.72 r, f being 6 units in the last place of float32: φ and ψ bear the weight above r/2."""
-    r, k = 1e-4, 2e4
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_sheet_rests_far_from_the_origin(dtype, device):
+    """At 50 m, in float64 where it does at the origin: φ bears the weight at a third of r.
+
+    In float32 the least gap f is 6 units in the last place, and ψ, which begins at 2f = 0.72 r, bears most of it above r/2.
+    """
+    r, k, w = 1e-4, 2e4, 0.15 * 9.81
     two = layers(n=4, gap=0.9 * r, distance=r, stiffness=k, gravity=(0.0, -9.81, 0.0), pins=np.arange(16))
     two = replace(two, positions=two.positions + np.array([0.0, 50.0, 0.0]), free_axes=np.tile([False, True, False], (32, 1)))
-    rest = wc.equilibrium(two, device=device, dtype="float64")
+    rest = wc.equilibrium(two, device=device, dtype=dtype)
     assert rest.status.ok and rest.stable, rest.status
-    d, f = rest.points[16:, 1] - rest.points[:16, 1], 6.0 * 2.0**-23 * two.positions.max()
+    d = rest.points[16:, 1].astype(float) - rest.points[:16, 1]
+    if dtype == "float64":
+        assert k * r * r / (4.0 * d) == pytest.approx(np.full(16, w), rel=1e-6)
+        return
+    f, ulp = 6.0 * 2.0**-23 * two.positions.max(), np.spacing(np.float32(50.0))
     assert 0.5 * r < d.min() and d.max() < 2.0 * f
-    assert k * (r - d + 100.0 * (0.5 * r) ** 2 * (2.0 - d / f) ** 2 / f) == pytest.approx(np.full(16, 0.15 * 9.81), rel=1e-6)
+    to_f = 2.0 - d / f
+    slope = k * (1.0 + 50.0 * r * r * to_f / f**2)
+    assert k * (r - d + 25.0 * r * r * to_f**2 / f) == pytest.approx(np.full(16, w), abs=(ulp * slope).max())
 
 
 @pytest.mark.host

@@ -90,15 +90,39 @@ def test_none_of_it_without_self_contact(device):
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_frames_too_coarse_for_the_gap_are_named(dtype, device):
-    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 16 m this is less than 4 · 2⁻¹⁹ m, from frame 4 on."""
+def test_frames_too_coarse_for_the_gap_are_named(dtype, device, tmp_path):
+    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 16 m this is less than 4 · 2⁻¹⁹ m, from frame 4 on.
+
+    Frames in memory have the precision of the run, those in a file are float32.
+    """
     soft = wc.SelfContact(DISTANCE, 1e-6)  # which does not push them apart in the meantime
     scene = sheets(gap=6e-6, turn=0.0, self_contact=soft)
     scene = replace(scene, velocities=np.tile([100.0, 0.0, 0.0], (32, 1)))
     near = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=3).self_contact
     assert near.too_near is None and near.least_gap == pytest.approx(6e-6, rel=1e-3)
-    far = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=5).self_contact
+    kept = wc.simulate(scene, SOLVER, device=device, dtype=dtype, frames=5).self_contact
+    far = wc.simulate(scene, SOLVER, tmp_path / "far.usdc", device=device, dtype=dtype, frames=5).self_contact
+    assert kept == (far if dtype == "float32" else far._replace(too_near=None))
     assert far.too_near.startswith("in frame 4 first, at vertex ") and "the least gap is 6e-06 m" in far.too_near
+
+
+def test_the_least_gap_is_that_of_good_frames(device, tmp_path):
+    """Also if frames were computed ahead of the one that diverged, as with an output, and in a copy that diverged alone."""
+    scene = sheets(velocity=(0.0, -0.1, 0.0), self_contact=wc.SelfContact(DISTANCE, 1e3))
+    solver, run = wc.Explicit(substeps=2, above_limit="allow"), {"device": device, "dtype": "float64", "frames": 9}
+    alone, written = (wc.simulate(scene, solver, output, **run) for output in (None, tmp_path / "out.usdc"))
+    good = alone.status.frame
+    assert alone.status.result is Result.DIVERGED and good == written.status.frame >= 1
+    distances = [gaps(scene, points).min() for points in alone.points]
+    assert alone.self_contact.least_gap == written.self_contact.least_gap == pytest.approx(min(distances), rel=1e-6)
+    both = wc.simulate(
+        scene,
+        solver,
+        copies=2,
+        vary={"velocities": [scene.velocities, -scene.velocities], "Spring.stiffness": [100.0, 1.0]},
+        **run,
+    )
+    assert both.status.good.tolist() == [good, 9] and both.self_contact.least_gap[0] == alone.self_contact.least_gap
 
 
 @pytest.mark.parametrize("axes", ["xyz", "y"])
@@ -147,7 +171,7 @@ def test_pins_that_go_their_way(device):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_the_filter_leaves_the_least_gap(far, dtype, device):
     """Where only one of two sides comes nearer too: a soft sheet sinks on another one at rest, also where float32 is coarse."""
-    least = max(1e-3 * DISTANCE, 4.0 * 2.0**-23 * far)
+    least = max(1e-3 * DISTANCE, 4.0 * float(np.finfo(dtype).eps) * far)
     scene = sheets(self_contact=wc.SelfContact(DISTANCE, 1e-3), gravity=np.array([0.0, -9.81, 0.0]), pins=np.arange(16))
     scene = replace(scene, positions=scene.positions + far, mesh=wc.Mesh(scene.mesh.points + far, scene.mesh.triangles))
     found = wc.simulate(scene, wc.XPBD(substeps=8, iterations=4), device=device, dtype=dtype, frames=8, record="pairs")

@@ -86,7 +86,7 @@ def _too_near(contact, x):
     of_vertices, of_edges = contact.proximity.counts.numpy()
     stencils = contact.proximity.stencils.numpy()[: of_vertices + of_edges]
     found, least = contact.begun.gap.numpy()[: len(stencils)], FLOOR * contact.declared.distance
-    ulps = 6.0 * float(np.finfo(np.float32).eps) * np.abs(points).max(initial=0.0, where=np.isfinite(points))
+    ulps = 6.0 * float(np.finfo(contact.model.numpy_dtype).eps) * np.abs(points).max(initial=0.0, where=np.isfinite(points))
     least += ulps
     near = stencils[found < least]
     split = int(np.count_nonzero(found[:of_vertices] < least))

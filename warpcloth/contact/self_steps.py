@@ -32,8 +32,8 @@ SKIN = 0.35
 THICK = 0.5
 
 
-class TooNear(NamedTuple):
-    """The first frame with a gap in cloth that float32, in which frames are stored, can hardly resolve.
+class FirstGap(NamedTuple):
+    """The first frame with a small gap between cloth and cloth.
 
     Attributes:
         copy: Index of the copy.
@@ -112,6 +112,7 @@ class SelfSteps:
         self._notes, self._per_frame = gap_notes.GapNotes(), steps_per_frame
         self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
         self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
+        self._notes.pressed = state.add("first pressed", model.scalars(wp.int64))
         self.held = HeldPins()
         self.held.first = state.add("first pin held back", model.scalars(wp.int64), Count(rest=model.per_copy))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
@@ -133,7 +134,12 @@ class SelfSteps:
         self.friction, self.tangles, self.stale = None, None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)
-        self._carried = self.proximity.found, self._most.array, self.lists, self._notes.nearest, self._notes.too_near
+        self._carried = (
+            self.proximity.found,
+            self._most.array,
+            self.lists,
+            *(getattr(self._notes, name) for name in ("nearest", "too_near", "pressed")),
+        )
         if declared.friction:
             slips = state.add_part("friction", Slips(model, self.proximity.capacity))
             slips.grow = self._grow_outside
@@ -258,17 +264,22 @@ class SelfSteps:
 
     @property
     def least_gap(self):
-        """The smallest distance of a pair in any frame so far, as stored in float32, (B,) [m]; infinite without pairs."""
+        """The smallest distance of a pair in any frame that a step has followed, (B,) [m]; infinite without pairs."""
         return _gaps(self._notes.nearest)
 
     @property
     def too_near(self):
-        """A :class:`TooNear` for each copy with a gap below 4 units in the last place of float32 coordinates."""
-        found, n = [], self.model.per_copy
-        for copy, value in enumerate(self._notes.too_near.numpy()):
-            if value:
-                found.append(TooNear(copy, *divmod(int(gap_notes.FIRST) - int(value), n)))
-        return found
+        """A :class:`FirstGap` for each copy with a gap below 4 units in the last place of float32 coordinates."""
+        return self._first(self._notes.too_near)
+
+    @property
+    def pressed(self):
+        """A :class:`FirstGap` for each copy with a gap below half the contact distance of its pair."""
+        return self._first(self._notes.pressed)
+
+    def _first(self, notes):
+        n, found = self.model.per_copy, enumerate(notes.numpy())
+        return [FirstGap(copy, *divmod(int(gap_notes.FIRST) - int(value), n)) for copy, value in found if value]
 
     @property
     def pins_held(self):
@@ -286,7 +297,7 @@ class SelfSteps:
         if self._counted is None:
             self._counted = model.kernel(gap_notes.count_pairs, model.dtype)
         counts, nearest = wp.zeros((model.copies, 2), dtype=wp.int32, device=model.device), model.scalars(wp.float64)
-        given = [self.pairs, self.begun, self.x_before, model.per_copy]
+        given = [self.pairs, self.begun, model.per_copy]
         model.launch(self._counted, len(self.pairs.stencils), given, [counts, nearest])
         return *counts.numpy().T, _gaps(nearest)
 

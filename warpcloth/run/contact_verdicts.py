@@ -1,8 +1,14 @@
-"""Faults of contact that make a run not usable: pins held back, cloth caught in colliders, cloth that meshes pass through."""
+"""Faults of contact that make a run not usable: pins held back, cloth caught in colliders, cloth that meshes pass through.
+
+And a warning, where contact is too soft for what presses on it.
+"""
 
 from typing import NamedTuple
 
+import numpy as np
+
 from ..base.turns import in_turn
+from ..terms.needs import NORMAL_FORCE
 from .history import collider_names
 
 
@@ -47,6 +53,51 @@ class Pierced(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.collider} has passed through triangle {self.triangle} of the cloth, between its vertices, {_where(self)}"
+
+
+class Pressed:
+    """Notes the first frame in which free vertices are nearer to each collider than half the contact distance.
+
+    Args:
+        model: The :class:`warpcloth.model.model.Model` of a scene with colliders.
+
+    Attributes:
+        first: That frame, from 1, or 0, (B, C).
+    """
+
+    carried = ("first",)
+
+    def __init__(self, model):
+        self._scene, self.first = model.scene, np.zeros((model.copies, len(model.scene.colliders)), dtype=int)
+        self._free = np.delete(np.arange(model.per_copy), model.scene.fixed)
+
+    def note(self, number, points, alive):
+        """Notes the colliders that are near at points (B, n, 3) of a frame of the copies ``alive`` (B,)."""
+        near = 0.5 * self._scene.contact.distance
+        for copy, c in np.argwhere((self.first == 0) & alive[:, None]):
+            if self._scene.colliders[c].is_near(points[copy, self._free], near, number):
+                self.first[copy, c] = number
+
+
+@in_turn
+def soft_contact_of(watch, stepper):
+    """Returns a sentence each about the first frame in which a gap to a collider, and one between cloth and cloth, falls below
+    half the contact distance."""
+    scene, found = stepper.model.scene, {}
+    if watch.pressed is not None:
+        names, first = collider_names(scene), watch.pressed.first
+        found["contact"] = [(first[of], of[0], f"to {names[of[1]]}") for of in zip(*np.nonzero(first), strict=True)]
+    if stepper.pairs is not None:
+        pairs = [(frame, copy, "between cloth and cloth") for copy, frame, _vertex in stepper.pairs.pressed]
+        found["self_contact"] = [each for each in pairs if each[0] <= watch.good[each[1]]]
+    sentences = []
+    for name, near in found.items():
+        for frame, copy, where in sorted(near, key=lambda each: each[:2])[:1]:
+            in_frame = f"in frame {frame}" + (f" of copy {copy}" if stepper.model.copies > 1 else "")
+            hard = NORMAL_FORCE in stepper.options.needs or np.isinf(getattr(scene, name).stiffness)
+            remedy = "more iterations leave" if hard else f"a larger {name}.stiffness leaves"
+            sentences.append(f"{in_frame} the gap {where} falls below half the contact distance; {remedy} a larger one")
+    return sentences
 
 
 def _where(found):

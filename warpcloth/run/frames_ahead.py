@@ -24,7 +24,7 @@ class Frame(NamedTuple):
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).
         seconds: Time of its computation [s]; on CUDA by events of the device.
-        error: What ``find`` of :func:`frames_of` returned after the frame, or None.
+        found: What ``find`` of :func:`frames_of` returned after the frame, or None.
         state: The state of the stepper, see :meth:`warpcloth.core.state.State.to_host`, or None.
     """
 
@@ -33,7 +33,7 @@ class Frame(NamedTuple):
     results: list
     residual: np.ndarray
     seconds: float
-    error: object = None
+    found: object = None
     state: dict | None = None
 
 
@@ -48,7 +48,7 @@ def frames_of(stepper, count, ahead, keeps=None, find=None):
         count: Number of frames.
         ahead: Largest number of frames computed ahead; 0 computes each on demand, without a thread.
         keeps: Function (number of frames before) → whether the next frame includes the state; or None.
-        find: Function that is called after each frame and returns its ``error``; or None.
+        find: Function that is called after each frame and returns its ``found``; or None.
     """
     numbers = itertools.count()
     copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
@@ -56,13 +56,13 @@ def frames_of(stepper, count, ahead, keeps=None, find=None):
     def compute():
         copy = next(copies)
         copy.frame()
-        error = None if find is None else find()
+        found = None if find is None else find()
         state = _state_of(stepper) if keeps is not None and keeps(next(numbers)) else None
-        return copy, list(stepper.results), np.array(stepper.residual), error, state
+        return copy, list(stepper.results), np.array(stepper.residual), found, state
 
-    def taken(copy, results, residual, error, state):
+    def taken(copy, results, residual, found, state):
         points, velocities, seconds = copy.take()
-        return Frame(points, velocities, results, residual, seconds, error, state)
+        return Frame(points, velocities, results, residual, seconds, found, state)
 
     first = taken(*compute())
     if ahead == 0:

@@ -51,9 +51,16 @@ class Grades:
         self.distance, self.gap, self.most = (np.zeros(model.copies) for _ in range(3))
         self.solved, self.ratio = np.zeros(model.copies), np.zeros(model.copies)
 
-    def note(self, number, frame, alive):
-        """Notes the errors and the energy in a :class:`warpcloth.run.frames_ahead.Frame` of the copies ``alive`` (B,)."""
-        error, balance = frame.error, self._balance
+    def note(self, number, frame, error, alive):
+        """Notes the energy in a :class:`warpcloth.run.frames_ahead.Frame` of the copies ``alive`` (B,), and its error.
+
+        Args:
+            number: Number of the frame.
+            frame: The frame.
+            error: Its :class:`warpcloth.run.step_errors.StepError`.
+            alive: Copies that are good.
+        """
+        balance = self._balance
         if self.flutter is not None:
             self.flutter.note(number, frame.points, frame.velocities, alive)
         self.solved, self.ratio = error.solved, error.ratio

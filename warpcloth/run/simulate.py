@@ -23,7 +23,16 @@ from ..scene.scene import Scene
 from ..solvers.step import Step
 from ..usd import FrameSequence
 from .checkpoint import facts_of
-from .contact_verdicts import Inside, Pierced, contact_faults, held_pins_of, held_sentence, inside_of, pierced_of
+from .contact_verdicts import (
+    Inside,
+    Pierced,
+    contact_faults,
+    held_pins_of,
+    held_sentence,
+    inside_of,
+    pierced_of,
+    soft_contact_of,
+)
 from .frames_ahead import state_of
 from .history import History, checked_record
 from .recorders import File, Memory
@@ -43,9 +52,10 @@ class SelfContactSummary(NamedTuple):
         lists: Number of lists that were made.
         kept: The fraction of the moves of free vertices, over all steps, that the filter left whole; with B > 1 copies one
             value per copy, (B,).
-        least_gap: The smallest distance of a pair in any frame, as stored in float32 [m], or (B,); infinite if none was listed.
-        too_near: None if all gaps in all frames are at least 4 units in the last place of the largest float32 coordinate of the
-            pair. Else a sentence that names the first frame, a vertex there, and the smallest gap.
+        least_gap: The smallest distance of a pair in any good frame [m], or (B,); infinite if none was listed.
+        too_near: None if frames are kept in float64, or all gaps in all frames are at least 4 units in the last place of the
+            largest float32 coordinate of the pair. Else a sentence that names the first frame, a vertex there, and the smallest
+            gap.
         held_pins: None if cloth held back no pin. Else a sentence that names the first pin that it held back and the frame, and
             the largest distance by which it held one back.
     """
@@ -281,7 +291,9 @@ def simulate(
                     progress(number, frames)
         recorder.finish()
     held, inside, pierced = held_pins_of(stepper), inside_of(stepper), pierced_of(watch)
-    status = watch.status(solver, contact_faults(scene, held, inside, pierced, copies))
+    self_contact = _self_contact(stepper, watch, output is not None, held)  # first, as it notes the gaps of the last frame
+    faults = contact_faults(scene, held, inside, pierced, copies)
+    status = watch.status(solver, faults, soft_contact_of(watch, stepper))
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     recorded = {
@@ -291,7 +303,7 @@ def simulate(
         "inside": inside,
         "pierced": pierced,
         "crossings": _crossings(stepper),
-        "self_contact": _self_contact(stepper, status.complete, held),
+        "self_contact": self_contact,
         **(history.by_name() if history else {}),
     }
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)
@@ -306,23 +318,28 @@ def _crossings(stepper):
 
 
 @in_turn
-def _self_contact(stepper, ok, held):
-    """Returns the :class:`SelfContactSummary` of a run that has ended. If it is ok, notes the gaps of the last frame first.
+def _self_contact(stepper, watch, in_file, held):
+    """Returns the :class:`SelfContactSummary` of a run that has ended, and notes the gaps of its last frame.
 
-    ``held`` are the pins that cloth held back.
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+        watch: The :class:`warpcloth.run.watch.Watch` of the run.
+        in_file: Whether its frames are in a file, in float32.
+        held: The pins that cloth held back.
     """
     pairs, model = stepper.pairs, stepper.model
     if pairs is None:
         return None
     with suppress(Stopped):  # the summary is then without the gaps of the last frame
-        while ok:
+        while watch.alive.any() and not watch.stopped:
             pairs.launch_begin(stepper.state.x)
             if not pairs.overflowed:
                 break
             pairs.grow()
 
-    gaps, near = pairs.least_gap, []
-    for copy, frame, vertex in pairs.too_near:
+    gaps, near = np.where(watch.alive, pairs.least_gap, watch.least_gap), []
+    coarse = in_file or model.numpy_dtype == np.float32
+    for copy, frame, vertex in (each for each in pairs.too_near if coarse and each.frame <= watch.good[each.copy]):
         vertex, of_copy = vertex if model.order is None else model.order[vertex], f" of copy {copy}" if model.copies > 1 else ""
         near.append(
             f"in frame {frame}{of_copy} first, at vertex {vertex}, cloth is nearer to itself than 4 units in the last place of "

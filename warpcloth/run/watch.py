@@ -9,6 +9,7 @@ from ..contact.piercings import piercings_of
 from ..core.status import Grade, Result, Status, Stopped, digits, sentence
 from ..numerics.iterate import ResidualScale
 from .balance import GAIN, STRETCHED, Balance
+from .contact_verdicts import Pressed
 from .frames_ahead import Frame, frames_of
 from .grades import Grades
 
@@ -69,6 +70,9 @@ class Watch:
         piercings: The :class:`warpcloth.contact.piercings.Piercings` of the run, if its scene can have some.
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
         grades: The :class:`warpcloth.run.grades.Grades` of the run, or None.
+        pressed: The :class:`warpcloth.run.contact_verdicts.Pressed` of a run with grades and colliders, else None.
+        least_gap: The smallest distance between cloth and cloth in the frames of each copy before its last checked one, (B,)
+            [m]. The stepper may be ahead of that frame, and goes on with copies that have diverged.
     """
 
     @in_turn
@@ -84,7 +88,9 @@ class Watch:
         if self.piercings is not None:
             stepper.state.add_part("piercings", self.piercings)
         self.last, self.stopped = Frame(None, None, stepper.results, stepper.residual, 0.0), False
-        self.grades = Grades(stepper, self.balance) if grades else None
+        self.grades, self._stepper = Grades(stepper, self.balance) if grades else None, stepper
+        self.pressed = Pressed(model) if grades and scene.colliders else None
+        self.least_gap = np.full(model.copies, np.inf)
 
     def passes(self, number, frame):
         """Checks a frame, and sets copies that diverged to NaN. Returns whether a copy is still good.
@@ -96,6 +102,8 @@ class Watch:
         self.last, points, velocities = frame, frame.points, frame.velocities
         self.seconds.append(frame.seconds)
         B, n = self.model.copies, self.model.per_copy
+        error, gap = (None, self.least_gap) if frame.found is None else frame.found
+        self.least_gap = np.where(self.alive, gap, self.least_gap)
         finite = (np.isfinite(points) & np.isfinite(velocities)).reshape(B, 3 * n)
         gains, strain = self.balance.gains(number, points, velocities), self._strain(points.reshape(B, n, 3))
         stepped = np.array([result is not Result.DIVERGED for result in frame.results])
@@ -119,8 +127,10 @@ class Watch:
             else:
                 self.messages[copy] = f"{where}: {self.balance.sentence(copy)}"
         self.good[self.alive] = number
-        if frame.error is not None:
-            self.grades.note(number, frame, self.alive)
+        if error is not None:
+            self.grades.note(number, frame, error, self.alive)
+        if self.pressed is not None:
+            self.pressed.note(number, points.reshape(B, n, 3), self.alive)
         self.growth = np.where(self.alive, np.fmax(self.growth, gains), self.growth)
         self.worst_strain = np.where(self.alive, np.fmax(self.worst_strain, strain), self.worst_strain)
         for array in (points, velocities):
@@ -131,13 +141,13 @@ class Watch:
         """Returns the ``find`` of :func:`warpcloth.run.frames_ahead.frames_of` for the frames after ``first``, or None."""
         if self.grades is None:
             return None
-        pierce = self.piercings and self.piercings.starts_at(first)
+        pierce, stepper = self.piercings and self.piercings.starts_at(first), self._stepper
 
         @in_turn
         def find():
             if pierce is not None:
                 pierce()
-            return self.grades.errors.find()
+            return self.grades.errors.find(), np.inf if stepper.pairs is None else stepper.pairs.least_gap
 
         return find
 
@@ -154,7 +164,7 @@ class Watch:
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
             yield source, source.carried
-        for part in (self.grades, self.grades and self.grades.flutter, self.history):
+        for part in (self.grades, self.grades and self.grades.flutter, self.pressed, self.history):
             if part is not None:
                 yield part, part.carried
 
@@ -185,12 +195,13 @@ class Watch:
         return found
 
     @in_turn
-    def status(self, solver, faults=()):
+    def status(self, solver, faults=(), warnings=()):
         """Returns the :class:`Status` of a run from its last frame.
 
         Args:
             solver: The record of the solver.
             faults: Further reasons why a copy is not usable, tuples (copy, frame, sentence).
+            warnings: Sentences that follow the message of a usable run.
         """
         results, residual = self.last.results, self.last.residual
         ended = [Result.STOPPED if self.stopped and alive else Result.DIVERGED for alive in self.alive]
@@ -211,5 +222,6 @@ class Watch:
             which, tolerance = copy if len(residual) > 1 else None, getattr(solver, "tolerance", None)
             why = min(faults, key=lambda fault: fault[1])[2] if faults else ""
             message = sentence(result, grade, np.fmax.reduce(distance), residual[copy], measure, unit, tolerance, which, why)
+            message = "; ".join((message, *warnings)) if grade is not Grade.NOT_USABLE else message
         good, distance = int(self.good.max()), of_copies(distance)
         return Status(result, good, of_copies(residual), message, self.good, measure, unit, grade, distance, grades)

@@ -172,6 +172,10 @@ class Collider:
         local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
         return _distances(self.solid, local.reshape(-1, 3), half, radius).reshape(local.shape[:-1])
 
+    def is_near(self, points: np.ndarray, distance: float, frame: int = 0) -> bool:
+        """Returns whether one of points (n, 3) [m] is nearer to its surface than a distance [m], or inside it, at a frame."""
+        return bool((self.distances(points, frame) < distance).any())
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plane(Collider):

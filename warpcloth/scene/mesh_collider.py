@@ -201,6 +201,14 @@ class MeshCollider(Collider):
             found = np.where(behind, -found, found)  # one that has shrunk to a point has no normals, and nothing is behind
         return found.reshape(points.shape[:-1])
 
+    def is_near(self, points: np.ndarray, distance: float, frame: int = 0) -> bool:
+        """Returns whether one of points (n, 3) [m] is nearer to its surface than a distance [m] at a frame."""
+        pose, vertices = (each[min(frame, len(each) - 1)] for each in (self.poses, self.frames))
+        local = (points - pose[:3]) @ turned(pose[3:], np.eye(3)).T
+        within = np.abs(local - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))) < 0.5 * np.ptp(vertices, axis=0) + distance
+        within = within.all(axis=1)  # of its box
+        return bool(within.any() and np.linalg.norm(self._away(points[within], frame)[0], axis=1).min() < distance)
+
     def _away(self, points, frame):
         """From the nearest points of the surface, in its frame; its vertices, and the faces and weights of these points."""
         pose = self.poses[min(frame, len(self.poses) - 1)]
