@@ -86,7 +86,7 @@ def note_gaps(dtype):
         s = pairs.stencils[e]
         copy = s[0] // per_copy
         d = step.gap[e]
-        if steps[copy] % per_frame != 0 or not d < wp.float64(wp.inf):
+        if steps[copy] % per_frame != 0:
             return
         inverse = ONE / d
         if inverse > notes.nearest[copy]:
@@ -123,9 +123,8 @@ def count_pairs(dtype):
         s = pairs.stencils[e]
         copy = s[0] // per_copy
         wp.atomic_add(counts, copy, 0, 1)
-        if step.gap[e] < wp.float64(wp.inf):
-            wp.atomic_max(nearest, copy, ONE / step.gap[e])
-            if step.gap[e] < wp.float64(pairs.distances[e]):
-                wp.atomic_add(counts, copy, 1, 1)
+        wp.atomic_max(nearest, copy, ONE / step.gap[e])
+        if step.gap[e] < wp.float64(pairs.distances[e]):
+            wp.atomic_add(counts, copy, 1, 1)
 
     return count_each_pair

@@ -153,7 +153,7 @@ def share_of_pins(dtype):
     are ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER, or LAGGING if a vertex is
     free, or, if it is larger, the sine of the turn of their normal. Gaps are those of :func:`turned_gap`, which do not change
     if a pair turns as one body. On the chords of a turn by θ between two keyframes they shrink, by up to tan θ/2 times this
-    sine. Pairs that are ``open`` do not hold pins.
+    sine.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -163,10 +163,8 @@ def share_of_pins(dtype):
         # elements
         pairs: near_pairs(dtype),
         inverse_mass: wp.array(dtype=dtype),
-        open: wp.array(dtype=wp.int32),
         # state in
         step: StepPairs,
-        x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         # parameters
         hard: bool,
@@ -176,9 +174,6 @@ def share_of_pins(dtype):
         e = wp.tid()
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
-        if open:
-            if open[e] != 0:
-                return
         s = pairs.stencils[e]
         w = step.weights[e]
         for i in range(4):
@@ -187,10 +182,6 @@ def share_of_pins(dtype):
         n = step.normal[e]
         sides = wp.where(e < pairs.counts[0], 1, 2)
         gap = step.gap[e]
-        if gap == wp.float64(wp.inf):  # left out of contact
-            gap = ZERO
-            for i in range(4):
-                gap += w[i] * wp.dot(n, exact(x_before[s[i]]))
         floor = wp.min(gap, wp.float64(pairs.distances[e]))
         end, turned = turned_gap(e < pairs.counts[0], n, exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
         most = TOGETHER

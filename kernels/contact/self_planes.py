@@ -138,17 +138,12 @@ def ways_of_sides(ways: wp.array(dtype=wp.vec2d), s: wp.vec4i, sides: int):
 
 
 @wp.func
-def needs_no_cut(e: int, way: wp.vec2d, margin: wp.float64, gap: wp.array(dtype=wp.float64), open: wp.array(dtype=wp.int32)):
-    """Whether pair e is ``open``, or its ``gap`` is too wide for moves of the length ``way`` of its sides to be shortened.
+def needs_no_cut(e: int, way: wp.vec2d, margin: wp.float64, gap: wp.array(dtype=wp.float64)):
+    """Whether the ``gap`` of pair e is too wide for moves of the length ``way`` of its sides to be shortened.
 
     For any division of the gap, approaches with at most this sum are not shortened.
     """
-    found = wp.bool(False)
-    if gap:
-        found = way[0] + way[1] <= WIDE * _value(gap, e) - KEPT / CLAMPED * margin
-    if open:
-        found = found or open[e] != 0
-    return found
+    return way[0] + way[1] <= WIDE * _value(gap, e) - KEPT / CLAMPED * margin
 
 
 @cache
@@ -157,7 +152,7 @@ def cut_by_planes(dtype):
 
     A plane normal to y is placed between the two sides. It divides their gap, minus the smallest distance, in the ratio of
     their approaches; each side gets at least CLAMPED of it. The ``common`` move of a copy does not count as an approach. There
-    is no plane for a pair that is ``open``, or whose ``gap`` is too wide for the moves that :func:`find_ways` bounds.
+    is no plane for a pair whose ``gap`` is too wide for the moves that :func:`find_ways` bounds.
 
     A vertex at the smallest distance from a plane that does not approach it moves by at least ``least_share``, or not at
     all. Roundings of shorter moves, which can be equal in many steps, would take it nearer.
@@ -172,7 +167,6 @@ def cut_by_planes(dtype):
         # elements
         pairs: near_pairs(dtype),
         gap: wp.array(dtype=wp.float64),
-        open: wp.array(dtype=wp.int32),
         # state in
         x: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
@@ -194,7 +188,7 @@ def cut_by_planes(dtype):
         sides = wp.where(of_vertex, 1, 2)
         way, far = ways_of_sides(ways, s, sides)
         margin = margin_of(least, ulp * far)
-        if needs_no_cut(e, way, margin, gap, open):
+        if needs_no_cut(e, way, margin, gap):
             return
         origin = exact(x[s[0]])
         _w, y, _inside = nearest(of_vertex, origin, exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
@@ -261,7 +255,6 @@ def cut_as_a_whole(dtype):
         # elements
         pairs: near_pairs(dtype),
         gap: wp.array(dtype=wp.float64),
-        open: wp.array(dtype=wp.int32),
         # state in
         x: wp.array(dtype=vec3),
         direction: wp.array(dtype=vec3),
@@ -281,7 +274,7 @@ def cut_as_a_whole(dtype):
         sides = wp.where(of_vertex, 1, 2)
         way, far = ways_of_sides(ways, s, sides)
         margin = margin_of(least, ulp * far)
-        if needs_no_cut(e, way, margin, gap, open):
+        if needs_no_cut(e, way, margin, gap):
             return
         a = exact(x[s[0]])
         b = exact(x[s[1]])

@@ -997,6 +997,8 @@ def test_what_is_refused(device):
         layers(stiffness=None, terms=[])
     with pytest.raises(ValueError, match="mesh without triangles"):
         wc.Scene(wc.Mesh.chain(3), density=1.0, self_contact=wc.SelfContact())
+    with pytest.raises(ValueError, match=r"self_contact\.held_pins is 'run'"):
+        wc.SelfContact(held_pins="run")
     with pytest.raises(ValueError, match="self_contact is 1; it must be a SelfContact or None"):
         wc.Scene(wc.Mesh.grid(3, 3), density=1.0, self_contact=1)
     with pytest.raises(ValueError, match="symplectic Euler is stable below"):
@@ -1015,7 +1017,7 @@ def test_all_pinned(device):
 
 def test_starts_that_are_refused(device):
     with pytest.raises(ValueError, match=r"vertex 0 and triangle .* start 1e-06 m apart; self_contact needs more than"):
-        wc.Newton(substeps=1).bind(layers(gap=1e-6).build(device=device))
+        wc.Newton(substeps=1).bind(layers(gap=1e-6, pins="all").build(device=device))
     scene = layers(turn=17.0)
     through = scene.positions.copy()
     through[40, 1] -= 0.04
@@ -1048,112 +1050,86 @@ def test_crossings():
     assert triangle.tolist() == [0, 1, 2]
 
 
-def tangled(start):
-    """Sheets that cross at the start: the corner of one in another, all of one in another, and two that coincide."""
-    sheets = layers(turn=17.0 * (start != "coincide"), gap=0.0 if start == "coincide" else 0.02)
-    positions = sheets.positions.copy()
-    if start == "corner":
-        positions[36:] -= [0.15, 0.0, 0.15]
-        positions[71, 1] -= 0.023
-    if start == "tilted":
-        positions[36:, 1] -= np.linspace(0.0, 0.04, 36)
-    velocities = np.zeros_like(positions)
-    velocities[36:, 1] = 0.3
-    return replace(
-        sheets, positions=positions, velocities=velocities, self_contact=replace(sheets.self_contact, crossing_start="run")
+STACK = wc.Mesh.grid(4, 4, size=0.5, pattern="alternating")
+
+
+def start_of(*panels, **fields):
+    """A scene of panels, each (points, triangles) or points of :data:`STACK`, with a contact distance of 2 mm."""
+    parts = [wc.Mesh(*panel) if isinstance(panel, tuple) else wc.Mesh(panel, STACK.triangles) for panel in panels]
+    return wc.Scene(
+        wc.Mesh.join({f"panel{k}": part for k, part in enumerate(parts)}),
+        density=0.15,
+        terms=[wc.Spring(stiffness=100.0)],
+        self_contact=wc.SelfContact(distance=2e-3, stiffness=1e4),
+        fps=24.0,
+        **fields,
     )
 
 
-def crossing_pairs(points, triangles):
-    """The pairs of triangles that intersect in points as stored, by the exact predicates of libigl, and touching ones too."""
-    predicates = pytest.importorskip("igl.predicates")
-    stored = np.asarray(points, dtype=np.float32).astype(np.float64)
-    return {tuple(sorted(pair)) for pair in predicates.find_self_intersections(stored, triangles.astype(np.int64))[1].tolist()}
+FLAT, UP = STACK.points, np.array([0.0, 1.0, 0.0])
+UPRIGHT = np.stack([FLAT[:, 0], FLAT[:, 2], 0.0 * FLAT[:, 1] + 0.2], axis=1)
+SHIFTED, FLIPPED = FLAT + np.array([0.1, 0.0, 0.05]), (FLAT, STACK.triangles[:, ::-1])
+# Panels that touch, and the moves of each over the contact distance, along its y axis; None if they cannot be moved.
+TOUCHING_STARTS = {
+    "coinciding": ([FLAT, FLAT], [-0.5, 0.5]),
+    "shifted": ([FLAT, SHIFTED], [-0.5, 0.5]),
+    "facing away": ([FLIPPED, FLAT], [-0.5, 0.5]),
+    "facing away, the other first": ([FLAT, FLIPPED], [0.5, -0.5]),
+    "a micrometre below": ([FLAT, FLAT - 1e-6 * UP], [0.5, -0.5 - 5e-4]),
+    "three": ([FLAT, FLIPPED, FLAT], [0.0, -1.0, 1.0]),
+    "five": ([FLAT] * 5, [-1.0, -0.5, 0.0, 0.5, 1.0]),
+    "pinned": ([FLAT, FLAT], [0.0, 1.0]),
+}
 
 
-# What stays of a start is one for all solvers; larger crossings have one that is explicit, that minimises, and that sweeps.
-@pytest.mark.parametrize(
-    ("name", "start"),
-    [
-        *slow_but([(name, "corner") for name in FEW], [(name, "corner") for name in SOLVERS]),
-        *(pytest.param(name, start, marks=SLOW) for start in ("tilted", "coincide") for name in ("explicit", "newton", "pbd")),
-    ],
-)
-def test_starts_that_cross(name, start, device):
-    """In no frame do triangles cross that did not at the start, or that have been free, and what is left is counted.
-
-    Sheets that coincided are free at once, and are then thrown back at each other.
-    """
-    scene = tangled(start)
-    stepper = SOLVERS[name].bind(scene.build(device=device, dtype="float64"))
-    tangles, triangles = stepper.pairs.tangles, scene.mesh.triangles
-    known = {tuple(sorted(pair)) for pair in tangles.pairs.tolist()}
-    assert known >= crossing_pairs(scene.positions, triangles) and len(known) == tangles.left()[0] > 0
-    for frame in range(4 if start == "coincide" else 12):
-        if start == "coincide" and frame == 2:
-            stepper.state.v.assign(-30.0 * scene.velocities)
-        stepper.frame()
-        left = {tuple(sorted(pair)) for pair in tangles.pairs[tangles.free == 0].tolist()}
-        assert left <= known and crossing_pairs(stepper.state.x.numpy(), triangles) <= left
-        known = left
-    assert len(known) == tangles.left()[0]
-    if start != "tilted":
-        assert not known
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", TOUCHING_STARTS)
+def test_panels_that_touch_start_apart(name, dtype, device):
+    """As layers along their normals before frame 0, by at most r, in any copy and order of vertices; the run says so."""
+    panels, moves = TOUCHING_STARTS[name]
+    scene = start_of(*panels, pins="part(panel0)" if name == "pinned" else ())
+    run = wc.simulate(scene, wc.XPBD(substeps=2), device=device, dtype=dtype, frames=2, copies=2)
+    expected = np.repeat(2e-3 * np.array(moves), 16)
+    for copy in range(2):
+        assert run.points[0, copy, :, 1] == pytest.approx(expected, abs=1e-9)
+        assert np.abs(run.points[0, copy] - scene.positions)[:, [0, 2]].max() <= np.finfo(dtype).eps
+    count = 2 * 16 * np.count_nonzero(moves)
+    assert run.self_contact.moved_apart == (
+        f"{count} vertices that touched other cloth at the start were moved off it, by up to {2.0 * np.abs(moves).max():.2g} mm"
+    )
+    assert not wc.intersections(run.points[:, 0], scene.mesh).counts.any()
+    shuffled = scene.build(device=device, dtype=dtype, order=np.random.default_rng(0).permutation(len(scene.positions)))
+    stepper = wc.XPBD(substeps=2).bind(shuffled)
+    found = shuffled.in_scene_order(stepper.state.x.numpy())
+    assert found == pytest.approx(run.points[0, 0], abs=1e-9)
+    stepper.frame()
+    stepper.reset()
+    assert (shuffled.in_scene_order(stepper.state.x.numpy()) == found).all()
 
 
-def test_pairs_of_a_start_that_crosses(device):
-    """A triangle with an edge through another: all pairs of their vertices and edges are left out, and of no other triangle."""
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [0.2, -0.5, 0.2], [0.3, 0.5, 0.2], [0.2, 0.5, 0.4], [0.4, 0.8, 0.4]])
-    mesh = wc.Mesh(points, [[0, 1, 2], [3, 4, 5], [4, 5, 6]])
-    run = wc.SelfContact(distance=5e-3, stiffness=1e4, crossing_start="run")
-    scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)], self_contact=run)
-    pairs, _model = steps_of(scene, device)
-    assert pairs.tangles.pairs.tolist() == [[0, 1]] and pairs.tangles.left().tolist() == [1]
-    with pytest.raises(ValueError, match=r"cross at the start.*; 1 pairs of triangles cross or are too near, crossing_start="):
-        steps_of(replace(scene, self_contact=replace(run, crossing_start="refuse")), device)
-    with pytest.raises(ValueError, match=r"self_contact\.crossing_start is 'go'"):
-        wc.SelfContact(crossing_start="go")
-    with pytest.raises(ValueError, match=r"self_contact\.held_pins is 'run'"):
-        wc.SelfContact(held_pins="run")
-    copies = scene.build(device=device, dtype="float64", copies=2)
-    found = wc.XPBD(substeps=2).bind(copies)
-    assert found.pairs.tangles.left().tolist() == [1, 1]
-    animation = wc.simulate(scene, wc.XPBD(substeps=2), device=device, frames=1)
-    assert animation.crossings == 1
+def test_a_panel_that_stands_on_another_starts_above_it(device):
+    """Only the triangles that it touches are moved."""
+    scene = start_of(FLAT, UPRIGHT)
+    start = wc.XPBD(substeps=2).bind(scene.build(device=device, dtype="float64")).state.x.numpy() - scene.positions
+    moved = np.linalg.norm(start, axis=1) > 0.0
+    assert moved[:16].sum() == 8 and moved[16:].sum() == 8 and start[:16, 1].min() == pytest.approx(-1e-3)
+    plain = wc.simulate(start_of(FLAT, UPRIGHT + 1e-3 * UP), wc.XPBD(substeps=2), device=device, frames=1)
+    assert plain.self_contact.moved_apart is None
 
 
-@few_solvers
-def test_pins_that_cross_at_the_start_are_free(name, device):
-    """Two triangles that cross, all of whose vertices are led apart: contact leaves out all their pairs, so no pin lags."""
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [0.2, -0.01, 0.2], [0.3, 0.01, 0.2], [0.2, 0.01, 0.4]])
-    keyframes = np.tile(points, (5, 1, 1))
-    keyframes[:, 3:, 1] += np.linspace(0.0, 0.12, 5)[:, None]
-    contact = wc.SelfContact(distance=5e-3, stiffness=1e4, crossing_start="run")
-    given = {"terms": [wc.Spring(stiffness=1.0)], "pins": wc.Pins("all", keyframes), "self_contact": contact}
-    mesh = wc.Mesh(points, [[0, 1, 2], [3, 4, 5]])
-    stepper = SOLVERS[name].bind(wc.Scene(mesh, density=0.1, fps=24.0, **given).build(device=device, dtype="float64"))
-    for frame in range(1, 5):
-        stepper.frame()
-        assert stepper.state.x.numpy() == pytest.approx(keyframes[frame], abs=1e-12)
-    assert not stepper.pairs.tangles.left().any()
+STAYING = {
+    "crossing at 90 degrees": (lambda: start_of(FLAT, UPRIGHT - [0.0, 0.25, 0.0]), "cross at the start; self_contact needs"),
+    "both pinned": (lambda: start_of(FLAT, FLAT, pins="all"), "start 0 m apart; self_contact needs more than"),
+    "one piece": (lambda: start_of(FLAT, positions=np.abs(FLAT - [0.25, 0.0, 0.0])), "start 0 m apart"),
+    "over a floor": (
+        lambda: start_of(FLAT, FLAT, colliders=[wc.Plane(position=(0.0, -5e-4, 0.0))]),
+        "starts 0.0005 m inside the collider Plane, after it was moved off other cloth",
+    ),
+}
 
 
-@few_solvers
-def test_forces_wait_until_all_tangles_of_a_pair_are_free(name, device):
-    """Two pinned triangles with a common vertex cross a free one, through which this vertex is led, to 3 mm above it.
-
-    The first is then free, but the second has another corner below until frame 4. Only then does contact push the free one.
-    """
-    large = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    around = [[0.3, -0.003, 0.3], [0.2, 0.1, 0.2], [0.3, 0.1, 0.2], [0.4, 0.1, 0.3], [0.35, -0.1, 0.35]]
-    keyframes = np.tile(around, (7, 1, 1))
-    keyframes[1:, 0, 1] = 0.003
-    keyframes[4:, 4, 1] = 0.1
-    mesh = wc.Mesh(np.concatenate([large, around]), [[0, 1, 2], [3, 4, 5], [3, 6, 7]])
-    contact = wc.SelfContact(distance=5e-3, stiffness=1e4, crossing_start="run")
-    given = {"terms": [wc.Spring(stiffness=1.0)], "pins": wc.Pins(np.arange(3, 8), keyframes), "self_contact": contact}
-    scene = wc.Scene(mesh, density=0.1, fps=24.0, gravity=(0.0, 0.0, 0.0), duration=6 / 24, **given)
-    run = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64")
-    moved = np.abs(run.points[:, :3] - large).max(axis=(1, 2))
-    assert (moved[:4] < 1e-9).all() and moved[-1] > 1e-3
-    assert run.points[3] == pytest.approx(np.concatenate([large, keyframes[3]]), abs=1e-9)
+@pytest.mark.parametrize("name", STAYING)
+def test_starts_that_stay_refused(name, device):
+    make, message = STAYING[name]
+    with pytest.raises(ValueError, match=message):
+        wc.XPBD(substeps=2).bind(make().build(device=device))

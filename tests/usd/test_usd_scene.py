@@ -190,7 +190,7 @@ def contact_alone():
     return wc.Scene(mesh(), density=0.1, terms=[SPRING], contact=wc.Contact(stiffness=math.inf))
 
 
-SELF_CONTACT = wc.SelfContact(distance=1 / 300, friction=0.3, crossing_start="run", held_pins="allow")
+SELF_CONTACT = wc.SelfContact(distance=1 / 300, friction=0.3, held_pins="allow")
 
 
 def self_contact():

@@ -59,7 +59,6 @@ def run(arguments):
                 draw_film([arguments.output], arguments.film, device=device.alias)  # draws everything in the stage
             except Interrupted as interrupted:
                 raise Interrupted(f"{interrupted}; frames 0 to {status.frame} are in {arguments.output}") from None
-        crosses = scene.self_contact is not None and scene.self_contact.crossing_start == "run"
         facts = {
             "scene": scene.name,
             "source": str(source.path),
@@ -76,7 +75,6 @@ def run(arguments):
             "worst_strain": animation.worst_strain,
             **({"cut": animation.cut, "inside": [each._asdict() for each in animation.inside]} if scene.colliders else {}),
             **({"pierced": [each._asdict() for each in animation.pierced]} if scene.colliders else {}),
-            **({"crossings": animation.crossings} if crosses else {}),
             **({"self_contact": _self_contact(animation.self_contact)} if animation.self_contact else {}),
             "residual": status.residual,
             "residual_measure": status.measure,
@@ -107,6 +105,8 @@ def _lines_of(found):
     yield f"  self-contact  {counts}, {100.0 * found['kept']:.4g} % of moves kept, {gap}"
     if found["too_near"]:
         yield f"  too near      {found['too_near']}"
+    if found["moved_apart"]:
+        yield f"  moved apart   {found['moved_apart']}"
     if found["held_pins"]:
         yield f"  pins          {found['held_pins']}"
 
@@ -119,8 +119,6 @@ def _summary(facts, inside, pierced):
     touching, by = facts.get("self_contact"), "colliders"
     by += " and other cloth" if touching else ""
     cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by {by}"] if "cut" in facts else []
-    left = facts.get("crossings")
-    crossings = [] if left is None else [f"  crossings     {left} pairs of triangles of the start are left"]
     return "\n".join(
         [
             f"{facts['scene']}: {facts['message']}",
@@ -130,7 +128,6 @@ def _summary(facts, inside, pierced):
             *cut,
             *(f"  inside        {each}" for each in inside),
             *(f"  pierced       {each}" for each in pierced),
-            *crossings,
             *(_lines_of(touching) if touching else ()),
             f"  residual      {residual}",
             f"  solver        {solver_line(facts)}",

@@ -35,6 +35,7 @@ class Proximity:
         found: Positions of the last list, (N,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
         flag, copies: (1,) and (B,) int32, see :meth:`moved`.
         listed: Positions (N,) [m] of the list that is in the arrays.
+        pieces: The connected piece of each vertex of a copy, −1 without an element, (n,).
         drift: Motion of each connected piece of all copies since ``found`` [m], see :meth:`launch_drift`.
     """
 
@@ -44,6 +45,7 @@ class Proximity:
         mesh, n, device = model.scene.mesh, model.per_copy, model.device
         self._triangles, self._edges = len(mesh.triangles) * model.copies, len(mesh.edges) * model.copies
         piece, points = self._connected(model.in_model(mesh.edges))
+        self.pieces = piece
         self._kept = {  # the struct holds no references
             "items": wp.array(self._items(), dtype=wp.vec4i, device=device),
             "rest": model.array(points, model.vec3),

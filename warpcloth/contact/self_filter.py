@@ -63,11 +63,6 @@ class SelfFilter:
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._count = model.kernel(count_step)
 
-    def hold(self, room):
-        """Allocates arrays for ``room`` pairs."""
-        run = self._contact.declared.crossing_start == "run"
-        self._open = wp.zeros(room, dtype=wp.int32, device=self.model.device) if run else None
-
     def _launch(self, factory, dim, inputs, outputs):
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
@@ -110,20 +105,15 @@ class SelfFilter:
         model.launch(self._count, model.copies, [], [self._contact.steps])
         if self._contact.friction is not None:
             self._contact.friction.launch_end(x)
-        if self._contact.tangles is not None:
-            self._contact.tangles.launch_free(x)
 
     def launch_hold(self, x, v, hard):
         """Shortens moves of pins to x that other pins are in the way of, before a solver draws cloth after them; corrects v.
 
         ``hard`` pairs keep the contact distance as a constraint.
         """
-        model, contact, open = self.model, self._contact, None
-        if contact.tangles is not None:
-            open = self._open
-            contact.tangles.launch_open(contact.pairs.stencils, contact.pairs.counts, open)
+        model, contact = self.model, self._contact
         self._share.fill_(1.0)
-        given = [contact.pairs, model.inverse_mass, open, contact.begun, contact.x_before, x, hard]
+        given = [contact.pairs, model.inverse_mass, contact.begun, x, hard]
         self._launch(self_filter.share_of_pins, len(contact.pairs.stencils), given, [self._share])
         given = [model.inverse_mass, self._share, contact.x_before, contact.steps, model.per_copy]
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
@@ -198,11 +188,7 @@ class SelfFilter:
             self._launch(self_planes.common_move, model.copies, [*wanted, model.per_copy], [self._common])
         given = [*wanted, self._common, self._contact.begun_at, model.per_copy]
         self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
-        gap, open = self._contact.begun.gap, None
-        if self._contact.tangles is not None:
-            gap, open = None, self._open  # the gap of a pair that is left out of contact is infinite
-            self._contact.tangles.launch_open(self._contact.pairs.stencils, self._contact.pairs.counts, open)
-        given = [self._contact.pairs, gap, open, *wanted, self._common, self._ways]
+        given = [self._contact.pairs, self._contact.begun.gap, *wanted, self._common, self._ways]
         given += [model.per_copy, FLOOR * self._contact.declared.distance]
         self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
         if target is not None and self._colliders is not None and self._colliders.faces is not None:
@@ -210,11 +196,9 @@ class SelfFilter:
 
     def _launch_whole(self, direction, active):
         """Finds and returns the fraction of a direction that all vertices of a copy may move (B,); call it after the planes."""
-        contact, gap, open = self._contact, self._contact.begun.gap, None
-        if contact.tangles is not None:
-            gap, open = None, self._open
+        contact = self._contact
         self._whole.fill_(1.0)
-        given = [contact.pairs, gap, open, contact.x_before, direction, self._ways, self.model.per_copy]
+        given = [contact.pairs, contact.begun.gap, contact.x_before, direction, self._ways, self.model.per_copy]
         given.append(FLOOR * contact.declared.distance)
         self._launch(self_planes.cut_as_a_whole, len(contact.pairs.stencils), given, [self._whole, self._stopping])
         noted = [self._stopping, self.stopped, self._blocked]
@@ -232,8 +216,7 @@ class SelfFilter:
     def iterates(self):
         """Prepares the methods below for a solver whose iterates stay apart."""
         self._iterates, self._contact.contact.apart, model = True, True, self.model
-        if self._contact.tangles is None:  # else pairs that cross at the start may pass
-            self._contact.contact.least = FLOOR * self._contact.declared.distance
+        self._contact.contact.least = FLOOR * self._contact.declared.distance
         self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)
         self._kernels[self_planes.cut_as_a_whole] = model.kernel(self_planes.cut_as_a_whole, model.dtype)
         self.stopped, self._stopping = (wp.zeros(model.count, dtype=wp.int32, device=model.device) for _ in range(2))

@@ -3,39 +3,41 @@
 Everything is computed in float64, without exact predicates.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
 from ..kernels.terms.contact import FLOOR
-from .tangles import Tangles
+from .start_layers import apart
 
 
 def check_start(contact, state):
     """Checks that cloth does not start with intersections, or with gaps below the smallest gap of the filter.
 
+    Pieces of cloth that only touch or coincide are moved apart, in the state and in the model, see
+    :func:`warpcloth.contact.start_layers.apart`.
+
     Args:
         contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
-        state: The :class:`warpcloth.core.state.State` of the solver, with the positions; tangles add their own arrays to it.
-
-    Returns:
-        With ``crossing_start="run"``, the :class:`warpcloth.contact.tangles.Tangles` of such a start; else None.
+        state: The :class:`warpcloth.core.state.State` of the solver, with the positions.
 
     Raises:
-        ValueError: Such a pair exists, without ``crossing_start="run"``. The message names the first.
+        ValueError: Cloth intersects cloth, or touches it and cannot be moved apart; the message names the first pair.
     """
-    near, split, gap, through, least = _too_near(contact, state.x)
-    if not len(near) and not through:
-        return None
-    crossing = [np.array([each[k] for each in through], dtype=np.int64).reshape(-1, 2 + k) for k in (0, 1)]
-    tangles = Tangles(contact.model, state, *crossing, (near[:split], near[split:]), least)
-    if contact.declared.crossing_start == "run":
-        return tangles
-    rule = f'; {len(tangles)} pairs of triangles cross or are too near, crossing_start="run" takes these'
-    return _refuse_pairs(contact.model, near, split, gap, through, least, rule)
+    start = _too_near(contact, state.x)
+    moved = _moved(contact, state.x, start) if len(start.near) else None
+    if moved is not None and not _too_near(contact, moved).bad:
+        contact.model.move_start(moved)
+        wp.copy(state.x, moved)
+        for points in contact.model.in_scene_order(moved.numpy()).reshape(contact.model.copies, -1, 3):
+            contact.model.scene.refuse_inside(points.astype(np.float64), ", after it was moved off other cloth")
+    elif start.bad:
+        _refuse_pairs(contact.model, start)
 
 
 def check_reset(contact, mask, x):
-    """Checks the positions of a reset of copies, as :func:`check_start`.
+    """Checks the positions of a reset of copies, as :func:`check_start`, but moves nothing.
 
     Args:
         contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
@@ -47,20 +49,57 @@ def check_reset(contact, mask, x):
     """
     model = contact.model
     x = np.where(np.repeat(mask, model.per_copy)[:, None], x, np.nan)  # NaN has no pairs
-    tangles, contact.tangles = contact.tangles, None
     with contact.looking():
         found = _too_near(contact, wp.array(x, dtype=model.vec3, device=model.device))
-    contact.tangles = tangles
-    if len(found[0]) or found[3]:
-        _refuse_pairs(model, *found, "")
+    if found.bad:
+        _refuse_pairs(model, found)
 
 
-def _refuse_pairs(model, near, split, gap, through, least, rule):
-    for stencil in near[:1]:
-        parts = (stencil[:1], stencil[1:]) if split else (stencil[:2], stencil[2:])
-        wanted = f"more than {least:.3g} m, a thousandth of its distance and rounding"
-        _refuse_pair(model, parts, f"start {gap:.3g} m apart; self_contact needs {wanted}{rule}")
-    _refuse_pair(model, through[0], f"cross at the start; self_contact needs a start without crossings{rule}")
+class _Start(NamedTuple):
+    """Pairs that are too near at a start, and intersections.
+
+    Attributes:
+        near: Pairs below the smallest distance, (m, 4).
+        split: The number of vertex–triangle pairs among them, which come first.
+        gaps: Their vectors from the second side to the first, (m, 3) [m]; 0 within rounding.
+        through: Edges that intersect triangles, or touch them at a side.
+        least: The smallest distance [m].
+    """
+
+    near: np.ndarray
+    split: int
+    gaps: np.ndarray
+    through: list
+    least: float
+
+    @property
+    def bad(self):
+        return len(self.near) > 0 or len(self.through) > 0
+
+
+def _moved(contact, x, start):
+    """Returns positions (N,) at which the pairs of a :class:`_Start` that touch are apart, or None."""
+    model, mesh = contact.model, contact.model.scene.mesh
+    n, copies, pieces = model.per_copy, np.arange(model.copies), contact.proximity.pieces
+    first = np.full(pieces.max() + 2, n)  # vertex of each piece in the scene, by which pieces are in order
+    np.minimum.at(first, pieces, np.arange(n) if model.order is None else model.order)
+    near, split = start.near, start.split
+    sides = np.stack([near[:, [0, 0, 0]], near[:, 1:]], axis=1)
+    sides[split:] = near[split:][:, [[0, 1, 1], [2, 3, 3]]]
+    triangles = (model.in_model(mesh.triangles) + n * copies[:, None, None]).reshape(-1, 3)
+    piece = (first[pieces] + n * copies[:, None]).ravel()
+    fixed = (model.coordinate_mobility().reshape(-1, 3) == 0.0).any(axis=1)
+    found = apart(x.numpy().astype(np.float64), triangles, sides, start.gaps, piece, fixed, contact.declared.distance)
+    return None if found is None else wp.array(found, dtype=model.vec3, device=model.device)
+
+
+def _refuse_pairs(model, start):
+    for parts in start.through[:1]:
+        _refuse_pair(model, parts, "cross at the start; self_contact needs a start without crossings")
+    for stencil, gap in zip(start.near[:1], start.gaps, strict=False):
+        parts = (stencil[:1], stencil[1:]) if start.split else (stencil[:2], stencil[2:])
+        wanted = f"more than {start.least:.3g} m, a thousandth of its distance and rounding"
+        _refuse_pair(model, parts, f"start {np.linalg.norm(gap):.3g} m apart; self_contact needs {wanted}")
 
 
 def _refuse_pair(model, parts, why):
@@ -73,13 +112,9 @@ def _refuse_pair(model, parts, why):
 
 
 def _too_near(contact, x):
-    """Lists the pairs at x (N,), and finds those that are too near, and edges that intersect triangles.
+    """Lists the pairs at x (N,), and returns the :class:`_Start` there.
 
     An edge that intersects a triangle is near one of its edges, so that this pair is listed.
-
-    Returns:
-        Pairs below the smallest distance, the number of vertex–triangle pairs among them, the gap of the first [m], edges that
-        intersect triangles, and the smallest distance [m].
     """
     points = x.numpy().astype(np.float64)
     contact.launch_begin_at_start(x, _longest_edge(contact.model, points))
@@ -88,7 +123,7 @@ def _too_near(contact, x):
     found, least = contact.begun.gap.numpy()[: len(stencils)], FLOOR * contact.declared.distance
     ulps = 6.0 * float(np.finfo(contact.model.numpy_dtype).eps) * np.abs(points).max(initial=0.0, where=np.isfinite(points))
     least += ulps
-    near = stencils[found < least]
+    near, y = stencils[found < least], contact.begun.normal.numpy()[: len(stencils)] * found[:, None]
     split = int(np.count_nonzero(found[:of_vertices] < least))
     edges = stencils[of_vertices:]
     through = [
@@ -96,8 +131,7 @@ def _too_near(contact, x):
         for own, other in ((edges[:, :2], edges[:, 2:]), (edges[:, 2:], edges[:, :2]))
         for each in crossings(points, own, _triangles_of(contact.model, other))
     ]
-    gap = found[np.argmax(found < least)] if len(near) else np.inf
-    return near, split, gap, through, least
+    return _Start(near, split, np.where(found > ulps, y.T, 0.0).T[found < least], through, least)
 
 
 def _longest_edge(model, points):

@@ -88,7 +88,6 @@ class SelfSteps:
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
         lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
         listed: 1 if the last list has pairs, else 0, (1,) int32.
-        tangles: :class:`warpcloth.contact.tangles.Tangles` if cloth crosses or touches cloth at the start, else None.
         friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
         stale: Whether the capacity of lists has grown outside of steps, so that graphs must be recorded again.
     """
@@ -131,7 +130,7 @@ class SelfSteps:
         self._block = wp.zeros(size, dtype=wp.float64, device=device) if device.is_cpu else None
         self._corners = model.device.is_cuda or declared.friction > 0.0
         self.contact, self.filter = PairContact(model, bounded, self.list_corners), SelfFilter(self, colliders)
-        self.friction, self.tangles, self.stale = None, None, False
+        self.friction, self.stale = None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)
         self._carried = (
@@ -145,7 +144,7 @@ class SelfSteps:
             slips.grow = self._grow_outside
             self.friction = SelfFriction(model, slips, self.steps, declared.friction, bounded)
         self.forces = Dynamic(model, [self.contact, *([self.friction] if self.friction else [])])
-        self.tangles = check_start(self, state)
+        check_start(self, state)
         self.start_again()
 
     def far_limits(self):
@@ -212,7 +211,6 @@ class SelfSteps:
         self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
         self.begun.nearest = wp.zeros(self.model.count, dtype=wp.int32, device=device)
         self.contact.hold_pairs(self.pairs, self.begun)
-        self.filter.hold(capacity)
 
     def list_corners(self):
         """Prepares the lists of the corners of pairs at each vertex, for kernels that sum over the pairs of a vertex."""
@@ -305,8 +303,6 @@ class SelfSteps:
         """Clears counts and the list, after a reset and after the steps in which an integrator finds its past state."""
         for array in (self.cut, self.steps, self.held.first, self.held.farthest, *self._carried):
             array.zero_()
-        if self.tangles is not None:
-            self.tangles.start_again()
 
     def _launch(self, factory, dim, inputs, outputs):
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
@@ -355,8 +351,6 @@ class SelfSteps:
         """Computes the side and the area of each listed pair, and which pairs act, in all or some ``copies`` (B,) int32."""
         count = len(self.pairs.stencils)
         self.launch_sides(x, copies)
-        if self.tangles is not None:
-            self.tangles.launch_leave_out(self.pairs.stencils, self.pairs.counts, self.begun.gap)
         self._launch(self_pairs.find_nearest, self.model.count, [self.pairs], [self.begun])
         self.pairs.number.zero_()
         given = [self.pairs, self._areas, self.begun_at, self.filter.stopped, self.declared.stiffness]

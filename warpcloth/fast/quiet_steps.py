@@ -30,7 +30,7 @@ class QuietSteps:
         self._plain, self._pairs, self.record, model = steps, pairs, steps.record, pairs.model
         self._dynamic = Gradient(model, terms=(), dynamic=pairs.forces.terms)
         one = len(pairs.proximity.drift) == model.copies
-        self._quiet = one and count is None and not model.scene.colliders and pairs.tangles is None
+        self._quiet = one and count is None and not model.scene.colliders
         self._v_before = model.vectors()
         self._left, self._again = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self._test = model.kernel(find_far, model.dtype)

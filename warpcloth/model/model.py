@@ -47,6 +47,8 @@ class Model:
 
     Attributes:
         positions, velocities: Initial state, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
+        moved_at_start: Distances by which vertices have been moved from the start of the scene, (B·n,) [m], see
+            :meth:`move_start`.
         mass, inverse_mass: (B·n,) [kg], [1/kg]; the inverse mass of a pinned vertex is 0.
         mobility: Inverse masses along each axis, 0 along locked axes, (B·n,) vectors [1/kg]; None if no coordinate of a moving
             vertex is locked.
@@ -110,6 +112,7 @@ class Model:
         refuse_coarse(scene.mesh, unlike_copies(positions), self.numpy_dtype, lambda copy, i: self._label("vertex", copy, i))
         self.positions = self._put("position", "m", positions, self.vec3)
         self.velocities = self._put("velocity", "m/s", velocities, self.vec3)
+        self.moved_at_start = np.zeros(self.count)
         self.mass = self._put("mass", "kg", masses, self.dtype)
         self.inverse_mass = self._put("inverse mass", "1/kg", inverse, self.dtype)
         gravity = vary.take("gravity", scene.gravity)[:, None]
@@ -188,6 +191,12 @@ class Model:
         """Sets vectors (N,) to 0 at coordinates that do not move, if a coordinate is locked."""
         if self.mobility is not None:
             self.launch(self.kernel(lock, self.dtype), self.count, [self.mobility], [values])
+
+    def move_start(self, x):
+        """Sets the initial positions to x (N,) [m], and notes how far vertices moved."""
+        moved = np.linalg.norm(x.numpy() - self.positions.numpy(), axis=1)
+        np.maximum(self.moved_at_start, moved, out=self.moved_at_start)  # in place, for models that share it
+        wp.copy(self.positions, x)
 
     def coordinate_mobility(self):
         """Returns the inverse mass of each coordinate, 0 if it does not move, (3 B·n,) [1/kg] float64 on the host."""

@@ -17,7 +17,7 @@ from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
 from ..base.notebooks import ShownInNotebooks
 from ..base.turns import in_turn
 from ..base.types import FilePath, Precision, Progress
-from ..core.status import Status, Stopped
+from ..core.status import Status, Stopped, millimetres
 from ..mesh.ordering import order_of_run
 from ..scene.scene import Scene
 from ..solvers.step import Step
@@ -56,6 +56,8 @@ class SelfContactSummary(NamedTuple):
         too_near: None if frames are kept in float64, or all gaps in all frames are at least 4 units in the last place of the
             largest float32 coordinate of the pair. Else a sentence that names the first frame, a vertex there, and the smallest
             gap.
+        moved_apart: None if no cloth touched other cloth at the start. Else a sentence that says how many vertices were moved,
+            and by how much, see :class:`SelfContact`.
         held_pins: None if cloth held back no pin. Else a sentence that names the first pin that it held back and the frame, and
             the largest distance by which it held one back.
     """
@@ -65,6 +67,7 @@ class SelfContactSummary(NamedTuple):
     kept: float | np.ndarray
     least_gap: float | np.ndarray
     too_near: str | None
+    moved_apart: str | None
     held_pins: str | None
 
 
@@ -106,8 +109,6 @@ class Animation(ShownInNotebooks):
             the collider moved over it or it into the collider, or it is caught between two obstacles.
         pierced: A tuple of :class:`Pierced`, the first triangle of the cloth through which a corner or an edge of each mesh
             has passed, as ``Contact(elements="vertices")`` lets it.
-        crossings: Number of pairs of triangles that crossed or touched at the start and still do at the end, see
-            ``SelfContact(crossing_start="run")``; with B > 1 copies one value per copy, (B,).
         self_contact: The :class:`SelfContactSummary` of a scene with self-contact, else None.
     """
 
@@ -127,7 +128,6 @@ class Animation(ShownInNotebooks):
     cuts: np.ndarray | None = None
     inside: tuple[Inside, ...] = ()
     pierced: tuple[Pierced, ...] = ()
-    crossings: int | np.ndarray = 0
     pairs: dict[str, np.ndarray] | None = None
     self_contact: SelfContactSummary | None = None
 
@@ -163,7 +163,7 @@ class Animation(ShownInNotebooks):
 
         of_frames = ("points", "velocities", "energies", "reactions", "collider_forces", "friction_forces", "cuts", "pairs")
         given = {name: one(getattr(self, name)) for name in of_frames if getattr(self, name) is not None}
-        given |= {name: np.asarray(getattr(self, name))[copy].item() for name in ("worst_strain", "cut", "crossings")}
+        given |= {name: np.asarray(getattr(self, name))[copy].item() for name in ("worst_strain", "cut")}
         summary = self.self_contact
         if summary is not None:
             summary = summary._replace(
@@ -302,19 +302,10 @@ def simulate(
         "cut": of_copies(stepper.cut),
         "inside": inside,
         "pierced": pierced,
-        "crossings": _crossings(stepper),
         "self_contact": self_contact,
         **(history.by_name() if history else {}),
     }
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)
-
-
-@in_turn
-def _crossings(stepper):
-    """Returns the number of pairs of triangles that crossed at the start and still do, one number or (B,)."""
-    tangles = None if stepper.pairs is None else stepper.pairs.tangles
-    left = np.zeros(stepper.model.copies, dtype=np.int64) if tangles is None else tangles.left()
-    return left if len(left) > 1 else int(left[0])
 
 
 @in_turn
@@ -346,7 +337,10 @@ def _self_contact(stepper, watch, in_file, held):
             f"float32 coordinates, in which frames are stored; the least gap is {gaps[copy]:.3g} m"
         )
     held = [f"{held_sentence(pin, model.copies)}; no cloth may pass through cloth" for pin in held]
-    of_run = of_copies(1.0 - pairs.share), of_copies(gaps), "; ".join(near) or None, "; ".join(held) or None
+    moved = model.moved_at_start[model.moved_at_start > 0.0]
+    apart = f"{len(moved)} vertices that touched other cloth at the start were moved off it, by up to "
+    apart = apart + millimetres(moved.max()) if len(moved) else None
+    of_run = of_copies(1.0 - pairs.share), of_copies(gaps), "; ".join(near) or None, apart, "; ".join(held) or None
     return SelfContactSummary(pairs.most, int(pairs.lists.numpy().max()), *of_run)
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 from ..base.checks import choice, keep_plain, number
 from ..base.types import Converted, default
 
-STARTS, HELD = ("refuse", "run"), ("fail", "allow")
+HELD = ("fail", "allow")
 
 
 @dataclass(frozen=True)
@@ -16,15 +16,14 @@ class SelfContact:
     The energy is U = Σ kA φ(d) over vertex–triangle pairs and edge–edge pairs at distance d, see
     :mod:`warpcloth.kernels.contact.self_contact`. Pairs that share a vertex do not collide. Within a connected piece, the
     contact distance of a pair is at most half its distance at rest, so that neighbours do not push one another. At the end of
-    each step a filter shortens moves that would cross, so that cloth never passes through cloth.
+    each step a filter shortens moves that would cross, so that cloth never passes through cloth. A start in which cloth crosses
+    cloth is refused. Pieces that only touch or coincide at the start are moved apart along their normals, by at most the
+    contact distance.
 
     Attributes:
         distance: Contact distance r [m]. None lets the scene set it: to its thickness, or to 1 mm without one.
         stiffness: k [Pa/m], by default by the rule of :class:`warpcloth.Contact`.
         friction: Coefficient μ of friction.
-        crossing_start: What to do if cloth crosses or touches cloth at the start: ``"refuse"`` the scene, or ``"run"`` it.
-            Triangles that cross or touch at the start then pass through one another until they are apart, and cannot cross
-            again after that. No other triangles can cross. ``Animation.crossings`` is the number of crossing pairs left.
         held_pins: What a run is in which cloth holds pins back from their keyframes: ``"fail"``, it is not usable, because the
             pins are not where the scene says; or ``"allow"``, it may be usable, for scenes in which cloth is to stop pins.
 
@@ -35,7 +34,6 @@ class SelfContact:
     distance: Converted[float | None, float] = default(None)
     stiffness: float | None = None
     friction: float = 0.0
-    crossing_start: Literal["refuse", "run"] = "refuse"
     held_pins: Literal["fail", "allow"] = "fail"
 
     def __post_init__(self) -> None:
@@ -45,5 +43,4 @@ class SelfContact:
         if self.stiffness is not None:
             number("self_contact.stiffness", self.stiffness, above=0.0)
         number("self_contact.friction", self.friction, least=0.0)
-        choice("self_contact.crossing_start", self.crossing_start, STARTS)
         choice("self_contact.held_pins", self.held_pins, HELD)

@@ -24,10 +24,10 @@ class FarSteps(TwinSteps):
 
     @staticmethod
     def serve(stepper):
-        """Returns whether a stepper can use it: each copy is one piece, starts without crossings, and nothing else moves it."""
+        """Returns whether a stepper can use it: each copy is one piece, and nothing else moves it."""
         pairs, model = stepper.pairs, stepper.model
         one = len(pairs.proximity.drift) == model.copies
-        return one and stepper.count is None and model.colliders is None and pairs.tangles is None
+        return one and stepper.count is None and model.colliders is None
 
     def _launch_look(self):
         """Launches the test before a step, and saves the state."""

@@ -96,7 +96,6 @@ ATTRIBUTES = (
     Attribute("self_contact.distance", "warpcloth:selfContact:distance", "cloth", ("double",)),
     Attribute("self_contact.stiffness", "warpcloth:selfContact:stiffness", "cloth", ("double",)),
     Attribute("self_contact.friction", "warpcloth:selfContact:friction", "cloth", ("double",)),
-    Attribute("self_contact.crossing_start", "warpcloth:selfContact:crossingStart", "cloth", ("token",)),
     Attribute("self_contact.held_pins", "warpcloth:selfContact:heldPins", "cloth", ("token",)),
     # The air around it; a wind that has time samples is that of keyframes, a sample for each frame.
     Attribute("air.wind", "warpcloth:air:wind", "cloth", ("double3", "double3[]")),

@@ -575,7 +575,7 @@ def _scene_values(scene):
             given[f"{name}.stiffness"] = contact.stiffness
     if scene.contact is not None and scene.contact.elements != Contact.elements:
         given["contact.elements"] = scene.contact.elements
-    for name in ("friction", "crossing_start", "held_pins"):
+    for name in ("friction", "held_pins"):
         if scene.self_contact is not None and (value := getattr(scene.self_contact, name)) != getattr(SelfContact, name):
             given[f"self_contact.{name}"] = value
     if scene.air is not None:
