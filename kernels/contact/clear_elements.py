@@ -48,6 +48,32 @@ def find_clear(term: Term, dtype):
 
 
 @cache
+def move_clear(term: Term, dtype):
+    """Kernel over contact elements: x[vertex] += max(r − d, 0) ∇d, for no two elements of a term share a vertex. Pins stay."""
+    vec3, _ = types(dtype)
+    rest_type = wp.types.vector(term.parameters, dtype)
+    y_of, gap, rest_of = local_coordinate(term, dtype, False), term.gap, load(rest_type)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def move(
+        # elements
+        stencil: wp.array2d(dtype=wp.int32),
+        rest: wp.array(dtype=rest_type),
+        inverse_mass: wp.array(dtype=dtype),
+        # in and out
+        x: wp.array(dtype=vec3),
+    ):
+        e = wp.tid()
+        i = stencil[e, 0]
+        r = rest_of(rest, e)
+        d, n = gap(y_of(stencil, e, r, x, x), r)
+        if inverse_mass[i] > dtype(0.0) and d < r[contact.DISTANCE]:
+            x[i] = x[i] + (r[contact.DISTANCE] - d) * n
+
+    return move
+
+
+@cache
 def add_energy(term: Term, dtype):
     """Kernel of one thread: out[copy] += Σ kₑ Aₑ u(yₑ) [J], in double precision."""
     vec3, _ = types(dtype)

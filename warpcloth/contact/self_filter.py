@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..kernels.contact import self_filter, self_planes
+from ..kernels.contact.clear_elements import move_clear
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 
@@ -208,13 +209,36 @@ class SelfFilter:
     # For methods whose iterates base + d stay apart too.
 
     def launch_first(self, base, d):
-        """Sets d so that base + d is the start of the step, where all pairs are apart."""
+        """Sets d so that base + d is the start of the step; if pins move, the positions of :meth:`launch_guess`."""
         self._blocked.zero_()
         self._renewed.zero_()
+        if self.model.keyframes is not None:
+            self._walk_clear(base)
         self._add(self._contact.x_before, base, -1.0, d)
+
+    def launch_guess(self, base, d, guess):
+        """Sets ``guess`` so that base + d + guess lies as far from the start of the step towards base as pairs stay apart."""
+        self._walk_clear(base)
+        self._add(self._contact.x_before, base, -1.0, guess)
+        self._add(guess, d, -1.0, guess)
+
+    def _walk_clear(self, base):
+        """Moves the positions of the iterate from the start of the step towards base, but not into a collider.
+
+        Vertices that would come nearer to a collider than the contact distance go to that distance instead. Inside a collider
+        contact is so stiff that a descent would take many iterations to get out.
+        """
+        wp.copy(self._target, base)
+        for elements in self._touching:
+            kernel = self.model.kernel(move_clear, elements.term, self.model.dtype)
+            given = [elements.stencil, elements.rest, self.model.inverse_mass]
+            self.model.launch(kernel, elements.count, given, [self._target])
+        self._walk(self._contact.x_before)
 
     def iterates(self):
         """Prepares the methods below for a solver whose iterates stay apart."""
+        terms = () if self._colliders is None else self._colliders.terms
+        self._touching = [elements for elements in terms if elements.term.gap]
         self._iterates, self._contact.contact.apart, model = True, True, self.model
         self._contact.contact.least = FLOOR * self._contact.declared.distance
         self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)

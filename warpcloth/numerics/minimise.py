@@ -59,8 +59,9 @@ class Minimiser:
         s: Weight of the inertia, 1/h² [1/s²].
         linear_iterations: Maximum number of iterations of a conjugate gradient solve.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter bounds steps; or None.
-        last: The array for d (N,) [m], which holds that of the last step. Without pairs a descent starts there if φ is lower
-            than at d = 0. None: every descent starts from d = 0.
+        last: The array for d (N,) [m], which holds that of the last step. Without contact a descent starts there if φ is lower
+            than at d = 0. With pairs it starts at the start of the step or, if φ is lower there, as far towards d = 0 as pairs
+            and colliders allow. None: every descent starts from d = 0.
 
     Attributes:
         correction: d (N,) [m].
@@ -72,6 +73,7 @@ class Minimiser:
     def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, last=None):
         self.model, self.base, self.pairs = model, base, pairs
         self.warm = last is not None and _resembles_the_last_step(model)
+        self.walks = last is not None and pairs is not None and model.keyframes is None
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
         self.search = Search(model, base, self.sums, s, pairs, last)
@@ -215,16 +217,21 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        """Launches the start from d = 0, or from the last d."""
+        """Launches the start from d = 0 or the start of the step, or from a guess where φ is lower there."""
         if self.warm:
             wp.copy(self.right, self.correction)
         self.clear()
         self._progress.proceed.zero_()
         given = [self.search.acceleration, self._limits]
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
-        if self.warm:
-            self._launch_mean(self.right)
+        if self.warm or self.walks:
+            if self.walks:
+                self.pairs.filter.launch_guess(self.base, self.correction, self.right)
+            else:
+                self._launch_mean(self.right)
             self.search.launch_guess(self.right, self.active)
+            if self.walks:
+                self.search.launch_again()  # with the areas of the pairs that the walk found
             self._progress.proceed.zero_()
             self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
