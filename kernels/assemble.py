@@ -4,6 +4,7 @@ They work for every term. Each is compiled only when a solver asks for it.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -15,6 +16,12 @@ from .transpose import LocalSource, add_outer, gather, scatter, to_block
 from .vectors import types
 
 AHEAD = wp.constant(4)  # elements for whose blocks memory is asked ahead
+
+
+@wp.func
+def is_clear(radius: Any, d: Any):
+    """Whether ‖d‖ is below the radius; False if d is not finite or the radius is NaN."""
+    return radius > type(radius)(0.0) and wp.dot(d, d) < radius * radius
 
 
 @cache
@@ -55,8 +62,11 @@ def of_element(term: Term, dtype, corrected: bool):
 
 
 @cache
-def energy(term: Term, dtype, corrected: bool = False):
-    """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in double precision, to be summed."""
+def energy(term: Term, dtype, corrected: bool = False, clearing: bool = False):
+    """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in double precision, to be summed.
+
+    If ``clearing``, elements of one vertex whose d is below their ``clear`` have no energy, see :mod:`.contact.clear_elements`.
+    """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     (energy_of, _gradient, _hessian), rest_of = of_element(term, dtype, corrected), load(rest_type)
@@ -70,18 +80,23 @@ def energy(term: Term, dtype, corrected: bool = False):
         # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
+        clear: wp.array(dtype=dtype),
         # out
         out: wp.array(dtype=wp.float64),
     ):
         e = wp.tid()
+        if wp.static(clearing):
+            if is_clear(clear[e], d[stencil[e, 0]]):
+                out[e] = wp.float64(0.0)
+                return
         out[e] = energy_of(stencil, stiffness, e, rest_of(rest, e), x, d)
 
     return energy_of_elements
 
 
 @cache
-def energy_parts(term: Term, dtype, block: int):
-    """Kernel over (copies, lanes): the parts of Σ kₑ Aₑ u(yₑ) [J] at x + d, see :func:`.reduce.block_sums`."""
+def energy_parts(term: Term, dtype, block: int, clearing: bool = False):
+    """Kernel over (copies, lanes): the parts of Σ kₑ Aₑ u(yₑ) [J] at x + d, see :func:`.reduce.block_sums`, :func:`energy`."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     (energy_of, _gradient, _hessian), rest_of = of_element(term, dtype, True), load(rest_type)
@@ -96,6 +111,7 @@ def energy_parts(term: Term, dtype, block: int):
         # state in
         x: wp.array(dtype=vec3),
         d: wp.array(dtype=vec3),
+        clear: wp.array(dtype=dtype),
         # parameters
         per_copy: int,
         lanes: int,
@@ -106,6 +122,9 @@ def energy_parts(term: Term, dtype, block: int):
         total = wp.float64(0.0)
         for j in range(lane, per_copy, lanes):
             e = copy * per_copy + j
+            if wp.static(clearing):
+                if is_clear(clear[e], d[stencil[e, 0]]):
+                    continue
             total += energy_of(stencil, stiffness, e, rest_of(rest, e), x, d)
         store_part(lane, total, parts, copy)
 
@@ -114,7 +133,7 @@ def energy_parts(term: Term, dtype, block: int):
 
 @cache
 def elastic(term: Term, dtype):
-    """Struct of the inputs of the forces of a term: its elements, and the state x, d."""
+    """Struct of the inputs of the forces of a term: its elements, the state x, d, and ``clear`` of elements to skip."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -123,13 +142,14 @@ def elastic(term: Term, dtype):
         stiffness: wp.array(dtype=dtype)
         x: wp.array(dtype=vec3)
         d: wp.array(dtype=vec3)
+        clear: wp.array(dtype=dtype)
 
     return Elastic
 
 
 @cache
-def forces(term: Term, dtype, corrected: bool = False):
-    """The :class:`.transpose.LocalSource` of kₑ Aₑ ∂u/∂y."""
+def forces(term: Term, dtype, corrected: bool = False, clearing: bool = False):
+    """The :class:`.transpose.LocalSource` of kₑ Aₑ ∂u/∂y; if ``clearing``, it leaves out as :func:`energy` does."""
     data, rest_type = elastic(term, dtype), wp.types.vector(term.parameters, dtype)
     _energy, gradient_of, _hessian = of_element(term, dtype, corrected)
 
@@ -137,17 +157,21 @@ def forces(term: Term, dtype, corrected: bool = False):
     def force(data: data, e: int, r: rest_type):
         return gradient_of(data.stencil, data.stiffness, e, r, data.x, data.d)
 
-    return LocalSource(data, force)
+    @wp.func
+    def skips(data: data, e: int):
+        return is_clear(data.clear[e], data.d[data.stencil[e, 0]])
+
+    return LocalSource(data, force, skips if clearing else None)
 
 
-def scatter_gradient(term: Term, dtype, corrected: bool = False):
+def scatter_gradient(term: Term, dtype, corrected: bool = False, clearing: bool = False):
     """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i], see :func:`.transpose.scatter`."""
-    return scatter(term, dtype, forces(term, dtype, corrected))
+    return scatter(term, dtype, forces(term, dtype, corrected, clearing))
 
 
-def gather_gradient(term: Term, dtype, corrected: bool = False):
+def gather_gradient(term: Term, dtype, corrected: bool = False, clearing: bool = False):
     """Kernel over vertices: the same sum as :func:`scatter_gradient`, see :func:`.transpose.gather`."""
-    return gather(term, dtype, forces(term, dtype, corrected))
+    return gather(term, dtype, forces(term, dtype, corrected, clearing))
 
 
 @cache

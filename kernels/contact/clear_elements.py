@@ -5,22 +5,15 @@ possible at x̃. Elements with a shorter correction d are skipped before their r
 """
 
 from functools import cache
-from typing import Any
 
 import warp as wp
 
-from ..assemble import of_element
+from ..assemble import is_clear, of_element
 from ..local import local_coordinate
 from ..memory import load, load_shared
 from ..term import Term
 from ..terms import contact
 from ..vectors import types
-
-
-@wp.func
-def is_clear(radius: Any, d: Any):
-    """Whether ‖d‖ is below the radius; False if d is not finite or the radius is NaN."""
-    return radius > type(radius)(0.0) and wp.dot(d, d) < radius * radius
 
 
 @cache
@@ -71,64 +64,6 @@ def move_clear(term: Term, dtype):
             x[i] = x[i] + (r[contact.DISTANCE] - d) * n
 
     return move
-
-
-@cache
-def add_energy(term: Term, dtype):
-    """Kernel of one thread: out[copy] += Σ kₑ Aₑ u(yₑ) [J], in double precision."""
-    vec3, _ = types(dtype)
-    rest_type = wp.types.vector(term.parameters, dtype)
-    (energy_of, _gradient, _hessian), rest_of = of_element(term, dtype, True), load(rest_type)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add(
-        # elements
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
-        rest: wp.array(dtype=rest_type),
-        clear: wp.array(dtype=dtype),
-        # state in
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        # parameters
-        per_copy: int,
-        # in and out
-        out: wp.array(dtype=wp.float64),
-    ):
-        for e in range(stencil.shape[0]):
-            if not is_clear(clear[e], d[stencil[e, 0]]):
-                value = energy_of(stencil, stiffness, e, rest_of(rest, e), x, d)
-                out[e // per_copy] = out[e // per_copy] + value
-
-    return add
-
-
-@cache
-def add_gradient(term: Term, dtype):
-    """Kernel of one thread: out[vertex] += kₑ Aₑ ∂u/∂y [N]."""
-    vec3, _ = types(dtype)
-    rest_type = wp.types.vector(term.parameters, dtype)
-    (_energy, gradient_of, _hessian), rest_of = of_element(term, dtype, True), load(rest_type)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add(
-        # elements
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
-        rest: wp.array(dtype=rest_type),
-        clear: wp.array(dtype=dtype),
-        # state in
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        # in and out
-        out: wp.array(dtype=vec3),
-    ):
-        for e in range(stencil.shape[0]):
-            i = stencil[e, 0]
-            if not is_clear(clear[e], d[i]):
-                out[i] = out[i] + gradient_of(stencil, stiffness, e, rest_of(rest, e), x, d)[0]
-
-    return add
 
 
 # A secant of add_secants ends at LEAP d, or at LIFT r if that is more, at most.

@@ -148,7 +148,7 @@ class Stencils(NamedTuple):
     def energy(self, correction=None):
         """(E,) [J]."""
         out = wp.zeros(len(self.x), dtype=wp.float64, device=self.device)
-        self.launch(*self.state(assemble.energy, correction), out)
+        self.launch(*self.state(assemble.energy, correction), None, out)
         return out.numpy()
 
     def gradient(self, correction=None):

@@ -2,7 +2,6 @@
 
 from ..base.turns import in_turn
 from ..kernels import assemble
-from ..kernels.contact.clear_elements import add_gradient
 from ..terms.refresh import EVALUATION, Moment
 from .dynamic import dynamic_of
 from .transpose import Transpose
@@ -18,15 +17,17 @@ class Gradient:
     def __init__(self, model, corrected=False, terms=None, dynamic=()):
         self.model, self.terms = model, model.terms if terms is None else terms
         self.dynamic = dynamic_of(model, terms, dynamic)
-        self._sums, self._clear = [], []
+        self._sums = []
         for elements in self.terms:
-            if corrected and elements.clear is not None:
-                self._clear.append((elements, model.kernel(add_gradient, elements.term, model.dtype)))
-                continue
-            factories = assemble.scatter_gradient, assemble.gather_gradient
+            factories, clearing = (
+                (assemble.scatter_gradient, assemble.gather_gradient),
+                corrected and elements.clear is not None,
+            )
             data = assemble.elastic(elements.term, model.dtype)()
             data.stencil, data.stiffness = elements.stencil, elements.stiffness
-            self._sums.append((Transpose(model, elements, *factories, elements.term, model.dtype, corrected), data))
+            if clearing:
+                data.clear = elements.clear
+            self._sums.append((Transpose(model, elements, *factories, elements.term, model.dtype, corrected, clearing), data))
 
     def add(self, x, out, correction=None):
         """Launches out += ∂U/∂x at x, or at x + correction if built with ``corrected``."""
@@ -36,7 +37,5 @@ class Gradient:
             if correction is not None:
                 data.d = correction
             transpose.add(data, out)
-        for elements, kernel in self._clear:
-            self.model.launch(kernel, 1, [*elements.arguments, elements.clear, x, correction], [out])
         self.dynamic.launch(x, correction)
         self.dynamic.add_gradient(out)
