@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from ..coulomb import huber_secant
 from ..terms import contact
 from ..terms.contact import turned
 from ..vectors import types
@@ -12,7 +13,7 @@ from .mesh_facets import BEYOND
 from .mesh_geometry import geometry, meshes, motions
 from .mesh_queries import near_lists, queries
 
-turned_by, slope_of = turned, contact.slope
+turned_by = turned
 
 
 @cache
@@ -27,8 +28,7 @@ def slip_of(dtype):
         if held[3] > dtype(0.0):
             u = X - vec3(held[0], held[1], held[2])
             u = u - wp.dot(n, u) * n
-            l = wp.length(u)
-            found = wp.where(l > held[3], held[3] / wp.max(l, held[3]), dtype(1.0)) * u
+            found = huber_secant(wp.length(u), held[3]) * u
         return found
 
     return slip
@@ -46,6 +46,7 @@ def anchor_vertices(dtype, solids, bounded: bool):
     _pose, anchor_type = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
     rest_type, gap, slip = wp.types.vector(8, dtype), gap_of(dtype, solids), slip_of(dtype)
+    slope = contact.bounded_slope if bounded else contact.slope
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -70,9 +71,7 @@ def anchor_vertices(dtype, solids, bounded: bool):
         pose = poses.before[copy, collider]
         X = to_local(pose, x[i])
         d, n = gap(shape, collider, X)
-        depth = -slope_of(d, distance)
-        if wp.static(bounded):
-            depth = wp.max(distance - d, dtype(0.0))
+        depth = -slope(d, distance)
         if depth > dtype(0.0):
             a = X - slip(anchors[i], X, n)
             now = poses.at[copy, collider]
@@ -106,6 +105,7 @@ def anchor_on_mesh(dtype, bounded: bool):
     corners, _from, _carry = geometry(dtype)
     nearest_beyond, _sweep, has_list, is_alone, _listed = queries(dtype)
     rest_type, slip, zero = wp.types.vector(8, dtype), slip_of(dtype), dtype(0.0)
+    slope = contact.bounded_slope if bounded else contact.slope
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -156,9 +156,7 @@ def anchor_on_mesh(dtype, bounded: bool):
             share = zero
             for k in range(count):
                 share += wp.abs(wp.dot(normals[j], normals[k]))
-            force = -slope_of(gaps[j], distance)
-            if wp.static(bounded):
-                force = wp.max(distance - gaps[j], zero)
+            force = -slope(gaps[j], distance)
             depth += force / share
             push += force / share * normals[j]
         r = rest[e]

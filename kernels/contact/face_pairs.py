@@ -16,6 +16,7 @@ from functools import cache
 
 import warp as wp
 
+from ..coulomb import huber_secant
 from ..terms import contact
 from ..terms.face_contact import PAIRS, PARAMETERS, WEIGHTS
 from ..terms.face_friction import PARAMETERS as OF_FRICTION
@@ -28,7 +29,6 @@ from .mesh_geometry import meshes as meshes_of
 from .self_gaps import ONE, ZERO, nearest, vertex_of
 from .self_pairs import PARALLEL
 
-slope_of = contact.slope
 MOST, WEIGHT = wp.constant(PAIRS), wp.constant(WEIGHTS)
 TWO = wp.constant(wp.float64(2.0))
 # Two pairs whose weights differ by more count both, though one is behind the other.
@@ -394,6 +394,7 @@ def anchor_face_pairs(dtype, bounded: bool):
     to_local, to_space = local_frames(dtype)
     _at, exact = vertex_of(dtype)
     kept_type, rest_type = anchor_type(dtype), wp.types.vector(OF_FRICTION, dtype)
+    slope = contact.bounded_slope if bounded else contact.slope
 
     @wp.kernel(module=f"warpcloth.face_pairs.{dtype.__name__}.{bounded}", enable_backward=False)
     def anchor_each_triangle(
@@ -426,9 +427,7 @@ def anchor_face_pairs(dtype, bounded: bool):
         for j in range(MOST):
             pair = pairs[f, j]
             if pair.share > ZERO and pair.gap < wp.float64(motion.r):
-                pressed = -pair.share * slope_of(pair.gap, wp.float64(motion.r))
-                if wp.static(bounded):
-                    pressed = pair.share * (wp.float64(motion.r) - pair.gap)
+                pressed = -pair.share * slope(pair.gap, wp.float64(motion.r))
                 area += pair.share
                 total += pressed
                 push += pressed * pair.normal
@@ -453,9 +452,7 @@ def anchor_face_pairs(dtype, bounded: bool):
                 at = wp.transpose(p) * wp.vec3d(wp.float64(held[4]), wp.float64(held[5]), wp.float64(held[6]))
                 u = at - wp.vec3d(wp.float64(held[0]), wp.float64(held[1]), wp.float64(held[2]))
                 u = u - wp.dot(n, u) * n
-                l = wp.length(u)
-                limit = wp.float64(held[3])
-                a = a - wp.where(l > limit, limit / wp.max(l, limit), ONE) * u
+                a = a - huber_secant(wp.length(u), wp.float64(held[3])) * u
             stay = a
             if mesh.frames[collider] > 1:
                 side = pairs[f, strongest].triangle

@@ -1,9 +1,9 @@
 """Factories of the kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(Σ wᵢxᵢ − a), a = Σ wᵢxᵢⁿ − ξ.
 
-H is the Huber function of :mod:`..terms.friction` with ε = μN/(kA): a spring with the stiffness of contact and a force of at
-most μN. Pairs, w, n, N and kA are those at the start of the step, at the positions xⁿ. ξ is the elongation of the spring there.
-A step updates it, ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of a
-sliding pair slides along.
+H is that of :mod:`..coulomb`, with ε = μN/(kA): a spring with the stiffness of contact and a force of at most μN. Pairs, w, n,
+N and kA are those at the start of the step, at the positions xⁿ. ξ is the elongation of the spring there. A step updates it,
+ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of a sliding pair slides
+along.
 
 ξ is stored relative to the edge between the last two vertices of a pair, so that it rotates with the cloth. A new pair starts
 with the mean ξ of the touching pairs between the same parts, which have a common vertex with it on each side.
@@ -13,18 +13,17 @@ from functools import cache
 
 import warp as wp
 
+from ..coulomb import huber_bend, huber_energy, huber_prox, huber_secant
 from ..terms import contact
 from ..vectors import types
 from .pair_sums import PairForces, PairRow, PairTerm
-from .self_gaps import ONE, SIDE, ZERO, vertex_of
+from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import StepPairs, near_pairs
-
-slope = contact.slope
 
 
 @wp.struct
 class RubbedPairs:
-    """Values of pairs at the start of the step: n, w, kA [N/m], μN [N] (0 without contact), and kA of contact [N/m].
+    """Values of pairs at the start of the step: n, w, kA [N/m], ε [m] (0 without contact), and kA of contact [N/m].
 
     Of pairs with friction also the anchor a [m], and the direction t of the edge of the pair in the plane normal to n.
     """
@@ -127,12 +126,13 @@ def slip_at(dtype):
 
 @cache
 def begin_friction(dtype, bounded: bool):
-    """Kernel over pairs at the start of a step: w, n, kA and μN, and which are acting, that is, have an area or friction.
+    """Kernel over pairs at the start of a step: w, n, kA and ε, and which are acting, that is, have an area or friction.
 
     kA is that of contact in the last step, from ``kept``, so that the mean of N is the force of contact. It is that of this
     step in three cases: in explicit steps, which evaluate contact at their start; in the first step of a copy; and for a pair
     that is not in ``kept``, if areas changed within the last step because the copy was ``relisted``.
     """
+    slope = contact.bounded_slope if bounded else contact.slope
 
     @wp.kernel(module=f"{friction_module(dtype)}.{bounded}", enable_backward=False)
     def begin_friction_of_pairs(
@@ -169,10 +169,8 @@ def begin_friction(dtype, bounded: bool):
                         q = kept.corners[j] // 4
                         if (q < kept.counts[0]) == (e < lists.counts[0]) and equal(s, kept.stencils[q]):
                             k = slips[q][3]
-            if wp.static(bounded):
-                limit = friction * k * (r - gap)
-            else:
-                limit = -friction * k * slope(gap, r)
+            if k > ZERO:
+                limit = -friction * slope(gap, r)
             rubbed.normal[e] = step.normal[e]
             rubbed.weights[e] = step.weights[e]
             rubbed.stiffness[e] = k
@@ -257,9 +255,7 @@ def set_anchors(dtype):
                             total += kept_slip[2] * stretch
         if not own and weight > ZERO:
             total = total / weight
-        pull = rubbed.stiffness[e] * wp.length(total)
-        if pull > limit:
-            total = limit / pull * total
+        total = huber_secant(wp.length(total), limit) * total
         rubbed.anchor[e] = y_of(s, rubbed.weights[e], x) - total
         rubbed.tangent[e] = edge_tangent(exact(x[s[3]]) - exact(x[s[2]]), n)
 
@@ -326,19 +322,14 @@ def find_friction(dtype):
         k = rubbed.stiffness[e]
         u = slip_of(pairs, rubbed, e, x, correction)
         l = wp.length(u)
-        least = wp.min(l, limit / k)
+        across = k * huber_secant(l, limit)
         along = perpendicular(n)
         if l > ZERO:
             along = u / l
-        pull = k
-        bend = wp.vec2d(k, k)
-        if k * l > limit:
-            pull = limit / l
-            bend = wp.vec2d(ZERO, pull)
         forces.weights[e] = w
-        forces.energy[e] = k * least * (l - SIDE * least)
-        forces.force[e] = pull * u
-        forces.bend[e] = bend
+        forces.energy[e] = k * huber_energy(l, limit)
+        forces.force[e] = across * u
+        forces.bend[e] = wp.vec2d(k * huber_bend(l, limit), across)
         forces.along[e] = along
         forces.across[e] = wp.cross(n, along)
         if forces.pressing:
@@ -407,7 +398,7 @@ def near_friction(dtype):
 
 @cache
 def push_friction(dtype):
-    """The ``push`` of friction, in the closed form of :func:`..terms.friction.prox`."""
+    """The ``push`` of friction by the prox of the law."""
 
     @wp.func
     def push_of(
@@ -422,11 +413,9 @@ def push_friction(dtype):
         hard: bool,
     ):
         found = wp.vec3d()
-        k = rubbed.stiffness[e]
         l = wp.length(u)
         if D > ZERO and l > ZERO:
-            most = wp.min(k * h * h * l / (ONE + D * k * h * h), rubbed.limit[e] * h * h)
-            found = -most / l * u
+            found = -huber_prox(l, rubbed.limit[e], D * rubbed.stiffness[e] * h * h) / D * u
         return found
 
     return push_of
@@ -451,7 +440,7 @@ def row_of_friction(dtype):
             found.C = wp.vec2d(wp.dot(u, found.first), wp.dot(u, found.second))
             found.held = held
             found.size = wp.length(u)
-            found.stiffness = wp.min(rubbed.stiffness[e], rubbed.limit[e] / wp.max(found.size, wp.float64(1e-300)))
+            found.stiffness = rubbed.stiffness[e] * huber_secant(found.size, rubbed.limit[e])
         return found
 
     return row_of

@@ -151,6 +151,12 @@ def slope(d: Any, r: Any):
 
 
 @wp.func
+def bounded_slope(d: Any, r: Any):
+    """φ′ of the quadratic stage alone, which explicit steps take."""
+    return wp.min(d - r, type(r)(0.0))
+
+
+@wp.func
 def bend(d: Any, r: Any):
     """φ″; at r its limit from below."""
     tau = type(r)(0.5) * r
@@ -355,13 +361,13 @@ def contact(solid: Solid):
     @wp.func
     def bounded_energy(y: Any, rest: Any):
         d, _n = gap(y, rest)
-        depth = wp.max(rest[11] - d, y.dtype(0.0))
+        depth = bounded_slope(d, rest[11])
         return y.dtype(0.5) * depth * depth
 
     @wp.func
     def bounded_gradient(y: Any, rest: Any):
         d, n = gap(y, rest)
-        return wp.matrix_from_rows(-wp.max(rest[11] - d, y.dtype(0.0)) * n)
+        return wp.matrix_from_rows(bounded_slope(d, rest[11]) * n)
 
     bounded = Term("Contact", 1, 1, PARAMETERS, rest_state, weight, measure, bounded_energy, bounded_gradient, bounded_hessian)
     return Term(

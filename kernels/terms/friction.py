@@ -1,8 +1,6 @@
 """Friction of a vertex on a collider: U = Σ kA H(‖u‖), u = (I − nnᵀ)(y − a), k in Pa/m.
 
-H is the Huber function, H = ½u² for u < ε and εu − ½ε² beyond, with ε = μN/(kA): a spring to the anchor a with a force of at
-most μN (Cundall and Strack 1979, *A discrete numerical model for granular assemblies*). The anchor, the normal n and N are
-constant in a step.
+H is that of :mod:`..coulomb`, with ε = μN/(kA): a spring to the anchor a with a force of at most μN.
 
 Stencil (x₀), y = x₀, measure A. Rest state: a, n, ε [m] and A. With ε = 0, energy and force are 0.
 """
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..coulomb import huber_bend, huber_energy, huber_prox, huber_secant
 from ..term import Term
 from .attachment import weight
 
@@ -50,9 +49,7 @@ def slip(y: Any, rest: Any):
 
 @wp.func
 def energy(y: Any, rest: Any):
-    l = wp.length(slip(y, rest))
-    least = wp.min(l, rest[6])
-    return least * (l - y.dtype(0.5) * least)
+    return huber_energy(wp.length(slip(y, rest)), rest[6])
 
 
 @wp.func
@@ -60,8 +57,7 @@ def gradient(y: Any, rest: Any):
     g = wp.matrix(shape=(1, 3), dtype=y.dtype)
     if rest[6] > y.dtype(0.0):
         u = slip(y, rest)
-        l = wp.length(u)
-        g[0] = wp.where(l > rest[6], rest[6] / wp.max(l, rest[6]), y.dtype(1.0)) * u
+        g[0] = huber_secant(wp.length(u), rest[6]) * u
     return g
 
 
@@ -72,19 +68,19 @@ def hessian(y: Any, rest: Any, negative: Any):
     l = wp.length(u)
     H = wp.matrix(shape=(3, 3), dtype=y.dtype)
     if rest[6] > y.dtype(0.0):
-        H = wp.identity(n=3, dtype=y.dtype) - wp.outer(n, n)
+        across = huber_secant(l, rest[6])
+        H = across * (wp.identity(n=3, dtype=y.dtype) - wp.outer(n, n))
         if l > rest[6]:
-            H = rest[6] / l * (H - wp.outer(u, u) / (l * l))
+            H += (huber_bend(l, rest[6]) - across) * wp.outer(u / l, u / l)
     return H
 
 
 @wp.func
 def secant(y: Any, rest: Any):
-    """ε/‖u‖ for a sliding vertex, else 1: the gradient is this times u."""
-    l = wp.length(slip(y, rest))
+    """H′/‖u‖: the gradient is this times u."""
     share = y.dtype(1.0)
-    if l > rest[6] and rest[6] > y.dtype(0.0):
-        share = rest[6] / l
+    if rest[6] > y.dtype(0.0):
+        share = huber_secant(wp.length(slip(y, rest)), rest[6])
     return share
 
 
@@ -96,14 +92,12 @@ def project(y: Any, rest: Any):
 
 @wp.func
 def prox(v: Any, rest: Any, compliance: Any):
-    """v moved towards the anchor by the fraction c/(1 + c) of u, at most by cε."""
+    """v moved towards the anchor."""
     u = slip(v, rest)
     l = wp.length(u)
-    part = v.dtype(1.0) - v.dtype(1.0) / (v.dtype(1.0) + compliance)
-    if part * l > compliance * rest[6]:
-        part = compliance * rest[6] / l
     p = v
-    p[0] = v[0] - part * u
+    if l > v.dtype(0.0):
+        p[0] = v[0] - huber_prox(l, rest[6], compliance) * u
     return p
 
 
