@@ -80,6 +80,7 @@ class Term:
         clearance: (y, rest) → a radius about y within which there is surely no force, 0 or less if there may be a force at y;
             for terms with ``idle``; or None.
         gap: Of contact with a collider, (y, rest) → the distance and its gradient; or None.
+        law: Of friction with a collider, its :class:`.coulomb.Law`; or None.
         secant: (y, rest) → s, 0 to 1. If p moves with y, y − p is s times the distance to a point that moves less. Constraint
             rows hold p fixed in an iteration, so they use that point and s k instead; or None.
         linear: Whether p does not depend on y, so that y − p is linear in the vertices. The Hessian is then constant: it is
@@ -118,6 +119,7 @@ class Term:
     idle: Any = None
     clearance: Any = None
     gap: Any = None
+    law: Any = None
     secant: Any = None
     linear: bool = False
     quadratic: bool = False

@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from ..coulomb import huber_secant
+from ..coulomb import Law
 from ..terms import contact
 from ..terms.contact import turned
 from ..vectors import types
@@ -17,10 +17,11 @@ turned_by = turned
 
 
 @cache
-def slip_of(dtype):
-    """Device function (anchor, X, n) → the part of the way from an anchor to X along the surface, at most ε; 0 without ε."""
+def slip_of(dtype, law: Law):
+    """Device function (anchor, X, n) → the way from an anchor to X along the surface, less what it follows; 0 without ε."""
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
+    kept = law.kept
 
     @wp.func
     def slip(held: anchor_type, X: vec3, n: vec3):
@@ -28,25 +29,25 @@ def slip_of(dtype):
         if held[3] > dtype(0.0):
             u = X - vec3(held[0], held[1], held[2])
             u = u - wp.dot(n, u) * n
-            found = huber_secant(wp.length(u), held[3]) * u
+            found = kept(wp.length(u), held[3]) * u
         return found
 
     return slip
 
 
 @cache
-def anchor_vertices(dtype, solids, bounded: bool):
+def anchor_vertices(dtype, solids, law: Law, bounded: bool):
     """Kernel over friction elements of one collider at the start of a step: anchors, and the rest states of the step.
 
-    ε = μN/(kA), with N = −kAφ′(d) at the state, or kA(r − d) if ``bounded``. The anchor of a vertex that comes into contact is
-    its position. If a vertex slid, that is, ‖u‖ is above the ε of the last step, its anchor follows to a distance of that ε.
-    Anchors are stored in the frame of the collider, with ε, which is 0 without contact.
+    N = −kAφ′(d) at the state, or kA(r − d) if ``bounded``; ε = μN/(kA) by Coulomb's law. The anchor of a vertex that comes into
+    contact is its position. If a vertex slid, that is, ‖u‖ is above the ε of the last step, its anchor follows to a distance of
+    that ε. Anchors are stored in the frame of the collider, with ε, which is 0 without contact.
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
     to_local, to_space = of_pose(dtype)
-    rest_type, gap, slip = wp.types.vector(8, dtype), gap_of(dtype, solids), slip_of(dtype)
-    slope = contact.bounded_slope if bounded else contact.slope
+    rest_type, gap, slip = wp.types.vector(8, dtype), gap_of(dtype, solids), slip_of(dtype, law)
+    slope, limit = contact.bounded_slope if bounded else contact.slope, law.limit
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -81,10 +82,10 @@ def anchor_vertices(dtype, solids, bounded: bool):
             for k in range(3):
                 r[k] = target[k]
                 r[3 + k] = normal[k]
-            r[6] = friction * depth
+            r[6] = limit(depth, friction)
             r[7] = rest[e][7]
             rest[e] = r
-            anchors[i] = anchor_type(a[0], a[1], a[2], friction * depth)
+            anchors[i] = anchor_type(a[0], a[1], a[2], r[6])
         elif rest[e][6] != dtype(0.0) or anchors[i][3] != dtype(0.0):
             rest[e][6] = dtype(0.0)
             anchors[i] = anchor_type()
@@ -93,7 +94,7 @@ def anchor_vertices(dtype, solids, bounded: bool):
 
 
 @cache
-def anchor_on_mesh(dtype, bounded: bool):
+def anchor_on_mesh(dtype, law: Law, bounded: bool):
     """Kernel over friction elements of one mesh at the start of a step, see :func:`anchor_vertices`.
 
     N and n are the length and the direction of the sum over the facets at the vertex. Anchors are on the surface, and move with
@@ -104,8 +105,8 @@ def anchor_on_mesh(dtype, bounded: bool):
     to_local, to_space = of_pose(dtype)
     corners, _from, _carry = geometry(dtype)
     nearest_beyond, _sweep, has_list, is_alone, _listed = queries(dtype)
-    rest_type, slip, zero = wp.types.vector(8, dtype), slip_of(dtype), dtype(0.0)
-    slope = contact.bounded_slope if bounded else contact.slope
+    rest_type, slip, zero = wp.types.vector(8, dtype), slip_of(dtype, law), dtype(0.0)
+    slope, limit = contact.bounded_slope if bounded else contact.slope, law.limit
 
     @wp.kernel(module="unique", enable_backward=False)
     def anchor(
@@ -161,7 +162,9 @@ def anchor_on_mesh(dtype, bounded: bool):
             push += force / share * normals[j]
         r = rest[e]
         kept = vec3()
+        r[6] = zero
         if depth > zero:
+            r[6] = limit(depth, friction)
             n = wp.normalize(push)
             a = p - wp.dot(normals[0], gaps[0] * n) * n
             a = a - slip(anchors[i], p, n)
@@ -178,8 +181,7 @@ def anchor_on_mesh(dtype, bounded: bool):
             for k in range(3):
                 r[k] = target[k]
                 r[3 + k] = normal[k]
-        r[6] = friction * depth
         rest[e] = r
-        anchors[i] = anchor_type(kept[0], kept[1], kept[2], friction * depth)
+        anchors[i] = anchor_type(kept[0], kept[1], kept[2], r[6])
 
     return anchor

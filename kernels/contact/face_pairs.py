@@ -16,7 +16,7 @@ from functools import cache
 
 import warp as wp
 
-from ..coulomb import huber_secant
+from ..coulomb import Law
 from ..terms import contact
 from ..terms.face_contact import PAIRS, PARAMETERS, WEIGHTS
 from ..terms.face_friction import PARAMETERS as OF_FRICTION
@@ -382,7 +382,7 @@ def anchor_type(dtype):
 
 
 @cache
-def anchor_face_pairs(dtype, bounded: bool):
+def anchor_face_pairs(dtype, law: Law, bounded: bool):
     """Kernel over the elements of friction with one mesh where a step begins: anchors, and the rest states of the step.
 
     Follows :func:`.anchors.anchor_vertices`. The point is the mean of those of the pairs by their forces; N and n are the
@@ -394,9 +394,9 @@ def anchor_face_pairs(dtype, bounded: bool):
     to_local, to_space = local_frames(dtype)
     _at, exact = vertex_of(dtype)
     kept_type, rest_type = anchor_type(dtype), wp.types.vector(OF_FRICTION, dtype)
-    slope = contact.bounded_slope if bounded else contact.slope
+    slope, kept_of, limit = contact.bounded_slope if bounded else contact.slope, law.kept, law.limit
 
-    @wp.kernel(module=f"warpcloth.face_pairs.{dtype.__name__}.{bounded}", enable_backward=False)
+    @wp.kernel(module=f"warpcloth.face_pairs.{law.name}.{dtype.__name__}.{bounded}", enable_backward=False)
     def anchor_each_triangle(
         # elements
         triangles: wp.array(dtype=wp.int32),
@@ -452,7 +452,7 @@ def anchor_face_pairs(dtype, bounded: bool):
                 at = wp.transpose(p) * wp.vec3d(wp.float64(held[4]), wp.float64(held[5]), wp.float64(held[6]))
                 u = at - wp.vec3d(wp.float64(held[0]), wp.float64(held[1]), wp.float64(held[2]))
                 u = u - wp.dot(n, u) * n
-                a = a - huber_secant(wp.length(u), wp.float64(held[3])) * u
+                a = a - kept_of(wp.length(u), wp.float64(held[3])) * u
             stay = a
             if mesh.frames[collider] > 1:
                 side = pairs[f, strongest].triangle
@@ -464,7 +464,7 @@ def anchor_face_pairs(dtype, bounded: bool):
             now = motion.at[copy, collider]
             target = to_space(now, a)
             normal = to_space(now, n) - to_space(now, wp.vec3d())
-            stretch = friction * dtype(size / area)
+            stretch = limit(dtype(size / area), friction)
             for k in range(3):
                 r[k] = dtype(target[k])
                 r[3 + k] = dtype(normal[k])

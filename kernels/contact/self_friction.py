@@ -9,11 +9,11 @@ along.
 with the mean ξ of the touching pairs between the same parts, which have a common vertex with it on each side.
 """
 
-from functools import cache
+from functools import cache, partial
 
 import warp as wp
 
-from ..coulomb import huber_bend, huber_energy, huber_prox, huber_secant
+from ..coulomb import Law
 from ..terms import contact
 from ..vectors import types
 from .pair_sums import PairForces, PairRow, PairTerm
@@ -40,8 +40,9 @@ class RubbedPairs:
 MODULE = "warpcloth.self_friction"
 
 
-def friction_module(dtype):
-    return f"{MODULE}.{dtype.__name__}"
+def friction_module(dtype, law=None):
+    """Returns the name of the module of kernels, of those for a law if that is given."""
+    return ".".join([MODULE, *([law.name] if law else []), dtype.__name__])
 
 
 @wp.func
@@ -125,16 +126,16 @@ def slip_at(dtype):
 
 
 @cache
-def begin_friction(dtype, bounded: bool):
+def begin_friction(dtype, law: Law, bounded: bool):
     """Kernel over pairs at the start of a step: w, n, kA and ε, and which are acting, that is, have an area or friction.
 
     kA is that of contact in the last step, from ``kept``, so that the mean of N is the force of contact. It is that of this
     step in three cases: in explicit steps, which evaluate contact at their start; in the first step of a copy; and for a pair
     that is not in ``kept``, if areas changed within the last step because the copy was ``relisted``.
     """
-    slope = contact.bounded_slope if bounded else contact.slope
+    slope, limit_of = contact.bounded_slope if bounded else contact.slope, law.limit
 
-    @wp.kernel(module=f"{friction_module(dtype)}.{bounded}", enable_backward=False)
+    @wp.kernel(module=f"{friction_module(dtype, law)}.{bounded}", enable_backward=False)
     def begin_friction_of_pairs(
         # elements
         pairs: near_pairs(dtype),
@@ -170,7 +171,7 @@ def begin_friction(dtype, bounded: bool):
                         if (q < kept.counts[0]) == (e < lists.counts[0]) and equal(s, kept.stencils[q]):
                             k = slips[q][3]
             if k > ZERO:
-                limit = -friction * slope(gap, r)
+                limit = limit_of(-slope(gap, r), friction)
             rubbed.normal[e] = step.normal[e]
             rubbed.weights[e] = step.weights[e]
             rubbed.stiffness[e] = k
@@ -196,12 +197,12 @@ def note_relisted(
 
 
 @cache
-def set_anchors(dtype):
+def set_anchors(dtype, law: Law):
     """Kernel over acting pairs at the start of a step: a and t; ξ is from ``kept`` of the last step, if there are ``steps``."""
     vec3, _ = types(dtype)
-    (_at, exact), y_of = vertex_of(dtype), difference_of(dtype)
+    (_at, exact), y_of, kept_of = vertex_of(dtype), difference_of(dtype), law.kept
 
-    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    @wp.kernel(module=friction_module(dtype, law), enable_backward=False)
     def set_anchor_of_pairs(
         # elements
         pairs: near_pairs(dtype),
@@ -255,7 +256,7 @@ def set_anchors(dtype):
                             total += kept_slip[2] * stretch
         if not own and weight > ZERO:
             total = total / weight
-        total = huber_secant(wp.length(total), limit) * total
+        total = kept_of(wp.length(total), limit) * total
         rubbed.anchor[e] = y_of(s, rubbed.weights[e], x) - total
         rubbed.tangent[e] = edge_tangent(exact(x[s[3]]) - exact(x[s[2]]), n)
 
@@ -293,12 +294,12 @@ def set_contact(dtype):
 
 
 @cache
-def find_friction(dtype):
+def find_friction(dtype, law: Law):
     """Kernel over acting pairs: the forces at x, or x + correction."""
     vec3, _ = types(dtype)
-    slip_of = slip_at(dtype)
+    slip_of, energy, secant, bend = slip_at(dtype), law.energy, law.secant, law.bend
 
-    @wp.kernel(module=friction_module(dtype), enable_backward=False)
+    @wp.kernel(module=friction_module(dtype, law), enable_backward=False)
     def find_friction_of_pairs(
         # elements
         pairs: near_pairs(dtype),
@@ -322,14 +323,14 @@ def find_friction(dtype):
         k = rubbed.stiffness[e]
         u = slip_of(pairs, rubbed, e, x, correction)
         l = wp.length(u)
-        across = k * huber_secant(l, limit)
+        across = k * secant(l, limit)
         along = perpendicular(n)
         if l > ZERO:
             along = u / l
         forces.weights[e] = w
-        forces.energy[e] = k * huber_energy(l, limit)
+        forces.energy[e] = k * energy(l, limit)
         forces.force[e] = across * u
-        forces.bend[e] = wp.vec2d(k * huber_bend(l, limit), across)
+        forces.bend[e] = wp.vec2d(k * bend(l, limit), across)
         forces.along[e] = along
         forces.across[e] = wp.cross(n, along)
         if forces.pressing:
@@ -397,8 +398,9 @@ def near_friction(dtype):
 
 
 @cache
-def push_friction(dtype):
+def push_friction(dtype, law: Law):
     """The ``push`` of friction by the prox of the law."""
+    prox = law.prox
 
     @wp.func
     def push_of(
@@ -415,17 +417,17 @@ def push_friction(dtype):
         found = wp.vec3d()
         l = wp.length(u)
         if D > ZERO and l > ZERO:
-            found = -huber_prox(l, rubbed.limit[e], D * rubbed.stiffness[e] * h * h) / D * u
+            found = -prox(l, rubbed.limit[e], D * rubbed.stiffness[e] * h * h) / D * u
         return found
 
     return push_of
 
 
 @cache
-def row_of_friction(dtype):
+def row_of_friction(dtype, law: Law):
     """The ``row`` of friction: C = (u·t, u·(n × t)). Those of a sliding pair are of a softer spring with the same force."""
     vec3, _ = types(dtype)
-    slip_of = slip_at(dtype)
+    slip_of, secant = slip_at(dtype), law.secant
 
     @wp.func
     def row_of(
@@ -440,12 +442,14 @@ def row_of_friction(dtype):
             found.C = wp.vec2d(wp.dot(u, found.first), wp.dot(u, found.second))
             found.held = held
             found.size = wp.length(u)
-            found.stiffness = rubbed.stiffness[e] * huber_secant(found.size, rubbed.limit[e])
+            found.stiffness = rubbed.stiffness[e] * secant(found.size, rubbed.limit[e])
         return found
 
     return row_of
 
 
-FRICTION_OF_PAIRS = PairTerm(
-    "self-friction", MODULE, 2, RubbedPairs, near_friction, push_friction, row_of_friction, isotropic=True
-)
+@cache
+def friction_of_pairs(law: Law):
+    """Returns the :class:`.pair_sums.PairTerm` of friction by a law."""
+    push, row = (partial(make, law=law) for make in (push_friction, row_of_friction))
+    return PairTerm("self-friction", f"{MODULE}.{law.name}", 2, RubbedPairs, near_friction, push, row, isotropic=True)

@@ -11,7 +11,7 @@ import warp as wp
 from ..contact.anchors import slip_of
 from ..contact.collider_filter import FilterNotes, outside
 from ..contact.colliders import gap_of, of_pose, pose_types, shapes, step_poses, turned_by
-from ..coulomb import huber_secant
+from ..coulomb import COULOMB, huber_secant
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..rotation import epsilon
@@ -92,7 +92,7 @@ def touching_step(dtype, symplectic: bool):
     to_local, _to_space = of_pose(dtype)
     gap, end_outside = gap_of(dtype, (ROUNDED_BOX,)), outside(dtype, (ROUNDED_BOX,))
     step, ball_type = kick_and_drift(dtype, symplectic), wp.types.vector(4, dtype)
-    put, slip_along = store(ball_type), slip_of(dtype)
+    put, slip_along = store(ball_type), slip_of(dtype, COULOMB)
 
     @wp.func
     def touch(guard: guard_struct(dtype), i: int, w: dtype, x: vec3, v: vec3, a: vec3, h: dtype):

@@ -4,13 +4,15 @@ Stencil (x₀, x₁, x₂), measure A. Rest state: the anchor, n, ε [m], w₀, 
 """
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from ..coulomb import COULOMB, Law
 from .face_contact import any_weight
-from .friction import BOUNDED_FRICTION, FRICTION
+from .friction import friction
 
 PARAMETERS = 11
 
@@ -40,10 +42,14 @@ _OF_TRIANGLES: dict[str, Any] = {
     "weight": weight,
     "measure": measure,
 }
-BOUNDED_FACE_FRICTION = replace(BOUNDED_FRICTION, **_OF_TRIANGLES)
 
-FACE_FRICTION = replace(
-    FRICTION, **_OF_TRIANGLES, any_weight=any_weight, idle=None, clearance=None, bounded=BOUNDED_FACE_FRICTION
-)
-# All that friction with colliders is.
-FRICTIONS = (FRICTION, FACE_FRICTION)
+
+@cache
+def face_friction(law: Law):
+    """The :class:`..term.Term` of friction of triangles by a law."""
+    term = friction(law)
+    bounded = replace(term.bounded, **_OF_TRIANGLES)
+    return replace(term, **_OF_TRIANGLES, any_weight=any_weight, idle=None, clearance=None, bounded=bounded)
+
+
+FACE_FRICTION = face_friction(COULOMB)

@@ -1,16 +1,17 @@
 """Friction of a vertex on a collider: U = Σ kA H(‖u‖), u = (I − nnᵀ)(y − a), k in Pa/m.
 
-H is that of :mod:`..coulomb`, with ε = μN/(kA): a spring to the anchor a with a force of at most μN.
+H and ε are those of a law, by default :mod:`..coulomb` with ε = μN/(kA): a spring to the anchor a with a force of at most μN.
 
 Stencil (x₀), y = x₀, measure A. Rest state: a, n, ε [m] and A. With ε = 0, energy and force are 0.
 """
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ..coulomb import huber_bend, huber_energy, huber_prox, huber_secant
+from ..coulomb import COULOMB, Law
 from ..term import Term
 from .attachment import weight
 
@@ -48,83 +49,85 @@ def slip(y: Any, rest: Any):
 
 
 @wp.func
-def energy(y: Any, rest: Any):
-    return huber_energy(wp.length(slip(y, rest)), rest[6])
-
-
-@wp.func
-def gradient(y: Any, rest: Any):
-    g = wp.matrix(shape=(1, 3), dtype=y.dtype)
-    if rest[6] > y.dtype(0.0):
-        u = slip(y, rest)
-        g[0] = huber_secant(wp.length(u), rest[6]) * u
-    return g
-
-
-@wp.func
-def hessian(y: Any, rest: Any, negative: Any):
-    n = wp.vector(rest[3], rest[4], rest[5])
-    u = slip(y, rest)
-    l = wp.length(u)
-    H = wp.matrix(shape=(3, 3), dtype=y.dtype)
-    if rest[6] > y.dtype(0.0):
-        across = huber_secant(l, rest[6])
-        H = across * (wp.identity(n=3, dtype=y.dtype) - wp.outer(n, n))
-        if l > rest[6]:
-            H += (huber_bend(l, rest[6]) - across) * wp.outer(u / l, u / l)
-    return H
-
-
-@wp.func
-def secant(y: Any, rest: Any):
-    """H′/‖u‖: the gradient is this times u."""
-    share = y.dtype(1.0)
-    if rest[6] > y.dtype(0.0):
-        share = huber_secant(wp.length(slip(y, rest)), rest[6])
-    return share
-
-
-@wp.func
-def project(y: Any, rest: Any):
-    """y minus the gradient of the energy."""
-    return y - gradient(y, rest)
-
-
-@wp.func
-def prox(v: Any, rest: Any, compliance: Any):
-    """v moved towards the anchor."""
-    u = slip(v, rest)
-    l = wp.length(u)
-    p = v
-    if l > v.dtype(0.0):
-        p[0] = v[0] - huber_prox(l, rest[6], compliance) * u
-    return p
-
-
-@wp.func
 def bounded_hessian(y: Any, rest: Any, negative: Any):
     """0, as the bounded Hessian of contact includes that of friction."""
     return wp.matrix(shape=(3, 3), dtype=y.dtype)
 
 
-BOUNDED_FRICTION = Term("Friction", 1, 1, 8, rest_state, weight, measure, energy, gradient, bounded_hessian)
+@cache
+def friction(law: Law):
+    """The :class:`..term.Term` of friction by a law."""
+    energy_of, secant_of, bend_of, prox_of = law.energy, law.secant, law.bend, law.prox
 
-FRICTION = Term(
-    name="Friction",
-    vertices=1,
-    rows=1,
-    parameters=8,
-    rest_state=rest_state,
-    weight=weight,
-    measure=measure,
-    energy=energy,
-    gradient=gradient,
-    hessian=hessian,
-    dead_zone=True,
-    project=project,
-    prox=prox,
-    idle=idle,
-    clearance=clearance,
-    secant=secant,
-    bounded=BOUNDED_FRICTION,
-)
+    @wp.func
+    def energy(y: Any, rest: Any):
+        return energy_of(wp.length(slip(y, rest)), rest[6])
+
+    @wp.func
+    def gradient(y: Any, rest: Any):
+        g = wp.matrix(shape=(1, 3), dtype=y.dtype)
+        if rest[6] > y.dtype(0.0):
+            u = slip(y, rest)
+            g[0] = secant_of(wp.length(u), rest[6]) * u
+        return g
+
+    @wp.func
+    def hessian(y: Any, rest: Any, negative: Any):
+        n = wp.vector(rest[3], rest[4], rest[5])
+        u = slip(y, rest)
+        l = wp.length(u)
+        H = wp.matrix(shape=(3, 3), dtype=y.dtype)
+        if rest[6] > y.dtype(0.0):
+            across = secant_of(l, rest[6])
+            H = across * (wp.identity(n=3, dtype=y.dtype) - wp.outer(n, n))
+            if l > rest[6]:
+                H += (bend_of(l, rest[6]) - across) * wp.outer(u / l, u / l)
+        return H
+
+    @wp.func
+    def secant(y: Any, rest: Any):
+        """H′/‖u‖: the gradient is this times u."""
+        share = y.dtype(1.0)
+        if rest[6] > y.dtype(0.0):
+            share = secant_of(wp.length(slip(y, rest)), rest[6])
+        return share
+
+    @wp.func
+    def project(y: Any, rest: Any):
+        """y minus the gradient of the energy."""
+        return y - gradient(y, rest)
+
+    @wp.func
+    def prox(v: Any, rest: Any, compliance: Any):
+        """v moved towards the anchor."""
+        u = slip(v, rest)
+        l = wp.length(u)
+        p = v
+        if l > v.dtype(0.0):
+            p[0] = v[0] - prox_of(l, rest[6], compliance) * u
+        return p
+
+    bounded = Term("Friction", 1, 1, 8, rest_state, weight, measure, energy, gradient, bounded_hessian, law=law)
+    return Term(
+        name="Friction",
+        vertices=1,
+        rows=1,
+        parameters=8,
+        rest_state=rest_state,
+        weight=weight,
+        measure=measure,
+        energy=energy,
+        gradient=gradient,
+        hessian=hessian,
+        dead_zone=True,
+        project=project,
+        prox=prox,
+        idle=idle,
+        clearance=clearance,
+        secant=secant,
+        bounded=bounded,
+        law=law,
+    )
+
+
+FRICTION = friction(COULOMB)

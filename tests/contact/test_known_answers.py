@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import warpcloth as wc
+from support.laws import EXTRA, SOFTNESS, Sticky
 from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.core.status import Grade, Result
@@ -67,14 +68,17 @@ def incline(degrees, friction, duration=1.0, mesh=False):
     return sheet(1e-3 - 1e-4 * c, plane, turn=turn, contact=contact, duration=duration), turn[:, 0]
 
 
+SLIDES = [(float, 0.1, False), (float, 0.3, False), (float, 0.3, True), (Sticky, 0.1, False), (Sticky, 0.1, True)]
+
+
 @sticky
-@pytest.mark.parametrize(("friction", "mesh"), slow_but([(0.3, False)], [(0.1, False), (0.3, False), (0.3, True)]))
-def test_a_sheet_slides_down_a_slope(name, friction, mesh, device):
-    """a = g(sin θ − μ cos θ), of the second half, when anchors are dragged along."""
-    scene, down = incline(30.0, friction, duration=0.5, mesh=mesh)
+@pytest.mark.parametrize(("law", "friction", "mesh"), slow_but([(float, 0.3, False), (Sticky, 0.1, False)], SLIDES))
+def test_a_sheet_slides_down_a_slope(name, law, friction, mesh, device):
+    """a = g(sin θ − μ cos θ), of the second half, when anchors are dragged along; less ke/ρ if each spring bears e more."""
+    scene, down = incline(30.0, law(friction), duration=0.5, mesh=mesh)
     animation = run(scene, name, 60 if name == "explicit" else 2, device)
     along = (animation.velocities @ down).mean(axis=1)
-    expected = G * (0.5 - friction * np.sqrt(0.75))
+    expected = G * (0.5 - friction * np.sqrt(0.75)) - (law is Sticky) * 10.0 * G / 1e-3 * EXTRA
     assert (along[-1] - along[15]) / 0.25 == pytest.approx(expected, rel=1e-4)
 
 
@@ -128,6 +132,16 @@ def test_a_sheet_sticks_to_a_slope(name, mesh, device):
     held = 0.3 * 1e-4  # ε = μN/(kA) with N = wA and w = k r/10
     assert abs(along[-1] - along[30]) < (held if name == "explicit" else 1e-9)
     assert 0.0 < along[-1] < 20.0 * held
+
+
+@sticky
+def test_a_sheet_sticks_by_a_law_from_outside(name, device):
+    """At tan θ = 0.45, of which μ is a third, springs are stretched by ρg sin θ/(ks) and do not creep."""
+    scene, down = incline(np.degrees(np.arctan(0.45)), Sticky(0.3), duration=1.0)
+    animation = run(scene, name, 60 if name == "explicit" else 2, device)
+    along = ((animation.points - animation.points[0]) @ down).mean(axis=1)
+    assert abs(along[-1] - along[30]) < (1e-4 if name == "explicit" else 1e-9)
+    assert 0.0 < along[-1] < 20.0 * (0.3 * 1e-4 + EXTRA) / SOFTNESS
 
 
 @each_solver

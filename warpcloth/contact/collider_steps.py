@@ -15,8 +15,6 @@ from ..kernels.contact.collider_filter import FIRST, FilterNotes, filter_step, h
 from ..kernels.contact.mesh_filter import filter_meshes
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
-from ..kernels.terms.face_friction import FRICTIONS
-from ..kernels.terms.friction import FRICTION
 from ..terms.refresh import STEP, Refresh
 from .face_steps import FaceSteps
 from .mesh_faces import MeshFaces
@@ -122,16 +120,16 @@ class ColliderSteps:
         if elements.on_faces:
             return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=self._refresh_of_faces(elements, state))
         anchors = None
-        if elements.term is FRICTION:
+        if elements.term.law:
             anchors = self.anchors[c] = state.add(f"anchors on collider {c}", self.anchor_rows[c])
         if declared.facets[c]:
-            if elements.term is FRICTION:
+            if elements.term.law:
                 of_mesh = self.meshes.friction(elements, float(declared.friction[c]), anchors)
             else:
                 of_mesh = self.meshes.contact(elements)
             launch = partial(self._on_mesh, of_mesh, anchors, state.v)
-        elif elements.term is FRICTION:
-            kernel = model.kernel(anchor_vertices, model.dtype, declared.solids, self.bounded)
+        elif elements.term.law:
+            kernel = model.kernel(anchor_vertices, model.dtype, declared.solids, elements.term.law, self.bounded)
             launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
         elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
             launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype, declared.solids), c, state.v)
@@ -148,7 +146,7 @@ class ColliderSteps:
         if self.face_steps is None:
             return None
         anchors = None
-        if elements.term in FRICTIONS:
+        if elements.term.law:
             c, steps = elements.collider, self.face_steps
             anchors = self.face_anchors[c] = state.add(f"anchors of triangles on collider {c}", steps.anchors(elements))
             launch = steps.friction(elements, float(self.model.colliders.friction[c]), anchors)

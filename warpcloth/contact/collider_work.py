@@ -7,7 +7,6 @@ from ..core.gradient import Gradient
 from ..core.sums import Sums
 from ..kernels.contact import collider_work as kernels
 from ..kernels.project import add_momentum
-from ..kernels.terms.face_friction import FRICTIONS
 from ..kernels.work import add_scaled
 from .present import ColliderPulls, PresentContact
 
@@ -117,7 +116,7 @@ class FilterWork:
         self._present = PresentContact(model, [(stepper.colliders, 0, model.copies)])
         pairs = zip(model.terms, self._present.terms, strict=True)
         pairs = [(each, own) for each, own in pairs if each.collider is not None and not each.hard]
-        contact = [own for each, own in pairs if each.term not in FRICTIONS]
+        contact = [own for each, own in pairs if each.term.law is None]
         self._contact = Energy(model, sums, terms=contact)
         self._before = [wp.zeros_like(each) for each in self._contact.of_elements]
         self._found, self._without, self._scratch = model.scalars(), model.scalars(), model.scalars()

@@ -19,8 +19,8 @@ class FaceSteps:
 
     def __init__(self, model, meshes, bounded):
         self.model, self._meshes, self._bounded, self._pairs, self._bits = model, meshes, bounded, {}, {}
-        factories = (kernels.find_face_pairs, not bounded), (kernels.pose_face_pairs,), (kernels.anchor_face_pairs, bounded)
-        self._find, self._pose, self._anchor = (model.kernel(each, model.dtype, *more) for each, *more in factories)
+        self._find = model.kernel(kernels.find_face_pairs, model.dtype, not bounded)
+        self._pose = model.kernel(kernels.pose_face_pairs, model.dtype)
 
     def arrays(self, elements):
         """Returns the triangle and the area [m²] of each element, (B·E,), in the order of the model."""
@@ -68,10 +68,11 @@ class FaceSteps:
         """
         model, c = self.model, elements.collider
         pairs, motion, geometry = self._pairs[c], self._meshes.motion, self._meshes.geometry
+        anchor = model.kernel(kernels.anchor_face_pairs, model.dtype, elements.term.law, self._bounded)
 
         def launch(elements, arrays, x, _v):
             given = [*arrays, elements.stencil, geometry, pairs, x, motion, c, elements.per_copy, friction]
-            model.launch(self._anchor, elements.count, given, [anchors, elements.rest])
+            model.launch(anchor, elements.count, given, [anchors, elements.rest])
 
         return launch
 

@@ -100,7 +100,7 @@ class MeshSteps:
             anchors: The array of anchors (N,).
         """
         model, c = self.model, elements.collider
-        anchor = model.kernel(anchor_on_mesh, model.dtype, self._bounded)
+        anchor = model.kernel(anchor_on_mesh, model.dtype, elements.term.law, self._bounded)
         most = self._facets[c].shape[1]
 
         def launch(elements, x, _v):

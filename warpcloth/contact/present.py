@@ -10,8 +10,6 @@ from ..core.gradient import Gradient
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.collider_work import collider_pulls
-from ..kernels.terms.face_friction import FRICTIONS
-from ..kernels.terms.friction import FRICTION
 from .face_steps import FaceSteps
 from .mesh_steps import MeshSteps
 
@@ -60,17 +58,17 @@ class PresentContact:
             if self._faces is not None:
                 self._launches.append(partial(self._launch_of_faces(elements), own, self._faces.arrays(elements)))
             return own
-        if elements.term is FRICTION:
+        if elements.term.law:
             anchors = wp.zeros(model.count, dtype=self._anchor_type, device=model.device)
         if model.colliders.facets[c]:
-            if elements.term is FRICTION:
+            if elements.term.law:
                 on_mesh = self._meshes.friction(elements, float(model.colliders.friction[c]), anchors)
                 self._launches.append(lambda _x, _v: self._copy_anchors(c, anchors))
             else:
                 on_mesh = self._meshes.contact(elements)
             self._launches.append(partial(on_mesh, own))
-        elif elements.term is FRICTION:
-            kernel = model.kernel(anchor_vertices, model.dtype, model.colliders.solids, steps.bounded)
+        elif elements.term.law:
+            kernel = model.kernel(anchor_vertices, model.dtype, model.colliders.solids, elements.term.law, steps.bounded)
             self._launches.append(partial(self._anchor, kernel, own, anchors))
         elif model.colliders.moves[c]:
             self._launches.append(
@@ -80,7 +78,7 @@ class PresentContact:
 
     def _launch_of_faces(self, elements):
         c = elements.collider
-        if elements.term not in FRICTIONS:
+        if elements.term.law is None:
             return self._faces.contact(elements)
         anchors = self._faces.anchors(elements)
         rest = self._faces.friction(elements, float(self.model.colliders.friction[c]), anchors)
@@ -138,7 +136,7 @@ class ColliderPulls:
         self.found, self._adds, self.hard = [], [], any(each.hard for each in terms if each.collider is not None)
         for c in range(len(model.scene.colliders)):
             mine = [elements for elements in terms if elements.collider == c]
-            friction = tuple(elements for elements in mine if elements.term.name in [each.name for each in FRICTIONS])
+            friction = tuple(elements for elements in mine if elements.term.law)
             contact = tuple(elements for elements in mine if elements not in friction)
             found = collider_pulls(model.dtype)()
             found.all = model.vectors()

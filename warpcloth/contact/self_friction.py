@@ -7,6 +7,7 @@ from ..core.dynamic import DynamicElements
 from ..core.scan import Scan
 from ..kernels.contact import self_friction as kernels
 from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
+from ..kernels.coulomb import law_of
 
 # Rows of each array of a list, per pair of its capacity.
 ROWS = {"stencils": 1, "corners": 4, "slips": 1}
@@ -99,7 +100,7 @@ class SelfFriction(DynamicElements):
         model: The :class:`warpcloth.model.model.Model`.
         slips: :class:`Slips`, a part of the state of the solver.
         steps: Steps since the start of each copy, (B,) int32.
-        friction: μ.
+        friction: μ, a number or a :class:`warpcloth.kernels.coulomb.Friction`.
         bounded: Whether contact has no logarithm, as in explicit steps.
 
     Attributes:
@@ -109,14 +110,16 @@ class SelfFriction(DynamicElements):
     stored = True
 
     def __init__(self, model, slips, steps, friction, bounded):
-        super().__init__(model, kernels.FRICTION_OF_PAIRS)
-        self._kept, self._steps, self._friction = slips, steps, friction
+        law = law_of(friction)
+        super().__init__(model, kernels.friction_of_pairs(law))
+        self._kept, self._steps, self._friction = slips, steps, float(friction)
         self._bounded = bounded
         self.start, self._step = model.vectors(), Slips(model, slips.room)
         self._vertices = Scan(model, model.count)
-        made = kernels.set_anchors, kernels.find_friction, kernels.end_friction, kernels.set_contact
         self._launch = model.launcher(
-            ((*made, fill_corners, sort_corners), model.dtype), ((kernels.begin_friction,), model.dtype, bounded)
+            ((kernels.end_friction, kernels.set_contact, fill_corners, sort_corners), model.dtype),
+            ((kernels.set_anchors, kernels.find_friction), model.dtype, law),
+            ((kernels.begin_friction,), model.dtype, law, bounded),
         )
         self.hold(slips.room)
 

@@ -13,7 +13,6 @@ from ..base.checks import choice
 from ..core.explicit_step import ExplicitStep
 from ..core.gradient import Gradient
 from ..core.jacobi_sweeps import JacobiSweeps
-from ..kernels.terms.contact import ROUNDED_BOX
 from .block_step import BlockStep
 from .compensation import needs_compensation
 from .contact_guard import ContactGuard
@@ -74,7 +73,7 @@ class Plan:
             steps = SubdomainSteps(*given, pool)
         else:
             backend = self.backend if self.model.uniform else "core"
-            if colliders is not None and self.model.colliders.solids != (ROUNDED_BOX,):
+            if colliders is not None and not self.model.colliders.plain:
                 backend = "core"
             if colliders is not None and colliders.meshes is None and backend != "core":
                 self.guard = ContactGuard(self.model, colliders)

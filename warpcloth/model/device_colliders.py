@@ -6,6 +6,8 @@ import numpy as np
 import warp as wp
 
 from ..kernels.contact.colliders import pose_types
+from ..kernels.coulomb import COULOMB, law_of
+from ..kernels.terms.contact import ROUNDED_BOX
 from .device_meshes import DeviceMeshes, meshes_on
 from .precision import refuse_large
 
@@ -21,6 +23,7 @@ class DeviceColliders(NamedTuple):
         core, radius: Sizes of shapes, (C,) vectors and (C,) numbers [m], see :mod:`warpcloth.kernels.terms.contact`.
         distance: Contact distance [m].
         friction: μ of each, (C,) on the host.
+        laws: The laws of friction.
         moves, half_space: Whether each has more than one pose, and whether it is a half-space, lists of C.
         facets: Number of half-spaces that approximate each near a vertex in a step, 0 for other shapes, a list of C.
         meshes: The triangle meshes among them, or None.
@@ -34,10 +37,16 @@ class DeviceColliders(NamedTuple):
     radius: wp.array
     distance: float
     friction: np.ndarray
+    laws: set
     moves: list
     half_space: list
     facets: list
     meshes: DeviceMeshes | None
+
+    @property
+    def plain(self):
+        """Whether faster explicit steps take them: those whose shape and law of friction are those of the package."""
+        return self.solids == (ROUNDED_BOX,) and self.laws <= {COULOMB}
 
     @property
     def arrays(self):
@@ -65,6 +74,7 @@ def colliders_on(model, scene):
         radius=model.array(np.array(radii), model.dtype),
         distance=float(scene.contact.distance),
         friction=np.array([collider.friction for collider in scene.colliders]),
+        laws={law_of(collider.friction) for collider in scene.colliders},
         moves=[collider.moves for collider in scene.colliders],
         half_space=[bool(np.isinf(core[0])) for core in cores],
         facets=[collider.facets for collider in scene.colliders],

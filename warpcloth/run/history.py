@@ -19,7 +19,6 @@ from ..core.sums import Sums
 from ..fast.plan import plan
 from ..kernels import work as kernels
 from ..kernels.terms.air import AIR
-from ..kernels.terms.face_friction import FRICTIONS
 from ..model.damping import dissipations
 from ..scene.scene import Scene
 from ..terms.refresh import STEP, Moment
@@ -112,9 +111,7 @@ class Evaluation:
         self._start, self._energies, self.stored = self._host(model.positions), None, np.zeros(model.copies)
         self.names = energy_names(model.scene)
         self._term_names = _term_names(model.scene)
-        self.names_of_friction = [
-            name for name, (_present, own) in zip(self._term_names, terms, strict=True) if own.term in FRICTIONS
-        ]
+        self.names_of_friction = [name for name, (_present, own) in zip(self._term_names, terms, strict=True) if own.term.law]
         if not forces:
             return
         self.gradient = model.vectors()

@@ -25,7 +25,6 @@ from ..kernels import step_error as kernels
 from ..kernels.reduce import keep_largest
 from ..kernels.term import HessianPolicy
 from ..kernels.terms.air import AIR
-from ..kernels.terms.face_friction import FRICTIONS
 from ..model.host_values import host_values
 from ..numerics.linear import ConjugateGradients
 
@@ -310,7 +309,7 @@ class _Step:
         if touching or dynamic:
             self.contact = Energy(self.model, of.sums, corrected=True, terms=touching, dynamic=dynamic)
         # The force of contact with colliders without friction and of self-contact, each with its contact distance.
-        scene, pushing = self.model.scene, tuple(each for each in touching if each.term not in FRICTIONS)
+        scene, pushing = self.model.scene, tuple(each for each in touching if each.term.law is None)
         kinds = (pushing, ()), ((), dynamic)
         self._pushes = [plan(self.model).gradient(True, *kind) if any(kind) else None for kind in kinds]
         present = zip(self._pushes, (scene.contact, scene.self_contact), strict=True)

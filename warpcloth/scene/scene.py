@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import array, as_array, keep_plain, number, refuse, shown
 from ..base.types import Converted, Precision, UpAxis, default
+from ..kernels.coulomb import law_of
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 from ..mesh.stage_mesh import StageMesh
@@ -363,7 +364,7 @@ class Scene:
                     shape = {"pose": collider.planes(self.positions[free]), "core": np.full(3, np.inf), "radius": 0.0}
                 found.append(VertexContact(name=f"contact with {collider.label}", facet=facet, **{**given, **shape}))
             if collider.friction:
-                found.append(VertexFriction(name=f"friction on {collider.label}", **given))
+                found.append(VertexFriction(name=f"friction on {collider.label}", law=law_of(collider.friction), **given))
             if self.contact.elements == "triangles" and isinstance(collider, MeshCollider):
                 found += self._face_terms(c, collider, self.contact)
         return tuple(found)
@@ -378,7 +379,7 @@ class Scene:
         given |= {"stiffness": contact.stiffness, "distance": contact.distance}
         names = f"contact of triangles with {collider.label}", f"friction of triangles on {collider.label}"
         found = [FaceContact(name=names[0], facet=pair, **given) for pair in range(PAIRS)]
-        return found + ([FaceFriction(name=names[1], **given)] if collider.friction else [])
+        return found + ([FaceFriction(name=names[1], law=law_of(collider.friction), **given)] if collider.friction else [])
 
     def _check_air(self):
         if not (self.air is None or isinstance(self.air, Air)):

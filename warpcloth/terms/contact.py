@@ -1,16 +1,16 @@
 """Contact and friction of vertices with one collider. A scene makes these terms from its colliders."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
+from ..kernels.coulomb import COULOMB, Law
 from ..kernels.term import Term
 from ..kernels.terms.contact import ROUNDED_BOX, Solid, contact, rest_state
 from ..kernels.terms.face_contact import FACE_CONTACT
 from ..kernels.terms.face_contact import PAIRS as PAIRS
-from ..kernels.terms.face_friction import FACE_FRICTION
-from ..kernels.terms.friction import FRICTION
+from ..kernels.terms.face_friction import FACE_FRICTION, face_friction
+from ..kernels.terms.friction import FRICTION, friction
 from ..mesh.mesh import Mesh
 from .declared import Declared, own_stencil
 
@@ -57,7 +57,11 @@ class VertexContact(Declared):
 class VertexFriction(VertexContact):
     """Friction of vertices on a collider, U = Σ kA H(‖u‖), see :mod:`warpcloth.kernels.terms.friction`."""
 
-    term: ClassVar[Term] = FRICTION
+    law: Law = COULOMB
+
+    @property
+    def term(self) -> Term:
+        return friction(self.law)
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         return FRICTION.rest_state(mesh.points, stencil, self.areas)
@@ -76,7 +80,10 @@ class FaceContact(Declared):
         facet: Index of the pair of each triangle. Steps set all.
     """
 
-    term: ClassVar[Term] = FACE_CONTACT
+    @property
+    def term(self) -> Term:
+        return FACE_CONTACT
+
     triangles: np.ndarray = field(default_factory=lambda: np.empty((0, 3), np.int32))
     areas: np.ndarray = field(default_factory=lambda: np.empty(0))
     distance: float = 1e-3
@@ -94,7 +101,11 @@ class FaceContact(Declared):
 class FaceFriction(FaceContact):
     """Friction of triangles on a mesh, U = Σ kA H(‖u‖), see :mod:`warpcloth.kernels.terms.face_friction`."""
 
-    term: ClassVar[Term] = FACE_FRICTION
+    law: Law = COULOMB
+
+    @property
+    def term(self) -> Term:
+        return face_friction(self.law)
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
         return FACE_FRICTION.rest_state(mesh.points, stencil, self.areas)

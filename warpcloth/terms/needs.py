@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..kernels.terms.air import AIR
-from ..kernels.terms.face_friction import FRICTIONS
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ CONSTANT_MATRIX = Need(
     "{label}, whose curvature is not known in advance",
 )
 NORMAL_FORCE = Need(
-    lambda elements: elements.term not in FRICTIONS,
+    lambda elements: elements.term.law is None,
     "{label}, whose normal force does not follow from positions",
     "leave friction at 0",
 )
