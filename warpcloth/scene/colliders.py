@@ -109,6 +109,18 @@ class Collider:
         """Half sizes and radius, as for :attr:`core`, of a shape that contains it at all frames."""
         return self.core
 
+    def clearing_gap(self, edge: float) -> float:
+        """Returns the gap d = √(R² + L²/3) − R of its vertices [m] that keeps a triangle outside.
+
+        R is the radius by which the shape is rounded, 0 for a box. Each point of the triangle is within L/√3 of a vertex. If it
+        is the nearest to a centre of rounding, at the distance h, then (R + d)² ≤ h² + L²/3, so h is not below R.
+
+        Args:
+            edge: The longest edge L of the triangle [m].
+        """
+        half, radius = self.core
+        return 0.0 if np.isinf(half[0]) else float(np.sqrt(radius**2 + edge**2 / 3.0) - radius)
+
     @property
     def extent(self) -> float:
         """Largest distance of its surface from ``position`` [m]."""

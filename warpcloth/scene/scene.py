@@ -507,11 +507,22 @@ class Scene:
         if self.colliders and self.contact is not None and self.contact.stiffness is not None:
             lines += [f"  {_described(collider)}" for collider in self.colliders]
             lines.append(f"  contact: distance {self.contact.distance:g} m, stiffness {self.contact.stiffness:.4g} Pa/m")
+            lines += self._cuts()
         if self.self_contact is not None:
             lines.append(f"  {_described(self.self_contact)}")
         if self.air is not None:
             lines.append(f"  {_described(self.air)}")
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
+
+    def _cuts(self):
+        """Yields a line about the shapes that may cut into triangles of the cloth between their vertices."""
+        edge = self.mesh.edge_lengths.max()
+        shapes = [each for each in self.colliders if len(self.mesh.triangles) and not isinstance(each, MeshCollider)]
+        gaps = {each.label: each.clearing_gap(edge) for each in shapes}
+        found = [f"{gap:.3g} m of {name}" for name, gap in gaps.items() if gap > self.contact.distance]
+        if found:
+            why = f"triangles may be cut into between vertices, as edges are up to {edge:.3g} m"
+            yield f"  {why}; gaps that prevent it: {', '.join(found)}"
 
 
 def _is_nan(value):
