@@ -72,7 +72,7 @@ def take_parts(dtype):
 def mark_items(dtype):
     """Kernel over items: which have a vertex that has moved, and the region of their boxes."""
     vec3, _ = types(dtype)
-    box_of, _level, _cell, _about = boxes(dtype)
+    box_of, _along, _level, _cell, _about = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def mark_each_item(

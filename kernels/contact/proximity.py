@@ -99,10 +99,51 @@ def cutoffs(dtype, of_edges: bool):
 
 
 @cache
-def find_pairs(dtype, of_edges: bool):
-    """Kernel over vertices, or edges: pairs with triangles, or with edges, of the same level and those above.
+def take_near(dtype, of_edges: bool):
+    """The function of :func:`search_pairs` that lists pairs nearer than their contact distance and the skin, and its struct."""
+    vec3, _ = types(dtype)
+    corner, pair_list = load(vec3), pair_lists(dtype)
+    closest, cutoff = closest_points(dtype, of_edges), cutoffs(dtype, of_edges)
+    KIND = wp.constant(int(of_edges))
 
-    The rows of cells near each vertex or edge are divided among ``shares`` threads, the second dimension of the launch.
+    @wp.func
+    def take(
+        surface: surfaces(dtype),
+        x: wp.array(dtype=vec3),
+        s: wp.vec4i,
+        first: int,
+        i: int,
+        k: int,
+        triangles: int,
+        pairs: pair_list,
+    ):
+        _w, y = closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
+        d = wp.length(y)
+        if d < surface.distance + surface.skin:
+            if d < surface.skin or d < surface.skin + cutoff(surface, s, first):
+                if pairs.counts[KIND] < MOST:
+                    slot = wp.atomic_add(pairs.counts, KIND, 1)
+                    row = i
+                    item = k
+                    if wp.static(of_edges):
+                        slot += pairs.counts[0]
+                        row = wp.min(i, k) + x.shape[0]
+                        item = wp.max(i, k)
+                    if slot < pairs.found.shape[0]:
+                        wp.atomic_add(pairs.row_counts, row, 1)
+                        pairs.found[slot] = wp.vec2i(row, item + triangles)
+
+    return take, pair_list
+
+
+@cache
+def search_pairs(dtype, of_edges: bool, take, name: str):
+    """Kernel over vertices, or edges: calls ``take`` for pairs with triangles, or with edges, whose boxes meet.
+
+    ``take`` (dtype, of_edges) returns a device function (surface, x, s, first, i, k, triangles, out) and the struct of ``out``.
+    s is the stencil of a pair, ``first`` the first vertex of its copy, i its vertex or edge, and k its triangle or other edge.
+    The boxes are at x, or along moves ``p`` from there. A box meets those of its own level and those above. The rows of cells
+    near each vertex or edge are divided among ``shares`` threads, the second dimension of the launch.
 
     Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices.
 
@@ -111,26 +152,27 @@ def find_pairs(dtype, of_edges: bool):
     the order of their indices.
     """
     vec3, _ = types(dtype)
-    box_of, level_of, cell_at, cells_about = boxes(dtype)
+    _box_of, box_along, level_of, cell_at, cells_about = boxes(dtype)
     number, corner, four = load(wp.int32), load(vec3), load(wp.vec4i)
     meet = boxes_meet(dtype)
-    closest, cutoff = closest_points(dtype, of_edges), cutoffs(dtype, of_edges)
+    visit, out_type = take(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
     # Separate modules: graphs on the CPU find kernels of a module by name, and both kinds have the same name.
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}.{KIND}", enable_backward=False)
+    @wp.kernel(module=f"{MODULE}.{name}.{dtype.__name__}.{KIND}", enable_backward=False)
     def find_each_pair(
         # elements
         surface: surfaces(dtype),
         # state in
         x: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
         grid: grids(dtype),
         # parameters
         triangles: int,
         shares: int,
         moved: moved_parts(dtype),
-        # out
-        pairs: pair_lists(dtype),
+        # in and out
+        out: out_type,
     ):
         i, share = wp.tid()
         few = wp.bool(False)
@@ -148,9 +190,7 @@ def find_pairs(dtype, of_edges: bool):
             own = wp.vec4i(i, i, i, 0)
             if surface.piece[i - copy * surface.vertices] < 0:
                 return
-        a = x[own[0]]
-        b = x[own[1]]
-        low, high = box_of(surface, a, b, b)
+        low, high = box_along(surface, x, p, own[0], own[1], own[1])
         level = level_of(grid.size, low, high)
         if level < 0:
             return
@@ -160,7 +200,6 @@ def find_pairs(dtype, of_edges: bool):
         lowest = level
         layer = cell_at(grid.size, low, high, level)[2]
         buckets = grid.counts.shape[0]
-        radius = surface.distance + surface.skin
         if wp.static(of_edges):
             if moved.items:
                 level = 0
@@ -209,21 +248,7 @@ def find_pairs(dtype, of_edges: bool):
                             s = wp.vec4i(own[0], other[0], other[1], other[2])
                         if entry[1] != cy or entry[2] != cz or entry[3] != code:
                             continue
-                        _w, y = closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
-                        d = wp.length(y)
-                        if d < radius:
-                            if d < surface.skin or d < surface.skin + cutoff(surface, s, copy * surface.vertices):
-                                if pairs.counts[KIND] >= MOST:
-                                    return
-                                slot = wp.atomic_add(pairs.counts, KIND, 1)
-                                row = i
-                                if wp.static(of_edges):
-                                    slot += pairs.counts[0]
-                                    row = wp.min(i, k) + x.shape[0]
-                                    k = wp.max(i, k)
-                                if slot < pairs.found.shape[0]:
-                                    wp.atomic_add(pairs.row_counts, row, 1)
-                                    pairs.found[slot] = wp.vec2i(row, k + triangles)
+                        visit(surface, x, s, copy * surface.vertices, i, k, triangles, out)
             present = present >> 1
             level += 1
 

@@ -10,6 +10,7 @@ from functools import cache
 
 import warp as wp
 
+from ..memory import load
 from ..rotation import epsilon
 from ..vectors import types
 
@@ -84,9 +85,9 @@ def moved_parts(dtype):
 
 @cache
 def boxes(dtype):
-    """Device functions on boxes: ``box_of``, ``level_of``, ``cell_at``, ``cells_about``."""
+    """Device functions on boxes: ``box_of``, ``box_along``, ``level_of``, ``cell_at``, ``cells_about``."""
     vec3, _ = types(dtype)
-    half, farthest = dtype(0.5), dtype(FARTHEST)
+    half, farthest, corner = dtype(0.5), dtype(FARTHEST), load(vec3)
 
     @wp.func
     def box_of(surface: surfaces(dtype), a: vec3, b: vec3, c: vec3):
@@ -99,6 +100,19 @@ def boxes(dtype):
         more += wp.dot(a, vec3()) + wp.dot(b, vec3()) + wp.dot(c, vec3())
         edge = vec3(more, more, more)
         return low - edge, high + edge
+
+    @wp.func
+    def box_along(surface: surfaces(dtype), x: wp.array(dtype=vec3), p: wp.array(dtype=vec3), i: int, j: int, k: int):
+        """The box of three vertices that move from x to x + p, or that stay, if p is None."""
+        a = corner(x, i)
+        b = corner(x, j)
+        c = corner(x, k)
+        low, high = box_of(surface, a, b, c)
+        if p:
+            l, h = box_of(surface, a + corner(p, i), b + corner(p, j), c + corner(p, k))
+            low = wp.min(low, l)
+            high = wp.max(high, h)
+        return low, high
 
     @wp.func
     def level_of(size: dtype, low: vec3, high: vec3):
@@ -140,7 +154,7 @@ def boxes(dtype):
             last = cell_of(most, high + edge)
         return first, last
 
-    return box_of, level_of, cell_at, cells_about
+    return box_of, box_along, level_of, cell_at, cells_about
 
 
 @cache
@@ -168,7 +182,7 @@ def count_items(dtype):
     If parts have ``moved``, only items whose box meets their region count.
     """
     vec3, _ = types(dtype)
-    box_of, level_of, cell_at, _about = boxes(dtype)
+    _box_of, box_along, level_of, cell_at, _about = boxes(dtype)
     meet = boxes_meet(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -177,13 +191,14 @@ def count_items(dtype):
         surface: surfaces(dtype),
         # state in
         x: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
         moved: moved_parts(dtype),
         # in and out
         grid: grids(dtype),
     ):
         item = wp.tid()
         v = surface.items[item]
-        low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
+        low, high = box_along(surface, x, p, v[0], v[1], v[2])
         level = level_of(grid.size, low, high)
         if moved.items:
             if not meet(low, high, moved.region[0], moved.region[1]):
@@ -204,7 +219,7 @@ def count_items(dtype):
 def fill_buckets(dtype):
     """Kernel over items: the entries of the buckets; counts ``counts`` down to 0."""
     vec3, _ = types(dtype)
-    box_of, level_of, cell_at, _about = boxes(dtype)
+    _box_of, box_along, level_of, cell_at, _about = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def fill_each_bucket(
@@ -212,6 +227,7 @@ def fill_buckets(dtype):
         surface: surfaces(dtype),
         # state in
         x: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
         # in and out
         grid: grids(dtype),
     ):
@@ -220,7 +236,7 @@ def fill_buckets(dtype):
         if key < 0:
             return
         v = surface.items[item]
-        low, high = box_of(surface, x[v[0]], x[v[1]], x[v[2]])
+        low, high = box_along(surface, x, p, v[0], v[1], v[2])
         level = level_of(grid.size, low, high)
         cell = cell_at(grid.size, low, high, level)
         slot = grid.first[key] + wp.atomic_sub(grid.counts, key, 1) - 1

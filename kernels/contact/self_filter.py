@@ -10,8 +10,7 @@ import warp as wp
 from ..vectors import types
 from .gap_notes import FIRST
 from .self_gaps import ONE, PLANAR, ZERO, vertex_of
-from .self_pairs import STOPPED, StepPairs, module_of, near_pairs
-from .self_planes import WHOLE
+from .self_pairs import StepPairs, module_of, near_pairs
 
 # Pins of hard pairs may approach by this fraction of their gap in a step. The second is for pairs with a free vertex, which
 # lags behind pins that turn.
@@ -378,148 +377,23 @@ def push_pairs(dtype):
 
 
 @cache
-def shorten(dtype):
-    """Kernel over vertices: p ← p·min(1, most/max‖pⱼ‖), with the maximum over the vertices of a copy."""
+def scale_directions(dtype):
+    """Kernel over vertices: p ← ``fraction``·p, with the fraction of the copy (B,)."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def shorten_each_direction(
+    def scale_each_direction(
         # state in
-        longest: wp.array(dtype=wp.float64),
-        # parameters
-        per_copy: int,
-        most: wp.float64,
-        # in and out
-        p: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        if longest[i // per_copy] > most:
-            p[i] = dtype(most / longest[i // per_copy]) * p[i]
-
-    return shorten_each_direction
-
-
-@cache
-def limit_direction(dtype):
-    """Kernel over vertices: p ← u + t(p − u), with u and t as in :func:`keep_apart`.
-
-    If ``whole`` is given and is at least WHOLE in a copy, p ← ``whole``·p there instead.
-    """
-    vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def limit_each_direction(
-        # state in
-        share: wp.array(dtype=wp.float64),
-        common: wp.array(dtype=wp.vec3d),
-        whole: wp.array(dtype=wp.float64),
-        # parameters
-        per_copy: int,
-        most: wp.float64,
-        # in and out
-        direction: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        u = common[i // per_copy]
-        move = exact(direction[i]) - u
-        t = wp.min(bounded_share(move, most), share[i])
-        if whole:
-            if whole[i // per_copy] >= WHOLE:
-                t = whole[i // per_copy]
-                u = t * u
-        if t < ONE:
-            end = u + t * move
-            direction[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
-
-    return limit_each_direction
-
-
-@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def count_stops(
-    # parameters
-    active: wp.array(dtype=wp.int32),
-    per_copy: int,
-    # in and out
-    stopping: wp.array(dtype=wp.int32),
-    stopped: wp.array(dtype=wp.int32),
-    # out
-    blocked: wp.array(dtype=wp.int32),
-):
-    """Kernel over vertices: counts up to STOPPED the directions that stopped at a vertex; blocked = 1 where it gets there.
-
-    It sets ``stopping`` to 0. Copies that are not ``active`` keep old directions, which do not count.
-    """
-    i = wp.tid()
-    if stopping[i] != 0:
-        stopping[i] = 0
-        if active[i // per_copy] != 0 and stopped[i] < STOPPED:
-            stopped[i] = stopped[i] + 1
-            if stopped[i] == STOPPED:
-                blocked[i // per_copy] = 1
-
-
-@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def take_blocked(
-    # parameters
-    active: wp.array(dtype=wp.int32),
-    most: int,
-    # in and out
-    blocked: wp.array(dtype=wp.int32),
-    turns: wp.array(dtype=wp.int32),
-    # out
-    taken: wp.array(dtype=wp.int32),
-    some: wp.array(dtype=wp.int32),
-):
-    """Kernel over copies: taken = 1 in active copies that are blocked, at most ``most`` times, else 0; some = 1 if any is."""
-    c = wp.tid()
-    taken[c] = 0
-    if active[c] != 0 and blocked[c] != 0 and turns[c] < most:
-        turns[c] = turns[c] + 1
-        taken[c] = 1
-        some[0] = 1
-    blocked[c] = 0
-
-
-@cache
-def precondition(dtype):
-    """Kernel over vertices: p = P r."""
-    vec3, mat33 = types(dtype)
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def precondition_each(
-        # state in
-        preconditioner: wp.array(dtype=mat33),
-        r: wp.array(dtype=vec3),
-        # out
-        p: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        p[i] = preconditioner[i] * r[i]
-
-    return precondition_each
-
-
-@cache
-def take_descent(dtype):
-    """Kernel over vertices: p = other, in copies where the slope along p is not negative."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def take_each_descent(
-        # state in
-        slope: wp.array(dtype=wp.float64),
-        other: wp.array(dtype=vec3),
+        fraction: wp.array(dtype=wp.float64),
         # parameters
         per_copy: int,
         # in and out
         p: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        if not slope[i // per_copy] < ZERO:
-            p[i] = other[i]
+        p[i] = dtype(fraction[i // per_copy]) * p[i]
 
-    return take_each_descent
+    return scale_each_direction
 
 
 @cache

@@ -17,9 +17,6 @@ from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
 SHARING = wp.constant(wp.float64(0.25))
 # The area of two edges decreases if sin² of their angle is below this, to 0 for parallel edges.
 PARALLEL = wp.constant(wp.float64(1e-3))
-# So many directions must stop at the vertices of pairs of edges before these have their whole area. One does not: the first
-# directions of a step may be far from the solution, and the areas would then not be those of other solvers.
-STOPPED = wp.constant(2)
 
 
 @cache
@@ -153,8 +150,7 @@ def set_areas(dtype):
     are about equally near. The area of a pair of edges is (A₁ + … + A₄)/12 if the pair is nearer by SHARING·r than the
     vertex–triangle pairs of its vertices on the same side; it falls linearly to 0 where they are as near. It is smaller if the
     edges are nearly parallel. So crossed folds are in contact too, and the areas of all pairs of two flat layers in contact sum
-    to the area of one layer. Where ``stopped`` (N,), if it is not None, is STOPPED at all four vertices of a pair of edges, its
-    area is the whole one whatever else is near.
+    to the area of one layer.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -167,7 +163,6 @@ def set_areas(dtype):
         areas: wp.array(dtype=wp.float64),
         # state in
         x: wp.array(dtype=vec3),
-        stopped: wp.array(dtype=wp.int32),
         # parameters
         stiffness: wp.float64,
         # in and out
@@ -231,9 +226,6 @@ def set_areas(dtype):
                             least = value(step.gap, other)
                 if least < wp.float64(wp.inf):
                     nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)
-            if stopped:
-                if wp.min(wp.min(stopped[s[0]], stopped[s[1]]), wp.min(stopped[s[2]], stopped[s[3]])) == STOPPED:
-                    nearer = ONE
             if nearer > ZERO:
                 ab = exact(x[s[1]]) - exact(x[s[0]])
                 cd = exact(x[s[3]]) - exact(x[s[2]])

@@ -16,12 +16,6 @@ CLAMPED = wp.constant(wp.float64(0.05))  # smallest distance of each side from t
 # A pair needs no plane if its sides approach by less than this fraction of the gap. It is below 0.9²: along y the sides are at
 # least 0.9 of the gap apart, and the fraction KEPT of this may be closed.
 WIDE = wp.constant(wp.float64(0.75))
-# A search direction is shortened as a whole if pairs allow this fraction of it, else at each vertex. To shorten it at single
-# vertices stretches stiff cloth and tears apart what is pressed together, so that the line search makes hardly any step.
-WHOLE = wp.constant(wp.float64(0.1))
-# The advances of a pair along a direction end after this number, or when no more than NEAR of the way to its floor is left.
-ADVANCES = wp.constant(64)
-NEAR = wp.constant(wp.float64(0.05))
 
 
 @cache
@@ -32,18 +26,13 @@ def ulp_of(dtype):
 
 @cache
 def wanted_move(dtype):
-    """Device function (x, target, direction, i) → wanted move of vertex i: its direction, or if that is None target − x."""
+    """Device function (x, target, i) → wanted move of vertex i, target − x."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
     @wp.func
-    def wanted(x: wp.array(dtype=vec3), target: wp.array(dtype=vec3), direction: wp.array(dtype=vec3), i: int):
-        found = wp.vec3d()
-        if direction:
-            found = exact(direction[i])
-        else:
-            found = exact(target[i]) - exact(x[i])
-        return found
+    def wanted(x: wp.array(dtype=vec3), target: wp.array(dtype=vec3), i: int):
+        return exact(target[i]) - exact(x[i])
 
     return wanted
 
@@ -59,7 +48,6 @@ def common_move(dtype):
         # state in
         x: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
         # parameters
         per_copy: int,
         # out
@@ -68,7 +56,7 @@ def common_move(dtype):
         copy = wp.tid()
         total = wp.vec3d()
         for i in range(copy * per_copy, (copy + 1) * per_copy):
-            total += wanted(x, target, direction, i)
+            total += wanted(x, target, i)
         common[copy] = total / wp.float64(per_copy)
 
     return find_common_move
@@ -90,7 +78,6 @@ def find_ways(dtype):
         # state in
         x: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
         common: wp.array(dtype=wp.vec3d),
         begun: wp.array(dtype=vec3),
         # parameters
@@ -102,7 +89,7 @@ def find_ways(dtype):
     ):
         i = wp.tid()
         start = exact(x[i])
-        move = wanted(x, target, direction, i)
+        move = wanted(x, target, i)
         far = wp.max(wp.max(wp.abs(start)), wp.max(wp.abs(start + move)))
         one = i - i % per_copy
         since = start - exact(begun[i]) - (exact(x[one]) - exact(begun[one]))
@@ -170,7 +157,6 @@ def cut_by_planes(dtype):
         # state in
         x: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
         common: wp.array(dtype=wp.vec3d),
         ways: wp.array(dtype=wp.vec2d),
         # parameters
@@ -200,7 +186,7 @@ def cut_by_planes(dtype):
         position = wp.vec4d()
         approaches = wp.vec4d()
         for i in range(4):
-            move = wanted(x, target, direction, s[i])
+            move = wanted(x, target, s[i])
             approach = wp.dot(n, move - common[s[i] // per_copy])
             along = wp.dot(n, exact(x[s[i]]) - origin)
             position[i] = along
@@ -232,93 +218,3 @@ def cut_by_planes(dtype):
                 wp.atomic_max(least_share, s[i], ulp * far / wp.max(-approaches[i], wp.float64(1e-300)))
 
     return cut_by_each_plane
-
-
-@cache
-def cut_as_a_whole(dtype):
-    """Kernel over pairs: reduces the ``whole`` of each copy, the fraction of the ``direction`` that all vertices may move.
-
-    A pair keeps a tenth of its gap. Where all vertices move by the same fraction, a plane between the two sides may move with
-    them: the two sides stay apart along y while no vertex of one side comes near the height of one of the other. Where this
-    allows less than the direction, as for cloth that slides over an edge, the pair advances until its gap could be closed at
-    the relative speed of its sides, finds its gap there, and goes on (Li, Kaufman and Jiang 2021, additive continuous collision
-    detection).
-
-    A pair of edges that may move by less than WHOLE of the direction sets ``stopping`` to 1 at its vertices.
-    """
-    vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
-    stencil, ulp = load(wp.vec4i), ulp_of(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def cut_each_as_a_whole(
-        # elements
-        pairs: near_pairs(dtype),
-        gap: wp.array(dtype=wp.float64),
-        # state in
-        x: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
-        ways: wp.array(dtype=wp.vec2d),
-        # parameters
-        per_copy: int,
-        least: wp.float64,
-        # in and out
-        whole: wp.array(dtype=wp.float64),
-        stopping: wp.array(dtype=wp.int32),
-    ):
-        e = wp.tid()
-        if e >= pairs.counts[0] + pairs.counts[1]:
-            return
-        s = stencil(pairs.stencils, e)
-        of_vertex = e < pairs.counts[0]
-        sides = wp.where(of_vertex, 1, 2)
-        way, far = ways_of_sides(ways, s, sides)
-        margin = margin_of(least, ulp * far)
-        if needs_no_cut(e, way, margin, gap):
-            return
-        a = exact(x[s[0]])
-        b = exact(x[s[1]])
-        c = exact(x[s[2]])
-        d = exact(x[s[3]])
-        mean = SIDE * SIDE * (exact(direction[s[0]]) + exact(direction[s[1]]) + exact(direction[s[2]]) + exact(direction[s[3]]))
-        _w, y, _inside = nearest(of_vertex, a, b, c, d)
-        distance = wp.length(y)
-        n = y / wp.max(distance, wp.float64(1e-300))
-        floor = (ONE - KEPT) * wp.max(distance - wp.float64(2.0) * margin, ZERO) + wp.float64(2.0) * margin
-        t = ONE
-        first = ZERO
-        second = ZERO
-        for i in range(4):
-            size = wp.length(exact(direction[s[i]]) - mean)
-            if i < sides:
-                first = wp.max(first, size)
-            else:
-                second = wp.max(second, size)
-            for j in range(sides, 4):
-                approach = wp.dot(n, exact(direction[s[j]]) - exact(direction[s[i]]))
-                if i < sides and approach > ZERO:
-                    apart = wp.dot(n, exact(x[s[i]]) - exact(x[s[j]])) - floor
-                    t = wp.min(t, wp.max(apart, ZERO) / approach)
-        room = distance - floor
-        if t < ONE and room > ZERO:
-            advanced = ZERO
-            enough = NEAR * room
-            for _ in range(ADVANCES):
-                if room > enough:
-                    advanced = wp.min(advanced + KEPT * room / (first + second), ONE)
-                    _w, y, _inside = nearest(
-                        of_vertex,
-                        a + advanced * (exact(direction[s[0]]) - mean),
-                        b + advanced * (exact(direction[s[1]]) - mean),
-                        c + advanced * (exact(direction[s[2]]) - mean),
-                        d + advanced * (exact(direction[s[3]]) - mean),
-                    )
-                    room = wp.where(advanced < ONE, wp.length(y) - floor, ZERO)
-            t = wp.max(t, advanced)
-        if t < ONE:
-            wp.atomic_min(whole, s[0] // per_copy, t)
-            if t < WHOLE and not of_vertex:
-                for i in range(4):
-                    stopping[s[i]] = 1
-
-    return cut_each_as_a_whole

@@ -15,7 +15,6 @@ from warpcloth.contact.self_steps import SelfSteps
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.contact.pair_blocks import BLOCK
-from warpcloth.kernels.contact.self_filter import count_stops
 from warpcloth.kernels.contact.self_gaps import nearest
 from warpcloth.kernels.contact.self_pairs import begin_pairs
 from warpcloth.scenes import loop
@@ -393,17 +392,6 @@ def test_areas_of_pairs(device):
     assert stiffness == pytest.approx(1e5 * expected, rel=1e-9, abs=1e-9 * stiffness.max())
     for some in (stiffness[:triangles], stiffness[triangles:]):
         assert (some > 0.0).any() and (some == 0.0).any()
-
-
-def test_stops_count_in_active_copies_alone(device):
-    """Of three copies of two vertices, the second of which has converged; the third was stopped once before."""
-    stopping, stopped, active, blocked = (
-        wp.array(values, dtype=wp.int32, device=device)
-        for values in ([1, 0, 1, 1, 1, 0], [0, 0, 1, 0, 1, 0], [1, 0, 1], [0, 0, 0])
-    )
-    wp.launch(count_stops, dim=6, inputs=[active, 2], outputs=[stopping, stopped, blocked], device=device)
-    assert stopped.numpy().tolist() == [1, 0, 1, 0, 2, 0] and blocked.numpy().tolist() == [0, 0, 1]
-    assert not stopping.numpy().any()
 
 
 @pytest.mark.slow

@@ -51,10 +51,12 @@ class Proximity:
             "rest": model.array(points, model.vec3),
             "piece": wp.array(piece, dtype=wp.int32, device=device),
         }
-        self._surface = proximity_grid.surfaces(model.dtype)()
+        self._surface, self._along = (proximity_grid.surfaces(model.dtype)() for _ in range(2))
         far = 2.0 * (distance + mesh.edge_lengths.max())
-        for name, value in ({"vertices": n, "distance": distance, "skin": skin, "far": far} | self._kept).items():
-            setattr(self._surface, name, value)
+        for surface in (self._surface, self._along):
+            for name, value in ({"vertices": n, "distance": distance, "skin": skin, "far": far} | self._kept).items():
+                setattr(surface, name, value)
+        self._along.distance = self._along.skin = 0.0
         self._allocate_grid()
         self._set_pieces(piece)
         self._all, self._moved = (proximity_grid.moved_parts(model.dtype)() for _ in range(2))
@@ -72,7 +74,7 @@ class Proximity:
         self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.copies = model.scalars(wp.int32)
         self._rows = Scan(model, model.count + self._edges)
-        self._pairs_of = {each: model.kernel(kernels.find_pairs, model.dtype, each) for each in (False, True)}
+        self._near = self.searches(kernels.take_near, "near")
         by_parts = list_again.take_parts, list_again.mark_items, list_again.merge_pairs
         self._launch = model.launcher(
             ((proximity_grid.count_items, proximity_grid.fill_buckets, kernels.fill_rows, kernels.write_pairs), model.dtype),
@@ -223,16 +225,27 @@ class Proximity:
 
     def _launch_search(self, x, moved):
         """Finds the pairs, or those with parts that have moved."""
-        surface, grid, items = self._surface, self._grid, self._triangles + self._edges
         self.counts.zero_()
+        self._launch_grid(self._surface, x, None, moved, self._near, self._pairs)
+
+    def searches(self, take, name):
+        """Returns the kernels of :func:`warpcloth.kernels.contact.proximity.search_pairs` for vertices and for edges."""
+        return [self.model.kernel(kernels.search_pairs, self.model.dtype, each, take, name) for each in (False, True)]
+
+    def launch_along(self, x, p, searches, out):
+        """Launches ``searches`` over all pairs whose boxes meet while vertices move from x to x + p, both (N,) [m]."""
+        self._launch_grid(self._along, x, p, self._all, searches, out)
+
+    def _launch_grid(self, surface, x, p, moved, searches, out):
+        grid, items = self._grid, self._triangles + self._edges
         self._grid_arrays["levels"].zero_()
-        self._launch(proximity_grid.count_items, items, [surface, x, moved], [grid])
+        self._launch(proximity_grid.count_items, items, [surface, x, p, moved], [grid])
         self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
-        self._launch(proximity_grid.fill_buckets, items, [surface, x], [grid])
-        for of_edges, count in ((False, self.model.count if self._triangles else 0), (True, self._edges)):
+        self._launch(proximity_grid.fill_buckets, items, [surface, x, p], [grid])
+        for search, count in zip(searches, (self.model.count if self._triangles else 0, self._edges), strict=True):
             if count:
-                given = [surface, x, grid, self._triangles, self._shares, moved]
-                self.model.launch(self._pairs_of[of_edges], (count, self._shares), given, [self._pairs])
+                given = [surface, x, p, grid, self._triangles, self._shares, moved]
+                self.model.launch(search, (count, self._shares), given, [out])
 
     def _launch_boxes(self, x):
         self._launch(piece_motion.begin_boxes, len(self.drift), [x], [self._pieces])

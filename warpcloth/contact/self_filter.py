@@ -4,6 +4,7 @@ import warp as wp
 
 from ..kernels.contact import self_filter, self_planes
 from ..kernels.contact.clear_elements import move_clear
+from ..kernels.contact.self_advance import advances, take_advance
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 
@@ -13,9 +14,6 @@ SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
 # The longest move of a vertex in a round, relative to the common motion, over the skin. The vertex may have moved as far since
 # the list was made, and so may the other side of a pair: together they approach by at most the skin.
 WAY = 0.25
-# The areas of contact are found again at an iterate if pairs of edges stopped the direction to it at further vertices, at most
-# RENEWALS times in a step. After that the energy no longer changes within the step.
-RENEWALS = 32
 # Vertices that cloth holds back in a collider are moved out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
 # keeps a gap of LEFT times the contact distance to other cloth, or its present gap if that is smaller.
 OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
@@ -29,8 +27,7 @@ class SelfFilter:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
-        stopped: How many directions pairs of edges have stopped at each vertex in this step, up to STOPPED, (N,) int32; None if
-            iterates need not stay apart.
+        relisted: 1 for copies whose last trial listed pairs again, (B,) int32; None unless iterates stay apart.
         moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
             an axis and there are no colliders.
     """
@@ -38,7 +35,7 @@ class SelfFilter:
     def __init__(self, contact, colliders):
         self.model = model = contact.model
         self._contact, self._colliders, self._cut_before, self._iterates = contact, colliders, None, False
-        self.stopped = None
+        self.relisted = None
         device = model.device
         self._target, self._from, self._other = (model.vectors() for _ in range(3))
         self._ways = wp.zeros(model.count, dtype=wp.vec2d, device=device)
@@ -47,11 +44,10 @@ class SelfFilter:
         self._cuts = wp.zeros((model.copies, 2), dtype=wp.int32, device=device)
         self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(2))
         self._proceed = wp.zeros(1, dtype=wp.int32, device=device)
-        self._few, self._slope = int(SHARE * model.per_copy), model.scalars()
+        self._few = int(SHARE * model.per_copy)
         self.moves_together = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
         made = self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move
         made += self_filter.keep_apart, self_filter.end_filter, self_filter.add_positions
-        made += self_filter.limit_direction, self_filter.precondition, self_filter.take_descent
         if model.keyframes is not None:
             made += self_filter.share_of_pins, self_filter.hold_pins
         declared = model.colliders
@@ -68,9 +64,7 @@ class SelfFilter:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self):
-        """Stores, at the start of a step, how many moves colliders have cut so far; no vertex is stopped yet."""
-        if self.stopped is not None:
-            self.stopped.zero_()
+        """Stores, at the start of a step, how many moves colliders have cut so far."""
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
@@ -147,7 +141,7 @@ class SelfFilter:
 
     def _launch_walk(self, x):
         model = self.model
-        self._launch_planes(x, self._target, None)
+        self._launch_planes(x, self._target)
         self._launch_apart(x, self._target)
         self._proceed.zero_()
         given = [self._few, NEAR_ROUNDS, FAR_ROUNDS]
@@ -177,14 +171,14 @@ class SelfFilter:
         for _ in range(SWEEPS):
             given = [self._contact.pairs, self._mobile, self._contact.begun, x, LEFT * self._contact.declared.distance]
             self._launch(self_filter.push_pairs, 1, given, [out])
-        self._launch_planes(x, out, None)
+        self._launch_planes(x, out)
         self._launch_apart(x, out)
         model.launch(self._count, 1, [], [self._turns])
         self._launch_held(x)
 
-    def _launch_planes(self, x, target, direction):
-        """Finds the fraction of each move, to ``target`` or along ``direction``, that planes allow."""
-        model, wanted = self.model, [x, target, direction]
+    def _launch_planes(self, x, target):
+        """Finds the fraction of each move to ``target`` that planes allow."""
+        model, wanted = self.model, [x, target]
         if self.moves_together:
             self._launch(self_planes.common_move, model.copies, [*wanted, model.per_copy], [self._common])
         given = [*wanted, self._common, self._contact.begun_at, model.per_copy]
@@ -192,26 +186,13 @@ class SelfFilter:
         given = [self._contact.pairs, self._contact.begun.gap, *wanted, self._common, self._ways]
         given += [model.per_copy, FLOOR * self._contact.declared.distance]
         self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
-        if target is not None and self._colliders is not None and self._colliders.faces is not None:
+        if self._colliders is not None and self._colliders.faces is not None:
             self._colliders.faces.launch_least(x, target, self._share)
-
-    def _launch_whole(self, direction, active):
-        """Finds and returns the fraction of a direction that all vertices of a copy may move (B,); call it after the planes."""
-        contact = self._contact
-        self._whole.fill_(1.0)
-        given = [contact.pairs, contact.begun.gap, contact.x_before, direction, self._ways, self.model.per_copy]
-        given.append(FLOOR * contact.declared.distance)
-        self._launch(self_planes.cut_as_a_whole, len(contact.pairs.stencils), given, [self._whole, self._stopping])
-        noted = [self._stopping, self.stopped, self._blocked]
-        self.model.launch(self_filter.count_stops, self.model.count, [active, self.model.per_copy], noted)
-        return self._whole
 
     # For methods whose iterates base + d stay apart too.
 
     def launch_first(self, base, d):
         """Sets d so that base + d is the start of the step; if pins move, the positions of :meth:`launch_guess`."""
-        self._blocked.zero_()
-        self._renewed.zero_()
         if self.model.keyframes is not None:
             self._walk_clear(base)
         self._add(self._contact.x_before, base, -1.0, d)
@@ -241,65 +222,37 @@ class SelfFilter:
         self._touching = [elements for elements in terms if elements.term.gap]
         self._iterates, self._contact.contact.apart, model = True, True, self.model
         self._contact.contact.least = FLOOR * self._contact.declared.distance
-        self._kernels[self_filter.shorten] = model.kernel(self_filter.shorten, model.dtype)
-        self._kernels[self_planes.cut_as_a_whole] = model.kernel(self_planes.cut_as_a_whole, model.dtype)
-        self.stopped, self._stopping = (wp.zeros(model.count, dtype=wp.int32, device=model.device) for _ in range(2))
-        self._whole = model.scalars()
-        self._longest, self._ones = model.scalars(), wp.ones(model.count, dtype=model.dtype, device=model.device)
-        self._blocked, self._renewed = (model.scalars(wp.int32) for _ in range(2))
-        self._renewing, self._renew = model.scalars(wp.int32), wp.zeros(1, dtype=wp.int32, device=model.device)
+        self._kernels[self_filter.scale_directions] = model.kernel(self_filter.scale_directions, model.dtype)
+        self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
+        self._fraction = self._advance.fraction = model.scalars()
+        self.relisted = model.scalars(wp.int32)
+        self._advance.least = FLOOR * self._contact.declared.distance
         faces = self._colliders is not None and self._colliders.faces is not None
         if self._colliders is not None and (not self._lets_out or (faces and not any(self.model.colliders.moves))):
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 
-    def launch_relist(self, base, d, active, launch):
-        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if vertices have moved far enough.
-
-        Otherwise, if pairs of edges stopped the last direction, it finds the areas alone again. In layers that a step presses
-        flat, pairs of crossing edges have hardly any area; where the layers then bend, the filter alone would keep these edges
-        apart. So for the rest of the step edges between vertices that have stopped often enough have their whole area. In both
-        cases it calls ``launch``.
-        """
-        model, x = self.model, self._contact.x_before
-        self._add(base, d, 1.0, x, active)
+    def launch_trial(self, base, d, active):
+        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if vertices have moved far enough."""
+        self._add(base, d, 1.0, self._contact.x_before, active)
 
         def relist(x):
             self._contact.launch_list(x)
             self._launch_areas_again(x, self._contact.proximity.copies)
-            launch()
+            wp.copy(self.relisted, self._contact.proximity.copies)
 
-        self.launch_fresh(x, relist, active)
+        self.launch_fresh(self._contact.x_before, relist, active)
 
-        def renew(x):
-            self._launch_areas_again(x, self._renewing)
-            launch()
+    def launch_limit(self, direction):
+        """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
 
-        self._renew.zero_()
-        noted = [self._blocked, self._renewed, self._renewing, self._renew]
-        model.launch(self_filter.take_blocked, model.copies, [active, RENEWALS], noted)
-        wp.capture_if(self._renew, renew, x=x)
-
-    def launch_limit(self, sums, gradient, preconditioner, right, direction, active):
-        """Shortens the direction from the positions of :meth:`launch_relist`, so that pairs stay apart all along it.
-
-        Directions of copies that are not ``active`` (B,) do not count as stopped.
-
-        A direction that is longer than the list of pairs allows is scaled as a whole: to cut it at each vertex would stretch
-        stiff cloth. So it is where pairs allow at least WHOLE of it. In copies where the energy does not decrease along the
-        result, the direction becomes P·right, with the preconditioner P, cut at each vertex.
+        All vertices of a copy move by the same fraction: shortened at each vertex, a direction would stretch stiff cloth.
         """
-        model, N = self.model, self.model.count
-        self._launch(self_filter.precondition, N, [preconditioner, right], [self._other])
-        for each in (direction, self._other):
-            sums.largest(self._ones, each, self._longest)
-            self._launch(self_filter.shorten, N, [self._longest, model.per_copy, WAY * self._contact.skin], [each])
-            self._launch_planes(self._contact.x_before, None, each)
-            whole = self._launch_whole(each, active) if each is direction else None
-            given = [self._share, self._common, whole, model.per_copy, WAY * self._contact.skin]
-            self._launch(self_filter.limit_direction, N, given, [each])
-        sums.dot(gradient, direction, self._slope)
-        self._launch(self_filter.take_descent, N, [self._slope, self._other, model.per_copy], [direction])
+        self.relisted.zero_()
+        self._fraction.fill_(1.0)
+        self._advance.direction = direction
+        self._contact.proximity.launch_along(self._contact.x_before, direction, self._advances, self._advance)
+        self._launch(self_filter.scale_directions, self.model.count, [self._fraction, self.model.per_copy], [direction])
 
     def _add(self, a, b, sign, out, active=None):
         self._launch(self_filter.add_positions, self.model.count, [a, b, sign, active, self.model.per_copy], [out])

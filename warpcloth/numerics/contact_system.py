@@ -119,20 +119,19 @@ class ContactSystem(CorrectedSystem):
         linear: Solves with A, ``solve(b, x)``.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia [1/s²].
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter gives the start of a line search; or None.
 
     Attributes:
         careful: Which copies are careful, (B,) booleans.
     """
 
-    def __init__(self, model, x, gradient, linear, sums, s, pairs=None):
+    def __init__(self, model, x, gradient, linear, sums, s):
         super().__init__(model, x, linear, [elements for elements in model.terms if elements.on_faces])
         touching = [elements for elements in model.terms if elements.collider is not None and not elements.on_faces]
         self._touching = [(elements, self._kernel_of(elements.term)) for elements in touching]
         held = model.inverse_mass.numpy() == 0.0
         self._diagonal = wp.array(np.where(held, -1, self.matrix.diagonal.numpy()), dtype=wp.int32, device=model.device)
         self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
-        self._search = Search(model, x, sums, s, pairs)
+        self._search = Search(model, x, sums, s)
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
         self._active = Mirror(model.scalars(wp.int32))
         self.careful, self._marked = np.ones(model.copies, dtype=bool), np.zeros(model.copies, dtype=bool)

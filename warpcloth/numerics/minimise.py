@@ -84,9 +84,6 @@ class Minimiser:
             self.linear = ConjugateGradients(self.hessian, linear_iterations, multigrid)
         else:
             self.linear = Factorised(self.hessian)
-        if pairs is not None:
-            self.hessian.prepare()
-            self.preconditioner = wp.zeros(model.count, dtype=model.mat33, device=model.device)
         self.right = model.vectors()
         lanes = self.search.lanes
         self._roundings = lanes.parts(3)
@@ -268,12 +265,11 @@ class Minimiser:
     def _launch_end(self):
         """Launches the line search, and finds the copies that have ended."""
         self._launch_search()
-        given = [self.search.state, self._roundings, self.resolution, self._limits]
+        relisted = None if self.pairs is None else self.pairs.filter.relisted
+        given = [self.search.state, self._roundings, relisted, self.resolution, self._limits]
         self._launch(kernels.end_newton, self.search.lanes.of_block, given, [self._progress])
 
     def _launch_assemble(self):
-        if self.pairs is not None:
-            self.pairs.filter.launch_relist(self.base, self.correction, self.active, self.search.launch_again)
         self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
         hessian, search, lanes = self.hessian, self.search, self.search.lanes
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
@@ -301,7 +297,5 @@ class Minimiser:
     def _launch_search(self):
         self._launch_mean(self.search.direction)
         if self.pairs is not None:
-            self.hessian.invert_diagonal(self.preconditioner)
-            given = self.search.gradient, self.preconditioner, self.right, self.search.direction, self.active
-            self.pairs.filter.launch_limit(self.sums, *given)
+            self.pairs.filter.launch_limit(self.search.direction)
         self.search.launch(self.active)

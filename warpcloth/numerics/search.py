@@ -101,11 +101,11 @@ class Search:
         """Launches the first trial, with steps of 1."""
         given = [self.correction, self.direction, active, self.model.per_copy, self.lanes.count]
         self._launch(kernels.begin_search, self.lanes.dim, given, [self.gradient, self.state, self.trial, self._slopes])
-        self._launch_trial()
+        self._launch_trial(self.state.searching)
 
     def _try_again(self):
         self._set_trial()
-        self._launch_trial()
+        self._launch_trial(self.state.searching)
         self._check_trial()
 
     def _return_to_start(self):
@@ -118,9 +118,11 @@ class Search:
         given = [self.correction, self.direction, self.model.per_copy]
         self._launch(kernels.set_trial, self.model.count, given, [self.state, self.trial, self.gradient])
 
-    def _launch_trial(self):
-        """Launches ∇φ at the trial, and the parts of what a trial sums."""
+    def _launch_trial(self, active=None):
+        """Launches ∇φ at the trial, and the parts of what a trial sums. Pairs are listed for ``active`` copies (B,), or all."""
         model, lanes = self.model, self.lanes
+        if self.pairs is not None:
+            self.pairs.filter.launch_trial(self.base, self.trial, active)
         self.gradient_of.add(self.base, self.gradient, self.trial)
         given = [self.inertia, self.trial, self.direction, model.per_copy, lanes.count]
         self._launch(kernels.finish_gradient, lanes.dim, given, [self.gradient, self._parts])

@@ -137,7 +137,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._sums, self._row_sums = Sums(model), RowSums(model, self.constraints.per_copy)
         self._search = None
         if options.stabilisation == "line-search":
-            self._search = Search(model, self.state.x, self._sums, 1.0 / self.he**2, self.pairs)
+            self._search = Search(model, self.state.x, self._sums, 1.0 / self.he**2)
             self.correction, self._direction, self._step = self._search.correction, self._search.direction, self._search.step
         else:
             self.correction, self._direction = model.vectors(), model.vectors()

@@ -147,7 +147,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
         self._contact = None
         if model.colliders is not None or model.dynamic:
-            given = model, self.state.x, self.gradient, self._linear, self.sums, self.inertia.s, self.pairs
+            given = model, self.state.x, self.gradient, self._linear, self.sums, self.inertia.s
             self._contact = ContactSystem(*given)
         self._gradient_of = plan(model).gradient(corrected=True)
         self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
