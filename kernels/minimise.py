@@ -208,8 +208,8 @@ def end_newton(block: int):
 
     Rounding allows no further progress if the gradient is within its rounding, and no step was found or φ fell by no more than
     its rounding. A copy is stuck if no step was found or the direction does not descend. It is not if its pairs were
-    ``relisted`` (B,), which may be None: the areas of contact, and so the energy, have then changed. ``roundings`` has the parts
-    of :func:`.linear.rounding`.
+    ``relisted`` (B,), which may be None: the areas of contact, and so the energy, have then changed. ``roundings`` has the
+    parts of :func:`.linear.rounding`.
     """
     (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
 
