@@ -208,8 +208,8 @@ def end_newton(block: int):
 
     Rounding allows no further progress if the gradient is within its rounding, and no step was found or φ fell by no more than
     its rounding. A copy is stuck if no step was found or the direction does not descend. It is not if its pairs were
-    ``relisted`` (B,), which may be None: the areas of contact, and so the energy, have then changed. ``roundings`` has the
-    parts of :func:`.linear.rounding`.
+    ``relisted`` (B,): the areas of contact, and so the energy, have then changed. Pairs leave a ``fraction`` (B,) of the
+    direction. Both may be None. ``roundings`` has the parts of :func:`.linear.rounding`.
     """
     (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
 
@@ -219,6 +219,7 @@ def end_newton(block: int):
         search: LineSearch,
         roundings: wp.array3d(dtype=wp.float64),
         relisted: wp.array(dtype=wp.int32),
+        fraction: wp.array(dtype=wp.float64),
         # parameters
         resolution: wp.float64,
         limits: Limits,
@@ -239,8 +240,13 @@ def end_newton(block: int):
         stuck = search.step[copy] == wp.float64(0.0) or not (search.slope[copy] < wp.float64(0.0))
         if relisted:
             stuck = stuck and relisted[copy] == 0
+        # A step so short that rounding undoes it would be repeated for ever.
+        undone = search.acceleration[copy] / limits.scale[copy] == progress.previous[copy] and search.energy[copy] == before
+        undone = undone and search.step[copy] > wp.float64(0.0)
+        if fraction:
+            undone = undone and fraction[copy] == wp.float64(1.0)
         ended = USED_UP
-        if noisy and (stuck or level):
+        if undone or (noisy and (stuck or level)):
             ended = ROUNDED
         elif stuck and not noisy:
             ended = STALLED

@@ -16,7 +16,11 @@ NEAR = wp.constant(wp.float64(0.05))
 
 @cache
 def advances(dtype):
-    """Struct of the moves ``direction`` (N,) [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m]."""
+    """Struct of the moves ``direction`` (N,) [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m].
+
+    ``stopped`` (N,) is 1 for vertices of pairs of edges nearer than ``reach`` [m] that stopped a direction; ``blocked`` (B,)
+    becomes 1 in their copies where a vertex stops first.
+    """
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -24,6 +28,9 @@ def advances(dtype):
         direction: wp.array(dtype=vec3)
         fraction: wp.array(dtype=wp.float64)
         least: wp.float64
+        reach: wp.float64
+        stopped: wp.array(dtype=wp.int32)
+        blocked: wp.array(dtype=wp.int32)
 
     return Advance
 
@@ -102,5 +109,11 @@ def take_advance(dtype, of_edges: bool):
             t = wp.max(t, advanced)
         if t < ONE:
             wp.atomic_min(out.fraction, s[0] // surface.vertices, t)
+            if wp.static(of_edges):
+                if distance < out.reach:
+                    for p in range(4):
+                        if out.stopped[s[p]] == 0:
+                            out.stopped[s[p]] = 1
+                            out.blocked[s[0] // surface.vertices] = 1
 
     return take, advance

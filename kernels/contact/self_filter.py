@@ -376,6 +376,22 @@ def push_pairs(dtype):
     return push_each_pair
 
 
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def take_blocked(
+    # in and out
+    blocked: wp.array(dtype=wp.int32),
+    # out
+    renewing: wp.array(dtype=wp.int32),
+    renew: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies: ``renewing`` = ``blocked``, which becomes 0; ``renew`` is 1 if any was blocked, and 0 before."""
+    c = wp.tid()
+    renewing[c] = blocked[c]
+    if blocked[c] != 0:
+        renew[0] = 1
+    blocked[c] = 0
+
+
 @cache
 def scale_directions(dtype):
     """Kernel over vertices: p ← ``fraction``·p, with the fraction of the copy (B,)."""

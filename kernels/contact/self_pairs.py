@@ -163,6 +163,7 @@ def set_areas(dtype):
         areas: wp.array(dtype=wp.float64),
         # state in
         x: wp.array(dtype=vec3),
+        stopped: wp.array(dtype=wp.int32),
         # parameters
         stiffness: wp.float64,
         # in and out
@@ -226,6 +227,9 @@ def set_areas(dtype):
                             least = value(step.gap, other)
                 if least < wp.float64(wp.inf):
                     nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)
+            if stopped:
+                if stopped[s[0]] + stopped[s[1]] + stopped[s[2]] + stopped[s[3]] == 4:
+                    nearer = ONE
             if nearer > ZERO:
                 ab = exact(x[s[1]]) - exact(x[s[0]])
                 cd = exact(x[s[3]]) - exact(x[s[2]])

@@ -27,6 +27,9 @@ class SelfFilter:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
+        stopped: 1 for vertices at which pairs of edges have stopped a direction in this step, (N,) int32; None unless iterates
+            stay apart.
+        fraction: The fraction of the last direction that pairs left each copy, (B,); only if iterates stay apart.
         relisted: 1 for copies whose last trial listed pairs again, (B,) int32; None unless iterates stay apart.
         moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
             an axis and there are no colliders.
@@ -35,7 +38,7 @@ class SelfFilter:
     def __init__(self, contact, colliders):
         self.model = model = contact.model
         self._contact, self._colliders, self._cut_before, self._iterates = contact, colliders, None, False
-        self.relisted = None
+        self.relisted = self.stopped = None
         device = model.device
         self._target, self._from, self._other = (model.vectors() for _ in range(3))
         self._ways = wp.zeros(model.count, dtype=wp.vec2d, device=device)
@@ -64,7 +67,10 @@ class SelfFilter:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self):
-        """Stores, at the start of a step, how many moves colliders have cut so far."""
+        """Stores, at the start of a step, how many moves colliders have cut so far; no vertex is stopped yet."""
+        if self.stopped is not None:
+            self.stopped.zero_()
+            self._blocked.zero_()
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
@@ -224,8 +230,12 @@ class SelfFilter:
         self._contact.contact.least = FLOOR * self._contact.declared.distance
         self._kernels[self_filter.scale_directions] = model.kernel(self_filter.scale_directions, model.dtype)
         self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
-        self._fraction = self._advance.fraction = model.scalars()
-        self.relisted = model.scalars(wp.int32)
+        self.fraction = self._advance.fraction = model.scalars()
+        self._advance.reach = self._contact.declared.distance
+        self.stopped = self._advance.stopped = wp.zeros(model.count, dtype=wp.int32, device=model.device)
+        self._blocked = self._advance.blocked = model.scalars(wp.int32)
+        self.relisted, self._renewing = (model.scalars(wp.int32) for _ in range(2))
+        self._renew = wp.zeros(1, dtype=wp.int32, device=model.device)
         self._advance.least = FLOOR * self._contact.declared.distance
         faces = self._colliders is not None and self._colliders.faces is not None
         if self._colliders is not None and (not self._lets_out or (faces and not any(self.model.colliders.moves))):
@@ -243,16 +253,32 @@ class SelfFilter:
 
         self.launch_fresh(self._contact.x_before, relist, active)
 
+    def launch_renew(self, launch):
+        """Finds the areas at the positions of :meth:`launch_trial` again, and calls ``launch``, where edges stopped the last
+        direction.
+
+        In layers that a step presses flat, pairs of crossing edges have hardly any area, so that directions run into them. For
+        the rest of the step, edges between vertices that have stopped have their whole area.
+        """
+
+        def renew(x):
+            self._launch_areas_again(x, self._renewing)
+            launch()
+
+        self._renew.zero_()
+        self.model.launch(self_filter.take_blocked, self.model.copies, [self._blocked], [self._renewing, self._renew])
+        wp.capture_if(self._renew, renew, x=self._contact.x_before)
+
     def launch_limit(self, direction):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
 
         All vertices of a copy move by the same fraction: shortened at each vertex, a direction would stretch stiff cloth.
         """
         self.relisted.zero_()
-        self._fraction.fill_(1.0)
+        self.fraction.fill_(1.0)
         self._advance.direction = direction
         self._contact.proximity.launch_along(self._contact.x_before, direction, self._advances, self._advance)
-        self._launch(self_filter.scale_directions, self.model.count, [self._fraction, self.model.per_copy], [direction])
+        self._launch(self_filter.scale_directions, self.model.count, [self.fraction, self.model.per_copy], [direction])
 
     def _add(self, a, b, sign, out, active=None):
         self._launch(self_filter.add_positions, self.model.count, [a, b, sign, active, self.model.per_copy], [out])

@@ -353,7 +353,7 @@ class SelfSteps:
         self.launch_sides(x, copies)
         self._launch(self_pairs.find_nearest, self.model.count, [self.pairs], [self.begun])
         self.pairs.number.zero_()
-        given = [self.pairs, self._areas, self.begun_at, self.declared.stiffness]
+        given = [self.pairs, self._areas, self.begun_at, self.filter.stopped, self.declared.stiffness]
         self._launch(self_pairs.set_areas, count, given, [self.begun])
         if self._corners:
             self._vertices.launch(self.pairs.corner_counts, self.pairs.first)

@@ -132,7 +132,7 @@ def without_filter(stepper):
     step, as with other methods.
     """
     kept = stepper.pairs.filter
-    kept.launch_end = kept.launch_trial = kept.launch_limit = lambda *given: None
+    kept.launch_end = kept.launch_trial = kept.launch_limit = kept.launch_renew = lambda *given: None
     kept.launch_first = lambda base, d: d.zero_()
     kept.launch_guess = lambda base, d, guess: guess.zero_()
     stepper.pairs.contact.apart, stepper.pairs.contact.least = False, 0.0

@@ -265,11 +265,13 @@ class Minimiser:
     def _launch_end(self):
         """Launches the line search, and finds the copies that have ended."""
         self._launch_search()
-        relisted = None if self.pairs is None else self.pairs.filter.relisted
-        given = [self.search.state, self._roundings, relisted, self.resolution, self._limits]
+        of_pairs = [None, None] if self.pairs is None else [self.pairs.filter.relisted, self.pairs.filter.fraction]
+        given = [self.search.state, self._roundings, *of_pairs, self.resolution, self._limits]
         self._launch(kernels.end_newton, self.search.lanes.of_block, given, [self._progress])
 
     def _launch_assemble(self):
+        if self.pairs is not None:
+            self.pairs.filter.launch_renew(self.search.launch_again)
         self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
         hessian, search, lanes = self.hessian, self.search, self.search.lanes
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
