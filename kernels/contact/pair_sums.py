@@ -1,9 +1,10 @@
 """Factories of the kernels that sum energies, forces and Hessians of pairs: those of contact, and those of friction.
 
 The energy of a pair is a function of y = Σ wᵢxᵢ, so vertex i gets wᵢ ∂U/∂y, and wᵢwⱼ ∂²U/∂y² joins vertices i and j. A
-:class:`PairTerm` finds these in :class:`PairForces`. Kernels gather, with a thread for each vertex, which takes its pairs in
-order. For the CPU they scatter: one thread takes the pairs with a force in order and adds to the vertices of each. So they need
-no list of the pairs of a vertex, and products with the Hessian find Σ wⱼpⱼ of each pair once. Both agree up to rounding.
+:class:`PairTerm` finds these in :class:`PairForces`. Kernels gather, with a thread for each vertex, which adds up its pairs in
+order, in float64. For the CPU they scatter: one thread takes the pairs with a force in order and adds to the vertices of each.
+So they need no list of the pairs of a vertex, and products with the Hessian find Σ wⱼpⱼ of each pair once. Both agree up to
+rounding.
 """
 
 from collections.abc import Callable
@@ -133,7 +134,9 @@ def pair_forces(term: PairTerm, dtype, scatters: bool):
         # in and out
         out: wp.array(dtype=vec3),
     ):
-        first, end = range_of(pairs, forces, wp.tid())
+        v = wp.tid()
+        total = wp.vec3d()
+        first, end = range_of(pairs, forces, v)
         for k in range(first, end):
             e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
@@ -141,7 +144,11 @@ def pair_forces(term: PairTerm, dtype, scatters: bool):
             whole = forces.force[e]
             for i in range(corner, end_corner):
                 force = w[i] * whole
-                out[s[i]] = out[s[i]] + vec3(dtype(force[0]), dtype(force[1]), dtype(force[2]))
+                if wp.static(scatters):
+                    out[s[i]] = out[s[i]] + vec3(dtype(force[0]), dtype(force[1]), dtype(force[2]))
+                total += force
+        if wp.static(not scatters):
+            out[v] = out[v] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
 
     return add_forces_of_pairs
 
@@ -187,7 +194,9 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
         # in and out
         values: wp.array(dtype=mat33),
     ):
-        first, end = range_of(pairs, forces, wp.tid())
+        v = wp.tid()
+        total = wp.mat33d()
+        first, end = range_of(pairs, forces, v)
         for k in range(first, end):
             e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
@@ -197,7 +206,11 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
                 block += forces.bend[e][1] * wp.outer(forces.across[e], forces.across[e])
             for i in range(corner, end_corner):
                 if inverse_mass[s[i]] > dtype(0.0):
-                    values[diagonal[s[i]]] = values[diagonal[s[i]]] + mat33(w[i] * w[i] * block)
+                    if wp.static(scatters):
+                        values[diagonal[s[i]]] = values[diagonal[s[i]]] + mat33(w[i] * w[i] * block)
+                    total += w[i] * w[i] * block
+        if wp.static(not scatters):
+            values[diagonal[v]] = values[diagonal[v]] + mat33(total)
 
     return add_diagonal_of_pairs
 
@@ -223,7 +236,9 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
         # in and out
         q: wp.array(dtype=vec3),
     ):
-        first, end = range_of(pairs, forces, wp.tid())
+        v = wp.tid()
+        total = wp.vec3d()
+        first, end = range_of(pairs, forces, v)
         for k in range(first, end):
             e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
@@ -248,6 +263,10 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
                         pull = w[i] * bend[0] * (whole - along[i]) * t
                         if wp.static(two):
                             pull += w[i] * bend[1] * (whole_across - across[i]) * u
-                        q[s[i]] = q[s[i]] + vec3(dtype(pull[0]), dtype(pull[1]), dtype(pull[2]))
+                        if wp.static(scatters):
+                            q[s[i]] = q[s[i]] + vec3(dtype(pull[0]), dtype(pull[1]), dtype(pull[2]))
+                        total += pull
+        if wp.static(not scatters):
+            q[v] = q[v] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
 
     return add_products_of_pairs

@@ -64,7 +64,7 @@ class Plan:
             ValueError: Threads cannot divide the steps; the message names the term.
         """
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
-        if pairs is not None:
+        if self.model.dynamic:
             blocks = self.backend == "blocks" and self.model.uniform and colliders is None
             plain = (BlockStep if blocks else ExplicitStep)(self.model.with_dynamic(()), *given[1:-1])
             steps = QuietSteps(plain, pairs, count)

@@ -302,7 +302,7 @@ class ExplicitStepper(LaunchedStepper):
         self.record((lambda: self.launch_steps(1), 1))
 
     def _record_frame(self):
-        if self.pairs is None:
+        if not self.model.dynamic:
             return super()._record_frame()
         return [(self._segments(lambda: self.launch_steps(self.steps_per_frame)), 1)]  # a loop on the device
 
