@@ -6,12 +6,8 @@ import warp as wp
 
 from ..vectors import types
 from .proximity_grid import surfaces
-from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
-from .self_planes import KEPT, margin_of, ulp_of
-
-# The advances of a pair end after this number, or when no more than NEAR of the way to its floor is left.
-ADVANCES = wp.constant(64)
-NEAR = wp.constant(wp.float64(0.05))
+from .self_gaps import ONE, ZERO, nearest, vertex_of
+from .self_planes import KEPT, margin_of, part_apart, ulp_of
 
 
 @cache
@@ -41,9 +37,7 @@ def take_advance(dtype, of_edges: bool):
 
     A pair keeps a tenth of its gap. Where all vertices move by the same fraction, a plane between the two sides may move with
     them: the two sides stay apart along y while no vertex of one side comes near the height of one of the other. Where this
-    allows less than the direction, as for cloth that slides over an edge, the pair advances until its gap could be closed at
-    the relative speed of its sides, finds its gap there, and goes on (Li, Kaufman and Jiang 2021, additive continuous collision
-    detection).
+    allows less than the direction, as for cloth that slides over an edge, :func:`.self_planes.part_apart` may allow more.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -69,7 +63,6 @@ def take_advance(dtype, of_edges: bool):
         pb = exact(out.direction[s[1]])
         pc = exact(out.direction[s[2]])
         pd = exact(out.direction[s[3]])
-        mean = SIDE * SIDE * (pa + pb + pc + pd)
         far = wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.max(wp.abs(c)), wp.max(wp.abs(d))))
         far += wp.max(wp.max(wp.length(pa), wp.length(pb)), wp.max(wp.length(pc), wp.length(pd)))
         margin = wp.float64(2.0) * margin_of(out.least, ulp * far)
@@ -78,35 +71,14 @@ def take_advance(dtype, of_edges: bool):
         n = y / wp.max(distance, wp.float64(1e-300))
         floor = (ONE - KEPT) * wp.max(distance - margin, ZERO) + margin
         t = ONE
-        fastest = ZERO
-        second = ZERO
-        for p in range(4):
-            move = exact(out.direction[s[p]])
-            if p < sides:
-                fastest = wp.max(fastest, wp.length(move - mean))
-            else:
-                second = wp.max(second, wp.length(move - mean))
+        for p in range(sides):
             for q in range(sides, 4):
-                approach = wp.dot(n, exact(out.direction[s[q]]) - move)
-                if p < sides and approach > ZERO:
+                approach = wp.dot(n, exact(out.direction[s[q]]) - exact(out.direction[s[p]]))
+                if approach > ZERO:
                     apart = wp.dot(n, exact(x[s[p]]) - exact(x[s[q]])) - floor
                     t = wp.min(t, wp.max(apart, ZERO) / approach)
-        room = distance - floor
-        if t < ONE and room > ZERO:
-            advanced = ZERO
-            enough = NEAR * room
-            for _ in range(ADVANCES):
-                if room > enough:
-                    advanced = wp.min(advanced + KEPT * room / (fastest + second), ONE)
-                    _w, y, _inside = nearest(
-                        of_vertex,
-                        a + advanced * (pa - mean),
-                        b + advanced * (pb - mean),
-                        c + advanced * (pc - mean),
-                        d + advanced * (pd - mean),
-                    )
-                    room = wp.where(advanced < ONE, wp.length(y) - floor, ZERO)
-            t = wp.max(t, advanced)
+        if t < ONE:
+            t = wp.max(t, part_apart(of_vertex, a, b, c, d, pa, pb, pc, pd, floor))
         if t < ONE:
             wp.atomic_min(out.fraction, s[0] // surface.vertices, t)
             if wp.static(of_edges):

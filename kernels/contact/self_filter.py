@@ -11,28 +11,19 @@ from ..vectors import types
 from .gap_notes import FIRST
 from .self_gaps import ONE, PLANAR, ZERO, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
+from .self_planes import bounded_share
 
 # Pins of hard pairs may approach by this fraction of their gap in a step. The second is for pairs with a free vertex, which
 # lags behind pins that turn.
 TOGETHER, LAGGING = wp.constant(wp.float64(0.01)), wp.constant(wp.float64(0.5))
 
 
-@wp.func
-def bounded_share(move: wp.vec3d, most: wp.float64):
-    """Returns min(1, most/‖move‖), the fraction of a move that is at most ``most`` long."""
-    size = wp.length(move)
-    far = ONE
-    if size > most:
-        far = most / size
-    return far
-
-
 @cache
 def keep_apart(dtype):
     """Kernel over vertices: x ← x + u + t(δ − u), with the ``common`` move u and t at most the ``share`` that planes allow.
 
-    ``most`` bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B, 2) counts the vertices whose move
-    planes shortened, and those whose move this bound alone shortened. Copies whose ``walk`` is 0 do not move.
+    ``most`` bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B,) counts the vertices whose move this
+    bound alone shortened. Copies whose ``walk`` is 0 do not move.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -51,7 +42,7 @@ def keep_apart(dtype):
         most: wp.float64,
         # out
         x: wp.array(dtype=vec3),
-        cuts: wp.array2d(dtype=wp.int32),
+        cuts: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
         copy = i // per_copy
@@ -66,7 +57,8 @@ def keep_apart(dtype):
                 t = ZERO
             end = exact(x_ref[i]) + u + t * move
             x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
-            wp.atomic_add(cuts, copy, wp.where(share[i] < far, 0, 1), 1)
+            if share[i] >= far:
+                wp.atomic_add(cuts, copy, 1)
         else:
             x[i] = target[i]
 
@@ -76,29 +68,25 @@ def keep_apart(dtype):
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
 def another_round(
     # parameters
-    few: int,
-    near_rounds: int,
-    far_rounds: int,
+    most: int,
     # in and out
-    cuts: wp.array2d(dtype=wp.int32),
+    cuts: wp.array(dtype=wp.int32),
     rounds: wp.array(dtype=wp.int32),
     # out
     walk: wp.array(dtype=wp.int32),
     proceed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: ``walk`` is 1 if a copy makes another round.
+    """Kernel over copies: ``walk`` is 1 if a copy makes another round, of at most ``most``.
 
-    It does so while planes shorten the moves of more than ``few`` vertices, in at most ``near_rounds`` rounds, and while the
-    bound of the list shortens one, in at most ``far_rounds`` rounds. ``proceed`` is 1 if any copy makes another round.
+    It does so while the bound of the list cuts the move of a vertex. ``proceed`` is 1 if any copy makes another round.
     """
     c = wp.tid()
     rounds[c] = rounds[c] + 1
     walk[c] = 0
-    if (cuts[c, 0] > few and rounds[c] < near_rounds) or (cuts[c, 1] > 0 and rounds[c] < far_rounds):
+    if cuts[c] > 0 and rounds[c] < most:
         walk[c] = 1
         proceed[0] = 1
-    cuts[c, 0] = 0
-    cuts[c, 1] = 0
+    cuts[c] = 0
 
 
 @wp.struct

@@ -16,12 +16,25 @@ CLAMPED = wp.constant(wp.float64(0.05))  # smallest distance of each side from t
 # A pair needs no plane if its sides approach by less than this fraction of the gap. It is below 0.9²: along y the sides are at
 # least 0.9 of the gap apart, and the fraction KEPT of this may be closed.
 WIDE = wp.constant(wp.float64(0.75))
+# The advances of a pair along a direction end after this number, or when no more than NEAR of the way to its floor is left.
+ADVANCES = wp.constant(64)
+NEAR = wp.constant(wp.float64(0.05))
 
 
 @cache
 def ulp_of(dtype):
     """The largest relative unit in the last place of a scalar type, as a constant of kernels in double precision."""
     return wp.constant(wp.float64(np.finfo(wp.dtype_to_numpy(dtype)).eps))
+
+
+@wp.func
+def bounded_share(move: wp.vec3d, most: wp.float64):
+    """Returns min(1, most/‖move‖), the fraction of a move that is at most ``most`` long."""
+    size = wp.length(move)
+    far = ONE
+    if size > most:
+        far = most / size
+    return far
 
 
 @cache
@@ -64,10 +77,12 @@ def common_move(dtype):
 
 @cache
 def find_ways(dtype):
-    """Kernel over vertices: a bound of its contribution to the approach of a pair [m], its largest coordinate [m]; share = 1.
+    """Kernel over vertices: the ``share`` of its wanted move, and ``ways`` with numbers of it.
 
-    The bound is the length of the wanted move minus the ``common`` move, plus WIDE times the length of the motion since
-    ``begun``, where the gaps were computed, minus the motion of the first vertex of the copy.
+    The share is the largest one with which the wanted move minus the ``common`` move is at most ``most``. Its ways are a bound
+    of its part in the approach of a pair [m], its largest coordinate [m], and its share. The bound is the length of the wanted
+    move minus the ``common`` move, plus WIDE times the length of the motion since ``begun``, where the gaps were computed,
+    minus the motion of the first vertex of the copy.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -82,19 +97,21 @@ def find_ways(dtype):
         begun: wp.array(dtype=vec3),
         # parameters
         per_copy: int,
+        most: wp.float64,
         # out
-        ways: wp.array(dtype=wp.vec2d),
+        ways: wp.array(dtype=wp.vec3d),
         share: wp.array(dtype=wp.float64),
         least_share: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
         start = exact(x[i])
         move = wanted(x, target, i)
+        own = move - common[i // per_copy]
         far = wp.max(wp.max(wp.abs(start)), wp.max(wp.abs(start + move)))
         one = i - i % per_copy
         since = start - exact(begun[i]) - (exact(x[one]) - exact(begun[one]))
-        ways[i] = wp.vec2d(wp.length(move - common[i // per_copy]) + WIDE * wp.length(since), far)
-        share[i] = ONE
+        share[i] = bounded_share(own, most)
+        ways[i] = wp.vec3d(wp.length(own) + WIDE * wp.length(since), far, share[i])
         least_share[i] = ZERO
 
     return find_each_way
@@ -106,11 +123,11 @@ def margin_of(least: wp.float64, ulp: wp.float64):
     return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
 
 
-_value, _way_of = load(wp.float64), load(wp.vec2d)
+_value, _way_of = load(wp.float64), load(wp.vec3d)
 
 
 @wp.func
-def ways_of_sides(ways: wp.array(dtype=wp.vec2d), s: wp.vec4i, sides: int):
+def ways_of_sides(ways: wp.array(dtype=wp.vec3d), s: wp.vec4i, sides: int):
     """The largest way of each side of a pair, whose first side has ``sides`` vertices, and its largest coordinate."""
     way = wp.vec2d()
     far = ZERO
@@ -133,13 +150,60 @@ def needs_no_cut(e: int, way: wp.vec2d, margin: wp.float64, gap: wp.array(dtype=
     return way[0] + way[1] <= WIDE * _value(gap, e) - KEPT / CLAMPED * margin
 
 
+@wp.func
+def part_apart(
+    of_vertex: bool,
+    a: wp.vec3d,
+    b: wp.vec3d,
+    c: wp.vec3d,
+    d: wp.vec3d,
+    move_a: wp.vec3d,
+    move_b: wp.vec3d,
+    move_c: wp.vec3d,
+    move_d: wp.vec3d,
+    floor: wp.float64,
+):
+    """The fraction of their moves for which a pair at a, b, c and d surely stays farther apart than ``floor``.
+
+    The pair advances until its gap could be closed at the relative speed of its sides, finds its gap there, and goes on (Li,
+    Kaufman and Jiang 2021, additive continuous collision detection).
+    """
+    mean = SIDE * SIDE * (move_a + move_b + move_c + move_d)
+    first = wp.length(move_a - mean)
+    second = wp.max(wp.length(move_c - mean), wp.length(move_d - mean))
+    if of_vertex:
+        second = wp.max(second, wp.length(move_b - mean))
+    else:
+        first = wp.max(first, wp.length(move_b - mean))
+    advanced = ZERO
+    _w, y, _inside = nearest(of_vertex, a, b, c, d)
+    room = wp.length(y) - floor
+    enough = NEAR * room
+    if room > ZERO:
+        for _ in range(ADVANCES):
+            if room > enough:
+                advanced = wp.min(advanced + KEPT * room / (first + second), ONE)
+                _w, y, _inside = nearest(
+                    of_vertex,
+                    a + advanced * (move_a - mean),
+                    b + advanced * (move_b - mean),
+                    c + advanced * (move_c - mean),
+                    d + advanced * (move_d - mean),
+                )
+                room = wp.where(advanced < ONE, wp.length(y) - floor, ZERO)
+    return advanced
+
+
 @cache
 def cut_by_planes(dtype):
     """Kernel over pairs: reduces the ``share`` of each vertex, the fraction of its wanted move from x that it may make.
 
-    A plane normal to y is placed between the two sides. It divides their gap, minus the smallest distance, in the ratio of
-    their approaches; each side gets at least CLAMPED of it. The ``common`` move of a copy does not count as an approach. There
-    is no plane for a pair whose ``gap`` is too wide for the moves that :func:`find_ways` bounds.
+    A pair cuts nothing while its sides stay apart, by a tenth of their gap or more, with the shares that its vertices had
+    before: along y, where a plane may move with them, or by :func:`part_apart`. So cloth that falls or turns together moves
+    freely. Otherwise each side gets a half-space for itself, so that the shares may fall further. A plane normal to y is
+    placed between the two sides. It divides their gap, minus the smallest distance, in the ratio of their approaches; each
+    side gets at least CLAMPED of it. The ``common`` move of a copy does not count as an approach. There is no plane for a
+    pair whose ``gap`` is too wide for the moves that :func:`find_ways` bounds.
 
     A vertex at the smallest distance from a plane that does not approach it moves by at least ``least_share``, or not at
     all. Roundings of shorter moves, which can be equal in many steps, would take it nearer.
@@ -158,7 +222,7 @@ def cut_by_planes(dtype):
         x: wp.array(dtype=vec3),
         target: wp.array(dtype=vec3),
         common: wp.array(dtype=wp.vec3d),
-        ways: wp.array(dtype=wp.vec2d),
+        ways: wp.array(dtype=wp.vec3d),
         # parameters
         per_copy: int,
         least: wp.float64,
@@ -181,6 +245,8 @@ def cut_by_planes(dtype):
         n = y / wp.max(wp.length(y), wp.float64(1e-300))
         lowest = wp.float64(wp.inf)
         highest = -wp.float64(wp.inf)
+        lowest_end = wp.float64(wp.inf)
+        highest_end = -wp.float64(wp.inf)
         first = ZERO
         second = ZERO
         position = wp.vec4d()
@@ -193,10 +259,12 @@ def cut_by_planes(dtype):
             if i < sides:
                 approaches[i] = -approach
                 lowest = wp.min(lowest, along)
+                lowest_end = wp.min(lowest_end, along + ways[s[i]][2] * approach)
                 first = wp.max(first, -approach)
             else:
                 approaches[i] = approach
                 highest = wp.max(highest, along)
+                highest_end = wp.max(highest_end, along + ways[s[i]][2] * approach)
                 second = wp.max(second, approach)
         part = SIDE
         if first + second > ZERO:
@@ -206,6 +274,23 @@ def cut_by_planes(dtype):
                 wp.atomic_min(share, s[i], ZERO)
             return
         between = wp.max(lowest - highest - wp.float64(2.0) * margin, ZERO)
+        floor = (ONE - KEPT) * between + wp.float64(2.0) * margin
+        if lowest_end - highest_end >= floor:
+            return
+        whole = part_apart(
+            of_vertex,
+            origin,
+            exact(x[s[1]]),
+            exact(x[s[2]]),
+            exact(x[s[3]]),
+            ways[s[0]][2] * (wanted(x, target, s[0]) - common[s[0] // per_copy]),
+            ways[s[1]][2] * (wanted(x, target, s[1]) - common[s[0] // per_copy]),
+            ways[s[2]][2] * (wanted(x, target, s[2]) - common[s[0] // per_copy]),
+            ways[s[3]][2] * (wanted(x, target, s[3]) - common[s[0] // per_copy]),
+            floor,
+        )
+        if whole == ONE:
+            return
         for i in range(4):
             room = highest - position[i] + part * between
             if i < sides:
@@ -218,3 +303,20 @@ def cut_by_planes(dtype):
                 wp.atomic_max(least_share, s[i], ulp * far / wp.max(-approaches[i], wp.float64(1e-300)))
 
     return cut_by_each_plane
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def note_cuts(
+    # state in
+    share: wp.array(dtype=wp.float64),
+    # in and out
+    ways: wp.array(dtype=wp.vec3d),
+    # out
+    changed: wp.array(dtype=wp.int32),
+):
+    """Kernel over vertices: takes the share into ``ways``; changed = 1 if one has fallen."""
+    i = wp.tid()
+    way = ways[i]
+    if share[i] < way[2]:
+        ways[i] = wp.vec3d(way[0], way[1], share[i])
+        changed[0] = 1

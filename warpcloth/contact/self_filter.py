@@ -2,15 +2,14 @@
 
 import warp as wp
 
-from ..kernels.contact import self_filter, self_planes
+from ..kernels.contact import retakes, self_filter, self_planes
 from ..kernels.contact.clear_elements import move_clear
 from ..kernels.contact.self_advance import advances, take_advance
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 
-# The filter works in rounds. While planes cut the moves of more than SHARE of the vertices, they are found again, in at most
-# NEAR_ROUNDS rounds. A move that is longer than one list of pairs allows is made in at most FAR_ROUNDS rounds.
-SHARE, NEAR_ROUNDS, FAR_ROUNDS = 0.01, 4, 32
+# A move that is longer than one list of pairs allows is made in at most ROUNDS rounds.
+ROUNDS = 32
 # The longest move of a vertex in a round, relative to the common motion, over the skin. The vertex may have moved as far since
 # the list was made, and so may the other side of a pair: together they approach by at most the skin.
 WAY = 0.25
@@ -41,16 +40,17 @@ class SelfFilter:
         self.relisted = self.stopped = None
         device = model.device
         self._target, self._from, self._other = (model.vectors() for _ in range(3))
-        self._ways = wp.zeros(model.count, dtype=wp.vec2d, device=device)
+        self._ways = wp.zeros(model.count, dtype=wp.vec3d, device=device)
         self._share, self._least_share = (wp.zeros(model.count, dtype=wp.float64, device=device) for _ in range(2))
         self._common = wp.zeros(model.copies, dtype=wp.vec3d, device=device)
-        self._cuts = wp.zeros((model.copies, 2), dtype=wp.int32, device=device)
+        self._cuts = model.scalars(wp.int32)
         self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(2))
         self._proceed = wp.zeros(1, dtype=wp.int32, device=device)
-        self._few = int(SHARE * model.per_copy)
+        self._changed = wp.zeros(1, dtype=wp.int32, device=device)
         self.moves_together = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
         made = self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move
         made += self_filter.keep_apart, self_filter.end_filter, self_filter.add_positions
+        made += self_filter.push_pairs, retakes.take_impact
         if model.keyframes is not None:
             made += self_filter.share_of_pins, self_filter.hold_pins
         declared = model.colliders
@@ -59,7 +59,7 @@ class SelfFilter:
             colliders.end_again()
             self._mobile = wp.zeros(model.count, dtype=model.dtype, device=device)
             self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
-            made += self_filter.find_held, self_filter.push_pairs
+            made += (self_filter.find_held,)
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._count = model.kernel(count_step)
 
@@ -119,6 +119,38 @@ class SelfFilter:
         given = [model.inverse_mass, self._share, contact.x_before, contact.steps, model.per_copy]
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
 
+    def launch_impact(self, x, v, move, again, he):
+        """Shortens predicted moves to x that cross the cloth, in copies that are ``again`` (B,); v and ``move`` change with it.
+
+        Where two sides of a pair would come nearer than a tenth of the contact distance, or than they are if that is less, they
+        first exchange momentum along n, as in an inelastic impact, which does not raise the kinetic energy. What still crosses
+        is cut. Pairs are then those that are near x, and the filter starts there.
+        """
+        model, contact = self.model, self._contact
+        wp.copy(self._target, x)
+        self._rounds.zero_()
+        self._cuts.zero_()
+        wp.copy(self._walking, again)
+        self._proceed.fill_(1)
+        wp.capture_while(self._proceed, self._launch_impact_round, x=contact.x_before)
+        given = [model.inverse_mass, model.mobility, contact.x_before, again, model.per_copy, he]
+        self._launch(retakes.take_impact, model.count, given, [x, v, move, contact.cut])
+        if self._iterates:
+            self._launch_areas_again(contact.x_before, again)
+        else:
+            contact.launch_areas(contact.x_before, again)
+
+    def _launch_impact_round(self, x):
+        self.launch_fresh(x, self._contact.launch_list, self._walking)
+        self._contact.launch_sides(x, self._walking)
+        self._launch_pushes(x, self.model.inverse_mass, self._target)
+        self._launch_walk(x)
+
+    def _launch_pushes(self, x, mobile, target):
+        for _ in range(SWEEPS):
+            given = [self._contact.pairs, mobile, self._contact.begun, x, LEFT * self._contact.declared.distance]
+            self._launch(self_filter.push_pairs, 1, given, [target])
+
     def launch_fresh(self, x, launch, active=None):
         """Calls ``launch`` with x if the next round might miss a pair, as a vertex has moved far since the last list.
 
@@ -150,8 +182,8 @@ class SelfFilter:
         self._launch_planes(x, self._target)
         self._launch_apart(x, self._target)
         self._proceed.zero_()
-        given = [self._few, NEAR_ROUNDS, FAR_ROUNDS]
-        model.launch(self_filter.another_round, model.copies, given, [self._cuts, self._rounds, self._walking, self._proceed])
+        noted = [self._cuts, self._rounds, self._walking, self._proceed]
+        model.launch(self_filter.another_round, model.copies, [ROUNDS], noted)
 
     def _launch_apart(self, x, target):
         model = self.model
@@ -174,9 +206,7 @@ class SelfFilter:
         model, out = self.model, self._other
         self.launch_fresh(x, self._contact.launch_list)
         self._contact.launch_sides(x)
-        for _ in range(SWEEPS):
-            given = [self._contact.pairs, self._mobile, self._contact.begun, x, LEFT * self._contact.declared.distance]
-            self._launch(self_filter.push_pairs, 1, given, [out])
+        self._launch_pushes(x, self._mobile, out)
         self._launch_planes(x, out)
         self._launch_apart(x, out)
         model.launch(self._count, 1, [], [self._turns])
@@ -187,13 +217,21 @@ class SelfFilter:
         model, wanted = self.model, [x, target]
         if self.moves_together:
             self._launch(self_planes.common_move, model.copies, [*wanted, model.per_copy], [self._common])
-        given = [*wanted, self._common, self._contact.begun_at, model.per_copy]
+        given = [*wanted, self._common, self._contact.begun_at, model.per_copy, WAY * self._contact.skin]
         self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
-        given = [self._contact.pairs, self._contact.begun.gap, *wanted, self._common, self._ways]
-        given += [model.per_copy, FLOOR * self._contact.declared.distance]
-        self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
         if self._colliders is not None and self._colliders.faces is not None:
             self._colliders.faces.launch_least(x, target, self._share)
+        given = [self._contact.pairs, self._contact.begun.gap, *wanted, self._common, self._ways]
+        self._changed.fill_(1)
+        wp.capture_while(self._changed, self._launch_cuts, given=given)
+
+    def _launch_cuts(self, given):
+        """Cuts the moves of pairs that would come too near, which may leave other pairs that do."""
+        model = self.model
+        given = [*given, model.per_copy, FLOOR * self._contact.declared.distance]
+        self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
+        self._changed.zero_()
+        model.launch(self_planes.note_cuts, model.count, [self._share], [self._ways, self._changed])
 
     # For methods whose iterates base + d stay apart too.
 
