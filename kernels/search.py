@@ -23,7 +23,7 @@ class LineSearch:
     ``energy`` is φ at d [J], ``before`` its value where the search began, ``slope`` its derivative along p and ``step`` the
     length of the trial step. At the trial they are ``trial_energy`` and ``trial_slope``, with ``square``, ‖∇φ‖² [N²], and
     ``acceleration``, max ‖∇φᵢ‖/mᵢ [m/s²]. ``other`` is an energy that is not in the parts. ``searching`` is 1 until a step is
-    found. ``trials`` counts, and ``proceed`` is 1 if another is needed.
+    found. ``trials`` counts, and ``proceed`` is 1 if another is needed. ``moved`` is 1 where the last search changed d.
     """
 
     energy: wp.array(dtype=wp.float64)
@@ -36,6 +36,7 @@ class LineSearch:
     acceleration: wp.array(dtype=wp.float64)
     other: wp.array(dtype=wp.float64)
     searching: wp.array(dtype=wp.int32)
+    moved: wp.array(dtype=wp.int32)
     trials: wp.array(dtype=wp.int32)
     proceed: wp.array(dtype=wp.int32)
 
@@ -91,6 +92,7 @@ def begin_search(dtype, block: int):
         if lane == 0:
             search.step[copy] = wp.float64(active[copy])
             search.searching[copy] = active[copy]
+            search.moved[copy] = 0
             search.before[copy] = search.energy[copy]
             search.other[copy] = wp.float64(0.0)
             if copy == 0:
@@ -319,6 +321,8 @@ def take_trial(dtype):
         correction: wp.array(dtype=vec3),
     ):
         i = wp.tid()
+        if wp.max(wp.abs(correction[i] - trial[i])) > dtype(0.0):
+            search.moved[i // (trial.shape[0] // search.moved.shape[0])] = 1
         correction[i] = trial[i]
         if i < search.energy.shape[0]:
             search.energy[i] = search.trial_energy[i]

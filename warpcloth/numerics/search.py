@@ -50,7 +50,7 @@ class Search:
         self.state = state = kernels.LineSearch()
         for name in ("energy", "before", "slope", "step", "trial_energy", "trial_slope", "square", "acceleration", "other"):
             setattr(state, name, model.scalars())
-        state.searching = model.scalars(wp.int32)
+        state.searching, state.moved = (model.scalars(wp.int32) for _ in range(2))
         state.trials, state.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self.energy, self.slope, self.step, self.acceleration = state.energy, state.slope, state.step, state.acceleration
         self._parts, self._slopes = lanes.parts(kernels.ROWS), lanes.parts()

@@ -112,7 +112,7 @@ class Retakes:
         self._energy.add(self._x, self._found)
         if pairs is not None:
             pairs.launch_areas(self._x)
-            pairs.forces.launch_forces(self._x)
+            pairs.forces.launch(self._x)
             pairs.forces.add_energy(self._sums, self._found)
         return self._found.numpy() + sum(map(self._stored_by, self._touching), np.zeros(model.copies))
 
@@ -120,8 +120,8 @@ class Retakes:
         """Returns the energy of contact elements, which sweeps do not sort by copies, (B,) [J]."""
         model = self._stepper.model
         values = wp.zeros(elements.count, dtype=wp.float64, device=model.device)
-        kernel = model.kernel(assemble.energy, elements.term, model.dtype, False)
-        model.launch(kernel, elements.count, [*elements.arguments, self._x, None], [values])
+        kernel = model.kernel(assemble.energy, elements.term, model.dtype, False, False)
+        model.launch(kernel, elements.count, [*elements.arguments, self._x, None, None], [values])
         copies = host_values(elements.stencil).reshape(elements.count, -1)[:, 0] // model.per_copy
         return np.bincount(copies, values.numpy(), model.copies)
 
