@@ -12,7 +12,7 @@ SOLVERS = {
     "newton": wc.Newton(substeps=1),
     "xpbd": wc.XPBD(substeps=1, iterations=30),
     "xpbd_300": wc.XPBD(substeps=1, iterations=300),
-    "xpbd_jacobi": wc.XPBD(substeps=1, iterations=100, sweep="constraint-averaged"),
+    "xpbd_jacobi": wc.XPBD(substeps=1, iterations=1000, sweep="constraint-averaged"),
     "pbd": wc.PBD(substeps=1),
     "hierarchical_pbd": wc.HierarchicalPBD(substeps=1),
     "projective_dynamics": wc.ProjectiveDynamics(substeps=1, iterations=100),

@@ -143,12 +143,12 @@ class SelfFilter:
     def _launch_impact_round(self, x):
         self.launch_fresh(x, self._contact.launch_list, self._walking)
         self._contact.launch_sides(x, self._walking)
-        self._launch_pushes(x, self.model.inverse_mass, self._target)
+        self._launch_pushes(x, self.model.inverse_mass, self._target, 2.0 * FLOOR)
         self._launch_walk(x)
 
-    def _launch_pushes(self, x, mobile, target):
+    def _launch_pushes(self, x, mobile, target, left):
         for _ in range(SWEEPS):
-            given = [self._contact.pairs, mobile, self._contact.begun, x, LEFT * self._contact.declared.distance]
+            given = [self._contact.pairs, mobile, self._contact.begun, x, left * self._contact.declared.distance]
             self._launch(self_filter.push_pairs, 1, given, [target])
 
     def launch_fresh(self, x, launch, active=None):
@@ -206,7 +206,7 @@ class SelfFilter:
         model, out = self.model, self._other
         self.launch_fresh(x, self._contact.launch_list)
         self._contact.launch_sides(x)
-        self._launch_pushes(x, self._mobile, out)
+        self._launch_pushes(x, self._mobile, out, LEFT)
         self._launch_planes(x, out)
         self._launch_apart(x, out)
         model.launch(self._count, 1, [], [self._turns])

@@ -13,14 +13,14 @@ from ..model.host_values import host_values
 
 
 class Retakes:
-    """Takes a step again in copies in which the filters raised the energy.
+    """Takes a step again in copies in which the filters cut moves.
 
     A filter cuts moves of neighbouring vertices by different fractions, which strains the cloth. A step in which it cut a move
     may end with at most the energy of its start. The start has the pins of the end, so that the work of pins and colliders is
     in its energy, and the potential of gravity and dead loads counts. Otherwise the step is taken again
 
-    - with self-contact, from a prediction that does not cross the cloth (an inelastic impact, see
-      :meth:`warpcloth.contact.self_filter.SelfFilter.launch_impact`), so that all pairs are known where it begins;
+    - with self-contact, wherever that filter cut a move, from a prediction that does not cross the cloth (an inelastic impact,
+      see :meth:`warpcloth.contact.self_filter.SelfFilter.launch_impact`), so that all pairs are known where it begins;
     - then, until the energy does not rise, at positions to which neighbours of cut vertices follow: the cut of the nearest such
       vertex is added to the solution times 1 − distance/R, R = 2, 4, … edges. Where R exceeds the piece and the energy still
       rises, the whole move of the piece is halved, again and again.
@@ -55,15 +55,12 @@ class Retakes:
 
     def begin(self):
         """Notes the number of cuts before a step."""
-        self._before = self._cuts()
-
-    def _cuts(self):
-        return sum(count.read().copy() for count in self._counts)
+        self._before = [count.read().copy() for count in self._counts]
 
     @property
     def cut(self):
         """In which copies a filter has cut a move since :meth:`begin`, (B,)."""
-        return self._cuts() > self._before
+        return np.any([count.read() > before for count, before in zip(self._counts, self._before, strict=True)], axis=0)
 
     def settle(self, kept, take):
         """Takes a step again where it must be.
@@ -74,13 +71,15 @@ class Retakes:
         """
         stepper, cut = self._stepper, self._moved()
         rose = self.cut & self._rose(kept)
-        if rose.any() and stepper.pairs is not None:
+        # A pin that other pins hold back along a locked axis does not move free coordinates.
+        again = rose | ((self._counts[-1].read() > self._before[-1]) & cut.any(axis=1))
+        if stepper.pairs is not None and again.any():
             stepper.state.assign(kept)
-            self._again.write(rose)
+            self._again.write(again)
             self._some.write(1)
             take()
             self._some.write(0)
-            rose &= self._rose(kept)
+            rose = (rose | again) & self._rose(kept)
         if rose.any():
             self._spread(kept, rose, cut)
 
