@@ -9,13 +9,14 @@ from .proximity_grid import surfaces
 from .self_gaps import ONE, ZERO, nearest, vertex_of
 from .self_planes import KEPT, margin_of, part_apart, ulp_of
 
+BLOCKED = wp.constant(wp.float64(0.1))
+
 
 @cache
 def advances(dtype):
     """Struct of the moves ``direction`` (N,) [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m].
 
-    ``stopped`` (N,) is 1 for vertices of pairs of edges nearer than ``reach`` [m] that stopped a direction; ``blocked`` (B,)
-    becomes 1 in their copies where a vertex stops first.
+    ``stopping`` (N,) becomes 1 for vertices of pairs of edges that leave less than ``BLOCKED`` of a direction.
     """
     vec3, _ = types(dtype)
 
@@ -24,9 +25,7 @@ def advances(dtype):
         direction: wp.array(dtype=vec3)
         fraction: wp.array(dtype=wp.float64)
         least: wp.float64
-        reach: wp.float64
-        stopped: wp.array(dtype=wp.int32)
-        blocked: wp.array(dtype=wp.int32)
+        stopping: wp.array(dtype=wp.int32)
 
     return Advance
 
@@ -82,10 +81,8 @@ def take_advance(dtype, of_edges: bool):
         if t < ONE:
             wp.atomic_min(out.fraction, s[0] // surface.vertices, t)
             if wp.static(of_edges):
-                if distance < out.reach:
+                if t < BLOCKED:
                     for p in range(4):
-                        if out.stopped[s[p]] == 0:
-                            out.stopped[s[p]] = 1
-                            out.blocked[s[0] // surface.vertices] = 1
+                        out.stopping[s[p]] = 1
 
     return take, advance

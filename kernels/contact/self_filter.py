@@ -10,7 +10,7 @@ import warp as wp
 from ..vectors import types
 from .gap_notes import FIRST
 from .self_gaps import ONE, PLANAR, ZERO, vertex_of
-from .self_pairs import StepPairs, module_of, near_pairs
+from .self_pairs import STOPPED, StepPairs, module_of, near_pairs
 from .self_planes import bounded_share
 
 # Pins of hard pairs may approach by this fraction of their gap in a step. The second is for pairs with a free vertex, which
@@ -362,6 +362,30 @@ def push_pairs(dtype):
                     target[s[i]] = target[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
 
     return push_each_pair
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def count_stops(
+    # parameters
+    active: wp.array(dtype=wp.int32),
+    per_copy: int,
+    # in and out
+    stopping: wp.array(dtype=wp.int32),
+    stopped: wp.array(dtype=wp.int32),
+    # out
+    blocked: wp.array(dtype=wp.int32),
+):
+    """Kernel over vertices: counts up to STOPPED the directions that stopped at a vertex; blocked = 1 where it gets there.
+
+    It sets ``stopping`` to 0. Copies that are not ``active`` keep old directions, which do not count.
+    """
+    i = wp.tid()
+    if stopping[i] != 0:
+        stopping[i] = 0
+        if active[i // per_copy] != 0 and stopped[i] < STOPPED:
+            stopped[i] = stopped[i] + 1
+            if stopped[i] == STOPPED:
+                blocked[i // per_copy] = 1
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)

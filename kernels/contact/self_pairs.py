@@ -15,6 +15,9 @@ from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
 # Triangles with a common vertex share the area of a vertex near them. The part of a triangle falls linearly to 0 at a gap that
 # exceeds the smallest one by SHARING·r.
 SHARING = wp.constant(wp.float64(0.25))
+# So many directions must stop at the vertices of pairs of edges before these have their whole area. One does not: the first
+# directions of a step may be far from the solution, and the areas would then not be those of other solvers.
+STOPPED = wp.constant(2)
 # The area of two edges decreases if sin² of their angle is below this, to 0 for parallel edges.
 PARALLEL = wp.constant(wp.float64(1e-3))
 
@@ -228,7 +231,7 @@ def set_areas(dtype):
                 if least < wp.float64(wp.inf):
                     nearer = wp.clamp((least - gap) / (SHARING * r), ZERO, ONE)
             if stopped:
-                if stopped[s[0]] + stopped[s[1]] + stopped[s[2]] + stopped[s[3]] == 4:
+                if wp.min(wp.min(stopped[s[0]], stopped[s[1]]), wp.min(stopped[s[2]], stopped[s[3]])) == STOPPED:
                     nearer = ONE
             if nearer > ZERO:
                 ab = exact(x[s[1]]) - exact(x[s[0]])

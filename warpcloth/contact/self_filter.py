@@ -26,8 +26,8 @@ class SelfFilter:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
-        stopped: 1 for vertices at which pairs of edges have stopped a direction in this step, (N,) int32; None unless iterates
-            stay apart.
+        stopped: How many directions pairs of edges have stopped at each vertex in this step, up to STOPPED, (N,) int32; None
+            unless iterates stay apart.
         fraction: The fraction of the last direction that pairs left each copy, (B,); only if iterates stay apart.
         relisted: 1 for copies whose last trial listed pairs again, (B,) int32; None unless iterates stay apart.
         moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
@@ -269,10 +269,9 @@ class SelfFilter:
         self._kernels[self_filter.scale_directions] = model.kernel(self_filter.scale_directions, model.dtype)
         self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
         self.fraction = self._advance.fraction = model.scalars()
-        self._advance.reach = self._contact.declared.distance
-        self.stopped = self._advance.stopped = wp.zeros(model.count, dtype=wp.int32, device=model.device)
-        self._blocked = self._advance.blocked = model.scalars(wp.int32)
-        self.relisted, self._renewing = (model.scalars(wp.int32) for _ in range(2))
+        self.stopped, self._stopping = (wp.zeros(model.count, dtype=wp.int32, device=model.device) for _ in range(2))
+        self._advance.stopping = self._stopping
+        self.relisted, self._blocked, self._renewing = (model.scalars(wp.int32) for _ in range(3))
         self._renew = wp.zeros(1, dtype=wp.int32, device=model.device)
         self._advance.least = FLOOR * self._contact.declared.distance
         faces = self._colliders is not None and self._colliders.faces is not None
@@ -296,7 +295,7 @@ class SelfFilter:
         direction.
 
         In layers that a step presses flat, pairs of crossing edges have hardly any area, so that directions run into them. For
-        the rest of the step, edges between vertices that have stopped have their whole area.
+        the rest of the step, edges between vertices that have stopped often enough have their whole area.
         """
 
         def renew(x):
@@ -307,15 +306,18 @@ class SelfFilter:
         self.model.launch(self_filter.take_blocked, self.model.copies, [self._blocked], [self._renewing, self._renew])
         wp.capture_if(self._renew, renew, x=self._contact.x_before)
 
-    def launch_limit(self, direction):
+    def launch_limit(self, direction, active):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
 
         All vertices of a copy move by the same fraction: shortened at each vertex, a direction would stretch stiff cloth.
+        Directions of copies that are not ``active`` (B,) do not count as stopped.
         """
         self.relisted.zero_()
         self.fraction.fill_(1.0)
         self._advance.direction = direction
         self._contact.proximity.launch_along(self._contact.x_before, direction, self._advances, self._advance)
+        noted = [self._stopping, self.stopped, self._blocked]
+        self.model.launch(self_filter.count_stops, self.model.count, [active, self.model.per_copy], noted)
         self._launch(self_filter.scale_directions, self.model.count, [self.fraction, self.model.per_copy], [direction])
 
     def _add(self, a, b, sign, out, active=None):

@@ -299,5 +299,5 @@ class Minimiser:
     def _launch_search(self):
         self._launch_mean(self.search.direction)
         if self.pairs is not None:
-            self.pairs.filter.launch_limit(self.search.direction)
+            self.pairs.filter.launch_limit(self.search.direction, self.active)
         self.search.launch(self.active)
