@@ -241,7 +241,7 @@ def end_newton(block: int):
         if relisted:
             stuck = stuck and relisted[copy] == 0
         # A step so short that rounding undoes it would be repeated for ever.
-        undone = search.moved[copy] == 0 and not stuck
+        undone = search.moved[copy] == 0 and search.step[copy] > wp.float64(0.0) and search.slope[copy] < wp.float64(0.0)
         if fraction:
             undone = undone and fraction[copy] == wp.float64(1.0)
         ended = USED_UP
