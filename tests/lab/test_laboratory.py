@@ -160,9 +160,9 @@ def test_a_stiff_disc_sinks_like_a_plate(device):
 
 
 def test_a_listed_drape_is_computed(device):
-    """All eight starts of canvas read 90.9 % with rows=8, and the first 91.1 % with rows=4."""
-    assert read(scene("cusick", fabric="canvas", rows=4), device)["drape coefficient"] == pytest.approx(
-        DRAPES["canvas"], abs=0.3
+    """All eight starts of canvas read 90.9 % with rows=8; with rows=4 there are several shapes of rest, from 89.9 to 91.7 %."""
+    assert read(scene("cusick", fabric="canvas", rows=8), device)["drape coefficient"] == pytest.approx(
+        DRAPES["canvas"], abs=0.05
     )
 
 
