@@ -389,6 +389,22 @@ def count_stops(
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def take_stops(
+    # state in
+    counted: wp.array(dtype=wp.int32),
+    # parameters
+    renewing: wp.array(dtype=wp.int32),
+    per_copy: int,
+    # out
+    stopped: wp.array(dtype=wp.int32),
+):
+    """Kernel over vertices: stopped = ``counted`` in copies that are ``renewing``, so that copies do not depend on others."""
+    i = wp.tid()
+    if renewing[i // per_copy] == 1:
+        stopped[i] = counted[i]
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
 def take_blocked(
     # in and out
     blocked: wp.array(dtype=wp.int32),

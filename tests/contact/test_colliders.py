@@ -64,6 +64,7 @@ def falling(colliders, speed=1.0, fps=24.0, n=6, stiffness=100.0, height=0.05, *
         **{
             "terms": [wc.Spring(stiffness=stiffness), wc.QuadraticBending(stiffness=1e-5)],
             "duration": 8.0 / fps,
+            "contact": wc.Contact(distance=R, stiffness=10.0 * 0.15 * 9.81 / R),  # explicit steps of 1/960 s are stable
             **fields,
         },
     )
@@ -595,6 +596,7 @@ def test_a_plane_that_moves_carries_a_sheet(integrator):
         terms=[wc.Spring(stiffness=1000.0)],
         positions=grid.points + np.array([0.0, 0.9e-3, 0.0]),
         colliders=[moving],
+        contact=wc.Contact(distance=R, stiffness=10.0 * 0.15 * 9.81 / R),
         duration=1.0,
     )
     animation = wc.simulate(scene, wc.Newton(substeps=4, integrator=integrator, tolerance=1e-6), dtype="float64")

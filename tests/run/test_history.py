@@ -397,7 +397,7 @@ def test_a_copy_of_a_batch_is_an_animation(device):
         assert getattr(one, name).keys() == getattr(alone, name).keys()
         for key, values in getattr(one, name).items():
             np.testing.assert_allclose(values, getattr(alone, name)[key], rtol=1e-9, atol=1e-9)
-    assert one.worst_strain == pytest.approx(alone.worst_strain) and one.cut == alone.cut and one.crossings == 0
+    assert one.worst_strain == pytest.approx(alone.worst_strain) and one.cut == alone.cut
     assert one.self_contact.kept == alone.self_contact.kept
     assert (one.status.residual, one.status.frame, one.status.good.tolist()) == (alone.status.residual, 2, [2])
     assert one.status.distance == pytest.approx(alone.status.distance, rel=1e-6) and one.status.grades == alone.status.grades

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..kernels.contact import retakes, self_filter, self_planes
+from ..kernels.contact import self_filter, self_planes
 from ..kernels.contact.clear_elements import move_clear
 from ..kernels.contact.self_advance import advances, take_advance
 from ..kernels.step import count_step
@@ -26,8 +26,8 @@ class SelfFilter:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
-        stopped: How many directions pairs of edges have stopped at each vertex in this step, up to STOPPED, (N,) int32; None
-            unless iterates stay apart.
+        stopped: How many directions pairs of edges have stopped at each vertex in this step, up to STOPPED, (N,) int32, when
+            areas were last found anew for that; None unless iterates stay apart.
         fraction: The fraction of the last direction that pairs left each copy, (B,); only if iterates stay apart.
         relisted: 1 for copies whose last trial listed pairs again, (B,) int32; None unless iterates stay apart.
         moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
@@ -50,7 +50,6 @@ class SelfFilter:
         self.moves_together = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
         made = self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move
         made += self_filter.keep_apart, self_filter.end_filter, self_filter.add_positions
-        made += self_filter.push_pairs, retakes.take_impact
         if model.keyframes is not None:
             made += self_filter.share_of_pins, self_filter.hold_pins
         declared = model.colliders
@@ -59,7 +58,7 @@ class SelfFilter:
             colliders.end_again()
             self._mobile = wp.zeros(model.count, dtype=model.dtype, device=device)
             self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
-            made += (self_filter.find_held,)
+            made += self_filter.find_held, self_filter.push_pairs
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._count = model.kernel(count_step)
 
@@ -69,8 +68,8 @@ class SelfFilter:
     def launch_begin(self):
         """Stores, at the start of a step, how many moves colliders have cut so far; no vertex is stopped yet."""
         if self.stopped is not None:
-            self.stopped.zero_()
-            self._blocked.zero_()
+            for array in (self.stopped, self._stops, self._blocked):
+                array.zero_()
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
@@ -118,38 +117,6 @@ class SelfFilter:
         self._launch(self_filter.share_of_pins, len(contact.pairs.stencils), given, [self._share])
         given = [model.inverse_mass, self._share, contact.x_before, contact.steps, model.per_copy]
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
-
-    def launch_impact(self, x, v, move, again, he):
-        """Shortens predicted moves to x that cross the cloth, in copies that are ``again`` (B,); v and ``move`` change with it.
-
-        Where two sides of a pair would come nearer than a tenth of the contact distance, or than they are if that is less, they
-        first exchange momentum along n, as in an inelastic impact, which does not raise the kinetic energy. What still crosses
-        is cut. Pairs are then those that are near x, and the filter starts there.
-        """
-        model, contact = self.model, self._contact
-        wp.copy(self._target, x)
-        self._rounds.zero_()
-        self._cuts.zero_()
-        wp.copy(self._walking, again)
-        self._proceed.fill_(1)
-        wp.capture_while(self._proceed, self._launch_impact_round, x=contact.x_before)
-        given = [model.inverse_mass, model.mobility, contact.x_before, again, model.per_copy, he]
-        self._launch(retakes.take_impact, model.count, given, [x, v, move, contact.cut])
-        if self._iterates:
-            self._launch_areas_again(contact.x_before, again)
-        else:
-            contact.launch_areas(contact.x_before, again)
-
-    def _launch_impact_round(self, x):
-        self.launch_fresh(x, self._contact.launch_list, self._walking)
-        self._contact.launch_sides(x, self._walking)
-        self._launch_pushes(x, self.model.inverse_mass, self._target, 2.0 * FLOOR)
-        self._launch_walk(x)
-
-    def _launch_pushes(self, x, mobile, target, left):
-        for _ in range(SWEEPS):
-            given = [self._contact.pairs, mobile, self._contact.begun, x, left * self._contact.declared.distance]
-            self._launch(self_filter.push_pairs, 1, given, [target])
 
     def launch_fresh(self, x, launch, active=None):
         """Calls ``launch`` with x if the next round might miss a pair, as a vertex has moved far since the last list.
@@ -206,7 +173,9 @@ class SelfFilter:
         model, out = self.model, self._other
         self.launch_fresh(x, self._contact.launch_list)
         self._contact.launch_sides(x)
-        self._launch_pushes(x, self._mobile, out, LEFT)
+        for _ in range(SWEEPS):
+            given = [self._contact.pairs, self._mobile, self._contact.begun, x, LEFT * self._contact.declared.distance]
+            self._launch(self_filter.push_pairs, 1, given, [out])
         self._launch_planes(x, out)
         self._launch_apart(x, out)
         model.launch(self._count, 1, [], [self._turns])
@@ -269,7 +238,8 @@ class SelfFilter:
         self._kernels[self_filter.scale_directions] = model.kernel(self_filter.scale_directions, model.dtype)
         self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
         self.fraction = self._advance.fraction = model.scalars()
-        self.stopped, self._stopping = (wp.zeros(model.count, dtype=wp.int32, device=model.device) for _ in range(2))
+        stops = [wp.zeros(model.count, dtype=wp.int32, device=model.device) for _ in range(3)]
+        self.stopped, self._stops, self._stopping = stops
         self._advance.stopping = self._stopping
         self.relisted, self._blocked, self._renewing = (model.scalars(wp.int32) for _ in range(3))
         self._renew = wp.zeros(1, dtype=wp.int32, device=model.device)
@@ -299,6 +269,8 @@ class SelfFilter:
         """
 
         def renew(x):
+            given = [self._stops, self._renewing, self.model.per_copy]
+            self.model.launch(self_filter.take_stops, self.model.count, given, [self.stopped])
             self._launch_areas_again(x, self._renewing)
             launch()
 
@@ -316,7 +288,7 @@ class SelfFilter:
         self.fraction.fill_(1.0)
         self._advance.direction = direction
         self._contact.proximity.launch_along(self._contact.x_before, direction, self._advances, self._advance)
-        noted = [self._stopping, self.stopped, self._blocked]
+        noted = [self._stopping, self._stops, self._blocked]
         self.model.launch(self_filter.count_stops, self.model.count, [active, self.model.per_copy], noted)
         self._launch(self_filter.scale_directions, self.model.count, [self.fraction, self.model.per_copy], [direction])
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..base.turns import in_turn
 from ..kernels.terms.friction import FRICTION
 from ..mesh.mesh import Mesh
-from ..scene.colliders import Plane
+from ..scene.colliders import Contact, Plane
 from ..scene.scene import EARTH, Scene
 from ..solvers import SOLVERS
 from ..terms import Spring
@@ -28,7 +28,7 @@ RATIOS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99)  # tan θ/μ of sheets that 
 STEEP = 30.0  # [°]
 ITERATIONS = (1, 3, 10, 30, 100, 300)
 SPEED = 1e-3  # ε_v [m/s]
-DENSITY = 0.15  # [kg/m²]
+DENSITY, DISTANCE = 0.15, 1e-3  # [kg/m²], [m]
 FRAMES = 60  # of 1/60 s
 # Below this speed [m/s], a sheet sticks or does not accelerate: a tenth of ε_v.
 STILL = 0.1 * SPEED
@@ -166,8 +166,9 @@ def slide(solver, coefficient, slopes, device, **options):
         grid,
         density=DENSITY,
         terms=[Spring(stiffness=10.0)],
-        positions=grid.points + np.array([0.0, 1e-3, 0.0]),
+        positions=grid.points + np.array([0.0, DISTANCE, 0.0]),
         colliders=[Plane(friction=coefficient)],
+        contact=Contact(distance=DISTANCE, stiffness=10.0 * DENSITY * EARTH / DISTANCE),
         duration=FRAMES / 60.0,
     )
     angles, contact = np.radians(slopes), scene.contact

@@ -517,7 +517,9 @@ class Scene:
     def _cuts(self):
         """Yields a line about the shapes that may cut into triangles of the cloth between their vertices."""
         edge = self.mesh.edge_lengths.max()
-        shapes = [each for each in self.colliders if len(self.mesh.triangles) and not isinstance(each, MeshCollider)]
+        if self.contact is None or not len(self.mesh.triangles):
+            return
+        shapes = [each for each in self.colliders if not isinstance(each, MeshCollider)]
         gaps = {each.label: each.clearing_gap(edge) for each in shapes}
         found = [f"{gap:.3g} m of {name}" for name, gap in gaps.items() if gap > self.contact.distance]
         if found:

@@ -18,7 +18,6 @@ from ..numerics.integrators import INTEGRATORS
 from ..terms.refresh import STEP
 from .clear_steps import ClearSteps
 from .far_steps import FarSteps
-from .retakes import Retakes
 
 
 class Stepper:
@@ -58,7 +57,6 @@ class Stepper:
     lead = None  # for a twin without contact, the stepper whose state it shares, see `find_twin`
     clear_steps = None  # the TwinSteps of a stepper with a twin
     predicted = correction = unfiltered = None
-    _cuts = False  # whether filters of contact have cut moves in the last steps, so that steps are taken one by one
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
@@ -81,7 +79,7 @@ class Stepper:
             part = 0.0 if integrator is None else 1.0 / INTEGRATORS[integrator].parts
             self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
             self.model = model = model.with_terms(self.colliders.terms)
-        self.pairs, self._kept, self._retakes = None, None, None
+        self.pairs, self._kept = None, None
         if model.scene.self_contact is not None and self.lead is None:
             self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
             self.model = model = model.with_dynamic(self.pairs.forces.terms)
@@ -93,8 +91,6 @@ class Stepper:
             self.predicted = model.vectors() if self.lead is None else self.lead.predicted
             if self.colliders is not None or self.pairs is not None:
                 self.unfiltered = model.vectors()
-            if self.pairs is not None or (self.colliders is not None and self.colliders.faces is not None):
-                self._retakes = Retakes(self)
 
     @classmethod
     def part_of(cls, motion, options, model):
@@ -226,13 +222,8 @@ class Stepper:
         self.integrator.launch_prediction()
         if self.pairs is not None and self.model.keyframes is not None:
             self.pairs.filter.launch_hold(*self.state, self.hard_pairs)
-        if self.pairs is not None:
-            wp.capture_if(self._retakes.some, self._launch_impact)
         if self.colliders is not None:
             self.colliders.launch_clear(self.model.terms, self.state.x)
-
-    def _launch_impact(self):
-        self.pairs.filter.launch_impact(*self.state, self.integrator.move, self._retakes.again, self.he)
 
     def launch_finish(self, correction):
         """Launches x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser (N,) [m]."""
@@ -255,42 +246,19 @@ class Stepper:
         if self.pairs is not None:
             self.pairs.filter.launch_end(x, v)
 
-    def take(self, steps, several=False):
-        """Calls ``steps``, and repeats it from the same state where that is needed.
-
-        It does so with more memory while the list of pairs overflows, and as :class:`warpcloth.solvers.retakes.Retakes` says.
-
-        Args:
-            steps: Function that takes a step, or several.
-            several: Whether it takes several.
-
-        Returns:
-            Whether it has taken the steps. Else the state is that before them, and they must be taken one by one.
-        """
-        if self.pairs is None and self._retakes is None:
+    def take(self, steps):
+        """Calls ``steps``, and repeats it from the same state with more memory while the list of pairs overflows."""
+        if self.pairs is None:
             steps()
-            return True
+            return
         if self._kept is None:
             self._kept = self.state.copy()
         self._kept.assign(self.state)
-        if self._retakes is not None:
-            self._retakes.begin()
-        self.take_all(steps)
-        self._cuts = self._retakes is not None and self._retakes.cut.any()
-        if self._cuts:
-            if several:
-                self.state.assign(self._kept)
-                return False
-            self._retakes.settle(self._kept, partial(self.take_all, steps))
-        return True
-
-    def take_all(self, steps):
-        """Calls ``steps``, and repeats it from the same state with more memory while the list of pairs overflows."""
-        if self.pairs is not None and self.pairs.stale:
+        if self.pairs.stale:
             self.record_again()
             self.pairs.stale = False
         steps()
-        while self.pairs is not None and self.pairs.overflowed:
+        while self.pairs.overflowed:
             self.state.assign(self._kept)
             self.pairs.grow()
             self.record_again()
@@ -435,12 +403,7 @@ class LaunchedStepper(Stepper):
             self._frame = self._record_frame()
 
     def frame(self):
-        if self._cuts or not self.take(self._replay_frame, self.steps_per_frame > 1):
-            cuts = False
-            for _ in range(self.steps_per_frame):
-                self.step()
-                cuts = cuts or self._cuts
-            self._cuts = cuts
+        self.take(self._replay_frame)
 
     def _replay_frame(self):
         self.prepare_frame()
