@@ -744,7 +744,7 @@ REFUSED = {
         "the surface of the collider Sphere is 1e+06 m from its centre, where float32 resolves 0.12 m",
     ),
     "weightless": (
-        lambda: falling([wc.Plane()], gravity=(0, 0, 0), terms=[]),
+        lambda: falling([wc.Plane()], gravity=(0, 0, 0), terms=[], contact=None),
         "contact.stiffness has no default without gravity and a spring or membrane of finite stiffness",
     ),
     "all pinned": (
@@ -908,10 +908,10 @@ def test_the_default_stiffness_is_said():
         (6, {"terms": [wc.CorotatedMembrane(stiffness=300.0), wc.Spring(stiffness=100.0)]}),
         (9, {"stiffness": 150.0 * np.sqrt(3.0)}),
     ):
-        scene = falling([wc.Plane()], n=n, **given)
+        scene = falling([wc.Plane()], n=n, contact=None, **given)
         assert scene.contact.stiffness == pytest.approx(2.0 / R * (0.15 * 9.81 * 0.5 / R + 300.0 / 0.5))
         assert "contact: distance 0.001 m, stiffness 2.67" in str(scene)
-    hard = falling([wc.Plane()], terms=[wc.Spring(stiffness=np.inf)])
+    hard = falling([wc.Plane()], terms=[wc.Spring(stiffness=np.inf)], contact=None)
     assert hard.contact.stiffness == pytest.approx(2.0 / R * 0.15 * 9.81 * 0.5 / R)
     chain = wc.Scene(
         wc.Mesh.chain(11, length=2.0), density=0.1, terms=[wc.Spring(stiffness=1e3)], colliders=[wc.Plane(position=(0, -3, 0))]
