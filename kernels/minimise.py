@@ -207,9 +207,8 @@ def end_newton(block: int):
     """Kernel over (copies, lanes of one block): finds whether an active copy has ended after an iteration.
 
     Rounding allows no further progress if the gradient is within its rounding, and no step was found or φ fell by no more than
-    its rounding. A copy is stuck if no step was found or the direction does not descend. It is not if its pairs were
-    ``relisted`` (B,): the areas of contact, and so the energy, have then changed. Pairs leave a ``fraction`` (B,) of the
-    direction. Both may be None. ``roundings`` has the parts of :func:`.linear.rounding`.
+    its rounding. A copy is stuck if no step was found or the direction does not descend. Pairs leave a ``fraction`` (B,) of the
+    direction, which may be None. ``roundings`` has the parts of :func:`.linear.rounding`.
     """
     (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
 
@@ -218,7 +217,6 @@ def end_newton(block: int):
         # state in
         search: LineSearch,
         roundings: wp.array3d(dtype=wp.float64),
-        relisted: wp.array(dtype=wp.int32),
         fraction: wp.array(dtype=wp.float64),
         # parameters
         resolution: wp.float64,
@@ -238,8 +236,6 @@ def end_newton(block: int):
         noisy = search.square[copy] <= ROUNDINGS * ROUNDINGS * rounding
         level = before - search.energy[copy] <= resolution * wp.abs(before) + TYPICAL * lost
         stuck = search.step[copy] == wp.float64(0.0) or not (search.slope[copy] < wp.float64(0.0))
-        if relisted:
-            stuck = stuck and relisted[copy] == 0
         # A step so short that rounding undoes it would be repeated for ever.
         undone = search.moved[copy] == 0 and search.step[copy] > wp.float64(0.0) and search.slope[copy] < wp.float64(0.0)
         if fraction:

@@ -27,7 +27,9 @@ from .mesh_facets import BEYOND, FAR
 from .mesh_geometry import corners_of, motions
 from .mesh_geometry import meshes as meshes_of
 from .self_gaps import ONE, ZERO, nearest, vertex_of
-from .self_pairs import PARALLEL
+
+# The area of two edges decreases if sin² of their angle is below this, to 0 for parallel edges.
+PARALLEL = wp.constant(wp.float64(1e-3))
 
 MOST, WEIGHT = wp.constant(PAIRS), wp.constant(WEIGHTS)
 TWO = wp.constant(wp.float64(2.0))

@@ -5,6 +5,7 @@ from functools import cache
 import warp as wp
 
 from ..vectors import types
+from .pair_potential import CLOSE
 from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
 
@@ -20,7 +21,7 @@ class GapNotes:
 
     ``nearest`` is 1/d for the smallest gap d [1/m]. ``too_near`` is 0 if float32 resolves all gaps. Else it is
     FIRST − (frame·n + vertex) with n vertices: the first frame with an unresolved pair, and the first vertex of such a pair.
-    ``pressed`` is the same for pairs nearer than half their contact distance.
+    ``pressed`` is the same for pairs with contact that are nearer than half their contact distance.
     """
 
     nearest: wp.array(dtype=wp.float64)
@@ -61,10 +62,24 @@ def find_frames(
 
 
 @cache
+def cutoff_of(dtype):
+    """Device function (pairs, e, r) → the gap at which contact of a pair begins [m]; 0 if it has none."""
+
+    @wp.func
+    def contact_distance(pairs: near_pairs(dtype), e: int, r: dtype):
+        found = ZERO
+        if pairs.distances[e] == r:
+            found = wp.where(e < pairs.counts[0], ONE, CLOSE) * wp.float64(r)
+        return found
+
+    return contact_distance
+
+
+@cache
 def note_gaps(dtype):
     """Kernel over pairs at the start of a step: records their gaps if a frame ends there."""
     vec3, _ = types(dtype)
-    resolved = resolved_gap(dtype)
+    resolved, contact_distance = resolved_gap(dtype), cutoff_of(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def note_each_gap(
@@ -75,6 +90,7 @@ def note_gaps(dtype):
         x: wp.array(dtype=vec3),
         steps: wp.array(dtype=wp.int32),
         # parameters
+        distance: dtype,
         per_frame: int,
         per_copy: int,
         # out
@@ -95,7 +111,7 @@ def note_gaps(dtype):
         key = FIRST - frame * wp.int64(per_copy) - wp.int64(s[0] - copy * per_copy)
         if not d >= resolved(s, x):
             wp.atomic_max(notes.too_near, copy, key)
-        if d < HALF * wp.float64(pairs.distances[e]):
+        if d < HALF * contact_distance(pairs, e, distance):
             wp.atomic_max(notes.pressed, copy, key)
 
     return note_each_gap
@@ -104,6 +120,7 @@ def note_gaps(dtype):
 @cache
 def count_pairs(dtype):
     """Kernel over pairs at the start of a step: for each copy the listed pairs, those in contact, and 1/d of the nearest."""
+    contact_distance = cutoff_of(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def count_each_pair(
@@ -112,6 +129,7 @@ def count_pairs(dtype):
         # state in
         step: StepPairs,
         # parameters
+        distance: dtype,
         per_copy: int,
         # out
         counts: wp.array2d(dtype=wp.int32),
@@ -124,7 +142,7 @@ def count_pairs(dtype):
         copy = s[0] // per_copy
         wp.atomic_add(counts, copy, 0, 1)
         wp.atomic_max(nearest, copy, ONE / step.gap[e])
-        if step.gap[e] < wp.float64(pairs.distances[e]):
+        if step.gap[e] < contact_distance(pairs, e, distance):
             wp.atomic_add(counts, copy, 1, 1)
 
     return count_each_pair

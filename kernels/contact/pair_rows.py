@@ -1,7 +1,9 @@
 """Factories of the constraint rows of pairs, for each :class:`.pair_sums.PairTerm`.
 
 Each copy has rows for all pairs of the list. Rows of pairs of other copies, or of pairs without a force, are inactive, see
-:mod:`..constraint_rows`. Pairs of a term of rank 1 have a second row with ``curved``, which adds the stiffness −λC″.
+:mod:`..constraint_rows`. Pairs of a term with one row have a second one with ``curved``, which adds the stiffness −λC″.
+
+λ is found anew from the positions, as −C/α and the ``fixed`` force, for pairs may have other slots than in the last rows.
 """
 
 from functools import cache
@@ -14,6 +16,9 @@ from ..vectors import types
 from .pair_sums import PairTerm
 from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import near_pairs
+
+# The compliance of a row whose force is given.
+FIXED = wp.constant(wp.float64(1e20))
 
 
 @wp.struct
@@ -35,7 +40,7 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
     """Kernel over copies and pairs at x̃ + d: rows as in :func:`..constraint_rows.linearise`."""
     vec3, _ = types(dtype)
     (_at, exact), row_of = vertex_of(dtype), term.row(dtype)
-    Q = wp.constant(2 if curved else term.rank)
+    Q = wp.constant(2 if curved else term.rows)
 
     @wp.kernel(module="unique", enable_backward=False)
     def linearise_each_pair(
@@ -56,13 +61,9 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
         rows: row_values(dtype),
     ):
         copy, e = wp.tid()
-        own = False
-        if e < pairs.counts[0] + pairs.counts[1]:
-            own = pairs.stencils[e][0] // per_copy == copy
+        own = pairs.stencils[e][0] // per_copy == copy
         start = row_of_pair(copy, e, layout, Q)
-        held = wp.vec2d()
         for j in range(Q):
-            held[j] = wp.float64(rows.multipliers[start + j])
             rows.multipliers[start + j] = dtype(0.0)
             rows.gap[start + j] = dtype(0.0)
             rows.compliance[start + j] = dtype(1.0)
@@ -74,7 +75,7 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
             return
         slopes.first[e] = wp.vec3d()
         slopes.second[e] = wp.vec3d()
-        found = row_of(pairs, data, e, x, d, held)
+        found = row_of(pairs, data, e, x, d)
         s = pairs.stencils[e]
         moved = ZERO
         most = ZERO
@@ -89,6 +90,8 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
             return
         slopes.weights[e] = found.weights
         slopes.first[e] = found.first
+        if wp.static(curved):
+            found.second *= h
         slopes.second[e] = found.second
         for j in range(Q):
             row = start + j
@@ -98,20 +101,23 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
             total = square * moved
             if wp.static(curved) and j == 1:
                 rows.inverse[row] = dtype(ONE / (total + ONE))
+            elif found.stiffness == ZERO:
+                rows.multipliers[row] = dtype(found.fixed * h * h)
+                rows.compliance[row] = dtype(FIXED)
+                rows.inverse[row] = dtype(ONE / FIXED)
             else:
                 steep = wp.sqrt(square)
                 alpha = ONE / (found.stiffness * h * h)
                 excess = wp.max(lowest_compliance(alpha, least) * total - alpha, ZERO)
                 alpha += excess
-                own_held = found.held[j]
-                C = found.C[j] + alpha * own_held
+                own_held = -found.C[j] / alpha
+                if j == 0:
+                    own_held += h * h * found.fixed
                 inverse = ONE / (total + alpha)
                 rows.multipliers[row] = dtype(own_held)
-                rows.gap[row] = dtype(C)
                 rows.compliance[row] = dtype(alpha)
                 rows.inverse[row] = dtype(inverse)
                 rows.carried[row] = most * steep * excess * wp.abs(own_held) * inverse
-                rows.residual[row] = most * steep * wp.abs(C) * inverse
                 lost = most * steep * (steep * size * inverse + wp.abs(own_held))
                 rows.rounding[row] = wp.float64(dtype(ROUNDINGS) * epsilon(dtype(lost)) * dtype(lost))
 
@@ -139,8 +145,6 @@ def apply_pair_rows(dtype, two: bool):
         rows: wp.array(dtype=dtype),
     ):
         e = wp.tid()
-        if e >= pairs.counts[0] + pairs.counts[1]:
-            return
         if wp.length_sq(slopes.first[e]) == ZERO:
             return
         s = pairs.stencils[e]

@@ -23,8 +23,9 @@ from .self_pairs import near_pairs
 class PairForces:
     """Values of each pair at some positions, in float64: w, U [J] and ∂U/∂y [N].
 
-    ∂²U/∂y² = bend[0]·along alongᵀ + bend[1]·across acrossᵀ [N/m], where ``across`` is for terms of rank 2. Both ``bend`` are 0
-    for pairs without a force. ``pressing`` lists the ``count`` (1,) pairs with a force, in order, for kernels that scatter.
+    ∂²U/∂y² = bend[0]·along alongᵀ + bend[1]·across acrossᵀ [N/m], where ``across`` is for friction and negative contacts. Both
+    ``bend`` are 0 for pairs without a force. ``pressing`` lists the ``count`` (1,) pairs with a force, in order, for kernels
+    that scatter.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -44,20 +45,20 @@ class PairTerm:
     Attributes:
         name: Its name in reports.
         module: Name of the Warp module of its kernels, without the precision.
-        rank: The rank of its ∂²U/∂y², 1 or 2.
+        rows: The number of its constraint rows, 1 or 2.
         data: Warp struct of what the step holds of each pair, among it its normal n.
-        near: Function of a precision, which makes the device function (pairs, data, turn, e, x, d, always) → whether pair e may
+        near: Function of a precision, which makes the device function (pairs, data, e, x, d, always) → whether pair e may
             have a force at x + d, v, n and w, for a sweep; n is a unit vector. v is the y of friction, and the gap along n of
-            contact. Pair e is number ``turn`` of those that act. With ``always``, w and v are found in any case.
+            contact. With ``always``, w and v are found in any case.
         push: Device function (pairs, data, e, v, n, D, least, h, hard) → λ = −h²∂U/∂y at v + Dλ [kg·m], v without the force of
             the pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.pair_sweeps`.
-        row: Function of a precision, which makes the device function (pairs, data, e, x, d, λ of its rows) → :class:`PairRow`.
+        row: Function of a precision, which makes the device function (pairs, data, e, x, d) → :class:`PairRow`.
         isotropic: Whether D is that of a vertex without locked axes, because ``push`` needs one D for all directions.
     """
 
     name: str
     module: str
-    rank: int
+    rows: int
     data: Any
     near: Callable
     push: Callable
@@ -71,18 +72,19 @@ class PairTerm:
 
 @wp.struct
 class PairRow:
-    """The constraint rows C of a pair at some positions: w, ∂C/∂y of both rows, 0 if inactive, C, λ, and the stiffness k [N/m].
+    """The constraint rows C of a pair at some positions: w, ∂C/∂y of both rows, 0 if inactive, C, and the stiffness k [N/m].
 
-    ``size`` is the length of what cancels in y, without the correction [m].
+    ``size`` is the length of what cancels in y, without the correction [m]. ``fixed`` is the part of the force of the first row
+    that does not follow from C [N]. A row without stiffness has that alone.
     """
 
     weights: wp.vec4d
     first: wp.vec3d
     second: wp.vec3d
     C: wp.vec2d
-    held: wp.vec2d
     stiffness: wp.float64
     size: wp.float64
+    fixed: wp.float64
 
 
 @cache
@@ -181,7 +183,7 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
 def pair_diagonal(term: PairTerm, dtype, scatters: bool):
     """Kernel over threads: adds Σ wᵢ² ∂²U/∂y² to the diagonal blocks of a Hessian, except those of pins."""
     _, mat33 = types(dtype)
-    (range_of, corners_at), two = taken_by(dtype, scatters), term.rank == 2
+    range_of, corners_at = taken_by(dtype, scatters)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
     def add_diagonal_of_pairs(
@@ -202,7 +204,7 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
             s = pairs.stencils[e]
             w = forces.weights[e]
             block = forces.bend[e][0] * wp.outer(forces.along[e], forces.along[e])
-            if wp.static(two):
+            if forces.bend[e][1] > ZERO:
                 block += forces.bend[e][1] * wp.outer(forces.across[e], forces.across[e])
             for i in range(corner, end_corner):
                 if inverse_mass[s[i]] > dtype(0.0):
@@ -219,7 +221,7 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
 def pair_products(term: PairTerm, dtype, scatters: bool):
     """Kernel over threads: q += wᵢ ∂²U/∂y² Σⱼ wⱼpⱼ over the other vertices j of each pair, in active copies."""
     vec3, _ = types(dtype)
-    (_at, exact), two = vertex_of(dtype), term.rank == 2
+    _at, exact = vertex_of(dtype)
     range_of, corners_at = taken_by(dtype, scatters)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
@@ -249,19 +251,19 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
                 along = wp.vec4d()
                 u = wp.vec3d()
                 across = wp.vec4d()
-                if wp.static(two):
+                if bend[1] > ZERO:
                     u = forces.across[e]
                 for i in range(4):
                     if inverse_mass[s[i]] > dtype(0.0):
                         along[i] = w[i] * wp.dot(t, exact(p[s[i]]))
-                        if wp.static(two):
+                        if bend[1] > ZERO:
                             across[i] = w[i] * wp.dot(u, exact(p[s[i]]))
                 whole = along[0] + along[1] + along[2] + along[3]
                 whole_across = across[0] + across[1] + across[2] + across[3]
                 for i in range(corner, end_corner):
                     if inverse_mass[s[i]] > dtype(0.0):
                         pull = w[i] * bend[0] * (whole - along[i]) * t
-                        if wp.static(two):
+                        if bend[1] > ZERO:
                             pull += w[i] * bend[1] * (whole_across - across[i]) * u
                         if wp.static(scatters):
                             q[s[i]] = q[s[i]] + vec3(dtype(pull[0]), dtype(pull[1]), dtype(pull[2]))

@@ -3,6 +3,9 @@
 A sweep removes the λ of a pair and adds that of its prox at what remains: with v̂ without the force of the pair and D = Σ wᵢ²/mᵢ
 along n, λ = −hₑ²∂U/∂y(v̂ + Dλ) in closed form, and Δxᵢ = wᵢλ/mᵢ. Then M(x − x̃) = Σ wᵢλ with w at x, and a fixed point minimises
 the objective of the step. Without multipliers nothing is removed (PBD).
+
+Where axes of a vertex are locked, a soft pair takes its D with all axes free. A larger D does not move the fixed point. With
+the smaller one, a pair that cannot open along its free axes would throw the cloth far along them.
 """
 
 from functools import cache
@@ -101,17 +104,20 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
             if multipliers:
                 before = multipliers[e]
             held = not (before == wp.vec3d())
-            touches, v, n, w = near(pairs, data, own, e, x, correction, held)
+            touches, v, n, w = near(pairs, data, e, x, correction, held)
             if touches:
                 s = stencil(pairs.stencils, e)
                 D = ZERO
-                least = ZERO
+                whole = ZERO
                 for i in range(4):
                     D += w[i] * w[i] * wp.dot(n, respond(inverse_mass, s[i], n))
-                    least += LOCKED * w[i] * w[i] * greatest(inverse_mass, s[i])
+                    whole += w[i] * w[i] * greatest(inverse_mass, s[i])
                     if held:
                         v -= w[i] * forces.weights[e][i] * respond(inverse_mass, s[i], before)
-                after = push(pairs, data, e, v, n, D, least, h, hard)
+                if not hard and D > ZERO:
+                    v -= (whole - D) * before
+                    D = whole
+                after = push(pairs, data, e, v, n, D, LOCKED * whole, h, hard)
                 for i in range(4):
                     move = w[i] * after
                     if held:
@@ -169,7 +175,7 @@ def touch_pairs(term: PairTerm, dtype):
         held = wp.bool(False)
         if multipliers:
             held = not (multipliers[e] == wp.vec3d())
-        touches, v, n, w = near(pairs, data, t, e, x, correction, held)
+        touches, v, n, w = near(pairs, data, e, x, correction, held)
         if touches:
             swept.touches[e] = 1
             swept.v[e] = v
@@ -220,15 +226,17 @@ def press_pairs(term: PairTerm, dtype, axes: bool):
         n = swept.normal[e]
         w = swept.weights[e]
         D = ZERO
-        least = ZERO
+        whole = ZERO
         for i in range(4):
             share = wp.float64(swept.touching[s[i]]) * w[i] * w[i]
             D += share * wp.dot(n, respond(inverse_mass, s[i], n))
-            least += LOCKED * share * greatest(inverse_mass, s[i])
+            whole += share * greatest(inverse_mass, s[i])
+        if not hard and D > ZERO:
+            D = whole
         before = wp.vec3d()
         if multipliers:
             before = multipliers[e]
-        after = push(pairs, data, e, swept.v[e] - D * before, n, D, least, h, hard)
+        after = push(pairs, data, e, swept.v[e] - D * before, n, D, LOCKED * whole, h, hard)
         for i in range(4):
             move = w[i] * after
             if not (before == wp.vec3d()):

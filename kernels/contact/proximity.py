@@ -140,10 +140,11 @@ def take_near(dtype, of_edges: bool):
 def search_pairs(dtype, of_edges: bool, take, name: str):
     """Kernel over vertices, or edges: calls ``take`` for pairs with triangles, or with edges, whose boxes meet.
 
-    ``take`` (dtype, of_edges) returns a device function (surface, x, s, first, i, k, triangles, out) and the struct of ``out``.
-    s is the stencil of a pair, ``first`` the first vertex of its copy, i its vertex or edge, and k its triangle or other edge.
-    The boxes are at x, or along moves ``p`` from there. A box meets those of its own level and those above. The rows of cells
-    near each vertex or edge are divided among ``shares`` threads, the second dimension of the launch.
+    ``take`` (dtype, of_edges) returns a device function (surface, x, s, first, i, k, triangles, out) and the struct of
+    ``out``. s is the stencil of a pair, ``first`` the first vertex of its copy, i its vertex or edge, and k its triangle or
+    other edge. The boxes are at x, or along moves ``p`` from there. A box meets those of its own level and those above, but
+    that of a vertex that moves meets those of all levels, for it may be larger than theirs. The rows of cells near each
+    vertex or edge are divided among ``shares`` threads, the second dimension of the launch.
 
     Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices.
 
@@ -204,6 +205,8 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
             if moved.items:
                 level = 0
                 lowest = -1
+        elif p:
+            level = 0
         present = grid.levels[KIND] >> level
         while present != 0:
             if (present & 1) != 0:
@@ -212,7 +215,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                 if wp.static(of_edges):
                     if level == lowest:
                         one[2] = layer
-                width = two[0] - one[0] + 1
+                width = wp.min(two[0] - one[0] + 1, buckets)
                 height = two[1] - one[1] + 1
                 for line in range(share, height * (two[2] - one[2] + 1), shares):
                     cz = one[2] + line // height

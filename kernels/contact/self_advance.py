@@ -9,15 +9,10 @@ from .proximity_grid import surfaces
 from .self_gaps import ONE, ZERO, nearest, vertex_of
 from .self_planes import KEPT, margin_of, part_apart, ulp_of
 
-BLOCKED = wp.constant(wp.float64(0.1))
-
 
 @cache
 def advances(dtype):
-    """Struct of the moves ``direction`` (N,) [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m].
-
-    ``stopping`` (N,) becomes 1 for vertices of pairs of edges that leave less than ``BLOCKED`` of a direction.
-    """
+    """Struct of the moves ``direction`` (N,) [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m]."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -25,7 +20,6 @@ def advances(dtype):
         direction: wp.array(dtype=vec3)
         fraction: wp.array(dtype=wp.float64)
         least: wp.float64
-        stopping: wp.array(dtype=wp.int32)
 
     return Advance
 
@@ -68,7 +62,7 @@ def take_advance(dtype, of_edges: bool):
         _w, y, _inside = nearest(of_vertex, a, b, c, d)
         distance = wp.length(y)
         n = y / wp.max(distance, wp.float64(1e-300))
-        floor = (ONE - KEPT) * wp.max(distance - margin, ZERO) + margin
+        floor = (ONE - KEPT) * wp.max(distance - margin, ZERO) + wp.min(distance, margin)
         t = ONE
         for p in range(sides):
             for q in range(sides, 4):
@@ -80,9 +74,5 @@ def take_advance(dtype, of_edges: bool):
             t = wp.max(t, part_apart(of_vertex, a, b, c, d, pa, pb, pc, pd, floor))
         if t < ONE:
             wp.atomic_min(out.fraction, s[0] // surface.vertices, t)
-            if wp.static(of_edges):
-                if t < BLOCKED:
-                    for p in range(4):
-                        out.stopping[s[p]] = 1
 
     return take, advance

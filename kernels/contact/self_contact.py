@@ -1,8 +1,8 @@
-"""Factories of the kernels of the energy of self-contact and its derivatives.
+"""Factories of the kernels of the energy of self-contact and its derivatives, from the contacts of :mod:`.pair_potential`.
 
-U = Σ kA φ(d) over the acting pairs, with the gap d of :mod:`.self_gaps`, the area A of :mod:`.self_pairs`, and φ as for
-colliders (:mod:`..terms.contact`). The nearest points minimise ‖y‖, so their motion does not contribute to the gradient
-∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian is approximated by its semi-definite part kA φ″ wᵢwⱼnnᵀ.
+U = Σ kA φ(d) over the contacts, with φ as for colliders (:mod:`..terms.contact`). The nearest points minimise ‖y‖, so their
+motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian is approximated by its
+semi-definite part kA φ″ wᵢwⱼnnᵀ, of contacts over a valley by their share of it.
 
 Everything is computed in float64 for every precision of the model, so that positions are exact.
 """
@@ -14,51 +14,16 @@ import warp as wp
 from ..memory import load
 from ..terms import contact
 from ..vectors import types
+from .pair_potential import ENDING, STARTING, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm
-from .self_gaps import SIDE, ZERO, gap_along, nearest, signed_gap, vertex_of
-from .self_pairs import MODULE, StepPairs, module_of, near_pairs
+from .self_gaps import ONE, SIDE, ZERO, perpendicular, vertex_of
+from .self_pairs import MODULE, module_of, near_pairs
 from .self_planes import margin_of, ulp_of
 
 potential, slope, bend, gap_after = contact.potential, contact.slope, contact.bend, contact.gap_after
 constraint_slope, constraint_bend = contact.constraint_slope, contact.constraint_bend
 # The force of ψ at the least gap, divided by that of φ there.
 STEEP = wp.constant(wp.float64(100.0))
-
-
-@cache
-def gap_in_step(dtype):
-    """Device function (pairs, step, e, x, correction, always) → whether a pair touches, d, n and w at x, or x + correction.
-
-    The nearest points are found only if d can be below the contact distance, or ``always``; the pair then touches at any d.
-    """
-    vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
-
-    @wp.func
-    def gap_of(
-        pairs: near_pairs(dtype),
-        step: StepPairs,
-        e: int,
-        x: wp.array(dtype=vec3),
-        correction: wp.array(dtype=vec3),
-        always: bool,
-    ):
-        s = pairs.stencils[e]
-        r = wp.float64(pairs.distances[e])
-        a = at(x, correction, s[0])
-        b = at(x, correction, s[1])
-        c = at(x, correction, s[2])
-        d = at(x, correction, s[3])
-        of_vertex = e < pairs.counts[0]
-        gap = r
-        n = wp.vec3d()
-        w = wp.vec4d()
-        if always or gap_along(of_vertex, step.normal[e], a, b, c, d) < r:
-            w, y, inside = nearest(of_vertex, a, b, c, d)
-            gap, n = signed_gap(y, step.normal[e], inside)
-        return always or gap < r, gap, n, w
-
-    return gap_of
 
 
 @cache
@@ -80,25 +45,23 @@ def least_gap(dtype):
 
 @cache
 def find_forces(dtype, bounded: bool):
-    """Kernel over acting pairs: the forces at x, or x + correction; φ = ½(r − d)² if ``bounded``.
+    """Kernel over contacts: their forces; φ = ½(r − d)² if ``bounded``.
 
-    With ``apart`` no pair passes through, so that d is never negative: where cloth slides over an edge, y may turn far from its
-    normal at the start of the step. If ``least`` [m], the least gap of the filter, is above 0, ψ is added to φ.
-    It begins at d = 2f, where it is C². Where r is below 2f, as far from the origin, ψ is left out.
+    If ``least`` [m], the least gap of the filter, is above 0, ψ is added to φ. It begins at d = 2f, where it is C². Where r is
+    below 2f, as far from the origin, ψ is left out. The Hessian of a negative contact is negative along n, which is left out.
+    Half of that across n, U′/d, stays.
     """
     vec3, _ = types(dtype)
-    gap_of, least_gap_of = gap_in_step(dtype), least_gap(dtype)
+    least_gap_of = least_gap(dtype)
 
     @wp.kernel(module=f"{module_of(dtype)}.{bounded}", enable_backward=False)
     def find_forces_of_pairs(
         # elements
         pairs: near_pairs(dtype),
         # state in
-        step: StepPairs,
+        contacts: Contacts,
         x: wp.array(dtype=vec3),
-        correction: wp.array(dtype=vec3),
         # parameters
-        apart: bool,
         least: wp.float64,
         # out
         forces: PairForces,
@@ -107,111 +70,100 @@ def find_forces(dtype, bounded: bool):
         if t >= pairs.number[0]:
             return
         e = pairs.acting[t]
-        forces.bend[e] = wp.vec2d()
-        touches, gap, n, w = gap_of(pairs, step, e, x, correction, False)
-        if touches:
-            if apart and gap < ZERO:
-                gap = -gap
-                n = -n
-            k = step.stiffness[e]
-            r = wp.float64(pairs.distances[e])
-            energy = SIDE * k * (r - gap) * (r - gap)
-            pull = k * (gap - r)
-            curvature = k
-            if wp.static(not bounded):
-                energy = k * potential(gap, r)
-                pull = k * slope(gap, r)
-                curvature = k * bend(gap, r)
-                if least > ZERO:
-                    f = least_gap_of(pairs.stencils[e], x, least)
-                    below = wp.float64(2.0) - gap / f
-                    if below > ZERO and wp.float64(2.0) * f <= r:
-                        more = STEEP * SIDE * SIDE * k * r * r * below
-                        energy += more * below * below / wp.float64(3.0)
-                        pull -= more * below / f
-                        curvature += wp.float64(2.0) * more / (f * f)
-            forces.weights[e] = w
-            forces.energy[e] = energy
-            forces.force[e] = pull * n
-            forces.bend[e] = wp.vec2d(curvature, ZERO)
+        k = contacts.stiffness[e]
+        r = contacts.distance[e]
+        gap = contacts.gap[e]
+        n = contacts.normal[e]
+        energy = SIDE * k * (r - gap) * (r - gap)
+        pull = k * (gap - r)
+        curvature = k
+        if wp.static(not bounded):
+            energy = k * potential(gap, r)
+            pull = k * slope(gap, r)
+            curvature = k * bend(gap, r)
+            if least > ZERO:
+                f = least_gap_of(pairs.stencils[e], x, least)
+                below = wp.float64(2.0) - gap / f
+                if below > ZERO and wp.float64(2.0) * f <= r:
+                    more = STEEP * SIDE * SIDE * k * r * r * below
+                    energy += more * below * below / wp.float64(3.0)
+                    pull -= more * below / f
+                    curvature += wp.float64(2.0) * more / (f * f)
+        forces.weights[e] = contacts.weights[e]
+        forces.energy[e] = energy
+        forces.force[e] = pull * n
+        if k > ZERO:
+            forces.bend[e] = wp.vec2d(curvature * contacts.share[e], ZERO)
             forces.along[e] = n
-            if forces.pressing:
-                forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
+        else:
+            q = SIDE * pull / wp.max(gap, wp.float64(1e-300))
+            u = perpendicular(n)
+            forces.bend[e] = wp.vec2d(q, q)
+            forces.along[e] = u
+            forces.across[e] = wp.cross(n, u)
+        if forces.pressing:
+            forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
 
     return find_forces_of_pairs
 
 
 @cache
-def find_clearances(dtype):
-    """Kernel over acting pairs: clearance = gap at x along n of the start of the step, minus the contact distance."""
+def gap_at(dtype):
+    """Device function (pairs, contacts, e, x, correction) → n·Σ wᵢ(xᵢ + dᵢ), the gap along n of a contact found elsewhere."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
+    at, _exact = vertex_of(dtype)
+    stencil, normal, weights = (load(each) for each in (wp.vec4i, wp.vec3d, wp.vec4d))
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def find_each_clearance(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        x: wp.array(dtype=vec3),
-        # in and out
-        step: StepPairs,
+    @wp.func
+    def gap_along_normal(
+        pairs: near_pairs(dtype), contacts: Contacts, e: int, x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3)
     ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
-            return
-        e = pairs.acting[t]
-        s = pairs.stencils[e]
-        gap = gap_along(e < pairs.counts[0], step.normal[e], exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
-        step.clearance[t] = gap - wp.float64(pairs.distances[e])
+        s = stencil(pairs.stencils, e)
+        w = weights(contacts.weights, e)
+        a = at(x, correction, s[0])
+        y = w[1] * (at(x, correction, s[1]) - a) + w[2] * (at(x, correction, s[2]) - a) + w[3] * (at(x, correction, s[3]) - a)
+        return wp.dot(normal(contacts.normal, e), y)
 
-    return find_each_clearance
+    return gap_along_normal
 
 
 @cache
 def near_contact(dtype):
-    """The ``near`` of contact. A pair is skipped quickly while corrections are below its ``clearance``, if it has one."""
+    """The ``near`` of contact, with n and w as last found."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
-    gap_of, vector = gap_in_step(dtype), load(vec3)
-    value, normal, stencil = (load(each) for each in (wp.float64, wp.vec3d, wp.vec4i))
+    gap_along_normal = gap_at(dtype)
 
     @wp.func
     def near_of(
         pairs: near_pairs(dtype),
-        step: StepPairs,
-        turn: int,
+        contacts: Contacts,
         e: int,
         x: wp.array(dtype=vec3),
         correction: wp.array(dtype=vec3),
         always: bool,
     ):
-        touches = wp.bool(True)
-        gap = ZERO
-        n = wp.vec3d()
-        w = wp.vec4d()
-        if step.clearance and not always:
-            s = stencil(pairs.stencils, e)
-            p0 = exact(vector(correction, s[0]))
-            p1 = exact(vector(correction, s[1]))
-            p2 = exact(vector(correction, s[2]))
-            p3 = exact(vector(correction, s[3]))
-            left = value(step.clearance, turn) + gap_along(e < pairs.counts[0], normal(step.normal, e), p0, p1, p2, p3)
-            touches = not left > ZERO
-        if touches:
-            touches, gap, n, w = gap_of(pairs, step, e, x, correction, always)
-        return touches, gap * n, n, w
+        gap = gap_along_normal(pairs, contacts, e, x, correction)
+        n = contacts.normal[e]
+        touches = always or gap < contacts.distance[e]
+        if contacts.followed.mode[0] == STARTING:
+            touches = True
+        return touches, gap * n, n, contacts.weights[e]
 
     return near_of
 
 
 @cache
 def push_contact(dtype):
-    """The ``push`` of contact: λ = (d* − d)/D of the gap d = v·n, with D at least ``least`` if the pair is ``hard``."""
+    """The ``push`` of contact: λ = (d* − d)/D of the gap d = v·n, with D at least ``least`` if the contact is ``hard``.
+
+    The prox is that of the share of the contact; the rest of the force, and that of a negative contact, is as where the contact
+    was found.
+    """
 
     @wp.func
     def push_of(
         pairs: near_pairs(dtype),
-        step: StepPairs,
+        contacts: Contacts,
         e: int,
         v: wp.vec3d,
         n: wp.vec3d,
@@ -220,17 +172,24 @@ def push_contact(dtype):
         h: wp.float64,
         hard: bool,
     ):
-        r = wp.float64(pairs.distances[e])
+        k = contacts.stiffness[e]
+        mode = contacts.followed.mode[0]
+        if mode == ENDING or not D > ZERO:
+            return wp.vec3d()
+        if mode == STARTING:
+            return wp.where(k > ZERO, contacts.followed.start[e], contacts.fixed[e]) * n
+        r = contacts.distance[e]
         gap = wp.dot(v, n)
-        found = ZERO
-        if D > ZERO and gap < r:
-            part = D
-            compliance = wp.float64(wp.inf)
-            if hard:
-                part = wp.max(D, least)
-            else:
-                compliance = D * step.stiffness[e] * h * h
-            found = (gap_after(gap, r, compliance) - gap) / part
+        if hard:
+            if gap < r and k > ZERO:
+                return (r - gap) / wp.max(D, least) * n
+            return wp.vec3d()
+        share = wp.where(k > ZERO, contacts.share[e], ZERO)
+        fixed = contacts.fixed[e]
+        gap += D * fixed
+        found = fixed
+        if gap < r and share > ZERO:
+            found += (gap_after(gap, r, D * share * k * h * h) - gap) / D
         return found * n
 
     return push_of
@@ -238,32 +197,38 @@ def push_contact(dtype):
 
 @cache
 def row_of_contact(dtype):
-    """The ``row`` of contact: C = −√(2φ(d)), as for contact with colliders. The second has the stiffness −λC″ along n."""
+    """The ``row`` of contact: C = −√(2φ(d)), as for contact with colliders. The second has the stiffness −λC″ along n.
+
+    C is that of the share of the contact; the rest of its force is ``fixed``.
+    """
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
 
     @wp.func
-    def row_of(
-        pairs: near_pairs(dtype), step: StepPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3), held: wp.vec2d
-    ):
+    def row_of(pairs: near_pairs(dtype), contacts: Contacts, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
         found = PairRow()
-        found.stiffness = step.stiffness[e]
-        if found.stiffness > ZERO:
-            s = pairs.stencils[e]
-            r = wp.float64(pairs.distances[e])
-            a = at(x, d, s[0])
-            w, y, inside = nearest(e < pairs.counts[0], a, at(x, d, s[1]), at(x, d, s[2]), at(x, d, s[3]))
-            gap, n = signed_gap(y, step.normal[e], inside)
-            found.weights = w
-            found.held[0] = wp.max(held[0], ZERO)
-            found.C[0] = -wp.sqrt(wp.float64(2.0) * potential(gap, r))
+        k = contacts.stiffness[e]
+        if k == ZERO:
+            return found
+        r = contacts.distance[e]
+        gap = contacts.gap[e]
+        n = contacts.normal[e]
+        share = wp.where(k > ZERO, contacts.share[e], ZERO)
+        found.weights = contacts.weights[e]
+        found.size = gap
+        found.fixed = -(ONE - share) * k * slope(gap, r)
+        found.stiffness = share * k
+        found.first = n
+        if share > ZERO:
+            steep = constraint_slope(gap, r)
+            if steep > ZERO:
+                found.fixed /= steep
+            C = -wp.sqrt(wp.float64(2.0) * potential(gap, r))
+            found.C[0] = C
             found.first = constraint_slope(gap, r) * n
-            found.second = wp.sqrt(wp.max(-found.held[0] * constraint_bend(gap, r), ZERO)) * n
-            for i in range(1, 4):
-                found.size += wp.abs(w[i]) * wp.length(at(x, d, s[i]) - a)
+            found.second = wp.sqrt(wp.max((found.stiffness * C - found.fixed) * constraint_bend(gap, r), ZERO)) * n
         return found
 
     return row_of
 
 
-CONTACT_OF_PAIRS = PairTerm("self-contact", MODULE, 1, StepPairs, near_contact, push_contact, row_of_contact, isotropic=False)
+CONTACT_OF_PAIRS = PairTerm("self-contact", MODULE, 1, Contacts, near_contact, push_contact, row_of_contact, isotropic=False)

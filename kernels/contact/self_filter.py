@@ -10,7 +10,7 @@ import warp as wp
 from ..vectors import types
 from .gap_notes import FIRST
 from .self_gaps import ONE, PLANAR, ZERO, vertex_of
-from .self_pairs import STOPPED, StepPairs, module_of, near_pairs
+from .self_pairs import StepPairs, module_of, near_pairs
 from .self_planes import bounded_share
 
 # Pins of hard pairs may approach by this fraction of their gap in a step. The second is for pairs with a free vertex, which
@@ -364,65 +364,9 @@ def push_pairs(dtype):
     return push_each_pair
 
 
-@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def count_stops(
-    # parameters
-    active: wp.array(dtype=wp.int32),
-    per_copy: int,
-    # in and out
-    stopping: wp.array(dtype=wp.int32),
-    stopped: wp.array(dtype=wp.int32),
-    # out
-    blocked: wp.array(dtype=wp.int32),
-):
-    """Kernel over vertices: counts up to STOPPED the directions that stopped at a vertex; blocked = 1 where it gets there.
-
-    It sets ``stopping`` to 0. Copies that are not ``active`` keep old directions, which do not count.
-    """
-    i = wp.tid()
-    if stopping[i] != 0:
-        stopping[i] = 0
-        if active[i // per_copy] != 0 and stopped[i] < STOPPED:
-            stopped[i] = stopped[i] + 1
-            if stopped[i] == STOPPED:
-                blocked[i // per_copy] = 1
-
-
-@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def take_stops(
-    # state in
-    counted: wp.array(dtype=wp.int32),
-    # parameters
-    renewing: wp.array(dtype=wp.int32),
-    per_copy: int,
-    # out
-    stopped: wp.array(dtype=wp.int32),
-):
-    """Kernel over vertices: stopped = ``counted`` in copies that are ``renewing``, so that copies do not depend on others."""
-    i = wp.tid()
-    if renewing[i // per_copy] == 1:
-        stopped[i] = counted[i]
-
-
-@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def take_blocked(
-    # in and out
-    blocked: wp.array(dtype=wp.int32),
-    # out
-    renewing: wp.array(dtype=wp.int32),
-    renew: wp.array(dtype=wp.int32),
-):
-    """Kernel over copies: ``renewing`` = ``blocked``, which becomes 0; ``renew`` is 1 if any was blocked, and 0 before."""
-    c = wp.tid()
-    renewing[c] = blocked[c]
-    if blocked[c] != 0:
-        renew[0] = 1
-    blocked[c] = 0
-
-
 @cache
 def scale_directions(dtype):
-    """Kernel over vertices: p ← ``fraction``·p, with the fraction of the copy (B,)."""
+    """Kernel over vertices: p ← ``fraction``·p, with the fraction of the copy (B,); or 0 if it is below 1 and ``whole``."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -431,11 +375,13 @@ def scale_directions(dtype):
         fraction: wp.array(dtype=wp.float64),
         # parameters
         per_copy: int,
+        whole: bool,
         # in and out
         p: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        p[i] = dtype(fraction[i // per_copy]) * p[i]
+        part = fraction[i // per_copy]
+        p[i] = dtype(wp.where(whole and part < ONE, ZERO, part)) * p[i]
 
     return scale_each_direction
 

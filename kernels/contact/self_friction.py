@@ -1,9 +1,9 @@
 """Factories of the kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(Σ wᵢxᵢ − a), a = Σ wᵢxᵢⁿ − ξ.
 
-H is that of :mod:`..coulomb`, with ε = μN/(kA): a spring with the stiffness of contact and a force of at most μN. Pairs, w, n,
-N and kA are those at the start of the step, at the positions xⁿ. ξ is the elongation of the spring there. A step updates it,
-ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of a sliding pair slides
-along.
+H is that of :mod:`..coulomb`, with ε = μN/(kA): a spring with the stiffness of contact and a force of at most μN. Contacts, w,
+n, kA and N = −kAφ′ times their share are those at the start of the step, at the positions xⁿ. ξ is the elongation of the spring
+there. A step updates it, ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of
+a sliding pair slides along.
 
 ξ is stored relative to the edge between the last two vertices of a pair, so that it rotates with the cloth. A new pair starts
 with the mean ξ of the touching pairs between the same parts, which have a common vertex with it on each side.
@@ -16,23 +16,24 @@ import warp as wp
 from ..coulomb import Law
 from ..terms import contact
 from ..vectors import types
+from .pair_potential import TWO_EDGES, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm
-from .self_gaps import ONE, ZERO, vertex_of
-from .self_pairs import StepPairs, near_pairs
+from .self_gaps import ONE, ZERO, perpendicular, vertex_of
+from .self_pairs import near_pairs
 
 
 @wp.struct
 class RubbedPairs:
-    """Values of pairs at the start of the step: n, w, kA [N/m], ε [m] (0 without contact), and kA of contact [N/m].
+    """Values of contacts at the start of the step: n, w, kA [N/m], ε [m], the anchor a [m], and the vertices on the first side.
 
-    Of pairs with friction also the anchor a [m], and the direction t of the edge of the pair in the plane normal to n.
+    t is the direction of the edge of the last two vertices in the plane normal to n.
     """
 
     normal: wp.array(dtype=wp.vec3d)
     weights: wp.array(dtype=wp.vec4d)
     stiffness: wp.array(dtype=wp.float64)
     limit: wp.array(dtype=wp.float64)
-    contact: wp.array(dtype=wp.float64)
+    sides: wp.array(dtype=wp.int32)
     anchor: wp.array(dtype=wp.vec3d)
     tangent: wp.array(dtype=wp.vec3d)
 
@@ -49,15 +50,6 @@ def friction_module(dtype, law=None):
 def edge_tangent(edge: wp.vec3d, n: wp.vec3d):
     """Direction of an edge in the plane normal to n; 0 for an edge along n."""
     t = edge - wp.dot(n, edge) * n
-    return t / wp.max(wp.length(t), wp.float64(1e-300))
-
-
-@wp.func
-def perpendicular(n: wp.vec3d):
-    """A unit vector normal to n."""
-    axis = wp.vec3d()
-    axis[wp.int32(wp.argmin(wp.abs(n)))] = ONE
-    t = wp.cross(n, axis)
     return t / wp.max(wp.length(t), wp.float64(1e-300))
 
 
@@ -127,73 +119,40 @@ def slip_at(dtype):
 
 @cache
 def begin_friction(dtype, law: Law, bounded: bool):
-    """Kernel over pairs at the start of a step: w, n, kA and ε, and which are acting, that is, have an area or friction.
-
-    kA is that of contact in the last step, from ``kept``, so that the mean of N is the force of contact. It is that of this
-    step in three cases: in explicit steps, which evaluate contact at their start; in the first step of a copy; and for a pair
-    that is not in ``kept``, if areas changed within the last step because the copy was ``relisted``.
-    """
+    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force, which act."""
     slope, limit_of = contact.bounded_slope if bounded else contact.slope, law.limit
 
     @wp.kernel(module=f"{friction_module(dtype, law)}.{bounded}", enable_backward=False)
     def begin_friction_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
-        lists: near_pairs(dtype),
+        touching: near_pairs(dtype),
         # state in
-        step: StepPairs,
-        kept: near_pairs(dtype),
-        slips: wp.array(dtype=wp.vec4d),
-        steps: wp.array(dtype=wp.int32),
-        relisted: wp.array(dtype=wp.int32),
+        contacts: Contacts,
         # parameters
-        per_copy: int,
         friction: wp.float64,
         # out
+        pairs: near_pairs(dtype),
         rubbed: RubbedPairs,
     ):
-        e = wp.tid()
-        if e >= lists.counts[0] + lists.counts[1]:
+        t = wp.tid()
+        if t >= touching.number[0]:
             return
-        s = lists.stencils[e]
-        r = wp.float64(lists.distances[e])
-        gap = step.gap[e]
-        k = step.stiffness[e]
-        rubbed.contact[e] = k
-        limit = ZERO
-        if gap < r:
-            if wp.static(not bounded):
-                if steps[s[0] // per_copy] > 0:
-                    if relisted[s[0] // per_copy] == 0:
-                        k = ZERO
-                    for j in range(kept.first[s[0]], kept.first[s[0] + 1]):
-                        q = kept.corners[j] // 4
-                        if (q < kept.counts[0]) == (e < lists.counts[0]) and equal(s, kept.stencils[q]):
-                            k = slips[q][3]
-            if k > ZERO:
-                limit = limit_of(-slope(gap, r), friction)
-            rubbed.normal[e] = step.normal[e]
-            rubbed.weights[e] = step.weights[e]
-            rubbed.stiffness[e] = k
-        rubbed.limit[e] = limit
-        if rubbed.contact[e] > ZERO or limit > ZERO:
-            pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
-            for i in range(4):
-                wp.atomic_add(pairs.corner_counts, s[i], 1)
+        e = touching.acting[t]
+        k = contacts.share[e] * contacts.stiffness[e]
+        if not (k > ZERO and contacts.gap[e] < contacts.distance[e]):
+            return
+        s = touching.stencils[e]
+        pairs.stencils[e] = s
+        rubbed.limit[e] = limit_of(-slope(contacts.gap[e], contacts.distance[e]), friction)
+        rubbed.normal[e] = contacts.normal[e]
+        rubbed.weights[e] = contacts.weights[e]
+        rubbed.stiffness[e] = k
+        rubbed.sides[e] = wp.where(contacts.code[e] == TWO_EDGES, 2, 1)
+        pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
+        for i in range(4):
+            wp.atomic_add(pairs.corner_counts, s[i], 1)
 
     return begin_friction_of_pairs
-
-
-@wp.kernel(module="warpcloth.self_friction", enable_backward=False)
-def note_relisted(
-    # state in
-    copies: wp.array(dtype=wp.int32),
-    # in and out
-    relisted: wp.array(dtype=wp.int32),
-):
-    """Kernel over copies: relisted = 1 for the given copies."""
-    c = wp.tid()
-    relisted[c] = wp.max(relisted[c], copies[c])
 
 
 @cache
@@ -225,7 +184,7 @@ def set_anchors(dtype, law: Law):
         if limit == ZERO:
             return
         n = rubbed.normal[e]
-        sides = wp.where(e < pairs.counts[0], 1, 2)
+        sides = rubbed.sides[e]
         total = wp.vec3d()
         weight = ZERO
         own = wp.bool(False)
@@ -237,7 +196,7 @@ def set_anchors(dtype, law: Law):
                 kept_slip = slips[e_kept]
                 if kept_slip[2] > ZERO and not own:
                     q = kept.stencils[e_kept]
-                    kept_sides = wp.where(e_kept < kept.counts[0], 1, 2)
+                    kept_sides = wp.int32(kept_slip[3])
                     # Some of the other pairs have their sides in the opposite order.
                     way = ZERO
                     if meet(s, 0, sides, q, 0, kept_sides) and meet(s, sides, 4, q, kept_sides, 4):
@@ -261,36 +220,6 @@ def set_anchors(dtype, law: Law):
         rubbed.tangent[e] = edge_tangent(exact(x[s[3]]) - exact(x[s[2]]), n)
 
     return set_anchor_of_pairs
-
-
-@cache
-def set_contact(dtype):
-    """Kernel over acting pairs: kA of contact from another list of pairs, 0 for pairs that are not acting there."""
-
-    @wp.kernel(module=friction_module(dtype), enable_backward=False)
-    def set_contact_of_pairs(
-        # elements
-        pairs: near_pairs(dtype),
-        others: near_pairs(dtype),
-        # state in
-        of_others: StepPairs,
-        # out
-        rubbed: RubbedPairs,
-    ):
-        turn = wp.tid()
-        if turn >= pairs.number[0]:
-            return
-        e = pairs.acting[turn]
-        s = pairs.stencils[e]
-        of_vertex = e < pairs.counts[0]
-        found = ZERO
-        for j in range(others.first[s[0]], others.first[s[0] + 1]):
-            other = others.corners[j] // 4
-            if (other < others.counts[0]) == of_vertex and equal(s, others.stencils[other]):
-                found = of_others.stiffness[other]
-        rubbed.contact[e] = found
-
-    return set_contact_of_pairs
 
 
 @cache
@@ -343,7 +272,7 @@ def find_friction(dtype, law: Law):
 def end_friction(dtype):
     """Kernel over acting pairs at the end x of a step: values for the next step.
 
-    These are the components of ξ along t and n × t; kA of friction, 0 without friction; and kA of contact.
+    These are the components of ξ along t and n × t, kA, and the number of vertices on the first side.
     """
     vec3, _ = types(dtype)
     y_of = difference_of(dtype)
@@ -362,12 +291,11 @@ def end_friction(dtype):
         if turn >= pairs.number[0]:
             return
         e = pairs.acting[turn]
-        slips[e] = wp.vec4d(ZERO, ZERO, ZERO, rubbed.contact[e])
-        if rubbed.limit[e] == ZERO:
-            return
         u = slip_from(rubbed, e, y_of(pairs.stencils[e], rubbed.weights[e], x))
         t = rubbed.tangent[e]
-        slips[e] = wp.vec4d(wp.dot(u, t), wp.dot(u, wp.cross(rubbed.normal[e], t)), rubbed.stiffness[e], rubbed.contact[e])
+        slips[e] = wp.vec4d(
+            wp.dot(u, t), wp.dot(u, wp.cross(rubbed.normal[e], t)), rubbed.stiffness[e], wp.float64(rubbed.sides[e])
+        )
 
     return end_friction_of_pairs
 
@@ -382,7 +310,6 @@ def near_friction(dtype):
     def near_of(
         pairs: near_pairs(dtype),
         rubbed: RubbedPairs,
-        turn: int,
         e: int,
         x: wp.array(dtype=vec3),
         correction: wp.array(dtype=vec3),
@@ -430,9 +357,7 @@ def row_of_friction(dtype, law: Law):
     slip_of, secant = slip_at(dtype), law.secant
 
     @wp.func
-    def row_of(
-        pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3), held: wp.vec2d
-    ):
+    def row_of(pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
         found = PairRow()
         if rubbed.limit[e] > ZERO:
             u = slip_of(pairs, rubbed, e, x, d)
@@ -440,7 +365,6 @@ def row_of_friction(dtype, law: Law):
             found.first = rubbed.tangent[e]
             found.second = wp.cross(rubbed.normal[e], rubbed.tangent[e])
             found.C = wp.vec2d(wp.dot(u, found.first), wp.dot(u, found.second))
-            found.held = held
             found.size = wp.length(u)
             found.stiffness = rubbed.stiffness[e] * secant(found.size, rubbed.limit[e])
         return found

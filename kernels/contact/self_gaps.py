@@ -1,8 +1,7 @@
 """Nearest points of a vertex and a triangle, or of two edges, and the gap between them, in float64.
 
 A pair has four vertices. y = Σ wᵢxᵢ is the vector between its nearest points, with w = (1, −β₁, −β₂, −β₃) for a vertex and a
-triangle, and (1 − s, s, −(1 − t), −t) for two edges. The gap is d = ±‖y‖. It is negative if the pair passed through one another
-in the step, that is, if y is opposite to the normal n at the start of the step.
+triangle, and (1 − s, s, −(1 − t), −t) for two edges. The gap is d = ‖y‖.
 """
 
 from functools import cache
@@ -144,20 +143,6 @@ def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
 
 
 @wp.func
-def signed_gap(y: wp.vec3d, normal: wp.vec3d, inside: int):
-    """d and n of a pair. If y is opposite to its ``normal`` at the start of the step, it passed through, and d is negative."""
-    d = wp.length(y)
-    n = normal
-    if d > ZERO:
-        n = y / d
-        along = wp.dot(n, normal)
-        if along < -SIDE or (inside == 1 and along < ZERO):
-            d = -d
-            n = -n
-    return d, n
-
-
-@wp.func
 def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """The gap between the two sides of a pair along n, |n| ≤ 1, which is a lower bound of d."""
     y = wp.dot(n, c - a)
@@ -167,6 +152,15 @@ def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3
     if not of_vertex:
         found = wp.min(x, ZERO) - wp.max(y, z)
     return found
+
+
+@wp.func
+def perpendicular(n: wp.vec3d):
+    """A unit vector normal to n."""
+    axis = wp.vec3d()
+    axis[wp.int32(wp.argmin(wp.abs(n)))] = ONE
+    t = wp.cross(n, axis)
+    return t / wp.max(wp.length(t), wp.float64(1e-300))
 
 
 @cache

@@ -120,7 +120,7 @@ def crossed(points, triangles):
 def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
     """By central differences with an error of O(η²) = 1e-10 of the third derivative, and ΣF = 0, Σ x × F = 0 to rounding.
 
-    Along p, the force kAφ′ of a pair grows by kAφ″ Σ wᵢn·pᵢ.
+    Along p, the force kAφ′ of a contact of a vertex grows by kAφ″ Σ wᵢn·pᵢ.
     """
     scene = layers(turn=17.0, gap=gap)
     pairs, model = steps_of(scene, device, bounded)
@@ -141,22 +141,33 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
         pairs.forces.add_gradient(out)
         return out.numpy()
 
-    def of_pairs(x, *names):
+    def of_contacts(x):
+        """F·n and kAφ″ by slots, 0 without contact, and what a contact is: its stencil and which of its weights are not 0."""
         pairs.forces.launch(model.array(x, model.vec3))
-        return [getattr(pairs.contact.forces, name).numpy()[acting] for name in names]
+        found, forces, n = pairs.contact, pairs.contact.forces, pairs.contact.data.normal.numpy()
+        share = np.maximum(found.data.share.numpy(), 1e-300)
+        acting = np.zeros(found.capacity, dtype=bool)
+        acting[found.pairs.acting.numpy()[: found.pairs.number.numpy()[0]]] = True
+        pull = np.where(acting, (forces.force.numpy() * n).sum(axis=1), 0.0)
+        bend = np.where(acting & (found.data.stiffness.numpy() > 0.0), forces.bend.numpy()[:, 0] / share, 0.0)
+        return pull, bend, n, found.data.weights.numpy(), found.pairs.stencils.numpy()
 
     force, size, eta = gradient(x), np.abs(gradient(x)).sum(), 1e-7
     assert size > 1.0
-    acting = pairs.pairs.acting.numpy()[: pairs.pairs.number.numpy()[0]]
-    stencils = pairs.pairs.stencils.numpy()[acting]
+    of_vertices = np.ones(pairs.contact.capacity, dtype=bool)
+    of_vertices[slice(*np.cumsum(pairs.proximity.counts.numpy()))] = False
     for _ in range(3):
         direction = rng.normal(size=x.shape)
-        bend, n, w = of_pairs(x, "bend", "along", "weights")
-        bend = bend[:, 0]
-        forces = (of_pairs(x + sign * eta * direction, "force", "along", "bend") for sign in (1.0, -1.0))
-        after, before = (np.where(c.any(axis=1), (force * n).sum(axis=1), 0.0) for force, n, c in forces)
-        growth = np.where(bend > 0.0, bend * np.einsum("ei,ej,eij->e", w, n, direction[stencils]), 0.0)
-        assert (after - before) / (2.0 * eta) == pytest.approx(growth, abs=1e-4 * bend.max())
+        (after, *_, w1, s1), (before, *_, w0, s0) = (of_contacts(x + sign * eta * direction) for sign in (1.0, -1.0))
+        _, bend, n, w, stencils = of_contacts(x)
+        same = of_vertices & (after != 0.0) & (before != 0.0)
+        for weights, each in ((w1, s1), (w0, s0)):
+            same &= ((weights != 0.0) == (w != 0.0)).all(axis=1) & (each == stencils).all(axis=1)
+        growth = bend * np.einsum("ei,ej,eij->e", w, n, direction[stencils])
+        assert (same & (bend > 0.0)).sum() > 20
+        assert ((after - before) / (2.0 * eta))[same & (bend > 0.0)] == pytest.approx(
+            growth[same & (bend > 0.0)], abs=1e-4 * bend.max()
+        )
         slope = (energy(x + eta * direction) - energy(x - eta * direction)) / (2.0 * eta)
         assert slope == pytest.approx((force * direction).sum(), abs=1e-5 * size)
     assert np.abs(force.sum(axis=0)).max() < 1e-13 * size
@@ -165,7 +176,7 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
 
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_pressure_of_a_stack(count, device):
-    """p = Σ m f(m d) on the top layer over all layers within r, f = −kφ′; areas of all pairs add up to that of a layer."""
+    """p = Σ m f(m d) on the top layer over all layers within r, f = −kφ′."""
     r, k, d = 5e-3, 1e5, 1.3e-3
     pairs, model = steps_of(layers(count, gap=d, distance=r, stiffness=k), device)
     pairs.launch_begin(model.positions)
@@ -191,14 +202,17 @@ def test_pressure_of_a_stack(count, device):
     ids=["explicit", "midpoint", "newton", "xpbd"],
 )
 def test_momentum_is_kept(solver, turns, device):
-    """Σp of two sheets that rebound with no vertex cut; ΣL by explicit steps and midpoint. To rounding, and 1e-13 of a step."""
+    """Σp of two sheets that rebound with no vertex cut; ΣL by explicit steps and midpoint. To rounding, and 1e-13 of a step.
+
+    Euler's implicit steps, d ← (d + hḋ + Kr)/(1 + K) within r with K = 2kh²/ρ = 23, leave flat sheets 5 mm/s each of 0.2 m/s.
+    """
     scene = layers(n=4, turn=17.0, gap=6e-3, speed=0.2)
     stepper = solver.bind(scene.build(device=device, dtype="float64"))
     mass, start = scene.vertex_masses[:, None], (scene.positions, scene.velocities)
     for _ in range(3):
         stepper.frame()
     end = tuple(array.numpy() for array in stepper.state)
-    assert stepper.cut == 0.0 and end[1][16:, 1].mean() > 0.01  # they fly apart
+    assert stepper.cut == 0.0 and end[1][16:, 1].mean() > (0.01 if turns else 5e-3)  # they fly apart
     linear = [(mass * v).sum(axis=0) for _, v in (start, end)]
     assert linear[1] == pytest.approx(linear[0], abs=1e-12 * (mass * np.abs(start[1])).sum())
     if turns:
@@ -350,48 +364,21 @@ def test_pins_that_turn_together(name, gap, held, angles, device):
     assert stepper.pairs.pins_held == []
 
 
-def test_acting_pairs(device):
-    """They are those of the list that have an area, and their corners are in order at each vertex."""
+def test_acting_contacts(device):
+    """They are the slots with a stiffness, and their corners are in order at each vertex."""
     pairs, model = steps_of(layers(3, turn=17.0, gap=2e-3), device)
-    pairs.list_corners()
+    contact = pairs.contact
+    contact.list_corners()
     for _ in range(2):
         pairs.launch_begin(model.positions)
-        count = pairs.proximity.counts.numpy().sum()
-        acting = np.flatnonzero(pairs.begun.stiffness.numpy()[:count] > 0.0)
-        assert 0 < len(acting) < count
-        assert (np.sort(pairs.pairs.acting.numpy()[: pairs.pairs.number.numpy()[0]]) == acting).all()
-        first, corners = pairs.pairs.first.numpy(), pairs.pairs.corners.numpy()[: 4 * len(acting)]
+        acting = np.flatnonzero(contact.data.stiffness.numpy())
+        assert 0 < len(acting) < pairs.proximity.counts.numpy().sum()
+        assert (np.sort(contact.pairs.acting.numpy()[: contact.pairs.number.numpy()[0]]) == acting).all()
+        first, corners = contact.pairs.first.numpy(), contact.pairs.corners.numpy()[: 4 * len(acting)]
         assert (np.sort(corners) == (4 * acting[:, None] + np.arange(4)).ravel()).all()
-        vertices = pairs.pairs.stencils.numpy().reshape(-1)[corners]
+        vertices = contact.pairs.stencils.numpy().reshape(-1)[corners]
         assert (vertices == np.repeat(np.arange(model.count), np.diff(first))).all()
         assert (np.diff(corners)[np.diff(vertices) == 0] > 0).all()
-
-
-def test_areas_of_pairs(device):
-    """In three layers that are not flat, those of the rule that is written with :func:`set_areas`, with all pairs compared."""
-    scene = layers(3, turn=17.0, gap=2e-3)
-    pairs, model = steps_of(scene, device)
-    x = model.positions.numpy() + 3e-4 * np.random.default_rng(0).normal(size=(model.count, 3))
-    pairs.launch_begin(model.array(x, model.vec3))
-    triangles, count = np.cumsum(pairs.proximity.counts.numpy())
-    arrays = pairs.pairs.stencils, pairs.begun.gap, pairs.begun.normal, pairs.pairs.distances, pairs.begun.stiffness
-    s, gap, n, r, stiffness = (array.numpy()[:count] for array in arrays)
-    areas, expected = np.empty(model.count), np.zeros(count)
-    areas[model.in_model(np.arange(model.count))] = scene.mesh.vertex_areas
-    for e in range(triangles):
-        others = np.flatnonzero(s[:triangles, 0] == s[e, 0])
-        others = others[(n[others] @ n[e] > 0.0) & np.isin(s[others, 1:], s[e, 1:]).any(axis=1)]
-        parts = np.maximum(1.0 - (gap[np.append(others, e)] - gap[others].min()) / (0.25 * r[e]), 0.0)
-        expected[e] = 0.5 * areas[s[e, 0]] * parts[-1] / parts[:-1].sum()
-    for e in range(triangles, count):
-        alike = [(s[:triangles, 0] == s[e, i]) & (sign * n[:triangles] @ n[e] > 0.5) for i, sign in enumerate((1, 1, -1, -1))]
-        nearer = np.clip((gap[:triangles][np.any(alike, axis=0)].min(initial=np.inf) - gap[e]) / (0.25 * r[e]), 0.0, 1.0)
-        ab, cd = x[s[e, 1]] - x[s[e, 0]], x[s[e, 3]] - x[s[e, 2]]
-        z = min((np.cross(ab, cd) ** 2).sum() / (1e-3 * (ab @ ab) * (cd @ cd)), 1.0)
-        expected[e] = nearer * z * (2.0 - z) * areas[s[e]].sum() / 12.0
-    assert stiffness == pytest.approx(1e5 * expected, rel=1e-9, abs=1e-9 * stiffness.max())
-    for some in (stiffness[:triangles], stiffness[triangles:]):
-        assert (some > 0.0).any() and (some == 0.0).any()
 
 
 @pytest.mark.slow
@@ -653,7 +640,7 @@ IMPACTS = {
 
 @pytest.mark.parametrize("meet", IMPACTS)
 def test_impact_converges(meet, device):
-    """Where a step presses sheets flat, pairs of crossing edges have hardly an area. `Newton` used to use up its iterations
+    """Where a step presses sheets flat, so that edges cross at small gaps. `Newton` used to use up its iterations
     there, held by the filter: it shortened directions at single vertices, so that the line search hardly made a step. Short
     steps stop the sheets with a pressure of ρv/h = 4600 Pa, where φ has 250 kr = 625 Pa at the least gap of the filter. They
     end at a residual of 0.35 m/s², 5e-6 of v/h."""
@@ -771,8 +758,8 @@ def test_lists_are_kept(count, device):
 
 
 @pytest.mark.parametrize("ratio", [1.5, 2.0])
-def test_areas_do_not_depend_on_the_age_of_a_list(ratio, device):
-    """Of thick folded cloth, where pairs beyond the contact distance share areas: forces are the same with a new list."""
+def test_forces_do_not_depend_on_the_age_of_a_list(ratio, device):
+    """Of thick folded cloth, where many contacts cancel: forces are the same, to the bit, with a new list."""
     scene = folded(gap=0.01)
     scene = replace(scene, self_contact=wc.SelfContact(distance=ratio * scene.mesh.edge_lengths.max(), stiffness=1e4))
     pairs, model = steps_of(scene, device)
@@ -853,19 +840,20 @@ def test_far_steps_are_those_with_contact(name, speed, device, monkeypatch):
             *((name, 5e-3, 2) for name in SOLVERS),
             *((name, 0.15, 2) for name in FEW),
             *(("constrained_dynamics", 5e-3, count) for count in (3, 4)),
+            ("xpbd_that_follows", 5e-3, 2),
         ],
     ),
 )
 def test_copies(name, distance, count, device):
     """Each of two copies, at speeds of their own, moves as one alone, to the bit, and again after it was put back.
 
-    Of these the filter cuts one and not the other, and lists are made anew at other times; of thick sheets the areas are of
-    pairs that are farther apart than the skin.
+    Of these the filter cuts one and not the other, and lists are made anew at other times, also within a step.
     """
+    solver = wc.XPBD(substeps=4, iterations=50) if name == "xpbd_that_follows" else SOLVERS[name]
     n = 5 if count == 2 else 4
     scene = layers(count, turn=17.0, speed=1.0, n=n, distance=distance, stiffness=1e5 if distance < 0.1 else 100.0)
     velocities = np.stack([3.0 * scene.velocities, 0.1 * scene.velocities])
-    steppers = [SOLVERS[name].bind(scene.build(device=device, copies=copies)) for copies in (1, 1, 2)]
+    steppers = [solver.bind(scene.build(device=device, copies=copies)) for copies in (1, 1, 2)]
     for stepper, given in zip(steppers, (velocities[:1], velocities[1:], velocities), strict=True):
         stepper.reset(velocities=given)
     both = steppers.pop()
@@ -879,6 +867,20 @@ def test_copies(name, distance, count, device):
         for found, stepper in zip(both.state.x.numpy().reshape(2, -1, 3), steppers, strict=True):
             assert (found == stepper.state.x.numpy()).all()
             assert crossed(found, scene.mesh.triangles) == 0
+
+
+@pytest.mark.parametrize("way", [0.03, 0.3, 3.0, 300.0])
+def test_directions_of_one_vertex(way, device):
+    """A vertex that is to go through a sheet at rest, whose triangles have boxes smaller than its own: it ends before it."""
+    scene = layers(gap=0.02)
+    pairs, model = steps_of(scene, device)
+    x = scene.positions + np.where(np.arange(72)[:, None] < 36, 0.0, [0.03, 0.0, 0.06])  # above the inside of a triangle
+    pairs.launch_begin(model.array(x, model.vec3))
+    direction = np.zeros((72, 3))
+    direction[36 + 14, 1] = -way
+    pairs.filter.launch_limit(model.array(direction, model.vec3))
+    (fraction,) = pairs.filter.fraction.numpy()
+    assert 0.5 * 0.02 < fraction * way < 0.02
 
 
 @pytest.mark.parametrize("length", [0.1, 1.0, 14.0])

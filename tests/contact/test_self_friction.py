@@ -89,12 +89,28 @@ def rubbing(gap=2.2e-3, speed=0.05, friction=0.3, n=4, **fields):
     )
 
 
+def valley():
+    """As :func:`rubbing`, but folded along the middle, at edges of 1.5 r, so that some vertices lie over a valley."""
+    grid, c, s = wc.Mesh.grid(4, 4, size=0.09, pattern="alternating"), np.cos(0.3), np.sin(0.3)
+    middle = grid.points.mean(axis=0)
+    above = (grid.points - middle) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) + middle
+    points = np.concatenate([grid.points, above])
+    points[:, 1] = 0.5 * np.abs(points[:, 0] - middle[0]) + np.where(np.arange(32) < 16, 0.0, 0.012)
+    return replace(
+        rubbing(),
+        mesh=wc.Mesh(points, np.concatenate([grid.triangles, grid.triangles + 16])),
+        positions=points,
+        self_contact=wc.SelfContact(distance=0.02, stiffness=1e3, friction=0.3),
+    )
+
+
 @pytest.mark.host
 @pytest.mark.parametrize("dtype", slow_but(["float32"], ["float64", "float32"]))
 def test_contact_that_is_gathered_is_what_is_scattered(dtype, device):
     """As on a GPU, which gathers: each of the four sums of contact and of friction, up to the rounding of some ten terms."""
     model = rubbing().build(device=device, dtype=dtype)
     pairs = SelfSteps(model, wc.Newton(substeps=10).bind(model).state, 0.01, 1, False, None)
+    pairs.contact.list_corners()
     pairs.launch_begin(model.positions)
     move, p = np.random.default_rng(4).normal(size=(2, model.count, 3))
     pairs.forces.launch(model.array(model.positions.numpy() + 1e-4 * move, model.vec3))
@@ -159,40 +175,52 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
         assert change == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
 
 
+PRESSED = {"4 mm": lambda: rubbing(4e-3), "2.2 mm": lambda: rubbing(2.2e-3), "valley": valley}
+
+
 @cache
-def third_step(name, gap, device):
+def third_step(name, pressed, device):
     """Where three steps of a solver of `MEET`, or of Newton's method, end; no vertex is cut."""
-    stepper = MEET.get(name, wc.Newton(substeps=10, tolerance=1e-13)).bind(rubbing(gap).build(device=device, dtype="float64"))
+    solver = MEET.get(name, wc.Newton(substeps=10, tolerance=1e-13))
+    stepper = solver.bind(PRESSED[pressed]().build(device=device, dtype="float64"))
     for _ in range(3):
         stepper.step()
-    assert stepper.cut == 0.0
+    contact = stepper.pairs.contact
+    signs = contact.data.stiffness.numpy()[contact.pairs.acting.numpy()[: contact.pairs.number.numpy()[0]]]
+    assert stepper.cut == 0.0 and (signs > 0.0).sum() > 10
+    assert (signs < 0.0).any() == (pressed == "valley")
+    assert (stepper.pairs.friction.data.limit.numpy() > 0.0).sum() > 10
     return stepper.state.x.numpy().copy()
 
 
 @pytest.mark.parametrize(
-    ("name", "gap"),
-    slow_but([("newton_factorised", 2.2e-3), ("admm", 2.2e-3)], [(name, gap) for name in MEET for gap in (4e-3, 2.2e-3)]),
+    ("name", "pressed"),
+    slow_but(
+        [("newton_factorised", "2.2 mm"), ("admm", "2.2 mm"), *((name, "valley") for name in ("xpbd", "admm", "constrained"))],
+        [(name, pressed) for name in MEET for pressed in PRESSED],
+    ),
 )
-def test_minimiser_is_the_same(name, gap, device):
-    """In a step that begins without stretch, and in the next ones: to 1e-8 m from Newton's method."""
-    assert third_step(name, gap, device) == pytest.approx(third_step("newton", gap, device), abs=1e-8)
+def test_minimiser_is_the_same(name, pressed, device):
+    """In a step that begins without stretch, and in the next ones: to 1e-8 m from Newton's method, where contacts push and,
+    over a valley, pull."""
+    assert third_step(name, pressed, device) == pytest.approx(third_step("newton", pressed, device), abs=1e-8)
 
 
 @pytest.mark.parametrize(
     ("name", "layers", "law", "error"),
     slow_but(
-        [("explicit", 1, float, 5e-3), ("newton", 1, Sticky, 5e-3), ("xpbd", 2, float, 0.02)],
+        [("explicit", 1, float, 1e-3), ("newton", 1, Sticky, 1e-3), ("xpbd", 2, float, 5e-3)],
         [
-            *((name, 1, law, 5e-3) for law in (float, Sticky) for name in SOLVERS),
-            *((name, 2, float, 0.02) for name in ("newton", "xpbd")),
+            *((name, 1, law, 1e-3) for law in (float, Sticky) for name in SOLVERS),
+            *((name, 2, float, 5e-3) for name in ("newton", "xpbd")),
         ],
     ),
 )
 def test_slides(name, layers, law, error, device):
     """On a slope of tan θ = 0.6, a = g sin θ − μ(g cos θ + a_y): all sheets, as each interface bears what is above it.
 
-    Of two sheets, the vertices of one come under the other and leave it, so that forces jump. If the springs bear e more, a is
-    less by ke/2ρ: half of the area is that of the vertices of the ground, and none of these is below the sheet.
+    If the springs bear e more, a is less by ke/2ρ: half of the area is that of the vertices of the ground, and none of these is
+    below the sheet.
     """
     stepper = SOLVERS[name].bind(slope(0.6, law(0.3), layers).build(device=device, dtype="float64"))
     for frame in range(6):
@@ -256,11 +284,10 @@ def test_momentum_and_energy(name, device):
 
 @pytest.mark.parametrize("name", slow_but(["xpbd"], ["explicit", "newton", "xpbd"]))
 def test_energy_becomes_heat(name, device):
-    """What a sheet that slides down a slope loses is μ mg cos θ times its way, and it never gains: to 4 % of the heat.
+    """What a sheet that slides down a slope loses is μ mg cos θ times its way, and it never gains: to 3 % of the heat.
 
-    As much is what contact gains and loses by areas that change, 2.5 %, and what implicit steps damp, 1.6 %. The record has
-    this heat too. Explicit steps damp nothing: the sheet bounces, so that N is not its weight, but the heat is all that it
-    loses, to 0.0016 in these steps and half of that in steps of half the length.
+    Implicit steps damp 1.8 % at the end. The record has this heat too. Explicit steps damp nothing: the sheet bounces, so that
+    N is not its weight, by 2.6 %, but the heat is all that it loses, to 0.002 in these steps.
     """
     scene = slope(0.6, duration=0.25)
     mass = scene.vertex_masses[4:, None]
@@ -271,9 +298,9 @@ def test_energy_becomes_heat(name, device):
     heat = 0.3 * mass.sum() * GRAVITY * np.cos(np.arctan(0.6)) * way
     print(name, (total[0] - total[1:]) / heat[1:], recorded[1:] / heat[1:])
     assert recorded[0] == 0.0 and (np.diff(recorded) > 0.0).all()
-    assert recorded[-1] == pytest.approx(heat[-1], rel=0.04)
+    assert recorded[-1] == pytest.approx(heat[-1], rel=0.03)
     assert (np.diff(total) < 0.0).all()
-    assert total[0] - total[-1] == pytest.approx(heat[-1], rel=0.04)
+    assert total[0] - total[-1] == pytest.approx(heat[-1], rel=0.03)
     if name == "explicit":
         assert total[0] - total[-1] == pytest.approx(recorded[-1], rel=0.003)
 

@@ -191,7 +191,7 @@ def _text(facts):
         powers = [f"{p:.2f}" + ("" if error is None else f" ± {error:.2f}") for p, error in (each["frame"], each["iteration"])]
         line = f"{' '.join(words)}: a frame grows as {over}^{powers[0]}, an iteration as {over}^{powers[1]}"
         if "list" in each:
-            line += f", a list of near pairs as {over}^{each['list'][0]:.2f}, their areas as {over}^{each['areas'][0]:.2f}"
+            line += f", a list of near pairs as {over}^{each['list'][0]:.2f}, their contacts as {over}^{each['find'][0]:.2f}"
         lines.append(line)
     return "\n".join(lines)
 
@@ -231,7 +231,7 @@ def _contact(row):
         kept = f"{100.0 * row['kept']:.4g} % of moves kept, least gap {gap}"
         said.append(f"{row['pairs']:,} pairs, {row['lists']:.2g} lists a substep, {kept}")
     if row.get("list_ns") is not None:
-        said.append(f"a list takes {row['list_ns']:.3g} ns a vertex, the areas of its pairs {row['areas_ns']:.3g}")
+        said.append(f"a list takes {row['list_ns']:.3g} ns a vertex, its contacts {row['find_ns']:.3g}")
     return "; ".join(said)
 
 

@@ -10,7 +10,8 @@ from ..core.scan import Scan
 from ..kernels.contact import list_again, piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 
-BYTES_OF_A_PAIR, BYTES_BEFORE = 56, 24  # the latter of the list before, on the CPU
+# Of a pair in the list 36, its gap 64, and two slots of contact with their forces 268 each; of the list before, on the CPU.
+BYTES_OF_A_PAIR, BYTES_BEFORE = 36 + 64 + 2 * 268, 24
 
 
 class Proximity:

@@ -26,10 +26,7 @@ class SelfFilter:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
-        stopped: How many directions pairs of edges have stopped at each vertex in this step, up to STOPPED, (N,) int32, when
-            areas were last found anew for that; None unless iterates stay apart.
         fraction: The fraction of the last direction that pairs left each copy, (B,); only if iterates stay apart.
-        relisted: 1 for copies whose last trial listed pairs again, (B,) int32; None unless iterates stay apart.
         moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
             an axis and there are no colliders.
     """
@@ -37,7 +34,6 @@ class SelfFilter:
     def __init__(self, contact, colliders):
         self.model = model = contact.model
         self._contact, self._colliders, self._cut_before, self._iterates = contact, colliders, None, False
-        self.relisted = self.stopped = None
         device = model.device
         self._target, self._from, self._other = (model.vectors() for _ in range(3))
         self._ways = wp.zeros(model.count, dtype=wp.vec3d, device=device)
@@ -66,10 +62,7 @@ class SelfFilter:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self):
-        """Stores, at the start of a step, how many moves colliders have cut so far; no vertex is stopped yet."""
-        if self.stopped is not None:
-            for array in (self.stopped, self._stops, self._blocked):
-                array.zero_()
+        """Stores, at the start of a step, how many moves colliders have cut so far."""
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
@@ -82,8 +75,6 @@ class SelfFilter:
         Pins have moved in ``parts`` equal parts of the step.
         """
         model = self.model
-        if self._contact.friction is not None and self._iterates:  # its areas may be those of a list made within the step
-            self._contact.friction.launch_contact(self._contact.pairs, self._contact.begun)
         if self._cut_before is not None:
             colliders = self._colliders
             given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
@@ -135,14 +126,7 @@ class SelfFilter:
 
     def _launch_round(self, x):
         self.launch_fresh(x, self._contact.relist, self._walking)
-        if self._iterates:
-            self._launch_areas_again(x, self._walking)
         self._launch_walk(x)
-
-    def _launch_areas_again(self, x, copies):
-        self._contact.launch_areas(x, copies)
-        if self._contact.friction is not None:
-            self._contact.friction.launch_relisted(copies)
 
     def _launch_walk(self, x):
         model = self.model
@@ -204,93 +188,81 @@ class SelfFilter:
 
     # For methods whose iterates base + d stay apart too.
 
-    def launch_first(self, base, d):
-        """Sets d so that base + d is the start of the step; if pins move, the positions of :meth:`launch_guess`."""
-        if self.model.keyframes is not None:
-            self._walk_clear(base)
-        self._add(self._contact.x_before, base, -1.0, d)
-
-    def launch_guess(self, base, d, guess):
-        """Sets ``guess`` so that base + d + guess lies as far from the start of the step towards base as pairs stay apart."""
-        self._walk_clear(base)
-        self._add(self._contact.x_before, base, -1.0, guess)
-        self._add(guess, d, -1.0, guess)
-
-    def _walk_clear(self, base):
-        """Moves the positions of the iterate from the start of the step towards base, but not into a collider.
-
-        Vertices that would come nearer to a collider than the contact distance go to that distance instead. Inside a collider
-        contact is so stiff that a descent would take many iterations to get out.
-        """
-        wp.copy(self._target, base)
-        for elements in self._touching:
-            kernel = self.model.kernel(move_clear, elements.term, self.model.dtype)
-            given = [elements.stencil, elements.rest, self.model.inverse_mass]
-            self.model.launch(kernel, elements.count, given, [self._target])
-        self._walk(self._contact.x_before)
-
     def iterates(self):
         """Prepares the methods below for a solver whose iterates stay apart."""
         terms = () if self._colliders is None else self._colliders.terms
         self._touching = [elements for elements in terms if elements.term.gap]
-        self._iterates, self._contact.contact.apart, model = True, True, self.model
+        self._iterates, model = True, self.model
         self._contact.contact.least = FLOOR * self._contact.declared.distance
         self._kernels[self_filter.scale_directions] = model.kernel(self_filter.scale_directions, model.dtype)
         self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
         self.fraction = self._advance.fraction = model.scalars()
-        stops = [wp.zeros(model.count, dtype=wp.int32, device=model.device) for _ in range(3)]
-        self.stopped, self._stops, self._stopping = stops
-        self._advance.stopping = self._stopping
-        self.relisted, self._blocked, self._renewing = (model.scalars(wp.int32) for _ in range(3))
-        self._renew = wp.zeros(1, dtype=wp.int32, device=model.device)
+        self._direction = model.vectors()
         self._advance.least = FLOOR * self._contact.declared.distance
         faces = self._colliders is not None and self._colliders.faces is not None
         if self._colliders is not None and (not self._lets_out or (faces and not any(self.model.colliders.moves))):
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 
-    def launch_trial(self, base, d, active):
+    def launch_start(self, base, d):
+        """Sets d so that base + d is base if pairs stay apart on the way there, else the start of the step; lists its pairs.
+
+        Pins with keyframes are at base in any case: cloth follows them from the start of the step as far as pairs stay apart.
+        Vertices stop at the contact distance of colliders. Inside a collider contact is so stiff that a descent would take many
+        iterations to get out.
+        """
+        x, direction = self._contact.x_before, self._direction
+        wp.copy(self._target, base)
+        for elements in self._touching:
+            kernel = self.model.kernel(move_clear, elements.term, self.model.dtype)
+            given = [elements.stencil, elements.rest, self.model.inverse_mass]
+            self.model.launch(kernel, elements.count, given, [self._target])
+        if self.model.keyframes is not None:
+            self._walk(x)
+        self._add(self._target, x, -1.0, direction)
+        self.launch_limit(direction, whole=True)
+        self._add(x, base, -1.0, d)
+        self._add(d, direction, 1.0, d)
+        self.launch_trial(base, d)
+
+    def launch_between(self, base, before, d):
+        """Moves d towards ``before`` (N,), whose pairs are listed, so that pairs stay apart on the way to base + d."""
+        self._add(d, before, -1.0, self._direction)
+        self.launch_limit(self._direction)
+        self._add(before, self._direction, 1.0, d)
+
+    def launch_trial(self, base, d, active=None):
         """Lists the pairs at base + d again, in copies that are ``active`` (B,), if vertices have moved far enough."""
         self._add(base, d, 1.0, self._contact.x_before, active)
+        self.launch_fresh(self._contact.x_before, self._contact.relist, active)
 
-        def relist(x):
-            self._contact.launch_list(x)
-            self._launch_areas_again(x, self._contact.proximity.copies)
-            wp.copy(self.relisted, self._contact.proximity.copies)
-
-        self.launch_fresh(self._contact.x_before, relist, active)
-
-    def launch_renew(self, launch):
-        """Finds the areas at the positions of :meth:`launch_trial` again, and calls ``launch``, where edges stopped the last
-        direction.
-
-        In layers that a step presses flat, pairs of crossing edges have hardly any area, so that directions run into them. For
-        the rest of the step, edges between vertices that have stopped often enough have their whole area.
-        """
-
-        def renew(x):
-            given = [self._stops, self._renewing, self.model.per_copy]
-            self.model.launch(self_filter.take_stops, self.model.count, given, [self.stopped])
-            self._launch_areas_again(x, self._renewing)
-            launch()
-
-        self._renew.zero_()
-        self.model.launch(self_filter.take_blocked, self.model.copies, [self._blocked], [self._renewing, self._renew])
-        wp.capture_if(self._renew, renew, x=self._contact.x_before)
-
-    def launch_limit(self, direction, active):
+    def launch_limit(self, direction, whole=False):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
 
-        All vertices of a copy move by the same fraction: shortened at each vertex, a direction would stretch stiff cloth.
-        Directions of copies that are not ``active`` (B,) do not count as stopped.
+        All vertices of a copy move by the same fraction: shortened at each vertex, a direction would stretch stiff cloth. With
+        ``whole``, a direction that pairs do not leave whole becomes 0.
         """
-        self.relisted.zero_()
+        contact, proximity, target = self._contact, self._contact.proximity, self._other
+
+        def shorten():
+            proximity.launch_along(contact.x_before, direction, self._advances, self._advance)
+            given = [self.fraction, self.model.per_copy, whole]
+            self._launch(self_filter.scale_directions, self.model.count, given, [direction])
+
         self.fraction.fill_(1.0)
         self._advance.direction = direction
-        self._contact.proximity.launch_along(self._contact.x_before, direction, self._advances, self._advance)
-        noted = [self._stopping, self._stops, self._blocked]
-        self.model.launch(self_filter.count_stops, self.model.count, [active, self.model.per_copy], noted)
-        self._launch(self_filter.scale_directions, self.model.count, [self.fraction, self.model.per_copy], [direction])
+        # Without pairs none can meet as long as the list would be kept.
+        self._add(contact.x_before, direction, 1.0, target)
+        wp.capture_if(proximity.moved(target), shorten, lambda: wp.capture_if(contact.listed, shorten))
+
+    def launch_follow(self, base, d):
+        """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs."""
+        x, direction = self._contact.x_before, self._direction
+        self._add(base, x, -1.0, direction)
+        self._add(direction, d, 1.0, direction)
+        self.launch_limit(direction)
+        self._add(x, direction, 1.0, x)
+        self.launch_fresh(x, self._contact.relist)
 
     def _add(self, a, b, sign, out, active=None):
         self._launch(self_filter.add_positions, self.model.count, [a, b, sign, active, self.model.per_copy], [out])

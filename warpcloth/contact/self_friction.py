@@ -11,7 +11,7 @@ from ..kernels.coulomb import law_of
 
 # Rows of each array of a list, per pair of its capacity.
 ROWS = {"stencils": 1, "corners": 4, "slips": 1}
-LISTS = "stencils", "counts", "first", "corners"
+LISTS = "stencils", "first", "corners"
 
 
 def acting_sizes(model, room, corners=True):
@@ -21,41 +21,39 @@ def acting_sizes(model, room, corners=True):
 
 
 class Slips:
-    """Pairs of a step, and the stretch of the friction spring of each at its end, which the next step takes over.
+    """Contacts of a step, and the stretch of the friction spring of each at its end, which the next step takes over.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        room: The number of pairs for which it allocates memory.
+        room: The number of contacts for which it allocates memory.
 
     Attributes:
         room: As given.
         pairs: A :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, without distances.
         slips: (room,), see :func:`warpcloth.kernels.contact.self_friction.end_friction`.
-        relisted: (B,) int32, 1 if pairs were listed again within the step.
-        grow: A function that takes a number of pairs and allocates memory for them, by default for this object alone.
+        grow: A function that takes a number of contacts and allocates memory for them, by default for this object alone.
     """
 
     def __init__(self, model, room):
         self.model, self.grow, self._arrays = model, self.hold, {}
-        for name, rows in (("counts", 2), ("first", model.count + 1), ("relisted", model.copies)):
-            self._arrays[name] = wp.zeros(rows, dtype=wp.int32, device=model.device)
+        self._arrays["first"] = wp.zeros(model.count + 1, dtype=wp.int32, device=model.device)
         self.hold(room)
 
     def hold(self, room):
-        """Allocates memory for ``room`` pairs, and keeps the pairs that it has."""
-        before, self.room = dict(self._arrays), room
+        """Allocates memory for ``room`` contacts, and keeps those that it has."""
+        before, self.room = self.to_host() if "slips" in self._arrays else None, room
         for (name, rows), dtype in zip(ROWS.items(), (wp.vec4i, wp.int32, wp.vec4d), strict=True):
             self._arrays[name] = wp.zeros(rows * room, dtype=dtype, device=self.model.device)
-            if name in before:
-                wp.copy(self._arrays[name], before[name], count=min(len(before[name]), rows * room))
-        self.slips, self.relisted = self._arrays["slips"], self._arrays["relisted"]
+        if before is not None:
+            self._write(before)
+        self.slips = self._arrays["slips"]
         self.pairs = near_pairs(self.model.dtype)()
         for name in LISTS:
             setattr(self.pairs, name, self._arrays[name])
 
-    def launch_lists(self, pairs, names):
-        """Copies the arrays ``names`` of other pairs, which have the same capacity."""
-        for name in names:
+    def launch_lists(self, pairs):
+        """Copies the lists of other contacts, which have the same capacity."""
+        for name in LISTS:
             wp.copy(getattr(self.pairs, name), getattr(pairs, name))
 
     # As a part of a state.
@@ -68,23 +66,27 @@ class Slips:
 
     def assign(self, other):
         """Copies the values of another object of the same model."""
-        if other.room > self.room:
-            self.grow(other.room)
-        for name, array in other._arrays.items():
-            wp.copy(self._arrays[name], array, count=len(array))
+        if other.room == self.room:
+            for name, array in other._arrays.items():
+                wp.copy(self._arrays[name], array)
+        else:
+            self.from_host(other.to_host())
 
     def to_host(self):
-        """Returns copies of the arrays, by name, without unused rows."""
+        """Returns copies of the arrays, by name, without unused rows: contacts are numbered anew, in the same order."""
         found = {name: array.numpy() for name, array in self._arrays.items()}
-        count, corners = int(found["counts"].sum()), int(found["first"][-1])
-        sizes = {"stencils": count, "slips": count, "corners": corners}
-        return {name: np.array(values[: sizes.get(name, len(values))]) for name, values in found.items()}
+        slots, corners = np.divmod(found["corners"][: found["first"][-1]], 4)
+        used, slots = np.unique(slots, return_inverse=True)
+        found |= {name: found[name][used] for name in ("stencils", "slips")}
+        return found | {"first": np.array(found["first"]), "corners": (4 * slots + corners).astype(np.int32)}
 
     def from_host(self, values):
         """Sets everything to what :meth:`to_host` returned."""
-        count = int(values["counts"].sum())
-        if count > self.room:
-            self.grow(count)
+        if len(values["slips"]) > self.room:
+            self.grow(len(values["slips"]))
+        self._write(values)
+
+    def _write(self, values):
         for name, array in self._arrays.items():
             whole = array.numpy()
             whole[: len(values[name])] = values[name]
@@ -117,7 +119,7 @@ class SelfFriction(DynamicElements):
         self.start, self._step = model.vectors(), Slips(model, slips.room)
         self._vertices = Scan(model, model.count)
         self._launch = model.launcher(
-            ((kernels.end_friction, kernels.set_contact, fill_corners, sort_corners), model.dtype),
+            ((kernels.end_friction, fill_corners, sort_corners), model.dtype),
             ((kernels.set_anchors, kernels.find_friction), model.dtype, law),
             ((kernels.begin_friction,), model.dtype, law, bounded),
         )
@@ -134,19 +136,17 @@ class SelfFriction(DynamicElements):
         self.hold_pairs(pairs, kernels.RubbedPairs())
         for name in ("normal", "anchor", "tangent"):
             setattr(self.data, name, self.room(wp.vec3d))
-        for name in ("stiffness", "limit", "contact"):
+        for name in ("stiffness", "limit"):
             setattr(self.data, name, self.room(wp.float64))
-        self.data.weights = self.room(wp.vec4d)
+        self.data.weights, self.data.sides = self.room(wp.vec4d), self.room(wp.int32)
 
-    def launch_begin(self, pairs, begun, x):
-        """At the start of a step, at x: takes the listed pairs, their n, w and kA, and the slips of the last step."""
+    def launch_begin(self, touching, contacts, x):
+        """At the start of a step, at x: takes the contacts there, and the slips of the last step."""
         model, kept = self.model, self._kept
         wp.copy(self.start, x)
-        self._step.launch_lists(pairs, ("stencils", "counts"))
         self.pairs.number.zero_()
-        self._step.relisted.zero_()
-        given = [self.pairs, pairs, begun, kept.pairs, kept.slips, self._steps, kept.relisted, model.per_copy, self._friction]
-        self._launch(kernels.begin_friction, kept.room, given, [self.data])
+        self.data.limit.zero_()
+        self._launch(kernels.begin_friction, kept.room, [touching, contacts, self._friction], [self.pairs, self.data])
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
         self._launch(fill_corners, kept.room, [], [self.pairs])
         self._launch(sort_corners, model.count, [], [self.pairs])
@@ -156,15 +156,6 @@ class SelfFriction(DynamicElements):
     def launch_release(self):
         """Launches the removal of all slips, for a step without pairs."""
         self._kept.pairs.first.zero_()
-
-    def launch_relisted(self, copies):
-        """Notes in which ``copies``, (B,) int32, pairs or areas have changed within the step."""
-        self.model.launch(kernels.note_relisted, self.model.copies, [copies], [self._step.relisted])
-
-    def launch_contact(self, pairs, begun):
-        """Takes kA from another list of pairs, which may have been made within the step."""
-        wp.copy(self._kept.relisted, self._step.relisted)
-        self._launch(kernels.set_contact, self._kept.room, [self.pairs, pairs, begun], [self.data])
 
     def launch_forces(self, x, correction):
         self._launch(kernels.find_friction, self._kept.room, [self.pairs, self.data, x, correction], [self.forces])
@@ -177,6 +168,5 @@ class SelfFriction(DynamicElements):
 
     def launch_end(self, x):
         """Stores the pairs of the step and the stretch of their springs at x, for the next step."""
-        self._kept.slips.zero_()
         self._launch(kernels.end_friction, self._kept.room, [self.pairs, self.data, x], [self._kept.slips])
-        self._kept.launch_lists(self.pairs, LISTS)
+        self._kept.launch_lists(self.pairs)

@@ -8,7 +8,6 @@ import warp as wp
 
 from ..core.capture import Mirror
 from ..core.dynamic import Dynamic
-from ..core.scan import Scan
 from ..core.state import Count
 from ..core.status import Stopped
 from ..core.sums import Sums
@@ -19,16 +18,14 @@ from ..kernels.contact.self_filter import HeldPins
 from .pair_contact import PairContact
 from .proximity import Proximity
 from .self_filter import WAY, SelfFilter
-from .self_friction import SelfFriction, Slips, acting_sizes
+from .self_friction import SelfFriction, Slips
 from .self_start import check_reset, check_start
 
 # The skin, over the longest edge of the rest shape. All pairs nearer than the contact distance plus the skin are listed. The
 # skin must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one of them. It
 # must be below 0.5, so that a flat grid has no pairs: a right-angled triangle with a longest side of 1 has that height.
 SKIN = 0.35
-# The smallest skin, over the contact distance. While a list is kept, two parts approach by up to half of the skin. Areas depend
-# on pairs that are up to a quarter (SHARING) of the contact distance farther apart than it. With a smaller skin areas would
-# depend on the age of the list.
+# The smallest skin, over the contact distance. While a list is kept, two parts approach by up to half of the skin.
 THICK = 0.5
 
 
@@ -65,8 +62,8 @@ class PinHeld(NamedTuple):
 class SelfSteps:
     """Pairs of near parts of cloth in the steps of one solver, with their forces and the filter.
 
-    At the start of a step, :meth:`launch_begin` lists the near pairs and computes the areas of their contact, which stay
-    constant in the step. At its end, the filter keeps the pairs apart.
+    At the start of a step, :meth:`launch_begin` lists the near pairs and finds the contacts there. Wherever forces are computed
+    later in the step, contacts are those there. At its end, the filter keeps the pairs apart.
 
     Args:
         model: The :class:`warpcloth.model.model.Model` of a scene with self-contact.
@@ -82,7 +79,7 @@ class SelfSteps:
         contact: :class:`warpcloth.contact.pair_contact.PairContact`.
         filter: :class:`warpcloth.contact.self_filter.SelfFilter`.
         pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
-        begun: Normals, gaps, weights and areas of the pairs, :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
+        begun: Normals, gaps and weights of the pairs, :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
         x_before: Positions at the start of the step, (N,) [m].
         begun_at: Positions at which the gaps of ``begun`` were found, (N,) [m].
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
@@ -99,10 +96,6 @@ class SelfSteps:
         self.proximity = Proximity(model, declared.distance, self.skin)
         device = model.device
         self.x_before, self.begun_at = model.vectors(), model.vectors()
-        areas = np.empty(model.per_copy)
-        areas[model.in_model(np.arange(model.per_copy))] = model.scene.mesh.vertex_areas
-        areas = np.tile(areas, model.copies)
-        self._areas = wp.array(areas, dtype=wp.float64, device=device)
         self.cut = state.add("vertices kept apart", wp.zeros(model.copies, dtype=wp.int64, device=device), Count(sums=True))
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32), Count())
         self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
@@ -117,19 +110,14 @@ class SelfSteps:
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
         made = (
             pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs,
-            self_pairs.find_nearest,
-            self_pairs.set_areas,
-            self_pairs.fill_corners,
-            self_pairs.sort_corners,
             gap_notes.note_gaps,
             take_moved,
         )
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
-        self._vertices, self._counted = Scan(model, model.count), None
+        self._counted = None
         size = pair_blocks.NUMBERS * pair_blocks.BLOCK
         self._block = wp.zeros(size, dtype=wp.float64, device=device) if device.is_cpu else None
-        self._corners = model.device.is_cuda or declared.friction > 0.0
-        self.contact, self.filter = PairContact(model, bounded, self.list_corners), SelfFilter(self, colliders)
+        self.contact, self.filter = PairContact(model, bounded, declared, self.listed), SelfFilter(self, colliders)
         self.friction, self.stale = None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)
@@ -140,9 +128,12 @@ class SelfSteps:
             *(getattr(self._notes, name) for name in ("nearest", "too_near", "pressed")),
         )
         if declared.friction:
-            slips = state.add_part("friction", Slips(model, self.proximity.capacity))
+            slips = state.add_part("friction", Slips(model, self.contact.capacity))
             slips.grow = self._grow_outside
             self.friction = SelfFriction(model, slips, self.steps, declared.friction, bounded)
+        if not bounded:
+            self.filter.iterates()
+            self.contact.follow(self.filter.launch_follow, self.x_before)
         self.forces = Dynamic(model, [self.contact, *([self.friction] if self.friction else [])])
         check_start(self, state)
         self.start_again()
@@ -176,10 +167,11 @@ class SelfSteps:
             self.launch_begin(x)
         self.forces.launch(x)
         self.forces.add_energy(Sums(self.model), energy)
-        copies = self.pairs.stencils.numpy()[: self.pairs.counts.numpy().sum(), 0] // self.model.per_copy
-        given = self.pairs.distances, self.begun.gap, self.begun.stiffness
-        distance, gap, stiffness = (array.numpy()[: len(copies)] for array in given)
-        open_by = np.where(stiffness > 0.0, np.maximum(distance - gap, 0.0), 0.0)
+        touching = self.contact.pairs
+        acting = touching.acting.numpy()[: touching.number.numpy()[0]]
+        copies = touching.stencils.numpy()[acting, 0] // self.model.per_copy
+        distance, gap = (array.numpy()[acting] for array in (self.contact.data.distance, self.contact.data.gap))
+        open_by = np.maximum(distance - gap, 0.0)
         touching, squares = (np.bincount(copies, each, self.model.copies) for each in (open_by > 0.0, open_by**2))
         return energy.numpy(), 0.5 * touching * squares
 
@@ -204,19 +196,10 @@ class SelfSteps:
         self.pairs = self_pairs.near_pairs(self.model.dtype)()
         for name in ("stencils", "counts", "rows", "distances"):
             setattr(self.pairs, name, getattr(found, name))
-        for name, size in acting_sizes(self.model, capacity, self._corners).items():
-            setattr(self.pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
         self.begun = self_pairs.StepPairs()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
-        self.begun.gap, self.begun.stiffness = room(wp.float64), room(wp.float64)
-        self.begun.nearest = wp.zeros(self.model.count, dtype=wp.int32, device=device)
-        self.contact.hold_pairs(self.pairs, self.begun)
-
-    def list_corners(self):
-        """Prepares the lists of the corners of pairs at each vertex, for kernels that sum over the pairs of a vertex."""
-        if not self._corners:
-            self._corners = True
-            self._hold()
+        self.begun.gap = room(wp.float64)
+        self.contact.hold(self.pairs, self.begun.normal)
 
     def grow(self):
         """Grows the lists for the pairs that did not fit. Graphs must then be recorded again.
@@ -234,7 +217,7 @@ class SelfSteps:
         self.proximity.grow(pairs)
         self._hold()
         if self.friction is not None:
-            self.friction.hold(self.proximity.capacity)
+            self.friction.hold(self.contact.capacity)
 
     def _grow_outside(self, pairs):
         self.grow_to(pairs)
@@ -295,7 +278,7 @@ class SelfSteps:
         if self._counted is None:
             self._counted = model.kernel(gap_notes.count_pairs, model.dtype)
         counts, nearest = wp.zeros((model.copies, 2), dtype=wp.int32, device=model.device), model.scalars(wp.float64)
-        given = [self.pairs, self.begun, model.per_copy]
+        given = [self.pairs, self.begun, self.declared.distance, model.per_copy]
         model.launch(self._counted, len(self.pairs.stencils), given, [counts, nearest])
         return *counts.numpy().T, _gaps(nearest)
 
@@ -315,7 +298,8 @@ class SelfSteps:
         wp.copy(self.x_before, x)
         self.filter.launch_begin()
         self.proximity.launch_kept(x, WAY, self.launch_list)
-        self.launch_areas(x)
+        self.launch_sides(x)
+        self.contact.launch_begin(x)
         if self._per_frame > 1:
             self._ends.zero_()
             self.model.launch(gap_notes.find_frames, self.model.copies, [self.steps, self._per_frame], [self._ends])
@@ -323,10 +307,10 @@ class SelfSteps:
         else:
             self._launch_notes(x)
         if self.friction is not None:
-            self.friction.launch_begin(self.pairs, self.begun, x)
+            self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
     def _launch_notes(self, x):
-        given = [self.pairs, self.begun, x, self.steps, self._per_frame, self.model.per_copy]
+        given = [self.pairs, self.begun, x, self.steps, self.declared.distance, self._per_frame, self.model.per_copy]
         self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [self._notes])
 
     def launch_begin_at_start(self, x, longest):
@@ -347,19 +331,6 @@ class SelfSteps:
         given = [self.proximity.counts, int(x is not self.proximity.found)]
         self.model.launch(self_pairs.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
 
-    def launch_areas(self, x, copies=None):
-        """Computes the side and the area of each listed pair, and which pairs act, in all or some ``copies`` (B,) int32."""
-        count = len(self.pairs.stencils)
-        self.launch_sides(x, copies)
-        self._launch(self_pairs.find_nearest, self.model.count, [self.pairs], [self.begun])
-        self.pairs.number.zero_()
-        given = [self.pairs, self._areas, self.begun_at, self.filter.stopped, self.declared.stiffness]
-        self._launch(self_pairs.set_areas, count, given, [self.begun])
-        if self._corners:
-            self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
-            self._launch(self_pairs.fill_corners, count, [], [self.pairs])
-            self._launch(self_pairs.sort_corners, self.model.count, [], [self.pairs])
-
     def launch_sides(self, x, copies=None):
         """Computes the side and the gap of each listed pair: in ``copies`` at x, in others where the last call did."""
         if copies is None:
@@ -373,7 +344,7 @@ class SelfSteps:
             self._launch(pair_blocks.begin_blocks, 1, given, [self._block, self.begun])
 
     def relist(self, x):
-        """Lists the pairs again at x, in copies that have moved, and computes their sides and gaps, but no areas."""
+        """Lists the pairs again at x, in copies that have moved, and computes their sides and gaps."""
         self.launch_list(x)
         self.launch_sides(x, self.proximity.copies)
 

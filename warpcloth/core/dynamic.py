@@ -45,9 +45,14 @@ class DynamicElements:
         self.pairs, self.data = pairs, data
         model, room = self.model, self.room
         self.forces = pair_sums.PairForces()
-        kinds = {"weights": wp.vec4d, "energy": wp.float64, "force": wp.vec3d, "bend": wp.vec2d, "along": wp.vec3d}
-        if self.term.rank == 2:
-            kinds["across"] = wp.vec3d
+        kinds = {
+            "weights": wp.vec4d,
+            "energy": wp.float64,
+            "force": wp.vec3d,
+            "bend": wp.vec2d,
+            "along": wp.vec3d,
+            "across": wp.vec3d,
+        }
         if model.device.is_cpu:
             kinds["pressing"], self.forces.count = wp.int32, wp.zeros(1, dtype=wp.int32, device=model.device)
         for name, kind in kinds.items():
@@ -102,15 +107,18 @@ class DynamicElements:
     def on_host(self):
         """Returns stencils (m, 4), w (m, 4), directions (m, 3) and bends (m,) [N/m] of all pairs with a force.
 
-        Those of rank 2 have two rows each, first all of ``along``, then all of ``across``.
+        There are two rows of each, first all of ``along``, then all of ``across``.
         """
         acting = np.sort(self.pairs.acting.numpy()[: self.pairs.number.numpy()[0]])
         bend = self.forces.bend.numpy()
         acting = acting[bend[acting].any(axis=1)]
-        directions = [self.forces.along, self.forces.across][: self.term.rank]
+        directions = [self.forces.along, self.forces.across]
         stencils, w = (array.numpy()[acting] for array in (self.pairs.stencils, self.forces.weights))
         rows = [(stencils, w, array.numpy()[acting], bend[acting, k]) for k, array in enumerate(directions)]
         return [np.concatenate(each) for each in zip(*rows, strict=True)]
+
+    def launch_rows(self, x, d):
+        """Prepares constraint rows at x + d."""
 
     # Sweeps, see :mod:`warpcloth.kernels.contact.pair_sweeps`.
 
@@ -123,7 +131,7 @@ class DynamicElements:
         if self._in_turn:
             self._sweep = model.kernel(pair_sweeps.sweep_pairs, self.term, model.dtype, axes)
         else:
-            self._number = model.kernel(pair_sweeps.number_corners, model.dtype)
+            self._number_corners = model.kernel(pair_sweeps.number_corners, model.dtype)
             self._touch = model.kernel(pair_sweeps.touch_pairs, self.term, model.dtype)
             self._press = model.kernel(pair_sweeps.press_pairs, self.term, model.dtype, axes)
             self._move = model.kernel(pair_sweeps.move_by_pairs, model.dtype, axes)
@@ -133,7 +141,11 @@ class DynamicElements:
         """Launches λ = 0 for all pairs before the first sweep, at x̃ (N,)."""
         self.multipliers.zero_()
         if not self._in_turn:
-            self.model.launch(self._number, len(self.pairs.corners), [self.pairs], [self._swept.slots])
+            self.launch_corner_slots()
+
+    def launch_corner_slots(self):
+        """Launches the search of the index of each corner in the lists of vertices, for Jacobi sweeps."""
+        self.model.launch(self._number_corners, len(self.pairs.corners), [self.pairs], [self._swept.slots])
 
     def launch_sweep(self, x, correction, h, adds, backward):
         """See :meth:`Dynamic.launch_sweep`."""

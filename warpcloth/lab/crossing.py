@@ -1,13 +1,12 @@
 """Two sheets that fly at each other, over relative speed and step, with the filter of self-contact and without it.
 
-Without the filter, pairs are found at the start of a step, and the path during the step is not tested. Explicit steps have
-contact only within the distance r. For v h ≥ r, a step can end beyond the other sheet, where the energy pushes it on; for
-v h ≥ 2r it can do so without contact. Contact also fails if its energy ½kr² is less than that of the motion, ½(ρ/2)v² of two
-free sheets of density ρ.
+Without the filter, the path during a step is not tested, and the energy of contact, a function of positions alone, does not
+know the side from which a sheet came. For v h ≥ r, a step can end beyond the other sheet, where the energy pushes it on; for
+v h ≥ 2r it can do so without contact. Contact also fails if its energy is less than that of the motion, ½(ρ/2)v² of two free
+sheets of density ρ. Per area it is ½kr² in explicit steps, and kτ²(2 + ln τ/δ) in those of Newton's method, with τ = r/2 and
+δ = r/1000, below which it is a parabola. Pairs of edges add to the latter below r/4.
 
-The other methods know the side of each pair listed at the start of the step, nearer than r plus the skin. The minimiser of such
-a step has a distance d at which kτ²/d, τ = r/2, stops half of v on each side, ρv/2h. Below δ = r/1000 the energy is a parabola,
-whose force at d = 0 is 2kτ²/δ. A step that needs more ends with the sheets beyond one another: above v = kr²h/(ρδ).
+Sweeps take contacts nearer than r plus the skin at the start of the step, and know their side.
 
 Vertices can move along the line of flight only. Otherwise sheets, or iterates within a step, could tip and pass each other.
 """
@@ -37,12 +36,12 @@ SPEEDS = np.geomspace(0.1, 100.0, 10)  # [m/s]
 PHASES = np.arange(4) / 4.0  # of a step, by which sheets start farther apart
 SHOWN = {"without": ("explicit", "newton", "xpbd", "pbd"), "filter": tuple(SOLVERS)}
 
-_QUADRATIC, _DEEP = "½ρv² = kr²", "v = kr²h/(ρδ)"
+_QUADRATIC, _LOGARITHM = "½ρv² = kr²", "ρv² = kr²(2 + ln r/2δ)"
 LAWS = {
     **BLIND,
     "v h = r + skin": lambda h: LISTED / h,
     _QUADRATIC: lambda h: DISTANCE * RATE * np.sqrt(2.0),
-    _DEEP: lambda h: RATE**2 * DISTANCE * h / FLOOR,
+    _LOGARITHM: lambda h: DISTANCE * RATE * np.sqrt(2.0 + np.log(0.5 / FLOOR)),
 }
 _FLIGHTS = Flights(
     speed="relative speed v [m/s]",
@@ -54,11 +53,7 @@ _FLIGHTS = Flights(
 
 
 def _panel(solver, kept):
-    if solver == "explicit":
-        names = [*BLIND, _QUADRATIC]
-    else:
-        # PBD has no stiffness of contact, and the sweeps of XPBD do not take a pair beyond d = 0 there.
-        names = ["v h = r + skin", *[_DEEP] * ("pbd" not in solver)]
+    names = ["v h = r + skin"] if "pbd" in solver else [*BLIND, _QUADRATIC if solver == "explicit" else _LOGARITHM]
     filtered = kept == "filter"
     title = f"{solver}, with the filter" if filtered else f"{solver}, without the filter"
     return _FLIGHTS.panel(f"{solver}, {kept}", title, {name: LAWS[name] for name in names}, filtered)
@@ -78,8 +73,8 @@ def measure(solver, kept, steps, speeds, device):
     return _FLIGHTS.points(_panel(solver, kept), lambda h: meetings(solver, kept, h, speeds, device), steps, speeds)
 
 
-def sheets(h, turn):
-    """Returns a scene of two sheets of nine vertices, one of them rotated by ``turn`` [°], with steps h as frames."""
+def sheets(h, turn, count=1):
+    """Returns a scene of two sheets of nine vertices, one of them rotated by ``turn`` [°], with ``count`` steps h as frames."""
     grid, (c, s) = Mesh.grid(3, 3, size=SIDE), (np.cos(np.radians(turn)), np.sin(np.radians(turn)))
     below = grid.points - [0.5 * SIDE, 0.0, 0.5 * SIDE]
     above = below @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) + [0.0, 2.0 * DISTANCE, 0.0]
@@ -90,7 +85,7 @@ def sheets(h, turn):
         gravity=(0.0, 0.0, 0.0),
         free_axes=np.tile([False, True, False], (18, 1)),
         fps=1.0 / h,
-        duration=h,
+        duration=count * h,
         self_contact=SelfContact(DISTANCE, STIFFNESS),
     )
 
@@ -104,7 +99,8 @@ def meetings(solver, kept, h, speeds, device):
     Raises:
         ValueError: The solver refuses the step.
     """
-    scene = sheets(h, TURN[kept])
+    count = count_steps(h, speeds)
+    scene = sheets(h, TURN[kept], count)  # the tolerance of iterations follows from the duration
     speed, phase = (each.ravel() for each in np.meshgrid(speeds, PHASES, indexing="ij"))
     positions = np.repeat(scene.mesh.points[None], len(speed), axis=0)
     positions[:, 9:, 1] = (DISTANCE + phase * speed * h)[:, None]
@@ -116,7 +112,7 @@ def meetings(solver, kept, h, speeds, device):
     if kept != "filter":
         without_filter(stepper)
     crossed = np.zeros(len(speed), dtype=bool)
-    for _ in range(count_steps(h, speeds)):
+    for _ in range(count):
         stepper.step()
         x = stepper.state.x.numpy().reshape(positions.shape)
         below, above = x[:, :9], x[:, 9:]
@@ -126,16 +122,12 @@ def meetings(solver, kept, h, speeds, device):
 
 
 def without_filter(stepper):
-    """Removes the filter of self-contact from a stepper, at the end of steps and in the iterates of Newton's method.
-
-    The two sides of a pair may then pass through each other in iterates. So the sign of a gap follows from the start of the
-    step, as with other methods.
-    """
+    """Removes the filter of self-contact from a stepper, at the end of steps and in the iterates of its method."""
     kept = stepper.pairs.filter
-    kept.launch_end = kept.launch_trial = kept.launch_limit = kept.launch_renew = lambda *given: None
-    kept.launch_first = lambda base, d: d.zero_()
+    kept.launch_end = kept.launch_limit = lambda *given: None
+    kept.launch_start = kept.launch_first = lambda base, d: d.zero_()
     kept.launch_guess = lambda base, d, guess: guess.zero_()
-    stepper.pairs.contact.apart, stepper.pairs.contact.least = False, 0.0
+    stepper.pairs.contact.least = 0.0
     stepper.record_again()
 
 

@@ -16,7 +16,7 @@ COLUMNS = (
     *("vertices", "elements", "substeps", "iterations", "frames", "ms", "ms_low", "ms_high", "cloths_per_s", "ns", "bytes"),
     *("bytes_per_s", "share", "launches"),
     *("start_s", "cold_start_s", "bind_s", "factorise_s", "memory", "triangles", "ms_without", "contact_ns"),
-    *("pairs", "lists", "kept", "least_gap", "list_ns", "areas_ns"),
+    *("pairs", "lists", "kept", "least_gap", "list_ns", "find_ns"),
     *("grade", "distance"),
 )
 
@@ -51,7 +51,7 @@ def growth(rows):
 
     Returns:
         list: For each benchmark ``solver``, the ``options`` that all sizes share, ``over``, "vertices" or "triangles", and
-        ``frame`` and ``iteration``, each [p, error] of :func:`exponent`; with self-contact also ``list`` and ``areas``.
+        ``frame`` and ``iteration``, each [p, error] of :func:`exponent`; with self-contact also ``list`` and ``find``.
     """
     found, known = [], [row for row in rows if row["status"] == "ok"]
     for number in dict.fromkeys(row["benchmark"] for row in known):
@@ -66,7 +66,7 @@ def growth(rows):
         shared = {k: v for k, v in of[0]["options"].items() if all(row["options"].get(k) == v for row in of)}
         one = {"benchmark": number, "solver": of[0]["solver"], "options": shared, "over": over}
         one |= {"frame": list(frame), "iteration": list(iteration)}
-        for name in ("list", "areas"):
+        for name in ("list", "find"):
             if all(row.get(f"{name}_ns") for row in of):
                 one[name] = list(exponent(sizes, [row[f"{name}_ns"] * row["vertices"] for row in of]))
         found.append(one)

@@ -20,7 +20,7 @@ from .measurements import SceneRef, Setup, finite
 
 # Number of warm-up frames, time after which no further frame begins [s], and minimum number of frames.
 _WARM_UP, _SECONDS, _FEWEST = 2, 10.0, 3
-OF_SELF_CONTACT = ("pairs", "lists", "kept", "least_gap", "list_ns", "areas_ns")
+OF_SELF_CONTACT = ("pairs", "lists", "kept", "least_gap", "list_ns", "find_ns")
 
 
 def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
@@ -57,8 +57,8 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
           difference over vertices, substeps and colliders, counting self-contact as one [ns].
         - ``pairs``, ``lists``, ``kept``, ``least_gap``: With self-contact, the largest number of pairs in a list, lists per
           step, the fraction of moves that the filter kept, and the smallest gap in any frame [m], of all copies.
-        - ``list_ns``, ``areas_ns``: With self-contact, the time per vertex to list near pairs, and to compute their gaps and
-          areas, in the last state [ns].
+        - ``list_ns``, ``find_ns``: With self-contact, the time per vertex to list near pairs, and to find their gaps and
+          contacts, in the last state [ns].
         - ``memory``: Peak memory of the process on a CPU, and of Warp's memory pool on CUDA [bytes].
     """
     names = (
@@ -163,13 +163,18 @@ def _warm(stepper, model, points, frames, elements):
 
 
 def _self_contact(stepper):
-    """Returns counts of self-contact in all steps so far, the smallest gap, and the times of a list and of areas."""
+    """Returns counts of self-contact in all steps so far, the smallest gap, and the times of a list and of its contacts."""
     pairs = stepper.pairs
     lists, steps = (int(array.numpy().max()) for array in (pairs.lists, pairs.steps))
     gap = float(pairs.least_gap.min())
     values = pairs.most, lists / steps, 1.0 - float(pairs.share.mean()), gap if np.isfinite(gap) else None
     vertices, x = stepper.model.count, stepper.state.x
-    timed = pairs.proximity.launch, pairs.launch_areas
+
+    def find(x):
+        pairs.launch_sides(x)
+        pairs.contact.launch_begin(x)
+
+    timed = pairs.proximity.launch, find
     times = [1e9 * _seconds(Segment(x.device, partial(each, x))) / vertices for each in timed]
     return dict(zip(OF_SELF_CONTACT, (*values, *times), strict=True))
 

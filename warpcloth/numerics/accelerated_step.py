@@ -100,6 +100,9 @@ class AcceleratedStep:
             self._launch(kernels.combine, N, [d, stepper.w, self.s, self.z, self._part.array, n], [self.plain])
         given = [d, stepper.w, self.s, self.z, self.coefficients.array, n]
         self._launch(kernels.combine, N, given, [self.accelerated])
+        if stepper.pairs is not None:
+            for each in (self.plain, self.accelerated):
+                stepper.pairs.filter.launch_between(stepper.state.x, d, each)
         self._launch_energy(self.plain, self._plain_energy)
         self._launch_energy(self.accelerated, self._energy)
         self._launch(kernels.next_slot, 1, [self.method.window], [self.slot])
@@ -112,6 +115,8 @@ class AcceleratedStep:
     def _launch_energy(self, d, out):
         """Launches out (B,) = φ(d) [J]."""
         stepper, model = self.stepper, self.stepper.model
+        if stepper.pairs is not None:
+            stepper.pairs.filter.launch_trial(stepper.state.x, d)
         stepper.inertia.add(d, self.unused)
         stepper.sums.sum(stepper.inertia.work, model.per_copy, out)
         self.energy_of.add(stepper.state.x, out, d)

@@ -124,14 +124,14 @@ class ContactSystem(CorrectedSystem):
         careful: Which copies are careful, (B,) booleans.
     """
 
-    def __init__(self, model, x, gradient, linear, sums, s):
+    def __init__(self, model, x, gradient, linear, sums, s, pairs):
         super().__init__(model, x, linear, [elements for elements in model.terms if elements.on_faces])
         touching = [elements for elements in model.terms if elements.collider is not None and not elements.on_faces]
         self._touching = [(elements, self._kernel_of(elements.term)) for elements in touching]
         held = model.inverse_mass.numpy() == 0.0
         self._diagonal = wp.array(np.where(held, -1, self.matrix.diagonal.numpy()), dtype=wp.int32, device=model.device)
         self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
-        self._search = Search(model, x, sums, s)
+        self._search, self._pairs = Search(model, x, sums, s, pairs), pairs
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
         self._active = Mirror(model.scalars(wp.int32))
         self.careful, self._marked = np.ones(model.copies, dtype=bool), np.zeros(model.copies, dtype=bool)
@@ -145,7 +145,12 @@ class ContactSystem(CorrectedSystem):
         device, search = self.model.device, self._search
         self._assemble = Segment(device, self._launch_assemble)
         self._begin = Segment(device, search.launch_again)
-        self._shorten = Segment(device, lambda: search.launch(self._active.array))
+        self._shorten = Segment(device, self._launch_shorten)
+
+    def _launch_shorten(self):
+        if self._pairs is not None:
+            self._pairs.filter.launch_limit(self._search.direction)
+        self._search.launch(self._active.array)
 
     def _kernel_of(self, term):
         """Returns the kernel that adds the blocks of a term."""
@@ -193,7 +198,8 @@ class ContactSystem(CorrectedSystem):
             self._direction.write(-found)
             self._active.write(active & self.careful)
             self._shorten()
-            found = self._scaled(np.where(self.careful, self._step.read(), 1.0), found)
+            step = self._step.read() if self._pairs is None else self._step.read() * self._pairs.filter.fraction.numpy()
+            found = self._scaled(np.where(self.careful, step, 1.0), found)
         self._found.write(found)
         wp.copy(w, self._result)
 
@@ -206,8 +212,9 @@ class PairSystem(CorrectedSystem):
         sums: :class:`warpcloth.core.sums.Sums`.
     """
 
-    def __init__(self, model, x, linear, sums):
+    def __init__(self, model, x, linear, sums, pairs):
         super().__init__(model, x, linear)
+        self._pairs = pairs
         self._sums, self._dynamic = sums, dynamic_of(model)
         trial, pull = model.vectors(), model.vectors()
         self._trial, self._pull, self._energy = Mirror(trial), Mirror(pull), Mirror(model.scalars())
@@ -217,10 +224,12 @@ class PairSystem(CorrectedSystem):
         super().record()
         device, trial = self.model.device, self._trial.array
         self._press = Segment(device, self._launch_press)
+        self._bound = Segment(device, lambda: self._pairs.filter.launch_limit(self._pull.array))
         self._assemble = Segment(device, lambda: self.matrix.assemble(self.x, 0.0, trial))
 
     def _launch_press(self):
         """Launches U and ∂U/∂x at the trial."""
+        self._pairs.filter.launch_trial(self.x, self._trial.array)
         self._dynamic.launch(self.x, self._trial.array)
         self._energy.array.zero_()
         self._dynamic.add_energy(self._sums, self._energy.array)
@@ -233,6 +242,12 @@ class PairSystem(CorrectedSystem):
         self._press()
         return self._energy.read().copy(), self._pull.read().astype(np.float64)
 
+    def _limited(self, *vectors):
+        """Returns the first of ``vectors``, which d becomes shorter by, as long as pairs stay apart, and the others as long."""
+        self._pull.write(-vectors[0])
+        self._bound()
+        return (self._scaled(self._pairs.filter.fraction.numpy(), each) for each in vectors)
+
     def correct(self, d, gradient, w, active):
         """Replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1."""
         d, b, found = (array.numpy().astype(np.float64) for array in (d, gradient, w))
@@ -241,6 +256,7 @@ class PairSystem(CorrectedSystem):
         Aw, pressed = b, self._product(found)
         if pressed.any():
             found, Aw = self._solve(b, found, pressed, active, True)
+        found, Aw = self._limited(found, Aw)
         slope, linear, square = (self._dot(one, found) for one in (b, b - pull, Aw))
         step, wanted = np.ones(self.model.copies), active & (slope > 0.0)
         for _ in range(HALVINGS):

@@ -60,8 +60,8 @@ class Minimiser:
         linear_iterations: Maximum number of iterations of a conjugate gradient solve.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter bounds steps; or None.
         last: The array for d (N,) [m], which holds that of the last step. Without contact a descent starts there if φ is lower
-            than at d = 0. With pairs it starts at the start of the step or, if φ is lower there, as far towards d = 0 as pairs
-            and colliders allow. None: every descent starts from d = 0.
+            than at d = 0. None: every descent starts from d = 0. With pairs a descent starts where
+            :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says.
 
     Attributes:
         correction: d (N,) [m].
@@ -73,7 +73,6 @@ class Minimiser:
     def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, last=None):
         self.model, self.base, self.pairs = model, base, pairs
         self.warm = last is not None and _resembles_the_last_step(model)
-        self.walks = last is not None and pairs is not None and model.keyframes is None
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
         self.search = Search(model, base, self.sums, s, pairs, last)
@@ -214,21 +213,16 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        """Launches the start from d = 0 or the start of the step, or from a guess where φ is lower there."""
+        """Launches the start from d = 0, or from the last d where φ is lower there."""
         if self.warm:
             wp.copy(self.right, self.correction)
         self.clear()
         self._progress.proceed.zero_()
         given = [self.search.acceleration, self._limits]
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
-        if self.warm or self.walks:
-            if self.walks:
-                self.pairs.filter.launch_guess(self.base, self.correction, self.right)
-            else:
-                self._launch_mean(self.right)
+        if self.warm:
+            self._launch_mean(self.right)
             self.search.launch_guess(self.right, self.active)
-            if self.walks:
-                self.search.launch_again()  # with the areas of the pairs that the walk found
             self._progress.proceed.zero_()
             self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
@@ -265,13 +259,11 @@ class Minimiser:
     def _launch_end(self):
         """Launches the line search, and finds the copies that have ended."""
         self._launch_search()
-        of_pairs = [None, None] if self.pairs is None else [self.pairs.filter.relisted, self.pairs.filter.fraction]
-        given = [self.search.state, self._roundings, *of_pairs, self.resolution, self._limits]
+        fraction = None if self.pairs is None else self.pairs.filter.fraction
+        given = [self.search.state, self._roundings, fraction, self.resolution, self._limits]
         self._launch(kernels.end_newton, self.search.lanes.of_block, given, [self._progress])
 
     def _launch_assemble(self):
-        if self.pairs is not None:
-            self.pairs.filter.launch_renew(self.search.launch_again)
         self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
         hessian, search, lanes = self.hessian, self.search, self.search.lanes
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
@@ -299,5 +291,5 @@ class Minimiser:
     def _launch_search(self):
         self._launch_mean(self.search.direction)
         if self.pairs is not None:
-            self.pairs.filter.launch_limit(self.search.direction, self.active)
+            self.pairs.filter.launch_limit(self.search.direction)
         self.search.launch(self.active)

@@ -24,8 +24,8 @@ class PairRows:
 
     def __init__(self, model, of, curved):
         of.list_corners()
-        curved = curved and of.term.rank == 1
-        self.model, self._of, self._rows = model, of, 2 if curved else of.term.rank
+        curved = curved and of.term.rows == 1
+        self.model, self._of, self._rows = model, of, 2 if curved else of.term.rows
         self._linearise = model.kernel(kernels.linearise_pair_rows, of.term, model.dtype, curved)
         self.per_copy = capacity = of.capacity
         self.count = self._rows * capacity
@@ -42,6 +42,7 @@ class PairRows:
     def launch_linearise(self, x, d, h, least, values):
         """As of the rows of a term."""
         model, of = self.model, self._of
+        of.launch_rows(x, d)
         given = [of.pairs, model.inverse_mass, of.data, x, d, h, least, model.per_copy, self._layout]
         model.launch(self._linearise, (model.copies, self.per_copy), given, [self._slopes, values])
 
@@ -57,8 +58,7 @@ class PairRows:
 
     def entries(self):
         """Returns J on the host: values, rows and columns."""
-        count = min(int(self._of.pairs.counts.numpy().sum()), self.per_copy)
-        binds = np.flatnonzero(self._slopes.first.numpy()[:count].any(axis=1))
+        binds = np.flatnonzero(self._slopes.first.numpy().any(axis=1))
         names = ("first", "second")[: self._rows]
         slopes = np.stack([getattr(self._slopes, name).numpy()[binds] for name in names], axis=1)
         w = self._slopes.weights.numpy()[binds]

@@ -68,7 +68,7 @@ class Search:
         if self.pairs is None:
             self.correction.zero_()
         else:
-            self.pairs.filter.launch_first(self.base, self.correction)
+            self.pairs.filter.launch_start(self.base, self.correction)
         self.launch_again()
 
     def launch_again(self):

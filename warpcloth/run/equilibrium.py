@@ -355,7 +355,7 @@ class _Descent:
         return result
 
     def _begin(self):
-        """Lists the pairs of self-contact, and fixes their areas."""
+        """Lists the pairs of self-contact."""
         if self.pairs is None:
             return
         self.pairs.launch_begin(self._apart)
@@ -404,9 +404,9 @@ class _Wind:
 
 
 def _settle_all(model, base, descent, part):
-    """Settles under the fraction ``part`` of loads and keyframes until loads and areas that follow the cloth are constant.
+    """Settles under the fraction ``part`` of loads and keyframes until loads that follow the cloth are constant.
 
-    Pressures follow the cloth, and so do the areas of pairs of self-contact. Pins that cloth held back move on.
+    Pressures and wind follow the cloth. Pins that cloth held back move on.
     """
     pins, loads, wind = model.scene.pins, model.loads, descent.wind
     follows = descent.pairs is not None or wind is not None or (loads is not None and loads.follows)

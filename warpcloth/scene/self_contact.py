@@ -13,10 +13,11 @@ HELD = ("fail", "allow")
 class SelfContact:
     """Contact of cloth with itself and with other pieces of cloth, with the φ of :class:`warpcloth.Contact`.
 
-    The energy is U = Σ kA φ(d) over vertex–triangle pairs and edge–edge pairs at distance d, see
-    :mod:`warpcloth.kernels.contact.self_contact`. Pairs that share a vertex do not collide. Within a connected piece, the
-    contact distance of a pair is at most half its distance at rest, so that neighbours do not push one another. At the end of
-    each step a filter shortens moves that would cross, so that cloth never passes through cloth. A start in which cloth crosses
+    The energy is a function of the positions alone, U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)), over
+    vertices v and faces, edges and vertices F near v, and over pairs of edges e and f, see
+    :mod:`warpcloth.kernels.contact.pair_potential`. :class:`warpcloth.Explicit` leaves out the second sum. Elements with a
+    common vertex, and elements of one connected piece whose distance at rest is below 2r, have no energy. At the end of each
+    step a filter shortens moves that would cross, so that cloth never passes through cloth. A start in which cloth crosses
     cloth is refused. Pieces that only touch or coincide at the start are moved apart along their normals, by at most the
     contact distance.
 

@@ -182,7 +182,7 @@ class ADMMStepper(ImplicitStepper):
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._scale = ResidualScale(model).acceleration
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
-        self._pressed = PairSystem(model, self.state.x, self._factors, self._sums) if model.dynamic else None
+        self._pressed = PairSystem(model, self.state.x, self._factors, self._sums, self.pairs) if model.dynamic else None
         self._record()
         self.ready()
 
@@ -240,7 +240,7 @@ class ADMMStepper(ImplicitStepper):
 
     def _launch_start(self):
         self.launch_prediction()
-        self.correction.zero_()
+        self.launch_first(self.correction)
         for elements, of, (start, _split) in self._each():
             self.model.launch(start, elements.count, [elements.stencil, elements.rest, self.state.x], [of])
 
@@ -268,6 +268,8 @@ class ADMMStepper(ImplicitStepper):
         model = self.model
         given = [self.correction, self._w, self._active.array, model.per_copy]
         model.launch(self._plain_step, model.count, given, [self.correction])
+        if self.pairs is not None:
+            self.pairs.filter.launch_trial(self.state.x, self.correction)
 
     def _each(self):
         return zip(self._terms, self._split, self._kernels, strict=True)

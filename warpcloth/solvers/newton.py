@@ -104,8 +104,6 @@ class NewtonStepper(ImplicitStepper):
     def __init__(self, options, model):
         super().__init__(options, model)
         model = self.model
-        if self.pairs is not None:
-            self.pairs.filter.iterates()
         last = self.state.add("correction", model.vectors())
         given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "last": last}
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, **given)

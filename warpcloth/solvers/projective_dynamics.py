@@ -147,7 +147,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
         self._contact = None
         if model.colliders is not None or model.dynamic:
-            given = model, self.state.x, self.gradient, self._linear, self.sums, self.inertia.s
+            given = model, self.state.x, self.gradient, self._linear, self.sums, self.inertia.s, self.pairs
             self._contact = ContactSystem(*given)
         self._gradient_of = plan(model).gradient(corrected=True)
         self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
@@ -205,7 +205,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
 
     def _launch_start(self):
         self.launch_prediction()
-        self.correction.zero_()
+        self.launch_first(self.correction)
         if self._accelerated:
             self._accelerated.launch_start()
         self._launch_gradient()
@@ -215,6 +215,8 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
             self._accelerated.launch_move()
         else:
             self.launch_plain_step(self.correction)
+        if self.pairs is not None:
+            self.pairs.filter.launch_trial(self.state.x, self.correction)
         self._launch_gradient()
 
     def launch_plain_step(self, out):

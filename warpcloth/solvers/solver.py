@@ -225,6 +225,13 @@ class Stepper:
         if self.colliders is not None:
             self.colliders.launch_clear(self.model.terms, self.state.x)
 
+    def launch_first(self, correction):
+        """Launches the first d = x − x̃ of a step: 0, or as near to it as pairs stay apart, which are then listed there."""
+        if self.pairs is None:
+            correction.zero_()
+        else:
+            self.pairs.filter.launch_start(self.state.x, correction)
+
     def launch_finish(self, correction):
         """Launches x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser (N,) [m]."""
         self.correction = correction

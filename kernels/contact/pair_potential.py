@@ -1,0 +1,554 @@
+"""Factories of the kernels that find the contacts of a surface at given positions, with a potential of these alone.
+
+U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)). The first sum is over the vertices v, with rest area aᵥ, half
+for each side, and the faces, edges and vertices F of the surface near v. The multiplicities m are those of inclusion and
+exclusion: 1 for a face, 1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces that have E edges there.
+Inside a surface these are 1, −1 and 1. As the nearest point of a face may be on its edge, most of them cancel: over a plane or
+a convex edge one term is left, with m = 1, and over a valley there are two faces and minus one edge. So a flat sheet has the
+pressure −kφ′, and the gradient is continuous.
+
+The second sum is over pairs of edges, for vertices do not find the place where two edges cross. b is the rest area of an edge
+over its length, and D² = min over s and t of ‖y(s, t)‖² (1 + ⅛((2s − 1)² + (2t − 1)²)), a strictly convex function, so that D
+has a gradient for parallel edges too. Edges act below a quarter of the contact distance of vertices, because flat sheets do not
+need them.
+
+Elements with a common vertex have no contact, nor have those of one piece whose rest distance is below 2r.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ..memory import load
+from ..vectors import types
+from .self_gaps import ONE, SIDE, ZERO, gap_along, in_plane, vertex_of
+from .self_pairs import module_of, near_pairs
+
+# Barycentric coordinates below this are 0: rounding must not decide between a face and its edge.
+ON_EDGE = wp.constant(wp.float64(1e-10))
+# The weight of the distance from the middles of edges. Below 1/6 the function is strictly convex.
+MIDDLE = wp.constant(wp.float64(0.125))
+CLOSE = wp.constant(wp.float64(0.25))  # contact distance of edges over that of vertices
+TWO, HALF_PI = wp.constant(wp.float64(2.0)), wp.constant(wp.float64(1.5707963267948966))
+# Where the nearest point of a face is: inside, on the edges ab, bc, ca from EDGE on, or at the vertices a, b, c from CORNER on.
+# NONE is a face that is not near, TWO_EDGES a pair of edges.
+NONE, INSIDE, EDGE, CORNER, TWO_EDGES = (wp.constant(code) for code in (-1, 0, 1, 4, 7))
+
+
+@wp.func
+def along(p: wp.vec3d, q: wp.vec3d):
+    """(q − p)·(−p), above 0 if the origin is beyond p towards q. It has the same bits for all faces with the edge."""
+    return -wp.dot(q - p, p)
+
+
+@wp.func
+def nearest_of_face(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """The code of the point of a face nearest to the origin, and its barycentric coordinates."""
+    ab = along(a, b)
+    ba = along(b, a)
+    bc = along(b, c)
+    cb = along(c, b)
+    ca = along(c, a)
+    ac = along(a, c)
+    n = wp.cross(b - a, c - a)
+    wa = wp.dot(n, wp.cross(b, c))
+    wb = wp.dot(n, wp.cross(c, a))
+    wc = wp.dot(n, wp.cross(a, b))
+    least = ON_EDGE * wp.dot(n, n)
+    code = INSIDE
+    w = wp.vec3d(wa, wb, wc) / (wa + wb + wc)
+    if ab <= ZERO and ac <= ZERO:
+        code = CORNER
+        w = wp.vec3d(ONE, ZERO, ZERO)
+    elif ba <= ZERO and bc <= ZERO:
+        code = CORNER + 1
+        w = wp.vec3d(ZERO, ONE, ZERO)
+    elif ca <= ZERO and cb <= ZERO:
+        code = CORNER + 2
+        w = wp.vec3d(ZERO, ZERO, ONE)
+    elif wc <= least and ab > ZERO and ba > ZERO:
+        code = EDGE
+        t = ab / (ab + ba)
+        w = wp.vec3d(ONE - t, t, ZERO)
+    elif wa <= least and bc > ZERO and cb > ZERO:
+        code = EDGE + 1
+        t = bc / (bc + cb)
+        w = wp.vec3d(ZERO, ONE - t, t)
+    elif wb <= least and ca > ZERO and ac > ZERO:
+        code = EDGE + 2
+        t = ca / (ca + ac)
+        w = wp.vec3d(t, ZERO, ONE - t)
+    return code, w
+
+
+@wp.func
+def on_two_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """s and t of the least ‖y‖² (1 + ⅛((2s − 1)² + (2t − 1)²)) of the edges ab and cd, by Newton's method within the square."""
+    u = b - a
+    v = d - c
+    w = a - c
+    uu = wp.dot(u, u)
+    vv = wp.dot(v, v)
+    uv = wp.dot(u, v)
+    s = SIDE
+    t = SIDE
+    turn = wp.int32(0)
+    while turn < 40:
+        turn += 1
+        y = w + s * u - t * v
+        q = wp.dot(y, y)
+        x = TWO * s - ONE
+        z = TWO * t - ONE
+        g = ONE + MIDDLE * (x * x + z * z)
+        qs = TWO * wp.dot(y, u)
+        qt = -TWO * wp.dot(y, v)
+        gs = wp.float64(4.0) * MIDDLE * x
+        gt = wp.float64(4.0) * MIDDLE * z
+        fs = g * qs + q * gs
+        ft = g * qt + q * gt
+        ss = TWO * g * uu + TWO * gs * qs + wp.float64(8.0) * MIDDLE * q
+        tt = TWO * g * vv + TWO * gt * qt + wp.float64(8.0) * MIDDLE * q
+        st = -TWO * g * uv + gs * qt + gt * qs
+        s_held = (s <= ZERO and fs > ZERO) or (s >= ONE and fs < ZERO)
+        t_held = (t <= ZERO and ft > ZERO) or (t >= ONE and ft < ZERO)
+        ds = ZERO
+        dt = ZERO
+        if s_held and t_held:
+            turn = 40
+        elif s_held:
+            dt = -ft / tt
+        elif t_held:
+            ds = -fs / ss
+        else:
+            det = ss * tt - st * st
+            ds = -(tt * fs - st * ft) / det
+            dt = -(ss * ft - st * fs) / det
+        before = g * q
+        step = ONE
+        s1 = s
+        t1 = t
+        tries = wp.int32(0)
+        while tries < 20:
+            s1 = wp.clamp(s + step * ds, ZERO, ONE)
+            t1 = wp.clamp(t + step * dt, ZERO, ONE)
+            y = w + s1 * u - t1 * v
+            x = TWO * s1 - ONE
+            z = TWO * t1 - ONE
+            if wp.dot(y, y) * (ONE + MIDDLE * (x * x + z * z)) <= before * (ONE + wp.float64(1e-13)):
+                tries = 20
+            step *= SIDE
+            tries += 1
+        if wp.max(wp.abs(s1 - s), wp.abs(t1 - t)) < wp.float64(1e-15):
+            turn = 40
+        s = s1
+        t = t1
+    x = TWO * s - ONE
+    z = TWO * t - ONE
+    return s, t, wp.sqrt(ONE + MIDDLE * (x * x + z * z))
+
+
+@wp.struct
+class Followed:
+    """The ``start`` of each λ where contacts are found anew; those ``carried`` from the last ones, with their stencils, rows.
+
+    ``mode`` (1,) is 0 in a sweep, STARTING if it only adds the start, and ENDING if it only removes the forces.
+    """
+
+    mode: wp.array(dtype=wp.int32)
+    start: wp.array(dtype=wp.float64)
+    carried: wp.array(dtype=wp.float64)
+    stencils: wp.array(dtype=wp.vec4i)
+    rows: wp.array(dtype=wp.int32)
+
+
+STARTING, ENDING = wp.constant(1), wp.constant(2)
+
+
+@wp.struct
+class Contacts:
+    """The contacts at some positions, by slots: w, n, d, r [m], kA with the sign of m [N/m], ``share``, and ``fixed`` λ [kg·m].
+
+    There are 2C slots. Slot e < C is that of the pair e: of the nearest point of a face, or of two edges. Those from
+    C + 3·rows[i] on are for terms of vertex i whose faces have their nearest points elsewhere. That is enough, because F
+    faces share at most 1.5 F edges, and as many vertices. kA is 0 in slots without a contact. ``code`` says where the nearest
+    point of a face is.
+
+    The ``share`` of a contact is the sum of m over its side of the vertex, divided by that of positive m. Sweeps compute this
+    share of its force anew, and leave the rest ``fixed``, see :mod:`.pair_follow`.
+
+    Two edges with 4D = cd have r/c and c²kA, for φ(cd) with r is c²φ(d) with r/c.
+    """
+
+    weights: wp.array(dtype=wp.vec4d)
+    normal: wp.array(dtype=wp.vec3d)
+    gap: wp.array(dtype=wp.float64)
+    distance: wp.array(dtype=wp.float64)
+    stiffness: wp.array(dtype=wp.float64)
+    share: wp.array(dtype=wp.float64)
+    fixed: wp.array(dtype=wp.float64)
+    code: wp.array(dtype=wp.int32)
+    followed: Followed
+
+
+@wp.struct
+class Areas:
+    """Rest areas of the vertices, and of each edge at them, (N,) [m²], and rest points of a copy (n,)."""
+
+    of_vertices: wp.array(dtype=wp.float64)
+    of_edges: wp.array(dtype=wp.float64)
+    rest: wp.array(dtype=wp.vec3d)
+
+
+@wp.func
+def corner_of(s: wp.vec4i, u: int):
+    """The corner 1 to 3 of a face at which vertex u is, or 0."""
+    found = wp.int32(0)
+    for i in range(1, 4):
+        if s[i] == u:
+            found = i
+    return found
+
+
+@wp.func
+def edge_between(i: int, j: int):
+    """The code of the edge between two corners, 1 to 3."""
+    return wp.where(i + j == 3, EDGE, EDGE + 6 - i - j)
+
+
+@cache
+def counts_of(dtype):
+    """Device functions (lists, codes, first, end, …) that count the near faces of a vertex at an edge pq, or at a vertex p.
+
+    Both return the face that owns the term, which is the first whose nearest point is there or else the first; the number of
+    faces; and of those whose nearest point is there. That of edges also returns the first face.
+    """
+    stencil, number = load(wp.vec4i), load(wp.int32)
+
+    @wp.func
+    def at_edge(lists: near_pairs(dtype), codes: wp.array(dtype=wp.int32), first: int, end: int, p: int, q: int):
+        lowest = wp.int32(-1)
+        owner = wp.int32(-1)
+        faces = wp.int32(0)
+        on = wp.int32(0)
+        for f in range(first, end):
+            code = number(codes, f)
+            if code != NONE:
+                s = stencil(lists.stencils, f)
+                i = corner_of(s, p)
+                j = corner_of(s, q)
+                if i > 0 and j > 0:
+                    here = code == edge_between(i, j)
+                    if faces == 0:
+                        lowest = f
+                    if faces == 0 or (here and on == 0):
+                        owner = f
+                    faces += 1
+                    on += wp.where(here, 1, 0)
+        return owner, faces, on, lowest
+
+    @wp.func
+    def at_vertex(lists: near_pairs(dtype), codes: wp.array(dtype=wp.int32), first: int, end: int, p: int):
+        owner = wp.int32(-1)
+        faces = wp.int32(0)
+        on = wp.int32(0)
+        for f in range(first, end):
+            code = number(codes, f)
+            if code != NONE:
+                i = corner_of(stencil(lists.stencils, f), p)
+                if i > 0:
+                    here = code == CORNER + i - 1
+                    if faces == 0 or (here and on == 0):
+                        owner = f
+                    faces += 1
+                    on += wp.where(here, 1, 0)
+        return owner, faces, on
+
+    return at_edge, at_vertex
+
+
+@cache
+def put_contact(dtype):
+    """Device function that stores a contact in a slot, and lists it."""
+
+    @wp.func
+    def put(
+        slot: int,
+        s: wp.vec4i,
+        w: wp.vec4d,
+        y: wp.vec3d,
+        r: wp.float64,
+        kA: wp.float64,
+        pairs: near_pairs(dtype),
+        contacts: Contacts,
+    ):
+        gap = wp.length(y)
+        pairs.stencils[slot] = s
+        contacts.weights[slot] = w
+        contacts.normal[slot] = y / wp.max(gap, wp.float64(1e-300))
+        contacts.gap[slot] = gap
+        contacts.distance[slot] = r
+        contacts.stiffness[slot] = kA
+        contacts.share[slot] = ONE
+        contacts.fixed[slot] = ZERO
+        pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = slot
+        if pairs.corner_counts:
+            for i in range(4):
+                wp.atomic_add(pairs.corner_counts, s[i], 1)
+
+    return put
+
+
+@wp.func
+def set_shares(contacts: Contacts, first: int, count: int, extra: int, extras: int):
+    """Sets the shares of the contacts in ``count`` slots from ``first`` on, and in ``extras`` slots from ``extra`` on."""
+    for i in range(count + extras):
+        one = wp.where(i < count, first + i, extra + i - count)
+        if contacts.stiffness[one] > ZERO:
+            total = ZERO
+            positive = ZERO
+            for j in range(count + extras):
+                other = wp.where(j < count, first + j, extra + j - count)
+                k = contacts.stiffness[other]
+                # Contacts beyond r have no force, so that others have the same share with a goal as without.
+                beyond = contacts.gap[other] >= contacts.distance[other] and contacts.gap[one] < contacts.distance[one]
+                if k != ZERO and not beyond and wp.dot(contacts.normal[one], contacts.normal[other]) > ZERO:
+                    total += k
+                    positive += wp.max(k, ZERO)
+            contacts.share[one] = wp.clamp(total / positive, ZERO, ONE)
+
+
+@cache
+def lowest_gap(dtype, of_vertex: bool):
+    """Device function (stencil, n, b, c, d, goal, move) → a lower bound of the gap; b, c and d are relative to vertex 0.
+
+    It is the less of the gaps along n there and, if given, at goal + move, where the pair may have passed through.
+    """
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+    VERTEX = wp.constant(of_vertex)
+
+    @wp.func
+    def find(
+        s: wp.vec4i,
+        n: wp.vec3d,
+        b: wp.vec3d,
+        c: wp.vec3d,
+        d: wp.vec3d,
+        goal: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+    ):
+        found = gap_along(VERTEX, n, wp.vec3d(), b, c, d)
+        if goal:
+            p = at(goal, move, s[0])
+            q = at(goal, move, s[1]) - p
+            t = at(goal, move, s[2]) - p
+            u = at(goal, move, s[3]) - p
+            found = wp.min(found, gap_along(VERTEX, n, wp.vec3d(), q, t, u))
+        return found
+
+    return find
+
+
+@cache
+def find_vertex_contacts(dtype):
+    """Kernel over vertices: their contacts with faces at x, or x + correction.
+
+    These have a force there, or may have one at goal + move if that is given.
+    """
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+    (at_edge, at_vertex), put, lowest = counts_of(dtype), put_contact(dtype), lowest_gap(dtype, True)
+    stencil, number = load(wp.vec4i), load(wp.int32)
+
+    @wp.func
+    def multiplicity_of_edge(
+        lists: near_pairs(dtype),
+        contacts: Contacts,
+        first: int,
+        end: int,
+        p: int,
+        q: int,
+        P: wp.vec3d,
+        Q: wp.vec3d,
+    ):
+        """m of the edge pq, and the owner of its term."""
+        owner, faces, m, _lowest = at_edge(lists, contacts.code, first, end, p, q)
+        if along(P, Q) > ZERO and along(Q, P) > ZERO:
+            m -= faces - 1
+        return m, owner
+
+    @wp.func
+    def multiplicity_of_vertex(
+        lists: near_pairs(dtype),
+        contacts: Contacts,
+        first: int,
+        end: int,
+        p: int,
+        a: wp.vec3d,
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        e: int,
+    ):
+        """m of the vertex p, and the owner of its term; only if that is e."""
+        owner, faces, m = at_vertex(lists, contacts.code, first, end, p)
+        edges = wp.int32(0)
+        if owner == e:
+            P = at(x, correction, p) - a
+            for f in range(first, end):
+                if number(contacts.code, f) != NONE:
+                    s = stencil(lists.stencils, f)
+                    i = corner_of(s, p)
+                    if i > 0:
+                        for j in range(1, 4):
+                            if j != i:
+                                _owner, count, _on, lowest = at_edge(lists, contacts.code, first, end, p, s[j])
+                                if lowest == f:
+                                    edges += 1
+                                    if along(P, at(x, correction, s[j]) - a) <= ZERO:
+                                        m -= count - 1
+            m += 1 + faces - edges
+        return m, owner
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_contacts_of_vertex(
+        # elements
+        lists: near_pairs(dtype),
+        areas: Areas,
+        # state in
+        normals: wp.array(dtype=wp.vec3d),
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        goal: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        # parameters
+        stiffness: wp.float64,
+        distance: dtype,
+        # out
+        pairs: near_pairs(dtype),
+        contacts: Contacts,
+    ):
+        v = wp.tid()
+        first = lists.rows[v]
+        end = lists.rows[v + 1]
+        extra = contacts.code.shape[0] // 2 + 3 * first
+        if first == end or extra + 3 * (end - first) > contacts.code.shape[0]:  # the latter where the list has overflowed
+            return
+        r = wp.float64(distance)
+        a = at(x, correction, v)
+        near = wp.int32(0)
+        for e in range(first, end):
+            code = NONE
+            if lists.distances[e] == distance:  # else the rest distance is below 2r
+                s = stencil(lists.stencils, e)
+                b = at(x, correction, s[1]) - a
+                c = at(x, correction, s[2]) - a
+                d = at(x, correction, s[3]) - a
+                if lowest(s, normals[e], b, c, d, goal, move) < r:
+                    of_face, w = nearest_of_face(b, c, d)
+                    y = w[0] * b + w[1] * c + w[2] * d
+                    if goal or wp.length(y) < r:
+                        code = of_face
+                        contacts.weights[e] = wp.vec4d(ONE, -w[0], -w[1], -w[2])
+                        near += 1
+            contacts.code[e] = code
+        if near == 0:
+            return
+        kA = SIDE * stiffness * areas.of_vertices[v]
+        extras = wp.int32(0)
+        for e in range(first, end):
+            code = number(contacts.code, e)
+            if code == NONE:
+                continue
+            s = stencil(lists.stencils, e)
+            b = at(x, correction, s[1]) - a
+            c = at(x, correction, s[2]) - a
+            d = at(x, correction, s[3]) - a
+            corners = wp.matrix_from_rows(b, c, d)
+            w4 = contacts.weights[e]
+            if code == INSIDE or near == 1:
+                y = in_plane(code == INSIDE, w4[1] * b + w4[2] * c + w4[3] * d, wp.cross(c - b, d - b), b)
+                put(e, s, w4, y, r, kA, pairs, contacts)
+            if near == 1:
+                continue
+            for i in range(1, 4):
+                j = wp.where(i == 3, 1, i + 1)
+                P = corners[i - 1]
+                Q = corners[j - 1]
+                m, owner = multiplicity_of_edge(lists, contacts, first, end, s[i], s[j], P, Q)
+                if owner == e and m != 0:
+                    t = along(P, Q) / (along(P, Q) + along(Q, P))
+                    y = (t - ONE) * P - t * Q
+                    if goal or wp.length(y) < r:
+                        w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
+                        w4[i] = t - ONE
+                        w4[j] = -t
+                        slot = wp.where(code == edge_between(i, j), e, extra + extras)
+                        extras += wp.where(slot == e, 0, 1)
+                        put(slot, s, w4, y, r, wp.float64(m) * kA, pairs, contacts)
+                m, owner = multiplicity_of_vertex(lists, contacts, first, end, s[i], a, x, correction, e)
+                if owner == e and m != 0 and (goal or wp.length(P) < r):
+                    w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
+                    w4[i] = -ONE
+                    slot = wp.where(code == CORNER + i - 1, e, extra + extras)
+                    extras += wp.where(slot == e, 0, 1)
+                    put(slot, s, w4, -P, r, wp.float64(m) * kA, pairs, contacts)
+        if extras > 0:
+            set_shares(contacts, first, end - first, extra, extras)
+
+    return find_contacts_of_vertex
+
+
+@cache
+def find_edge_contacts(dtype):
+    """Kernel over pairs of edges: their contacts, as :func:`find_vertex_contacts`."""
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+
+    put, lowest = put_contact(dtype), lowest_gap(dtype, False)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_contact_of_edges(
+        # elements
+        lists: near_pairs(dtype),
+        areas: Areas,
+        # state in
+        normals: wp.array(dtype=wp.vec3d),
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        goal: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        # parameters
+        stiffness: wp.float64,
+        distance: dtype,
+        # out
+        pairs: near_pairs(dtype),
+        contacts: Contacts,
+    ):
+        e = lists.counts[0] + wp.tid()
+        if e >= wp.min(lists.counts[0] + lists.counts[1], lists.stencils.shape[0]):
+            return
+        contacts.code[e] = TWO_EDGES
+        if lists.distances[e] != distance:
+            return
+        s = lists.stencils[e]
+        a = at(x, correction, s[0])
+        zero = wp.vec3d()
+        b = at(x, correction, s[1]) - a
+        c = at(x, correction, s[2]) - a
+        d = at(x, correction, s[3]) - a
+        r = CLOSE * wp.float64(distance)
+        if lowest(s, normals[e], b, c, d, goal, move) >= r:
+            return
+        u, t, factor = on_two_edges(zero, b, c, d)
+        y = u * b - (c + t * (d - c))
+        if not goal and factor * wp.length(y) >= r:
+            return
+        factor /= CLOSE
+        n = areas.rest.shape[0]
+        ab = wp.length(areas.rest[s[1] % n] - areas.rest[s[0] % n])
+        cd = wp.length(areas.rest[s[3] % n] - areas.rest[s[2] % n])
+        A = HALF_PI * (areas.of_edges[s[0]] + areas.of_edges[s[1]]) * (areas.of_edges[s[2]] + areas.of_edges[s[3]]) / (ab * cd)
+        w = wp.vec4d(ONE - u, u, t - ONE, -t)
+        put(e, s, w, y, wp.float64(distance) / factor, factor * factor * stiffness * A, pairs, contacts)
+
+    return find_contact_of_edges
