@@ -167,6 +167,17 @@ def test_energy_of_a_book(pages, device):
     assert potential.multiplicities().min() == pytest.approx(-2.0)
 
 
+def test_sheets_that_part_have_no_force(device):
+    """Also where kernels gather by vertex: with an empty list they must not go on with the last contacts."""
+    mesh, x = pair_of(0.1, 0.15)
+    potential = Potential(mesh, R, device)
+    potential.steps.contact.list_corners()
+    potential.steps.contact.set_sums(scatters=False)
+    assert np.abs(potential.gradient(x)).max() > 0.0
+    far = mesh.points + np.where(np.arange(len(x)) < len(x) // 2, 0.0, 1.0)[:, None]  # flat, so that no neighbours are listed
+    assert (potential.gradient(far) == 0.0).all() and potential.steps.proximity.counts.numpy().sum() == 0
+
+
 @pytest.mark.parametrize(("ratio", "gap"), CRUMPLED)
 def test_numbering(ratio, gap, device):
     """Vertices, triangles and the corners of each in another order: U to 1e-13, and ∂U/∂x to that or, where edges are longer

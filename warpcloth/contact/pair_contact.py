@@ -76,7 +76,13 @@ class PairContact(DynamicElements):
         """Finds the contacts with a force at x, or x + correction, and those that may have one at goal + move."""
         self.pairs.number.zero_()
         self.data.stiffness.zero_()
-        wp.capture_if(self._listed, self._launch_listed, x=x, correction=correction, goal=goal, move=move)
+        given = {"x": x, "correction": correction, "goal": goal, "move": move}
+        wp.capture_if(self._listed, self._launch_listed, self._launch_empty, **given)
+
+    def _launch_empty(self, **_given):
+        """Empties the lists by vertex, for kernels that gather would go on with the last contacts."""
+        if self._corners:
+            self.pairs.first.zero_()
 
     def _launch_listed(self, x, correction, goal, move):
         declared = self._declared

@@ -243,7 +243,7 @@ class PairSystem(CorrectedSystem):
         return self._energy.read().copy(), self._pull.read().astype(np.float64)
 
     def _limited(self, *vectors):
-        """Returns the first of ``vectors``, which d becomes shorter by, as long as pairs stay apart, and the others as long."""
+        """Returns ``vectors`` times the fraction for which pairs stay apart while d moves by minus the first of them."""
         self._pull.write(-vectors[0])
         self._bound()
         return (self._scaled(self._pairs.filter.fraction.numpy(), each) for each in vectors)
