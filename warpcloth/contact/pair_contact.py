@@ -30,8 +30,7 @@ class PairContact(DynamicElements):
     """
 
     def __init__(self, model, bounded, declared, listed):
-        super().__init__(model, kernels.CONTACT_OF_PAIRS)
-        self._listed = listed
+        super().__init__(model, kernels.CONTACT_OF_PAIRS, listed)
         self.least, self._declared = 0.0, declared
         mesh, device = model.scene.mesh, model.device
         of_vertices = mesh.vertex_areas
@@ -74,15 +73,10 @@ class PairContact(DynamicElements):
 
     def _launch_found(self, x, correction=None, goal=None, move=None):
         """Finds the contacts with a force at x, or x + correction, and those that may have one at goal + move."""
-        self.pairs.number.zero_()
+        self.launch_none()
         self.data.stiffness.zero_()
         given = {"x": x, "correction": correction, "goal": goal, "move": move}
-        wp.capture_if(self._listed, self._launch_listed, self._launch_empty, **given)
-
-    def _launch_empty(self, **_given):
-        """Empties the lists by vertex, for kernels that gather would go on with the last contacts."""
-        if self._corners:
-            self.pairs.first.zero_()
+        wp.capture_if(self.present, self._launch_listed, **given)
 
     def _launch_listed(self, x, correction, goal, move):
         declared = self._declared
@@ -135,7 +129,7 @@ class PairContact(DynamicElements):
         self._turn.zero_()
 
     def launch_sweep(self, x, correction, h, adds, backward):
-        self.model.launch(pair_follow.count_sweep, 1, [EVERY, self._listed], [self._turn, self._due])
+        self.model.launch(pair_follow.count_sweep, 1, [EVERY, self.present], [self._turn, self._due])
         wp.capture_if(self._due, self._launch_follow, x=x, correction=correction, h=h, adds=adds)
         super().launch_sweep(x, correction, h, adds, backward)
 

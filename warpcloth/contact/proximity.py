@@ -283,19 +283,24 @@ class Proximity:
         Returns:
             wp.array: The flag, (1,) int32.
         """
-        for array in (self.flag, self.copies, self._stale):
+        self.flag.zero_()
+        self.launch_moved_since(x, part, active, self.flag)
+        return self.flag
+
+    def launch_moved_since(self, x, part, active, flag):
+        """Launches ``flag`` (1,) = 1 where :meth:`moved` sets it, which does not change it otherwise."""
+        for array in (self.copies, self._stale):
             array.zero_()
         several = self._pieces.per_copy > 1
         if several:
             self._pieces.motion.zero_()
         self.launch_drift(x)
         given = [x, self.found, self.listed, active, part * self.skin]
-        self._launch(piece_motion.find_motion, self.model.count, given, [self._pieces, self.copies, self.flag, self._stale])
+        self._launch(piece_motion.find_motion, self.model.count, given, [self._pieces, self.copies, flag, self._stale])
         if several:
             wp.capture_if(self._stale, lambda: self._launch_boxes(self.found))
             given = [self._pieces, active, self.distance + self.skin, 2.0 * part * self.skin]
-            self._launch(piece_motion.compare_motions, len(self.drift), given, [self.copies, self.flag])
-        return self.flag
+            self._launch(piece_motion.compare_motions, len(self.drift), given, [self.copies, flag])
 
     @property
     def overflowed(self):

@@ -1,5 +1,7 @@
 """The filter of self-contact: it shortens moves that would cross, in the steps of a solver and in its iterates."""
 
+from functools import partial
+
 import warp as wp
 
 from ..kernels.contact import self_filter, self_planes
@@ -79,29 +81,38 @@ class SelfFilter:
             colliders = self._colliders
             given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
             self._launch(self_filter.walk_from_start, model.count, given, [self._contact.x_before])
+        if self._iterates:
+            self.launch_fresh(self._contact.x_before, self._contact.relist)
+        self._contact.launch_near(x, partial(self._launch_end, x, v, move, parts))
+        if self._lets_out:
+            self._colliders.launch_inside(x, self._from)
+        model.launch(self._count, model.copies, [], [self._contact.steps])
+        friction = self._contact.friction
+        if friction is not None:
+            wp.capture_if(friction.present, friction.launch_end, x=x)
+
+    def _launch_end(self, x, v, move, parts):
+        model = self.model
         wp.copy(self._target, x)
         wp.copy(x, self._contact.x_before)
-        if self._iterates:
-            self.launch_fresh(x, self._contact.relist)
         self._walk(x)
         if self._lets_out:
             self._turns.zero_()
             self._walking.fill_(1)
             self._launch_held(x)
             wp.capture_while(self._within, self._launch_let_out, x=x)
-            self._colliders.launch_inside(x, self._from)
         given = [model.inverse_mass, model.mobility, self._target, x, self._contact.steps, model.per_copy]
         given += [self._contact.h, self._contact.h / parts]
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
-        model.launch(self._count, model.copies, [], [self._contact.steps])
-        if self._contact.friction is not None:
-            self._contact.friction.launch_end(x)
 
     def launch_hold(self, x, v, hard):
         """Shortens moves of pins to x that other pins are in the way of, before a solver draws cloth after them; corrects v.
 
         ``hard`` pairs keep the contact distance as a constraint.
         """
+        wp.capture_if(self._contact.listed, self._launch_hold, x=x, v=v, hard=hard)
+
+    def _launch_hold(self, x, v, hard):
         model, contact = self.model, self._contact
         self._share.fill_(1.0)
         given = [contact.pairs, model.inverse_mass, contact.begun, x, hard]
@@ -251,9 +262,8 @@ class SelfFilter:
 
         self.fraction.fill_(1.0)
         self._advance.direction = direction
-        # Without pairs none can meet as long as the list would be kept.
         self._add(contact.x_before, direction, 1.0, target)
-        wp.capture_if(proximity.moved(target), shorten, lambda: wp.capture_if(contact.listed, shorten))
+        contact.launch_near(target, shorten)
 
     def launch_follow(self, base, d):
         """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs."""

@@ -113,7 +113,7 @@ class SelfFriction(DynamicElements):
 
     def __init__(self, model, slips, steps, friction, bounded):
         law = law_of(friction)
-        super().__init__(model, kernels.friction_of_pairs(law))
+        super().__init__(model, kernels.friction_of_pairs(law), wp.zeros(1, dtype=wp.int32, device=model.device))
         self._kept, self._steps, self._friction = slips, steps, float(friction)
         self._bounded = bounded
         self.start, self._step = model.vectors(), Slips(model, slips.room)
@@ -143,6 +143,7 @@ class SelfFriction(DynamicElements):
     def launch_begin(self, touching, contacts, x):
         """At the start of a step, at x: takes the contacts there, and the slips of the last step."""
         model, kept = self.model, self._kept
+        self.present.fill_(1)
         wp.copy(self.start, x)
         self.pairs.number.zero_()
         self.data.limit.zero_()
@@ -153,8 +154,10 @@ class SelfFriction(DynamicElements):
         given = [self.pairs, x, kept.pairs, kept.slips, self._steps, model.per_copy]
         self._launch(kernels.set_anchors, kept.room, given, [self.data])
 
-    def launch_release(self):
-        """Launches the removal of all slips, for a step without pairs."""
+    def launch_none(self):
+        """Empties the lists of this step and of the last one, at the start of a step without pairs."""
+        super().launch_none()
+        self.present.zero_()
         self._kept.pairs.first.zero_()
 
     def launch_forces(self, x, correction):

@@ -12,7 +12,6 @@ from ..core.state import Count
 from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels.contact import gap_notes, pair_blocks, self_pairs
-from ..kernels.contact.far_step import far_limits
 from ..kernels.contact.piece_motion import take_moved
 from ..kernels.contact.self_filter import HeldPins
 from .pair_contact import PairContact
@@ -121,6 +120,7 @@ class SelfSteps:
         self.friction, self.stale = None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)
+        self._near = wp.zeros(1, dtype=wp.int32, device=device)
         self._carried = (
             self.proximity.found,
             self._most.array,
@@ -137,15 +137,6 @@ class SelfSteps:
         self.forces = Dynamic(model, [self.contact, *([self.friction] if self.friction else [])])
         check_start(self, state)
         self.start_again()
-
-    def far_limits(self):
-        """Returns :func:`warpcloth.kernels.contact.far_step.far_limits` of a step, and the launch dimensions of its tests."""
-        model, limits = self.model, far_limits(self.model.dtype)()
-        limits.per_copy, limits.size = model.per_copy, model.per_copy if model.device.is_cpu else 1
-        # Both are below what the list and the filter allow, by more than rounding.
-        limits.h, limits.way, limits.together = self.h, (1.0 - 1e-4) * WAY * self.skin, self.filter.moves_together
-        limits.most = 0.49 * limits.way if limits.together else limits.way
-        return limits, (model.copies, -(-model.per_copy // limits.size))
 
     def refuse_reset(self, mask, x):
         """Refuses a reset of copies in ``mask`` (B,) to positions x (B·n, 3) at which cloth crosses or nearly touches cloth.
@@ -298,6 +289,15 @@ class SelfSteps:
         wp.copy(self.x_before, x)
         self.filter.launch_begin()
         self.proximity.launch_kept(x, WAY, self.launch_list)
+        wp.capture_if(self.listed, self._launch_begin, self._launch_none, x=x)
+
+    def _launch_none(self, x):
+        """Begins a step without pairs."""
+        wp.copy(self.begun_at, x)
+        for each in self.forces.terms:
+            each.launch_none()
+
+    def _launch_begin(self, x):
         self.launch_sides(x)
         self.contact.launch_begin(x)
         if self._per_frame > 1:
@@ -308,6 +308,15 @@ class SelfSteps:
             self._launch_notes(x)
         if self.friction is not None:
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
+
+    def launch_near(self, x, launch):
+        """Calls ``launch`` unless no pair is listed and none can be missing on a straight way to x (N,).
+
+        The way starts where the list has all pairs, as at the start of a step and at an iterate.
+        """
+        wp.copy(self._near, self.listed)
+        self.proximity.launch_moved_since(x, 0.5, None, self._near)
+        wp.capture_if(self._near, launch)
 
     def _launch_notes(self, x):
         given = [self.pairs, self.begun, x, self.steps, self.declared.distance, self._per_frame, self.model.per_copy]

@@ -1,5 +1,7 @@
 """Dynamic elements: those of four vertices and one row whose number and stencils change on the device, as pairs in contact."""
 
+from functools import partial
+
 import numpy as np
 import warp as wp
 
@@ -17,8 +19,10 @@ class DynamicElements:
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         term: The :class:`warpcloth.kernels.contact.pair_sums.PairTerm`.
+        present: Whether there may be pairs, (1,) int32 on the device. Without, nothing is launched for them.
 
     Attributes:
+        present: As given.
         pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
         data: The ``data`` of the term.
         forces: :class:`warpcloth.kernels.contact.pair_sums.PairForces`.
@@ -28,8 +32,8 @@ class DynamicElements:
 
     stored = False
 
-    def __init__(self, model, term):
-        self.model, self.term, self._swept, self._in_turn = model, term, None, None
+    def __init__(self, model, term, present):
+        self.model, self.term, self.present, self._swept, self._in_turn = model, term, present, None, None
         self.set_sums(model.device.is_cpu)
 
     def set_sums(self, scatters):
@@ -79,6 +83,12 @@ class DynamicElements:
 
     def list_corners(self):
         """Prepares the lists of the corners of pairs at each vertex, which sweeps and rows need, if they are not there."""
+
+    def launch_none(self):
+        """Empties the list of acting pairs."""
+        self.pairs.number.zero_()
+        if self.pairs.first:
+            self.pairs.first.zero_()
 
     def launch(self, x, correction=None):
         """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""
@@ -180,15 +190,17 @@ class Dynamic:
     def __len__(self):
         return len(self.terms)
 
+    def _launch_each(self, name, *given, order=1):
+        for each in self.terms[::order]:
+            wp.capture_if(each.present, partial(getattr(each, name), *given))
+
     def launch(self, x, correction=None):
         """Launches the forces at x, or at x + correction. The methods below sum them."""
-        for each in self.terms:
-            each.launch(x, correction)
+        self._launch_each("launch", x, correction)
 
     def add_gradient(self, out):
         """out (N,) += ∂U/∂x."""
-        for each in self.terms:
-            each.add_gradient(out)
+        self._launch_each("add_gradient", out)
 
     def add_energy(self, sums, out, stored=False):
         """out (B,) += U, or the part of it that is ``stored`` in the state."""
@@ -196,18 +208,16 @@ class Dynamic:
         if terms:
             self._energies.zero_()
             for each in terms:
-                each.add_energies(self._energies)
+                wp.capture_if(each.present, partial(each.add_energies, self._energies))
             sums.sum(self._energies, self.model.per_copy, out, accumulate=1)
 
     def add_diagonal(self, diagonal, values):
         """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
-        for each in self.terms:
-            each.add_diagonal(diagonal, values)
+        self._launch_each("add_diagonal", diagonal, values)
 
     def add_products(self, p, q, active):
         """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
-        for each in self.terms:
-            each.add_products(p, q, active)
+        self._launch_each("add_products", p, q, active)
         if self.terms:
             self.model.lock(q)
 
@@ -234,8 +244,7 @@ class Dynamic:
 
     def launch_sweep_start(self, x):
         """Launches λ = 0 before the first sweep, at x̃ (N,)."""
-        for each in self.terms:
-            each.launch_sweep_start(x)
+        self._launch_each("launch_sweep_start", x)
 
     def launch_sweep(self, x, correction, h, adds, backward=False):
         """Launches a sweep over all elements.
@@ -247,8 +256,7 @@ class Dynamic:
             adds: Whether multipliers accumulate over sweeps; else elements are hard.
             backward: Whether a Gauss–Seidel sweep goes from the last element to the first.
         """
-        for each in reversed(self.terms) if backward else self.terms:
-            each.launch_sweep(x, correction, h, adds, backward)
+        self._launch_each("launch_sweep", x, correction, h, adds, backward, order=-1 if backward else 1)
 
 
 def dynamic_of(model, terms=None, dynamic=()):

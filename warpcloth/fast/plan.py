@@ -19,9 +19,9 @@ from .contact_guard import ContactGuard
 from .gather_corrections import GatherSweeps
 from .gather_gradient import GatherGradient
 from .gather_step import GatherStep
-from .quiet_steps import QuietSteps
 from .scatter_corrections import ScatterSweeps
 from .subdomains import SubdomainSteps
+from .touching_steps import TouchingSteps
 
 BACKENDS = ("auto", "core", "blocks", "gather")
 
@@ -67,7 +67,7 @@ class Plan:
         if self.model.dynamic:
             blocks = self.backend == "blocks" and self.model.uniform and colliders is None
             plain = (BlockStep if blocks else ExplicitStep)(self.model.with_dynamic(()), *given[1:-1])
-            steps = QuietSteps(plain, pairs, count)
+            steps = TouchingSteps(plain, pairs)
         elif pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
             steps = SubdomainSteps(*given, pool)

@@ -17,7 +17,6 @@ from ..model.damping import damped_terms
 from ..numerics.integrators import INTEGRATORS
 from ..terms.refresh import STEP
 from .clear_steps import ClearSteps
-from .far_steps import FarSteps
 
 
 class Stepper:
@@ -101,16 +100,16 @@ class Stepper:
         return stepper
 
     def find_twin(self):
-        """Makes a twin for steps without contact, if there is contact and the residual of the twin has the same meaning."""
+        """Makes a twin for steps without contact, if there are colliders and the residual of the twin has the same meaning."""
         model = self.declared
-        if not FarSteps.serve(self) if self.pairs is not None else model.colliders is None:
+        if self.pairs is not None or model.colliders is None:
             return
         if self.options.residual_on(model) != self.options.residual_on(model.without_colliders()):
             return
         twin = type(self).__new__(type(self))
         twin._motion, twin.lead = tuple(self.state), self
         twin.__init__(self.options, model.without_colliders())
-        self.clear_steps = (ClearSteps if self.pairs is None else FarSteps)(self, twin)
+        self.clear_steps = ClearSteps(self, twin)
 
     @property
     def results(self):
