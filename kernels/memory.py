@@ -89,18 +89,3 @@ def prefetch(dtype):
     def prefetch_entries(a: wp.array(dtype=dtype), indices: wp.array(dtype=wp.int32), first: int, last: int): ...
 
     return prefetch_entries
-
-
-@cache
-def copy_range(dtype):
-    """Device function (to, at, source, first, count) → to[at + k] = source[first + k] for each k < count, contiguous memory."""
-    number, numbers, _kind, _copy = _copied(dtype)
-
-    @wp.func_native(
-        f"{number}* into = ({number}*)to.data + {numbers} * size_t(at); "
-        f"const {number}* from = (const {number}*)source.data + {numbers} * size_t(first); "
-        f"for (size_t k = 0; k < {numbers} * size_t(count); ++k) into[k] = from[k];"
-    )
-    def copy_entries(to: wp.array(dtype=dtype), at: int, source: wp.array(dtype=dtype), first: int, count: int): ...
-
-    return copy_entries

@@ -7,7 +7,7 @@ import warp as wp
 from ..memory import load
 from ..vectors import types
 from .mesh_geometry import geometry
-from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, grids, moved_parts, surfaces
+from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, grids, surfaces
 
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 
@@ -146,14 +146,11 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     that of a vertex that moves meets those of all levels, for it may be larger than theirs. The rows of cells near each
     vertex or edge are divided among ``shares`` threads, the second dimension of the launch.
 
-    Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices.
-
-    If parts have ``moved``, only pairs with one of them are found: those of vertices that have moved, those of other vertices
-    with triangles that have, and those of edges that have, on all levels. The distance of two edges is always computed in
-    the order of their indices.
+    Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices. The distance
+    of two edges is always computed in the order of their indices.
     """
     vec3, _ = types(dtype)
-    _box_of, box_along, level_of, cell_at, cells_about = boxes(dtype)
+    box_along, level_of, cell_at, cells_about = boxes(dtype)
     number, corner, four = load(wp.int32), load(vec3), load(wp.vec4i)
     meet = boxes_meet(dtype)
     visit, out_type = take(dtype, of_edges)
@@ -171,18 +168,10 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
         # parameters
         triangles: int,
         shares: int,
-        moved: moved_parts(dtype),
         # in and out
         out: out_type,
     ):
         i, share = wp.tid()
-        few = wp.bool(False)
-        if moved.items:
-            if wp.static(of_edges):
-                if moved.items[triangles + i] == 0:
-                    return
-            else:
-                few = moved.vertices[i] == 0
         if wp.static(of_edges):
             own = surface.items[triangles + i]
             copy = own[3] >> 1
@@ -195,18 +184,12 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
         level = level_of(grid.size, low, high)
         if level < 0:
             return
-        if few:
-            if not meet(low, high, moved.region[0], moved.region[1]):
-                return
         lowest = level
         layer = cell_at(grid.size, low, high, level)[2]
         buckets = grid.counts.shape[0]
-        if wp.static(of_edges):
-            if moved.items:
+        if wp.static(not of_edges):
+            if p:
                 level = 0
-                lowest = -1
-        elif p:
-            level = 0
         present = grid.levels[KIND] >> level
         while present != 0:
             if (present & 1) != 0:
@@ -229,9 +212,6 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                         if not meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
                             continue
                         entry = four(grid.entries, slot)
-                        if few:
-                            if moved.items[entry[0]] == 0:
-                                continue
                         other = four(surface.items, entry[0])
                         if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
                             continue
@@ -240,9 +220,6 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                         if wp.static(of_edges):
                             if level == lowest and cz == layer and k <= i:
                                 continue
-                            if lowest < 0:  # the other finds this one too if it has moved
-                                if k < i and moved.items[entry[0]] != 0:
-                                    continue
                             if k < i:
                                 s = wp.vec4i(other[0], other[1], own[0], own[1])
                         elif other[2] == own[0]:

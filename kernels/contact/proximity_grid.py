@@ -67,25 +67,8 @@ def grids(dtype):
 
 
 @cache
-def moved_parts(dtype):
-    """Struct of what has moved since the last list: 1 for such ``vertices``, and for ``items`` with such a vertex, else 0.
-
-    ``region`` (2,) has the lowest and the highest corner of the boxes of these items. The arrays are empty for a new list.
-    """
-    vec3, _ = types(dtype)
-
-    @wp.struct
-    class MovedParts:
-        vertices: wp.array(dtype=wp.int32)
-        items: wp.array(dtype=wp.int32)
-        region: wp.array(dtype=vec3)
-
-    return MovedParts
-
-
-@cache
 def boxes(dtype):
-    """Device functions on boxes: ``box_of``, ``box_along``, ``level_of``, ``cell_at``, ``cells_about``."""
+    """Device functions on boxes: ``box_along``, ``level_of``, ``cell_at``, ``cells_about``."""
     vec3, _ = types(dtype)
     half, farthest, corner = dtype(0.5), dtype(FARTHEST), load(vec3)
 
@@ -154,7 +137,7 @@ def boxes(dtype):
             last = cell_of(most, high + edge)
         return first, last
 
-    return box_of, box_along, level_of, cell_at, cells_about
+    return box_along, level_of, cell_at, cells_about
 
 
 @cache
@@ -177,13 +160,9 @@ def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
 
 @cache
 def count_items(dtype):
-    """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist.
-
-    If parts have ``moved``, only items whose box meets their region count.
-    """
+    """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist."""
     vec3, _ = types(dtype)
-    _box_of, box_along, level_of, cell_at, _about = boxes(dtype)
-    meet = boxes_meet(dtype)
+    box_along, level_of, cell_at, _about = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def count_each_item(
@@ -192,7 +171,6 @@ def count_items(dtype):
         # state in
         x: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
-        moved: moved_parts(dtype),
         # in and out
         grid: grids(dtype),
     ):
@@ -200,9 +178,6 @@ def count_items(dtype):
         v = surface.items[item]
         low, high = box_along(surface, x, p, v[0], v[1], v[2])
         level = level_of(grid.size, low, high)
-        if moved.items:
-            if not meet(low, high, moved.region[0], moved.region[1]):
-                level = -1
         key = wp.int32(-1)
         if level >= 0:
             if (grid.levels[v[3] & 1] & (1 << level)) == 0:
@@ -219,7 +194,7 @@ def count_items(dtype):
 def fill_buckets(dtype):
     """Kernel over items: the entries of the buckets; counts ``counts`` down to 0."""
     vec3, _ = types(dtype)
-    _box_of, box_along, level_of, cell_at, _about = boxes(dtype)
+    box_along, level_of, cell_at, _about = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def fill_each_bucket(

@@ -7,11 +7,11 @@ from ..base.limits import refuse_memory
 from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.scan import Scan
-from ..kernels.contact import list_again, piece_motion, proximity_grid
+from ..kernels.contact import piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 
-# Of a pair in the list 36, its gap 64, and two slots of contact with their forces 268 each; of the list before, on the CPU.
-BYTES_OF_A_PAIR, BYTES_BEFORE = 36 + 64 + 2 * 268, 24
+# Of a pair in the list 36, its gap 64, and two slots of contact with their forces 268 each.
+BYTES_OF_A_PAIR = 36 + 64 + 2 * 268
 
 
 class Proximity:
@@ -60,28 +60,17 @@ class Proximity:
         self._along.distance = self._along.skin = 0.0
         self._allocate_grid()
         self._set_pieces(piece)
-        self._all, self._moved = (proximity_grid.moved_parts(model.dtype)() for _ in range(2))
-        # Lists of one piece on the CPU are made anew where it has moved. On CUDA a list of all is as quick.
-        self._by_parts = model.device.is_cpu and self._pieces.per_copy == 1
         self._shares = 8 if model.device.is_cuda else 1
-        if self._by_parts:
-            sizes = {"vertices": model.count, "items": self._triangles + self._edges}
-            self._moved_arrays = {k: wp.zeros(size, dtype=wp.int32, device=device) for k, size in sizes.items()}
-            self._moved_arrays["region"] = wp.zeros(2, dtype=model.vec3, device=device)
-            for name, value in self._moved_arrays.items():
-                setattr(self._moved, name, value)
         self.found = model.vectors()  # all 0, so that the first call makes a list
         self.listed = model.vectors()
         self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.copies = model.scalars(wp.int32)
         self._rows = Scan(model, model.count + self._edges)
         self._near = self.searches(kernels.take_near, "near")
-        by_parts = list_again.take_parts, list_again.mark_items, list_again.merge_pairs
         self._launch = model.launcher(
             ((proximity_grid.count_items, proximity_grid.fill_buckets, kernels.fill_rows, kernels.write_pairs), model.dtype),
             ((piece_motion.begin_boxes, piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.take_moved), model.dtype),
-            *([(by_parts, model.dtype)] if self._by_parts else []),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
@@ -152,8 +141,7 @@ class Proximity:
     def _allocate(self, capacity):
         model = self.model
         rows = model.count + self._edges
-        each = BYTES_OF_A_PAIR + BYTES_BEFORE * self._by_parts
-        refuse_memory(f"the cloth has {capacity} pairs that are near one another", each * capacity)
+        refuse_memory(f"the cloth has {capacity} pairs that are near one another", BYTES_OF_A_PAIR * capacity)
 
         def zeros(count, dtype=wp.int32):
             return wp.zeros(count, dtype=dtype, device=model.device)
@@ -174,13 +162,6 @@ class Proximity:
         self._pairs = kernels.pair_lists(model.dtype)()
         for name, value in self._arrays.items():
             setattr(self._pairs, name, value)
-        if self._by_parts:
-            room = {"first": rows + 1, "row_counts": rows, "items": capacity}
-            self._before_arrays = {k: zeros(size) for k, size in room.items()}
-            self._before_arrays |= {"stencils": zeros(capacity, wp.vec4i), "distances": zeros(capacity, model.dtype)}
-            self._before = kernels.pair_lists(model.dtype)()
-            for name, value in self._before_arrays.items():
-                setattr(self._before, name, value)
 
     def set_skin(self, skin):
         """Sets another skin [m]; the next :meth:`launch_kept` makes a new list."""
@@ -190,26 +171,11 @@ class Proximity:
     def launch_moved(self, x):
         """Launches the detection at x (N,) in ``copies``, and at the previous positions in the others.
 
-        So the pairs of a copy do not depend on other copies. On the CPU the list of a single piece is made anew where vertices
-        have moved, see :mod:`warpcloth.kernels.contact.list_again`. Follows :meth:`moved`.
+        So the pairs of a copy do not depend on other copies. Follows :meth:`moved`.
         """
         model = self.model
-        if self._by_parts:
-            given = [x, self.copies, self._pieces, model.per_copy, list_again.PART * self.skin]
-            self._launch(list_again.take_parts, model.copies, given, [self.found, self._moved])
-            # Both give the same list, so that it does not matter whether the last one was lost, as when a run is resumed.
-            wp.capture_if(self._stale, lambda: self.launch(self.found), self._launch_parts)
-        else:
-            self._launch(piece_motion.take_moved, model.count, [x, self.copies, model.per_copy], [self.found])
-            self.launch(self.found)
-
-    def _launch_parts(self):
-        moved, N = self._moved, self.model.count
-        self._launch(list_again.mark_items, self._triangles + self._edges, [self._surface, self.found], [moved])
-        wp.copy(self.listed, self.found)
-        self._launch_search(self.found, moved)
-        given = [self._surface, moved, N, self._triangles]
-        self._launch(list_again.merge_pairs, 1, given, [self._before, self._pairs])
+        self._launch(piece_motion.take_moved, model.count, [x, self.copies, model.per_copy], [self.found])
+        self.launch(self.found)
 
     def launch(self, x):
         """Launches the detection at positions x (N,)."""
@@ -219,15 +185,11 @@ class Proximity:
         wp.copy(self.listed, x)
         if self._pieces.per_copy > 1:
             self._launch_boxes(x)
-        self._launch_search(x, self._all)
+        self.counts.zero_()
+        self._launch_grid(self._surface, x, None, self._near, pairs)
         self._rows.launch(own["row_counts"], own["first"])
         self._launch(kernels.fill_rows, self.capacity, [], [pairs])
         self._launch(kernels.write_pairs, N + self._edges, [self._surface, N, self._triangles], [pairs])
-
-    def _launch_search(self, x, moved):
-        """Finds the pairs, or those with parts that have moved."""
-        self.counts.zero_()
-        self._launch_grid(self._surface, x, None, moved, self._near, self._pairs)
 
     def searches(self, take, name):
         """Returns the kernels of :func:`warpcloth.kernels.contact.proximity.search_pairs` for vertices and for edges."""
@@ -235,17 +197,17 @@ class Proximity:
 
     def launch_along(self, x, p, searches, out):
         """Launches ``searches`` over all pairs whose boxes meet while vertices move from x to x + p, both (N,) [m]."""
-        self._launch_grid(self._along, x, p, self._all, searches, out)
+        self._launch_grid(self._along, x, p, searches, out)
 
-    def _launch_grid(self, surface, x, p, moved, searches, out):
+    def _launch_grid(self, surface, x, p, searches, out):
         grid, items = self._grid, self._triangles + self._edges
         self._grid_arrays["levels"].zero_()
-        self._launch(proximity_grid.count_items, items, [surface, x, p, moved], [grid])
+        self._launch(proximity_grid.count_items, items, [surface, x, p], [grid])
         self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
         self._launch(proximity_grid.fill_buckets, items, [surface, x, p], [grid])
         for search, count in zip(searches, (self.model.count if self._triangles else 0, self._edges), strict=True):
             if count:
-                given = [surface, x, p, grid, self._triangles, self._shares, moved]
+                given = [surface, x, p, grid, self._triangles, self._shares]
                 self.model.launch(search, (count, self._shares), given, [out])
 
     def _launch_boxes(self, x):
