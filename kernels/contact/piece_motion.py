@@ -75,13 +75,20 @@ def extend_boxes(dtype):
 
 
 @wp.func
-def note_moved(active: wp.array(dtype=wp.int32), copy: int, moved: wp.array(dtype=wp.int32), some: wp.array(dtype=wp.int32)):
+def note_moved(
+    active: wp.array(dtype=wp.int32),
+    copy: int,
+    moved: wp.array(dtype=wp.int32),
+    some: wp.array(dtype=wp.int32),
+    due: wp.array(dtype=wp.int32),
+):
     found = wp.bool(True)
     if active:
         found = active[copy] != 0
     if found:
         moved[copy] = 1
         some[0] = 1
+        due[0] = 1
 
 
 @cache
@@ -147,7 +154,7 @@ def find_motion(dtype):
     """Kernel over vertices: finds copies in which a vertex has moved by more than ``most`` since ``found``.
 
     The motion is relative to the drift of the piece. moved = 1 for such copies, among the ``active`` ones if given;
-    some = 1 if there is one; stale = 1 if the pairs were not listed at ``found``.
+    some = 1 if there is one; due = 1 then, and if the pairs were not listed at ``found``.
     """
     vec3, _ = types(dtype)
 
@@ -165,16 +172,16 @@ def find_motion(dtype):
         # out
         moved: wp.array(dtype=wp.int32),
         some: wp.array(dtype=wp.int32),
-        stale: wp.array(dtype=wp.int32),
+        due: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
         if not (wp.length_sq(found[i] - listed[i]) <= dtype(0.0)):
-            stale[0] = 1
+            due[0] = 1
         p = pieces.piece[i]
         if p >= 0:
             own = wp.length((x[i] - found[i]) - pieces.drift[p])
             if not (own <= most):
-                note_moved(active, p // pieces.per_copy, moved, some)
+                note_moved(active, p // pieces.per_copy, moved, some, due)
             if pieces.per_copy > 1:
                 if own > pieces.motion[p]:
                     wp.atomic_max(pieces.motion, p, own)
@@ -184,7 +191,7 @@ def find_motion(dtype):
 
 @cache
 def compare_motions(dtype):
-    """Kernel over pieces: moved and some as in :func:`find_motion`, if the piece and a later one of its copy may be too near.
+    """Kernel over pieces: moved, some and due as in :func:`find_motion`, if the piece and a later one of its copy may be too near.
 
     That is, if their approach may exceed ``most`` plus the excess of the distance of their boxes over ``radius``, up to which
     pairs are listed.
@@ -202,6 +209,7 @@ def compare_motions(dtype):
         # out
         moved: wp.array(dtype=wp.int32),
         some: wp.array(dtype=wp.int32),
+        due: wp.array(dtype=wp.int32),
     ):
         p = wp.tid()
         for q in range(p + 1, (p // pieces.per_copy + 1) * pieces.per_copy):
@@ -209,6 +217,6 @@ def compare_motions(dtype):
             gap = wp.max(pieces.lower[p] - pieces.upper[q], pieces.lower[q] - pieces.upper[p])
             gap = wp.max(gap, vec3())
             if not (nearer <= most + wp.max(wp.length(gap) - radius, dtype(0.0))):
-                note_moved(active, p // pieces.per_copy, moved, some)
+                note_moved(active, p // pieces.per_copy, moved, some, due)
 
     return compare_each_motion

@@ -124,17 +124,16 @@ def sort_corners(dtype):
 def note_list(
     # state in
     counts: wp.array(dtype=wp.int32),
-    # parameters
-    made: int,
+    made: wp.array(dtype=wp.int32),
     # in and out
     most: wp.array(dtype=wp.int32),
     lists: wp.array(dtype=wp.int32),
     # out
     listed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: the most pairs in any list, the number of lists, to which it adds ``made``, and ``listed``."""
+    """Kernel over copies: the most pairs in any list, the number of lists, to which it adds ``made`` (1,), and ``listed``."""
     c = wp.tid()
     if c == 0:
         listed[0] = wp.min(counts[0] + counts[1], 1)
     most[c] = wp.max(most[c], wp.max(counts[0] + counts[1], 3 * counts[0]))
-    lists[c] = lists[c] + made
+    lists[c] = lists[c] + made[0]

@@ -370,6 +370,7 @@ def test_acting_contacts(device):
     contact.list_corners()
     for _ in range(2):
         pairs.launch_begin(model.positions)
+        contact.launch(model.positions)
         acting = np.flatnonzero(contact.data.stiffness.numpy())
         assert 0 < len(acting) < pairs.proximity.counts.numpy().sum()
         assert (np.sort(contact.pairs.acting.numpy()[: contact.pairs.number.numpy()[0]]) == acting).all()

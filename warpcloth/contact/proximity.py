@@ -63,7 +63,7 @@ class Proximity:
         self._shares = 8 if model.device.is_cuda else 1
         self.found = model.vectors()  # all 0, so that the first call makes a list
         self.listed = model.vectors()
-        self.flag, self._stale = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self.flag, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.copies = model.scalars(wp.int32)
         self._rows = Scan(model, model.count + self._edges)
         self._near = self.searches(kernels.take_near, "near")
@@ -215,12 +215,12 @@ class Proximity:
         self._launch(piece_motion.extend_boxes, self.model.count, [x], [self._pieces])
 
     def launch_kept(self, x, part, launch):
-        """Calls ``launch`` at x if :meth:`moved` sets the flag, else at ``found`` if the list is not that of ``found``.
+        """Calls ``launch`` with x if :meth:`moved` sets the flag, or if the list is not that of ``found``.
 
         So the list depends only on x and ``found``, not on lists made since ``found`` was set.
         """
-        flag = self.moved(x, part)
-        wp.capture_if(flag, launch, lambda x: wp.capture_if(self._stale, lambda: launch(self.found)), x=x)
+        self.moved(x, part)
+        wp.capture_if(self._due, launch, x=x)
 
     def launch_drift(self, x):
         """Finds the drift of each piece from ``found`` to x (N,)."""
@@ -251,18 +251,18 @@ class Proximity:
 
     def launch_moved_since(self, x, part, active, flag):
         """Launches ``flag`` (1,) = 1 where :meth:`moved` sets it, which does not change it otherwise."""
-        for array in (self.copies, self._stale):
+        for array in (self.copies, self._due):
             array.zero_()
         several = self._pieces.per_copy > 1
         if several:
             self._pieces.motion.zero_()
         self.launch_drift(x)
         given = [x, self.found, self.listed, active, part * self.skin]
-        self._launch(piece_motion.find_motion, self.model.count, given, [self._pieces, self.copies, flag, self._stale])
+        self._launch(piece_motion.find_motion, self.model.count, given, [self._pieces, self.copies, flag, self._due])
         if several:
-            wp.capture_if(self._stale, lambda: self._launch_boxes(self.found))
+            wp.capture_if(self._due, lambda: self._launch_boxes(self.found))
             given = [self._pieces, active, self.distance + self.skin, 2.0 * part * self.skin]
-            self._launch(piece_motion.compare_motions, len(self.drift), given, [self.copies, flag])
+            self._launch(piece_motion.compare_motions, len(self.drift), given, [self.copies, flag, self._due])
 
     @property
     def overflowed(self):

@@ -81,7 +81,7 @@ class SelfFilter:
             colliders = self._colliders
             given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
             self._launch(self_filter.walk_from_start, model.count, given, [self._contact.x_before])
-        if self._iterates:
+        if self._cut_before is not None:
             self.launch_fresh(self._contact.x_before, self._contact.relist)
         self._contact.launch_near(x, partial(self._launch_end, x, v, move, parts))
         if self._lets_out:

@@ -299,7 +299,6 @@ class SelfSteps:
 
     def _launch_begin(self, x):
         self.launch_sides(x)
-        self.contact.launch_begin(x)
         if self._per_frame > 1:
             self._ends.zero_()
             self.model.launch(gap_notes.find_frames, self.model.copies, [self.steps, self._per_frame], [self._ends])
@@ -307,6 +306,7 @@ class SelfSteps:
         else:
             self._launch_notes(x)
         if self.friction is not None:
+            self.contact.launch_begin(x)
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
     def launch_near(self, x, launch):
@@ -332,12 +332,12 @@ class SelfSteps:
         self.proximity.set_skin(self.skin)
 
     def launch_list(self, x):
-        """Lists the pairs again at x, in copies that have moved, and notes their number. It does not count a list at ``found``.
+        """Lists the pairs again at x, in copies that have moved, and notes their number. It counts no list if none has moved.
 
         Call it after :meth:`warpcloth.contact.proximity.Proximity.moved`.
         """
         self.proximity.launch_moved(x)
-        given = [self.proximity.counts, int(x is not self.proximity.found)]
+        given = [self.proximity.counts, self.proximity.flag]
         self.model.launch(self_pairs.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
 
     def launch_sides(self, x, copies=None):
