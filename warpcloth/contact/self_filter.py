@@ -265,6 +265,12 @@ class SelfFilter:
         self._add(contact.x_before, direction, 1.0, target)
         contact.launch_near(target, shorten)
 
+    def launch_look(self, base, d, w):
+        """Lists the pairs at base + d, and tests whether the way from there by −w (N,) may be near other cloth."""
+        self.launch_trial(base, d)
+        self._add(self._contact.x_before, w, -1.0, self._other)
+        self._contact.launch_look(self._other)
+
     def launch_follow(self, base, d):
         """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs."""
         x, direction = self._contact.x_before, self._direction

@@ -82,6 +82,7 @@ class SelfSteps:
         x_before: Positions at the start of the step, (N,) [m].
         begun_at: Positions at which the gaps of ``begun`` were found, (N,) [m].
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
+        near: The :class:`warpcloth.core.capture.Mirror` of what :meth:`launch_look` found, (1,) int32.
         lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
         listed: 1 if the last list has pairs, else 0, (1,) int32.
         friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
@@ -120,7 +121,7 @@ class SelfSteps:
         self.friction, self.stale = None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)
-        self._near = wp.zeros(1, dtype=wp.int32, device=device)
+        self.near = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
         self._carried = (
             self.proximity.found,
             self._most.array,
@@ -309,14 +310,18 @@ class SelfSteps:
             self.contact.launch_begin(x)
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
-    def launch_near(self, x, launch):
-        """Calls ``launch`` unless no pair is listed and none can be missing on a straight way to x (N,).
+    def launch_look(self, x):
+        """Launches ``near`` = 0 if no pair is listed and none can be missing on a straight way to x (N,), else 1.
 
         The way starts where the list has all pairs, as at the start of a step and at an iterate.
         """
-        wp.copy(self._near, self.listed)
-        self.proximity.launch_moved_since(x, 0.5, None, self._near)
-        wp.capture_if(self._near, launch)
+        wp.copy(self.near.array, self.listed)
+        self.proximity.launch_moved_since(x, 0.5, None, self.near.array)
+
+    def launch_near(self, x, launch):
+        """Calls ``launch`` if :meth:`launch_look` finds that the way to x (N,) may be near other cloth."""
+        self.launch_look(x)
+        wp.capture_if(self.near.array, launch)
 
     def _launch_notes(self, x):
         given = [self.pairs, self.begun, x, self.steps, self.declared.distance, self._per_frame, self.model.per_copy]

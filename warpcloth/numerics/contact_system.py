@@ -225,6 +225,7 @@ class PairSystem(CorrectedSystem):
         device, trial = self.model.device, self._trial.array
         self._press = Segment(device, self._launch_press)
         self._bound = Segment(device, lambda: self._pairs.filter.launch_limit(self._pull.array))
+        self._look = Segment(device, lambda: self._pairs.filter.launch_look(self.x, trial, self._pull.array))
         self._assemble = Segment(device, lambda: self.matrix.assemble(self.x, 0.0, trial))
 
     def _launch_press(self):
@@ -236,6 +237,13 @@ class PairSystem(CorrectedSystem):
         self._pull.array.zero_()
         self._dynamic.add_gradient(self._pull.array)
         self.model.lock(self._pull.array)
+
+    def _meets(self, d, w):
+        """Returns whether cloth may be near other cloth on the way from d to d − w."""
+        wp.copy(self._trial.array, d)
+        wp.copy(self._pull.array, w)
+        self._look()
+        return bool(self._pairs.near.read()[0])
 
     def _pressed(self, d):
         self._trial.write(d)
@@ -249,7 +257,9 @@ class PairSystem(CorrectedSystem):
         return (self._scaled(self._pairs.filter.fraction.numpy(), each) for each in vectors)
 
     def correct(self, d, gradient, w, active):
-        """Replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1."""
+        """Replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1. Away from other cloth w minimises ψ as it is."""
+        if not self._meets(d, w):
+            return
         d, b, found = (array.numpy().astype(np.float64) for array in (d, gradient, w))
         energy, pull = self._pressed(d)
         self._assemble()
