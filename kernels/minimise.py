@@ -282,7 +282,10 @@ def mean_parts(dtype, block: int):
 
 @cache
 def take_mean(dtype, block: int):
-    """Kernel over (copies, lanes): p −= Σ m(d + p)/Σ m along the axes of ``inverse``, (B,) vectors 1/Σ m, else 0 [1/kg]."""
+    """Kernel over (copies, lanes): p −= Σ m(d + p)/Σ m along the axes of ``inverse``, (B,) vectors 1/Σ m, else 0 [1/kg].
+
+    Copies that may be ``near`` a collider, (B,) int32 or None, keep p.
+    """
     vec3, _ = types(dtype)
     _store, add_up = block_sums(block)
 
@@ -290,6 +293,7 @@ def take_mean(dtype, block: int):
     def take_mean_of_copies(
         # elements
         inverse: wp.array(dtype=wp.vec3d),
+        near: wp.array(dtype=wp.int32),
         # state in
         parts: wp.array3d(dtype=wp.float64),
         # parameters
@@ -299,6 +303,9 @@ def take_mean(dtype, block: int):
         direction: wp.array(dtype=vec3),
     ):
         copy, lane = wp.tid()
+        if near:
+            if near[copy] != 0:
+                return
         total = wp.vec3d(add_up(lane, parts[0], copy), add_up(lane, parts[1], copy), add_up(lane, parts[2], copy))
         mean = vec3(wp.cw_mul(inverse[copy], total))
         for k in range(lane, per_copy, lanes):

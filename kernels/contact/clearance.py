@@ -11,33 +11,34 @@ from .colliders import gap_of, of_pose, shapes, step_poses
 
 
 @cache
-def balls(dtype):
-    """Struct of the balls of vertices: center and radius [m]. No collider is in the ball at the start of step ``found``.
+def clearances(dtype):
+    """Struct of what is known of the distances of vertices to colliders that stand.
 
-    Surfaces of colliders move by at most ``drift`` per step [m]. ``distance`` is the contact distance [m]. ``x``, ``v`` and
-    ``step`` are those at the start of the last step.
+    ``balls`` has the centre and the radius of a ball about each vertex [m]; no collider is within the contact ``distance`` of
+    it. A ball that contains the motion of its vertex makes the distance to the colliders unnecessary. ``near`` is 1 for copies
+    with a vertex that may come near in this step, ``before`` for those of the last step (B,). ``some`` is 1 if there is one in
+    this step. If steps are ``followed``, all refresh contact.
     """
 
     @wp.struct
-    class Balls:
+    class Clearances:
         balls: wp.array(dtype=wp.types.vector(4, dtype))
-        found: wp.array(dtype=wp.int32)
-        x: wp.array(dtype=types(dtype)[0])
-        v: wp.array(dtype=types(dtype)[0])
-        step: wp.array(dtype=wp.int32)
-        drift: dtype
+        near: wp.array(dtype=wp.int32)
+        before: wp.array(dtype=wp.int32)
+        some: wp.array(dtype=wp.int32)
+        followed: wp.array(dtype=wp.int32)
         distance: dtype
 
-    return Balls
+    return Clearances
 
 
 @cache
 def near_colliders(dtype, ended: bool):
-    """Kernel over vertices: near = 1 if a vertex may come within the contact distance of a collider in a step.
+    """Kernel over vertices: due = 1 if a vertex may come near a collider in a step.
 
-    Before steps of duration h, together, a vertex is assumed to move by twice its prediction, 2‖h v + h² g‖, and x, v and
-    ``step`` are saved. After a step (``ended``), it moved from ``x`` to ``end``. The distance from x to the colliders decides.
-    A ball that contains the motion makes this distance unnecessary. When one vertex is near, the others are skipped.
+    At the start of a step the motion is the prediction h v + h² g, and the contact distance further, because what refreshes
+    contact looks so far. due is also 1 if a copy was near before, so that a refresh leaves anchors and half-spaces behind. When
+    one vertex of a copy is near, the others are skipped. After a step (``ended``), a vertex moved from x to ``end``.
     """
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)
@@ -54,41 +55,37 @@ def near_colliders(dtype, ended: bool):
         v: wp.array(dtype=vec3),
         end: wp.array(dtype=vec3),
         poses: step_poses(dtype),
-        step: wp.array(dtype=wp.int32),
         # parameters
         per_copy: int,
         h: dtype,
         # in and out
-        clear: balls(dtype),
-        near: wp.array(dtype=wp.int32),
+        clear: clearances(dtype),
+        due: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
         copy = i // per_copy
-        x0 = x[i]
-        now = step[copy]
-        if wp.static(not ended):
-            clear.x[i] = x0
-            clear.v[i] = v[i]
-            if i == copy * per_copy:
-                clear.step[copy] = now
-        if near[0] != 0:
-            return
-        way = clear.drift
         if wp.static(ended):
-            way += wp.length(end[i] - x0)
+            if due[0] != 0:
+                return
+            way = wp.length(end[i] - x[i])
         else:
-            way += dtype(2.0) * h * wp.length(v[i] + h * gravity[i // per_gravity])
+            if i == copy * per_copy and wp.max(clear.before[copy], clear.followed[0]) != 0:
+                due[0] = 1
+            if clear.near[copy] != 0:
+                return
+            way = h * wp.length(v[i] + h * gravity[i // per_gravity]) + clear.distance
         ball = clear.balls[i]
-        off = wp.length(x0 - vec3(ball[0], ball[1], ball[2])) + clear.drift * dtype(wp.abs(now - clear.found[i]))
-        if not (off + way <= ball[3]):
+        if not (wp.length(x[i] - vec3(ball[0], ball[1], ball[2])) + way <= ball[3]):
             radius = dtype(wp.inf)
             for c in range(shape.radius.shape[0]):
-                d, _n = gap(shape, c, to_local(poses.before[copy, c], x0))
+                d, _n = gap(shape, c, to_local(poses.before[copy, c], x[i]))
                 radius = wp.min(radius, d)
-            radius -= clear.distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(x0))
-            clear.balls[i] = ball_type(x0[0], x0[1], x0[2], radius)
-            clear.found[i] = now
+            radius -= clear.distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(x[i]))
+            clear.balls[i] = ball_type(x[i][0], x[i][1], x[i][2], radius)
             if not (way <= radius):
-                near[0] = 1
+                due[0] = 1
+                if wp.static(not ended):
+                    clear.near[copy] = 1
+                    clear.some[0] = 1
 
     return find

@@ -191,7 +191,7 @@ def find_motion(dtype):
 
 @cache
 def compare_motions(dtype):
-    """Kernel over pieces: moved, some and due as in :func:`find_motion`, if the piece and a later one of its copy may be too near.
+    """Kernel over pieces: moved, some and due as in :func:`find_motion`, if it and a later one of its copy may be too near.
 
     That is, if their approach may exceed ``most`` plus the excess of the distance of their boxes over ``radius``, up to which
     pairs are listed.

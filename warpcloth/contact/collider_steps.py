@@ -16,6 +16,7 @@ from ..kernels.contact.mesh_filter import filter_meshes
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..terms.refresh import STEP, Refresh
+from .clearance import Clearance
 from .face_steps import FaceSteps
 from .mesh_faces import MeshFaces
 from .mesh_steps import MeshSteps
@@ -51,6 +52,7 @@ class ColliderSteps:
         shapes: A :func:`warpcloth.kernels.contact.colliders.shapes`.
         anchors: The anchors of friction, by the index of each collider with friction. They are rows of ``anchor_rows`` (C, N).
         least: The smallest distance from a collider at which a vertex may end a step [m].
+        near: See :class:`warpcloth.contact.clearance.Clearance`; None if all steps refresh contact.
         faces: :class:`warpcloth.contact.mesh_faces.MeshFaces` that keeps triangles from crossing meshes, or None.
         face_steps: :class:`warpcloth.contact.face_steps.FaceSteps` of the pairs of triangles and meshes, or None.
         face_anchors: Anchors of the friction of triangles on each mesh that has it, (B, E) by its index.
@@ -107,6 +109,10 @@ class ColliderSteps:
             self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(hold_locked, model.dtype)
             self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
         self._finds_clear = model.device.is_cpu and not (self.bounded or resting)
+        self._clearance = None
+        if not (self.bounded or resting or any(declared.moves)):
+            self._clearance = Clearance(self, state, self.faces is not None)
+        self.near = None if self._clearance is None else self._clearance.near
         self.terms = []
         for elements in model.terms:
             c = elements.collider
@@ -135,7 +141,7 @@ class ColliderSteps:
             launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype, declared.solids), c, state.v)
         else:
             launch = None
-        refresh = Refresh(STEP, partial(self._refresh, first, launch))
+        refresh = Refresh(STEP, partial(self._refresh, first, launch, state.v))
         clear = None
         if self._finds_clear:
             clear = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
@@ -155,19 +161,27 @@ class ColliderSteps:
 
         def launch_on_faces(_model, elements, _moment):
             with self._kept(anchors, self._face_spares.get(elements.collider)):
-                launch(elements, elements.refresh.arrays, self.x_before, state.v)
+                self._launch_if_near(partial(launch, elements, elements.refresh.arrays, self.x_before, state.v))
 
         return Refresh(STEP, launch_on_faces, self.face_steps.arrays(elements))
 
-    def _refresh(self, first, launch, model, elements, moment):
+    def _refresh(self, first, launch, v, model, elements, moment):
         """Launches what the start of a step needs. The first of the terms also moves the colliders, once for all terms."""
         if first:
             self.launch_move()
             if self.meshes is not None:
                 self.meshes.launch_trees()
             wp.copy(self.x_before, moment.x)
+            if self._clearance is not None:
+                self._clearance.launch_begin(self.x_before, v)
         if launch is not None:
-            launch(model, elements)
+            self._launch_if_near(partial(launch, model, elements))
+
+    def _launch_if_near(self, launch):
+        if self._clearance is None:
+            launch()
+        else:
+            self._clearance.launch_refresh(launch)
 
     def _on_mesh(self, launch, anchors, v, model, elements):
         with self._kept(anchors, self._spare):
@@ -206,17 +220,12 @@ class ColliderSteps:
             self._reads = False
 
     def follow(self):
-        """Allocates what :meth:`reading_anchors` needs."""
+        """Allocates what :meth:`reading_anchors` needs, and makes all steps refresh contact."""
+        if self._clearance is not None:
+            self._clearance.follow()
         if self._spare is None:
             self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
             self._face_spares = {c: wp.zeros_like(anchors) for c, anchors in self.face_anchors.items()}
-
-    def launch_release(self):
-        """Launches the removal of all anchors, for a step without contact."""
-        if self.anchors:
-            self.anchor_rows.zero_()
-        for anchors in self.face_anchors.values():
-            anchors.zero_()
 
     def launch_move(self):
         """Launches the computation of the poses of colliders at the start of a step."""
@@ -245,6 +254,14 @@ class ColliderSteps:
 
     def launch_end(self, x, v, move=None):
         """Moves vertices that would end in a collider, or cross one, out of it; corrects x, v and ``move``, (N,)."""
+        if self._clearance is None:
+            self._launch_end(x, v, move)
+        else:
+            self._clearance.launch_end(self.x_before, x, partial(self._launch_end, x, v, move))
+        if not self._again:
+            self.launch_count()
+
+    def _launch_end(self, x, v, move):
         model = self.model
         if model.mobility is not None:
             for wanted, array in zip(self._wanted, (x, v), strict=True):
@@ -255,8 +272,6 @@ class ColliderSteps:
             self._launch_filter(self._fixed, x, v, move, self.notes)
         if self.faces is not None:
             self.faces.launch_end(self.x_before, x, v, move, self.notes)
-        if not self._again:
-            self.launch_count()
 
     def _launch_filter(self, inverse_mass, x, v, move, notes):
         model = self.model

@@ -41,13 +41,12 @@ class State:
         starts: Initial values by name, for arrays that start neither at 0 nor from the model.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,).
-        lent: Arrays of another state by name, which :meth:`add` uses in place of the given ones.
         counts: Arrays that count steps, by name: a :class:`Count` of each.
     """
 
     def __init__(self, x, v, batch_size, shares=()):
         self.arrays, self.starts, self.shares, self.parts = {"x": x, "v": v}, {}, tuple(shares), {}
-        self.lent, self.counts = {}, {}
+        self.counts = {}
         self._results, self._residual = [Result.COMPLETED] * batch_size, np.zeros(batch_size)
 
     @property
@@ -83,7 +82,7 @@ class State:
         return iter((self.x, self.v))
 
     def add(self, name, array, count=None):
-        """Registers an array that is 0 at the start, and returns it, or the array that is lent in its place; ignores None.
+        """Registers an array that is 0 at the start, and returns it; ignores None.
 
         Args:
             name: Its name.
@@ -91,7 +90,7 @@ class State:
             count: The :class:`Count` of an array whose values depend on the number of steps, or None.
         """
         if array is not None:
-            array = self.arrays[name] = self.lent.get(name, array)
+            self.arrays[name] = array
             if count is not None:
                 self.counts[name] = count
         return array

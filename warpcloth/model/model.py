@@ -216,12 +216,6 @@ class Model:
         other.dynamic = tuple(dynamic)
         return other
 
-    def without_colliders(self):
-        """Returns a model without colliders and contact that shares all else."""
-        other = self.with_terms(elements for elements in self.terms if elements.collider is None).with_dynamic(())
-        other.colliders = None
-        return other
-
     def refresh(self, when, moment, terms=None):
         """Updates loads and the rest states of terms, or those of ``terms`` alone, see :mod:`warpcloth.terms.refresh`.
 

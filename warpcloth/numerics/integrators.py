@@ -141,10 +141,8 @@ class BDF2(Euler):
     def start(self):
         """Computes the past state by two Euler steps of hₑ, which are steps with x₋₁ = x₀ and v₋₁ = v₀, and restores x and v.
 
-        The results of these steps count like those of other steps. A twin shares the past state of its lead.
+        The results of these steps count like those of other steps.
         """
-        if self.stepper.lead is not None:
-            return
         stepper, model, (x, v) = self.stepper, self.stepper.model, self.stepper.state
         for _ in range(2):
             self.move.zero_()

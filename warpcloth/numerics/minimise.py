@@ -29,19 +29,22 @@ def _resembles_the_last_step(model):
     """Whether the correction of a step is a good start of the next one.
 
     After an impact it is not: long midpoint steps would gain energy. In rigid clusters of 1e12 N/m its rounding would hide the
-    descent. Steps far from contact start as those with contact do.
+    descent.
     """
     touches = model.scene.self_contact is not None or model.colliders is not None
     return not touches and all(elements.cells is None for elements in model.terms)
 
 
-def _free_axes(model):
+def _free_axes(model, near):
     """Returns which axes are those of moves of the whole cloth that change no energy, (3,) booleans.
 
-    Terms with stencils of one vertex, contact with colliders and air hold the cloth in space; so do pins and locks, by axes.
+    Terms with stencils of one vertex and air hold the cloth in space; so do pins and locks, by axes, and contact with colliders
+    where copies may be ``near``, or everywhere if that is None.
     """
     held = (
-        elements.collider is not None or elements.term is AIR or (elements.term.vertices == 1 and not elements.cells)
+        near is None
+        if elements.collider is not None
+        else elements.term is AIR or (elements.term.vertices == 1 and not elements.cells)
         for elements in model.terms
     )
     return (model.coordinate_mobility().reshape(-1, 3) > 0.0).all(axis=0) & (not any(held))
@@ -59,6 +62,7 @@ class Minimiser:
         s: Weight of the inertia, 1/h² [1/s²].
         linear_iterations: Maximum number of iterations of a conjugate gradient solve.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter bounds steps; or None.
+        near: 1 for copies that may come near colliders in a step, (B,) int32 on the device; None if all may.
         last: The array for d (N,) [m], which holds that of the last step. Without contact a descent starts there if φ is lower
             than at d = 0. None: every descent starts from d = 0. With pairs a descent starts where
             :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says.
@@ -70,8 +74,8 @@ class Minimiser:
         iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
 
-    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, last=None):
-        self.model, self.base, self.pairs = model, base, pairs
+    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, near=None, last=None):
+        self.model, self.base, self.pairs, self._near = model, base, pairs, near
         self.warm = last is not None and _resembles_the_last_step(model)
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
@@ -90,7 +94,7 @@ class Minimiser:
         self.resolution = 4.0 * float(np.finfo(np.float64).eps)  # of energies, whatever the precision of the model
         self._allocate_progress()
         self._inverse_total = None
-        axes = _free_axes(model)
+        axes = _free_axes(model, near)
         if axes.any():
             total = model.mass.numpy().astype(np.float64).reshape(model.copies, -1).sum(axis=1)
             self._inverse_total = wp.array(axes / total[:, None], dtype=wp.vec3d, device=model.device)
@@ -286,7 +290,7 @@ class Minimiser:
         size = [self.model.per_copy, lanes.count]
         given = [self.model.mass, search.correction, direction, *size]
         self._launch(kernels.mean_parts, lanes.dim, given, [self._moments])
-        self._launch(kernels.take_mean, lanes.dim, [self._inverse_total, self._moments, *size], [direction])
+        self._launch(kernels.take_mean, lanes.dim, [self._inverse_total, self._near, self._moments, *size], [direction])
 
     def _launch_search(self):
         self._launch_mean(self.search.direction)

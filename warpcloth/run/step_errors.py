@@ -227,9 +227,7 @@ class _Residuals(_Stored):
 
     def _prepare(self):
         stepper, model = self.stepper, self.model
-        clear = stepper.clear_steps
-        self._far = None if clear is None else _Step(clear.twin, self)
-        self._near, self._is_near = _Step(stepper, self), None if clear is None else Mirror(clear.near)
+        self._taken = _Step(stepper, self)
         self.residual, self.weighted, self.moved = (model.vectors() for _ in range(3))
         self.kernels = model.launcher(((kernels.add_moves, kernels.finish_residual), model.dtype))
         self.keep = model.kernel(keep_largest)
@@ -245,10 +243,7 @@ class _Residuals(_Stored):
         return he**2 * bound, energies
 
     def _launch_bound(self):
-        if self._far is None:
-            self._near.launch()
-        else:
-            wp.capture_if(self._is_near.array, self._near.launch, self._far.launch)
+        self._taken.launch()
 
     def launch_sums(self, first):
         """Launches the largest ‖rᵢ‖/mᵢ; with ``first`` also Σ ‖rᵢ‖²/mᵢ."""
@@ -280,20 +275,14 @@ class _Residuals(_Stored):
             bound: Of the distance, (B,) [m].
             counts: The frames in a row in which contact of each vertex was not resolved, (N,) int32, to be updated.
         """
-        taken = self._taken
-        if (bound > 0.5 * taken.contact_distance).any():  # no smaller residual unbalances half of such a force
-            return taken.unresolved(counts)
+        if (bound > 0.5 * self._taken.contact_distance).any():  # no smaller residual unbalances half of such a force
+            return self._taken.unresolved(counts)
         counts.zero_()
         return np.zeros(len(bound), dtype=bool)
 
-    @property
-    def _taken(self):
-        """The :class:`_Step` of the last step."""
-        return self._near if self._is_near is None or self._is_near.read()[0] else self._far
-
 
 class _Step:
-    """φ of the steps of a stepper, or of its twin without contact.
+    """φ of the steps of a stepper.
 
     Args:
         stepper: The stepper.

@@ -184,7 +184,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._move()
         self._stuck = self._stepped.read() == 0.0
 
-    def multiplier_forces(self, collider=None):
+    def constraint_forces(self, collider=None):
         """See :meth:`Stepper.constraint_forces`: adds −Jᵀλ/hₑ², from M(x − x̃) = Jᵀλ."""
         model, constraints = self.model, self.constraints
         of_terms = [part for part in constraints.parts if part.elements is not None]

@@ -334,11 +334,8 @@ class ErrorStepper(Stepper):
         of = self.reported.steps_per_frame
         return [(copy, c, step * self.steps_per_frame // of, *rest) for copy, c, step, *rest in self.reported.inside]
 
-    def multiplier_forces(self, collider=None):
+    def constraint_forces(self, collider=None):
         raise ValueError(
             "error is given, with which neither the forces of terms with infinite stiffness nor the reactions of their pins "
             "are known; take dt or substeps, or a finite stiffness"
         )
-
-    def constraint_forces(self, collider=None):
-        return self.multiplier_forces(collider)

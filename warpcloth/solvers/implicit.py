@@ -20,10 +20,7 @@ class ImplicitStepper(Stepper):
         self.iterations = 0
 
     def ready(self):
-        """Captures the graph of the end of a step, makes a twin, and starts the integrator, which may step."""
-        self.find_twin()
-        if self.clear_steps is not None:
-            self.clear_steps.record()
+        """Captures the graph of the end of a step, and starts the integrator, which may step."""
         self._record_end()
         self.integrator.start()
 
@@ -33,14 +30,9 @@ class ImplicitStepper(Stepper):
     def follow_contact(self):
         super().follow_contact()
         self._record_end()
-        if self.clear_steps is not None:
-            self.clear_steps.record()
 
     def step(self):
-        if self.clear_steps is None:
-            self.take(self._iterate)
-        else:
-            self.clear_steps.step(lambda: self.take(self._iterate))
+        self.take(self._iterate)
 
     def _iterate(self):
         ended = self.minimise()

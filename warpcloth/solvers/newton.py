@@ -105,7 +105,8 @@ class NewtonStepper(ImplicitStepper):
         super().__init__(options, model)
         model = self.model
         last = self.state.add("correction", model.vectors())
-        given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "last": last}
+        near = None if self.colliders is None else self.colliders.near
+        given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "near": near, "last": last}
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, **given)
         self.correction, self._scale = self.minimiser.correction, ResidualScale(model).acceleration
         self._predict = Segment(model.device, self.launch_prediction)

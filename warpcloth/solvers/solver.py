@@ -16,7 +16,6 @@ from ..kernels import step as kernels
 from ..model.damping import damped_terms
 from ..numerics.integrators import INTEGRATORS
 from ..terms.refresh import STEP
-from .clear_steps import ClearSteps
 
 
 class Stepper:
@@ -53,8 +52,6 @@ class Stepper:
     even = True
     uniform = False  # whether all steps have the same number of iterations
     _motion = None  # x and v, if they are views of those of another stepper, see `part_of`
-    lead = None  # for a twin without contact, the stepper whose state it shares, see `find_twin`
-    clear_steps = None  # the TwinSteps of a stepper with a twin
     predicted = correction = unfiltered = None
 
     def __init_subclass__(cls, **options):
@@ -68,8 +65,6 @@ class Stepper:
         self.h = 1.0 / (fps * self.steps_per_frame)
         motion = self._motion or (wp.clone(model.positions), wp.clone(model.velocities))
         self.state = State(*motion, model.copies)
-        if self.lead is not None:
-            self.state.lent = self.lead.state.arrays
         self.count = self.state.add("steps of keyframes", model.scalars(wp.int32) if model.timed else None, Count())
         self._reset = None
         self.integrator, self.he = None, self.h
@@ -79,7 +74,7 @@ class Stepper:
             self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
             self.model = model = model.with_terms(self.colliders.terms)
         self.pairs, self._kept = None, None
-        if model.scene.self_contact is not None and self.lead is None:
+        if model.scene.self_contact is not None:
             self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
             self.model = model = model.with_dynamic(self.pairs.forces.terms)
         if integrator is not None:
@@ -87,7 +82,7 @@ class Stepper:
             self.he = self.integrator.he
             self.model = model.with_terms(damped_terms(model, self.he))
             self.elements = self.model.terms
-            self.predicted = model.vectors() if self.lead is None else self.lead.predicted
+            self.predicted = model.vectors()
             if self.colliders is not None or self.pairs is not None:
                 self.unfiltered = model.vectors()
 
@@ -98,18 +93,6 @@ class Stepper:
         stepper._motion = motion
         stepper.__init__(options, model)
         return stepper
-
-    def find_twin(self):
-        """Makes a twin for steps without contact, if there are colliders and the residual of the twin has the same meaning."""
-        model = self.declared
-        if self.pairs is not None or model.colliders is None:
-            return
-        if self.options.residual_on(model) != self.options.residual_on(model.without_colliders()):
-            return
-        twin = type(self).__new__(type(self))
-        twin._motion, twin.lead = tuple(self.state), self
-        twin.__init__(self.options, model.without_colliders())
-        self.clear_steps = ClearSteps(self, twin)
 
     @property
     def results(self):
@@ -153,8 +136,7 @@ class Stepper:
         The motion does not change. Call it before reading these from :attr:`colliders`, and take steps one by one.
         """
         self.colliders.note_pushes()
-        if self.clear_steps is not None:
-            self.clear_steps.follow()
+        self.colliders.follow()
 
     def launch_pins(self, parts=1):
         """Launches the move of pins with keyframes by h/``parts``; all calls must have the same ``parts``."""
@@ -201,13 +183,6 @@ class Stepper:
         Raises:
             ValueError: The method has no multipliers.
         """
-        touching = self.multiplier_forces(collider)
-        if self.clear_steps is None:
-            return touching
-        return self.clear_steps.constraint_forces(touching, self.clear_steps.twin.multiplier_forces(collider))
-
-    def multiplier_forces(self, collider=None):
-        """See :meth:`constraint_forces`; for steps that its twin did not take."""
         raise ValueError(
             f"{type(self.options).__name__} has no multipliers, so the forces of terms with infinite stiffness and the "
             "reactions of pins are not known; take XPBD or ConstrainedDynamics, or a finite stiffness"
@@ -345,18 +320,12 @@ class LaunchedStepper(Stepper):
             parts: Pairs (function, number of calls). The function launches the share of the thread of the pool that calls it.
         """
         self.parts = [(launch, times) for launch, times in parts if times]
-        if self.lead is not None:
-            return  # which records both
-        if self.integrator is not None and self.pool.threads == 1:
-            self.find_twin()
         self._record_step()
 
     def _record_step(self):
-        launches, self._taken = self.model.launches, self.parts
-        if self.clear_steps is not None:
-            self._taken = self.clear_steps.parts(self.parts)
+        launches = self.model.launches
         self._step, self._frame, self._size = [], None, 0
-        for launch, times in self._taken:
+        for launch, times in self.parts:
             before = launches[0]
             self._step.append((self._segments(launch), times))
             self._size += (launches[0] - before) // self.pool.threads * times
@@ -373,15 +342,13 @@ class LaunchedStepper(Stepper):
     def launch_steps(self, steps):
         """Launches this number of steps."""
         for _ in range(steps):
-            for launch, times in self._taken:
+            for launch, times in self.parts:
                 for _ in range(times):
                     launch()
 
     def _record_frame(self):
         """Captures the segments of a frame, on first use, and returns them with the number of replays of each."""
         steps = self.steps_per_frame
-        if self.clear_steps is not None and self.clear_steps.several(steps, self._size):
-            return [(self._segments(lambda: self.clear_steps.launch_several(self.parts, steps)), 1)]
         chunk = min(steps, LAUNCHES // max(self._size, 1))
         if chunk < 2:
             return self._step * steps

@@ -195,7 +195,7 @@ class XPBDStepper(LaunchedStepper):
         given = [self.model.mass, self.sweep.correction, sign / self.he**2]
         self.model.launch(self._add_momentum, self.model.count, given, [self._force])
 
-    def multiplier_forces(self, collider=None):
+    def constraint_forces(self, collider=None):
         """See :meth:`Stepper.constraint_forces`: adds −Gᵀλ/hₑ², as M(x − x̃) = Gᵀλ holds after any number of sweeps."""
         model, pulls = self.model, []
         for elements, values, key in self.sweep.with_multipliers():

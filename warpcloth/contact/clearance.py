@@ -1,0 +1,75 @@
+"""The test whether a step may come near colliders that stand, without which their contact is neither refreshed nor filtered."""
+
+import numpy as np
+import warp as wp
+
+from ..kernels.contact.clearance import clearances, near_colliders
+from ..kernels.contact.colliders import shapes
+
+# How far edges may be stretched, at most, where triangles far from the meshes among the colliders are told by their vertices.
+STRETCHED = 4.0
+
+
+class Clearance:
+    """Tells the steps in which vertices may come near a collider. In all others contact has no force, and the filter no effect.
+
+    A step after one that came near also refreshes contact, which then leaves the anchors of friction and half-spaces behind.
+
+    Args:
+        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`.
+        state: The :class:`warpcloth.core.state.State` of the solver.
+        triangles: Whether triangles of the cloth, not only vertices, have contact with meshes.
+
+    Attributes:
+        near: 1 for copies in which a vertex may come near a collider in this step, else 0, (B,) int32.
+    """
+
+    def __init__(self, colliders, state, triangles):
+        self._colliders, self.model = colliders, colliders.model
+        model, device = self.model, self.model.device
+        self._clear = clear = clearances(model.dtype)()
+        clear.before, clear.near = state.add("near colliders", model.scalars(wp.int32)), model.scalars(wp.int32)
+        # Rest states may also be those near colliders because the state was set to another one.
+        clear.some = wp.full(1, 1, dtype=wp.int32, device=device)
+        clear.followed, self._due, self._ended = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
+        self.near, clear.distance = clear.near, model.colliders.distance
+        balls = np.zeros((model.count, 4))
+        balls[:, 3] = -1.0
+        if model.pins is None:
+            balls[model.inverse_mass.numpy() == 0.0, 3] = np.inf  # pins may stand near
+        clear.balls = model.array(balls, wp.types.vector(4, model.dtype))
+        halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
+        if triangles:
+            # Points of a triangle are no farther from one of its vertices than its longest edge over √3.
+            max_length = STRETCHED / np.sqrt(3.0) * float(model.scene.mesh.edge_lengths.max())
+            bounding = np.array(bounding) + [max_length if collider.facets else 0.0 for collider in model.scene.colliders]
+        self._bounds = shapes(model.dtype)()
+        self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
+        self._finds = [model.kernel(near_colliders, model.dtype, ended) for ended in (False, True)]
+
+    def follow(self):
+        """Makes all steps refresh contact, because others read it."""
+        self._clear.followed.fill_(1)
+
+    def launch_begin(self, x, v):
+        """Launches the test at the start of a step at x with v, (N,)."""
+        wp.copy(self._due, self._clear.some)
+        self._clear.some.zero_()
+        self.near.zero_()
+        self._find(False, x, v, None, self._due)
+        wp.copy(self._clear.before, self.near)
+
+    def launch_refresh(self, launch):
+        """Calls ``launch`` if the step refreshes contact."""
+        wp.capture_if(self._due, launch)
+
+    def launch_end(self, x, end, launch):
+        """Calls ``launch`` if a vertex may have come near a collider on its way from x to ``end`` (N,)."""
+        wp.copy(self._ended, self._due)
+        self._find(True, x, None, end, self._ended)
+        wp.capture_if(self._ended, launch)
+
+    def _find(self, ended, x, v, end, due):
+        colliders, model = self._colliders, self.model
+        given = [self._bounds, *model.free_gravity, x, v, end, colliders.poses, model.per_copy, colliders.h]
+        model.launch(self._finds[ended], model.count, given, [self._clear, due])
