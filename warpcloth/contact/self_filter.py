@@ -132,15 +132,12 @@ class SelfFilter:
         self._rounds.zero_()
         self._cuts.zero_()
         self._walking.fill_(1)
-        self._launch_walk(x)
+        self._proceed.fill_(1)
         wp.capture_while(self._proceed, self._launch_round, x=x)
 
     def _launch_round(self, x):
-        self.launch_fresh(x, self._contact.relist, self._walking)
-        self._launch_walk(x)
-
-    def _launch_walk(self, x):
         model = self.model
+        self.launch_fresh(x, self._contact.relist, self._walking)
         self._launch_planes(x, self._target)
         self._launch_apart(x, self._target)
         self._proceed.zero_()
@@ -216,7 +213,7 @@ class SelfFilter:
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 
     def launch_start(self, base, d):
-        """Sets d so that base + d is base if pairs stay apart on the way there, else the start of the step; lists its pairs.
+        """Sets d so that base + d is base if pairs stay apart on the way there, else the start of the step.
 
         Pins with keyframes are at base in any case: cloth follows them from the start of the step as far as pairs stay apart.
         Vertices stop at the contact distance of colliders. Inside a collider contact is so stiff that a descent would take many
@@ -234,7 +231,6 @@ class SelfFilter:
         self.launch_limit(direction, whole=True)
         self._add(x, base, -1.0, d)
         self._add(d, direction, 1.0, d)
-        self.launch_trial(base, d)
 
     def launch_between(self, base, before, d):
         """Moves d towards ``before`` (N,), whose pairs are listed, so that pairs stay apart on the way to base + d."""

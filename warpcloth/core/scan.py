@@ -23,6 +23,7 @@ class Scan:
     def launch(self, values, out):
         """Launches out (n+1,) = the sum of the values (n,) before each, and the sum of all."""
         chunks = len(self._sums)
-        self._launch(scan.sum_chunks, chunks, [values, self._size], [self._sums])
-        self._launch(scan.add_chunks, 1, [], [self._sums])
+        if chunks > 1:  # else 0 comes before the only one
+            self._launch(scan.sum_chunks, chunks, [values, self._size], [self._sums])
+            self._launch(scan.add_chunks, 1, [], [self._sums])
         self._launch(scan.write_sums, chunks, [values, self._sums, self._size], [out])

@@ -205,6 +205,7 @@ class Stepper:
             correction.zero_()
         else:
             self.pairs.filter.launch_start(self.state.x, correction)
+            self.pairs.filter.launch_trial(self.state.x, correction)
 
     def launch_finish(self, correction):
         """Launches x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser (N,) [m]."""
