@@ -4,6 +4,7 @@ from functools import cache
 
 import warp as wp
 
+from ..memory import load
 from ..vectors import types
 from .proximity_grid import MODULE
 
@@ -187,6 +188,50 @@ def find_motion(dtype):
                     wp.atomic_max(pieces.motion, p, own)
 
     return find_each_motion
+
+
+@cache
+def find_motion_of_pieces(dtype):
+    """Kernel over copies of one piece each, for the CPU: :func:`find_motion` by a loop without branches."""
+    vec3, _ = types(dtype)
+    vector = load(vec3)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def find_motion_of_each_piece(
+        # state in
+        x: wp.array(dtype=vec3),
+        found: wp.array(dtype=vec3),
+        listed: wp.array(dtype=vec3),
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        most: dtype,
+        per_copy: int,
+        # in and out
+        pieces: pieces(dtype),
+        # out
+        moved: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
+        due: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        drift = pieces.drift[copy]
+        moving = per_copy
+        other = per_copy
+        i = copy * per_copy
+        end = i + per_copy
+        while i < end:
+            at_list = vector(found, i)
+            own = vector(x, i) - at_list - drift
+            apart = at_list - vector(listed, i)
+            moving -= wp.where(wp.dot(own, own) <= most * most, 1, 0)
+            other -= wp.where(wp.dot(apart, apart) <= dtype(0.0), 1, 0)
+            i += 1
+        if other != 0:
+            due[0] = 1
+        if moving != 0:
+            note_moved(active, copy, moved, some, due)
+
+    return find_motion_of_each_piece
 
 
 @cache

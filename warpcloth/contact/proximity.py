@@ -60,6 +60,7 @@ class Proximity:
         self._along.distance = self._along.skin = 0.0
         self._allocate_grid()
         self._set_pieces(piece)
+        self._whole = model.device.is_cpu and self._pieces.per_copy == 1 and (piece >= 0).all()
         self._shares = 8 if model.device.is_cuda else 1
         self.found = model.vectors()  # all 0, so that the first call makes a list
         self.listed = model.vectors()
@@ -71,6 +72,7 @@ class Proximity:
             ((proximity_grid.count_items, proximity_grid.fill_buckets, kernels.fill_rows, kernels.write_pairs), model.dtype),
             ((piece_motion.begin_boxes, piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.take_moved), model.dtype),
+            ((piece_motion.find_motion_of_pieces,), model.dtype),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
@@ -257,8 +259,12 @@ class Proximity:
         if several:
             self._pieces.motion.zero_()
         self.launch_drift(x)
-        given = [x, self.found, self.listed, active, part * self.skin]
-        self._launch(piece_motion.find_motion, self.model.count, given, [self._pieces, self.copies, flag, self._due])
+        given, out = [x, self.found, self.listed, active, part * self.skin], [self._pieces, self.copies, flag, self._due]
+        if self._whole:
+            given.append(self.model.per_copy)
+            self._launch(piece_motion.find_motion_of_pieces, self.model.copies, given, out)
+        else:
+            self._launch(piece_motion.find_motion, self.model.count, given, out)
         if several:
             wp.capture_if(self._due, lambda: self._launch_boxes(self.found))
             given = [self._pieces, active, self.distance + self.skin, 2.0 * part * self.skin]
