@@ -48,7 +48,7 @@ def touching(name):
     """Texts by frame: the fraction of vertices nearer to a collider than the contact distance, and pairs of self-contact."""
     given, frames = SCENES[name]
     scene = SceneRef(*given).load()
-    record = ("pairs",) if scene.self_contact else ()
+    record = ("pairs",) if scene.has_pairs else ()
     found = wc.simulate(scene, wc.Newton(substeps=32, integrator="bdf2"), dtype="float64", frames=frames, record=record)
     near = np.zeros(found.points.shape[:2], dtype=bool)
     for collider in scene.colliders:

@@ -295,13 +295,10 @@ def row_norms(dtype):
 
 @cache
 def constant_blocks(term: Term, dtype):
-    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ wᵢ·wⱼ [N/m], the blocks of kAGᵀG, in double precision.
-
-    If weights change during a run, they are those of ``any_weight``.
-    """
-    K, M = wp.constant(term.vertices), wp.constant(term.vertices if term.any_weight else term.rows)
+    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ wᵢ·wⱼ [N/m], the blocks of kAGᵀG, in double precision."""
+    K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
-    weight, measure = term.any_weight or term.weight, term.measure
+    weight, measure = term.weight, term.measure
 
     @wp.kernel(module="unique", enable_backward=False)
     def blocks_of_weights(

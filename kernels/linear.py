@@ -6,11 +6,10 @@ copies. ``active[copy]`` is 1 while that copy iterates.
 Kernels that always run together share a module, which compiles faster. Conjugate gradients take vector unknowns with 3×3
 preconditioner blocks, or with ``numbers`` scalar ones.
 
-An iteration of conjugate gradients has three launches over (copies, lanes). A lane takes every lanes-th unknown of its copy. On
-CUDA each unknown has a lane, up to a limit, and blocks of ``block`` threads store their part of a scalar product. The next
-launch adds the parts of a copy, in each of its blocks. The CPU has one lane, and ``block`` is 0. So sums have a fixed order.
-No thread reads what another thread of the same launch writes for a copy; the next launch finds it in ``next_active`` and
-``next_rz``.
+An iteration of conjugate gradients has two launches over (copies, lanes), one for the direction and its product, one for the
+rest. A lane takes every lanes-th unknown of its copy. On CUDA each unknown has a lane, up to a limit, and blocks of ``block``
+threads store their part of a scalar product. The next launch adds the parts of a copy, in each of its blocks. The CPU has one
+lane, and ``block`` is 0. So sums have a fixed order.
 """
 
 from functools import cache
@@ -18,8 +17,9 @@ from typing import Any
 
 import warp as wp
 
+from .block_rows import block_rows, lanes_of_rows, product_of_row, symmetric_product
 from .memory import load
-from .reduce import block_largest, block_sums, larger
+from .reduce import block_largest, block_sums, larger, sum_of_lanes
 from .rotation import epsilon
 from .vectors import types
 
@@ -272,8 +272,11 @@ def _unknowns(dtype, numbers):
 class Solves:
     """The conjugate gradients of each copy, (B,) arrays, and of all, (1,).
 
-    ``rz`` is rᵀz, ``first`` its first value, ``pq`` pᵀAp; ``negative`` is 1 after a direction of negative curvature.
-    ``iteration`` counts iterations from 1, up to ``most``; ``proceed`` is 1 if a copy is active.
+    ``rz`` is rᵀz, ``first`` its first value; ``negative`` is 1 after a direction of negative curvature. ``iteration`` counts
+    iterations from 1, up to ``most``; ``proceed`` is 1 if a copy is active.
+
+    A launch that turns directions writes the values ``next``, from which the launch that advances takes them over. So no
+    thread reads what another one of the same launch writes.
     """
 
     active: wp.array(dtype=wp.int32)
@@ -282,9 +285,9 @@ class Solves:
     rz: wp.array(dtype=wp.float64)
     next_rz: wp.array(dtype=wp.float64)
     first: wp.array(dtype=wp.float64)
-    pq: wp.array(dtype=wp.float64)
     tolerance: wp.array(dtype=wp.float64)
     iteration: wp.array(dtype=wp.int32)
+    next_iteration: wp.array(dtype=wp.int32)
     most: wp.array(dtype=wp.int32)
     proceed: wp.array(dtype=wp.int32)
 
@@ -304,20 +307,37 @@ def scalar_product(numbers: bool):
 
 
 @wp.func
-def begin_pass(solves: Solves, copy: int, lane: int):
-    """Takes over what the last pass wrote for the next, and returns whether the copy is active."""
+def begin_iteration(solves: Solves, copy: int, lane: int, rz: wp.float64):
+    """Begins an iteration of an active copy, or ends the copy: returns the ratio of rᵀz to that before, or −1 if it has ended.
+
+    A copy ends if √(rᵀz) has fallen to its tolerance, or after ``most`` iterations. NaN ends it too; the caller finds it in the
+    result.
+    """
+    if copy == 0 and lane == 0:
+        solves.proceed[0] = 0
+    if solves.active[copy] == 0:
+        if lane == 0:
+            solves.next_active[copy] = 0
+        return wp.float64(-1.0)
+    done = solves.iteration[copy]
+    ratio = wp.float64(0.0)
+    going = rz > wp.float64(0.0)
+    if done > 0:
+        ratio = rz / solves.rz[copy]
+        left = solves.tolerance[copy] * solves.tolerance[copy] * solves.first[copy]
+        going = rz > left and done < solves.most[0]
     if lane == 0:
-        solves.active[copy] = solves.next_active[copy]
-        solves.rz[copy] = solves.next_rz[copy]
-        if copy == 0:
-            solves.iteration[0] = solves.iteration[0] + 1
-            solves.proceed[0] = 0
-    return solves.next_active[copy] == 1
+        if done == 0:
+            solves.first[copy] = rz
+        solves.next_rz[copy] = rz
+        solves.next_active[copy] = wp.where(going, 1, 0)
+        solves.next_iteration[copy] = wp.where(going, done + 1, done)
+    return wp.where(going, ratio, wp.float64(-1.0))
 
 
 @cache
-def start_iteration(dtype, numbers: bool, block: int):
-    """Kernel over (copies, lanes): x = 0, r = b, z = P r, p = z in the copies that are ``wanted``; the parts of rᵀz."""
+def start_solves(dtype, numbers: bool, block: int):
+    """Kernel over (copies, lanes): x = 0, r = b, z = P r, p = 0 in the copies that are ``wanted``; the parts of rᵀz."""
     vector, matrix, module = _unknowns(dtype, numbers)
     store, _add_up = block_sums(block)
     multiplied = scalar_product(numbers)
@@ -346,60 +366,25 @@ def start_iteration(dtype, numbers: bool, block: int):
                 i = copy * per_copy + j
                 if wp.static(numbers):
                     x[i] = dtype(0.0)
+                    p[i] = dtype(0.0)
                 else:
                     x[i] = vector()
+                    p[i] = vector()
                 r[i] = b[i]
                 z[i] = preconditioner[i] * b[i]
-                p[i] = z[i]
                 total += multiplied(r[i], z[i])
         store(lane, total, parts, copy)
-        if copy == 0 and lane == 0:
-            solves.iteration[0] = 0
-            solves.proceed[0] = 0
-
-    return start
-
-
-@cache
-def start_copies(block: int):
-    """Kernel over (copies, lanes of one block): activates wanted copies with rᵀz > 0, and stores their rᵀz."""
-    _store, add_up = block_sums(block)
-
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def start(
-        # state in
-        parts: wp.array2d(dtype=wp.float64),
-        # parameters
-        wanted: wp.array(dtype=wp.int32),
-        # out
-        solves: Solves,
-    ):
-        copy, lane = wp.tid()
-        rz = add_up(lane, parts, copy)
         if lane == 0:
-            solves.first[copy] = rz
-            solves.next_rz[copy] = rz
+            solves.active[copy] = wanted[copy]
             solves.negative[copy] = 0
-            going = wp.where(rz > wp.float64(0.0), wanted[copy], 0)
-            solves.next_active[copy] = going
-            if going == 1:
-                solves.proceed[0] = 1
+            solves.iteration[copy] = 0
+            solves.next_iteration[copy] = 0
+            solves.first[copy] = wp.float64(0.0)
+            solves.next_rz[copy] = wp.float64(0.0)
+            if wanted[copy] == 1:
+                solves.proceed[0] = 1  # it is 0 after a solve
 
     return start
-
-
-@cache
-def begin_multiplying():
-    """Kernel over copies: begins an iteration whose product is launched by itself."""
-
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def begin(
-        # in and out
-        solves: Solves,
-    ):
-        begin_pass(solves, wp.tid(), 0)
-
-    return begin
 
 
 @cache
@@ -433,49 +418,96 @@ def dot_parts(dtype, numbers: bool, block: int):
 
 
 @cache
-def multiply_parts(dtype, block: int):
-    """Kernel over (copies, lanes): begins an iteration; q = A p in active copies, and the parts of pᵀq."""
-    vec3, mat33 = types(dtype)
-    store, _add_up = block_sums(block)
-    multiplied = scalar_product(False)
+def turn(dtype, numbers: bool, block: int):
+    """Kernel over (copies, lanes): p = z + ratio·p in the copies of which an iteration begins, see :func:`begin_iteration`."""
+    vector, _matrix, module = _unknowns(dtype, numbers)
+    _store, add_up = block_sums(block)
 
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
-    def multiply_rows_and_dot(
-        # elements
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
+    @wp.kernel(module=module, enable_backward=False)
+    def turn_directions(
         # state in
-        values: wp.array(dtype=mat33),
-        p: wp.array(dtype=vec3),
+        z: wp.array(dtype=vector),
+        parts: wp.array2d(dtype=wp.float64),
         # parameters
         per_copy: int,
         lanes: int,
         # in and out
         solves: Solves,
-        # out
-        q: wp.array(dtype=vec3),
-        parts: wp.array2d(dtype=wp.float64),
+        p: wp.array(dtype=vector),
     ):
         copy, lane = wp.tid()
-        total = wp.float64(0.0)
-        if begin_pass(solves, copy, lane):
+        ratio = dtype(begin_iteration(solves, copy, lane, add_up(lane, parts, copy)))
+        if ratio >= dtype(0.0):
             for j in range(lane, per_copy, lanes):
                 i = copy * per_copy + j
-                row = vec3()
-                for s in range(offsets[i], offsets[i + 1]):
-                    row += values[s] * p[columns[s]]
-                q[i] = row
-                total += multiplied(p[i], row)
-        store(lane, total, parts, copy)
+                p[i] = z[i] + ratio * p[i]
 
-    return multiply_rows_and_dot
+    return turn_directions
+
+
+@cache
+def turn_and_multiply(dtype, block: int, terms: int = 0):
+    """As :func:`turn`, from ``before`` to p, also q = A p and the parts of pᵀq.
+
+    On CUDA threads compute p of the neighbours of a vertex again, so that one launch does both. On the CPU ``before`` is p.
+    """
+    vec3, _ = types(dtype)
+    store, add_up = block_sums(block)
+    multiplied, lanes = scalar_product(False), lanes_of_rows(block)
+    product, sum_over = product_of_row(dtype, lanes, terms, True), sum_of_lanes(dtype, lanes)
+    symmetric = symmetric_product(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}.{terms}", enable_backward=False)
+    def turn_directions_and_multiply(
+        # elements
+        matrix: block_rows(dtype),
+        # state in
+        z: wp.array(dtype=vec3),
+        before: wp.array(dtype=vec3),
+        parts: wp.array2d(dtype=wp.float64),
+        # parameters
+        per_copy: int,
+        threads: int,
+        # in and out
+        solves: Solves,
+        # out
+        p: wp.array(dtype=vec3),
+        q: wp.array(dtype=vec3),
+        pq_parts: wp.array2d(dtype=wp.float64),
+    ):
+        copy, thread = wp.tid()
+        ratio = dtype(begin_iteration(solves, copy, thread, add_up(thread, parts, copy)))
+        total = wp.float64(0.0)
+        if ratio >= dtype(0.0):
+            if wp.static(block == 0):
+                for j in range(per_copy):
+                    i = copy * per_copy + j
+                    p[i] = z[i] + ratio * before[i]
+                symmetric(matrix, copy * per_copy, (copy + 1) * per_copy, p, q)
+                for j in range(per_copy):
+                    i = copy * per_copy + j
+                    total += multiplied(p[i], q[i])
+            else:
+                lane = thread % wp.static(lanes)
+                for j in range(thread // wp.static(lanes), per_copy, threads // wp.static(lanes)):
+                    i = copy * per_copy + j
+                    row = sum_over(product(matrix, i, lane, z, before, ratio))
+                    if lane == 0:
+                        own = z[i] + ratio * before[i]
+                        p[i] = own
+                        q[i] = row
+                        total += multiplied(own, row)
+        store(thread, total, pq_parts, copy)
+
+    return turn_directions_and_multiply
 
 
 @cache
 def advance(dtype, numbers: bool, block: int):
     """Kernel over (copies, lanes): x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy; the parts of rᵀz.
 
-    If pᵀq ≤ 0, the first step sets x = p, and a later step leaves x. Both give a descent direction (Steihaug 1983).
+    A copy with pᵀq ≤ 0 ends. Its first iteration sets x = p, and a later one leaves x. Both give a descent direction
+    (Steihaug 1983).
     """
     vector, matrix, module = _unknowns(dtype, numbers)
     store, add_up = block_sums(block)
@@ -502,16 +534,18 @@ def advance(dtype, numbers: bool, block: int):
         copy, lane = wp.tid()
         pq = add_up(lane, pq_parts, copy)
         total = wp.float64(0.0)
-        if solves.active[copy] == 1:
-            if lane == 0:
-                solves.pq[copy] = pq
+        going = solves.next_active[copy] == 1
+        if going:
             if pq <= wp.float64(0.0):
-                if solves.iteration[0] == 1:
+                going = False
+                if solves.next_iteration[copy] == 1:
                     for j in range(lane, per_copy, lanes):
                         i = copy * per_copy + j
                         x[i] = p[i]
+                if lane == 0:
+                    solves.negative[copy] = 1
             else:
-                a = dtype(solves.rz[copy] / pq)
+                a = dtype(solves.next_rz[copy] / pq)
                 for j in range(lane, per_copy, lanes):
                     i = copy * per_copy + j
                     x[i] = x[i] + a * p[i]
@@ -519,49 +553,11 @@ def advance(dtype, numbers: bool, block: int):
                     z[i] = preconditioner[i] * r[i]
                     total += multiplied(r[i], z[i])
         store(lane, total, parts, copy)
+        if lane == 0:
+            solves.active[copy] = wp.where(going, 1, 0)
+            solves.rz[copy] = solves.next_rz[copy]
+            solves.iteration[copy] = solves.next_iteration[copy]
+            if going:
+                solves.proceed[0] = 1
 
     return advance_unknowns
-
-
-@cache
-def turn(dtype, numbers: bool, block: int):
-    """Kernel over (copies, lanes): ends the copies that are done, and p = z + (new rᵀz/old rᵀz) p in the others.
-
-    A copy is done if √(rᵀz) has fallen to its tolerance, after ``most`` iterations, or at pᵀq ≤ 0. NaN ends it too; the caller
-    finds it in the result.
-    """
-    vector, _matrix, module = _unknowns(dtype, numbers)
-    _store, add_up = block_sums(block)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def turn_directions(
-        # state in
-        z: wp.array(dtype=vector),
-        parts: wp.array2d(dtype=wp.float64),
-        # parameters
-        per_copy: int,
-        lanes: int,
-        # in and out
-        solves: Solves,
-        p: wp.array(dtype=vector),
-    ):
-        copy, lane = wp.tid()
-        rz = add_up(lane, parts, copy)
-        if solves.active[copy] == 1:
-            curved = solves.pq[copy] <= wp.float64(0.0)
-            left = solves.tolerance[copy] * solves.tolerance[copy] * solves.first[copy]
-            going = rz > left and not curved and solves.iteration[0] < solves.most[0]
-            if going:
-                ratio = dtype(rz / solves.rz[copy])
-                for j in range(lane, per_copy, lanes):
-                    i = copy * per_copy + j
-                    p[i] = z[i] + ratio * p[i]
-            if lane == 0:
-                solves.next_active[copy] = wp.where(going, 1, 0)
-                solves.next_rz[copy] = rz
-                if curved:
-                    solves.negative[copy] = 1
-                if going:
-                    solves.proceed[0] = 1
-
-    return turn_directions

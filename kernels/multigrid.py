@@ -10,7 +10,9 @@ from functools import cache
 import warp as wp
 
 from .block_pattern import find_column
+from .block_rows import block_rows, lanes_of_rows, product_of_row
 from .linear import Solves
+from .reduce import sum_of_lanes
 from .vectors import types
 
 MODULE = "warpcloth.multigrid"
@@ -18,12 +20,11 @@ MODULE = "warpcloth.multigrid"
 OMEGA = 1.8
 # New coarse matrices cost about as much as so many iterations.
 SPARED = 2
-# An iteration with a cycle costs about as much as so many with diagonal blocks.
-CYCLE = 4
 # The other preconditioner is tried again after so many solves.
 AGED = 64
 # A solve with diagonal blocks ends once it has cost this many times a solve with multigrid.
 PATIENCE = 1.5
+FADE = wp.constant(wp.float64(1.0 - 1.0 / AGED))
 
 
 @wp.struct
@@ -36,33 +37,35 @@ class Rows:
 
 
 @cache
-def residual(dtype, products: bool):
-    """Device function (i, rows, x, r) → r[i] − (A x)[i], with ``products`` also minus a further product with x."""
-    vec3, mat33 = types(dtype)
+def residual(dtype, block: int, terms: int):
+    """Device function (i, lane, matrix, x, further, r) → r[i] − (A x)[i] − further[i], in all lanes of the row.
+
+    ``further`` may be None.
+    """
+    vec3, _ = types(dtype)
+    lanes = lanes_of_rows(block)
+    product, sum_over = product_of_row(dtype, lanes, terms), sum_of_lanes(dtype, lanes)
 
     @wp.func
     def residual_of_row(
         i: int,
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
-        values: wp.array(dtype=mat33),
+        lane: int,
+        matrix: block_rows(dtype),
         x: wp.array(dtype=vec3),
         further: wp.array(dtype=vec3),
         r: wp.array(dtype=vec3),
     ):
-        total = r[i]
-        if wp.static(products):
+        total = r[i] - sum_over(product(matrix, i, lane, x, x, dtype(0.0)))
+        if further:
             total -= further[i]
-        for s in range(offsets[i], offsets[i + 1]):
-            total -= values[s] * x[columns[s]]
         return total
 
     return residual_of_row
 
 
-def _module(dtype, products):
+def _module(dtype, terms=0):
     """The name of a module, in which no two kernels have one name."""
-    return f"{MODULE}.{dtype.__name__}" + ".products" * products
+    return f"{MODULE}.{dtype.__name__}" + f".{terms}" * (terms > 0)
 
 
 @cache
@@ -116,7 +119,7 @@ def list_multiples(dtype):
     ``slots`` and ``firsts`` are those of :func:`find_slots`, ``starts`` the first multiple of each row.
     """
 
-    @wp.kernel(module=_module(dtype, False), enable_backward=False)
+    @wp.kernel(module=_module(dtype), enable_backward=False)
     def list_each_multiple(
         # elements
         A: Rows,
@@ -166,7 +169,7 @@ def multiply_by_transfers(dtype):
     """Kernel over (copies, upper blocks): A_c = Σ weight·A, a block of PᵀAP, which is stored with its transpose."""
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=_module(dtype, False), enable_backward=False)
+    @wp.kernel(module=_module(dtype), enable_backward=False)
     def multiply_blocks(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -202,7 +205,7 @@ def eliminate(dtype):
     """
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=_module(dtype, False), enable_backward=False)
+    @wp.kernel(module=_module(dtype), enable_backward=False)
     def eliminate_pivot(
         # state in
         before: wp.array(dtype=mat33),
@@ -239,7 +242,7 @@ def factorise_diagonal(dtype):
     """
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=_module(dtype, False), enable_backward=False)
+    @wp.kernel(module=_module(dtype), enable_backward=False)
     def factorise(
         # elements
         diagonal: wp.array(dtype=wp.int32),
@@ -287,7 +290,7 @@ def scale_sweeps(dtype):
     """
     _, mat33 = types(dtype)
 
-    @wp.kernel(module=_module(dtype, False), enable_backward=False)
+    @wp.kernel(module=_module(dtype), enable_backward=False)
     def scale(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -323,23 +326,27 @@ class PreconditionerChoice:
     """Which preconditioner solves use, (1,) arrays; of ``rates`` the first is that of diagonal blocks.
 
     ``used`` is 1 for multigrid, ``outdated`` 1 if its coarse matrices must be computed again. ``fresh`` is the number of
-    iterations of the first solve with these, or −1 before it. ``rates`` are decades of √(rᵀPr) for the cost of an iteration
-    with diagonal blocks, (2,), of the last solve with each, 0 if it was cut off. ``trial`` is 1 if a solve tries the other
-    preconditioner, ``age`` the number of solves since the last trial.
+    iterations of the first solve with these, or −1 before it. ``progress`` and ``count`` are those of the last solve, see
+    :func:`measure_progress`. ``rates``, (2,), are decades of √(rᵀPr) for the cost of an iteration with diagonal blocks: those
+    ``gained`` over ``costs``, (2,), sums over past solves of which those count less that are longer ago. ``trial`` is 1 if a
+    solve tries the other preconditioner, ``age`` the number of solves since the last trial.
     """
 
     used: wp.array(dtype=wp.int32)
     outdated: wp.array(dtype=wp.int32)
     fresh: wp.array(dtype=wp.int32)
     progress: wp.array(dtype=wp.float64)
+    count: wp.array(dtype=wp.int32)
     rates: wp.array(dtype=wp.float64)
+    gained: wp.array(dtype=wp.float64)
+    costs: wp.array(dtype=wp.float64)
     trial: wp.array(dtype=wp.int32)
     age: wp.array(dtype=wp.int32)
 
 
 @cache
 def measure_progress():
-    """Kernel over copies: progress = the largest fall of √(rᵀPr) in a solve, in decades.
+    """Kernel over copies: progress = the largest fall of √(rᵀPr) in a solve, in decades; count = its iterations.
 
     A solve that ends at a negative curvature does not count: its few iterations say nothing of the many that others take.
     """
@@ -352,6 +359,7 @@ def measure_progress():
         choice: PreconditionerChoice,
     ):
         copy = wp.tid()
+        wp.atomic_max(choice.count, 0, solves.iteration[copy])
         if solves.negative[copy] == 1:
             return
         if solves.first[copy] > wp.float64(0.0) and solves.next_rz[copy] > wp.float64(0.0):
@@ -366,24 +374,27 @@ def choose():
     """Kernel over one thread: chooses the preconditioner of the next solve by the decades that each gained for its cost.
 
     The first solve is by multigrid. The other preconditioner is tried in the second one. It is tried again ``AGED`` solves
-    after the last trial, or sooner if its last solve gained more for its cost than this one. A trial that costs twice as much
-    as the solve before is cut off and has failed. The better one stays. The coarse matrices are outdated if a solve takes 3/2
+    after the last trial, or sooner if it has gained more for its cost than this one. Solves of different matrices differ, so
+    both are means, in which a solve counts 1/e after ``AGED`` others. A solve that is cut off, as a trial that costs twice as
+    much as the solve before, has gained nothing. The better one stays. The coarse matrices are outdated if a solve takes 3/2
     times as many iterations as the first with them. After a negative curvature in every copy they are outdated too, because the
     matrix will differ, and the preconditioner stays. ``most`` becomes 0 before a solve with diagonal blocks that is no trial,
-    see :func:`limit_iterations`.
+    see :func:`limit_iterations`. An iteration with a cycle costs as much as ``cycle`` with diagonal blocks.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def choose_next(
         # parameters
         most: int,
+        cycle: int,
         # in and out
         solves: Solves,
         choice: PreconditionerChoice,
     ):
         used = choice.used[0]
         other = 1 - used
-        count = solves.iteration[0]
+        count = choice.count[0]
+        choice.count[0] = 0
         if choice.progress[0] <= wp.float64(0.0) and count < solves.most[0]:
             if used == 1:
                 choice.outdated[0] = 1
@@ -392,16 +403,19 @@ def choose():
             return
         cost = count + 1
         if used == 1:
-            cost = wp.static(CYCLE) * (count + wp.static(SPARED))
+            cost = cycle * (count + wp.static(SPARED))
             choice.outdated[0] = 0
             if choice.fresh[0] < 0:
                 choice.fresh[0] = count
             elif 2 * count > 3 * choice.fresh[0] + wp.static(2 * SPARED):
                 choice.outdated[0] = 1
-        if count >= solves.most[0]:
-            choice.rates[used] = wp.float64(0.0)
-        elif choice.progress[0] > wp.float64(0.0):
-            choice.rates[used] = choice.progress[0] / wp.float64(cost)
+        for k in range(2):
+            choice.gained[k] = FADE * choice.gained[k]
+            choice.costs[k] = FADE * choice.costs[k]
+        choice.costs[used] = choice.costs[used] + wp.float64(cost)
+        if count < solves.most[0]:
+            choice.gained[used] = choice.gained[used] + choice.progress[0]
+        choice.rates[used] = choice.gained[used] / choice.costs[used]
         choice.progress[0] = wp.float64(0.0)
         solves.most[0] = most
         if choice.trial[0] == 1:
@@ -417,7 +431,7 @@ def choose():
                 limit = 2 * cost
                 if other == 1:
                     choice.outdated[0] = 1
-                    limit = limit / wp.static(CYCLE) + 1
+                    limit = limit / cycle + 1
                 solves.most[0] = wp.min(most, limit)
         if choice.used[0] == 0 and choice.trial[0] == 0:
             solves.most[0] = 0
@@ -455,18 +469,16 @@ def limit_iterations():
 
 
 @cache
-def subtract_product(dtype, products: bool = False):
-    """Kernel over block rows: out = r − A x, with ``products`` also minus a further product with x."""
-    vec3, mat33 = types(dtype)
-    remaining = residual(dtype, products)
+def subtract_product(dtype, block: int, terms: int = 0):
+    """Kernel over the lanes of block rows: out = r − A x, minus a ``further`` product with x if that is not None."""
+    vec3, _ = types(dtype)
+    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
 
-    @wp.kernel(module=_module(dtype, products), enable_backward=False)
+    @wp.kernel(module=_module(dtype, terms), enable_backward=False)
     def subtract_rows(
         # elements
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
+        matrix: block_rows(dtype),
         # state in
-        values: wp.array(dtype=mat33),
         x: wp.array(dtype=vec3),
         further: wp.array(dtype=vec3),
         r: wp.array(dtype=vec3),
@@ -476,10 +488,14 @@ def subtract_product(dtype, products: bool = False):
         # out
         out: wp.array(dtype=vec3),
     ):
-        i = wp.tid()
+        thread = wp.tid()
+        i = thread // wp.static(lanes)
         if active[i // per_copy] == 0:
             return
-        out[i] = remaining(i, offsets, columns, values, x, further, r)
+        lane = thread - i * wp.static(lanes)
+        total = remaining(i, lane, matrix, x, further, r)
+        if lane == 0:
+            out[i] = total
 
     return subtract_rows
 
@@ -489,7 +505,7 @@ def restrict(dtype):
     """Kernel over (copies, coarse rows): r_c = Pᵀr, x_c = S r_c."""
     vec3, mat33 = types(dtype)
 
-    @wp.kernel(module=_module(dtype, False), enable_backward=False)
+    @wp.kernel(module=_module(dtype), enable_backward=False)
     def restrict_rows(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -524,7 +540,7 @@ def prolong(dtype):
     """Kernel over (copies, rows): d = P x_c."""
     vec3, _ = types(dtype)
 
-    @wp.kernel(module=_module(dtype, False), enable_backward=False)
+    @wp.kernel(module=_module(dtype), enable_backward=False)
     def prolong_rows(
         # elements
         offsets: wp.array(dtype=wp.int32),
@@ -551,18 +567,16 @@ def prolong(dtype):
 
 
 @cache
-def sweep_after(dtype, products: bool = False):
-    """Kernel over block rows: x += d + S(r − A d), with ``products`` minus a further product with d."""
+def sweep_after(dtype, block: int, terms: int = 0):
+    """Kernel over the lanes of block rows: x += d + S(r − A d), minus a ``further`` product with d if that is not None."""
     vec3, mat33 = types(dtype)
-    remaining = residual(dtype, products)
+    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
 
-    @wp.kernel(module=_module(dtype, products), enable_backward=False)
+    @wp.kernel(module=_module(dtype, terms), enable_backward=False)
     def sweep_rows(
         # elements
-        offsets: wp.array(dtype=wp.int32),
-        columns: wp.array(dtype=wp.int32),
+        matrix: block_rows(dtype),
         # state in
-        values: wp.array(dtype=mat33),
         sweep: wp.array(dtype=mat33),
         d: wp.array(dtype=vec3),
         further: wp.array(dtype=vec3),
@@ -573,9 +587,13 @@ def sweep_after(dtype, products: bool = False):
         # in and out
         x: wp.array(dtype=vec3),
     ):
-        i = wp.tid()
+        thread = wp.tid()
+        i = thread // wp.static(lanes)
         if active[i // per_copy] == 0:
             return
-        x[i] = x[i] + d[i] + sweep[i] * remaining(i, offsets, columns, values, d, further, r)
+        lane = thread - i * wp.static(lanes)
+        total = remaining(i, lane, matrix, d, further, r)
+        if lane == 0:
+            x[i] = x[i] + d[i] + sweep[i] * total
 
     return sweep_rows

@@ -92,6 +92,28 @@ def block_largest(block: int):
 
 
 @cache
+def sum_of_lanes(dtype, lanes: int):
+    """Device function (value) → sum over the ``lanes`` neighbouring threads of a warp that take one vertex or row."""
+    vec3, _ = types(dtype)
+    if lanes == 1:
+
+        @wp.func
+        def itself(value: vec3):
+            return value
+
+        return itself
+    shuffle = "value.c[{0}] += __shfl_xor_sync(mask, value.c[{0}], n);"
+
+    @wp.func_native(
+        f"const unsigned mask = {(1 << lanes) - 1}u << (threadIdx.x & 31 & ~{lanes - 1}); "
+        f"for (int n = 1; n < {lanes}; n *= 2) {{ {' '.join(shuffle.format(c) for c in range(3))} }} return value;"
+    )
+    def sum_over_lanes(value: vec3) -> vec3: ...
+
+    return sum_over_lanes
+
+
+@cache
 def partial_sum(block: int):
     """Kernel over (copies, lanes): the parts of Σ values."""
     store, _add_up = block_sums(block)

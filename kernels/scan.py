@@ -30,16 +30,28 @@ def sum_chunks():
 
 
 @cache
-def add_chunks():
-    """Kernel of one thread: replaces the sum of each chunk by the sum of the chunks before it."""
+def add_chunks(block: int):
+    """Kernel over the threads of a block: replaces the sum of each chunk by the sum of the chunks before it.
 
-    @wp.kernel(module=MODULE, enable_backward=False)
+    ``block`` is their number, 0 on the CPU, which has one.
+    """
+    threads = max(block, 1)
+
+    @wp.kernel(module=f"{MODULE}.{block}", enable_backward=False)
     def add_all(
         # in and out
         sums: wp.array(dtype=wp.int32),
     ):
+        thread = wp.tid()
+        each = (sums.shape[0] + wp.static(threads - 1)) // wp.static(threads)
+        first = wp.min(thread * each, sums.shape[0])
+        end = wp.min(first + each, sums.shape[0])
         total = wp.int32(0)
-        for c in range(sums.shape[0]):
+        if wp.static(block > 1):
+            for c in range(first, end):
+                total += sums[c]
+            total = wp.untile(wp.tile_scan_exclusive(wp.tile(total)))
+        for c in range(first, end):
             value = sums[c]
             sums[c] = total
             total += value

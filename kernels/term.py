@@ -55,8 +55,6 @@ class Term:
         rest_state: NumPy function (points (n, 3) [m], stencil (E, K), …) → (E, P), the rest state of every element; keyword
             arguments are parameters of the material other than its stiffness.
         weight: (rest, i) → (M,), the weights of vertex i in y; also ∂y/∂xᵢ. None where K is 0.
-        any_weight: (rest, i) → (K,), weights of K rows in place of ``weight`` whose block DᵀD is an upper bound of that of any
-            rest state, for terms whose weights change during a run; or None.
         measure: (rest) → Aₑ.
         energy: (y, rest) → u.
         gradient: (y, rest) → ∂u/∂y (M, 3).
@@ -108,7 +106,6 @@ class Term:
     energy: Any
     gradient: Any
     hessian: Any
-    any_weight: Any = None
     dead_zone: bool = False
     max_lengths: Callable | None = None
     cells: bool = False

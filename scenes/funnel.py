@@ -12,12 +12,8 @@ def scene(
     pull: float = 0.5,
     friction: float = 0.2,
     duration: float = 3.0,
-    elements: str = "triangles",
 ):
-    """Vertices per side, side, spout radius, displacement of the middle [m], friction, duration [s], what collides.
-
-    The rims of the funnel are sharp, so with ``elements="vertices"`` they cut into triangles of the cloth.
-    """
+    """Vertices per side, side, spout radius, displacement of the middle [m], friction, duration [s]."""
     wc.checks.whole("n", n, 3)
     for name, value in {"size": size, "spout": spout, "duration": duration}.items():
         wc.checks.number(name, value, above=0.0)
@@ -54,7 +50,7 @@ def scene(
         colliders=[
             wc.MeshCollider(np.concatenate(rings), np.concatenate([band, band + around]), friction=friction, name="funnel")
         ],
-        contact=wc.Contact(distance=distance, elements=elements),
+        contact=wc.Contact(distance=distance),
         self_contact=wc.SelfContact(distance=distance),
         duration=duration,
         fps=fps,

@@ -7,8 +7,6 @@ import warp as wp
 from ..vectors import types
 from ..work import wide_dot
 from .colliders import of_pose, pose_types, step_poses
-from .mesh_geometry import geometry, meshes, motions
-from .mesh_queries import near_lists, queries
 
 UNCUT, NOW = wp.constant(0), wp.constant(2)  # the filter shortened no move of a vertex, or one in this step (1: in the last)
 
@@ -69,51 +67,6 @@ def rigid_moves(dtype):
         copy = i // per_copy
         X = to_local(poses[copy, collider], x[i])
         out[i] = to_space(step.after[copy, collider], X) - to_space(step.before[copy, collider], X)
-
-    return moves
-
-
-@cache
-def surface_moves(dtype):
-    """Kernel over vertices after a step: displacements in it of the material of a deforming mesh at the points nearest to x.
-
-    x and ``poses`` are those after ``when`` half steps. The displacement is 0 beyond the contact distance.
-    """
-    vec3, mat33 = types(dtype)
-    pose_type, _anchor = pose_types(dtype)
-    to_local, to_space = of_pose(dtype)
-    corners, _from, _carry = geometry(dtype)
-    nearest_beyond, _sweep, _has_list, _is_alone, _listed = queries(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def moves(
-        # elements
-        mesh: meshes(dtype),
-        # state in
-        x: wp.array(dtype=vec3),
-        poses: wp.array2d(dtype=pose_type),
-        motion: motions(dtype),
-        # parameters
-        when: int,
-        collider: int,
-        per_copy: int,
-        lists: near_lists(dtype),
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        copy = i // per_copy
-        first = 2 * motion.steps[copy] - 2  # the first half step of the finished step
-        p = to_local(poses[copy, collider], x[i])
-        d, n, face, w = nearest_beyond(
-            mesh, collider, first + when, motion.per_frame, p, motion.r, dtype(0.0), 0, mat33(), vec3(), lists, -1, i
-        )
-        found = vec3()
-        if face >= 0:
-            start = wp.transpose(corners(mesh, collider, face, first, motion.per_frame)) * w
-            end = wp.transpose(corners(mesh, collider, face, first + 2, motion.per_frame)) * w
-            found = to_space(motion.after[copy, collider], end + d * n) - to_space(motion.before[copy, collider], start + d * n)
-        out[i] = found
 
     return moves
 

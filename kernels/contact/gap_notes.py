@@ -5,12 +5,16 @@ from functools import cache
 import warp as wp
 
 from ..vectors import types
-from .pair_potential import CLOSE
+from .obstacles import cloth_vertex, copy_of, has_obstacle
+from .pair_potential import CLOSE, Laws
+from .self_contact import least_gap
 from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
 
 FOUR = wp.constant(wp.float64(4.0))
 HALF = wp.constant(wp.float64(0.5))
+# The least gap that coarse positions leave is 6 units in the last place. Rounding changes gaps by two of them.
+ROUNDED = wp.constant(wp.float64(4.0 / 3.0))
 MORE = wp.constant(wp.float32(0.75 * 2.0**-23))
 FIRST = wp.constant(wp.int64(2**62))
 
@@ -21,12 +25,15 @@ class GapNotes:
 
     ``nearest`` is 1/d for the smallest gap d [1/m]. ``too_near`` is 0 if float32 resolves all gaps. Else it is
     FIRST − (frame·n + vertex) with n vertices: the first frame with an unresolved pair, and the first vertex of such a pair.
-    ``pressed`` is the same for pairs with contact that are nearer than half their contact distance.
+    ``pressed`` (copies, 2) is the same for pairs with contact that are nearer than half the distance where that begins, of
+    cloth with cloth and with meshes. ``unresolved`` is the same for pairs that the filter stops where their contact begins,
+    within rounding, as positions far from the origin are coarse.
     """
 
     nearest: wp.array(dtype=wp.float64)
     too_near: wp.array(dtype=wp.int64)
-    pressed: wp.array(dtype=wp.int64)
+    pressed: wp.array2d(dtype=wp.int64)
+    unresolved: wp.array(dtype=wp.int64)
 
 
 @cache
@@ -63,13 +70,16 @@ def find_frames(
 
 @cache
 def cutoff_of(dtype):
-    """Device function (pairs, e, r) → the gap at which contact of a pair begins [m]; 0 if it has none."""
+    """Device function (pairs, laws, e) → the gap at which contact of a pair begins [m]; 0 if it has none."""
 
     @wp.func
-    def contact_distance(pairs: near_pairs(dtype), e: int, r: dtype):
+    def contact_distance(pairs: near_pairs(dtype), laws: Laws, e: int):
+        s = pairs.stencils[e]
+        r = dtype(laws.distance[wp.where(has_obstacle(pairs.layout, s), 1, 0)])
         found = ZERO
         if pairs.distances[e] == r:
-            found = wp.where(e < pairs.counts[0], ONE, CLOSE) * wp.float64(r)
+            close = e >= pairs.counts[0] or s[0] >= pairs.layout.cloth
+            found = wp.where(close, CLOSE, ONE) * wp.float64(r)
         return found
 
     return contact_distance
@@ -77,9 +87,12 @@ def cutoff_of(dtype):
 
 @cache
 def note_gaps(dtype):
-    """Kernel over pairs at the start of a step: records their gaps if a frame ends there."""
+    """Kernel over pairs at the start of a step: records their gaps if a frame ends there.
+
+    ``least`` [m] is the least gap of the filter without rounding if it keeps iterates apart, else 0.
+    """
     vec3, _ = types(dtype)
-    resolved, contact_distance = resolved_gap(dtype), cutoff_of(dtype)
+    resolved, contact_distance, least_gap_of = resolved_gap(dtype), cutoff_of(dtype), least_gap(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def note_each_gap(
@@ -90,9 +103,9 @@ def note_gaps(dtype):
         x: wp.array(dtype=vec3),
         steps: wp.array(dtype=wp.int32),
         # parameters
-        distance: dtype,
+        laws: Laws,
         per_frame: int,
-        per_copy: int,
+        least: wp.float64,
         # out
         notes: GapNotes,
     ):
@@ -100,7 +113,7 @@ def note_gaps(dtype):
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
         s = pairs.stencils[e]
-        copy = s[0] // per_copy
+        copy = copy_of(pairs.layout, s[0])
         d = step.gap[e]
         if steps[copy] % per_frame != 0:
             return
@@ -108,11 +121,17 @@ def note_gaps(dtype):
         if inverse > notes.nearest[copy]:
             wp.atomic_max(notes.nearest, copy, inverse)
         frame = wp.int64(steps[copy] // per_frame)
-        key = FIRST - frame * wp.int64(per_copy) - wp.int64(s[0] - copy * per_copy)
+        first = cloth_vertex(pairs.layout, s) - copy * pairs.layout.per_copy
+        key = FIRST - frame * wp.int64(pairs.layout.per_copy) - wp.int64(first)
         if not d >= resolved(s, x):
             wp.atomic_max(notes.too_near, copy, key)
-        if d < HALF * contact_distance(pairs, e, distance):
-            wp.atomic_max(notes.pressed, copy, key)
+        begins = contact_distance(pairs, laws, e)
+        law = wp.where(has_obstacle(pairs.layout, s), 1, 0)
+        if d < HALF * begins and (law == 0 or least > ZERO):  # edges have no contact with meshes in explicit steps
+            wp.atomic_max(notes.pressed, copy, law, key)
+        f = least_gap_of(s, x, least)
+        if least > ZERO and begins > ZERO and wp.max(begins, d) <= ROUNDED * f:
+            wp.atomic_max(notes.unresolved, copy, key)
 
     return note_each_gap
 
@@ -129,8 +148,7 @@ def count_pairs(dtype):
         # state in
         step: StepPairs,
         # parameters
-        distance: dtype,
-        per_copy: int,
+        laws: Laws,
         # out
         counts: wp.array2d(dtype=wp.int32),
         nearest: wp.array(dtype=wp.float64),
@@ -139,10 +157,10 @@ def count_pairs(dtype):
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
         s = pairs.stencils[e]
-        copy = s[0] // per_copy
+        copy = copy_of(pairs.layout, s[0])
         wp.atomic_add(counts, copy, 0, 1)
         wp.atomic_max(nearest, copy, ONE / step.gap[e])
-        if step.gap[e] < contact_distance(pairs, e, distance):
+        if step.gap[e] < contact_distance(pairs, laws, e):
             wp.atomic_add(counts, copy, 1, 1)
 
     return count_each_pair

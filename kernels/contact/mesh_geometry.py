@@ -1,8 +1,6 @@
-"""Factories of the structs of mesh colliders and of their motion in a step, and of device functions on triangles.
+"""Factories of the struct of mesh colliders, and of device functions on their points and on triangles.
 
-Everything is in the frame of the collider. Points of the mesh move linearly between its keyframes, and so within a step.
-``halves`` are numbers of half steps. Distances are unsigned: a vertex starts on one side of the surface, and the filter never
-lets it cross. So open and non-manifold meshes, and meshes with inconsistent winding, work like closed ones.
+Points of a mesh move linearly between its keyframes, in the frame of the collider. ``halves`` are numbers of half steps.
 """
 
 from functools import cache
@@ -10,15 +8,14 @@ from functools import cache
 import warp as wp
 
 from ..vectors import types
-from .colliders import pose_types
 
 
 @cache
 def meshes(dtype):
     """Struct of the meshes of C colliders. ``points`` has the keyframes of all meshes, ``triangles`` their triangles.
 
-    For each collider: the hierarchy ``bvh`` or 0, the index of the first triangle, the index of the first point, the points per
-    keyframe, the number of keyframes, and the margin of the hierarchy for rounding.
+    For each collider: the index of the first triangle, the index of the first point, the points per keyframe, and the number of
+    keyframes, 0 if it is not a mesh.
     """
     vec3, _ = types(dtype)
 
@@ -26,84 +23,40 @@ def meshes(dtype):
     class Meshes:
         points: wp.array(dtype=vec3)
         triangles: wp.array(dtype=wp.vec3i)
-        bvh: wp.array(dtype=wp.uint64)
         first_triangle: wp.array(dtype=wp.int32)
         first_point: wp.array(dtype=wp.int32)
         size: wp.array(dtype=wp.int32)
         frames: wp.array(dtype=wp.int32)
-        margin: wp.array(dtype=wp.float32)
 
     return Meshes
 
 
 @cache
-def motions(dtype):
-    """Struct of a step: the poses (copies, colliders) of :func:`.colliders.step_poses`, and parameters of all kernels.
+def point_at(dtype):
+    """Device function (mesh, c, i, halves, per_frame) → point i of mesh c after ``halves`` half steps.
 
-    ``steps`` is the number of steps of h [s] of each copy. A frame has ``per_frame`` half steps. Forces are evaluated after
-    ``ahead`` half steps. ``r`` is the contact distance, ``least`` the smallest distance that the filter allows, ``landing`` the
-    distance at which it stops vertices, and predictions stop.
+    A frame has ``per_frame`` half steps. After the last keyframe points stand still.
     """
-    pose_type, _anchor = pose_types(dtype)
-
-    @wp.struct
-    class Motion:
-        before: wp.array2d(dtype=pose_type)
-        at: wp.array2d(dtype=pose_type)
-        after: wp.array2d(dtype=pose_type)
-        steps: wp.array(dtype=wp.int32)
-        per_frame: wp.int32
-        ahead: wp.int32
-        h: dtype
-        r: dtype
-        least: dtype
-        landing: dtype
-
-    return Motion
-
-
-@cache
-def corners_of(dtype, wide):
-    """Device function (mesh, c, triangle, halves, per_frame) → the corners of a triangle, as rows, in the precision ``wide``.
-
-    They are those after ``halves`` half steps; a frame has ``per_frame`` half steps.
-    """
-    vec3, mat33 = types(wide)
 
     @wp.func
-    def point(mesh: meshes(dtype), i: int):
-        p = mesh.points[i]
-        return vec3(wide(p[0]), wide(p[1]), wide(p[2]))
-
-    @wp.func
-    def corners(mesh: meshes(dtype), c: int, triangle: int, halves: int, per_frame: int):
-        v = mesh.triangles[mesh.first_triangle[c] + triangle]
-        first = mesh.first_point[c]
+    def point(mesh: meshes(dtype), c: int, i: int, halves: int, per_frame: int):
         frames = mesh.frames[c]
-        found = mat33()
-        if frames == 1:
-            for k in range(3):
-                found[k] = point(mesh, first + v[k])
-        else:
-            size = mesh.size[c]
-            frame = wp.max(wp.min(halves // per_frame, frames - 1), 0)
-            after = wp.min(frame + 1, frames - 1)
-            part = wide(wp.max(halves, 0) - frame * per_frame) / wide(per_frame)
-            if after == frame:
-                part = wide(0.0)
-            for k in range(3):
-                a = point(mesh, first + frame * size + v[k])
-                found[k] = a + part * (point(mesh, first + after * size + v[k]) - a)
+        frame = wp.max(wp.min(halves // per_frame, frames - 1), 0)
+        here = mesh.first_point[c] + frame * mesh.size[c] + i
+        found = mesh.points[here]
+        if frame + 1 < frames:
+            part = dtype(wp.max(halves, 0) - frame * per_frame) / dtype(per_frame)
+            found = found + part * (mesh.points[here + mesh.size[c]] - found)
         return found
 
-    return corners
+    return point
 
 
 @cache
-def geometry(dtype):
-    """Device functions on triangles: :func:`corners_of`, ``from_triangle``, ``carry``."""
+def nearest_on_triangle(dtype):
+    """Device function (p, corners) → distance to a triangle, direction away from it, barycentric coordinates of the point."""
     vec3, mat33 = types(dtype)
-    corners, zero, one = corners_of(dtype, dtype), dtype(0.0), dtype(1.0)
+    zero, one = dtype(0.0), dtype(1.0)
 
     @wp.func
     def nearer_side(p: vec3, a: vec3, b: vec3, best: dtype):
@@ -167,18 +120,4 @@ def geometry(dtype):
                 away = away / d
         return d, away, w
 
-    @wp.func
-    def frame_of(t: mat33):
-        """An orthonormal frame of a triangle, as rows."""
-        x = wp.normalize(t[1] - t[0])
-        z = wp.normalize(wp.cross(t[1] - t[0], t[2] - t[0]))
-        y = wp.cross(z, x)
-        return mat33(x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
-
-    @wp.func
-    def carry(n: vec3, before: mat33, after: mat33):
-        """A direction rotated with a triangle; unchanged for a degenerate triangle."""
-        found = wp.transpose(frame_of(after)) * (frame_of(before) * n)
-        return wp.where(wp.dot(found, found) > dtype(0.5), found, n)
-
-    return corners, from_triangle, carry
+    return from_triangle

@@ -35,7 +35,7 @@ def carry_forces(dtype):
         if t < pairs.number[0]:
             e = pairs.acting[t]
             contacts.followed.carried[e] = wp.dot(multipliers[e], contacts.normal[e])
-            contacts.followed.stencils[e] = pairs.stencils[e]
+            contacts.followed.stencils[e] = contacts.parts[e]
 
     return carry_each_force
 
@@ -67,7 +67,7 @@ def start_forces(dtype):
             found = -contacts.stiffness[e] * slope(gap, r) * h * h
         # The list may have been made anew, so that the contact is now in another slot of its row.
         half = contacts.code.shape[0] // 2
-        row = pairs.stencils[e][0]
+        row = contacts.parts[e][0]
         if e >= lists.counts[0] and e < half:
             row = vertices
             above = lists.rows.shape[0] - 1
@@ -83,7 +83,7 @@ def start_forces(dtype):
             first = half + 3 * first
             end = wp.min(half + 3 * end, 2 * half)
         for k in range(first, end):
-            if contacts.followed.carried[k] > ZERO and equal(pairs.stencils[e], contacts.followed.stencils[k]):
+            if contacts.followed.carried[k] > ZERO and equal(contacts.parts[e], contacts.followed.stencils[k]):
                 found = contacts.followed.carried[k]
         contacts.followed.start[e] = wp.where(contacts.stiffness[e] > ZERO, found, ZERO)
 

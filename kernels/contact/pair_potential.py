@@ -13,6 +13,9 @@ has a gradient for parallel edges too. Edges act below a quarter of the contact 
 need them.
 
 Elements with a common vertex have no contact, nor have those of one piece whose rest distance is below 2r.
+
+Vertices of cloth have their whole area against meshes, Σᵥ k aᵥ Σ_F m φ(d), and vertices of meshes keep out of the faces of the
+cloth like edges, by k aᵥ φ(4d). Positions of meshes are not unknowns, so y = Σ wᵢxᵢ + o with the vertices of the cloth alone.
 """
 
 from functools import cache
@@ -21,6 +24,7 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
+from .obstacles import Layout, cloth_vertex, has_obstacle, in_copy
 from .self_gaps import ONE, SIDE, ZERO, gap_along, in_plane, vertex_of
 from .self_pairs import module_of, near_pairs
 
@@ -165,6 +169,15 @@ STARTING, ENDING = wp.constant(1), wp.constant(2)
 
 
 @wp.struct
+class Laws:
+    """Contact distance r [m] and stiffness k [Pa/m] of cloth with cloth, and with meshes; the largest b of a mesh [m]."""
+
+    distance: wp.vec2d
+    stiffness: wp.vec2d
+    width: wp.float64
+
+
+@wp.struct
 class Contacts:
     """The contacts at some positions, by slots: w, n, d, r [m], kA with the sign of m [N/m], ``share``, and ``fixed`` λ [kg·m].
 
@@ -173,10 +186,14 @@ class Contacts:
     faces share at most 1.5 F edges, and as many vertices. kA is 0 in slots without a contact. ``code`` says where the nearest
     point of a face is.
 
+    ``parts`` has the vertices of the surface between which a contact is. The stencil of its slot has those of the cloth, and
+    the first of them with w = 0 in place of each obstacle. With obstacles there is the ``offset`` o = Σ wⱼXⱼ [m] of their
+    positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,).
+
     The ``share`` of a contact is the sum of m over its side of the vertex, divided by that of positive m. Sweeps compute this
     share of its force anew, and leave the rest ``fixed``, see :mod:`.pair_follow`.
 
-    Two edges with 4D = cd have r/c and c²kA, for φ(cd) with r is c²φ(d) with r/c.
+    Two edges with 4D = cd have r/c and c²kA, for φ(cd) with r is c²φ(d) with r/c. Their ``ratio`` is D/d, else 1.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -185,14 +202,19 @@ class Contacts:
     distance: wp.array(dtype=wp.float64)
     stiffness: wp.array(dtype=wp.float64)
     share: wp.array(dtype=wp.float64)
+    ratio: wp.array(dtype=wp.float64)
     fixed: wp.array(dtype=wp.float64)
     code: wp.array(dtype=wp.int32)
+    parts: wp.array(dtype=wp.vec4i)
+    offset: wp.array(dtype=wp.vec3d)
+    travel: wp.array(dtype=wp.vec3d)
+    moves: wp.array(dtype=wp.vec3d)
     followed: Followed
 
 
 @wp.struct
 class Areas:
-    """Rest areas of the vertices, and of each edge at them, (N,) [m²], and rest points of a copy (n,)."""
+    """Rest areas of the vertices of the surface, and of each edge at them, (V,) [m²], and rest points of a copy (n + m,)."""
 
     of_vertices: wp.array(dtype=wp.float64)
     of_edges: wp.array(dtype=wp.float64)
@@ -269,6 +291,8 @@ def counts_of(dtype):
 @cache
 def put_contact(dtype):
     """Device function that stores a contact in a slot, and lists it."""
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
 
     @wp.func
     def put(
@@ -278,10 +302,25 @@ def put_contact(dtype):
         y: wp.vec3d,
         r: wp.float64,
         kA: wp.float64,
+        x: wp.array(dtype=vec3),
         pairs: near_pairs(dtype),
         contacts: Contacts,
     ):
         gap = wp.length(y)
+        contacts.parts[slot] = s
+        if pairs.layout.obstacles > 0:
+            own = cloth_vertex(pairs.layout, s)
+            o = wp.vec3d()
+            travel = wp.vec3d()
+            for i in range(4):
+                j = s[i] - pairs.layout.cloth
+                if j >= 0:
+                    o += w[i] * exact(x[s[i]])
+                    travel += w[i] * contacts.moves[j]
+                    s[i] = own
+                    w[i] = ZERO
+            contacts.offset[slot] = o
+            contacts.travel[slot] = travel
         pairs.stencils[slot] = s
         contacts.weights[slot] = w
         contacts.normal[slot] = y / wp.max(gap, wp.float64(1e-300))
@@ -289,6 +328,7 @@ def put_contact(dtype):
         contacts.distance[slot] = r
         contacts.stiffness[slot] = kA
         contacts.share[slot] = ONE
+        contacts.ratio[slot] = ONE
         contacts.fixed[slot] = ZERO
         pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = slot
         if pairs.corner_counts:
@@ -421,8 +461,7 @@ def find_vertex_contacts(dtype):
         goal: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
         # parameters
-        stiffness: wp.float64,
-        distance: dtype,
+        laws: Laws,
         # out
         pairs: near_pairs(dtype),
         contacts: Contacts,
@@ -433,13 +472,15 @@ def find_vertex_contacts(dtype):
         extra = contacts.code.shape[0] // 2 + 3 * first
         if first == end or extra + 3 * (end - first) > contacts.code.shape[0]:  # the latter where the list has overflowed
             return
-        r = wp.float64(distance)
+        cloth = lists.layout.cloth
         a = at(x, correction, v)
         near = wp.int32(0)
         for e in range(first, end):
             code = NONE
-            if lists.distances[e] == distance:  # else the rest distance is below 2r
-                s = stencil(lists.stencils, e)
+            s = stencil(lists.stencils, e)
+            r = laws.distance[wp.where(has_obstacle(lists.layout, s), 1, 0)]
+            if lists.distances[e] == dtype(r):  # else the rest distance is below 2r
+                r = wp.where(v < cloth, r, CLOSE * r)
                 b = at(x, correction, s[1]) - a
                 c = at(x, correction, s[2]) - a
                 d = at(x, correction, s[3]) - a
@@ -453,13 +494,20 @@ def find_vertex_contacts(dtype):
             contacts.code[e] = code
         if near == 0:
             return
-        kA = SIDE * stiffness * areas.of_vertices[v]
         extras = wp.int32(0)
         for e in range(first, end):
             code = number(contacts.code, e)
             if code == NONE:
                 continue
             s = stencil(lists.stencils, e)
+            r = laws.distance[0]
+            kA = SIDE * laws.stiffness[0] * areas.of_vertices[v]
+            if has_obstacle(lists.layout, s):
+                r = laws.distance[1]
+                kA = laws.stiffness[1] * areas.of_vertices[v]
+                if v >= cloth:
+                    r *= CLOSE
+                    kA /= CLOSE * CLOSE
             b = at(x, correction, s[1]) - a
             c = at(x, correction, s[2]) - a
             d = at(x, correction, s[3]) - a
@@ -467,7 +515,7 @@ def find_vertex_contacts(dtype):
             w4 = contacts.weights[e]
             if code == INSIDE or near == 1:
                 y = in_plane(code == INSIDE, w4[1] * b + w4[2] * c + w4[3] * d, wp.cross(c - b, d - b), b)
-                put(e, s, w4, y, r, kA, pairs, contacts)
+                put(e, s, w4, y, r, kA, x, pairs, contacts)
             if near == 1:
                 continue
             for i in range(1, 4):
@@ -484,18 +532,28 @@ def find_vertex_contacts(dtype):
                         w4[j] = -t
                         slot = wp.where(code == edge_between(i, j), e, extra + extras)
                         extras += wp.where(slot == e, 0, 1)
-                        put(slot, s, w4, y, r, wp.float64(m) * kA, pairs, contacts)
+                        put(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
                 m, owner = multiplicity_of_vertex(lists, contacts, first, end, s[i], a, x, correction, e)
                 if owner == e and m != 0 and (goal or wp.length(P) < r):
                     w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                     w4[i] = -ONE
                     slot = wp.where(code == CORNER + i - 1, e, extra + extras)
                     extras += wp.where(slot == e, 0, 1)
-                    put(slot, s, w4, -P, r, wp.float64(m) * kA, pairs, contacts)
+                    put(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
         if extras > 0:
             set_shares(contacts, first, end - first, extra, extras)
 
     return find_contacts_of_vertex
+
+
+@wp.func
+def width_of(areas: Areas, layout: Layout, laws: Laws, i: int, j: int):
+    """The rest area of an edge over its length; of a mesh, whose triangles may be large, at most the largest of the cloth."""
+    length = wp.length(areas.rest[in_copy(layout, j)] - areas.rest[in_copy(layout, i)])
+    found = (areas.of_edges[i] + areas.of_edges[j]) / length
+    if i >= layout.cloth:
+        found = wp.min(found, laws.width)
+    return found
 
 
 @cache
@@ -518,8 +576,7 @@ def find_edge_contacts(dtype):
         goal: wp.array(dtype=vec3),
         move: wp.array(dtype=vec3),
         # parameters
-        stiffness: wp.float64,
-        distance: dtype,
+        laws: Laws,
         # out
         pairs: near_pairs(dtype),
         contacts: Contacts,
@@ -528,27 +585,27 @@ def find_edge_contacts(dtype):
         if e >= wp.min(lists.counts[0] + lists.counts[1], lists.stencils.shape[0]):
             return
         contacts.code[e] = TWO_EDGES
-        if lists.distances[e] != distance:
-            return
         s = lists.stencils[e]
+        law = wp.where(has_obstacle(lists.layout, s), 1, 0)
+        if lists.distances[e] != dtype(laws.distance[law]):
+            return
         a = at(x, correction, s[0])
         zero = wp.vec3d()
         b = at(x, correction, s[1]) - a
         c = at(x, correction, s[2]) - a
         d = at(x, correction, s[3]) - a
-        r = CLOSE * wp.float64(distance)
+        r = CLOSE * laws.distance[law]
         if lowest(s, normals[e], b, c, d, goal, move) >= r:
             return
         u, t, factor = on_two_edges(zero, b, c, d)
         y = u * b - (c + t * (d - c))
         if not goal and factor * wp.length(y) >= r:
             return
+        ratio = factor
         factor /= CLOSE
-        n = areas.rest.shape[0]
-        ab = wp.length(areas.rest[s[1] % n] - areas.rest[s[0] % n])
-        cd = wp.length(areas.rest[s[3] % n] - areas.rest[s[2] % n])
-        A = HALF_PI * (areas.of_edges[s[0]] + areas.of_edges[s[1]]) * (areas.of_edges[s[2]] + areas.of_edges[s[3]]) / (ab * cd)
+        A = HALF_PI * width_of(areas, lists.layout, laws, s[0], s[1]) * width_of(areas, lists.layout, laws, s[2], s[3])
         w = wp.vec4d(ONE - u, u, t - ONE, -t)
-        put(e, s, w, y, wp.float64(distance) / factor, factor * factor * stiffness * A, pairs, contacts)
+        put(e, s, w, y, laws.distance[law] / factor, factor * factor * laws.stiffness[law] * A, x, pairs, contacts)
+        contacts.ratio[e] = ratio
 
     return find_contact_of_edges

@@ -38,6 +38,19 @@ class PairForces:
     count: wp.array(dtype=wp.int32)
 
 
+@cache
+def pair_blocks(dtype):
+    """Struct of what products of each pair read, in the precision of the matrix: w, 0 at pins, and ∂²U/∂y² [N/m]."""
+    _, mat33 = types(dtype)
+
+    @wp.struct
+    class PairBlocks:
+        weights: wp.array(dtype=wp.types.vector(4, dtype))
+        blocks: wp.array(dtype=mat33)
+
+    return PairBlocks
+
+
 @dataclass(frozen=True)
 class PairTerm:
     """The record of an energy of pairs.
@@ -177,6 +190,43 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
                 energies[v] = energies[v] + forces.energy[e]
 
     return add_energies_of_pairs
+
+
+@cache
+def set_pair_blocks(term: PairTerm, dtype):
+    """Kernel over acting pairs: the :func:`pair_blocks` for kernels that gather products."""
+    _, mat33 = types(dtype)
+    vec4 = wp.types.vector(4, dtype)
+
+    @wp.kernel(module=term.of(dtype, False), enable_backward=False)
+    def set_blocks_of_pairs(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        # state in
+        forces: PairForces,
+        # out
+        out: pair_blocks(dtype),
+    ):
+        t = wp.tid()
+        if t >= pairs.number[0]:
+            return
+        e = pairs.acting[t]
+        block = wp.mat33d()
+        bend = forces.bend[e]
+        if wp.max(bend) > ZERO:
+            block = bend[0] * wp.outer(forces.along[e], forces.along[e])
+            if bend[1] > ZERO:
+                block += bend[1] * wp.outer(forces.across[e], forces.across[e])
+            s = pairs.stencils[e]
+            w = forces.weights[e]
+            for i in range(4):
+                if inverse_mass[s[i]] == dtype(0.0):
+                    w[i] = ZERO
+            out.weights[e] = vec4(dtype(w[0]), dtype(w[1]), dtype(w[2]), dtype(w[3]))
+        out.blocks[e] = mat33(block)
+
+    return set_blocks_of_pairs
 
 
 @cache

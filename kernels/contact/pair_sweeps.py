@@ -183,7 +183,12 @@ def touch_pairs(term: PairTerm, dtype):
             swept.weights[e] = w
             s = pairs.stencils[e]
             for i in range(4):
-                wp.atomic_add(swept.touching, s[i], 1)
+                again = wp.bool(False)  # as for obstacles, which the stencil has not
+                for j in range(i):
+                    if s[j] == s[i]:
+                        again = True
+                if not again:
+                    wp.atomic_add(swept.touching, s[i], 1)
 
     return touch_each_pair
 

@@ -6,6 +6,7 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
+from .obstacles import Layout, copy_of
 from .proximity_grid import MODULE
 
 SAMPLES = wp.constant(9)  # vertices whose median motion is that of a piece
@@ -17,7 +18,8 @@ def pieces(dtype):
 
     The drift is its motion: along each axis the median of that of SAMPLES of its vertices, ``samples`` (pieces·SAMPLES,). A
     part that moves alone, such as a fold that rolls, hardly changes it. If a copy has more than one piece (``per_copy``), each
-    also has a box, and the largest motion of its vertices relative to the drift [m].
+    also has a box, and the largest motion of its vertices relative to the drift [m]. Its first ones are those of the ``cloth``,
+    which meet one another if that meets ``itself``, and the others are meshes.
     """
     vec3, _ = types(dtype)
 
@@ -27,6 +29,9 @@ def pieces(dtype):
         samples: wp.array(dtype=wp.int32)
         drift: wp.array(dtype=vec3)
         per_copy: wp.int32
+        cloth: wp.int32
+        itself: wp.bool
+        layout: Layout
         lower: wp.array(dtype=vec3)
         upper: wp.array(dtype=vec3)
         motion: wp.array(dtype=dtype)
@@ -103,12 +108,12 @@ def take_moved(dtype):
         x: wp.array(dtype=vec3),
         moved: wp.array(dtype=wp.int32),
         # parameters
-        per_copy: int,
+        layout: Layout,
         # out
         out: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        if moved[i // per_copy] != 0:
+        if moved[copy_of(layout, i)] != 0:
             out[i] = x[i]
 
     return take_each_moved
@@ -257,7 +262,12 @@ def compare_motions(dtype):
         due: wp.array(dtype=wp.int32),
     ):
         p = wp.tid()
-        for q in range(p + 1, (p // pieces.per_copy + 1) * pieces.per_copy):
+        first = p + 1
+        if p % pieces.per_copy >= pieces.cloth:
+            return
+        if not pieces.itself:
+            first = p // pieces.per_copy * pieces.per_copy + pieces.cloth
+        for q in range(first, (p // pieces.per_copy + 1) * pieces.per_copy):
             nearer = wp.length(pieces.drift[q] - pieces.drift[p]) + pieces.motion[p] + pieces.motion[q]
             gap = wp.max(pieces.lower[p] - pieces.upper[q], pieces.lower[q] - pieces.upper[p])
             gap = wp.max(gap, vec3())

@@ -6,8 +6,9 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
-from .mesh_geometry import geometry
-from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, grids, surfaces
+from .mesh_geometry import nearest_on_triangle
+from .obstacles import OBSTACLE, copy_of, has_obstacle, in_copy
+from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, grids, groups_meet, surfaces
 
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 
@@ -41,7 +42,7 @@ def closest_points(dtype, of_edges: bool):
     """
     vec3, mat33 = types(dtype)
     vec4 = wp.types.vector(4, dtype)
-    _corners, from_triangle, _carry = geometry(dtype)
+    from_triangle = nearest_on_triangle(dtype)
     zero, one = dtype(0.0), dtype(1.0)
 
     @wp.func
@@ -78,20 +79,24 @@ def closest_points(dtype, of_edges: bool):
 
 @cache
 def cutoffs(dtype, of_edges: bool):
-    """Device function (surface, stencil, first vertex of the copy) → contact distance of a pair [m].
+    """Device function (surface, stencil) → contact distance of a pair [m].
 
     For two elements of one piece, it is at most half the rest distance.
     """
     closest = closest_points(dtype, of_edges)
 
     @wp.func
-    def cutoff(surface: surfaces(dtype), s: wp.vec4i, first: int):
+    def cutoff(surface: surfaces(dtype), s: wp.vec4i):
         found = surface.distance
-        a = s[0] - first
-        d = s[3] - first
-        if surface.piece[a] == surface.piece[d]:
+        a = in_copy(surface.layout, s[0])
+        d = in_copy(surface.layout, s[3])
+        if has_obstacle(surface.layout, s):
+            found = surface.of_meshes
+        elif surface.piece[a] == surface.piece[d]:
             if not (wp.length(surface.rest[a] - surface.rest[d]) > surface.far):
-                _w, y = closest(surface.rest[a], surface.rest[s[1] - first], surface.rest[s[2] - first], surface.rest[d])
+                b = in_copy(surface.layout, s[1])
+                c = in_copy(surface.layout, s[2])
+                _w, y = closest(surface.rest[a], surface.rest[b], surface.rest[c], surface.rest[d])
                 found = wp.min(found, dtype(0.5) * wp.length(y))
         return found
 
@@ -111,7 +116,6 @@ def take_near(dtype, of_edges: bool):
         surface: surfaces(dtype),
         x: wp.array(dtype=vec3),
         s: wp.vec4i,
-        first: int,
         i: int,
         k: int,
         triangles: int,
@@ -119,8 +123,8 @@ def take_near(dtype, of_edges: bool):
     ):
         _w, y = closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
         d = wp.length(y)
-        if d < surface.distance + surface.skin:
-            if d < surface.skin or d < surface.skin + cutoff(surface, s, first):
+        if d < surface.max_distance + surface.skin:
+            if d < surface.skin or d < surface.skin + cutoff(surface, s):
                 if pairs.counts[KIND] < MOST:
                     slot = wp.atomic_add(pairs.counts, KIND, 1)
                     row = i
@@ -140,11 +144,12 @@ def take_near(dtype, of_edges: bool):
 def search_pairs(dtype, of_edges: bool, take, name: str):
     """Kernel over vertices, or edges: calls ``take`` for pairs with triangles, or with edges, whose boxes meet.
 
-    ``take`` (dtype, of_edges) returns a device function (surface, x, s, first, i, k, triangles, out) and the struct of
-    ``out``. s is the stencil of a pair, ``first`` the first vertex of its copy, i its vertex or edge, and k its triangle or
-    other edge. The boxes are at x, or along moves ``p`` from there. A box meets those of its own level and those above, but
+    ``take`` (dtype, of_edges) returns a device function (surface, x, s, i, k, triangles, out) and the struct of ``out``. s is
+    the stencil of a pair, i its vertex or edge, and k its triangle or other edge. The boxes are at x, or along moves ``p`` from
+    there, of the cloth or of all vertices. A box meets those of its own level and those above, but
     that of a vertex that moves meets those of all levels, for it may be larger than theirs. The rows of cells near each
-    vertex or edge are divided among ``shares`` threads, the second dimension of the launch.
+    vertex or edge are divided among ``shares`` threads, the second dimension of the launch. Where there are more rows than
+    buckets, as for a move that is much longer than the boxes of a level, it goes through the buckets instead.
 
     Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices. The distance
     of two edges is always computed in the order of their indices.
@@ -175,15 +180,21 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
         if wp.static(of_edges):
             own = surface.items[triangles + i]
             copy = own[3] >> 1
+            group = surface.groups[triangles + i]
         else:
-            copy = i // surface.vertices
+            copy = copy_of(surface.layout, i)
             own = wp.vec4i(i, i, i, 0)
-            if surface.piece[i - copy * surface.vertices] < 0:
+            j = in_copy(surface.layout, i)
+            if surface.piece[j] < 0:
                 return
+            group = surface.vertex_groups[j]
         low, high = box_along(surface, x, p, own[0], own[1], own[1])
         level = level_of(grid.size, low, high)
         if level < 0:
             return
+        if group == OBSTACLE:
+            if not meet(low, high, surface.region[2 * copy], surface.region[2 * copy + 1]):
+                return
         lowest = level
         layer = cell_at(grid.size, low, high, level)[2]
         buckets = grid.counts.shape[0]
@@ -200,10 +211,16 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                         one[2] = layer
                 width = wp.min(two[0] - one[0] + 1, buckets)
                 height = two[1] - one[1] + 1
-                for line in range(share, height * (two[2] - one[2] + 1), shares):
+                rows = wp.int64(height) * wp.int64(two[2] - one[2] + 1)
+                everywhere = rows > wp.int64(buckets)
+                if everywhere:
+                    width = 1
+                for line in range(share, wp.int32(wp.min(rows, wp.int64(buckets))), shares):
                     cz = one[2] + line // height
                     cy = one[1] + line - height * (cz - one[2])
-                    run = bucket_of(one[0], cy, cz, code, buckets)
+                    run = line
+                    if not everywhere:
+                        run = bucket_of(one[0], cy, cz, code, buckets)
                     begin = number(grid.first, run)
                     end = number(grid.first, wp.min(run + width, buckets))
                     # A sequence beyond the last bucket continues at the first.
@@ -212,6 +229,13 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                         if not meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
                             continue
                         entry = four(grid.entries, slot)
+                        if everywhere:
+                            cy = entry[1]
+                            cz = entry[2]
+                            if cz < one[2]:
+                                continue
+                        if not groups_meet(group, number(surface.groups, entry[0]), surface.itself):
+                            continue
                         other = four(surface.items, entry[0])
                         if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
                             continue
@@ -228,7 +252,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                             s = wp.vec4i(own[0], other[0], other[1], other[2])
                         if entry[1] != cy or entry[2] != cz or entry[3] != code:
                             continue
-                        visit(surface, x, s, copy * surface.vertices, i, k, triangles, out)
+                        visit(surface, x, s, i, k, triangles, out)
             present = present >> 1
             level += 1
 
@@ -305,14 +329,13 @@ def write_pairs(dtype):
         sort(pairs.items, first, end)
         for k in range(first, end):
             v = surface.items[pairs.items[k]]
-            vertex = (v[3] >> 1) * surface.vertices
             if row < vertices:
                 s = wp.vec4i(row, v[0], v[1], v[2])
-                d = vertex_cutoff(surface, s, vertex)
+                d = vertex_cutoff(surface, s)
             else:
                 own = surface.items[row - vertices + triangles]
                 s = wp.vec4i(own[0], own[1], v[0], v[1])
-                d = edge_cutoff(surface, s, vertex)
+                d = edge_cutoff(surface, s)
             pairs.stencils[k] = s
             pairs.distances[k] = d
 

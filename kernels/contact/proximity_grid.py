@@ -13,6 +13,7 @@ import warp as wp
 from ..memory import load
 from ..rotation import epsilon
 from ..vectors import types
+from .obstacles import OBSTACLE, Layout, vector_within
 
 LEVELS = wp.constant(30)  # levels of the grid; the last has one cell
 FARTHEST = 1e9  # largest cell coordinate; the outermost cells contain everything beyond
@@ -23,23 +24,40 @@ MODULE = "warpcloth.proximity"
 def surfaces(dtype):
     """Struct of the cloths: the vertices of each item (the last vertex of an edge twice), with 2·copy + kind.
 
-    A copy has n ``vertices``. ``rest`` is the rest position of each [m], and ``piece`` its connected piece, −1 without an
-    element. ``distance`` is the contact distance and ``skin`` the skin [m]. Elements whose first vertices are more than ``far``
-    apart at rest are surely at least twice the contact distance apart [m].
+    ``rest`` is the rest position of each vertex of a copy [m], and ``piece`` its connected piece, −1 without an element.
+    ``groups`` of items and ``vertex_groups`` say which elements meet, and ``itself`` whether cloth meets cloth. ``distance`` is
+    the contact distance of cloth with cloth, ``of_meshes`` that with meshes, ``max_distance`` the larger one, and ``skin`` the
+    skin [m]. Elements whose first vertices are more than ``far`` apart at rest are surely at least twice the contact distance
+    apart [m]. ``region`` has the lowest and the highest corner of the cloth of each copy; without obstacles it is empty.
     """
     vec3, _ = types(dtype)
 
     @wp.struct
-    class Surface:
+    class ContactSurface:
+        layout: Layout
         items: wp.array(dtype=wp.vec4i)
-        vertices: wp.int32
+        groups: wp.array(dtype=wp.int32)
+        vertex_groups: wp.array(dtype=wp.int32)
+        itself: wp.bool
         rest: wp.array(dtype=vec3)
         piece: wp.array(dtype=wp.int32)
         distance: dtype
+        of_meshes: dtype
+        max_distance: dtype
         skin: dtype
         far: dtype
+        region: wp.array(dtype=vec3)
 
-    return Surface
+    return ContactSurface
+
+
+@wp.func
+def groups_meet(a: int, b: int, itself: bool):
+    """Whether elements of two groups meet: cloth and obstacles, and cloth with cloth if it meets ``itself``."""
+    found = itself
+    if wp.max(a, b) == OBSTACLE:
+        found = a + b == OBSTACLE and a != b
+    return found
 
 
 @cache
@@ -70,14 +88,14 @@ def grids(dtype):
 def boxes(dtype):
     """Device functions on boxes: ``box_along``, ``level_of``, ``cell_at``, ``cells_about``."""
     vec3, _ = types(dtype)
-    half, farthest, corner = dtype(0.5), dtype(FARTHEST), load(vec3)
+    half, farthest, corner, vector_or_zero = dtype(0.5), dtype(FARTHEST), load(vec3), vector_within(dtype)
 
     @wp.func
     def box_of(surface: surfaces(dtype), a: vec3, b: vec3, c: vec3):
         """The box of three points, enlarged by half of the contact distance and the skin, and by a margin for rounding."""
         low = wp.min(wp.min(a, b), c)
         high = wp.max(wp.max(a, b), c)
-        more = half * (surface.distance + surface.skin)
+        more = half * (surface.max_distance + surface.skin)
         more += dtype(4.0) * epsilon(more) * wp.max(wp.max(wp.abs(low)), wp.max(wp.abs(high)))
         # min and max ignore NaN; these products do not.
         more += wp.dot(a, vec3()) + wp.dot(b, vec3()) + wp.dot(c, vec3())
@@ -92,7 +110,7 @@ def boxes(dtype):
         c = corner(x, k)
         low, high = box_of(surface, a, b, c)
         if p:
-            l, h = box_of(surface, a + corner(p, i), b + corner(p, j), c + corner(p, k))
+            l, h = box_of(surface, a + vector_or_zero(p, i), b + vector_or_zero(p, j), c + vector_or_zero(p, k))
             low = wp.min(low, l)
             high = wp.max(high, h)
         return low, high
@@ -159,10 +177,50 @@ def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
 
 
 @cache
+def bound_cloth(dtype):
+    """Kernel over vertices of the cloth: extends the ``region`` of their copy, which holds their boxes along p.
+
+    With ``begins`` it sets the region to that of the first vertex of the copy, as a kernel over copies.
+    """
+    vec3, _ = types(dtype)
+    box_along, _level_of, _cell_at, _about = boxes(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def bound_each_vertex(
+        # elements
+        surface: surfaces(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
+        # parameters
+        begins: bool,
+    ):
+        i = wp.tid()
+        copy = i
+        if begins:
+            i = copy * surface.layout.per_copy
+        else:
+            copy = i // surface.layout.per_copy
+        low, high = box_along(surface, x, p, i, i, i)
+        if begins:
+            surface.region[2 * copy] = low
+            surface.region[2 * copy + 1] = high
+        elif wp.max(wp.max(surface.region[2 * copy] - low, high - surface.region[2 * copy + 1])) > dtype(0.0):
+            wp.atomic_min(surface.region, 2 * copy, low)
+            wp.atomic_max(surface.region, 2 * copy + 1, high)
+
+    return bound_each_vertex
+
+
+@cache
 def count_items(dtype):
-    """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist."""
+    """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist.
+
+    Obstacles count where they meet the region of the cloth.
+    """
     vec3, _ = types(dtype)
     box_along, level_of, cell_at, _about = boxes(dtype)
+    meet = boxes_meet(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def count_each_item(
@@ -178,6 +236,10 @@ def count_items(dtype):
         v = surface.items[item]
         low, high = box_along(surface, x, p, v[0], v[1], v[2])
         level = level_of(grid.size, low, high)
+        if surface.groups[item] == OBSTACLE:
+            copy = v[3] >> 1
+            if not meet(low, high, surface.region[2 * copy], surface.region[2 * copy + 1]):
+                level = -1
         key = wp.int32(-1)
         if level >= 0:
             if (grid.levels[v[3] & 1] & (1 << level)) == 0:

@@ -4,29 +4,37 @@ from functools import cache
 
 import warp as wp
 
+from ..memory import load
 from ..vectors import types
+from .obstacles import copy_of, vector_within
 from .proximity_grid import surfaces
 from .self_gaps import ONE, ZERO, nearest, vertex_of
-from .self_planes import KEPT, margin_of, part_apart, ulp_of
+from .self_pairs import module_of, near_pairs
+from .self_planes import KEPT, margin_of, needs_no_cut, part_apart, ulp_of, ways_of_sides
 
 
 @cache
 def advances(dtype):
-    """Struct of the moves ``direction`` (N,) [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m]."""
+    """Struct of the moves ``direction`` [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m].
+
+    The direction is that of the cloth (N,), or of all vertices of the surface. ``far`` is 1 for copies that move so far that
+    pairs may meet which are not in the list (B,).
+    """
     vec3, _ = types(dtype)
 
     @wp.struct
     class Advance:
         direction: wp.array(dtype=vec3)
         fraction: wp.array(dtype=wp.float64)
+        far: wp.array(dtype=wp.int32)
         least: wp.float64
 
     return Advance
 
 
 @cache
-def take_advance(dtype, of_edges: bool):
-    """The function of :func:`.proximity.search_pairs` that reduces the ``fraction`` of a copy for a pair, and its struct.
+def allowed_fraction(dtype, of_edges: bool):
+    """Device function (stencil, x, advance) → the fraction of its moves that a pair may make.
 
     A pair keeps a tenth of its gap. Where all vertices move by the same fraction, a plane between the two sides may move with
     them: the two sides stay apart along y while no vertex of one side comes near the height of one of the other. Where this
@@ -34,29 +42,28 @@ def take_advance(dtype, of_edges: bool):
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
-    ulp, advance, sides = ulp_of(dtype), advances(dtype), wp.constant(2 if of_edges else 1)
+    ulp, vector_or_zero, advance, sides = (
+        ulp_of(dtype),
+        vector_within(dtype),
+        advances(dtype),
+        wp.constant(2 if of_edges else 1),
+    )
     of_vertex = wp.constant(not of_edges)
 
     @wp.func
-    def take(
-        surface: surfaces(dtype),
-        x: wp.array(dtype=vec3),
-        s: wp.vec4i,
-        first: int,
-        i: int,
-        k: int,
-        triangles: int,
-        out: advance,
-    ):
+    def allowed(s: wp.vec4i, x: wp.array(dtype=vec3), out: advance):
         a = exact(x[s[0]])
         b = exact(x[s[1]])
         c = exact(x[s[2]])
         d = exact(x[s[3]])
-        pa = exact(out.direction[s[0]])
-        pb = exact(out.direction[s[1]])
-        pc = exact(out.direction[s[2]])
-        pd = exact(out.direction[s[3]])
-        far = wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.max(wp.abs(c)), wp.max(wp.abs(d))))
+        pa = exact(vector_or_zero(out.direction, s[0]))
+        pb = exact(vector_or_zero(out.direction, s[1]))
+        pc = exact(vector_or_zero(out.direction, s[2]))
+        pd = exact(vector_or_zero(out.direction, s[3]))
+        far = ZERO
+        for i in range(4):
+            if s[i] < out.direction.shape[0]:  # obstacles that stand are not rounded
+                far = wp.max(far, wp.max(wp.abs(exact(x[s[i]]))))
         far += wp.max(wp.max(wp.length(pa), wp.length(pb)), wp.max(wp.length(pc), wp.length(pd)))
         margin = wp.float64(2.0) * margin_of(out.least, ulp * far)
         _w, y, _inside = nearest(of_vertex, a, b, c, d)
@@ -66,13 +73,82 @@ def take_advance(dtype, of_edges: bool):
         t = ONE
         for p in range(sides):
             for q in range(sides, 4):
-                approach = wp.dot(n, exact(out.direction[s[q]]) - exact(out.direction[s[p]]))
+                approach = wp.dot(n, exact(vector_or_zero(out.direction, s[q])) - exact(vector_or_zero(out.direction, s[p])))
                 if approach > ZERO:
                     apart = wp.dot(n, exact(x[s[p]]) - exact(x[s[q]])) - floor
                     t = wp.min(t, wp.max(apart, ZERO) / approach)
         if t < ONE:
             t = wp.max(t, part_apart(of_vertex, a, b, c, d, pa, pb, pc, pd, floor))
+        return t
+
+    return allowed
+
+
+@cache
+def take_advance(dtype, of_edges: bool):
+    """The function of :func:`.proximity.search_pairs` that reduces the ``fraction`` of copies that move ``far``; its struct."""
+    vec3, _ = types(dtype)
+    advance, allowed = advances(dtype), allowed_fraction(dtype, of_edges)
+
+    @wp.func
+    def take(
+        surface: surfaces(dtype),
+        x: wp.array(dtype=vec3),
+        s: wp.vec4i,
+        i: int,
+        k: int,
+        triangles: int,
+        out: advance,
+    ):
+        copy = copy_of(surface.layout, s[0])
+        if out.far[copy] == 0:
+            return
+        t = allowed(s, x, out)
         if t < ONE:
-            wp.atomic_min(out.fraction, s[0] // surface.vertices, t)
+            wp.atomic_min(out.fraction, copy, t)
 
     return take, advance
+
+
+@cache
+def advance_listed(dtype):
+    """Kernel over listed pairs: reduces the ``fraction`` of copies that do not move ``far``, whose list is complete.
+
+    Pairs whose ``gap`` is too wide for the ``ways`` of their vertices, see :func:`.self_planes.find_ways`, are left out, unless
+    that is None, as where obstacles move.
+    """
+    vec3, _ = types(dtype)
+    of_vertices, of_edges = (allowed_fraction(dtype, each) for each in (False, True))
+    stencil, ulp = load(wp.vec4i), ulp_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def advance_each_pair(
+        # elements
+        pairs: near_pairs(dtype),
+        gap: wp.array(dtype=wp.float64),
+        # state in
+        x: wp.array(dtype=vec3),
+        ways: wp.array(dtype=wp.vec3d),
+        # in and out
+        out: advances(dtype),
+    ):
+        e = wp.tid()
+        if e >= wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0]):
+            return
+        s = stencil(pairs.stencils, e)
+        if ways:
+            way, size = ways_of_sides(ways, s, wp.where(e < pairs.counts[0], 1, 2))
+            if needs_no_cut(e, way, margin_of(out.least, ulp * size), gap):
+                return
+        copy = copy_of(pairs.layout, s[0])
+        if out.far[copy] != 0:
+            return
+        t = ONE
+        if e < pairs.counts[0]:
+            t = of_vertices(s, x, out)
+        else:
+            t = of_edges(s, x, out)
+        if t < ONE:
+            wp.atomic_min(out.fraction, copy, t)
+
+    return advance_each_pair

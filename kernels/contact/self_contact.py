@@ -24,6 +24,7 @@ potential, slope, bend, gap_after = contact.potential, contact.slope, contact.be
 constraint_slope, constraint_bend = contact.constraint_slope, contact.constraint_bend
 # The force of ψ at the least gap, divided by that of φ there.
 STEEP = wp.constant(wp.float64(100.0))
+ALL = wp.constant(wp.vec4d(1.0, 1.0, 1.0, 1.0))
 
 
 @cache
@@ -47,9 +48,9 @@ def least_gap(dtype):
 def find_forces(dtype, bounded: bool):
     """Kernel over contacts: their forces; φ = ½(r − d)² if ``bounded``.
 
-    If ``least`` [m], the least gap of the filter, is above 0, ψ is added to φ. It begins at d = 2f, where it is C². Where r is
-    below 2f, as far from the origin, ψ is left out. The Hessian of a negative contact is negative along n, which is left out.
-    Half of that across n, U′/d, stays.
+    If ``least`` [m], the least gap of the filter, is above 0, ψ is added to φ. It begins at d = 2f, where it is C², or at r if
+    that is less, as far from the origin. Without ψ, cloth would be pressed to f, where one pair stops the whole copy. The
+    Hessian of a negative contact is negative along n, which is left out. Half of that across n, U′/d, stays.
     """
     vec3, _ = types(dtype)
     least_gap_of = least_gap(dtype)
@@ -82,13 +83,14 @@ def find_forces(dtype, bounded: bool):
             pull = k * slope(gap, r)
             curvature = k * bend(gap, r)
             if least > ZERO:
-                f = least_gap_of(pairs.stencils[e], x, least)
-                below = wp.float64(2.0) - gap / f
-                if below > ZERO and wp.float64(2.0) * f <= r:
+                f = least_gap_of(pairs.stencils[e], x, least) / contacts.ratio[e]  # ψ is a function of D, as φ is
+                width = wp.min(f, r - f)
+                below = (f + width) / width - gap / width
+                if width > ZERO and below > ZERO:
                     more = STEEP * SIDE * SIDE * k * r * r * below
                     energy += more * below * below / wp.float64(3.0)
-                    pull -= more * below / f
-                    curvature += wp.float64(2.0) * more / (f * f)
+                    pull -= more * below / width
+                    curvature += wp.float64(2.0) * more / (width * width)
         forces.weights[e] = contacts.weights[e]
         forces.energy[e] = energy
         forces.force[e] = pull * n
@@ -122,6 +124,8 @@ def gap_at(dtype):
         w = weights(contacts.weights, e)
         a = at(x, correction, s[0])
         y = w[1] * (at(x, correction, s[1]) - a) + w[2] * (at(x, correction, s[2]) - a) + w[3] * (at(x, correction, s[3]) - a)
+        if pairs.layout.obstacles > 0:  # Σ wᵢ of the cloth is not 0
+            y += wp.dot(w, ALL) * a + contacts.offset[e]
         return wp.dot(normal(contacts.normal, e), y)
 
     return gap_along_normal

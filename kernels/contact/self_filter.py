@@ -9,6 +9,7 @@ import warp as wp
 
 from ..vectors import types
 from .gap_notes import FIRST
+from .obstacles import Layout, copy_of, has_obstacle, vector_within
 from .self_gaps import ONE, PLANAR, ZERO, vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
 from .self_planes import bounded_share
@@ -89,6 +90,21 @@ def another_round(
     cuts[c] = 0
 
 
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def walk_where_blocked(
+    # state in
+    fraction: wp.array(dtype=wp.float64),
+    # out
+    walk: wp.array(dtype=wp.int32),
+    proceed: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies: ``walk`` is 1 for copies whose ``fraction`` of a direction is below 1; then ``proceed`` is 1."""
+    c = wp.tid()
+    walk[c] = wp.where(fraction[c] < ONE, 1, 0)
+    if fraction[c] < ONE:
+        proceed[0] = 1
+
+
 @wp.struct
 class HeldPins:
     """The prescribed moves that the filter has shortened, (copies,).
@@ -162,6 +178,8 @@ def share_of_pins(dtype):
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
         s = pairs.stencils[e]
+        if has_obstacle(pairs.layout, s):
+            return
         w = step.weights[e]
         for i in range(4):
             if w[i] == ZERO:
@@ -328,9 +346,14 @@ def find_held(dtype):
 
 @cache
 def push_pairs(dtype):
-    """Kernel of one thread: each pair in turn moves its targets apart along n, to its gap at x or ``left``, the smaller one."""
+    """Kernel of one thread: each pair in turn moves the ends of moves p apart along n, to its gap or ``left``, the smaller one.
+
+    If it ``opens``, to twice its gap, so that rounding does not stop pairs at the least gap that should move together.
+    Obstacles move if p has their moves, and cannot be pushed.
+    """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
+    vector_or_zero = vector_within(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def push_each_pair(
@@ -339,11 +362,11 @@ def push_pairs(dtype):
         mobile: wp.array(dtype=dtype),
         # state in
         step: StepPairs,
-        x: wp.array(dtype=vec3),
         # parameters
         left: wp.float64,
+        opens: bool,
         # in and out
-        target: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
     ):
         count = wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0])
         for e in range(count):
@@ -351,15 +374,18 @@ def push_pairs(dtype):
             n = step.normal[e]
             w = step.weights[e]
             gap = step.gap[e]
+            one = exact(vector_or_zero(p, s[0]))  # relative to this, so that equal moves change no gap
             W = ZERO
             for i in range(4):
-                W += w[i] * w[i] * wp.float64(mobile[s[i]])
-                gap += w[i] * wp.dot(n, exact(target[s[i]]) - exact(x[s[i]]))
-            short = wp.min(step.gap[e], left) - gap
+                if s[i] < mobile.shape[0]:
+                    W += w[i] * w[i] * wp.float64(mobile[s[i]])
+                gap += w[i] * wp.dot(n, exact(vector_or_zero(p, s[i])) - one)
+            short = wp.min(wp.where(opens, step.gap[e] + step.gap[e], step.gap[e]), left) - gap
             if short > ZERO and W > ZERO:
                 for i in range(4):
-                    move = w[i] * wp.float64(mobile[s[i]]) * short / W * n
-                    target[s[i]] = target[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+                    if s[i] < mobile.shape[0]:
+                        move = w[i] * wp.float64(mobile[s[i]]) * short / W * n
+                        p[s[i]] = p[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
 
     return push_each_pair
 
@@ -374,22 +400,57 @@ def scale_directions(dtype):
         # state in
         fraction: wp.array(dtype=wp.float64),
         # parameters
-        per_copy: int,
+        layout: Layout,
         whole: bool,
         # in and out
         p: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        part = fraction[i // per_copy]
+        part = fraction[copy_of(layout, i)]
         p[i] = dtype(wp.where(whole and part < ONE, ZERO, part)) * p[i]
 
     return scale_each_direction
 
 
 @cache
-def add_positions(dtype):
-    """Kernel over vertices: out = a + sign·b in the copies that are ``active``, or in all."""
+def turn_where_blocked(dtype):
+    """Kernel over vertices: p = target − x in copies whose ``fraction`` of p is below 1, with ``pins`` of pinned axes only."""
     vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def turn_each(
+        # state in
+        fraction: wp.array(dtype=wp.float64),
+        inverse_mass: wp.array(dtype=dtype),
+        mobility: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        # parameters
+        pins: bool,
+        per_copy: int,
+        # in and out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        if fraction[i // per_copy] < ONE:
+            move = target[i] - x[i]
+            if pins:
+                free = vec3(inverse_mass[i])
+                if mobility:
+                    free = mobility[i]
+                for axis in range(3):
+                    if free[axis] > dtype(0.0):
+                        move[axis] = dtype(0.0)
+            p[i] = move
+
+    return turn_each
+
+
+@cache
+def add_positions(dtype):
+    """Kernel over vertices: out = a + sign·b in the copies that are ``active``, or in all; b is 0 beyond its end."""
+    vec3, _ = types(dtype)
+    vector_or_zero = vector_within(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def add_each_position(
@@ -407,6 +468,6 @@ def add_positions(dtype):
         if active:
             if active[i // per_copy] == 0:
                 return
-        out[i] = a[i] + sign * b[i]
+        out[i] = a[i] + sign * vector_or_zero(b, i)
 
     return add_each_position

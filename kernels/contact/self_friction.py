@@ -16,6 +16,7 @@ import warp as wp
 from ..coulomb import Law
 from ..terms import contact
 from ..vectors import types
+from .obstacles import Layout, copy_of, in_copy
 from .pair_potential import TWO_EDGES, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm
 from .self_gaps import ONE, ZERO, perpendicular, vertex_of
@@ -26,7 +27,8 @@ from .self_pairs import near_pairs
 class RubbedPairs:
     """Values of contacts at the start of the step: n, w, kA [N/m], ε [m], the anchor a [m], and the vertices on the first side.
 
-    t is the direction of the edge of the last two vertices in the plane normal to n.
+    t is the direction of the edge of the last two vertices in the plane normal to n. ``parts`` are the vertices of the surface,
+    and ``travel`` the part of y that obstacles add by the end of the step, of which forces see the fraction ``ahead``.
     """
 
     normal: wp.array(dtype=wp.vec3d)
@@ -36,6 +38,9 @@ class RubbedPairs:
     sides: wp.array(dtype=wp.int32)
     anchor: wp.array(dtype=wp.vec3d)
     tangent: wp.array(dtype=wp.vec3d)
+    parts: wp.array(dtype=wp.vec4i)
+    travel: wp.array(dtype=wp.vec3d)
+    ahead: wp.float64
 
 
 MODULE = "warpcloth.self_friction"
@@ -79,24 +84,28 @@ def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_la
 
 @cache
 def difference_of(dtype):
-    """Device function (stencil, w, x) → Σ wᵢxᵢ, computed relative to the first vertex."""
+    """Device function (layout, stencil, w, x) → Σ wᵢxᵢ over the cloth, without obstacles relative to the first vertex."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
     @wp.func
-    def difference(s: wp.vec4i, w: wp.vec4d, x: wp.array(dtype=vec3)):
+    def difference(layout: Layout, s: wp.vec4i, w: wp.vec4d, x: wp.array(dtype=vec3)):
         y = wp.vec3d()
         for i in range(1, 4):
             y += w[i] * (exact(x[s[i]]) - exact(x[s[0]]))
+        if layout.obstacles > 0:
+            y += (w[0] + w[1] + w[2] + w[3]) * exact(x[s[0]])
         return y
 
     return difference
 
 
 @wp.func
-def slip_from(rubbed: RubbedPairs, e: int, y: wp.vec3d):
-    """Returns u of a pair."""
+def slip_from(layout: Layout, rubbed: RubbedPairs, e: int, y: wp.vec3d, ahead: wp.float64):
+    """Returns u of a pair, after the fraction ``ahead`` of the step."""
     u = y - rubbed.anchor[e]
+    if layout.obstacles > 0:
+        u += ahead * rubbed.travel[e]
     return u - wp.dot(rubbed.normal[e], u) * rubbed.normal[e]
 
 
@@ -109,17 +118,20 @@ def slip_at(dtype):
     @wp.func
     def slip_of(pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
         s = pairs.stencils[e]
-        y = y_of(s, rubbed.weights[e], x)
+        y = y_of(pairs.layout, s, rubbed.weights[e], x)
         if d:
-            y += y_of(s, rubbed.weights[e], d)
-        return slip_from(rubbed, e, y)
+            y += y_of(pairs.layout, s, rubbed.weights[e], d)
+        return slip_from(pairs.layout, rubbed, e, y, rubbed.ahead)
 
     return slip_of
 
 
 @cache
 def begin_friction(dtype, law: Law, bounded: bool):
-    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force, which act."""
+    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force and friction, which act.
+
+    μ is the first one of ``friction`` for cloth with cloth, and then that of each obstacle of a copy.
+    """
     slope, limit_of = contact.bounded_slope if bounded else contact.slope, law.limit
 
     @wp.kernel(module=f"{friction_module(dtype, law)}.{bounded}", enable_backward=False)
@@ -129,7 +141,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
         # state in
         contacts: Contacts,
         # parameters
-        friction: wp.float64,
+        friction: wp.array(dtype=wp.float64),
         # out
         pairs: near_pairs(dtype),
         rubbed: RubbedPairs,
@@ -141,9 +153,19 @@ def begin_friction(dtype, law: Law, bounded: bool):
         k = contacts.share[e] * contacts.stiffness[e]
         if not (k > ZERO and contacts.gap[e] < contacts.distance[e]):
             return
+        own = wp.int32(0)
+        for i in range(4):
+            if contacts.parts[e][i] >= touching.layout.cloth:
+                own = 1 + in_copy(touching.layout, contacts.parts[e][i]) - touching.layout.per_copy
+        limit = limit_of(-slope(contacts.gap[e], contacts.distance[e]), friction[own])
+        if limit == ZERO:
+            return
         s = touching.stencils[e]
+        rubbed.parts[e] = contacts.parts[e]
         pairs.stencils[e] = s
-        rubbed.limit[e] = limit_of(-slope(contacts.gap[e], contacts.distance[e]), friction)
+        rubbed.limit[e] = limit
+        if touching.layout.obstacles > 0:
+            rubbed.travel[e] = contacts.travel[e]
         rubbed.normal[e] = contacts.normal[e]
         rubbed.weights[e] = contacts.weights[e]
         rubbed.stiffness[e] = k
@@ -170,8 +192,6 @@ def set_anchors(dtype, law: Law):
         kept: near_pairs(dtype),
         slips: wp.array(dtype=wp.vec4d),
         steps: wp.array(dtype=wp.int32),
-        # parameters
-        per_copy: int,
         # in and out
         rubbed: RubbedPairs,
     ):
@@ -180,18 +200,19 @@ def set_anchors(dtype, law: Law):
             return
         e = pairs.acting[turn]
         limit = rubbed.limit[e]
-        s = pairs.stencils[e]
-        if limit == ZERO:
-            return
+        s = rubbed.parts[e]
         n = rubbed.normal[e]
         sides = rubbed.sides[e]
         total = wp.vec3d()
         weight = ZERO
         own = wp.bool(False)
-        if steps[s[0] // per_copy] == 0:
-            sides = 0
-        for side in range(sides):
-            for j in range(kept.first[s[side]], kept.first[s[side] + 1]):
+        side = wp.where(s[0] < pairs.layout.cloth, 0, sides)
+        end = wp.where(s[0] < pairs.layout.cloth, sides, 4)
+        if steps[copy_of(pairs.layout, s[0])] == 0:
+            end = side
+        while side < end:
+            side += 1
+            for j in range(kept.first[s[side - 1]], kept.first[s[side - 1] + 1]):
                 e_kept = kept.corners[j] // 4
                 kept_slip = slips[e_kept]
                 if kept_slip[2] > ZERO and not own:
@@ -216,7 +237,7 @@ def set_anchors(dtype, law: Law):
         if not own and weight > ZERO:
             total = total / weight
         total = kept_of(wp.length(total), limit) * total
-        rubbed.anchor[e] = y_of(s, rubbed.weights[e], x) - total
+        rubbed.anchor[e] = y_of(pairs.layout, pairs.stencils[e], rubbed.weights[e], x) - total
         rubbed.tangent[e] = edge_tangent(exact(x[s[3]]) - exact(x[s[2]]), n)
 
     return set_anchor_of_pairs
@@ -291,7 +312,7 @@ def end_friction(dtype):
         if turn >= pairs.number[0]:
             return
         e = pairs.acting[turn]
-        u = slip_from(rubbed, e, y_of(pairs.stencils[e], rubbed.weights[e], x))
+        u = slip_from(pairs.layout, rubbed, e, y_of(pairs.layout, pairs.stencils[e], rubbed.weights[e], x), ONE)
         t = rubbed.tangent[e]
         slips[e] = wp.vec4d(
             wp.dot(u, t), wp.dot(u, wp.cross(rubbed.normal[e], t)), rubbed.stiffness[e], wp.float64(rubbed.sides[e])

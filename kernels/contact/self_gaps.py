@@ -177,7 +177,8 @@ def vertex_of(dtype):
     def at(x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3), i: int):
         found = exact(vector(x, i))
         if correction:
-            found += exact(vector(correction, i))
+            if i < correction.shape[0]:  # obstacles have none
+                found += exact(vector(correction, i))
         return found
 
     return at, exact

@@ -5,6 +5,7 @@ from functools import cache
 import warp as wp
 
 from ..vectors import types
+from .obstacles import Layout
 from .proximity import sort
 from .self_gaps import nearest, vertex_of
 
@@ -15,7 +16,8 @@ def near_pairs(dtype):
 
     Near pairs have the fields up to ``distances``. ``counts`` has the numbers of vertex–triangle pairs, which come first, and
     of edge–edge pairs. The triangles near vertex i are in rows ``rows`` [i] to rows[i+1]. ``distances`` [m] is r, or half the
-    rest distance if that is less.
+    rest distance if that is less. Their vertices are those of the surface with this ``layout``; an energy has vertices of the
+    cloth alone.
 
     An energy has ``stencils`` and the others. ``acting`` lists the slots that act; ``number`` has their number. ``corners``
     lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is scratch, 0
@@ -24,6 +26,7 @@ def near_pairs(dtype):
 
     @wp.struct
     class Pairs:
+        layout: Layout
         stencils: wp.array(dtype=wp.vec4i)
         counts: wp.array(dtype=wp.int32)
         rows: wp.array(dtype=wp.int32)

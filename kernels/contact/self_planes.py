@@ -7,6 +7,7 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
+from .obstacles import copy_of
 from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
 from .self_pairs import module_of, near_pairs
 
@@ -40,13 +41,16 @@ def bounded_share(move: wp.vec3d, most: wp.float64):
 
 @cache
 def wanted_move(dtype):
-    """Device function (x, target, i) → wanted move of vertex i, target − x."""
+    """Device function (x, target, i) → wanted move of vertex i, target − x; 0 for obstacles, which have no target."""
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
     @wp.func
     def wanted(x: wp.array(dtype=vec3), target: wp.array(dtype=vec3), i: int):
-        return exact(target[i]) - exact(x[i])
+        found = wp.vec3d()
+        if i < target.shape[0]:
+            found = exact(target[i]) - exact(x[i])
+        return found
 
     return wanted
 
@@ -82,8 +86,8 @@ def find_ways(dtype):
 
     The share is the largest one with which the wanted move minus the ``common`` move is at most ``most``. Its ways are a bound
     of its part in the approach of a pair [m], its largest coordinate [m], and its share. The bound is the length of the wanted
-    move minus the ``common`` move, plus WIDE times the length of the motion since ``begun``, where the gaps were computed,
-    minus the motion of the first vertex of the copy.
+    move minus the ``common`` move, plus WIDE times the length of the motion since ``begun``, where the gaps were computed. That
+    is ``relative`` to the first vertex of the copy where cloth meets nothing but itself; obstacles have not moved since.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -99,6 +103,7 @@ def find_ways(dtype):
         # parameters
         per_copy: int,
         most: wp.float64,
+        relative: bool,
         # out
         ways: wp.array(dtype=wp.vec3d),
         share: wp.array(dtype=wp.float64),
@@ -109,8 +114,10 @@ def find_ways(dtype):
         move = wanted(x, target, i)
         own = move - common[i // per_copy]
         far = wp.max(wp.max(wp.abs(start)), wp.max(wp.abs(start + move)))
-        one = i - i % per_copy
-        since = start - exact(begun[i]) - (exact(x[one]) - exact(begun[one]))
+        since = start - exact(begun[i])
+        if relative:
+            one = i - i % per_copy
+            since -= exact(x[one]) - exact(begun[one])
         share[i] = bounded_share(own, most)
         ways[i] = wp.vec3d(wp.length(own) + WIDE * wp.length(since), far, share[i])
         least_share[i] = ZERO
@@ -284,7 +291,6 @@ def cut_by_planes(dtype):
         common: wp.array(dtype=wp.vec3d),
         ways: wp.array(dtype=wp.vec3d),
         # parameters
-        per_copy: int,
         least: wp.float64,
         # in and out
         share: wp.array(dtype=wp.float64),
@@ -294,6 +300,7 @@ def cut_by_planes(dtype):
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
         s = stencil(pairs.stencils, e)
+        own = common[copy_of(pairs.layout, s[0])]
         of_vertex = e < pairs.counts[0]
         sides = wp.where(of_vertex, 1, 2)
         way, far = ways_of_sides(ways, s, sides)
@@ -313,7 +320,7 @@ def cut_by_planes(dtype):
         approaches = wp.vec4d()
         for i in range(4):
             move = wanted(x, target, s[i])
-            approach = wp.dot(n, move - common[s[i] // per_copy])
+            approach = wp.dot(n, move - own)
             along = wp.dot(n, exact(x[s[i]]) - origin)
             position[i] = along
             if i < sides:
@@ -343,10 +350,10 @@ def cut_by_planes(dtype):
             exact(x[s[1]]),
             exact(x[s[2]]),
             exact(x[s[3]]),
-            ways[s[0]][2] * (wanted(x, target, s[0]) - common[s[0] // per_copy]),
-            ways[s[1]][2] * (wanted(x, target, s[1]) - common[s[0] // per_copy]),
-            ways[s[2]][2] * (wanted(x, target, s[2]) - common[s[0] // per_copy]),
-            ways[s[3]][2] * (wanted(x, target, s[3]) - common[s[0] // per_copy]),
+            ways[s[0]][2] * (wanted(x, target, s[0]) - own),
+            ways[s[1]][2] * (wanted(x, target, s[1]) - own),
+            ways[s[2]][2] * (wanted(x, target, s[2]) - own),
+            ways[s[3]][2] * (wanted(x, target, s[3]) - own),
             floor,
         )
         if whole == ONE:

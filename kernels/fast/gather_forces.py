@@ -6,25 +6,11 @@ import warp as wp
 
 from ..local import from_corner
 from ..memory import load, load_shared, store
+from ..reduce import sum_of_lanes
 from ..transpose import to_corner
 from ..vectors import types
 from .packed_residual import unpack_residual
 from .term_facts import TermFacts, chain_of, elements_struct, local_gradient
-
-
-@cache
-def sum_of_lanes(dtype, lanes: int):
-    """Device function (value) → sum over the ``lanes`` neighbouring threads of a warp that take one vertex."""
-    vec3, _ = types(dtype)
-    shuffle = "value.c[{0}] += __shfl_xor_sync(mask, value.c[{0}], n);"
-
-    @wp.func_native(
-        f"const unsigned mask = {(1 << lanes) - 1}u << (threadIdx.x & 31 & ~{lanes - 1}); "
-        f"for (int n = 1; n < {lanes}; n *= 2) {{ {' '.join(shuffle.format(c) for c in range(3))} }} return value;"
-    )
-    def sum_over_lanes(value: vec3) -> vec3: ...
-
-    return sum_over_lanes
 
 
 @cache

@@ -342,7 +342,7 @@ def test_points_rest_on_a_shape_from_outside(name, device):
     np.testing.assert_allclose((found - height) * upwards, gaps, atol=R / 500)
 
 
-def stretched(gravity, friction, mesh=False):
+def stretched(gravity, friction):
     """A sheet in tension over a ball and on a plane, which it enters in the step that follows."""
     grid = wc.Mesh.grid(8, 8, size=0.5)
     x, _, z = grid.points.T
@@ -352,9 +352,6 @@ def stretched(gravity, friction, mesh=False):
         wc.Sphere(radius=0.2, position=(0.25, -0.2, 0.25), friction=friction),
         wc.Plane(position=(0.0, -0.15, 0.0), friction=friction),
     ]
-    if mesh:
-        ball = trimesh.creation.icosphere(4, radius=0.2)
-        colliders[0] = wc.MeshCollider(ball.vertices, ball.faces, position=(0.25, -0.2, 0.25), friction=friction)
     return wc.Scene(
         wc.Mesh(0.8 * grid.points, grid.triangles),
         density=0.15,
@@ -367,13 +364,39 @@ def stretched(gravity, friction, mesh=False):
     )
 
 
+def roofed(gravity, friction):
+    """A sheet in tension, bent along the two edges of a flat roof of triangles, on its top and slopes and on a plane.
+
+    Cloth that slides over many edges of a mesh, as over a ball, has several minima, 1e-4 m apart, and methods end at different
+    ones. Here it slides by up to 3 mm.
+    """
+    grid, slope = wc.Mesh.grid(8, 8, size=0.5), 0.1
+    x, _, z = grid.points.T
+    top, foot = 0.5 / 7.0 * 1.5, 1.0
+
+    def height(x):
+        return -slope * np.maximum(np.abs(x - 0.25) - top, 0.0)
+
+    corners = [(0.25 + side, height(0.25 + side), end) for side in (-foot, -top, top, foot) for end in (-0.2, 0.7)]
+    roof = trimesh.convex.convex_hull(corners)
+    return replace(
+        stretched(gravity, friction),
+        mesh=wc.Mesh(0.99 * grid.points, grid.triangles),
+        positions=np.stack([x, height(x) + 0.4 * R * np.hypot(1.0, slope), z], axis=1),
+        colliders=[
+            wc.MeshCollider(roof.vertices, roof.faces, friction=friction),
+            wc.Plane(position=(0.0, height(0.0), 0.0), friction=friction),
+        ],
+    )
+
+
 @cache
 def minimiser(gravity, friction, mesh=False, device="cpu", dtype="float64"):
     """Where a step of Newton's method ends, which no vertex cuts in float64."""
-    scene = stretched(gravity, friction, mesh)
+    scene = (roofed if mesh else stretched)(gravity, friction)
     stepper = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised").bind(scene.build(device=device, dtype=dtype))
     stepper.step()
-    assert stepper.cut[0] == 0.0 or dtype == "float32"
+    assert dtype == "float32" or (stepper.cut[0] == 0.0 and stepper.results[0] in (Result.CONVERGED, Result.ROUNDED))
     return stepper.state.x.numpy().copy()
 
 
@@ -397,8 +420,8 @@ PLAIN = {
             [(name, 981.0, 0.3, False) for name in ("newton clamp", "xpbd")], [(name, 981.0, 0.3, False) for name in EXACT]
         ),
         *slow_but(
-            [("newton clamp", 200.0, 0.3, True)],
-            [(name, *load) for name in EXACT for load in [(300.0, 0.0, False), (200.0, 0.3, True)]],
+            [("newton clamp", 250.0, 0.3, True)],
+            [(name, *load) for name in EXACT for load in [(300.0, 0.0, False), (250.0, 0.3, True)]],
         ),
         pytest.param("projective dynamics none", 981.0, 0.3, False, marks=SLOW),
         *(pytest.param(name, 981.0, 30.0, False, marks=SLOW) for name in EXACT),
@@ -409,12 +432,12 @@ def test_all_meet_at_one_minimiser(name, friction, gravity, mesh):
 
     Contact alone would move a vertex by 0.26 m in the step, beyond the middle of the ball, whose far side is then nearer.
     """
-    scene, expected = stretched(gravity, friction, mesh), minimiser(gravity, friction, mesh)
+    scene, expected = (roofed if mesh else stretched)(gravity, friction), minimiser(gravity, friction, mesh)
     stepper = (EXACT | PLAIN)[name].bind(scene.build(dtype="float64"))
     stepper.step()
     assert stepper.cut[0] == 0.0
     gaps = np.min([collider.distances(expected) for collider in scene.colliders], axis=0)
-    assert (gaps < R).sum() > (20 if mesh else 30) and gaps.min() < R / 10.0
+    assert (gaps < R).sum() > (50 if mesh else 30) and gaps.min() < R / 10.0
     assert np.abs(stepper.state.x.numpy() - expected).max() < 1e-8
 
 
@@ -456,7 +479,7 @@ def test_all_meet_as_far_as_float32_allows(name, device):
 
 @each_solver
 def test_nothing_near_changes_nothing(name):
-    """Free fall with contact declared, far from it or past a mesh that is a point: to rounding, or to the bit.
+    """Free fall with contact declared, far from it or past a mesh that is a point, to rounding.
 
     Without colliders nothing is built.
     """
@@ -467,7 +490,7 @@ def test_nothing_near_changes_nothing(name):
     far = falling(colliders, 0.0, contact=wc.Contact(stiffness=1e3))
     alone = replace(far, colliders=(), contact=None)
     one, other = (wc.simulate(scene, solver, dtype="float64") for scene in (far, alone))
-    np.testing.assert_allclose(one.points, other.points, rtol=0.0, atol={"explicit": 0.0, "admm": 1e-6}.get(name, 1e-12))
+    np.testing.assert_allclose(one.points, other.points, rtol=0.0, atol=1e-6 if name == "admm" else 1e-12)
     assert one.cut == 0.0
     stepper = solver.bind(alone.build())
     assert stepper.colliders is None and stepper.model.colliders is None
@@ -511,8 +534,7 @@ def test_a_step_with_nothing_near_has_few_launches_more(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("elements", ("vertices", "triangles"))
-def test_a_record_does_not_change_friction_on_a_mesh(elements):
+def test_a_record_does_not_change_friction_on_a_mesh():
     """A recorded run refreshes contact in every step, and no more than once where contact begins, on a mesh that deforms."""
     corners = np.array([[-2.0, 0.0, -2.0], [2.0, 0.0, -2.0], [2.0, 0.0, 2.0], [-2.0, 0.0, 2.0]])
     widening = [corners * [1.0 + 0.02 * frame, 1.0, 1.0] for frame in range(13)]
@@ -524,7 +546,7 @@ def test_a_record_does_not_change_friction_on_a_mesh(elements):
         terms=[wc.Spring(stiffness=100.0)],
         positions=grid.points + np.array([0.2, 0.03, 0.0]),
         colliders=[floor],
-        contact=wc.Contact(distance=R, stiffness=1e5, elements=elements),
+        contact=wc.Contact(distance=R, stiffness=1e5),
         duration=0.2,
     )
     solver = wc.XPBD(substeps=4, iterations=5)
@@ -669,7 +691,6 @@ def meshed(shape):
     [
         pytest.param(wc.Plane(), 0.02, None, id="plane"),
         pytest.param(wc.Box(size=(0.2, 0.1, 0.3), position=(0.25, -0.1, 0.25)), 0.0, [0, 6, 42, 48], id="box"),
-        pytest.param(wc.Sphere(radius=0.2, position=(0.25, -0.205, 0.25)), 0.0, [0, 6, 42, 48], id="sphere"),
     ],
 )
 def test_an_equilibrium_on_a_mesh_is_that_on_its_shape(shape, height, pins):
@@ -683,8 +704,19 @@ def test_an_equilibrium_on_a_mesh_is_that_on_its_shape(shape, height, pins):
     assert np.abs(one.points - two.points).max() < off + 1e-9
 
 
+def test_an_equilibrium_on_a_ball_keeps_triangles_out_of_its_mesh():
+    """With contact of vertices alone, the middles of flat triangles of this size dip 2 mm into the ball and more."""
+    ball = wc.Sphere(radius=0.2, position=(0.25, -0.205, 0.25))
+    mesh, off = meshed(ball)
+    rests = [wc.equilibrium(falling([each], n=7, height=0.0, pins=[0, 6, 42, 48])) for each in (ball, mesh)]
+    assert all(each.status.result is Result.CONVERGED and each.stable for each in rests)
+    grid = wc.Mesh.grid(7, 7)
+    dips, out = (ball.distances(each.points[grid.triangles].mean(axis=1)).min() for each in rests)
+    assert dips < -2e-3 and out > -off
+
+
 def test_an_equilibrium_in_a_groove():
-    """Of an open mesh of two slopes, which a sheet falls into from above: the nearest half-spaces change on its way."""
+    """Of an open mesh of two slopes, which a sheet falls into from above: the nearest triangles change on its way."""
     points = np.array([[-2, 2, -2], [-2, 2, 2], [0, 0, -2], [0, 0, 2], [2, 2, -2], [2, 2, 2]])
     groove = wc.MeshCollider(points * [0.25, 0.1, 0.25] + [0.25, -0.15, 0.25], [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
     rest = wc.equilibrium(falling([groove], n=5, height=0.08), record="reactions")
@@ -708,7 +740,6 @@ REFUSED = {
     ),
     "friction": (lambda: wc.Plane(friction=-0.1), "Plane.friction is -0.1; it must be a number of 0 or more"),
     "distance": (lambda: wc.Contact(distance=0.0), "contact.distance is 0.0"),
-    "elements": (lambda: wc.Contact(elements="edges"), "contact.elements is 'edges'"),
     "stiffness": (lambda: wc.Contact(stiffness=0.0), "contact.stiffness is 0.0; it must be a number above 0"),
     "stiffness as a text": (lambda: wc.Contact(stiffness="a"), "contact.stiffness is 'a'; it must be a number above 0"),
     "ragged": (lambda: wc.Plane(position=[[0, 0, 0], [1, 2]]), "Plane.position is [[0, 0, 0], [1, 2]], which is not numeric"),
@@ -728,6 +759,10 @@ REFUSED = {
     "weightless": (
         lambda: falling([wc.Plane()], gravity=(0, 0, 0), terms=[], contact=None),
         "contact.stiffness has no default without gravity and a spring or membrane of finite stiffness",
+    ),
+    "hard contact with a mesh": (
+        lambda: falling([wc.MeshCollider(CUBE.vertices, CUBE.faces)], contact=wc.Contact(stiffness=np.inf)),
+        "contact.stiffness is infinite and the collider MeshCollider is a mesh, with which contact is soft; give a finite",
     ),
     "all pinned": (
         lambda: wc.simulate(falling([wc.Plane()], pins=range(36)), wc.XPBD(substeps=1)),

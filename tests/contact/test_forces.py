@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 
 import warpcloth as wc
 from support.rows import slow_but
@@ -115,9 +114,10 @@ ORDERS = {
 }
 
 
-# The work of a swelling mesh is found as that of a pushed one, whatever the integrator.
+# The work of a swelling mesh is found as that of a pushed one, but in explicit steps, where the filter of pairs moves the cloth
+# and records no work.
 CASES = [(pushed, name, 0.4) for name in ORDERS] + [(swelling, "newton", 0.4)]
-CASES += [(pushed, name, 0.0) for name in ORDERS] + [(swelling, name, 0.4) for name in ("explicit", "xpbd")]
+CASES += [(pushed, name, 0.0) for name in ORDERS] + [(swelling, "xpbd", 0.4)]
 CASES = slow_but([(pushed, "newton midpoint", 0.4), (swelling, "newton", 0.4)], CASES)
 
 
@@ -126,7 +126,7 @@ def test_work_of_colliders_is_the_change_of_energy_to_the_order_of_the_scheme(sc
     """With friction too, of which the heat is counted; below 1e-4 of the work midpoint has no order any more."""
     solver, order = ORDERS[name]
     gaps = []
-    for substeps in (32, 64):
+    for substeps in (64, 128) if scene is swelling else (32, 64):
         solver = replace(solver, substeps=substeps)
         run = wc.simulate(scene(friction), solver, device=device, dtype="float64", frames=11, record=BOTH)
         sums = total(run.energies)
@@ -183,16 +183,12 @@ def test_the_filter_takes_the_energy_of_what_it_stops(device):
             np.testing.assert_allclose(sums, sums[0], rtol=1e-8)  # of the tolerance of Newton's method
 
 
-def jumping(shape, friction=0.0):
+def jumping(friction=0.0):
     """A hanging sheet, and a collider that jumps by centimetres in each frame."""
     jumps = np.random.default_rng(1).normal(scale=0.03, size=(12, 3))
     jumps[0] = 0.0
     position = np.array([0.25, -0.106, 0.23]) + np.cumsum(jumps, axis=0)
-    if shape == "mesh":
-        box = trimesh.creation.box((0.2, 0.2, 0.2))
-        collider = wc.MeshCollider(box.vertices, box.faces, position=position, friction=friction)
-    else:
-        collider = wc.Sphere(radius=0.1, position=position, friction=friction)
+    collider = wc.Sphere(radius=0.1, position=position, friction=friction)
     return wc.Scene(
         wc.Mesh.grid(8, 8, size=0.5),
         density=DENSITY,
@@ -203,17 +199,13 @@ def jumping(shape, friction=0.0):
     )
 
 
-JUMPS = [("sphere", 0.0, "float64"), ("sphere", 0.3, "float32")]
-JUMPS += [pytest.param("mesh", 0.3, "float64", marks=pytest.mark.slow)]
-
-
-@pytest.mark.parametrize(("shape", "friction", "dtype"), JUMPS)
-def test_works_balance_with_cuts_too_to_the_order_of_the_scheme(shape, friction, dtype, device):
+@pytest.mark.parametrize(("friction", "dtype"), ((0.0, "float64"), (0.3, "float32")))
+def test_works_balance_with_cuts_too_to_the_order_of_the_scheme(friction, dtype, device):
     """Nearly all that explicit steps get is of the filter; a box, whose edges cut often, needs shorter steps."""
     gaps = []
     for substeps in (64, 128):
         solver = wc.Explicit(substeps=substeps)
-        run = wc.simulate(jumping(shape, friction), solver, device=device, dtype=dtype, frames=11, record="energies")
+        run = wc.simulate(jumping(friction), solver, device=device, dtype=dtype, frames=11, record="energies")
         sums = total(run.energies)
         gaps.append(np.abs(sums - sums[0]).max())
     of_filter = np.abs(run.energies["work of the filter"]).max()
@@ -326,3 +318,18 @@ def test_a_run_writes_them(tmp_path, monkeypatch, capsys, device):
     heat = [cloth.GetPrimvar("energies:heat_of_friction").Get(frame) for frame in range(5)]
     np.testing.assert_allclose(heat, table["heat of friction"], rtol=1e-6, atol=1e-12)
     assert table["force on slope y"][-1] < -0.01
+
+
+@pytest.mark.parametrize("integrator", ("euler", "midpoint"))
+def test_heat_on_a_mesh_is_that_on_a_plane(integrator):
+    """Of a belt that carries a sheet away; Euler's trapezoidal rule on the plane takes half of the first step for rest."""
+    corners = [[-2.0, 0.0, -2.0], [-2.0, 0.0, 2.0], [2.0, 0.0, 2.0], [2.0, 0.0, -2.0]]
+    given = {"position": [(0.03 * k, -0.0009, 0.0) for k in range(7)], "friction": 0.3}
+    heats = []
+    for belt in (wc.MeshCollider(corners, [[0, 1, 2], [0, 2, 3]], **given), wc.Plane(**given)):
+        contact = wc.Contact(distance=R, stiffness=1.5e4)
+        fields = {"terms": [wc.Spring(stiffness=100.0)], "density": DENSITY, "duration": 0.25, "fps": 24.0}
+        scene = wc.Scene(wc.Mesh.grid(4, 4, size=0.5), colliders=[belt], contact=contact, **fields)
+        solver = wc.Newton(substeps=8, tolerance=1e-7, integrator=integrator)
+        heats.append(wc.simulate(scene, solver, dtype="float64", record="energies").energies["heat of friction"][-1])
+    assert heats[0] == pytest.approx(heats[1], rel=0.03) and heats[1] > 1e-3

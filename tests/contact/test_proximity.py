@@ -8,6 +8,7 @@ import warpcloth as wc
 from support.pairs import all_pairs
 from support.rows import slow_but
 from warpcloth.contact.proximity import Proximity
+from warpcloth.contact.surface import ContactSurface
 from warpcloth.model.model import Model
 
 
@@ -26,7 +27,7 @@ def pieces(mesh):
 def proximity(mesh, distance, skin, device, **options):
     pins = mesh.isolated if len(mesh.isolated) else None
     model = Model(wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)], pins=pins), device=device, **options)
-    return model, Proximity(model, distance, skin)
+    return model, Proximity(ContactSurface(model), distance, skin)
 
 
 def detect(found, x):
@@ -194,7 +195,7 @@ def test_lists_of_what_has_moved_are_those_of_all(mesh, device):
     """To the bit, of copies in which few or all vertices move; of a list that has too little room the number is right."""
     rng, skin = np.random.default_rng(5), 0.03
     model, found = proximity(mesh, 0.02, skin, device, copies=2)
-    other, lost = (Proximity(model, 0.02, skin) for _ in range(2))
+    other, lost = (Proximity(ContactSurface(model), 0.02, skin) for _ in range(2))
     lift = np.array([0.0, 1.0, 0.0])
     x = np.concatenate([folded(mesh, rng, 0.02) + each * lift for each in (0.0, 2.0)])
     detect(found, x)

@@ -100,9 +100,9 @@ def folded(n=13, gap=0.02, **fields):
     )
 
 
-def steps_of(scene, device, bounded=False, h=1.0 / 24.0):
+def steps_of(scene, device, bounded=False, h=1.0 / 24.0, copies=1):
     """The :class:`SelfSteps` of a scene in float64, in no solver, and its model."""
-    model = scene.build(device=device, dtype="float64")
+    model = scene.build(device=device, dtype="float64", copies=copies)
     return SelfSteps(model, wc.Explicit(substeps=1000, above_limit="allow").bind(model).state, h, 1, bounded, None), model
 
 
@@ -872,6 +872,54 @@ def test_directions_of_one_vertex(way, device):
     pairs.filter.launch_limit(model.array(direction, model.vec3))
     (fraction,) = pairs.filter.fraction.numpy()
     assert 0.5 * 0.02 < fraction * way < 0.02
+
+
+def test_sweeps_over_coarse_levels_find_no_contacts_anew(device):
+    """Only those over all terms count, where the halves of a fold are near enough to be listed."""
+    stepper = wc.HierarchicalPBD(substeps=1, iterations=3).bind(folded(gap=-0.05).build(device=device))
+    stepper.step()
+    assert len(stepper.levels) > 1 and stepper.pairs.contact.turn.numpy() == [3]
+
+
+@pytest.mark.parametrize(("way", "walks"), [(0.01, False), (-0.05, True)])
+def test_where_a_step_with_moving_pins_starts(way, walks, device):
+    """Sheets that would pass through one another, whose pin moves: cloth stays, but follows a pin that itself meets cloth.
+
+    The pin is of the upper sheet, and goes through the lower one too in the second case.
+    """
+    pin = 36 + 14
+    frames = layers().positions[[pin]] + np.array([0.0, 1.0, 0.0]) * np.array([0.0, way])[:, None, None]
+    scene = layers(pins=wc.Pins([pin], frames), duration=1.0 / 24.0)
+    pairs, model = steps_of(scene, device)
+    pairs.launch_begin(model.positions)
+    base, d = scene.positions.copy(), model.vectors()
+    base[36:, 1] -= 0.05
+    base[pin] = frames[-1]
+    pairs.filter.launch_start(model.array(base, model.vec3), d)
+    start = base + d.numpy()
+    free = np.arange(72) != pin
+    assert crossed(start, scene.mesh.triangles) == 0
+    if walks:
+        assert (np.abs(start - scene.positions).max(axis=1)[36:] > 1e-3).all()
+    else:
+        assert start[pin] == pytest.approx(base[pin], abs=1e-15)
+        assert start[free] == pytest.approx(scene.positions[free], abs=1e-15)
+
+
+def test_directions_by_the_list(device):
+    """Along moves for which the list is kept, its pairs give the fraction that a search of all pairs gives, to the bit."""
+    scene = layers(turn=17.0, gap=5e-3)
+    pairs, model = steps_of(scene, device)
+    pairs.launch_begin(model.positions)
+    random, found = np.random.default_rng(0), []
+    direction = 0.2 * pairs.skin * random.uniform(-1.0, 1.0, scene.positions.shape)
+    for listed in (True, False):
+        if not listed:
+            pairs.proximity.found.assign(random.uniform(-1.0, 1.0, scene.positions.shape))
+        pairs.filter.launch_limit(model.array(direction, model.vec3))
+        assert pairs.proximity.copies.numpy() == [not listed]
+        found.append(pairs.filter.fraction.numpy()[0])
+    assert found[0] == found[1] and 0.0 < found[0] < 1.0
 
 
 @pytest.mark.parametrize("length", [0.1, 1.0, 14.0])

@@ -84,7 +84,7 @@ def test_totals_of_copies(device):
 def test_none_of_it_without_self_contact(device):
     scene = sheets(self_contact=None)
     assert wc.simulate(scene, SOLVER, device=device, frames=1).self_contact is None
-    with pytest.raises(ValueError, match="record is 'pairs', which only runs of scenes with self_contact have"):
+    with pytest.raises(ValueError, match="record is 'pairs', which only runs of scenes with self_contact or mesh"):
         wc.simulate(scene, SOLVER, device=device, record=("energies", "pairs"))
     with pytest.raises(ValueError, match="record is 'pairs', which only runs"):
         wc.equilibrium(sheets(), device=device, record="pairs")
@@ -211,7 +211,7 @@ def test_command(tmp_path, capsys, device):
     given = ["run", str(stage), *options, "-o", files["run.usdc"]]
     assert main([*given, "--csv", files["run.csv"], "--report", files["run.json"]]) == 0
     printed = capsys.readouterr().out
-    assert "  self-contact  up to " in printed and " % of moves kept, least gap 0.00" in printed
+    assert "  contact       up to " in printed and " % of moves kept, least gap 0.00" in printed
     with open(files["run.csv"], newline="") as file:
         rows = list(csv.DictReader(file))
     with open(files["run.json"]) as file:
@@ -285,3 +285,19 @@ def test_work_of_pins_where_a_step_makes_room(device):
         assert (len(stepper.pairs.pairs.stencils) > before) == (room is None)
         works.append(history.energies)
     assert (works[0] == works[1]).all() and works[0][-1, 0, history.names.index("work of pins")] != 0.0
+
+
+TIP = [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]
+
+
+def test_a_gap_to_a_mesh_names_the_stiffness_of_contact(device):
+    """Of edges too, which no vertex of the cloth shows."""
+    tip = wc.MeshCollider([[-0.2, -0.3, -0.1], [0.2, -0.3, -0.1], [0.0, -0.3, 0.2], [0.02, -0.01, 0.01]], TIP)
+    grid = wc.Mesh.grid(3, 3, size=0.2)
+    fields = {"terms": [wc.Spring(stiffness=100.0)], "density": 0.15, "fps": 24.0, "duration": 4 / 24}
+    contact, itself = wc.Contact(distance=5e-3, stiffness=100.0), wc.SelfContact(distance=5e-3, stiffness=1e5)
+    mesh = wc.Mesh(grid.points - [0.1, 0.0, 0.1], grid.triangles)
+    scene = wc.Scene(mesh, colliders=[tip], contact=contact, self_contact=itself, **fields)
+    message = wc.simulate(scene, wc.Newton(substeps=4), device=device, dtype="float64").status.message
+    assert "the gap between cloth and a mesh falls below half the contact distance; a larger contact.stiffness" in message
+    assert "self_contact.stiffness" not in message

@@ -11,7 +11,7 @@ from support.continuum import flat, hill, jittered
 from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.core.hessian import Hessian
-from warpcloth.kernels.multigrid import CYCLE, OMEGA, SPARED
+from warpcloth.kernels.multigrid import OMEGA, SPARED
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.numerics import minimise
 from warpcloth.numerics.interpolation import interpolations, neighbours
@@ -148,9 +148,16 @@ def test_coarse_matrices_are_products_with_the_interpolation(device):
                 np.testing.assert_allclose(dense, A, atol=1e-10 * np.abs(A).max())
 
 
+def has_gained(multigrid, rates):
+    """Sets what diagonal blocks and multigrid have gained for their cost."""
+    multigrid._choice.gained.assign(rates)
+    multigrid._choice.costs.fill_(1.0)
+    multigrid._choice.rates.assign(rates)
+
+
 def keep(multigrid, used):
     """Lets all solves use multigrid, or diagonal blocks."""
-    multigrid._choice.rates.assign([0.0, 1.0] if used else [1.0, 0.0])
+    has_gained(multigrid, [0.0, 1e9] if used else [1e9, 0.0])
     multigrid._choice.age.fill_(-1_000_000)
     multigrid.used.fill_(int(used))
 
@@ -236,7 +243,8 @@ def test_trials_cost_little(device, blocks, cycles):
     """Most of the gain of a solve comes early, so that a trial that is cut off looks good; it may not win."""
     hessian = Hessian(scene("hanging", n=3).build(device=device), HessianPolicy.CLAMP)
     solver = ConjugateGradients(hessian, 10_000, Multigrid(hessian, 10_000))
-    solves, choose, used = solver._solves, solver.multigrid.choose, solver.multigrid.used
+    solves, choose, used, cycle = solver._solves, solver.multigrid.choose, solver.multigrid.used, 4
+    solver.multigrid.cycle = cycle
     solves.first.fill_(1.0)
     solves.tolerance.fill_(1e-3)
     wanted = wp.ones(1, dtype=wp.int32, device=device)
@@ -249,9 +257,9 @@ def test_trials_cost_little(device, blocks, cycles):
         taken = min(needed, int(solves.most.numpy()[0]))
         solves.iteration.fill_(taken)
         solves.next_rz.fill_(10.0 ** (-3.0 * np.sqrt(taken / needed)))
-        total += CYCLE * (taken + SPARED) if multigrid else taken + 1
+        total += cycle * (taken + SPARED) if multigrid else taken + 1
         choose(solves)
-    best = min(blocks + 1, CYCLE * (cycles + SPARED))
+    best = min(blocks + 1, cycle * (cycles + SPARED))
     assert total <= 1.1 * count * best
 
 
@@ -261,7 +269,7 @@ def test_diagonal_blocks_stop_where_multigrid_costs_less(device):
     def use(solver):
         solver._solves.most.zero_()
         solver.multigrid.used.zero_()
-        solver.multigrid._choice.rates.assign([1.0, 0.1])
+        has_gained(solver.multigrid, [1.0, 0.1])
 
     assert iterations(16, 1e5, device, False) > 60
     solver = weighed(16, 1e5, device, use)
@@ -280,7 +288,7 @@ def test_a_negative_curvature_changes_no_choice(device):
     b, x = (model.array(np.random.default_rng(k).normal(size=(model.count, 3)), model.vec3) for k in range(2))
     for used in (1, 0):
         choice.used.fill_(used)
-        choice.rates.assign(rates)
+        has_gained(solver.multigrid, rates)
         solver.solve(b, x, wp.ones(1, dtype=wp.int32, device=device))
         assert solver.negative.numpy()[0] == 1 and choice.used.numpy()[0] == used
         assert (choice.rates.numpy() == rates).all() and choice.outdated.numpy()[0] == 1

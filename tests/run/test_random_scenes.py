@@ -25,13 +25,28 @@ def test_what_a_judge_condemns_is_not_called_usable(seed, device):
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("seed", [41, 89])
+@pytest.mark.parametrize("seed", [76, 89])
 def test_unbalanced_contact_is_counted_over_steps_of_all_lengths(seed, device):
     """In some frames more than half of a force is not balanced, in others not; steps become as long as they may."""
     case = random_case(seed)
     solver = replace(case.solver, substeps=None, dt=None, error=1e9)
     said = wc.simulate(case.scene, solver, dtype=case.dtype, device=device).status.message
     assert "at least half of a force of contact is not balanced" in said
+
+
+@pytest.mark.host
+def test_an_impact_does_not_stall(device):
+    """Two sheets with moving pins meet at 9 m/s, by projective dynamics: one pair must not stop the whole cloth for ever."""
+    case = random_case(379)
+    animation, condemned = run_case(case, device)
+    assert condemned == [] and animation.status.complete and animation.worst_strain < 0.3
+
+
+@pytest.mark.host
+def test_no_crossing_after_a_line_search_for_the_direction(device):
+    """Projective dynamics shortens directions where φ rose, by trials elsewhere, from where iterates must not be bounded."""
+    _, condemned = run_case(random_case(43), device)
+    assert condemned == []
 
 
 # The judges. What they see is a fall as it is in books, of two sheets over a plane and a cone.
@@ -48,7 +63,7 @@ SHEETS = wc.Scene(
     velocities=np.tile([1.0, 0.0, 0.0], (2 * N * N, 1)),
     terms=[wc.Spring(pairs="edges", stiffness=100.0)],
     colliders=[wc.Plane(), replace(CONE, position=(0.0, 0.2, 0.0))],
-    contact=wc.Contact(distance=1e-3, stiffness=1e6, elements="triangles"),
+    contact=wc.Contact(distance=1e-3, stiffness=1e6),
     self_contact=wc.SelfContact(distance=1e-3, stiffness=1e4),
     duration=FRAMES / FPS,
     fps=FPS,

@@ -120,12 +120,12 @@ def inside(run):
 
 
 def pierced(run):
-    """Condemns cloth that crosses a mesh whose contact is that of triangles, by more than a thousandth of r.
+    """Condemns cloth that crosses a mesh, by more than a thousandth of r.
 
     Triangles with a pinned corner are left out, and meshes that cross the cloth at the start.
     """
     for collider in run.colliders:
-        if not isinstance(collider, wc.MeshCollider) or run.scene.contact.elements != "triangles":
+        if not collider.is_mesh:
             continue
         sides, margin = edges_of(collider.triangles), 1e-3 * run.scene.contact.distance + run.rounding
         edges, triangles = (each[run.free[each].all(axis=1)] for each in (edges_of(run.triangles), run.triangles))

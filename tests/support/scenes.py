@@ -85,7 +85,7 @@ FOLDING = {
     "fold": {"nx": 3, "ny": 13, "folds": 2},
     "twist": {"around": 12, "along": 8, "turns": 1.5, "duration": 0.8},
     "knot": {"along": 40, "across": 1, "duration": 0.8},
-    "funnel": {"n": 9, "duration": 0.8, "elements": "vertices"},  # Explicit takes 36 times as long with triangles
+    "funnel": {"n": 9, "duration": 0.8},
     "sleeve": {"around": 12, "along": 6, "duration": 0.6},
 }
 QUICK = {

@@ -8,8 +8,9 @@ from .terminal import check_writable
 
 EPILOG = """\
 --csv and --report record energies [J], the reaction forces of pins and the forces of the cloth on each collider [N] in every
-frame. The table of --csv has the sum of the reactions; the JSON of --report has the reaction of each pin. With self-contact,
-both have the numbers of pairs in contact, of pairs listed and of new lists, the fraction of moves kept, and the least gap [m].
+frame. The table of --csv has the sum of the reactions; the JSON of --report has the reaction of each pin. With self-contact or
+mesh colliders, both have the numbers of pairs in contact, of pairs listed and of new lists, the fraction of moves kept, and the
+least gap [m].
 An unknown value is an empty cell in the table, and null in JSON.
 """
 
@@ -20,7 +21,7 @@ def record_of(arguments, scene):
     check_apart([arguments.output, arguments.film, *files])
     check_writable(*files)
     check_replaceable(*files)
-    return ("energies", "reactions", *["pairs"] * (scene.self_contact is not None)) if files else ()
+    return ("energies", "reactions", *["pairs"] * scene.has_pairs) if files else ()
 
 
 def write_history(arguments, scene, animation):

@@ -74,7 +74,7 @@ def run(arguments):
             "compile_seconds": setup.seconds + animation.timings["compile"],
             "worst_strain": animation.worst_strain,
             **({"cut": animation.cut, "inside": [each._asdict() for each in animation.inside]} if scene.colliders else {}),
-            **({"pierced": [each._asdict() for each in animation.pierced]} if scene.colliders else {}),
+            **({"forced": [each._asdict() for each in animation.forced]} if scene.colliders else {}),
             **({"self_contact": _self_contact(animation.self_contact)} if animation.self_contact else {}),
             "residual": status.residual,
             "residual_measure": status.measure,
@@ -86,7 +86,7 @@ def run(arguments):
             "frames_folder": frames_folder_of(arguments),
             **values_of(arguments, "threads", "film", "csv", "report"),
         }
-        print(json_text(facts) if arguments.json else _summary(facts, animation.inside, animation.pierced))
+        print(json_text(facts) if arguments.json else _summary(facts, animation.inside, animation.forced))
         if status.ok:
             return 0
         where = f"all {frames} frames are" if status.complete else f"the last good frame is {status.frame},"
@@ -99,10 +99,10 @@ def _self_contact(found):
 
 
 def _lines_of(found):
-    """Yields the lines of the summary about self-contact."""
+    """Yields the lines of the summary about pairs."""
     gap = "no pair was listed" if found["least_gap"] is None else f"least gap {found['least_gap']:.3g} m"
     counts = f"up to {found['pairs']:,} pairs, {found['lists']:,} lists of them"
-    yield f"  self-contact  {counts}, {100.0 * found['kept']:.4g} % of moves kept, {gap}"
+    yield f"  contact       {counts}, {100.0 * found['kept']:.4g} % of moves kept, {gap}"
     if found["too_near"]:
         yield f"  too near      {found['too_near']}"
     if found["moved_apart"]:
@@ -111,14 +111,13 @@ def _lines_of(found):
         yield f"  pins          {found['held_pins']}"
 
 
-def _summary(facts, inside, pierced):
+def _summary(facts, inside, forced):
     from ..core.status import digits
 
     threads, measured = facts["threads"], facts["residual_measure"] is not None
     residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none, the method does not compute one"
-    touching, by = facts.get("self_contact"), "colliders"
-    by += " and other cloth" if touching else ""
-    cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by {by}"] if "cut" in facts else []
+    touching = facts.get("self_contact")
+    cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by contact"] if "cut" in facts else []
     return "\n".join(
         [
             f"{facts['scene']}: {facts['message']}",
@@ -127,7 +126,7 @@ def _summary(facts, inside, pierced):
             f"  worst strain  {100.0 * facts['worst_strain']:.3g} %",
             *cut,
             *(f"  inside        {each}" for each in inside),
-            *(f"  pierced       {each}" for each in pierced),
+            *(f"  forced        {each}" for each in forced),
             *(_lines_of(touching) if touching else ()),
             f"  residual      {residual}",
             f"  solver        {solver_line(facts)}",

@@ -6,9 +6,6 @@ import warp as wp
 from ..kernels.contact.clearance import clearances, near_colliders
 from ..kernels.contact.colliders import shapes
 
-# How far edges may be stretched, at most, where triangles far from the meshes among the colliders are told by their vertices.
-STRETCHED = 4.0
-
 
 class Clearance:
     """Tells the steps in which vertices may come near a collider. In all others contact has no force, and the filter no effect.
@@ -18,13 +15,12 @@ class Clearance:
     Args:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`.
         state: The :class:`warpcloth.core.state.State` of the solver.
-        triangles: Whether triangles of the cloth, not only vertices, have contact with meshes.
 
     Attributes:
         near: 1 for copies in which a vertex may come near a collider in this step, else 0, (B,) int32.
     """
 
-    def __init__(self, colliders, state, triangles):
+    def __init__(self, colliders, state):
         self._colliders, self.model = colliders, colliders.model
         model, device = self.model, self.model.device
         self._clear = clear = clearances(model.dtype)()
@@ -39,10 +35,6 @@ class Clearance:
             balls[model.inverse_mass.numpy() == 0.0, 3] = np.inf  # pins may stand near
         clear.balls = model.array(balls, wp.types.vector(4, model.dtype))
         halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
-        if triangles:
-            # Points of a triangle are no farther from one of its vertices than its longest edge over √3.
-            max_length = STRETCHED / np.sqrt(3.0) * float(model.scene.mesh.edge_lengths.max())
-            bounding = np.array(bounding) + [max_length if collider.facets else 0.0 for collider in model.scene.colliders]
         self._bounds = shapes(model.dtype)()
         self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
         self._finds = [model.kernel(near_colliders, model.dtype, ended) for ended in (False, True)]

@@ -12,14 +12,10 @@ from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.clear_elements import find_clear
 from ..kernels.contact.collider_filter import FIRST, FilterNotes, filter_step, hold_locked
-from ..kernels.contact.mesh_filter import filter_meshes
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..terms.refresh import STEP, Refresh
 from .clearance import Clearance
-from .face_steps import FaceSteps
-from .mesh_faces import MeshFaces
-from .mesh_steps import MeshSteps
 
 # The filter puts a vertex that would end in a collider at this gap, relative to the contact distance. At a much smaller gap the
 # logarithm would push hard, and in float32 noisily.
@@ -29,10 +25,11 @@ CLOTH = "other cloth"
 
 
 class ColliderSteps:
-    """The motion of colliders, anchors of friction and the filter, in the steps of one solver.
+    """The motion of colliders, and the anchors of friction and the filter of those that are no meshes, in one solver's steps.
 
     At the start of a step, a ``Refresh`` of the terms moves the colliders, stores the positions of the vertices, and sets the
-    anchors of friction. At the end of the step, :meth:`launch_end` moves vertices out of colliders.
+    anchors of friction. At the end of the step, :meth:`launch_end` moves vertices out of colliders. Meshes have no terms, see
+    :mod:`.self_steps`. If no collider has any, the solver calls :meth:`launch_start` itself.
 
     Args:
         model: The :class:`warpcloth.model.model.Model` of a scene with colliders.
@@ -41,7 +38,6 @@ class ColliderSteps:
         steps_per_frame: Steps per frame.
         part: The time within a step at which forces are evaluated, from 0 (its start) to 1 (its end). It is 0 for explicit
             steps, whose contact is ``bounded``.
-        resting: Whether this is for an equilibrium instead of a solver. Its rounds are the steps, and h is 0.
 
     Attributes:
         terms: The elements of the model. Those of contact have rest states of their own.
@@ -52,10 +48,8 @@ class ColliderSteps:
         shapes: A :func:`warpcloth.kernels.contact.colliders.shapes`.
         anchors: The anchors of friction, by the index of each collider with friction. They are rows of ``anchor_rows`` (C, N).
         least: The smallest distance from a collider at which a vertex may end a step [m].
+        moved_by_terms: Whether the refresh of a term moves the colliders at the start of a step.
         near: See :class:`warpcloth.contact.clearance.Clearance`; None if all steps refresh contact.
-        faces: :class:`warpcloth.contact.mesh_faces.MeshFaces` that keeps triangles from crossing meshes, or None.
-        face_steps: :class:`warpcloth.contact.face_steps.FaceSteps` of the pairs of triangles and meshes, or None.
-        face_anchors: Anchors of the friction of triangles on each mesh that has it, (B, E) by its index.
         steps_per_frame: As given.
         notes: :class:`warpcloth.kernels.contact.collider_filter.FilterNotes`.
         steps: The number of steps so far, (B,) int32.
@@ -64,7 +58,7 @@ class ColliderSteps:
             (N,) double precision. They exist after :meth:`note_pushes`.
     """
 
-    def __init__(self, model, state, h, steps_per_frame, part, resting=False):
+    def __init__(self, model, state, h, steps_per_frame, part):
         self.model, self.h, self.part, device = model, h, part, model.device
         self.steps_per_frame = steps_per_frame
         declared = model.colliders
@@ -88,30 +82,21 @@ class ColliderSteps:
         self.correction, self.he = None, h
         self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
-        self._spare, self._face_spares, self._reads, self._again = None, {}, False, False
+        self._spare, self._reads, self._again = None, False, False
         self.least = FLOOR * declared.distance
         # Midpoint evaluates forces at the middle of a step, other integrators at its end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
         self.bounded = part == 0.0
         self._move, self._count = model.kernel(kernels.move_colliders, model.dtype), model.kernel(count_step)
-        self.meshes = self.faces = self.face_steps = None
-        self.face_anchors = {}
-        if declared.meshes is not None:
-            given = {"steps": self.steps, "per_frame": 2 * steps_per_frame, "ahead": self._given[-1], "h": h}
-            given |= {"r": declared.distance, "least": self.least, "landing": LANDING * declared.distance}
-            self.meshes = MeshSteps(model, self.poses, self.bounded, resting, **given)
-            if model.scene.contact.elements == "triangles" and not resting:
-                self.faces = MeshFaces(model, self.meshes, h)
-                if any(elements.on_faces for elements in model.terms):
-                    self.face_steps = FaceSteps(model, self.meshes, self.bounded)
-        self._filter = model.kernel(filter_step if self.meshes is None else filter_meshes, model.dtype, declared.solids)
+        self._filter = None if all(declared.is_mesh) else model.kernel(filter_step, model.dtype, declared.solids)
         if model.mobility is not None:
             self._wanted, self._hold = [model.vectors(), model.vectors()], model.kernel(hold_locked, model.dtype)
             self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
-        self._finds_clear = model.device.is_cpu and not (self.bounded or resting)
+        self._finds_clear = model.device.is_cpu and not self.bounded
+        self.moved_by_terms = any(elements.collider is not None for elements in model.terms)
         self._clearance = None
-        if not (self.bounded or resting or any(declared.moves)):
-            self._clearance = Clearance(self, state, self.faces is not None)
+        if self.moved_by_terms and not (self.bounded or any(declared.moves)):
+            self._clearance = Clearance(self, state)
         self.near = None if self._clearance is None else self._clearance.near
         self.terms = []
         for elements in model.terms:
@@ -123,18 +108,10 @@ class ColliderSteps:
         model, declared = self.model, self.model.colliders
         first = all(each.refresh is None or each.collider is None for each in self.terms)
         term = elements.term.bounded if self.bounded else elements.term
-        if elements.on_faces:
-            return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=self._refresh_of_faces(elements, state))
         anchors = None
         if elements.term.law:
             anchors = self.anchors[c] = state.add(f"anchors on collider {c}", self.anchor_rows[c])
-        if declared.facets[c]:
-            if elements.term.law:
-                of_mesh = self.meshes.friction(elements, float(declared.friction[c]), anchors)
-            else:
-                of_mesh = self.meshes.contact(elements)
-            launch = partial(self._on_mesh, of_mesh, anchors, state.v)
-        elif elements.term.law:
+        if elements.term.law:
             kernel = model.kernel(anchor_vertices, model.dtype, declared.solids, elements.term.law, self.bounded)
             launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
         elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
@@ -147,31 +124,10 @@ class ColliderSteps:
             clear = wp.zeros(elements.count, dtype=model.dtype, device=model.device)
         return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=refresh, clear=clear)
 
-    def _refresh_of_faces(self, elements, state):
-        """The refresh of contact or friction of triangles with a mesh; None for an equilibrium, which has neither."""
-        if self.face_steps is None:
-            return None
-        anchors = None
-        if elements.term.law:
-            c, steps = elements.collider, self.face_steps
-            anchors = self.face_anchors[c] = state.add(f"anchors of triangles on collider {c}", steps.anchors(elements))
-            launch = steps.friction(elements, float(self.model.colliders.friction[c]), anchors)
-        else:
-            launch = self.face_steps.contact(elements)
-
-        def launch_on_faces(_model, elements, _moment):
-            with self._kept(anchors, self._face_spares.get(elements.collider)):
-                self._launch_if_near(partial(launch, elements, elements.refresh.arrays, self.x_before, state.v))
-
-        return Refresh(STEP, launch_on_faces, self.face_steps.arrays(elements))
-
     def _refresh(self, first, launch, v, model, elements, moment):
         """Launches what the start of a step needs. The first of the terms also moves the colliders, once for all terms."""
         if first:
-            self.launch_move()
-            if self.meshes is not None:
-                self.meshes.launch_trees()
-            wp.copy(self.x_before, moment.x)
+            self.launch_start(moment.x)
             if self._clearance is not None:
                 self._clearance.launch_begin(self.x_before, v)
         if launch is not None:
@@ -183,10 +139,6 @@ class ColliderSteps:
         else:
             self._clearance.launch_refresh(launch)
 
-    def _on_mesh(self, launch, anchors, v, model, elements):
-        with self._kept(anchors, self._spare):
-            launch(elements, self.x_before, v)
-
     def _pose_elements(self, kernel, c, v, model, elements):
         given = [elements.stencil, self.shapes, *model.free_gravity, self.x_before, v, self.poses]
         given += [c, elements.per_copy, self.least, 0.0 if self.bounded else self.h]
@@ -195,20 +147,11 @@ class ColliderSteps:
     def _anchor(self, kernel, c, anchors, friction, model, elements):
         given = [elements.stencil, self.shapes, self.x_before, self.poses]
         given += [c, elements.per_copy, model.colliders.distance, friction]
-        with self._kept(anchors, self._spare):
-            model.launch(kernel, elements.count, given, [anchors, elements.rest])
-
-    @contextmanager
-    def _kept(self, anchors, spare):
-        """Sets anchors, or None, back at the end of this context if it is within :meth:`reading_anchors`."""
-        if anchors is None or not self._reads:
-            yield
-            return
-        wp.copy(spare, anchors)
-        try:
-            yield
-        finally:
-            wp.copy(anchors, spare)
+        if self._reads:
+            wp.copy(self._spare, anchors)
+        model.launch(kernel, elements.count, given, [anchors, elements.rest])
+        if self._reads:
+            wp.copy(anchors, self._spare)
 
     @contextmanager
     def reading_anchors(self):
@@ -225,7 +168,11 @@ class ColliderSteps:
             self._clearance.follow()
         if self._spare is None:
             self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
-            self._face_spares = {c: wp.zeros_like(anchors) for c, anchors in self.face_anchors.items()}
+
+    def launch_start(self, x):
+        """Launches the start of a step from positions x (N,): :meth:`launch_move`, and a copy of x to ``x_before``."""
+        self.launch_move()
+        wp.copy(self.x_before, x)
 
     def launch_move(self):
         """Launches the computation of the poses of colliders at the start of a step."""
@@ -253,7 +200,7 @@ class ColliderSteps:
         self.notes.pushed, self.notes.kicked = self.pushed, self.kicked
 
     def launch_end(self, x, v, move=None):
-        """Moves vertices that would end in a collider, or cross one, out of it; corrects x, v and ``move``, (N,)."""
+        """Moves vertices that would end in a collider that is no mesh, or cross it, out; corrects x, v and ``move``, (N,)."""
         if self._clearance is None:
             self._launch_end(x, v, move)
         else:
@@ -270,17 +217,13 @@ class ColliderSteps:
         if model.mobility is not None:  # vertices that locked axes hold inside are noted like pins
             model.launch(self._hold, model.count, [model.mobility, *self._wanted], [x, v, move, self.notes])
             self._launch_filter(self._fixed, x, v, move, self.notes)
-        if self.faces is not None:
-            self.faces.launch_end(self.x_before, x, v, move, self.notes)
 
     def _launch_filter(self, inverse_mass, x, v, move, notes):
+        if self._filter is None:
+            return
         model = self.model
-        if self.meshes is None:
-            given = [inverse_mass, self.shapes, self.x_before, self.poses]
-            given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
-        else:
-            given = [inverse_mass, self.shapes, self.meshes.geometry, self.x_before]
-            given += [self.meshes.motion, self.meshes.lists, model.per_copy]
+        given = [inverse_mass, self.shapes, self.x_before, self.poses]
+        given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
         model.launch(self._filter, model.count, given, [x, v, move, notes])
 
     # For self-contact, which can hold vertices back inside a collider that moves onto them.
@@ -296,8 +239,6 @@ class ColliderSteps:
     def launch_out(self, x, v):
         """Moves vertices in x and v as :meth:`launch_end` does, and notes nothing."""
         self._launch_filter(self.model.inverse_mass, x, v, None, self._unread)
-        if self.faces is not None and any(self.model.colliders.moves):
-            self.faces.launch_out(self.x_before, x)
 
     def launch_inside(self, x, v):
         """Notes vertices that are inside colliders at the end of the step, and counts the step. It does not move them."""
@@ -327,5 +268,5 @@ class ColliderSteps:
 
     def start_again(self):
         """Clears counts and anchors after the steps that an integrator makes to find its past state."""
-        for array in (self.steps, self.notes.cut, self.notes.inside, *self.anchors.values(), *self.face_anchors.values()):
+        for array in (self.steps, self.notes.cut, self.notes.inside, *self.anchors.values()):
             array.zero_()

@@ -7,12 +7,12 @@ from ..core.gradient import Gradient
 from ..core.sums import Sums
 from ..kernels.contact import collider_work as kernels
 from ..kernels.project import add_momentum
-from ..kernels.work import add_scaled
+from ..kernels.work import add_rubbing_work, add_scaled
 from .present import ColliderPulls, PresentContact
 
 
 class ColliderWork:
-    """Sums the work over the steps of one stepper, from the forces that its steps used.
+    """Sums the work of colliders but meshes over the steps of one stepper, from the forces that its steps used.
 
     Args:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the stepper.
@@ -27,12 +27,13 @@ class ColliderWork:
         self._sums, self._at_end = [of_colliders, against_friction, of_filter], colliders.part == 1.0
         self._cuts = cuts.cuts
         self.pulls = ColliderPulls(model, terms, hard)
+        self._solid = [(c, self.pulls.found[c]) for c in self.pulls.solid]
         self._before, self._x_step = [], self._x if self._at_end else colliders.x_before
         others, self._limit = [elements for elements in terms if elements.collider is None], None
         if colliders.correction is not None and model.mobility is None and not any(elements.hard for elements in others):
             self._limit = [model.kernel(each, model.dtype) for each in (add_momentum, add_scaled, kernels.limit_pulls)]
             self._elastic, self._given, self._taken = Gradient(model, terms=others), model.vectors(), model.vectors()
-        for now in self.pulls.found:
+        for _c, now in self._solid:
             before = kernels.collider_pulls(model.dtype)()
             now.move = model.vectors()
             if self._at_end:
@@ -43,14 +44,12 @@ class ColliderWork:
         if colliders.part == 0.5:
             self._half_way, self._x_step = model.kernel(kernels.half_way, model.dtype), model.vectors()
         self._add = model.kernel(kernels.add_collider_work, model.dtype)
-        self._rigid, meshes = model.kernel(kernels.rigid_moves, model.dtype), model.colliders.meshes
-        self._deform = [] if meshes is None else meshes.deform
-        self._surface = model.kernel(kernels.surface_moves, model.dtype) if self._deform else None
+        self._rigid = model.kernel(kernels.rigid_moves, model.dtype)
 
     def begin(self, found, vertices):
         """Sets the state before the first step from the pulls ``found``, of which it takes the slice ``vertices``."""
         if self._at_end:
-            for before, now in zip(self._before, found, strict=True):
+            for before, now in zip(self._before, (found[c] for c in self.pulls.solid), strict=True):
                 wp.copy(before.all, now.all[vertices])
                 if before.friction:
                     wp.copy(before.friction, now.friction[vertices])
@@ -63,10 +62,10 @@ class ColliderWork:
         self.pulls.launch(self._x_step)
         if self._limit:
             self._launch_limit()
-        for c, (now, before) in enumerate(zip(self.pulls.found, self._before, strict=True)):
-            self._launch_moves(c, self._x_step, colliders.poses.at, int(2.0 * colliders.part), now.move)
+        for (c, now), before in zip(self._solid, self._before, strict=True):
+            self._launch_moves(c, self._x_step, colliders.poses.at, now.move)
             if self._at_end:
-                self._launch_moves(c, colliders.x_before, colliders.poses.before, 0, before.move)
+                self._launch_moves(c, colliders.x_before, colliders.poses.before, before.move)
             given = [colliders.x_before, self._x, self._cuts, now, model.colliders.distance]
             model.launch(self._add, model.count, given, [before, *self._sums])
 
@@ -78,20 +77,68 @@ class ColliderWork:
         self._elastic.add(self._x_step, self._given)
         he = self.colliders.he
         model.launch(momentum, model.count, [model.mass, self.colliders.correction, 1.0 / he**2], [self._given])
-        for now in self.pulls.found:
+        for _c, now in self._solid:
             model.launch(add, model.count, [now.all, 1.0], [self._taken])
-        for now in self.pulls.found:
+        for _c, now in self._solid:
             model.launch(limit, model.count, [self._given, self._taken], [now])
 
-    def _launch_moves(self, c, x, poses, when, out):
-        """Launches out = displacements of the material of collider c at x, ``when`` half steps after the start of the step."""
-        model, colliders = self.model, self.colliders
-        if c in self._deform:
-            meshes = colliders.meshes
-            given = [meshes.geometry, x, poses, meshes.motion, when, c, model.per_copy, meshes.lists]
-            model.launch(self._surface, model.count, given, [out])
-        else:
-            model.launch(self._rigid, model.count, [x, poses, colliders.poses, c, model.per_copy], [out])
+    def _launch_moves(self, c, x, poses, out):
+        """Launches out = displacements of the material of collider c at x in a step, from its ``poses``."""
+        model = self.model
+        model.launch(self._rigid, model.count, [x, poses, self.colliders.poses, c, model.per_copy], [out])
+
+
+class PairWork:
+    """Sums the work of meshes on cloth, and the work against friction of pairs, over the steps of one stepper.
+
+    Work is ∂U/∂y times the travel of the meshes in a step, with y = Σ wᵢxᵢ of each pair where the step evaluates its forces.
+
+    Args:
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`, with pairs.
+        against_friction: Sums per vertex of the cloth, (N,) float64 [J]. The part of meshes is in ``against_meshes``.
+
+    Attributes:
+        of_meshes, against_meshes: Sums for each collider, (B, C) float64 [J].
+    """
+
+    def __init__(self, stepper, against_friction):
+        self._stepper, self._against, model = stepper, against_friction, stepper.model
+        size = model.copies, len(model.scene.colliders)
+        self.of_meshes, self.against_meshes = (wp.zeros(size, dtype=wp.float64, device=model.device) for _ in range(2))
+        self._moves, self._x = any(model.scene.colliders[c].moves for c in model.scene.meshes), model.vectors()
+        self._half_way = model.kernel(kernels.half_way, model.dtype)
+        self._pulls, self._rub = model.vectors(), model.kernel(add_rubbing_work, model.dtype)
+
+    def launch(self):
+        """Launches the sums after a step, before pairs are listed anew."""
+        stepper, pairs, x = self._stepper, self._stepper.pairs, self._stepper.state.x
+        friction, acting = pairs.friction, self._positions(x)
+        if self._moves:
+            pairs.forces.launch(acting)
+            pairs.launch_work(self.of_meshes, pairs.forces.terms)
+        if friction is not None:
+            friction.launch_acting(acting, self._pulls)
+            stepper.model.launch(self._rub, stepper.model.count, [self._pulls, friction.start, x], [self._against])
+            if self._moves:
+                pairs.launch_work(self.against_meshes, [friction])
+
+    def _positions(self, x):
+        """Returns the positions at which the last step, which ended at x (N,), evaluated its forces [m]."""
+        stepper, model, integrator = self._stepper, self._stepper.model, self._stepper.integrator
+        if (integrator is not None and integrator.parts == 1) or not (self._moves or stepper.pairs.friction):
+            return x
+        start = stepper.pairs.friction.start if stepper.x_before is None else stepper.x_before
+        if integrator is None:
+            return start
+        model.launch(self._half_way, model.count, [start, x], [self._x])
+        return self._x
+
+    def sums(self):
+        """Returns the work of meshes, and the part of meshes in the work against friction, (B,) [J], and resets both to 0."""
+        found = [array.numpy().sum(axis=1) for array in (self.of_meshes, self.against_meshes)]
+        for array in (self.of_meshes, self.against_meshes):
+            array.zero_()
+        return found
 
 
 class FilterWork:

@@ -1,6 +1,5 @@
 """The energy of self-contact in the steps of a solver."""
 
-import numpy as np
 import warp as wp
 
 from ..core.dynamic import DynamicElements
@@ -11,7 +10,8 @@ from ..kernels.contact import self_contact as kernels
 from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
 from .self_friction import acting_sizes
 
-# Sweeps find contacts anew once in a step of 20 sweeps, the default.
+# Sweeps find contacts anew after so many, once in a step of 20 sweeps, the default. Of a hierarchy, only those of the finest
+# level count. To find contacts costs as much as 2 or 3 sweeps. Sooner, XPBD gains no less energy.
 EVERY = 10
 
 
@@ -19,30 +19,31 @@ class PairContact(DynamicElements):
     """Contact of cloth with itself: the potential of :mod:`warpcloth.kernels.contact.pair_potential`.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
+        surface: The :class:`warpcloth.contact.surface.ContactSurface`.
         bounded: Whether contact is that of explicit steps, without the logarithm.
-        declared: The :class:`warpcloth.SelfContact`.
+        laws: :class:`warpcloth.kernels.contact.pair_potential.Laws`.
         listed: Whether there are listed pairs, (1,) int32.
 
     Attributes:
+        obstacles: Where forces are evaluated, positions of the obstacles are behind those of the cloth, (V,) [m].
         least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
         lists: The listed pairs, a :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
+        turn: The number of sweeps of the step that count among those after which contacts are found anew, (1,) int32.
     """
 
-    def __init__(self, model, bounded, declared, listed):
+    def __init__(self, surface, bounded, laws, listed):
+        self.surface = surface
+        model = surface.model
         super().__init__(model, kernels.CONTACT_OF_PAIRS, listed)
-        self.least, self._declared = 0.0, declared
-        mesh, device = model.scene.mesh, model.device
-        of_vertices = mesh.vertex_areas
-        of_edges = of_vertices / np.maximum(np.bincount(mesh.edges.ravel(), minlength=len(of_vertices)), 1)
-        areas = np.empty((2, model.per_copy))
-        areas[:, model.in_model(np.arange(model.per_copy))] = of_vertices, of_edges
+        self.least, self._laws, device = 0.0, laws, model.device
+        areas = surface.areas(surface.of_cloth)
         self._areas = potential.Areas()
         self._areas.of_vertices, self._areas.of_edges = (
-            wp.array(np.tile(each, model.copies), dtype=wp.float64, device=device) for each in areas
+            wp.array(surface.of_model(each), dtype=wp.float64, device=device) for each in areas
         )
-        self._areas.rest = wp.array(model.rest_points, dtype=wp.vec3d, device=device)
-        self._of_edges = not bounded  # the filter alone keeps edges apart in explicit steps
+        self._areas.rest = wp.array(surface.rest, dtype=wp.vec3d, device=device)
+        self.obstacles, self._goal = (surface.vectors() for _ in range(2)) if surface.obstacles else (None, None)
+        self._of_edges = not bounded  # the filter alone keeps edges, and vertices of meshes, apart in explicit steps
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
         made = potential.find_vertex_contacts, potential.find_edge_contacts, fill_corners, sort_corners
         self._launch = model.launcher((made, model.dtype))
@@ -58,15 +59,20 @@ class PairContact(DynamicElements):
         """Takes the listed pairs and their normals (capacity,), and allocates contacts."""
         self.lists, self._normals = lists, normals
         pairs, slots, device = near_pairs(self.model.dtype)(), 2 * len(lists.stencils), self.model.device
-        pairs.stencils = wp.zeros(slots, dtype=wp.vec4i, device=device)
+        pairs.stencils, pairs.layout = wp.zeros(slots, dtype=wp.vec4i, device=device), self.surface.layout
         for name, size in acting_sizes(self.model, slots, self._corners).items():
             setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
         contacts = potential.Contacts()
         for name, kind in (("weights", wp.vec4d), ("normal", wp.vec3d), ("code", wp.int32)):
             setattr(contacts, name, wp.zeros(slots, dtype=kind, device=device))
-        for name in ("gap", "distance", "stiffness", "share", "fixed"):
+        for name in ("gap", "distance", "stiffness", "share", "ratio", "fixed"):
             setattr(contacts, name, wp.zeros(slots, dtype=wp.float64, device=device))
         contacts.followed.mode = wp.zeros(1, dtype=wp.int32, device=device)
+        contacts.parts = pairs.stencils
+        if self.surface.obstacles:
+            contacts.parts = wp.zeros(slots, dtype=wp.vec4i, device=device)
+            contacts.offset, contacts.travel = (wp.zeros(slots, dtype=wp.vec3d, device=device) for _ in range(2))
+            contacts.moves = self.surface.moves_of_step
         self.hold_pairs(pairs, contacts)
         if self._in_turn is not None:
             self._hold_followed()
@@ -75,13 +81,26 @@ class PairContact(DynamicElements):
         """Finds the contacts with a force at x, or x + correction, and those that may have one at goal + move."""
         self.launch_none()
         self.data.stiffness.zero_()
+        x, goal = self._whole(x, self.obstacles), self._whole(goal, self._goal)
         given = {"x": x, "correction": correction, "goal": goal, "move": move}
         wp.capture_if(self.present, self._launch_listed, **given)
 
+    def _whole(self, x, whole):
+        """Returns positions of the cloth (N,) with the obstacles behind them, or x if it is None or has them."""
+        if whole is None or x is None or len(x) == self.surface.count:
+            return x
+        wp.copy(whole, x, count=len(x))
+        return whole
+
+    def launch_obstacles(self, positions):
+        """Takes the positions of the obstacles where the step evaluates its forces, (B·m,) [m]."""
+        for whole in (self.obstacles, self._goal):
+            wp.copy(self.surface.behind(whole), positions)
+
     def _launch_listed(self, x, correction, goal, move):
-        declared = self._declared
-        given = [self.lists, self._areas, self._normals, x, correction, goal, move, declared.stiffness, declared.distance]
-        self._launch(potential.find_vertex_contacts, self.model.count, given, [self.pairs, self.data])
+        given = [self.lists, self._areas, self._normals, x, correction, goal, move, self._laws]
+        vertices = self.surface.count if self._of_edges else self.model.count
+        self._launch(potential.find_vertex_contacts, vertices, given, [self.pairs, self.data])
         if self._of_edges:
             self._launch(potential.find_edge_contacts, len(self.lists.stencils), given, [self.pairs, self.data])
         if self._corners:
@@ -102,14 +121,15 @@ class PairContact(DynamicElements):
 
     # Sweeps, see :mod:`warpcloth.kernels.contact.pair_follow`.
 
-    def follow(self, launch, positions):
-        """Prepares sweeps, which take contacts at ``positions`` (N,) that follow their iterates.
+    def follow(self, start, launch, positions):
+        """Prepares sweeps, which take contacts at ``positions`` (V,) that follow their iterates.
 
         Args:
+            start: ``start()`` moves meshes to where forces are evaluated, and cloth out of their way, in the positions.
             launch: ``launch(x, correction)`` moves the positions towards x + correction, as far as pairs stay apart.
-            positions: (N,) [m].
+            positions: (V,) [m].
         """
-        self._follow, self._positions = launch, positions
+        self._start, self._follow, self._positions = start, launch, positions
 
     def sweeps(self, in_turn):
         super().sweeps(in_turn)
@@ -121,17 +141,19 @@ class PairContact(DynamicElements):
         followed, device = self.data.followed, self.model.device
         followed.start, followed.carried, followed.stencils = map(self.room, (wp.float64, wp.float64, wp.vec4i))
         followed.rows = wp.zeros_like(self.lists.rows)
-        self._turn, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self.turn, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
 
     def launch_sweep_start(self, x):
+        self._start()
         self._launch_found(self._positions, goal=x)
         super().launch_sweep_start(x)
-        self._turn.zero_()
+        self.turn.zero_()
 
-    def launch_sweep(self, x, correction, h, adds, backward):
-        self.model.launch(pair_follow.count_sweep, 1, [EVERY, self.present], [self._turn, self._due])
-        wp.capture_if(self._due, self._launch_follow, x=x, correction=correction, h=h, adds=adds)
-        super().launch_sweep(x, correction, h, adds, backward)
+    def launch_sweep(self, x, correction, h, adds, backward, follows):
+        if follows:
+            self.model.launch(pair_follow.count_sweep, 1, [EVERY, self.present], [self.turn, self._due])
+            wp.capture_if(self._due, self._launch_follow, x=x, correction=correction, h=h, adds=adds)
+        super().launch_sweep(x, correction, h, adds, backward, follows)
 
     def _launch_follow(self, x, correction, h, adds):
         """Finds the contacts where the iterate is now; those that add forces take over those of the last ones."""
@@ -145,12 +167,13 @@ class PairContact(DynamicElements):
         if not self._in_turn:
             self.launch_corner_slots()
         if adds:
-            self._take_over(pair_follow.start_forces, self.capacity, [self.lists, self.pairs, h, self.model.count], [self.data])
-            self._take_over(pair_follow.fix_forces, self.model.count, [self.lists, h], [self.data])
+            vertices = self.surface.count
+            self._take_over(pair_follow.start_forces, self.capacity, [self.lists, self.pairs, h, vertices], [self.data])
+            self._take_over(pair_follow.fix_forces, vertices, [self.lists, h], [self.data])
             self._launch_all(potential.STARTING, x, correction, h)
 
     def _launch_all(self, mode, x, correction, h):
         """Launches a sweep that removes all forces, or adds those at their start."""
         self.data.followed.mode.fill_(int(mode))
-        super().launch_sweep(x, correction, h, True, False)
+        super().launch_sweep(x, correction, h, True, False, False)
         self.data.followed.mode.zero_()

@@ -10,8 +10,6 @@ from ..core.gradient import Gradient
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.collider_work import collider_pulls
-from .face_steps import FaceSteps
-from .mesh_steps import MeshSteps
 
 
 class PresentContact:
@@ -42,32 +40,14 @@ class PresentContact:
         self._moved.after = after  # poses after the next step, which are not read
         self._given = [declared.keyframes, declared.firsts, self._steps, steps.steps_per_frame, 0]
         self._move, self._shapes, self._least = model.kernel(kernels.move_colliders, model.dtype), steps.shapes, steps.least
-        self._meshes = self._faces = None
-        if steps.meshes is not None:
-            given = steps.meshes.given | {"steps": self._steps, "ahead": 0}
-            self._meshes = MeshSteps(model, self._poses, steps.bounded, **given)
-            self._launches.append(lambda _x, _v: self._meshes.launch_trees())
-            self._faces = FaceSteps(model, self._meshes, steps.bounded) if steps.face_steps is not None else None
         self.terms = tuple(elements if elements.collider is None else self._own(elements, steps) for elements in model.terms)
 
     def _own(self, elements, steps):
         model, c = self.model, elements.collider
         term = elements.term.bounded if steps.bounded else elements.term
         own = replace(elements, term=term, rest=wp.clone(elements.rest))
-        if elements.on_faces:
-            if self._faces is not None:
-                self._launches.append(partial(self._launch_of_faces(elements), own, self._faces.arrays(elements)))
-            return own
         if elements.term.law:
             anchors = wp.zeros(model.count, dtype=self._anchor_type, device=model.device)
-        if model.colliders.facets[c]:
-            if elements.term.law:
-                on_mesh = self._meshes.friction(elements, float(model.colliders.friction[c]), anchors)
-                self._launches.append(lambda _x, _v: self._copy_anchors(c, anchors))
-            else:
-                on_mesh = self._meshes.contact(elements)
-            self._launches.append(partial(on_mesh, own))
-        elif elements.term.law:
             kernel = model.kernel(anchor_vertices, model.dtype, model.colliders.solids, elements.term.law, steps.bounded)
             self._launches.append(partial(self._anchor, kernel, own, anchors))
         elif model.colliders.moves[c]:
@@ -75,20 +55,6 @@ class PresentContact:
                 partial(self._pose, model.kernel(kernels.pose_collider, model.dtype, model.colliders.solids), own)
             )
         return own
-
-    def _launch_of_faces(self, elements):
-        c = elements.collider
-        if elements.term.law is None:
-            return self._faces.contact(elements)
-        anchors = self._faces.anchors(elements)
-        rest = self._faces.friction(elements, float(self.model.colliders.friction[c]), anchors)
-
-        def launch(*given):
-            for steps, first, end in self._parts:
-                wp.copy(anchors[first:end], steps.face_anchors[c])
-            rest(*given)
-
-        return launch
 
     def launch(self, x, v):
         """Launches the rest states at positions x (N,) [m] and velocities v (N,) [m/s]."""
@@ -126,30 +92,38 @@ class ColliderPulls:
         terms: Elements; those of soft contact and of friction are used.
         hard: Function (index) → launcher that adds ∂U/∂x of hard contact with that collider to an array (N,), from its
             multipliers; or None.
+        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` with the pairs of cloth and meshes; None leaves the pulls of
+            meshes 0.
 
     Attributes:
         found: A :func:`warpcloth.kernels.contact.collider_work.collider_pulls` for each collider.
-        hard: Whether contact is hard.
+        solid: The indices of the colliders that are not meshes, whose contact is terms.
+        hard: Whether their contact is hard.
     """
 
-    def __init__(self, model, terms, hard=None):
-        self.found, self._adds, self.hard = [], [], any(each.hard for each in terms if each.collider is not None)
-        for c in range(len(model.scene.colliders)):
+    def __init__(self, model, terms, hard=None, pairs=None):
+        self.found, self._adds, self.hard = [], {}, any(each.hard for each in terms if each.collider is not None)
+        self._pairs, scene = pairs, model.scene
+        self.solid = [c for c in range(len(scene.colliders)) if c not in scene.meshes]
+        for collider in scene.colliders:
+            found = collider_pulls(model.dtype)()
+            found.all = model.vectors()
+            if collider.friction:
+                found.friction = model.vectors()
+            self.found.append(found)
+        for c in self.solid:
             mine = [elements for elements in terms if elements.collider == c]
             friction = tuple(elements for elements in mine if elements.term.law)
             contact = tuple(elements for elements in mine if elements not in friction)
-            found = collider_pulls(model.dtype)()
-            found.all = model.vectors()
-            if friction:
-                found.friction = model.vectors()
             add = None if self.hard else Gradient(model, terms=contact)
             hidden = hard(c) if hard and self.hard else None
-            self.found.append(found)
-            self._adds.append((add, Gradient(model, terms=friction) if friction else None, hidden))
+            self._adds[c] = add, Gradient(model, terms=friction) if friction else None, hidden
 
     def launch(self, x):
-        """Launches ∂U/∂x at x (N,)."""
-        for found, (contact, friction, hidden) in zip(self.found, self._adds, strict=True):
+        """Launches ∂U/∂x at x (N,). The pairs must be those there."""
+        self._launch_meshes(x)
+        for c, (contact, friction, hidden) in self._adds.items():
+            found = self.found[c]
             found.all.zero_()
             if contact is not None:
                 contact.add(x, found.all)
@@ -159,6 +133,19 @@ class ColliderPulls:
                 friction.add(x, found.all)
                 found.friction.zero_()
                 friction.add(x, found.friction)
+
+    def _launch_meshes(self, x):
+        pairs = self._pairs
+        for c, found in enumerate(self.found):
+            if c in self._adds or pairs is None:
+                continue
+            pairs.forces.launch(x)
+            pairs.keep(c)
+            found.all.zero_()
+            pairs.forces.add_gradient(found.all)
+            if found.friction:
+                found.friction.zero_()
+                pairs.friction.add_gradient(found.friction)
 
     def sums(self, copies):
         """Forces of the cloth on the colliders: total, and the part of friction, (B, C, 2, 3) [N]."""

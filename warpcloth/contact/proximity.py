@@ -10,21 +10,22 @@ from ..core.scan import Scan
 from ..kernels.contact import piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 
-# Of a pair in the list 36, its gap 64, and two slots of contact with their forces 268 each.
-BYTES_OF_A_PAIR = 36 + 64 + 2 * 268
+# Of a pair in the list 36, its gap 64, two slots of contact with forces 268, blocks 104 and, with meshes, 64 of these.
+BYTES_OF_A_PAIR = 36 + 64 + 2 * (268 + 104 + 64)
 
 
 class Proximity:
-    """The vertex–triangle pairs and edge–edge pairs that are near one another in each copy of a model.
+    """The vertex–triangle pairs and edge–edge pairs that are near one another in each copy of a surface.
 
     A pair is listed if its distance is below r_c + skin. r_c is the contact distance, but at most half the rest distance of two
     elements of one connected piece. Pairs with a common vertex or with coordinates that are not finite are not listed. Edge
-    meshes have only edge–edge pairs.
+    meshes have only edge–edge pairs among themselves. Positions (V,) are those of all vertices of the surface.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
+        surface: The :class:`warpcloth.contact.surface.ContactSurface`.
         distance: The contact distance r [m].
         skin: Skin of the list [m]. The list is complete until two vertices have approached one another by the skin.
+        of_meshes: The contact distance of cloth with meshes [m].
 
     Attributes:
         capacity: Number of pairs that the arrays can hold.
@@ -33,43 +34,49 @@ class Proximity:
         distances: (capacity,) r_c of each pair [m].
         counts: (2,) int32, numbers of pairs found of each kind, which may exceed the capacity.
         rows: Pairs rows[i] to rows[i+1] are the vertex–triangle pairs of vertex i. Those of edges follow, by their first edge.
-        found: Positions of the last list, (N,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
+        found: Positions of the last list, (V,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
         flag, copies: (1,) and (B,) int32, see :meth:`moved`.
-        listed: Positions (N,) [m] of the list that is in the arrays.
-        pieces: The connected piece of each vertex of a copy, −1 without an element, (n,).
+        listed: Positions (V,) [m] of the list that is in the arrays.
+        pieces: The connected piece of each vertex of the cloth of a copy, −1 without an element, (n,).
         drift: Motion of each connected piece of all copies since ``found`` [m], see :meth:`launch_drift`.
     """
 
     @in_turn
-    def __init__(self, model, distance, skin):
-        self.model, self.distance, self.skin = model, distance, skin
-        mesh, n, device = model.scene.mesh, model.per_copy, model.device
-        self._triangles, self._edges = len(mesh.triangles) * model.copies, len(mesh.edges) * model.copies
-        piece, points = self._connected(model.in_model(mesh.edges))
-        self.pieces = piece
+    def __init__(self, surface, distance, skin, of_meshes=0.0):
+        self.surface, self.model, self.skin = surface, surface.model, skin
+        model, device = self.model, self.model.device
+        self._max_distance = max(distance * surface.meets_itself, of_meshes)
+        self._triangles, self._edges, self._vertices = surface.triangles, surface.edges, surface.count
+        self.pieces, points = self._connected(model.in_model(model.scene.mesh.edges))
+        piece = surface.pieces(self.pieces)
+        rest = np.concatenate([points, surface.rest[len(points) :]])
         self._kept = {  # the struct holds no references
-            "items": wp.array(self._items(), dtype=wp.vec4i, device=device),
-            "rest": model.array(points, model.vec3),
+            "items": wp.array(surface.items, dtype=wp.vec4i, device=device),
+            "groups": wp.array(surface.groups, dtype=wp.int32, device=device),
+            "vertex_groups": wp.array(surface.vertex_groups, dtype=wp.int32, device=device),
+            "rest": model.array(rest, model.vec3),
             "piece": wp.array(piece, dtype=wp.int32, device=device),
+            "region": wp.zeros(2 * model.copies if surface.obstacles else 0, dtype=model.vec3, device=device),
         }
+        values = {"layout": surface.layout, "itself": surface.meets_itself, "distance": distance, "of_meshes": of_meshes}
+        values |= {"max_distance": self._max_distance, "skin": skin, "far": 2.0 * (distance + surface.edge_lengths.max())}
         self._surface, self._along = (proximity_grid.surfaces(model.dtype)() for _ in range(2))
-        far = 2.0 * (distance + mesh.edge_lengths.max())
-        for surface in (self._surface, self._along):
-            for name, value in ({"vertices": n, "distance": distance, "skin": skin, "far": far} | self._kept).items():
-                setattr(surface, name, value)
-        self._along.distance = self._along.skin = 0.0
+        for each in (self._surface, self._along):
+            for name, value in (values | self._kept).items():
+                setattr(each, name, value)
+        self._along.max_distance = self._along.skin = 0.0
         self._allocate_grid()
         self._set_pieces(piece)
         self._whole = model.device.is_cpu and self._pieces.per_copy == 1 and (piece >= 0).all()
         self._shares = 8 if model.device.is_cuda else 1
-        self.found = model.vectors()  # all 0, so that the first call makes a list
-        self.listed = model.vectors()
+        self.found, self.listed = surface.vectors(), surface.vectors()  # all 0, so that the first call makes a list
         self.flag, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.copies = model.scalars(wp.int32)
-        self._rows = Scan(model, model.count + self._edges)
+        self._rows = Scan(model, self._vertices + self._edges)
         self._near = self.searches(kernels.take_near, "near")
         self._launch = model.launcher(
-            ((proximity_grid.count_items, proximity_grid.fill_buckets, kernels.fill_rows, kernels.write_pairs), model.dtype),
+            ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
+            ((kernels.fill_rows, kernels.write_pairs), model.dtype),
             ((piece_motion.begin_boxes, piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.take_moved), model.dtype),
             ((piece_motion.find_motion_of_pieces,), model.dtype),
@@ -77,16 +84,6 @@ class Proximity:
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
         self._allocate(max(1024, 4 * model.count))
-
-    def _items(self):
-        """Vertices of the triangles, then of the edges, of all copies, each with 2·copy + kind, (items, 4) int32."""
-        model, mesh = self.model, self.model.scene.mesh
-        kinds = []
-        for kind, elements in enumerate((mesh.triangles, mesh.edges[:, [0, 1, 1]])):
-            copy = np.repeat(np.arange(model.copies), len(elements))
-            vertices = np.tile(model.in_model(elements), (model.copies, 1)) + copy[:, None] * model.per_copy
-            kinds.append(np.column_stack([vertices, 2 * copy + kind]))
-        return np.concatenate(kinds).astype(np.int32)
 
     def _connected(self, edges):
         """The connected piece of each vertex (−1 without an element), and rest points relative to the middle of their piece."""
@@ -102,20 +99,21 @@ class Proximity:
 
     def _set_pieces(self, piece):
         """Numbers the pieces of all copies, and takes vertices of each for its drift, by multiples of the golden ratio."""
-        model = self.model
+        model, surface = self.model, self.surface
         used, numbers = np.unique(piece[piece >= 0], return_inverse=True)
-        number = np.full(model.per_copy, -1)
+        number = np.full(len(piece), -1)
         number[piece >= 0] = numbers
         members = np.argsort(number, kind="stable")
         ends = np.searchsorted(number[members], np.arange(len(used) + 1))
         part = (np.arange(piece_motion.SAMPLES) + 0.5) * 0.6180339887 % 1.0
         samples = members[(ends[:-1, None] + np.diff(ends)[:, None] * part).astype(int)].ravel()
-        copy = np.arange(model.copies)[:, None]
+        n, copy = model.per_copy, np.arange(model.copies)[:, None]
+        of_copies = np.where(number < 0, -1, number + copy * len(used))
         arrays = {
-            "piece": np.where(number < 0, -1, number + copy * len(used)),
-            "samples": samples + copy * model.per_copy,
+            "piece": np.concatenate([of_copies[:, :n].ravel(), of_copies[:, n:].ravel()]),
+            "samples": np.where(samples < n, samples + copy * n, model.count + copy * surface.obstacles + samples - n).ravel(),
         }
-        self._piece_arrays = {k: wp.array(v.ravel(), dtype=wp.int32, device=model.device) for k, v in arrays.items()}
+        self._piece_arrays = {k: wp.array(v, dtype=wp.int32, device=model.device) for k, v in arrays.items()}
         kinds = {"drift": model.vec3}
         if len(used) > 1:
             kinds |= {"lower": model.vec3, "upper": model.vec3, "motion": model.dtype}
@@ -123,13 +121,13 @@ class Proximity:
             self._piece_arrays[name] = wp.zeros(model.copies * len(used), dtype=kind, device=model.device)
         self.drift = self._piece_arrays["drift"]
         self._pieces = piece_motion.pieces(model.dtype)()
-        for name, value in ({"per_copy": len(used)} | self._piece_arrays).items():
+        numbers = {"per_copy": len(used), "cloth": len(used) - len(np.unique(surface.colliders))}
+        for name, value in (numbers | {"layout": surface.layout, "itself": surface.meets_itself} | self._piece_arrays).items():
             setattr(self._pieces, name, value)
 
     def _allocate_grid(self):
-        model, items = self.model, self._triangles + self._edges
-        lengths = model.scene.mesh.edge_lengths
-        size = 0.5 * (min(1.05 * lengths.max(), 2.0 * np.median(lengths)) + self.distance + self.skin)
+        model, items, lengths = self.model, self._triangles + self._edges, self.surface.edge_lengths
+        size = 0.5 * (min(1.05 * lengths.max(), 2.0 * np.median(lengths)) + self._max_distance + self.skin)
         buckets = 1 << max(4, (items - 1).bit_length())
         count = {"levels": 2, "counts": buckets, "keys": items, "first": buckets + 1}
         self._grid_arrays = {k: wp.zeros(size, dtype=wp.int32, device=model.device) for k, size in count.items()}
@@ -142,7 +140,7 @@ class Proximity:
 
     def _allocate(self, capacity):
         model = self.model
-        rows = model.count + self._edges
+        rows = self._vertices + self._edges
         refuse_memory(f"the cloth has {capacity} pairs that are near one another", BYTES_OF_A_PAIR * capacity)
 
         def zeros(count, dtype=wp.int32):
@@ -171,17 +169,16 @@ class Proximity:
         self.listed.fill_(np.nan)
 
     def launch_moved(self, x):
-        """Launches the detection at x (N,) in ``copies``, and at the previous positions in the others.
+        """Launches the detection at x (V,) in ``copies``, and at the previous positions in the others.
 
         So the pairs of a copy do not depend on other copies. Follows :meth:`moved`.
         """
-        model = self.model
-        self._launch(piece_motion.take_moved, model.count, [x, self.copies, model.per_copy], [self.found])
+        self._launch(piece_motion.take_moved, self._vertices, [x, self.copies, self.surface.layout], [self.found])
         self.launch(self.found)
 
     def launch(self, x):
-        """Launches the detection at positions x (N,)."""
-        pairs, N, own = self._pairs, self.model.count, self._arrays
+        """Launches the detection at positions x (V,)."""
+        pairs, N, own = self._pairs, self._vertices, self._arrays
         if x is not self.found:
             wp.copy(self.found, x)
         wp.copy(self.listed, x)
@@ -198,23 +195,29 @@ class Proximity:
         return [self.model.kernel(kernels.search_pairs, self.model.dtype, each, take, name) for each in (False, True)]
 
     def launch_along(self, x, p, searches, out):
-        """Launches ``searches`` over all pairs whose boxes meet while vertices move from x to x + p, both (N,) [m]."""
+        """Launches ``searches`` over all pairs whose boxes meet while vertices move from x (V,) to x + p [m].
+
+        p is (V,), or (N,) if obstacles stand.
+        """
         self._launch_grid(self._along, x, p, searches, out)
 
     def _launch_grid(self, surface, x, p, searches, out):
-        grid, items = self._grid, self._triangles + self._edges
+        grid, items, model = self._grid, self._triangles + self._edges, self.model
         self._grid_arrays["levels"].zero_()
+        if self.surface.obstacles:
+            for count, begins in ((model.copies, True), (model.count, False)):
+                self._launch(proximity_grid.bound_cloth, count, [surface, x, p, begins], [])
         self._launch(proximity_grid.count_items, items, [surface, x, p], [grid])
         self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
         self._launch(proximity_grid.fill_buckets, items, [surface, x, p], [grid])
-        for search, count in zip(searches, (self.model.count if self._triangles else 0, self._edges), strict=True):
+        for search, count in zip(searches, (self._vertices if self._triangles else 0, self._edges), strict=True):
             if count:
                 given = [surface, x, p, grid, self._triangles, self._shares]
                 self.model.launch(search, (count, self._shares), given, [out])
 
     def _launch_boxes(self, x):
         self._launch(piece_motion.begin_boxes, len(self.drift), [x], [self._pieces])
-        self._launch(piece_motion.extend_boxes, self.model.count, [x], [self._pieces])
+        self._launch(piece_motion.extend_boxes, self._vertices, [x], [self._pieces])
 
     def launch_kept(self, x, part, launch):
         """Calls ``launch`` with x if :meth:`moved` sets the flag, or if the list is not that of ``found``.
@@ -225,11 +228,11 @@ class Proximity:
         wp.capture_if(self._due, launch, x=x)
 
     def launch_drift(self, x):
-        """Finds the drift of each piece from ``found`` to x (N,)."""
+        """Finds the drift of each piece from ``found`` to x (V,)."""
         self._launch(piece_motion.find_drift, len(self.drift), [x, self.found], [self._pieces])
 
     def moved(self, x, part=0.5, active=None):
-        """Launches flag = 1 if pairs may be missing at x (N,), else 0, and returns it, for :func:`warp.capture_if`.
+        """Launches flag = 1 if pairs may be missing at x (V,), else 0, and returns it, for :func:`warp.capture_if`.
 
         ``copies`` is 1 for copies in which pairs may be missing.
 
@@ -239,7 +242,7 @@ class Proximity:
         skin. So sheets that fall together, or far apart, need no detection.
 
         Args:
-            x: Positions (N,) [m].
+            x: Positions (V,) [m].
             part: At most ½. If the flag is 0, no pair within its r_c is missing, also after each vertex moves by another
                 fraction ½ − ``part`` of the skin.
             active: Copies that count (B,) int32; None for all.
@@ -264,10 +267,10 @@ class Proximity:
             given.append(self.model.per_copy)
             self._launch(piece_motion.find_motion_of_pieces, self.model.copies, given, out)
         else:
-            self._launch(piece_motion.find_motion, self.model.count, given, out)
+            self._launch(piece_motion.find_motion, self._vertices, given, out)
         if several:
             wp.capture_if(self._due, lambda: self._launch_boxes(self.found))
-            given = [self._pieces, active, self.distance + self.skin, 2.0 * part * self.skin]
+            given = [self._pieces, active, self._max_distance + self.skin, 2.0 * part * self.skin]
             self._launch(piece_motion.compare_motions, len(self.drift), given, [self.copies, flag, self._due])
 
     @property

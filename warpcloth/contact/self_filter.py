@@ -4,11 +4,10 @@ from functools import partial
 
 import warp as wp
 
-from ..kernels.contact import self_filter, self_planes
+from ..kernels.contact import mesh_moves, self_filter, self_planes
 from ..kernels.contact.clear_elements import move_clear
-from ..kernels.contact.self_advance import advances, take_advance
+from ..kernels.contact.self_advance import advance_listed, advances, take_advance
 from ..kernels.step import count_step
-from ..kernels.terms.contact import FLOOR
 
 # A move that is longer than one list of pairs allows is made in at most ROUNDS rounds.
 ROUNDS = 32
@@ -35,11 +34,14 @@ class SelfFilter:
 
     def __init__(self, contact, colliders):
         self.model = model = contact.model
+        self._surface, self._moves = contact.surface, None
         self._contact, self._colliders, self._cut_before, self._iterates = contact, colliders, None, False
         device = model.device
-        self._target, self._from, self._other = (model.vectors() for _ in range(3))
-        self._ways = wp.zeros(model.count, dtype=wp.vec3d, device=device)
-        self._share, self._least_share = (wp.zeros(model.count, dtype=wp.float64, device=device) for _ in range(2))
+        self._target, self._from, self._outside, self._other = *(model.vectors() for _ in range(3)), contact.surface.vectors()
+        # Obstacles have the share 1 of no way.
+        self._ways = wp.zeros(contact.surface.count, dtype=wp.vec3d, device=device)
+        self._ways.fill_(wp.vec3d(0.0, 0.0, 1.0))
+        self._share, self._least_share = (wp.ones(contact.surface.count, dtype=wp.float64, device=device) for _ in range(2))
         self._common = wp.zeros(model.copies, dtype=wp.vec3d, device=device)
         self._cuts = model.scalars(wp.int32)
         self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(2))
@@ -51,13 +53,18 @@ class SelfFilter:
         if model.keyframes is not None:
             made += self_filter.share_of_pins, self_filter.hold_pins
         declared = model.colliders
-        self._lets_out = colliders is not None and (declared.meshes is not None or any(declared.moves))
+        self._lets_out = colliders is not None and any(
+            moves and not is_mesh for moves, is_mesh in zip(declared.moves, declared.is_mesh, strict=True)
+        )
         if self._lets_out:
             colliders.end_again()
             self._mobile = wp.zeros(model.count, dtype=model.dtype, device=device)
             self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+            self._pushed = model.vectors()
             made += self_filter.find_held, self_filter.push_pairs
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
+        if contact.surface.moves:
+            self._prepare_moves()
         self._count = model.kernel(count_step)
 
     def _launch(self, factory, dim, inputs, outputs):
@@ -81,9 +88,18 @@ class SelfFilter:
             colliders = self._colliders
             given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
             self._launch(self_filter.walk_from_start, model.count, given, [self._contact.x_before])
-        if self._cut_before is not None:
+            if self._moves is not None:
+                given = [self._surface.layout, self._contact.placed[0], self._cut_before, colliders.notes.cut]
+                self._launch_move(mesh_moves.return_obstacles, given, [self._surface.behind(self._contact.x_before)])
             self.launch_fresh(self._contact.x_before, self._contact.relist)
-        self._contact.launch_near(x, partial(self._launch_end, x, v, move, parts))
+            if self._moves is not None:
+                self._contact.launch_sides(self._contact.x_before)
+        self._launch_meshes(self._contact.placed[2])
+        wp.copy(self._other, x, count=model.count)
+        if self._surface.obstacles:
+            wp.copy(self._surface.behind(self._other), self._surface.behind(self._contact.x_before))
+        walk = partial(self._launch_end, x, v, move, parts)
+        self._contact.launch_near(self._other, walk, walk)
         if self._lets_out:
             self._colliders.launch_inside(x, self._from)
         model.launch(self._count, model.copies, [], [self._contact.steps])
@@ -92,15 +108,15 @@ class SelfFilter:
             wp.capture_if(friction.present, friction.launch_end, x=x)
 
     def _launch_end(self, x, v, move, parts):
-        model = self.model
+        model, start = self.model, self._contact.x_before
         wp.copy(self._target, x)
-        wp.copy(x, self._contact.x_before)
-        self._walk(x)
+        self._walk(start)
         if self._lets_out:
             self._turns.zero_()
             self._walking.fill_(1)
-            self._launch_held(x)
-            wp.capture_while(self._within, self._launch_let_out, x=x)
+            self._launch_held(start)
+            wp.capture_while(self._within, self._launch_let_out, x=start)
+        wp.copy(x, start, count=model.count)
         given = [model.inverse_mass, model.mobility, self._target, x, self._contact.steps, model.per_copy]
         given += [self._contact.h, self._contact.h / parts]
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
@@ -129,9 +145,13 @@ class SelfFilter:
 
     def _walk(self, x):
         """Moves x towards the target as far as pairs stay apart. On a long move pairs are listed again."""
+        self._walking.fill_(1)
+        self._launch_rounds(x)
+
+    def _launch_rounds(self, x):
+        """Moves x towards the target in copies that are ``_walking``."""
         self._rounds.zero_()
         self._cuts.zero_()
-        self._walking.fill_(1)
         self._proceed.fill_(1)
         wp.capture_while(self._proceed, self._launch_round, x=x)
 
@@ -146,15 +166,15 @@ class SelfFilter:
 
     def _launch_apart(self, x, target):
         model = self.model
-        wp.copy(self._from, x)
+        wp.copy(self._from, x, count=self.model.count)
         given = [self._share, self._least_share, self._from, target, self._common, self._walking]
         given += [model.per_copy, WAY * self._contact.skin]
         self._launch(self_filter.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
         """Finds the vertices that cloth holds back inside a collider, and the positions outside to which they must move."""
-        model, out = self.model, self._other
-        wp.copy(out, x)
+        model, out = self.model, self._outside
+        wp.copy(out, x, count=model.count)
         self._colliders.launch_out(out, self._from)
         self._within.zero_()
         given = [model.inverse_mass, x, out, self._turns, OUT_ROUNDS]
@@ -162,37 +182,118 @@ class SelfFilter:
 
     def _launch_let_out(self, x):
         """Moves vertices that are held back towards the outside, and other cloth out of their way."""
-        model, out = self.model, self._other
+        model, out = self.model, self._outside
         self.launch_fresh(x, self._contact.launch_list)
         self._contact.launch_sides(x)
-        for _ in range(SWEEPS):
-            given = [self._contact.pairs, self._mobile, self._contact.begun, x, LEFT * self._contact.declared.distance]
-            self._launch(self_filter.push_pairs, 1, given, [out])
+        self._add(out, x, -1.0, self._pushed)
+        self._launch_pushes(self._mobile, self._pushed, opens=False)
+        self._add(x, self._pushed, 1.0, out)
         self._launch_planes(x, out)
         self._launch_apart(x, out)
         model.launch(self._count, 1, [], [self._turns])
         self._launch_held(x)
 
-    def _launch_planes(self, x, target):
-        """Finds the fraction of each move to ``target`` that planes allow."""
+    def _launch_pushes(self, mobile, p, opens):
+        """Pushes the ends of moves p apart, where pairs would come nearer than they may."""
+        for _ in range(SWEEPS):
+            given = [self._contact.pairs, mobile, self._contact.begun, LEFT * self._contact.distance, opens]
+            self._launch(self_filter.push_pairs, 1, given, [p])
+
+    def _launch_ways(self, x, target):
+        """Finds how far vertices move from x to ``target`` at most, relative to their common move."""
         model, wanted = self.model, [x, target]
         if self.moves_together:
             self._launch(self_planes.common_move, model.copies, [*wanted, model.per_copy], [self._common])
         given = [*wanted, self._common, self._contact.begun_at, model.per_copy, WAY * self._contact.skin]
+        given += [self._surface.obstacles == 0]
         self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
-        if self._colliders is not None and self._colliders.faces is not None:
-            self._colliders.faces.launch_least(x, target, self._share)
-        given = [self._contact.pairs, self._contact.begun.gap, *wanted, self._common, self._ways]
+
+    def _launch_planes(self, x, target):
+        """Finds the fraction of each move to ``target`` that planes allow."""
+        self._launch_ways(x, target)
+        given = [self._contact.pairs, self._contact.begun.gap, x, target, self._common, self._ways]
         self._changed.fill_(1)
         wp.capture_while(self._changed, self._launch_cuts, given=given)
 
     def _launch_cuts(self, given):
         """Cuts the moves of pairs that would come too near, which may leave other pairs that do."""
         model = self.model
-        given = [*given, model.per_copy, FLOOR * self._contact.declared.distance]
+        given = [*given, self._contact.least]
         self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
         self._changed.zero_()
         model.launch(self_planes.note_cuts, model.count, [self._share], [self._ways, self._changed])
+
+    def _prepare_advance(self):
+        """Prepares :meth:`launch_limit`."""
+        model = self.model
+        self._kernels |= {each: model.kernel(each, model.dtype) for each in (self_filter.scale_directions, advance_listed)}
+        self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
+        self.fraction = self._advance.fraction = model.scalars()
+        self._advance.far, self._advance.least = self._contact.proximity.copies, self._contact.least
+
+    # Meshes that move, and cloth that they carry along, see :mod:`warpcloth.kernels.contact.mesh_moves`.
+
+    def _prepare_moves(self):
+        model, device = self.model, self.model.device
+        self._prepare_advance()
+        self._moves = self._surface.vectors()
+        self._carried, self._keys = (wp.zeros(model.count, dtype=wp.int64, device=device) for _ in range(2))
+        made = mesh_moves.are_away, mesh_moves.aim_obstacles, mesh_moves.carry_vertices, mesh_moves.end_move
+        made += mesh_moves.return_obstacles, self_filter.push_pairs
+        self._kernels |= {factory: model.kernel(factory, model.dtype) for factory in made}
+        self._carriers = [model.kernel(mesh_moves.find_carriers, model.dtype, each) for each in (True, False)]
+
+    def _launch_move(self, factory, inputs, outputs):
+        self._launch(factory, self._surface.count - self.model.count, inputs, outputs)
+
+    def launch_meshes(self):
+        """Moves meshes to where the step evaluates forces, and cloth out of their way, in the positions of the step."""
+        self._launch_meshes(self._contact.placed[1])
+
+    def _launch_meshes(self, goal):
+        """Moves meshes to their ``goal`` (B·m,) [m], and cloth that would be in their way, in the positions of the step."""
+        if self._moves is None:
+            return
+        x = self._contact.x_before
+        for array in (self._rounds, self._proceed):
+            array.zero_()
+        self._launch_move(mesh_moves.are_away, [goal, self._surface.behind(x)], [self._proceed])
+        wp.capture_while(self._proceed, self._launch_meshes_on, x=x, goal=goal)
+
+    def _launch_meshes_on(self, x, goal):
+        model, p, contact = self.model, self._moves, self._contact
+        self.launch_fresh(x, contact.relist)
+        contact.launch_sides(x)
+        for array in (p, self._carried, self._keys):
+            array.zero_()
+        self._launch_move(mesh_moves.aim_obstacles, [goal], [self._surface.behind(x), self._surface.behind(p)])
+        self._launch_carriers(self._carriers[0])
+        self._changed.fill_(1)
+        wp.capture_while(self._changed, self._launch_carriers, kernel=self._carriers[1])
+        self._launch_pushes(model.inverse_mass, p, opens=True)
+        model.lock(p)
+        self.launch_limit(p)
+        self._add(x, p, 1.0, x)
+        model.launch(self._count, 1, [], [self._rounds])
+        self._proceed.zero_()
+        given = [self.fraction, self._rounds, contact.steps, ROUNDS, contact.per_frame]
+        self._launch(mesh_moves.end_move, model.copies, given, [self._proceed, contact.first_forced])
+        wp.capture_if(self._proceed, lambda: None, lambda: self._launch_arrived(x, goal))
+
+    def _launch_arrived(self, x, goal):
+        """Puts meshes at their goal, also those that are still on their way, and lists the pairs there."""
+        wp.copy(self._surface.behind(x), goal)
+        self.launch_fresh(x, self._contact.relist)
+        self._contact.launch_sides(x)
+
+    def _launch_carriers(self, kernel):
+        model, contact = self.model, self._contact
+        self._changed.zero_()
+        given = [contact.pairs, contact.begun, self._carried, contact.skin + contact.max_distance]
+        model.launch(kernel, len(contact.pairs.stencils), given, [self._keys, self._changed])
+        given = [contact.pairs, model.inverse_mass, model.mobility, contact.begun, self._keys, self._carried]
+        self._launch(mesh_moves.carry_vertices, model.count, given, [self._moves])
+        wp.copy(self._carried, self._keys)
 
     # For methods whose iterates base + d stay apart too.
 
@@ -201,36 +302,53 @@ class SelfFilter:
         terms = () if self._colliders is None else self._colliders.terms
         self._touching = [elements for elements in terms if elements.term.gap]
         self._iterates, model = True, self.model
-        self._contact.contact.least = FLOOR * self._contact.declared.distance
-        self._kernels[self_filter.scale_directions] = model.kernel(self_filter.scale_directions, model.dtype)
-        self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
-        self.fraction = self._advance.fraction = model.scalars()
+        self._contact.contact.least = self._contact.least
+        self._prepare_advance()
+        if model.keyframes is not None:
+            turn = self_filter.turn_where_blocked
+            self._kernels[turn] = model.kernel(turn, model.dtype)
         self._direction = model.vectors()
-        self._advance.least = FLOOR * self._contact.declared.distance
-        faces = self._colliders is not None and self._colliders.faces is not None
-        if self._colliders is not None and (not self._lets_out or (faces and not any(self.model.colliders.moves))):
+        if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
 
     def launch_start(self, base, d):
         """Sets d so that base + d is base if pairs stay apart on the way there, else the start of the step.
 
-        Pins with keyframes are at base in any case: cloth follows them from the start of the step as far as pairs stay apart.
-        Vertices stop at the contact distance of colliders. Inside a collider contact is so stiff that a descent would take many
-        iterations to get out.
+        Pins with keyframes are at base in any case. If pairs do not stay apart on the way of the pins alone, other vertices
+        move towards base too, as far as pairs stay apart. Vertices stop at the contact distance of colliders: inside a collider
+        contact is so stiff that a descent would take many iterations to get out.
         """
         x, direction = self._contact.x_before, self._direction
+        self.launch_meshes()
         wp.copy(self._target, base)
         for elements in self._touching:
             kernel = self.model.kernel(move_clear, elements.term, self.model.dtype)
             given = [elements.stencil, elements.rest, self.model.inverse_mass]
             self.model.launch(kernel, elements.count, given, [self._target])
-        if self.model.keyframes is not None:
-            self._walk(x)
         self._add(self._target, x, -1.0, direction)
         self.launch_limit(direction, whole=True)
+        if self.model.keyframes is not None:
+            self._turn(direction, pins=True)
+            self.launch_limit(direction, whole=True)
+            self._proceed.zero_()
+            self.model.launch(
+                self_filter.walk_where_blocked, self.model.copies, [self.fraction], [self._walking, self._proceed]
+            )
+            wp.capture_if(self._proceed, self._launch_walk_of_pins, x=x)
         self._add(x, base, -1.0, d)
         self._add(d, direction, 1.0, d)
+
+    def _turn(self, direction, pins):
+        model, filtered = self.model, [self._contact.x_before, self._target]
+        given = [self.fraction, model.inverse_mass, model.mobility, *filtered, pins, model.per_copy]
+        self._launch(self_filter.turn_where_blocked, model.count, given, [direction])
+
+    def _launch_walk_of_pins(self, x):
+        """Moves the cloth with its pins in copies that are ``_walking``, and sets their directions from there."""
+        self._launch_rounds(x)
+        self._turn(self._direction, pins=False)
+        self.launch_limit(self._direction, whole=True)
 
     def launch_between(self, base, before, d):
         """Moves d towards ``before`` (N,), whose pairs are listed, so that pairs stay apart on the way to base + d."""
@@ -251,15 +369,23 @@ class SelfFilter:
         """
         contact, proximity, target = self._contact, self._contact.proximity, self._other
 
-        def shorten():
+        def far():
             proximity.launch_along(contact.x_before, direction, self._advances, self._advance)
-            given = [self.fraction, self.model.per_copy, whole]
-            self._launch(self_filter.scale_directions, self.model.count, given, [direction])
+            listed()
+
+        def listed():
+            ways = None if len(direction) > self.model.count else self._ways
+            if ways is not None:
+                self._launch_ways(contact.x_before, target)
+            given = [contact.pairs, contact.begun.gap, contact.x_before, ways]
+            self._launch(advance_listed, len(contact.pairs.stencils), given, [self._advance])
+            given = [self.fraction, self._surface.layout, whole]
+            self._launch(self_filter.scale_directions, len(direction), given, [direction])
 
         self.fraction.fill_(1.0)
         self._advance.direction = direction
         self._add(contact.x_before, direction, 1.0, target)
-        contact.launch_near(target, shorten)
+        contact.launch_near(target, listed, far)
 
     def launch_look(self, base, d, w):
         """Lists the pairs at base + d, and tests whether the way from there by −w (N,) may be near other cloth."""
@@ -277,4 +403,5 @@ class SelfFilter:
         self.launch_fresh(x, self._contact.relist)
 
     def _add(self, a, b, sign, out, active=None):
-        self._launch(self_filter.add_positions, self.model.count, [a, b, sign, active, self.model.per_copy], [out])
+        count = min(len(a), len(out))
+        self._launch(self_filter.add_positions, count, [a, b, sign, active, self.model.per_copy], [out])

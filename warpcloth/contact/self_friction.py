@@ -7,7 +7,6 @@ from ..core.dynamic import DynamicElements
 from ..core.scan import Scan
 from ..kernels.contact import self_friction as kernels
 from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
-from ..kernels.coulomb import law_of
 
 # Rows of each array of a list, per pair of its capacity.
 ROWS = {"stencils": 1, "corners": 4, "slips": 1}
@@ -51,10 +50,10 @@ class Slips:
         for name in LISTS:
             setattr(self.pairs, name, self._arrays[name])
 
-    def launch_lists(self, pairs):
-        """Copies the lists of other contacts, which have the same capacity."""
-        for name in LISTS:
-            wp.copy(getattr(self.pairs, name), getattr(pairs, name))
+    def launch_lists(self, pairs, parts):
+        """Copies the lists of other contacts, which have the same capacity, with the vertices of the surface of each."""
+        for name, array in (("stencils", parts), ("first", pairs.first), ("corners", pairs.corners)):
+            wp.copy(getattr(self.pairs, name), array)
 
     # As a part of a state.
 
@@ -99,11 +98,13 @@ class SelfFriction(DynamicElements):
     Its ``pairs`` are those of the step, without distances.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
+        surface: The :class:`warpcloth.contact.surface.ContactSurface`.
         slips: :class:`Slips`, a part of the state of the solver.
         steps: Steps since the start of each copy, (B,) int32.
-        friction: μ, a number or a :class:`warpcloth.kernels.coulomb.Friction`.
+        law: The :class:`warpcloth.kernels.coulomb.Law` of friction.
+        friction: μ of cloth with cloth, then that of each obstacle of a copy, (1 + m,).
         bounded: Whether contact has no logarithm, as in explicit steps.
+        ahead: The fraction of the step after which it evaluates forces.
 
     Attributes:
         start: Positions at the start of the step, (N,) [m].
@@ -111,11 +112,12 @@ class SelfFriction(DynamicElements):
 
     stored = True
 
-    def __init__(self, model, slips, steps, friction, bounded):
-        law = law_of(friction)
+    def __init__(self, surface, slips, steps, law, friction, bounded, ahead):
+        self.surface = surface
+        model = surface.model
         super().__init__(model, kernels.friction_of_pairs(law), wp.zeros(1, dtype=wp.int32, device=model.device))
-        self._kept, self._steps, self._friction = slips, steps, float(friction)
-        self._bounded = bounded
+        self._kept, self._steps, self._ahead = slips, steps, ahead
+        self._friction = wp.array(friction, dtype=wp.float64, device=model.device)
         self.start, self._step = model.vectors(), Slips(model, slips.room)
         self._vertices = Scan(model, model.count)
         self._launch = model.launcher(
@@ -133,7 +135,12 @@ class SelfFriction(DynamicElements):
         for name in ("acting", "number", "corner_counts"):
             size = acting_sizes(self.model, room)[name]
             setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=self.model.device))
+        pairs.layout, slots = self.surface.layout, len(pairs.stencils)
         self.hold_pairs(pairs, kernels.RubbedPairs())
+        self.data.parts, self.data.ahead = pairs.stencils, self._ahead
+        if self.surface.obstacles:
+            self.data.parts = wp.zeros(slots, dtype=wp.vec4i, device=self.model.device)
+            self.data.travel = self.room(wp.vec3d)
         for name in ("normal", "anchor", "tangent"):
             setattr(self.data, name, self.room(wp.vec3d))
         for name in ("stiffness", "limit"):
@@ -141,17 +148,17 @@ class SelfFriction(DynamicElements):
         self.data.weights, self.data.sides = self.room(wp.vec4d), self.room(wp.int32)
 
     def launch_begin(self, touching, contacts, x):
-        """At the start of a step, at x: takes the contacts there, and the slips of the last step."""
+        """At the start of a step, at x (V,): takes the contacts there, and the slips of the last step."""
         model, kept = self.model, self._kept
         self.present.fill_(1)
-        wp.copy(self.start, x)
+        wp.copy(self.start, x, count=model.count)
         self.pairs.number.zero_()
         self.data.limit.zero_()
         self._launch(kernels.begin_friction, kept.room, [touching, contacts, self._friction], [self.pairs, self.data])
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
         self._launch(fill_corners, kept.room, [], [self.pairs])
         self._launch(sort_corners, model.count, [], [self.pairs])
-        given = [self.pairs, x, kept.pairs, kept.slips, self._steps, model.per_copy]
+        given = [self.pairs, x, kept.pairs, kept.slips, self._steps]
         self._launch(kernels.set_anchors, kept.room, given, [self.data])
 
     def launch_none(self):
@@ -164,12 +171,12 @@ class SelfFriction(DynamicElements):
         self._launch(kernels.find_friction, self._kept.room, [self.pairs, self.data, x, correction], [self.forces])
 
     def launch_acting(self, x, out):
-        """Sets out (N,) to ∂U/∂x where the step evaluated its forces: at its start if it is explicit, else at its end x."""
-        self.launch(self.start if self._bounded else x)
+        """Sets out (N,) to ∂U/∂x at the positions x (N,) at which the step evaluated its forces."""
+        self.launch(x)
         out.zero_()
         self.add_gradient(out)
 
     def launch_end(self, x):
         """Stores the pairs of the step and the stretch of their springs at x, for the next step."""
         self._launch(kernels.end_friction, self._kept.room, [self.pairs, self.data, x], [self._kept.slips])
-        self._kept.launch_lists(self.pairs)
+        self._kept.launch_lists(self.pairs, self.data.parts)

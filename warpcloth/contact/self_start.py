@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..kernels.terms.contact import FLOOR
 from .start_layers import apart
 
 
@@ -89,7 +88,7 @@ def _moved(contact, x, start):
     triangles = (model.in_model(mesh.triangles) + n * copies[:, None, None]).reshape(-1, 3)
     piece = (first[pieces] + n * copies[:, None]).ravel()
     fixed = (model.coordinate_mobility().reshape(-1, 3) == 0.0).any(axis=1)
-    found = apart(x.numpy().astype(np.float64), triangles, sides, start.gaps, piece, fixed, contact.declared.distance)
+    found = apart(x.numpy().astype(np.float64), triangles, sides, start.gaps, piece, fixed, contact.distance)
     return None if found is None else wp.array(found, dtype=model.vec3, device=model.device)
 
 
@@ -120,10 +119,13 @@ def _too_near(contact, x):
     contact.launch_begin_at_start(x, _longest_edge(contact.model, points))
     of_vertices, of_edges = contact.proximity.counts.numpy()
     stencils = contact.proximity.stencils.numpy()[: of_vertices + of_edges]
-    found, least = contact.begun.gap.numpy()[: len(stencils)], FLOOR * contact.declared.distance
+    found, least = contact.begun.gap.numpy()[: len(stencils)], contact.least
     ulps = 6.0 * float(np.finfo(contact.model.numpy_dtype).eps) * np.abs(points).max(initial=0.0, where=np.isfinite(points))
     least += ulps
-    near, y = stencils[found < least], contact.begun.normal.numpy()[: len(stencils)] * found[:, None]
+    _refuse_meshes(contact, stencils, found, least)
+    own = (stencils < contact.model.count).all(axis=1)  # pairs of cloth with cloth
+    of_vertices, stencils, found = int(own[:of_vertices].sum()), stencils[own], found[own]
+    near, y = stencils[found < least], contact.begun.normal.numpy()[: len(own)][own] * found[:, None]
     split = int(np.count_nonzero(found[:of_vertices] < least))
     edges = stencils[of_vertices:]
     through = [
@@ -132,6 +134,22 @@ def _too_near(contact, x):
         for each in crossings(points, own, _triangles_of(contact.model, other))
     ]
     return _Start(near, split, np.where(found > ulps, y.T, 0.0).T[found < least], through, least)
+
+
+def _refuse_meshes(contact, stencils, gaps, least):
+    """Raises ValueError if cloth starts at a mesh, with a gap below ``least`` [m]."""
+    model, surface = contact.model, contact.surface
+    for s, gap in zip(stencils, gaps, strict=True):
+        behind = s[s >= model.count]
+        if len(behind) and gap < least:
+            mesh = model.scene.colliders[surface.colliders[(behind[0] - model.count) % surface.obstacles]].label
+            own = int(s[s < model.count][0])
+            vertex = own % model.per_copy if model.order is None else int(model.order[own % model.per_copy])
+            copy = f" of copy {own // model.per_copy}" if model.copies > 1 else ""
+            raise ValueError(
+                f"vertex {vertex}{copy}, or an element at it, starts {gap:.3g} m from {mesh}; it must start more than "
+                f"{least:.3g} m away, a thousandth of the contact distance and rounding"
+            )
 
 
 def _longest_edge(model, points):

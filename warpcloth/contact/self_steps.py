@@ -12,13 +12,18 @@ from ..core.state import Count
 from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels.contact import gap_notes, pair_blocks, self_pairs
+from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes
+from ..kernels.contact.obstacles import find_moves
+from ..kernels.contact.pair_potential import Laws
 from ..kernels.contact.piece_motion import take_moved
 from ..kernels.contact.self_filter import HeldPins
+from ..kernels.terms.contact import FLOOR
 from .pair_contact import PairContact
 from .proximity import Proximity
 from .self_filter import WAY, SelfFilter
 from .self_friction import SelfFriction, Slips
 from .self_start import check_reset, check_start
+from .surface import ContactSurface
 
 # The skin, over the longest edge of the rest shape. All pairs nearer than the contact distance plus the skin are listed. The
 # skin must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one of them. It
@@ -73,14 +78,18 @@ class SelfSteps:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
+        surface: The :class:`warpcloth.contact.surface.ContactSurface`: the cloth, and meshes among the colliders.
+        distance, max_distance: The smaller and the larger of the contact distances of cloth with itself and with meshes [m].
+        least: The least gap of the filter [m].
+        placed: Positions of the meshes at the start of the step, where it evaluates forces, and at its end, (B·m,) [m].
         proximity: :class:`warpcloth.contact.proximity.Proximity`.
         forces: The :class:`warpcloth.core.dynamic.Dynamic` of contact and friction.
         contact: :class:`warpcloth.contact.pair_contact.PairContact`.
         filter: :class:`warpcloth.contact.self_filter.SelfFilter`.
         pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
         begun: Normals, gaps and weights of the pairs, :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
-        x_before: Positions at the start of the step, (N,) [m].
-        begun_at: Positions at which the gaps of ``begun`` were found, (N,) [m].
+        x_before: Positions at the start of the step, or of an iterate, and of obstacles behind them, (V,) [m].
+        begun_at: Positions at which the gaps of ``begun`` were found, (V,) [m].
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
         near: The :class:`warpcloth.core.capture.Mirror` of what :meth:`launch_look` found, (1,) int32.
         lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
@@ -90,23 +99,34 @@ class SelfSteps:
     """
 
     def __init__(self, model, state, h, steps_per_frame, bounded, colliders):
-        declared = model.scene.self_contact
-        self.model, self.h, self.declared = model, h, declared
-        self.skin = max(SKIN * float(model.scene.mesh.edge_lengths.max()), THICK * declared.distance)
-        self.proximity = Proximity(model, declared.distance, self.skin)
-        device = model.device
-        self.x_before, self.begun_at = model.vectors(), model.vectors()
+        scene, device = model.scene, model.device
+        declared = [scene.self_contact, scene.contact if model.colliders is not None and model.colliders.meshes else None]
+        self.model, self.h, self._colliders = model, h, colliders
+        self.surface = surface = ContactSurface(model, scene.self_contact is not None)
+        distances, stiffnesses = (
+            [(each and getattr(each, name)) or 0.0 for each in declared] for name in ("distance", "stiffness")
+        )
+        self.distance, self.max_distance = min(filter(None, distances)), max(distances)
+        self.least, self.per_frame = FLOOR * self.distance, steps_per_frame
+        self._laws = Laws()
+        self._laws.distance, self._laws.stiffness = wp.vec2d(*distances), wp.vec2d(*stiffnesses)
+        self._laws.width = surface.width
+        self.skin = max(SKIN * float(scene.mesh.edge_lengths.max()), THICK * self.max_distance)
+        self.proximity = Proximity(surface, distances[0], self.skin, distances[1])
+        self.x_before, self.begun_at = surface.vectors(), surface.vectors()
         self.cut = state.add("vertices kept apart", wp.zeros(model.copies, dtype=wp.int64, device=device), Count(sums=True))
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32), Count())
         self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
         self.listed, self._ends = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
-        self._notes, self._per_frame = gap_notes.GapNotes(), steps_per_frame
+        self._notes = gap_notes.GapNotes()
         self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
         self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
-        self._notes.pressed = state.add("first pressed", model.scalars(wp.int64))
+        self._notes.pressed = state.add("first pressed", wp.zeros((model.copies, 2), dtype=wp.int64, device=device))
+        self._notes.unresolved = state.add("first unresolved", model.scalars(wp.int64))
         self.held = HeldPins()
         self.held.first = state.add("first pin held back", model.scalars(wp.int64), Count(rest=model.per_copy))
+        self.first_forced = state.add("first mesh that went through cloth", model.scalars(wp.int64))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
         made = (
             pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs,
@@ -117,7 +137,11 @@ class SelfSteps:
         self._counted = None
         size = pair_blocks.NUMBERS * pair_blocks.BLOCK
         self._block = wp.zeros(size, dtype=wp.float64, device=device) if device.is_cpu else None
-        self.contact, self.filter = PairContact(model, bounded, declared, self.listed), SelfFilter(self, colliders)
+        self.placed, self._ahead = [None, None, None], 0 if colliders is None else int(np.ceil(2.0 * colliders.part))
+        self.contact = PairContact(surface, bounded, self._laws, self.listed)
+        if surface.obstacles:
+            self._prepare_obstacles()
+        self.filter = SelfFilter(self, colliders)
         self.friction, self.stale = None, False
         self._hold()
         state.add("positions of the list", self.proximity.found)
@@ -126,15 +150,17 @@ class SelfSteps:
             self.proximity.found,
             self._most.array,
             self.lists,
-            *(getattr(self._notes, name) for name in ("nearest", "too_near", "pressed")),
+            *(getattr(self._notes, name) for name in ("nearest", "too_near", "pressed", "unresolved")),
         )
-        if declared.friction:
+        friction = surface.friction()
+        if friction is not None:
             slips = state.add_part("friction", Slips(model, self.contact.capacity))
             slips.grow = self._grow_outside
-            self.friction = SelfFriction(model, slips, self.steps, declared.friction, bounded)
+            ahead = 1.0 if colliders is None else colliders.part
+            self.friction = SelfFriction(surface, slips, self.steps, *friction, bounded, ahead)
         if not bounded:
             self.filter.iterates()
-            self.contact.follow(self.filter.launch_follow, self.x_before)
+            self.contact.follow(self.filter.launch_meshes, self.filter.launch_follow, self.x_before)
         self.forces = Dynamic(model, [self.contact, *([self.friction] if self.friction else [])])
         check_start(self, state)
         self.start_again()
@@ -191,6 +217,7 @@ class SelfSteps:
         self.begun = self_pairs.StepPairs()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
         self.begun.gap = room(wp.float64)
+        self.pairs.layout = self.surface.layout
         self.contact.hold(self.pairs, self.begun.normal)
 
     def grow(self):
@@ -243,15 +270,24 @@ class SelfSteps:
     @property
     def too_near(self):
         """A :class:`FirstGap` for each copy with a gap below 4 units in the last place of float32 coordinates."""
-        return self._first(self._notes.too_near)
+        return self._first(self._notes.too_near.numpy())
 
     @property
     def pressed(self):
-        """A :class:`FirstGap` for each copy with a gap below half the contact distance of its pair."""
-        return self._first(self._notes.pressed)
+        """A :class:`FirstGap` for each copy in which cloth is nearer to cloth than half the distance where contact begins.
+
+        And the same of cloth and meshes; explicit steps note none of these.
+        """
+        notes = self._notes.pressed.numpy()
+        return self._first(notes[:, 0]), self._first(notes[:, 1])
+
+    @property
+    def unresolved(self):
+        """A :class:`FirstGap` for each copy in which rounding stops a pair where its contact begins."""
+        return self._first(self._notes.unresolved.numpy())
 
     def _first(self, notes):
-        n, found = self.model.per_copy, enumerate(notes.numpy())
+        n, found = self.model.per_copy, enumerate(notes)
         return [FirstGap(copy, *divmod(int(gap_notes.FIRST) - int(value), n)) for copy, value in found if value]
 
     @property
@@ -261,7 +297,7 @@ class SelfSteps:
         for copy, value in enumerate(self.held.first.numpy()):
             if value:
                 step, vertex = divmod(int(gap_notes.FIRST) - int(value), n)
-                found.append(PinHeld(copy, step // self._per_frame + 1, vertex, float(farthest[copy])))
+                found.append(PinHeld(copy, step // self.per_frame + 1, vertex, float(farthest[copy])))
         return found
 
     def in_frame(self):
@@ -270,13 +306,13 @@ class SelfSteps:
         if self._counted is None:
             self._counted = model.kernel(gap_notes.count_pairs, model.dtype)
         counts, nearest = wp.zeros((model.copies, 2), dtype=wp.int32, device=model.device), model.scalars(wp.float64)
-        given = [self.pairs, self.begun, self.declared.distance, model.per_copy]
+        given = [self.pairs, self.begun, self._laws]
         model.launch(self._counted, len(self.pairs.stencils), given, [counts, nearest])
         return *counts.numpy().T, _gaps(nearest)
 
     def start_again(self):
         """Clears counts and the list, after a reset and after the steps in which an integrator finds its past state."""
-        for array in (self.cut, self.steps, self.held.first, self.held.farthest, *self._carried):
+        for array in (self.cut, self.steps, self.held.first, self.held.farthest, self.first_forced, *self._carried):
             array.zero_()
 
     def _launch(self, factory, dim, inputs, outputs):
@@ -287,7 +323,14 @@ class SelfSteps:
 
         It keeps an earlier list as long as the filter at the end of this step cannot miss a pair with it.
         """
-        wp.copy(self.x_before, x)
+        wp.copy(self.x_before, x, count=self.model.count)
+        if self.surface.moves:
+            if not self._colliders.moved_by_terms:
+                self._colliders.launch_start(x)
+            self._launch_obstacles()
+        elif self.surface.obstacles and not self._colliders.moved_by_terms:
+            wp.copy(self._colliders.x_before, x)
+        x = self.x_before
         self.filter.launch_begin()
         self.proximity.launch_kept(x, WAY, self.launch_list)
         wp.capture_if(self.listed, self._launch_begin, self._launch_none, x=x)
@@ -300,9 +343,9 @@ class SelfSteps:
 
     def _launch_begin(self, x):
         self.launch_sides(x)
-        if self._per_frame > 1:
+        if self.per_frame > 1:
             self._ends.zero_()
-            self.model.launch(gap_notes.find_frames, self.model.copies, [self.steps, self._per_frame], [self._ends])
+            self.model.launch(gap_notes.find_frames, self.model.copies, [self.steps, self.per_frame], [self._ends])
             wp.capture_if(self._ends, self._launch_notes, x=x)
         else:
             self._launch_notes(x)
@@ -311,25 +354,98 @@ class SelfSteps:
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
     def launch_look(self, x):
-        """Launches ``near`` = 0 if no pair is listed and none can be missing on a straight way to x (N,), else 1.
+        """Launches ``near`` = 0 if no pair is listed and none can be missing on a straight way to x (V,), else 1.
 
         The way starts where the list has all pairs, as at the start of a step and at an iterate.
         """
         wp.copy(self.near.array, self.listed)
         self.proximity.launch_moved_since(x, 0.5, None, self.near.array)
 
-    def launch_near(self, x, launch):
-        """Calls ``launch`` if :meth:`launch_look` finds that the way to x (N,) may be near other cloth."""
-        self.launch_look(x)
-        wp.capture_if(self.near.array, launch)
+    def launch_near(self, x, listed, others):
+        """Calls ``others`` if pairs that are not listed may meet on the way to x (V,), else ``listed`` if any is listed."""
+        near = self.near.array
+        near.zero_()
+        self.proximity.launch_moved_since(x, 0.5, None, near)
+        wp.capture_if(near, others, lambda: wp.capture_if(self.listed, listed))
+
+    # Obstacles.
+
+    def _prepare_obstacles(self):
+        """Allocates positions of obstacles, and places those that stand."""
+        surface, model = self.surface, self.model
+        self.placed = [wp.zeros(surface.count - model.count, dtype=model.vec3, device=model.device) for _ in range(3)]
+        self._kept_poses = [wp.zeros_like(self._colliders.poses.before) for _ in range(3)]
+        self._colliders.launch_move()
+        self._find_moves = model.kernel(find_moves, model.dtype)
+        self._launch_obstacles()
+
+    def _launch_obstacles(self):
+        """Places the obstacles of a step, at its start where pairs are listed."""
+        surface, poses = self.surface, self._colliders.poses
+        for at, halves, out in zip((poses.before, poses.at, poses.after), (0, self._ahead, 2), self.placed, strict=True):
+            surface.launch_positions(self._colliders, at, halves, out)
+        self.model.launch(self._find_moves, len(self.placed[0]), [self.placed[0], self.placed[2]], [surface.moves_of_step])
+        wp.copy(surface.behind(self.x_before), self.placed[0])
+        self.contact.launch_obstacles(self.placed[1])
+
+    def keep(self, collider):
+        """Leaves only the forces and energies of contact with a mesh after ``forces.launch``, for records.
+
+        Args:
+            collider: The index of the mesh in the scene, or −1 for contact of cloth with cloth.
+        """
+        surface = self.surface
+        if not surface.obstacles:
+            return
+        for each in self.forces.terms:
+            given = [each.pairs, each.data.parts, surface.of_obstacles.collider, collider]
+            self.model.launch(self.model.kernel(keep_forces, self.model.dtype), each.capacity, given, [each.forces])
+
+    def launch_present(self, x):
+        """Lists the pairs near x (N,), with meshes where they are after the last step, for records between steps.
+
+        The poses of colliders stay those of the last step, which sums of work need.
+        """
+        if not self.surface.moves:
+            self.launch_begin(x)
+            return
+        poses = self._colliders.poses
+        kept = list(zip(self._kept_poses, (poses.before, poses.at, poses.after), strict=True))
+        for spare, array in kept:
+            wp.copy(spare, array)
+        self._colliders.launch_move()
+        self.launch_begin(x)
+        self.contact.launch_obstacles(self.placed[0])
+        if self.friction is not None:
+            self.friction.data.travel.zero_()
+        for spare, array in kept:
+            wp.copy(array, spare)
+
+    def launch_work(self, out, terms):
+        """Launches out (B, C) += the work of meshes on the cloth in the last step [J], by the forces of ``terms`` at last."""
+        for each in terms if self.surface.obstacles else ():
+            given = [each.pairs, each.data.parts, self.surface.of_obstacles.collider, each.data.travel, each.forces]
+            self.model.launch(self.model.kernel(work_of_meshes, self.model.dtype), 1, given, [out])
+
+    @property
+    def forced(self):
+        """The copies in which a mesh went through cloth that could not get out of its way: (copy, first frame, mesh).
+
+        The mesh is the index of its collider, or None if several move.
+        """
+        moving = [c for c, each in enumerate(self.model.scene.colliders) if each.is_mesh and each.moves]
+        mesh = moving[0] if len(moving) == 1 else None
+        return [(c, int(gap_notes.FIRST) - int(note), mesh) for c, note in enumerate(self.first_forced.numpy()) if note]
 
     def _launch_notes(self, x):
-        given = [self.pairs, self.begun, x, self.steps, self.declared.distance, self._per_frame, self.model.per_copy]
+        given = [self.pairs, self.begun, x, self.steps, self._laws, self.per_frame, self.contact.least]
         self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [self._notes])
 
     def launch_begin_at_start(self, x, longest):
         """Lists all pairs near x (N,) at the start of a run, and grows the lists. The longest edge is ``longest`` [m]."""
         self.proximity.set_skin(max(self.skin, SKIN * longest))
+        if self.surface.moves:
+            self._colliders.launch_move()
         self.launch_begin(x)
         while self.overflowed:
             self.grow()
@@ -350,7 +466,7 @@ class SelfSteps:
         if copies is None:
             wp.copy(self.begun_at, x)
         else:
-            self._launch(take_moved, self.model.count, [x, copies, self.model.per_copy], [self.begun_at])
+            self._launch(take_moved, self.surface.count, [x, copies, self.surface.layout], [self.begun_at])
         given = [self.pairs, self.begun_at]
         if self._block is None:
             self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), given, [self.begun])

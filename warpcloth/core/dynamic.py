@@ -26,23 +26,29 @@ class DynamicElements:
         pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
         data: The ``data`` of the term.
         forces: :class:`warpcloth.kernels.contact.pair_sums.PairForces`.
+        blocks: :func:`warpcloth.kernels.contact.pair_sums.pair_blocks`, empty if sums are scattered.
         multipliers: λ of sweeps [kg·m].
         stored: Whether its energy is not a function of positions alone, but stored in the state.
+        scatters: Whether sums are scattered.
     """
 
     stored = False
 
     def __init__(self, model, term, present):
-        self.model, self.term, self.present, self._swept, self._in_turn = model, term, present, None, None
+        self.model, self.term, self.present = model, term, present
+        self._swept, self._in_turn, self.pairs = None, None, None
         self.set_sums(model.device.is_cpu)
 
     def set_sums(self, scatters):
         """Sets whether sums are scattered."""
-        model = self.model
+        model, self.scatters = self.model, scatters
         self._sums_over = 1 if scatters else model.count
         self._forces, self._energies, self._diagonal, self._products = (
             model.kernel(factory, self.term, model.dtype, scatters) for factory in SUMS
         )
+        self._set_blocks = None if scatters else model.kernel(pair_sums.set_pair_blocks, self.term, model.dtype)
+        if self.pairs is not None:
+            self._hold_blocks()
 
     def hold_pairs(self, pairs, data):
         """Takes the arrays of pairs, and allocates arrays for their forces and sweeps."""
@@ -61,6 +67,7 @@ class DynamicElements:
             kinds["pressing"], self.forces.count = wp.int32, wp.zeros(1, dtype=wp.int32, device=model.device)
         for name, kind in kinds.items():
             setattr(self.forces, name, room(kind))
+        self._hold_blocks()
         if self._in_turn is not None:
             self.multipliers = room(wp.vec3d)
         if self._in_turn is False:
@@ -71,6 +78,11 @@ class DynamicElements:
             self._swept.slots = wp.zeros(corners, dtype=wp.int32, device=model.device)
             self._swept.moves = wp.zeros(corners, dtype=wp.vec3d, device=model.device)
             self._swept.touching = wp.zeros(model.count, dtype=wp.int32, device=model.device)
+
+    def _hold_blocks(self):
+        self.blocks, model = pair_sums.pair_blocks(self.model.dtype)(), self.model
+        if not self.scatters:
+            self.blocks.weights, self.blocks.blocks = map(self.room, (wp.types.vector(4, model.dtype), model.mat33))
 
     @property
     def capacity(self):
@@ -105,9 +117,11 @@ class DynamicElements:
         self.model.launch(self._energies, self._sums_over, [self.pairs, self.forces], [out])
 
     def add_diagonal(self, diagonal, values):
-        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
-        given = [self.pairs, self.model.inverse_mass, diagonal, self.forces]
-        self.model.launch(self._diagonal, self._sums_over, given, [values])
+        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`, and sets ``blocks`` for its products."""
+        model, pairs, forces = self.model, self.pairs, self.forces
+        if self._set_blocks is not None:
+            model.launch(self._set_blocks, self.capacity, [pairs, model.inverse_mass, forces], [self.blocks])
+        model.launch(self._diagonal, self._sums_over, [pairs, model.inverse_mass, diagonal, forces], [values])
 
     def add_products(self, p, q, active):
         """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
@@ -157,7 +171,7 @@ class DynamicElements:
         """Launches the search of the index of each corner in the lists of vertices, for Jacobi sweeps."""
         self.model.launch(self._number_corners, len(self.pairs.corners), [self.pairs], [self._swept.slots])
 
-    def launch_sweep(self, x, correction, h, adds, backward):
+    def launch_sweep(self, x, correction, h, adds, backward, follows):
         """See :meth:`Dynamic.launch_sweep`."""
         model, mobility, multipliers = self.model, self.model.local_mobility, self.multipliers if adds else None
         if self._in_turn:
@@ -221,6 +235,21 @@ class Dynamic:
         if self.terms:
             self.model.lock(q)
 
+    @property
+    def terms_in_rows(self):
+        """The number of terms, if their sums gather and :meth:`set_pairs` has room for them; else 0."""
+        gathered = not any(each.scatters for each in self.terms) and len(self.terms) <= 2
+        return len(self.terms) if gathered else 0
+
+    def set_pairs(self, rows):
+        """Sets the pairs in a :func:`warpcloth.kernels.block_rows.block_rows`."""
+        model, names = self.model, (("pairs", "blocks"), ("other_pairs", "other_blocks"))
+        if model.mobility is not None:
+            rows.mobility = model.mobility
+        for each, (pairs, blocks) in zip(self.terms, names, strict=False):
+            setattr(rows, pairs, each.pairs)
+            setattr(rows, blocks, each.blocks)
+
     def rows(self):
         """The Hessian ∂²U/∂x² = JᵀDJ at the last :meth:`launch`; waits for the device.
 
@@ -246,7 +275,7 @@ class Dynamic:
         """Launches λ = 0 before the first sweep, at x̃ (N,)."""
         self._launch_each("launch_sweep_start", x)
 
-    def launch_sweep(self, x, correction, h, adds, backward=False):
+    def launch_sweep(self, x, correction, h, adds, backward=False, follows=True):
         """Launches a sweep over all elements.
 
         Args:
@@ -255,8 +284,9 @@ class Dynamic:
             h: Step [s].
             adds: Whether multipliers accumulate over sweeps; else elements are hard.
             backward: Whether a Gauss–Seidel sweep goes from the last element to the first.
+            follows: Whether it counts among the sweeps after which elements are found anew.
         """
-        self._launch_each("launch_sweep", x, correction, h, adds, backward, order=-1 if backward else 1)
+        self._launch_each("launch_sweep", x, correction, h, adds, backward, follows, order=-1 if backward else 1)
 
 
 def dynamic_of(model, terms=None, dynamic=()):

@@ -5,6 +5,7 @@ import warp as wp
 
 from ..base.turns import in_turn
 from ..kernels import assemble, linear, sparse
+from ..kernels.block_rows import block_rows
 from ..kernels.term import HessianPolicy
 from ..model.host_values import host_values
 from .block_pattern import TermCorners, find_pattern, slots_of
@@ -146,9 +147,22 @@ class BlockMatrix:
         self._lost = 16.0 * float(np.finfo(self.model.numpy_dtype).eps) * self._ill_conditioned
 
     @property
+    def terms_in_rows(self):
+        """The number of dynamic elements of which :meth:`block_rows` has the pairs."""
+        return self.dynamic.terms_in_rows if self.dynamic else 0
+
+    @property
+    def apart(self):
+        """The dynamic elements of which it has not, so that their products have launches of their own; or None."""
+        return self.dynamic if self.dynamic and not self.terms_in_rows else None
+
     def block_rows(self):
-        """The offsets, columns and values of the rows; None with dynamic elements, whose blocks are not all there."""
-        return None if self.dynamic else (self.offsets, self.columns, self.values)
+        """Returns the :func:`warpcloth.kernels.block_rows.block_rows`, which holds no references."""
+        rows = block_rows(self.model.dtype)()
+        rows.offsets, rows.columns, rows.diagonal, rows.values = self.offsets, self.columns, self.diagonal, self.values
+        if self.dynamic:
+            self.dynamic.set_pairs(rows)
+        return rows
 
     def invert_diagonal(self, out):
         """Launches out (N,) = the inverse diagonal blocks."""
@@ -194,6 +208,11 @@ class Hessian(BlockMatrix):
         The sum of the terms whose Hessian is constant is computed once, and copied. A function ``further``(values) may add to
         the blocks.
         """
+        self.dynamic.launch(x, correction)
+        self.assemble_after_gradient(x, scale, correction, further)
+
+    def assemble_after_gradient(self, x, scale, correction=None, further=None):
+        """As :meth:`assemble`, where a gradient at the same place has found the forces of dynamic elements."""
         if self._constant is None:
             self.values.zero_()
         else:
@@ -201,7 +220,6 @@ class Hessian(BlockMatrix):
         self.launch_masses(scale)
         for one in self._varying:
             one.add(self.values, x, correction, self.policy)
-        self.dynamic.launch(x, correction)
         self.dynamic.add_diagonal(self.diagonal, self.values)
         if further is not None:
             further(self.values)

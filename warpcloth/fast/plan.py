@@ -57,8 +57,8 @@ class Plan:
             count: Number of steps of the moved pins (B,) int32, or None.
             pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that divides the work.
             colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`, with which faster classes handle contact
-                themselves. None: the terms and the end of each step handle it, as with mesh colliders.
-            pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact, or None.
+                themselves. None: the terms and the end of each step handle it.
+            pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact and mesh colliders, or None.
 
         Raises:
             ValueError: Threads cannot divide the steps; the message names the term.
@@ -75,7 +75,7 @@ class Plan:
             backend = self.backend if self.model.uniform else "core"
             if colliders is not None and not self.model.colliders.plain:
                 backend = "core"
-            if colliders is not None and colliders.meshes is None and backend != "core":
+            if colliders is not None and backend != "core":
                 self.guard = ContactGuard(self.model, colliders)
                 given = *given, self.guard
             steps = {"core": ExplicitStep, "blocks": BlockStep, "gather": GatherStep}[backend](*given)

@@ -14,7 +14,6 @@ from ..core.capture import Mirror, Segment
 from ..core.status import Result
 from ..mesh.ordering import order_of_run
 from ..run.watch import Watch, watched_frames
-from ..scene.mesh_collider import MeshCollider
 from .counts import compulsory_bytes, elements_of, launches_of
 from .measurements import SceneRef, Setup, finite
 
@@ -103,7 +102,7 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
         "start_s": time.time() - started,
         "bind_s": bound - stepper.factorise_seconds,
         "factorise_s": stepper.factorise_seconds,
-        "triangles": sum(len(each.triangles) for each in declared.colliders if isinstance(each, MeshCollider)),
+        "triangles": sum(len(declared.colliders[c].triangles) for c in declared.meshes),
     }
     if frames:
         found |= _warm(stepper, model, points, frames, found["elements"])

@@ -11,6 +11,9 @@ from ..kernels.terms.contact import ROUNDED_BOX
 from .device_meshes import DeviceMeshes, meshes_on
 from .precision import refuse_large
 
+# Core and radius of a shape without a point. Its distance is finite, so that differences are not NaN.
+EMPTY = np.zeros(3), -1e30
+
 
 class DeviceColliders(NamedTuple):
     """The C colliders of a scene, which all copies share.
@@ -25,8 +28,8 @@ class DeviceColliders(NamedTuple):
         friction: μ of each, (C,) on the host.
         laws: The laws of friction.
         moves, half_space: Whether each has more than one pose, and whether it is a half-space, lists of C.
-        facets: Number of half-spaces that approximate each near a vertex in a step, 0 for other shapes, a list of C.
-        meshes: The triangle meshes among them, or None.
+        is_mesh: Whether each is a triangle mesh, a list of C. Its shape here is empty.
+        meshes: The meshes among them, or None.
     """
 
     keyframes: wp.array
@@ -40,7 +43,7 @@ class DeviceColliders(NamedTuple):
     laws: set
     moves: list
     half_space: list
-    facets: list
+    is_mesh: list
     meshes: DeviceMeshes | None
 
     @property
@@ -60,7 +63,7 @@ def colliders_on(model, scene):
         return None
     centred = [collider.centred() for collider in scene.colliders]
     poses = [collider.poses for collider in centred]
-    cores, radii = zip(*(collider.core for collider in scene.colliders), strict=True)
+    cores, radii = zip(*(EMPTY if collider.is_mesh else collider.core for collider in scene.colliders), strict=True)
     solids = tuple(sorted(dict.fromkeys(each.solid for each in scene.colliders), key=lambda solid: not solid.convex))
     kinds = [len(solids) - 1 - solids.index(each.solid) for each in scene.colliders]
     refuse_large(scene, model.numpy_dtype)
@@ -77,6 +80,6 @@ def colliders_on(model, scene):
         laws={law_of(collider.friction) for collider in scene.colliders},
         moves=[collider.moves for collider in scene.colliders],
         half_space=[bool(np.isinf(core[0])) for core in cores],
-        facets=[collider.facets for collider in scene.colliders],
+        is_mesh=[collider.is_mesh for collider in scene.colliders],
         meshes=meshes_on(model, centred),
     )

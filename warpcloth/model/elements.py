@@ -28,7 +28,6 @@ class DeviceElements:
         refresh: :class:`warpcloth.terms.refresh.Refresh` of a rest state that changes during a run, or None.
         cells: :class:`Cells` or :class:`SparseCells` whose vertices the elements are, or None.
         collider: For contact and friction, index of the collider in the scene; else None.
-        facet: For contact with a mesh, index of the half-space.
         clear: How far each vertex may move from x̃ in a step before there is a force, (B·E,) [m], see
             :mod:`warpcloth.kernels.contact.clear_elements`; None for elements that are always evaluated.
     """
@@ -44,18 +43,12 @@ class DeviceElements:
     refresh: Refresh | None = None
     cells: Cells | SparseCells | None = None
     collider: int | None = None
-    facet: int = 0
     clear: wp.array | None = None
 
     @property
     def arguments(self):
         """The first arguments of every kernel over elements."""
         return [self.stencil, self.stiffness, self.rest]
-
-    @property
-    def on_faces(self):
-        """Whether it is contact or friction of triangles with a mesh."""
-        return self.collider is not None and self.term.vertices == 3
 
     @property
     def arrays(self):
@@ -138,8 +131,7 @@ class DeviceElements:
         A limit has an empty range about the rest shape ``points`` (n, 3) [m]. Contact has its ``bounded`` term.
         """
         if self.term.bounded is not None:
-            found = replace(self, term=self.term.bounded)
-            return found.weighed(np.zeros(self.count)) if self.facet else found  # facets share the stiffness of one
+            return replace(self, term=self.term.bounded)
         if not self.term.dead_zone:
             return self
         rest = self.term.rest_state(points, host_values(self.stencil) % len(points), least=1.0, most=1.0)
@@ -208,7 +200,6 @@ def elements_on(model, term, positions, vary):
         cells=cells,
         refresh=one.refresh,
         collider=getattr(term, "collider", None),
-        facet=getattr(term, "facet", 0),
     )
     return found if model.order is None or cells else found.by_lowest()
 

@@ -187,6 +187,11 @@ class Model:
         """Inverse masses for local steps, (B·n,) numbers, or vectors if coordinates are locked [1/kg]."""
         return self.inverse_mass if self.mobility is None else self.mobility
 
+    @property
+    def has_pairs(self):
+        """Whether steps list pairs: those of cloth with itself, or with a mesh among the colliders."""
+        return self.scene.self_contact is not None or (self.colliders is not None and self.colliders.meshes is not None)
+
     def lock(self, values):
         """Sets vectors (N,) to 0 at coordinates that do not move, if a coordinate is locked."""
         if self.mobility is not None:

@@ -86,6 +86,8 @@ def refuse_large(scene, dtype):
     mesh, limits = scene.mesh, np.finfo(dtype)
     edge = np.median(np.linalg.norm(np.diff(mesh.points[mesh.edges], axis=1), axis=2))
     for collider in scene.colliders:
+        if collider.is_mesh:
+            continue
         half, radius = collider.core
         size = half.min() + radius
         if np.isfinite(size) and limits.eps * size > max(0.2 * scene.contact.distance, 1e-4 * edge):

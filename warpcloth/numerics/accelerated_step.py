@@ -101,6 +101,8 @@ class AcceleratedStep:
         given = [d, stepper.w, self.s, self.z, self.coefficients.array, n]
         self._launch(kernels.combine, N, given, [self.accelerated])
         if stepper.pairs is not None:
+            # A line search for w has listed the pairs of its trial.
+            stepper.pairs.filter.launch_trial(stepper.state.x, d)
             for each in (self.plain, self.accelerated):
                 stepper.pairs.filter.launch_between(stepper.state.x, d, each)
         self._launch_energy(self.plain, self._plain_energy)

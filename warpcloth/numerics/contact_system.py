@@ -33,17 +33,16 @@ class CorrectedSystem:
         model: The :class:`warpcloth.model.model.Model`.
         x: x̃ (N,) [m].
         linear: Solves with A, ``solve(b, x)``.
-        terms: The elements in D besides the dynamic ones.
 
     Attributes:
         matrix: D, a :class:`warpcloth.core.hessian.Hessian`.
     """
 
-    def __init__(self, model, x, linear, terms=()):
+    def __init__(self, model, x, linear):
         self.model, self.x, self._linear = model, x, linear
         right, self._result = model.vectors(), model.vectors()
         self._right, self._found = Mirror(right), Mirror(self._result)
-        self.matrix = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=terms, dynamic=model.dynamic)
+        self.matrix = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=(), dynamic=model.dynamic)
         self.matrix.prepare()
         self._p, self._q = Mirror(model.vectors()), Mirror(model.vectors())
         self._all = wp.full(model.copies, 1, dtype=wp.int32, device=model.device)
@@ -108,8 +107,9 @@ class ContactSystem(CorrectedSystem):
     """Solves (A + D) w = ∇φ, D the semi-definite Hessian of contact: accurately if φ rose or is near its minimum, else roughly.
 
     The curvature of contact has no bound, so no constant matrix is an upper bound of the Hessian. A copy where φ rose is
-    ``careful`` in the next 4 iterations, after a second rise in 16, and so on: w is then also shortened until φ falls. In other
-    copies the blocks of vertices near colliders are those of :func:`warpcloth.kernels.contact.clear_elements.add_secants`.
+    ``careful`` in the next 4 iterations, after a second rise in 16, and so on: w is then also shortened until φ falls. With
+    self-contact all solves are accurate, because a rough w runs into pairs, which then stop the whole copy. In other copies the
+    blocks of vertices near colliders are those of :func:`warpcloth.kernels.contact.clear_elements.add_secants`.
     Without :meth:`start`, all copies always are careful.
 
     Args:
@@ -125,8 +125,8 @@ class ContactSystem(CorrectedSystem):
     """
 
     def __init__(self, model, x, gradient, linear, sums, s, pairs):
-        super().__init__(model, x, linear, [elements for elements in model.terms if elements.on_faces])
-        touching = [elements for elements in model.terms if elements.collider is not None and not elements.on_faces]
+        super().__init__(model, x, linear)
+        touching = [elements for elements in model.terms if elements.collider is not None]
         self._touching = [(elements, self._kernel_of(elements.term)) for elements in touching]
         held = model.inverse_mass.numpy() == 0.0
         self._diagonal = wp.array(np.where(held, -1, self.matrix.diagonal.numpy()), dtype=wp.int32, device=model.device)
@@ -190,7 +190,8 @@ class ContactSystem(CorrectedSystem):
             b = self._gradient.numpy().astype(np.float64)
             first = self._dot(b, found)
             self._start = np.maximum(self._start, first)
-            found, _ = self._solve(b, found, pressed, active, self.careful | (first <= NEAR**2 * self._start))
+            closely = self.careful | (first <= NEAR**2 * self._start) | (self._pairs is not None)
+            found, _ = self._solve(b, found, pressed, active, closely)
         elif not self.careful.any():
             return
         if self.careful.any():
@@ -226,7 +227,7 @@ class PairSystem(CorrectedSystem):
         self._press = Segment(device, self._launch_press)
         self._bound = Segment(device, lambda: self._pairs.filter.launch_limit(self._pull.array))
         self._look = Segment(device, lambda: self._pairs.filter.launch_look(self.x, trial, self._pull.array))
-        self._assemble = Segment(device, lambda: self.matrix.assemble(self.x, 0.0, trial))
+        self._assemble = Segment(device, lambda: self.matrix.assemble_after_gradient(self.x, 0.0, trial))
 
     def _launch_press(self):
         """Launches U and ∂U/∂x at the trial."""

@@ -2,7 +2,6 @@
 
 import importlib.util
 import time
-from functools import partial
 
 import numpy as np
 import warp as wp
@@ -16,22 +15,27 @@ from .constant_multigrid import CopyCycles
 
 # Largest number of unknowns for which all eigenvalues are computed.
 SMALL = 100
+# Iterations of conjugate gradients in the body of a loop on CUDA, even for two directions take turns. On an H200 a turn of the
+# loop costs as much as the launches of 1.5 iterations that do nothing.
+AT_ONCE = 4
 
 
 class ConjugateGradients:
     """Solves A x = b for each copy by conjugate gradients.
 
-    The preconditioner P is the inverse diagonal blocks, or a cycle of ``multigrid`` where solves take less time with it.
+    The preconditioner P is the inverse diagonal blocks, or a cycle of ``multigrid`` where solves take less work with it.
     It runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) has fallen to its tolerance times the first
     value, or at a direction of negative curvature. In that case x is still a descent direction of ½xᵀAx − bᵀx, and ``negative``
     is 1 (Steihaug 1983).
 
     Args:
         matrix: A, an object with ``count``, ``per_copy``, ``vector``, ``block``, ``prepare``, ``multiply`` and
-            ``invert_diagonal``, such as :class:`warpcloth.core.hessian.Hessian`. ``block_rows`` has its offsets, columns and
-            values if these are all of it, else None.
+            ``invert_diagonal``, such as :class:`warpcloth.core.hessian.Hessian`. ``block_rows`` is None if it has none.
         iterations: Maximum number of iterations of one solve.
         multigrid: A :class:`warpcloth.numerics.multigrid.Multigrid` of the matrix, or None.
+
+    Attributes:
+        iteration: Number of iterations of the last solve, (B,) int32.
     """
 
     capturable = True
@@ -48,40 +52,35 @@ class ConjugateGradients:
         self.preconditioner = per_unknown(matrix.block) if multigrid is None else multigrid.sweep
 
         self._solves = solves = linear.Solves()
-        for name in ("active", "next_active", "negative"):
+        for name in ("active", "next_active", "negative", "iteration", "next_iteration"):
             setattr(solves, name, model.scalars(wp.int32))
-        for name in ("rz", "next_rz", "first", "pq", "tolerance"):
+        for name in ("rz", "next_rz", "first", "tolerance"):
             setattr(solves, name, model.scalars())
-        solves.iteration, solves.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        solves.proceed = wp.zeros(1, dtype=wp.int32, device=model.device)
         solves.most = wp.full(1, iterations, dtype=wp.int32, device=model.device)
         self.active, self.negative, self.tolerance = solves.active, solves.negative, solves.tolerance
         self.iteration = solves.iteration
 
         lanes = Lanes(model, matrix.per_copy)
-        block, self._lanes, self._dim, self._of_block = lanes.block, lanes.count, lanes.dim, lanes.of_block
-        self._parts, self._pq_parts = lanes.parts(), lanes.parts()
-        of_unknowns = linear.start_iteration, linear.dot_parts, linear.advance, linear.turn
-        self._launch = model.launcher(
-            (of_unknowns, model.dtype, matrix.vector is model.dtype, block),
-            ((linear.multiply_parts,) if matrix.block_rows else (), model.dtype, block),
-            ((linear.start_copies,), block),
-            ((linear.begin_multiplying,),),
-        )
+        block, self._lanes, self._dim, self._at_once = lanes.block, lanes.count, lanes.dim, AT_ONCE if lanes.block else 1
+        self._parts = lanes.parts()
+        of_unknowns = linear.start_solves, linear.dot_parts, linear.turn, linear.advance
+        self._launch = model.launcher((of_unknowns, model.dtype, matrix.vector is model.dtype, block))
+        self._turn_and_multiply, self._other = None, self.p
+        if matrix.block_rows is not None:
+            self._turn_and_multiply = model.kernel(linear.turn_and_multiply, model.dtype, block, matrix.terms_in_rows)
+            lanes = Lanes(model, matrix.per_copy * linear.lanes_of_rows(block))
+            if block:
+                self._other = per_unknown(matrix.vector)
+        self._row_threads, self._row_dim, self._pq_parts = lanes.count, lanes.dim, lanes.parts()
 
     def solve(self, b, x, wanted):
         """Solves for x = A⁻¹ b to the relative ``tolerance`` (B,), for the copies that are ``wanted`` (B,); others keep x."""
+        given = {"b": b, "x": x, "wanted": wanted}
         if self.multigrid is None:
-            self._prepare_diagonal()
+            self._solve_with_blocks(**given)
         else:
-            wp.capture_if(self.multigrid.used, self.multigrid.update, partial(self._prepare_limited, wanted))
-        given = [self.preconditioner, b, wanted, self.matrix.per_copy, self._lanes]
-        out = [x, self.r, self.z, self.p, self._parts, self._solves]
-        self._launch(linear.start_iteration, self._dim, given, out)
-        if self.multigrid is not None:
-            wp.capture_if(self.multigrid.used, self._refine_first, wanted=wanted)
-        self._launch(linear.start_copies, self._of_block, [self._parts, wanted], [self._solves])
-        wp.capture_while(self._solves.proceed, self._iterate, x=x)
-        if self.multigrid is not None:
+            wp.capture_if(self.multigrid.used, self._solve_with_cycles, self._solve_with_blocks, **given)
             self.multigrid.choose(self._solves)
 
     def outdate(self):
@@ -89,37 +88,51 @@ class ConjugateGradients:
         if self.multigrid is not None:
             self.multigrid.outdate()
 
-    def _prepare_diagonal(self):
+    def _solve_with_blocks(self, b, x, wanted):
         self.matrix.invert_diagonal(self.preconditioner)
+        if self.multigrid is not None:
+            self.multigrid.limit(self._solves, wanted)
+        self._launch_start(b, x, wanted)
+        wp.capture_while(self._solves.proceed, self._iterate, x=x, count=self._at_once)
 
-    def _prepare_limited(self, wanted):
-        self._prepare_diagonal()
-        self.multigrid.limit(self._solves, wanted)
-
-    def _refine_first(self, wanted):
+    def _solve_with_cycles(self, b, x, wanted):
+        self.multigrid.update()
+        self._launch_start(b, x, wanted)
         self._refine(wanted)
-        wp.copy(self.p, self.z)
+        wp.capture_while(self._solves.proceed, self._iterate, x=x, count=min(self._at_once, 2), refine=True)
+
+    def _launch_start(self, b, x, wanted):
+        given = [self.preconditioner, b, wanted, self.matrix.per_copy, self._lanes]
+        self._launch(linear.start_solves, self._dim, given, [x, self.r, self.z, self.p, self._parts, self._solves])
 
     def _refine(self, active):
         """Launches z = P r by multigrid and the parts of rᵀz, after the sweep in which z = S r."""
         self.multigrid.refine(self.r, self.z, active)
         self._launch_dot(self.r, self.z, active, self._parts)
 
-    def _iterate(self, x):
-        matrix, size = self.matrix, [self.matrix.per_copy, self._lanes]
-        if matrix.block_rows:
-            given = [*matrix.block_rows, self.p, *size]
-            self._launch(linear.multiply_parts, self._dim, given, [self._solves, self.q, self._pq_parts])
-        else:
-            self._launch(linear.begin_multiplying, self.model.copies, [], [self._solves])
-            matrix.multiply(self.p, self.q, self.active)
-            self._launch_dot(self.p, self.q, self.active, self._pq_parts)
-        given = [self.preconditioner, self.p, self.q, self._pq_parts, *size]
-        self._launch(linear.advance, self._dim, given, [self._solves, x, self.r, self.z, self._parts])
-        if self.multigrid is not None:
-            wp.capture_if(self.multigrid.used, self._refine, active=self.active)
-        given = [self.z, self._parts, *size]
-        self._launch(linear.turn, self._dim, given, [self._solves, self.p])
+    def _iterate(self, x, count, refine=False):
+        """Launches ``count`` iterations, an even number if directions have two arrays that take turns."""
+        for k in range(count):
+            before, p = (self._other, self.p) if k % 2 else (self.p, self._other)
+            self._launch_product(before, p)
+            given = [self.preconditioner, p, self.q, self._pq_parts, self.matrix.per_copy, self._lanes]
+            self._launch(linear.advance, self._dim, given, [self._solves, x, self.r, self.z, self._parts])
+            if refine:
+                self._refine(self.active)
+
+    def _launch_product(self, before, p):
+        """Launches p = z + ratio·``before``, q = A p and the parts of pᵀq; ``before`` may be p."""
+        matrix = self.matrix
+        if self._turn_and_multiply is not None:
+            given = [matrix.block_rows(), self.z, before, self._parts, matrix.per_copy, self._row_threads]
+            self.model.launch(self._turn_and_multiply, self._row_dim, given, [self._solves, p, self.q, self._pq_parts])
+            if matrix.apart is not None:
+                matrix.apart.add_products(p, self.q, self._solves.next_active)
+                self._launch_dot(p, self.q, self._solves.next_active, self._pq_parts)
+            return
+        self._launch(linear.turn, self._dim, [self.z, self._parts, matrix.per_copy, self._lanes], [self._solves, p])
+        matrix.multiply(p, self.q, self._solves.next_active)
+        self._launch_dot(p, self.q, self._solves.next_active, self._pq_parts)
 
     def _launch_dot(self, a, b, active, parts):
         """Launches the parts of aᵀb in the copies that are ``active`` (B,)."""

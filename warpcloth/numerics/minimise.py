@@ -38,16 +38,16 @@ def _resembles_the_last_step(model):
 def _free_axes(model, near):
     """Returns which axes are those of moves of the whole cloth that change no energy, (3,) booleans.
 
-    Terms with stencils of one vertex and air hold the cloth in space; so do pins and locks, by axes, and contact with colliders
-    where copies may be ``near``, or everywhere if that is None.
+    Terms with stencils of one vertex, meshes and air hold the cloth in space; so do pins and locks, by axes, and contact with
+    other colliders where copies may be ``near``, or everywhere if that is None.
     """
-    held = (
+    held = any(collider.is_mesh for collider in model.scene.colliders) or any(
         near is None
         if elements.collider is not None
         else elements.term is AIR or (elements.term.vertices == 1 and not elements.cells)
         for elements in model.terms
     )
-    return (model.coordinate_mobility().reshape(-1, 3) > 0.0).all(axis=0) & (not any(held))
+    return (model.coordinate_mobility().reshape(-1, 3) > 0.0).all(axis=0) & (not held)
 
 
 class Minimiser:
@@ -56,7 +56,7 @@ class Minimiser:
     Args:
         model: The :class:`warpcloth.model.model.Model`.
         base: The positions at d = 0, (N,) vectors [m]; the caller's array, read only.
-        hessian: ``"adaptive"`` (raw, but reduced in iterations whose matrix is indefinite), ``"raw"``, ``"clamp"``
+        hessian: ``"adaptive"`` (raw, but its negative part is reduced where the matrix is indefinite), ``"raw"``, ``"clamp"``
             or ``"absolute"``.
         linear: ``"cg"`` or ``"factorised"``.
         s: Weight of the inertia, 1/h² [1/s²].
@@ -268,7 +268,7 @@ class Minimiser:
         self._launch(kernels.end_newton, self.search.lanes.of_block, given, [self._progress])
 
     def _launch_assemble(self):
-        self.hessian.assemble(self.base, self.search.inertia.s, self.correction)
+        self.hessian.assemble_after_gradient(self.base, self.search.inertia.s, self.correction)
         hessian, search, lanes = self.hessian, self.search, self.search.lanes
         given = [hessian.offsets, hessian.columns, hessian.diagonal, hessian.values, self.base, self.correction]
         given += [search.gradient, self.edge, self.model.per_copy, lanes.count]

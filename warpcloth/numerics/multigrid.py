@@ -4,7 +4,9 @@ import numpy as np
 import warp as wp
 
 from ..core.block_pattern import dense_pattern, pattern_of_product, to_device
+from ..core.sums import Lanes
 from ..kernels import multigrid as kernels
+from ..kernels.block_rows import block_rows, lanes_of_rows
 from ..kernels.linear import multiply
 from .interpolation import find, neighbours
 
@@ -16,6 +18,8 @@ COARSEST = 12
 DENSE = 48
 # Pairs of self-contact have 4 vertices, and so a matrix of at most 4 times its diagonal blocks.
 PAIRED = 4.0
+# A launch on CUDA takes as long as reading so many blocks: 3 µs at 3 TB/s.
+LAUNCH = 250_000
 
 
 class _Level:
@@ -35,6 +39,13 @@ class _Level:
         self.values = wp.zeros(len(whole.columns), dtype=model.mat33, device=device)
         self.sweep = wp.zeros(model.copies * self.n, dtype=model.mat33, device=device)
         self.r, self.x, self.d = (wp.zeros(model.copies * self.n, dtype=model.vec3, device=device) for _ in range(3))
+        self._dtype = model.dtype
+
+    def block_rows(self):
+        """Returns the :func:`warpcloth.kernels.block_rows.block_rows`, which holds no references."""
+        rows = block_rows(self._dtype)()
+        rows.offsets, rows.columns, rows.values = self.offsets, self.columns, self.values
+        return rows
 
 
 class _Finest:
@@ -50,6 +61,7 @@ class _Finest:
         )
         self.sweep = wp.zeros(model.count, dtype=model.mat33, device=model.device)
         self.r, self.d = model.vectors(), model.vectors()
+        self.block_rows = hessian.block_rows
 
 
 class _Transfer:
@@ -163,30 +175,48 @@ class Multigrid:
             self._other = wp.zeros_like(self._levels[-1].values)
         self.sweep = self._levels[0].sweep
         self._factor = wp.zeros(model.count, dtype=model.mat33, device=model.device)
-        self._further = model.vectors() if hessian.dynamic else None
+        self._further = None if hessian.apart is None else model.vectors()
         self._choice, self._iterations = kernels.PreconditionerChoice(), iterations
         choice = self._choice
         choice.used, choice.outdated, choice.fresh = (wp.ones(1, dtype=wp.int32, device=model.device) for _ in range(3))
         choice.progress = wp.zeros(1, dtype=wp.float64, device=model.device)
-        choice.rates = wp.zeros(2, dtype=wp.float64, device=model.device)
-        choice.trial = wp.zeros(1, dtype=wp.int32, device=model.device)
+        for name in ("rates", "gained", "costs"):
+            setattr(choice, name, wp.zeros(2, dtype=wp.float64, device=model.device))
+        choice.trial, choice.count = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         choice.age = wp.full(1, kernels.AGED, dtype=wp.int32, device=model.device)
-        self.used = choice.used
+        self.used, self.cycle = choice.used, self._cost_of_cycle()
 
     def _make_kernels(self):
         model = self.model
+        self._block = block = Lanes(model, 1).block
+        self._lanes = lanes_of_rows(block)
         of_matrix = kernels.list_multiples, kernels.multiply_by_transfers, kernels.factorise_diagonal, kernels.scale_sweeps
         products = kernels.subtract_product, kernels.sweep_after
         of_vectors = kernels.eliminate, kernels.restrict, kernels.prolong
         choices = kernels.find_slots, kernels.measure_progress, kernels.choose, kernels.limit_iterations
-        self._launch = model.launcher((of_matrix + products + of_vectors, model.dtype), ((multiply,), model.dtype), (choices,))
-        self._launch_finest = self._launch
-        if self.hessian.dynamic:
-            self._launch_finest = model.launcher((products, model.dtype, True))
+        self._launch = model.launcher(
+            ((*of_matrix, *of_vectors), model.dtype), (products, model.dtype, block), ((multiply,), model.dtype), (choices,)
+        )
+        self._launch_finest, terms = self._launch, self.hessian.terms_in_rows
+        if terms:
+            self._launch_finest = model.launcher((products, model.dtype, block, terms))
+
+    def _cost_of_cycle(self):
+        """Returns the cost of an iteration with a cycle over that of one with diagonal blocks.
+
+        It counts the blocks that both read, vectors as blocks of a third each, and launches on CUDA.
+        """
+        copies, launch = self.model.copies, LAUNCH if self.model.device.is_cuda else 0
+        of_levels = [len(level.columns) // copies for level in self._levels]
+        plain = of_levels[0] + 4 * self.sizes[0] + 2 * launch / copies
+        products = 2 * sum(of_levels[:-1]) + of_levels[-1] * (1 if self._dense else 0)
+        vectors = sum(4 * n for n in self.sizes[:-1])
+        launches = 4 * len(self._transfers) + self._dense + 1
+        return max(round((plain + products + vectors + launches * launch / copies) / plain), 1)
 
     def update(self):
         """Launches the sweeps of the finest level for the present A, and the coarse matrices if they are ``outdated``."""
-        self._set_sweeps(self._levels[0], 1.0 if self._further is None else PAIRED)
+        self._set_sweeps(self._levels[0], PAIRED if self.hessian.dynamic else 1.0)
         if self._transfers:
             wp.capture_if(self._choice.outdated, self._update_coarse)
 
@@ -197,7 +227,7 @@ class Multigrid:
     def choose(self, solves):
         """Launches the choice whether the next solve uses multigrid, see :func:`warpcloth.kernels.multigrid.choose`."""
         self._launch(kernels.measure_progress, self.model.copies, [solves], [self._choice])
-        self._launch(kernels.choose, 1, [self._iterations], [solves, self._choice])
+        self._launch(kernels.choose, 1, [self._iterations, self.cycle], [solves, self._choice])
 
     def limit(self, solves, wanted):
         """Launches the limit of iterations of a solve with diagonal blocks, see `limit_iterations` of the kernels."""
@@ -211,8 +241,8 @@ class Multigrid:
         right, x = r, z
         for finer, level, transfer in zip(self._levels, self._levels[1:], self._transfers, strict=False):
             launch, further = self._with_dynamic(finer, x, active)
-            given = [finer.offsets, finer.columns, finer.values, x, further, right, active, finer.n]
-            launch(kernels.subtract_product, B * finer.n, given, [finer.r])
+            given = [finer.block_rows(), x, further, right, active, finer.n]
+            launch(kernels.subtract_product, B * finer.n * self._lanes, given, [finer.r])
             given = [*transfer.columns, finer.r, level.sweep, active, finer.n, level.n]
             self._launch(kernels.restrict, (B, level.n), given, [level.r, level.x])
             right, x = level.r, level.x
@@ -226,15 +256,16 @@ class Multigrid:
             if k == 0:
                 self.model.lock(level.d)
             launch, further = self._with_dynamic(level, level.d, active)
-            given = [level.offsets, level.columns, level.values, level.sweep, level.d, further, level.r, active, level.n]
-            launch(kernels.sweep_after, B * level.n, given, [level.x if k else z])
+            given = [level.block_rows(), level.sweep, level.d, further, level.r, active, level.n]
+            launch(kernels.sweep_after, B * level.n * self._lanes, given, [level.x if k else z])
 
     def _with_dynamic(self, level, x, active):
-        """Returns the function that launches kernels of a level, and its further product with x, that of dynamic elements."""
-        if self._further is None or level is not self._levels[0]:
+        """Returns the function that launches kernels of a level, and a product with x of dynamic elements that it lacks."""
+        if level is not self._levels[0]:
             return self._launch, None
-        self._further.zero_()
-        self.hessian.dynamic.add_products(x, self._further, active)
+        if self._further is not None:
+            self._further.zero_()
+            self.hessian.apart.add_products(x, self._further, active)
         return self._launch_finest, self._further
 
     def _update_coarse(self):

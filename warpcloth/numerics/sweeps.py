@@ -179,6 +179,7 @@ class GaussSeidelSweep(_Sweep):
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool` whose threads share coloured sweeps; None for one thread.
         before: Positions at the start of the step (N,) [m], from which one CPU thread lists the elements of terms with
             ``clear`` that may have a force; or None.
+        follows: Whether dynamic elements are found anew after some of these sweeps.
 
     Attributes:
         ranges: For each term, the ranges (first, count) of elements of its launches.
@@ -197,9 +198,10 @@ class GaussSeidelSweep(_Sweep):
         correction=None,
         pool=None,
         before=None,
+        follows=True,
     ):
         super().__init__(model, x, h, relaxation, scalar, multipliers, correction)
-        self.multipliers_add = multipliers
+        self.multipliers_add, self._follows = multipliers, follows
         self._dynamic.sweeps(in_turn=True)
         self.pool, self.spread, self.ordered = pool or ThreadPool(1), spread or 1, kind == "sequential"
         self.ranges = [[(0, (elements.cells or elements).count)] for elements in model.terms]
@@ -286,4 +288,4 @@ class GaussSeidelSweep(_Sweep):
             self._sweep_dynamic(backward)
 
     def _sweep_dynamic(self, backward):
-        self._dynamic.launch_sweep(self.x, self.correction, self.h, self.multipliers_add, backward)
+        self._dynamic.launch_sweep(self.x, self.correction, self.h, self.multipliers_add, backward, self._follows)

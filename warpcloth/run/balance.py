@@ -140,8 +140,9 @@ class Balance:
         points, mass, inverse = (model.in_scene_order(array.numpy()).astype(np.float64) for array in arrays)
         self.mass = np.where(inverse > 0.0, mass, 0.0).reshape(model.copies, -1)
         self.total = self.mass.sum(axis=1)
-        # A term with stencils of one vertex, and without cells, holds vertices in space.
+        # A term with stencils of one vertex, and without cells, holds vertices in space, and so do meshes.
         held = any(elements.term.vertices == 1 and not elements.cells for elements in model.terms)
+        held = held or any(each.is_mesh for each in model.scene.colliders)
         self.free = not (held or len(model.scene.fixed) or model.mobility is not None)
         self._gravity = model.gravity.numpy().astype(np.float64)
         constant = None if model.loads is None or self.free else model.loads.constant

@@ -1,6 +1,6 @@
-"""Faults of contact that make a run not usable: pins held back, cloth caught in colliders, cloth that meshes pass through.
+"""Faults of contact that make a run not usable: pins held back, cloth caught in colliders, meshes that move through cloth.
 
-And a warning, where contact is too soft for what presses on it.
+And warnings, where contact is too soft for what presses on it, and where cloth crosses a mesh from the start.
 """
 
 from typing import NamedTuple
@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.turns import in_turn
+from ..scene.colliders import turned
 from ..terms.needs import NORMAL_FORCE
 from .history import collider_names
 
@@ -36,23 +37,21 @@ class Inside(NamedTuple):
         return f"vertex {self.vertex} is caught between {self.collider} and {self.other} {_where(self)}"
 
 
-class Pierced(NamedTuple):
-    """A triangle of the cloth through which a corner or an edge of a mesh has passed, between its vertices.
+class Forced(NamedTuple):
+    """The first time that a mesh moved through cloth that could not get out of its way.
 
     Attributes:
-        triangle: Its index in the mesh of the cloth.
-        frame: The frame at the end of which that was so first.
-        collider: Name of the mesh.
-        copy: Index of its copy.
+        frame: The frame in whose steps it did.
+        collider: Name of the mesh, or "a mesh" if several move.
+        copy: Index of the copy.
     """
 
-    triangle: int
     frame: int
     collider: str
     copy: int = 0
 
     def __str__(self) -> str:
-        return f"{self.collider} has passed through triangle {self.triangle} of the cloth, between its vertices, {_where(self)}"
+        return f"{self.collider} moves through cloth that cannot get out of its way {_where(self)}"
 
 
 class Pressed:
@@ -82,14 +81,15 @@ class Pressed:
 @in_turn
 def soft_contact_of(watch, stepper):
     """Returns a sentence each about the first frame in which a gap to a collider, and one between cloth and cloth, falls below
-    half the contact distance."""
+    half the contact distance. That of edges, and of vertices of meshes, is r/4."""
     scene, found = stepper.model.scene, {}
     if watch.pressed is not None:
         names, first = collider_names(scene), watch.pressed.first
         found["contact"] = [(first[of], of[0], f"to {names[of[1]]}") for of in zip(*np.nonzero(first), strict=True)]
-    if stepper.pairs is not None:
-        pairs = [(frame, copy, "between cloth and cloth") for copy, frame, _vertex in stepper.pairs.pressed]
-        found["self_contact"] = [each for each in pairs if each[0] <= watch.good[each[1]]]
+    pressed = ((), ()) if stepper.pairs is None else stepper.pairs.pressed
+    for name, other, gaps in zip(("self_contact", "contact"), ("cloth", "a mesh"), pressed, strict=True):
+        pairs = [(frame, copy, f"between cloth and {other}") for copy, frame, _vertex in gaps]
+        found[name] = found.get(name, []) + [each for each in pairs if each[0] <= watch.good[each[1]]]
     sentences = []
     for name, near in found.items():
         for frame, copy, where in sorted(near, key=lambda each: each[:2])[:1]:
@@ -114,11 +114,113 @@ def inside_of(stepper):
     return tuple(sorted(found, key=lambda each: each.frame))
 
 
-def pierced_of(watch):
-    """Returns the :class:`Pierced` of each mesh and copy in the good frames of a watch, the first frame first."""
-    names, first = collider_names(watch.model.scene), [] if watch.piercings is None else watch.piercings.first()
-    found = [Pierced(triangle, frame, names[c], copy) for copy, c, frame, triangle in first if frame <= watch.good[copy]]
+@in_turn
+def forced_of(stepper):
+    """Returns the :class:`Forced` of each mesh and copy in the steps so far, the first frame first."""
+    scene = stepper.model.scene
+    names, first = collider_names(scene), stepper.pairs.forced if scene.meshes else []
+    return tuple(sorted(Forced(frame, "a mesh" if c is None else names[c], copy) for copy, frame, c in first))
+
+
+class Unresolved(NamedTuple):
+    """The first time that rounding of positions stopped cloth where its contact begins.
+
+    Attributes:
+        frame: The frame in or before which it did.
+        vertex: Index of a vertex of the pair in the mesh.
+        type: Name of the scalar type of positions.
+        copy: Index of the copy.
+    """
+
+    frame: int
+    vertex: int
+    type: str
+    copy: int = 0
+
+    def __str__(self) -> str:
+        return (
+            f"{self.type} is too coarse for the contact distance so far from the origin: rounding of positions stops cloth at "
+            f"vertex {self.vertex} {_where(self)}"
+        )
+
+
+@in_turn
+def unresolved_of(stepper):
+    """Returns the :class:`Unresolved` of each copy in the steps so far, the first frame first."""
+    found, name = [] if stepper.pairs is None else stepper.pairs.unresolved, stepper.model.numpy_dtype.__name__
+    found = [Unresolved(frame, _in_scene(stepper, vertex), name, copy) for copy, frame, vertex in found]
     return tuple(sorted(found, key=lambda each: each.frame))
+
+
+@in_turn
+def crossings_at_start(model):
+    """Returns a sentence about the triangles of free cloth that cross each mesh at the start of the first copy where some do.
+
+    Triangles with a vertex that is pinned, or locked along an axis, are left out, because these may be inside a mesh.
+    """
+    scene, sentences, n = model.scene, [], model.per_copy
+    if not scene.meshes:
+        return sentences
+    free = model.in_scene_order((model.coordinate_mobility().reshape(-1, 3) > 0.0).all(axis=1)).reshape(-1, n)[0]
+    triangles = scene.mesh.triangles[free[scene.mesh.triangles].all(axis=1)]
+    points = model.in_scene_order(model.positions.numpy()).astype(np.float64).reshape(-1, n, 3)
+    _, first = np.unique(points.reshape(len(points), -1), axis=0, return_index=True)  # copies that start alike are tested once
+    names = collider_names(scene)
+    for c in scene.meshes:
+        mesh = scene.colliders[c]
+        corners = (turned(mesh.poses[0, 3:], mesh.frames[0]) + mesh.poses[0, :3])[mesh.triangles]
+        for copy in np.sort(first):
+            count = _count_crossing(points[copy, triangles], corners)
+            if count:
+                what, stays = f"{count} triangles of the cloth cross", "they stay hooked"
+                if count == 1:
+                    what, stays = "1 triangle of the cloth crosses", "it stays hooked"
+                of_copy = f" of copy {copy}" if model.copies > 1 else ""
+                sentences.append(f"{what} the collider {names[c]} at the start{of_copy}; {stays}")
+                break
+    return sentences
+
+
+def _count_crossing(own, others):
+    """Returns how many triangles (T, 3, 3) others (S, 3, 3) cross. Those that only touch do not cross."""
+    from scipy.spatial import cKDTree
+
+    if not len(own):
+        return 0
+    others = others[_boxes_meet(others, own.reshape(1, -1, 3))]
+    (centres, radii), (other_centres, other_radii) = _balls(own), _balls(others)
+    near = cKDTree(centres).query_ball_point(other_centres, other_radii + radii.max(), return_sorted=False)
+    second = np.repeat(np.arange(len(others)), [len(each) for each in near])
+    first = np.concatenate([*near, []]).astype(np.int64)
+    meet = _boxes_meet(own[first], others[second])
+    first, second = first[meet], second[meet]
+    crosses = np.zeros(len(first), dtype=bool)
+    for one, other in ((own[first], others[second]), (others[second], own[first])):
+        for k in range(3):
+            crosses |= _passes_through(one[:, k], one[:, k - 1], *other.swapaxes(0, 1))
+    return len(np.unique(first[crosses]))
+
+
+def _boxes_meet(one, other):
+    """Returns whether the bounding boxes of points (k, i, 3) and of points (k, j, 3) have a common point, (k,)."""
+    return ((one.min(axis=1) <= other.max(axis=1)) & (other.min(axis=1) <= one.max(axis=1))).all(axis=1)
+
+
+def _balls(corners):
+    """Returns centres (T, 3) and radii (T,) of balls around triangles (T, 3, 3)."""
+    centres = corners.mean(axis=1)
+    return centres, np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+
+
+def _passes_through(p, q, a, b, c):
+    """Returns whether the segments from p to q pass through triangles a, b, c, all (k, 3), (k,)."""
+
+    def volume(a, b, c, d):
+        return np.einsum("ki,ki->k", np.cross(b - a, c - a), d - a)
+
+    sides = np.sign([volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)])
+    within = (sides >= 0.0).all(axis=0) | (sides <= 0.0).all(axis=0)
+    return within & (volume(a, b, c, p) * volume(a, b, c, q) < 0.0)
 
 
 @in_turn
@@ -136,10 +238,10 @@ def held_sentence(pin, copies):
 
 def unwanted(scene, held):
     """Returns those of the pins that cloth holds back that the scene does not allow."""
-    return held if scene.self_contact is not None and scene.self_contact.held_pins != "allow" else []
+    return held if scene.self_contact is None or scene.self_contact.held_pins != "allow" else []
 
 
-def contact_faults(scene, held, inside, pierced, copies=1):
+def contact_faults(scene, held, inside, forced, unresolved, copies=1):
     """Returns what makes a run not usable because of contact, a list of (copy, frame, sentence), the first frame first.
 
     Vertices that are not free and inside a collider are no fault, as the scene puts them there.
@@ -148,7 +250,8 @@ def contact_faults(scene, held, inside, pierced, copies=1):
         scene: The :class:`warpcloth.Scene`.
         held: As of :func:`held_pins_of`.
         inside: The :class:`Inside` of the run.
-        pierced: The :class:`Pierced` of the run.
+        forced: The :class:`Forced` of the run.
+        unresolved: The :class:`Unresolved` of the run.
         copies: Number of copies.
     """
     remedy = 'move the pins so that they do not run into cloth, or allow it by SelfContact(held_pins="allow")'
@@ -156,8 +259,11 @@ def contact_faults(scene, held, inside, pierced, copies=1):
     for each in inside:
         if each.other is not None:
             found.append((each.copy, each.frame, f"{each}; leave the cloth room between the two"))
-    remedy = 'take Contact(elements="triangles"), in a stage warpcloth:contact:elements, to keep meshes out of triangles too'
-    found += [(each.copy, each.frame, f"{each}; {remedy}") for each in pierced]
+    for each in forced:
+        found.append((each.copy, each.frame, f"{each}; take more steps a frame, or move {each.collider} more slowly"))
+    for each in unresolved:
+        remedy = "move the scene to the origin, compute in float64, or allow a larger contact distance"
+        found.append((each.copy, each.frame, f"{each}; {remedy}"))
     return sorted(found, key=lambda fault: fault[1])
 
 

@@ -88,14 +88,10 @@ def equilibrium(
     came there, and free vertices must start outside them. With friction there are many rest shapes, and the motion decides
     among them, so colliders and self-contact with friction are refused: run such a scene with damping until it rests.
 
-    A mesh collider is approximated near each vertex by half-spaces that touch it, see
-    :mod:`warpcloth.kernels.contact.mesh_facets`. They are updated after the cloth has settled, and it settles again, until
-    they no longer change the balance. No vertex crosses a triangle on the straight line between two of these rounds.
-
     With self-contact, no iterate crosses itself, pins included: pins with keyframes move as far as cloth lets them, and if they
-    do not arrive, the iterations are used up. The areas of contact are held constant while the cloth settles, then computed
-    again, until forces balance. ``stable`` and ``lowest_eigenvalue`` neglect the rotation of pairs. Layers without friction may
-    slide off one another, so they often have no equilibrium.
+    do not arrive, the iterations are used up. With mesh colliders, no iterate crosses a mesh. The pairs are held constant while
+    the cloth settles, then found again, until forces balance. ``stable`` and ``lowest_eigenvalue`` neglect the rotation of
+    pairs. Layers without friction may slide off one another, so they often have no equilibrium.
 
     Wind is that of the last keyframe, or of a function at the end of the scene. Its force follows the normals: cloth without
     mass moves in it until it rests. ``stable`` and ``lowest_eigenvalue`` are those under the final forces, held constant.
@@ -158,13 +154,13 @@ def equilibrium(
     base = wp.clone(model.positions)
     if start is not None:
         base.assign(_with_held(scene, model, array("start", start, (model.count, 3))))
-    contact = None
-    if model.colliders is not None and model.colliders.meshes is not None:
-        contact = ColliderSteps(model, State(base, model.vectors(), 1), 0.0, 1, 1.0, resting=True)
-        model = model.with_terms(contact.terms)
     pairs = None
-    if scene.self_contact is not None:
-        pairs = SelfSteps(model, State(base, model.vectors(), 1), h=0.0, steps_per_frame=1, bounded=False, colliders=None)
+    if model.has_pairs:
+        state, colliders = State(base, model.vectors(), 1), None
+        if model.colliders is not None and model.colliders.meshes is not None:  # whose poses the pairs need
+            colliders = ColliderSteps(model, state, 0.0, 1, 1.0)
+            colliders.launch_move()
+        pairs = SelfSteps(model, state, h=0.0, steps_per_frame=1, bounded=False, colliders=colliders)
         pairs.filter.iterates()
     if linear == "auto":
         linear = "cg" if model.per_copy >= LEAST else "factorised"
@@ -175,7 +171,7 @@ def equilibrium(
     if start is None and load_steps == 1 and _only_hangs(scene) and _is_at_rest(model, base):
         _start_softly(model, base, descent, linear)
     for part in range(1, load_steps + 1):
-        result = _settle_on_meshes(model, base, descent, part / load_steps, contact)
+        result = _settle_all(model, base, descent, part / load_steps)
     # Forces balance, but they do for a straight chain that stands on its pin too. A small perturbation tells them apart.
     if wind is not None:
         wind.hold()
@@ -183,12 +179,10 @@ def equilibrium(
         base.assign(base.numpy() + _nudge(model))
         # A small unbalanced force compresses the edges of a nearly straight chain by much more, and changes the eigenvalues.
         descent.tolerance *= 0.01
-        if contact is not None:
-            contact.launch_end(base, model.vectors())
-        if contact is None and pairs is None and wind is None:
+        if pairs is None and wind is None:
             result = descent.run(1.0, _frequency_scale(model))
         else:
-            result = _settle_on_meshes(model, base, descent, 1.0, contact)
+            result = _settle_all(model, base, descent, 1.0)
         if wind is not None:
             wind.hold()
         if result in SETTLED and minimiser.curves_down(tolerance):
@@ -432,30 +426,6 @@ def _settle_all(model, base, descent, part):
             return result
         if wind is not None:
             wind.adapt(descent.found)
-        descent.used += 1
-
-
-def _settle_on_meshes(model, base, descent, part, contact):
-    """Settles by :func:`_settle_all`, and repeats that with new half-spaces of meshes until the cloth is in balance.
-
-    ``contact`` is the :class:`warpcloth.contact.collider_steps.ColliderSteps` of a scene with meshes, else None.
-    """
-    if contact is None:
-        return _settle_all(model, base, descent, part)
-
-    def find_facets():
-        model.refresh(STEP, Moment(base))
-
-    velocity = model.vectors()  # 0
-    while True:
-        find_facets()
-        result = _settle_all(model, base, descent, part)
-        contact.notes.cut.zero_()
-        contact.launch_end(base, velocity)
-        if result is Result.DIVERGED or descent.used >= descent.iterations:
-            return result
-        if not contact.notes.cut.numpy().any() and (result not in SETTLED or descent.balanced(find_facets)):
-            return result
         descent.used += 1
 
 

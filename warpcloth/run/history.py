@@ -11,7 +11,7 @@ from ..base.checks import shown
 from ..base.limits import MOST_FRAMES
 from ..base.texts import numbered
 from ..base.turns import in_turn
-from ..contact.collider_work import ColliderWork, FilterWork
+from ..contact.collider_work import ColliderWork, FilterWork, PairWork
 from ..contact.present import ColliderPulls, PresentContact
 from ..core.capture import Segment
 from ..core.energy import Energy
@@ -40,30 +40,40 @@ def checked_record(record: Any, scene: Scene | None = None) -> tuple[str, ...]:
     for word in words:
         if word not in RECORDS:
             raise ValueError(f"record is {shown(word)}; it must be some of {', '.join(map(repr, RECORDS))}")
-        if word == "pairs" and (scene is None or scene.self_contact is None):
-            raise ValueError("record is 'pairs', which only runs of scenes with self_contact have")
+        if word == "pairs" and (scene is None or not scene.has_pairs):
+            raise ValueError("record is 'pairs', which only runs of scenes with self_contact or mesh colliders have")
     return tuple(word for word in RECORDS if word in words)
 
 
 def energy_names(scene: Scene) -> list[str]:
     """Returns the names of the energies and works that a run of a scene records."""
-    return [*dict.fromkeys(_term_names(scene)), *_other_names(scene)]
+    of_terms, of_meshes = _names_of_contact(scene)
+    return [*of_terms, *of_meshes.values(), *_other_names(scene)]
 
 
-def _term_names(scene):
-    """Returns names of terms, contact and friction: their labels, numbered if equal; all facets of a collider share one."""
-    terms = [*scene.terms, *scene.contact_terms]
-    first = [k for k, term in enumerate(terms) if not getattr(term, "facet", 0)]
-    names = numbered((terms[k].label for k in first), _other_names(scene))
-    return [names[np.searchsorted(first, k, side="right") - 1] for k in range(len(terms))]
+def _names_of_contact(scene):
+    """Returns the labels of terms, contact and friction, numbered if equal.
+
+    Returns:
+        A list of those of the terms, and a dictionary of those of the pairs with meshes: of contact with the mesh ``c`` by
+        ``(c, False)``, of friction on it by ``(c, True)``.
+    """
+    labels = [term.label for term in (*scene.terms, *scene.contact_terms)]
+    of_meshes = {}
+    for c in scene.meshes:
+        of_meshes[c, False] = f"contact with {scene.colliders[c].label}"
+        if c in scene.rubbing:
+            of_meshes[c, True] = f"friction on {scene.colliders[c].label}"
+    names = numbered([*labels, *of_meshes.values()], _other_names(scene))
+    return names[: len(labels)], dict(zip(of_meshes, names[len(labels) :], strict=True))
 
 
 def _other_names(scene):
-    moved = any(collider.moves for collider in scene.colliders)
+    moved, filtered = any(collider.moves for collider in scene.colliders), len(scene.meshes) < len(scene.colliders)
     others = ["self-contact"] * (scene.self_contact is not None) + ["kinetic", "gravity"]
     others += ["work of pins"] * scene.pins.moves + ["work of loads"] * bool(scene.loads)
     others += ["work of air"] * bool(scene.air_terms)
-    others += ["work of colliders"] * moved + ["work of the filter"] * bool(scene.colliders)
+    others += ["work of colliders"] * moved + ["work of the filter"] * filtered
     of_cloth = scene.self_contact is not None and scene.self_contact.friction > 0.0
     return others + ["heat of friction"] * (of_cloth or bool(scene.rubbing))
 
@@ -82,12 +92,11 @@ class Evaluation:
         stepper: The :class:`warpcloth.solvers.solver.Stepper` with the colliders and multipliers; None for colliders at their
             start and without hard terms.
         forces: Whether to compute forces.
-        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact, if there is no stepper.
+        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of a scene with pairs, if there is no stepper.
 
     Attributes:
         names: Names of the energies.
-        names_of_friction: Names of those that friction with colliders stores.
-        stored: U of the friction springs of self-contact, of the last :meth:`energies`, (B,) [J].
+        stored: U of all friction springs, of the last :meth:`energies`, (B,) [J].
         hidden: Whether some forces follow from multipliers.
         gradient: ∂U/∂x of the last :meth:`launch`, (N,) [N].
         pulls: Its :class:`warpcloth.contact.present.ColliderPulls`, or None without colliders.
@@ -110,15 +119,15 @@ class Evaluation:
         self._gravity = model.gravity.numpy().astype(np.float64)[:, None]
         self._start, self._energies, self.stored = self._host(model.positions), None, np.zeros(model.copies)
         self.names = energy_names(model.scene)
-        self._term_names = _term_names(model.scene)
-        self.names_of_friction = [name for name, (_present, own) in zip(self._term_names, terms, strict=True) if own.term.law]
+        of_terms, self._mesh_names = _names_of_contact(model.scene)
+        self._term_names = list(zip(of_terms, (bool(own.term.law) for _present, own in terms), strict=True))
         if not forces:
             return
         self.gradient = model.vectors()
         if self.hidden:
             self._pull = stepper.constraint_forces()
         if model.colliders is not None:
-            self.pulls = ColliderPulls(model, self._terms, stepper and stepper.constraint_forces)
+            self.pulls = ColliderPulls(model, self._terms, stepper and stepper.constraint_forces, self._pairs)
         soft = tuple(elements for elements in self._terms if not elements.hard and elements.collider is None)
         self._elastic = plan(model).gradient(terms=soft) if soft else None
         self._of_air = plan(model).gradient(terms=self._blown) if self._blown else None
@@ -135,11 +144,13 @@ class Evaluation:
         """Launches ∂U/∂x at x into ``gradient`` (N,) [N], with damping at velocities v and the forces of hard terms."""
         model = self.model
         self.gradient.zero_()
+        if self._pairs is not None:
+            self._pairs.launch_present(x)
         if self.pulls:
             self._present.launch(x, v)
             self.pulls.launch(x)
-            for found in self.pulls.found if not self.pulls.hard else ():  # hard contact is among the hard terms
-                model.launch(self._add, model.count, [found.all, 1.0], [self.gradient])
+            for c in self.pulls.solid if not self.pulls.hard else ():  # hard contact is among the hard terms
+                model.launch(self._add, model.count, [self.pulls.found[c].all, 1.0], [self.gradient])
         if self._elastic:
             self._elastic.add(x, self.gradient)
         if self._of_air is not None:
@@ -152,7 +163,6 @@ class Evaluation:
             model.refresh(STEP, Moment(self._before), self._damped)
             self._dissipative.add(self._before, self.gradient, self._move)
         if self._pairs is not None:
-            self._pairs.launch_begin(x)
             self._pairs.forces.launch(x)
             self._pairs.forces.add_gradient(self.gradient)
         if self._pull:
@@ -170,23 +180,21 @@ class Evaluation:
 
         Those of gravity and loads are relative to the start.
         """
-        model, found = self.model, {}
+        model, found, self.stored = self.model, {}, np.zeros(self.model.copies)
         if self._energies is None:
             sums = Sums(model)
             self._energies = [None if each.hard else Energy(model, sums, terms=(each,)) for each in self._terms]
         self._present.launch(x, v)
-        for name, energy in zip(self._term_names, self._energies, strict=True):
+        for (name, rubs), energy in zip(self._term_names, self._energies, strict=True):
             total = model.scalars()
             if energy is not None:  # hard terms store no energy
                 energy.add(x, total)
-            found[name] = found.get(name, 0.0) + total.numpy()
+            found[name] = total.numpy()
+            if rubs:
+                self.stored = self.stored + found[name]
         if self._pairs is not None:
-            total, stored, sums = model.scalars(), model.scalars(), Sums(model)
-            self._pairs.launch_begin(x)
-            self._pairs.forces.launch(x)
-            self._pairs.forces.add_energy(sums, total)
-            self._pairs.forces.add_energy(sums, stored, stored=True)
-            found["self-contact"], self.stored = total.numpy(), stored.numpy()
+            self._pairs.launch_present(x)
+            found |= self._energies_of_pairs(x)
         moved = self._host(x) - self._start
         if v is not None:
             with np.errstate(over="ignore"):  # a copy may diverge
@@ -194,6 +202,27 @@ class Evaluation:
         found["gravity"] = -(self._mass * (moved * self._gravity).sum(axis=2)).sum(axis=1)
         if model.loads is not None and model.loads.constant is not None:
             found["work of loads"] = (model.loads.constant * moved).sum(axis=(1, 2))
+        return found
+
+    def _energies_of_pairs(self, x):
+        """Returns the energies of pairs at x, which are listed there, by name, and adds to ``stored``."""
+        model, pairs, found = self.model, self._pairs, {}
+        of_cloth = [-1] if model.scene.self_contact is not None else []
+        for c in (*of_cloth, *model.scene.meshes):
+            total, stored, sums = model.scalars(), model.scalars(), Sums(model)
+            pairs.forces.launch(x)
+            if model.scene.meshes:
+                pairs.keep(c)
+            pairs.forces.add_energy(sums, total)
+            pairs.forces.add_energy(sums, stored, stored=True)
+            total, stored = total.numpy(), stored.numpy()
+            self.stored = self.stored + stored
+            if c < 0:
+                found["self-contact"] = total
+                continue
+            found[self._mesh_names[c, False]] = total - stored
+            if (c, True) in self._mesh_names:
+                found[self._mesh_names[c, True]] = stored
         return found
 
     def kinetic_of_pins(self, v):
@@ -257,6 +286,7 @@ class History:
         forces: Total force and friction force on each collider in each kept frame, (F, B, C, 2, 3) [N].
         pairs: :data:`PAIRS` of each kept frame, (F, B, 5).
         cuts: Fraction of the moves in each kept frame that contact cut short, (F, B).
+        find: Function that is called after the last step of each frame, or None; ``found`` is what it returned.
         totals: Work of pins, without their kinetic energy, of loads, of colliders, against friction, of the filter and of the
             air, up to the last kept frame, (6, B) [J].
 
@@ -271,13 +301,12 @@ class History:
     def __init__(self, stepper, model, record):
         self._stepper, self.model, self._record, scene = stepper, model, record, model.scene
         changing = model.loads is not None and model.loads.constant is None
-        rubbed = bool(scene.rubbing)
-        touched = rubbed or any(collider.moves for collider in scene.colliders)
-        asked = "energies" in record
+        rubbed, solid = bool(scene.rubbing), [collider for collider in scene.colliders if not collider.is_mesh]
+        touched, asked = any(collider.friction or collider.moves for collider in solid), "energies" in record
         self._moving, self._driven, self._rubbed, self._touched = (
             asked and each for each in (scene.pins.moves, changing, rubbed, touched)
         )
-        self._filtered, self._blown = asked and bool(scene.colliders), asked and bool(scene.air_terms)
+        self._filtered, self._blown = asked and bool(solid), asked and bool(scene.air_terms)
         if asked and not stepper.even and (scene.colliders or scene.air_terms or scene.self_contact is not None):
             raise ValueError(
                 "record is 'energies' of a scene with contact or air, whose work is summed over steps of one length; give dt "
@@ -285,7 +314,7 @@ class History:
             )
         forces = "reactions" in record or self._moving or self._touched
         self._evaluation = Evaluation(model, stepper.h, stepper, forces)
-        self._found, self._frame = deque(), 0
+        self._found, self._frame, self.find, self.found = deque(), 0, None, None
         of_contact = ["forces"] * ("reactions" in record and bool(scene.colliders))
         of_contact += ["cuts"] * (bool(scene.colliders) or scene.self_contact is not None)
         self._rows = {name: [] for name in (*record, *of_contact)}
@@ -294,13 +323,13 @@ class History:
         self._total, self._each_step = np.zeros((6, model.copies)), None
         self._seen = self._counted()
         x, v = stepper.state
-        self._pulls_itself = None
-        if asked and stepper.pairs is not None and stepper.pairs.friction is not None:
-            self._pulls_itself, self._rubbed = model.vectors(), True
-            self._rub = model.kernel(kernels.add_rubbing_work, model.dtype)
-        if self._moving or self._driven or self._filtered or self._blown or self._pulls_itself:
+        rubs = asked and stepper.pairs is not None and stepper.pairs.friction is not None
+        self._rubbed, self._of_pairs = self._rubbed or rubs, None
+        pushes = rubs or (asked and any(scene.colliders[c].moves for c in scene.meshes))
+        if self._moving or self._driven or self._filtered or self._blown or pushes:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
+            self._of_pairs = PairWork(stepper, self._works[3]) if pushes else None
             self._room = None if stepper.pairs is None else stepper.pairs.proximity.capacity
         self._note()
 
@@ -363,15 +392,23 @@ class History:
         """Takes one frame of the stepper, and sums its work."""
         if self._each_step is None:
             self._stepper.frame()
+            self._find()
         else:
             self._begin()
-            for _ in self._stepper.steps_of_frame():
-                self._add_rubbing()
+            for number, _ in enumerate(self._stepper.steps_of_frame(), start=1):
+                if self._of_pairs is not None:
+                    self._of_pairs.launch()
+                if self._stepper.even and number == self._stepper.steps_per_frame:
+                    self._find()
                 self._make_room()
                 self._each_step()
             for total, work in zip(self._total, self._works, strict=False):
                 total += work.numpy().reshape(self.model.copies, -1).sum(axis=1)
                 work.zero_()
+            if not self._stepper.even:  # of a scene without contact
+                self._find()
+            if self._of_pairs is not None:
+                self._total[2:4] += self._of_pairs.sums()
             if self._of_air:
                 self._total[5] += np.concatenate([air.sums() for air in self._of_air])
             if self._touches:
@@ -379,23 +416,20 @@ class History:
         self._frame += 1
         self._note()
 
-    def _add_rubbing(self):
-        """Adds the work against friction of self-contact in the last step."""
-        if self._pulls_itself is not None:
-            friction, x = self._stepper.pairs.friction, self._stepper.state.x
-            friction.launch_acting(x, self._pulls_itself)
-            self.model.launch(self._rub, self.model.count, [self._pulls_itself, friction.start, x], [self._works[3]])
+    def _find(self):
+        if self.find is not None:
+            self.found = self.find()
 
     def _make_room(self):
-        """Allocates memory for all pairs of self-contact at the present state, and captures their launches again."""
+        """Allocates memory for all pairs at the present state, and captures their launches again."""
         pairs = self._stepper.pairs
         if pairs is None:
             return
-        pairs.launch_begin(self._stepper.state.x)
+        pairs.launch_present(self._stepper.state.x)
         while pairs.overflowed:
             pairs.grow()
             self._stepper.record_again()
-            pairs.launch_begin(self._stepper.state.x)
+            pairs.launch_present(self._stepper.state.x)
         if self._each_step is not None and self._room != pairs.proximity.capacity:  # which steps enlarge too
             self._each_step, self._room = Segment(self.model.device, self._each_step.record), pairs.proximity.capacity
 
@@ -412,8 +446,7 @@ class History:
             energies["work of colliders"], energies["work of the filter"] = self._total[2].copy(), self._total[4].copy()
             energies["work of air"] = self._total[5].copy()
             if self._rubbed:
-                stored = evaluation.stored + sum(energies[name] for name in evaluation.names_of_friction)
-                energies["heat of friction"] = self._total[3] - stored
+                energies["heat of friction"] = self._total[3] - evaluation.stored
             found["energies"] = np.stack([energies[name] for name in self.names], axis=-1)
         if "reactions" in self._record:
             if loads is not None:

@@ -24,14 +24,16 @@ from ..solvers.step import Step
 from ..usd import FrameSequence
 from .checkpoint import facts_of
 from .contact_verdicts import (
+    Forced,
     Inside,
-    Pierced,
     contact_faults,
+    crossings_at_start,
+    forced_of,
     held_pins_of,
     held_sentence,
     inside_of,
-    pierced_of,
     soft_contact_of,
+    unresolved_of,
 )
 from .frames_ahead import state_of
 from .history import History, checked_record
@@ -44,7 +46,7 @@ AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
 
 
 class SelfContactSummary(NamedTuple):
-    """The contact of cloth with itself in a run.
+    """The pairs of cloth with cloth, and with meshes among the colliders, in a run.
 
     Attributes:
         pairs: The largest number of pairs in a list of all copies. A list has the pairs nearer than the contact distance plus
@@ -107,9 +109,8 @@ class Animation(ShownInNotebooks):
             per copy, (B,).
         inside: A tuple of :class:`Inside`, the first vertex inside each collider that contained one. It is either not free, and
             the collider moved over it or it into the collider, or it is caught between two obstacles.
-        pierced: A tuple of :class:`Pierced`, the first triangle of the cloth through which a corner or an edge of each mesh
-            has passed, as ``Contact(elements="vertices")`` lets it.
-        self_contact: The :class:`SelfContactSummary` of a scene with self-contact, else None.
+        forced: A tuple of :class:`Forced`, the first time that each mesh moved through cloth that could not get out of its way.
+        self_contact: The :class:`SelfContactSummary` of a scene with self-contact or meshes among its colliders, else None.
     """
 
     points: np.ndarray | FrameSequence
@@ -127,7 +128,7 @@ class Animation(ShownInNotebooks):
     friction_forces: dict[str, np.ndarray] | None = None
     cuts: np.ndarray | None = None
     inside: tuple[Inside, ...] = ()
-    pierced: tuple[Pierced, ...] = ()
+    forced: tuple[Forced, ...] = ()
     pairs: dict[str, np.ndarray] | None = None
     self_contact: SelfContactSummary | None = None
 
@@ -170,7 +171,7 @@ class Animation(ShownInNotebooks):
                 kept=float(np.asarray(summary.kept)[copy]), least_gap=float(np.asarray(summary.least_gap)[copy])
             )
         of_copy: dict[str, Any] = {
-            name: tuple(each for each in getattr(self, name) if each.copy == copy) for name in ("inside", "pierced")
+            name: tuple(each for each in getattr(self, name) if each.copy == copy) for name in ("inside", "forced")
         }
         good = np.asarray(self.status.good)
         status, grade = self.status._replace(frame=int(good[copy]), good=good[copy : copy + 1]), self.status.grades[copy]
@@ -290,10 +291,10 @@ def simulate(
                 if progress is not None:
                     progress(number, frames)
         recorder.finish()
-    held, inside, pierced = held_pins_of(stepper), inside_of(stepper), pierced_of(watch)
+    held, inside, forced = held_pins_of(stepper), inside_of(stepper), forced_of(stepper)
     self_contact = _self_contact(stepper, watch, output is not None, held)  # first, as it notes the gaps of the last frame
-    faults = contact_faults(scene, held, inside, pierced, copies)
-    status = watch.status(solver, faults, soft_contact_of(watch, stepper))
+    faults = contact_faults(scene, held, inside, forced, unresolved_of(stepper), copies)
+    status = watch.status(solver, faults, [*crossings_at_start(model), *soft_contact_of(watch, stepper)])
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     recorded = {
@@ -301,7 +302,7 @@ def simulate(
         "scene": scene,
         "cut": of_copies(stepper.cut),
         "inside": inside,
-        "pierced": pierced,
+        "forced": forced,
         "self_contact": self_contact,
         **(history.by_name() if history else {}),
     }
@@ -323,18 +324,18 @@ def _self_contact(stepper, watch, in_file, held):
         return None
     with suppress(Stopped):  # the summary is then without the gaps of the last frame
         while watch.alive.any() and not watch.stopped:
-            pairs.launch_begin(stepper.state.x)
+            pairs.launch_present(stepper.state.x)
             if not pairs.overflowed:
                 break
             pairs.grow()
 
     gaps, near = np.where(watch.alive, pairs.least_gap, watch.least_gap), []
-    coarse = in_file or model.numpy_dtype == np.float32
+    coarse, other = in_file or model.numpy_dtype == np.float32, "itself" + " or a mesh" * bool(model.scene.meshes)
     for copy, frame, vertex in (each for each in pairs.too_near if coarse and each.frame <= watch.good[each.copy]):
         vertex, of_copy = vertex if model.order is None else model.order[vertex], f" of copy {copy}" if model.copies > 1 else ""
         near.append(
-            f"in frame {frame}{of_copy} first, at vertex {vertex}, cloth is nearer to itself than 4 units in the last place of "
-            f"float32 coordinates, in which frames are stored; the least gap is {gaps[copy]:.3g} m"
+            f"in frame {frame}{of_copy} first, at vertex {vertex}, cloth is nearer to {other} than 4 units in the last place "
+            f"of float32 coordinates, in which frames are stored; the least gap is {gaps[copy]:.3g} m"
         )
     held = [f"{held_sentence(pin, model.copies)}; no cloth may pass through cloth" for pin in held]
     moved = model.moved_at_start[model.moved_at_start > 0.0]

@@ -8,7 +8,6 @@ from functools import cached_property, singledispatch
 
 import numpy as np
 
-from ..contact.present import PresentContact
 from ..numerics.rotation import kabsch
 from ..scene.air import Air
 from ..scene.colliders import Collider
@@ -85,15 +84,6 @@ class Start(Source):
             energy, of_pairs = stepper.pairs.at_start()
             self._energy += energy
             gaps = gaps + stepper.options.closes * of_pairs
-        if any(elements.on_faces for elements in model.terms):  # whose pairs are found in steps, so that the model has none
-            present = PresentContact(model, [(each.colliders, first, end) for each, first, end in stepper.shares])
-            present.launch(model.positions, model.velocities)
-            faces = model.with_terms(each for each in present.terms if each.on_faces)
-            of_faces = type(elastic)(faces)
-            self._energy += of_faces.energy(model.positions)
-            gaps = gaps + len(faces.terms) * faces.terms[0].per_copy * of_faces.gaps(
-                model.positions, of_faces.hard + (of_faces.soft if stepper.options.closes else ())
-            )
         self._energy += 4.0 * balance.total * gaps / stepper.he**2
 
     @staticmethod
@@ -115,7 +105,8 @@ class MovingPins(Source):
     Pins joined by edges form a patch. If a patch moves as a rigid body, the cloth can move with it and keep its energy relative
     to that motion. A change δ of the speed of a patch, over the whole cloth, adds at most ½δ² + δ·speed per unit mass. Apart
     from that, only lifting adds energy. Patches that move relative to one another store at most the energy of the start
-    deformed by them, each vertex by the mean of their motions with weights 1/distance².
+    deformed by them, each vertex by the mean of their motions with weights 1/distance². Where there are meshes, which may hold
+    the cloth back, also a single patch stores energy: at most that of the start with all other vertices as they were.
     """
 
     name = "moving pins"
@@ -193,13 +184,14 @@ class MovingPins(Source):
         elastic, pins = self._balance.elastic, self._balance.model.scene.pins.vertices
         while self._seen < min(frame, len(self._frames) - 1):
             self._seen += 1
-            points = np.zeros_like(self._points)
+            moved = np.zeros_like(self._points)
             for weight, maps in zip(self._weights.T, self._maps, strict=True):
                 matrix = maps[self._seen]
-                points += weight[:, None] * (self._points @ matrix[:, :3].T + matrix[:, 3])
-            points[pins] = self._frames[self._seen]
-            x = elastic.put(np.tile(points, (self._balance.model.copies, 1)))
-            self._stored = np.maximum(self._stored, elastic.energy(x))
+                moved += weight[:, None] * (self._points @ matrix[:, :3].T + matrix[:, 3])
+            for points in (moved, self._points.copy()) if self._balance.model.scene.meshes else (moved,):
+                points[pins] = self._frames[self._seen]
+                x = elastic.put(np.tile(points, (self._balance.model.copies, 1)))
+                self._stored = np.maximum(self._stored, elastic.energy(x))
         return self._stored
 
 

@@ -297,12 +297,13 @@ class _Step:
         self.contact = None
         if touching or dynamic:
             self.contact = Energy(self.model, of.sums, corrected=True, terms=touching, dynamic=dynamic)
-        # The force of contact with colliders without friction and of self-contact, each with its contact distance.
-        scene, pushing = self.model.scene, tuple(each for each in touching if each.term.law is None)
+        # The forces of contact that is terms, without friction, and of pairs, each with its contact distance.
+        pushing = tuple(each for each in touching if each.term.law is None)
         kinds = (pushing, ()), ((), dynamic)
         self._pushes = [plan(self.model).gradient(True, *kind) if any(kind) else None for kind in kinds]
-        present = zip(self._pushes, (scene.contact, scene.self_contact), strict=True)
-        distances = [contact.distance for pushes, contact in present if pushes is not None]
+        self._distances = _contact_distances(self.model.scene)
+        present = zip(self._pushes, self._distances, strict=True)
+        distances = [distance for pushes, distance in present if pushes is not None]
         self.contact_distance, self._wrong, self._forces = min(distances, default=np.inf), None, None
         if distances:
             self._forces = self.model.vectors(), self.model.vectors() if dynamic else None
@@ -366,14 +367,13 @@ class _Step:
         return self._wrong.read() > 0.0
 
     def _launch_unresolved(self, counts):
-        of, model, scene = self._of, self.model, self.model.scene
-        given = [model.inverse_mass, *self._launch_pushes(), of.residual, self.stepper.he**2]
-        given += [0.0 if each is None else each.distance for each in (scene.contact, scene.self_contact)]
+        of, model = self._of, self.model
+        given = [model.inverse_mass, *self._launch_pushes(), of.residual, self.stepper.he**2, *self._distances]
         model.launch(self._count, model.count, given, [counts, of.weighted])
         of.sums.largest(self._ones, of.weighted, self._wrong.array)
 
     def _launch_pushes(self):
-        """Launches the forces of colliders without friction, and of self-contact, and returns them, the latter or None."""
+        """Launches the forces of contact that is terms, and of pairs, and returns them, the latter or None."""
         for pushes, force in zip(self._pushes, self._forces, strict=True):
             if pushes is not None:
                 force.zero_()
@@ -386,14 +386,24 @@ class _Step:
         return self.stepper.correction if self.stepper.unfiltered is None else self._of.moved
 
     def _launch_newton(self):
-        of, model, scene = self._of, self.model, self.model.scene
+        of, model = self._of, self.model
         self._hessian.assemble(self.stepper.predicted, 1.0 / self.stepper.he**2, self._moved)
         self._linear.solve(of.residual, self._direction, self._all)
         distance, *gaps = (mirror.array for mirror in self._largest)
         of.sums.largest(self._ones, self._direction, distance)
         if self._forces is None:
             return
-        for force, contact, gap in zip(self._launch_pushes(), (scene.contact, scene.self_contact), gaps, strict=True):
-            if force is not None and contact is not None:
-                model.launch(self._project, model.count, [force, self._direction, contact.distance], [of.weighted])
+        for force, distance, gap in zip(self._launch_pushes(), self._distances, gaps, strict=True):
+            if force is not None and distance:
+                model.launch(self._project, model.count, [force, self._direction, distance], [of.weighted])
                 of.sums.largest(self._ones, of.weighted, gap)
+
+
+def _contact_distances(scene):
+    """Returns the contact distance of colliders that are not meshes, and that of pairs [m]; 0 for what the scene does not have.
+
+    Where cloth meets itself and meshes, a vertex may have both kinds of pairs: then the larger distance counts.
+    """
+    of_pairs = [scene.contact] * bool(scene.meshes) + [scene.self_contact] * (scene.self_contact is not None)
+    of_terms = scene.contact.distance if scene.colliders else 0.0
+    return of_terms, max((each.distance for each in of_pairs), default=0.0)

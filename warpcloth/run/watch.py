@@ -5,7 +5,6 @@ from contextlib import closing
 import numpy as np
 
 from ..base.turns import in_turn
-from ..contact.piercings import piercings_of
 from ..core.status import Grade, Result, Status, Stopped, digits, sentence
 from ..numerics.iterate import ResidualScale
 from .balance import GAIN, STRETCHED, Balance
@@ -31,7 +30,7 @@ def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
     if first == frames:
         return
     of_number, number = None if keeps is None else lambda before: keeps(first + 1 + before), first
-    with closing(frames_of(stepper, frames - first, ahead, of_number, watch.found_at_ends(first))) as found:
+    with closing(frames_of(stepper, frames - first, ahead, of_number, watch.found_at_ends())) as found:
         try:
             for number, frame in enumerate(found, start=first + 1):
                 if not watch.passes(number, frame):
@@ -67,7 +66,6 @@ class Watch:
         stopped: Whether the run could not go on.
         seconds: Time of the computation of each frame [s], a list.
         history: The :class:`warpcloth.run.history.History` of the run, if it has one.
-        piercings: The :class:`warpcloth.contact.piercings.Piercings` of the run, if its scene can have some.
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
         grades: The :class:`warpcloth.run.grades.Grades` of the run, or None.
         pressed: The :class:`warpcloth.run.contact_verdicts.Pressed` of a run with grades and colliders, else None.
@@ -84,9 +82,6 @@ class Watch:
         self.worst_strain, self.messages, self.seconds = np.zeros(model.copies), {}, []
         self.good, self.alive = np.zeros(model.copies, dtype=int), np.ones(model.copies, dtype=bool)
         self.growth, self.balance, self.history = np.zeros(model.copies), Balance(model, stepper), None
-        self.piercings = piercings_of(model, stepper.state.x) if grades else None
-        if self.piercings is not None:
-            stepper.state.add_part("piercings", self.piercings)
         self.last, self.stopped = Frame(None, None, stepper.results, stepper.residual, 0.0), False
         self.grades, self._stepper = Grades(stepper, self.balance) if grades else None, stepper
         self.pressed = Pressed(model) if grades and scene.colliders else None
@@ -137,19 +132,20 @@ class Watch:
             array.reshape(B, n, 3)[~self.alive] = np.nan
         return bool(self.alive.any())
 
-    def found_at_ends(self, first):
-        """Returns the ``find`` of :func:`warpcloth.run.frames_ahead.frames_of` for the frames after ``first``, or None."""
+    def found_at_ends(self):
+        """Returns the ``find`` of :func:`warpcloth.run.frames_ahead.frames_of`, or None."""
         if self.grades is None:
             return None
-        pierce, stepper = self.piercings and self.piercings.starts_at(first), self._stepper
+        stepper = self._stepper
 
         @in_turn
         def find():
-            if pierce is not None:
-                pierce()
             return self.grades.errors.find(), np.inf if stepper.pairs is None else stepper.pairs.least_gap
 
-        return find
+        if self.history is None:
+            return find
+        self.history.find = find  # which needs the pairs of the last step, before records list them anew
+        return lambda: self.history.found
 
     def stops(self, number, why):
         """Notes that frame ``number`` cannot be computed, and why."""

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
 
-from ..base.checks import array, as_array, choice, keep_plain, number, shown
+from ..base.checks import array, as_array, keep_plain, number, shown
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..base.types import Converted, default
@@ -20,17 +20,15 @@ class Contact:
     """Contact of cloth with colliders: a pressure of k(r − d) at distances r/2 ≤ d < r, and of kr²/(4d) at d < r/2.
 
     The energy is U = Σ kA φ(d) over the vertices, where A is the area of a vertex; see :mod:`warpcloth.kernels.terms.contact`.
-    With ``elements="triangles"`` also over pairs of triangles with meshes, :mod:`warpcloth.kernels.contact.face_pairs`.
+    Meshes are met by vertices, edges and triangles of the cloth, as cloth meets itself in :class:`warpcloth.SelfContact`.
     A pressure p leaves a gap of r − p/k, or of kr²/(4p) if p is above kr/2. Friction also has the stiffness k: a vertex that
     sticks moves by up to μN/(kA) before it slides.
 
     Attributes:
         distance: Contact distance r [m]. None lets the scene set it: to half of its thickness, or to 1 mm without one.
-        stiffness: k [Pa/m]; infinite for solvers that take hard constraints. By default
+        stiffness: k [Pa/m]; infinite for solvers that take hard constraints, but not with meshes. By default
             (2/r)(wL/r + Y/L) with the weight w of the cloth per area [Pa], its stiffness Y, force per width and strain [N/m],
             and its size L, the root of its area [m]; see :func:`warpcloth.scene.colliders.default_stiffness`.
-        elements: What touches meshes: ``"vertices"`` of the cloth, or also its ``"triangles"``, which spikes and edges of a
-            mesh can otherwise pierce between the vertices. On a plane of triangles both give the same pressure.
 
     Raises:
         ValueError: If a value is not allowed.
@@ -38,11 +36,9 @@ class Contact:
 
     distance: Converted[float | None, float] = default(None)
     stiffness: float | None = None
-    elements: Literal["vertices", "triangles"] = "vertices"
 
     def __post_init__(self) -> None:
         keep_plain(self)
-        choice("contact.elements", self.elements, ("vertices", "triangles"))
         if self.distance is not None:
             number("contact.distance", self.distance, above=0.0)
         if self.stiffness is not None and (np.ndim(self.stiffness) or self.stiffness != np.inf):
@@ -68,6 +64,7 @@ class Collider:
     """
 
     solid: ClassVar[Solid] = ROUNDED_BOX
+    is_mesh: ClassVar[bool] = False
 
     position: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 0.0, 0.0))
     rotation: Converted[Sequence | np.ndarray, np.ndarray] = default((0.0, 0.0, 0.0, 1.0))
@@ -131,11 +128,6 @@ class Collider:
     def deforms(self) -> np.ndarray:
         """Largest displacement of a point in its own frame from each keyframe to the next, (F − 1,) [m]; empty if rigid."""
         return np.zeros(0)
-
-    @property
-    def facets(self) -> int:
-        """Number of half-spaces that approximate it near a vertex in a step; 0 if :attr:`core` is its shape."""
-        return 0
 
     @property
     def up(self) -> np.ndarray:

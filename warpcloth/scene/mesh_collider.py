@@ -2,6 +2,7 @@
 
 from dataclasses import MISSING, dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -12,10 +13,9 @@ from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..base.types import Converted, default
 from ..kernels import nearest
-from ..kernels.contact.mesh_facets import FACETS, FAR
 from ..mesh.distances import nearest_weights
 from ..mesh.mesh import Mesh, areas_of
-from .colliders import Collider, from_y, turned
+from .colliders import Collider, turned
 
 _FLAT = 1e-6  # volume below which a closed surface is a sheet, relative to the cube of its size
 _THIN = 0.02  # thickness below which fronts that face inwards are those of a sheet, relative to a length of it
@@ -45,6 +45,8 @@ class MeshCollider(Collider):
         >>> tetrahedron.closed, tetrahedron.distances([[0.1, 0.1, -0.5], [0.1, 0.1, 0.05]]).tolist()
         (True, [0.5, -0.05])
     """
+
+    is_mesh: ClassVar[bool] = True
 
     points: Converted[ArrayLike, np.ndarray] = default(MISSING)
     triangles: Converted[ArrayLike, np.ndarray] = default(MISSING)
@@ -90,10 +92,6 @@ class MeshCollider(Collider):
         return self.points.reshape(-1, *self.points.shape[-2:])
 
     @property
-    def core(self) -> tuple[np.ndarray, float]:
-        return np.zeros(3), -FAR
-
-    @property
     def bounds(self) -> tuple[np.ndarray, float]:
         return np.abs(self.frames).max(axis=(0, 1)), 0.0
 
@@ -104,24 +102,6 @@ class MeshCollider(Collider):
     @property
     def deforms(self) -> np.ndarray:
         return np.linalg.norm(np.diff(self.frames, axis=0), axis=-1).max(axis=-1, initial=0.0)
-
-    @cached_property
-    def facets(self) -> int:
-        """1 if it is convex at all frames, else the number of half-spaces that a corner may need."""
-        return 1 if self.closed and all(map(self._bulges, self.frames)) else FACETS
-
-    def _bulges(self, vertices):
-        """Returns whether no edge is concave by more than 1e-4 [rad]."""
-        corners = vertices[self.triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-        sides = self._welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        keys, back = sides @ [sides.max() + 1, 1], sides[:, ::-1] @ [sides.max() + 1, 1]
-        order = np.argsort(keys)
-        other = order[np.searchsorted(keys[order], back)]  # the side of the neighbour
-        away = corners.reshape(-1, 3)[other // 3 * 3 + (other + 2) % 3] - corners.reshape(-1, 3)
-        height = np.einsum("si,si->s", away, np.repeat(normals, 3, axis=0))
-        return bool((height <= 1e-4 * np.linalg.norm(away, axis=1)).all())
 
     @property
     def moves(self) -> bool:
@@ -138,7 +118,7 @@ class MeshCollider(Collider):
         return replace(self, points=self.points - centre, position=position, rotation=poses[:, 3:])
 
     @cached_property
-    def _welded(self) -> np.ndarray:
+    def welded(self) -> np.ndarray:
         """The triangles with one index for each position."""
         rows = np.ascontiguousarray(self.frames.transpose(1, 0, 2).reshape(self.frames.shape[1], -1) + 0.0)
         _, index = np.unique(rows.view(np.dtype((np.void, rows.shape[1] * rows.itemsize))).ravel(), return_inverse=True)
@@ -153,7 +133,7 @@ class MeshCollider(Collider):
     @cached_property
     def _directed_sides(self):
         """The sides of triangles in their direction and reversed, as sorted numbers (3T,) each."""
-        sides = self._welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        sides = self.welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         return [np.sort(each @ [sides.max() + 1, 1]) for each in (sides, sides[:, ::-1])]
 
     @cached_property
@@ -177,10 +157,10 @@ class MeshCollider(Collider):
     @cached_property
     def _uncovered(self):
         """The triangles, less those that coincide with others reversed, as these enclose nothing together."""
-        at = self._welded.argmin(axis=1)[:, None]
-        second, third = (np.take_along_axis(self._welded, (at + k) % 3, axis=1)[:, 0] for k in (1, 2))
+        at = self.welded.argmin(axis=1)[:, None]
+        second, third = (np.take_along_axis(self.welded, (at + k) % 3, axis=1)[:, 0] for k in (1, 2))
         turns = np.where(second < third, 1, -1)
-        _, first, which = np.unique(np.sort(self._welded, axis=1), axis=0, return_index=True, return_inverse=True)
+        _, first, which = np.unique(np.sort(self.welded, axis=1), axis=0, return_index=True, return_inverse=True)
         times = np.bincount(which.ravel(), turns).astype(int) * turns[first]
         found = np.where((times < 0)[:, None], self.triangles[first, ::-1], self.triangles[first])
         return np.repeat(found, np.abs(times), axis=0)
@@ -217,12 +197,6 @@ class MeshCollider(Collider):
         faces, weights = nearest_points(local, vertices, self.triangles)
         return local - np.einsum("kc,kci->ki", weights, vertices[self.triangles[faces]]), vertices, faces, weights
 
-    def planes(self, points: np.ndarray) -> np.ndarray:
-        """Poses (n, 7) of half-spaces that touch it, at the start, where it is nearest to points (n, 3) outside."""
-        away = turned(self.poses[0, 3:], self._away(points, 0)[0])
-        normals = away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None]
-        return np.concatenate([points - away, from_y(normals)], axis=1)
-
     def _normals(self, vertices, faces, weights):
         """The normals of the face, the side or the corner where the nearest points of faces (k,) are, (k, 3).
 
@@ -235,9 +209,9 @@ class MeshCollider(Collider):
         size = np.linalg.norm(cross, axis=2)
         angles = np.arctan2(size, np.einsum("tci,tci->tc", ahead, behind))
         flat = cross[:, 0] / np.maximum(size[:, :1], 1e-300)
-        at_corners = np.zeros((self._welded.max() + 1, 3))
-        np.add.at(at_corners, self._welded, angles[..., None] * flat[:, None])
-        sides = np.sort(np.stack([np.roll(self._welded, -1, axis=1), np.roll(self._welded, 1, axis=1)], axis=2), axis=2)
+        at_corners = np.zeros((self.welded.max() + 1, 3))
+        np.add.at(at_corners, self.welded, angles[..., None] * flat[:, None])
+        sides = np.sort(np.stack([np.roll(self.welded, -1, axis=1), np.roll(self.welded, 1, axis=1)], axis=2), axis=2)
         _, side = np.unique(sides @ [len(at_corners), 1], return_inverse=True)
         side = side.reshape(-1, 3)  # of each triangle that opposite to each corner
         at_sides = np.zeros((side.max() + 1, 3))
@@ -246,7 +220,7 @@ class MeshCollider(Collider):
         at_corner, at_side = zero.sum(axis=1) == 2, zero.sum(axis=1) == 1
         found = flat[faces]
         found[at_side] = at_sides[side[faces[at_side], np.argmax(zero[at_side], axis=1)]]
-        found[at_corner] = at_corners[self._welded[faces[at_corner], np.argmin(zero[at_corner], axis=1)]]
+        found[at_corner] = at_corners[self.welded[faces[at_corner], np.argmin(zero[at_corner], axis=1)]]
         return found
 
 

@@ -15,7 +15,7 @@ from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 from ..mesh.stage_mesh import StageMesh
 from ..model.model import Model
-from ..terms.contact import PAIRS, FaceContact, FaceFriction, VertexContact, VertexFriction
+from ..terms.contact import VertexContact, VertexFriction
 from ..terms.declared import Declared
 from ..terms.loads import Load, Loads, checked_loads
 from ..terms.triangle_air import TriangleAir
@@ -24,7 +24,6 @@ from .colliders import Collider, Contact, checked_colliders, default_stiffness, 
 from .fabric import Fabric
 from .joining import fields_of_cloths, pins_of_cloths
 from .measured_fabrics import fabrics
-from .mesh_collider import MeshCollider
 from .self_contact import SelfContact
 from .warp import warp_on
 
@@ -275,6 +274,11 @@ class Scene:
         contact = self._with_distance(contact, "contact", 0.5)
         if not self.colliders:
             return contact
+        for collider in (each for each in self.colliders if each.is_mesh and np.isinf(contact.stiffness or 0.0)):
+            raise ValueError(
+                f"contact.stiffness is infinite and the collider {collider.label} is a mesh, with which contact is soft; "
+                "give a finite stiffness, or take a plane, sphere, capsule or box"
+            )
         for collider in (each for each in self.colliders if each.friction and np.isinf(contact.stiffness or 0.0)):
             raise ValueError(
                 f"{collider.label} has friction {collider.friction:g} and contact.stiffness is infinite, which leaves no gap "
@@ -302,7 +306,7 @@ class Scene:
             finite = [K[np.isfinite(K)] for K in held]
             stretching, size = (
                 max((float(K.mean()) for K in finite if len(K)), default=0.0),
-                float(np.sqrt(self._touching_areas.sum())),
+                float(np.sqrt(self.touching_areas.sum())),
             )
         else:  # a line of edges has no width, so no force per width
             stretching, size = 0.0, float(self.mesh.vertex_lengths.sum())
@@ -325,8 +329,8 @@ class Scene:
         return replace(contact, distance=DISTANCE if self.thickness is None else thicknesses * self.thickness)
 
     @property
-    def _touching_areas(self):
-        """Areas of the vertices (n,) [m²]; for a mesh of edges, their lengths times twice the contact distance."""
+    def touching_areas(self) -> np.ndarray:
+        """Areas of the vertices in contact (n,) [m²]; for a mesh of edges, their lengths times twice the contact distance."""
         mesh = self.mesh
         if len(mesh.triangles):
             return mesh.vertex_areas
@@ -336,50 +340,31 @@ class Scene:
     @property
     def _areal_mass(self):
         """Mass per area [kg/m²] of the vertices that have an area."""
-        areas = self._touching_areas
+        areas = self.touching_areas
         return float(self.vertex_masses[areas > 0.0].sum() / areas.sum())
 
     @property
-    def contact_terms(self) -> tuple[VertexContact | FaceContact, ...]:
-        """The terms of its colliders: contact of the free vertices with each collider, and friction if it has any.
-
-        With ``Contact(elements="triangles")`` also those of the triangles with meshes.
-        """
+    def contact_terms(self) -> tuple[VertexContact, ...]:
+        """The terms of its colliders but meshes: contact of the free vertices with each, and friction if it has any."""
         if not self.colliders or self.contact is None or self.contact.stiffness is None:
             return ()
-        areas, mass = self._touching_areas, self._areal_mass
+        areas, mass = self.touching_areas, self._areal_mass
         areas = np.where(areas > 0.0, areas, self.vertex_masses / mass)  # a vertex without a triangle has an area by its mass
         free = np.delete(np.arange(len(areas), dtype=np.int32), self.fixed)
         if not len(free):
             raise ValueError("pins hold every vertex; colliders need one that is free")
-        given = {"vertices": free, "areas": areas[free]}
+        given: dict[str, Any] = {"vertices": free, "areas": areas[free]}
         given |= {"stiffness": self.contact.stiffness, "distance": self.contact.distance}
-        found: list[VertexContact | FaceContact] = []
+        found: list[VertexContact] = []
         for c, collider in enumerate(self.colliders):
+            if collider.is_mesh:
+                continue
             core, radius = collider.core
             given |= {"collider": c, "pose": collider.poses[0], "core": core, "radius": radius, "solid": collider.solid}
-            for facet in range(max(collider.facets, 1)):
-                shape = {}
-                if isinstance(collider, MeshCollider) and facet == 0:  # steps set the other facets
-                    shape = {"pose": collider.planes(self.positions[free]), "core": np.full(3, np.inf), "radius": 0.0}
-                found.append(VertexContact(name=f"contact with {collider.label}", facet=facet, **{**given, **shape}))
+            found.append(VertexContact(name=f"contact with {collider.label}", **given))
             if collider.friction:
                 found.append(VertexFriction(name=f"friction on {collider.label}", law=law_of(collider.friction), **given))
-            if self.contact.elements == "triangles" and isinstance(collider, MeshCollider):
-                found += self._face_terms(c, collider, self.contact)
         return tuple(found)
-
-    def _face_terms(self, c: int, collider: MeshCollider, contact: Contact) -> list[FaceContact]:
-        """The terms of the triangles that have a free vertex, with the mesh c."""
-        free = ~np.isin(self.mesh.triangles, self.fixed).all(axis=1)
-        if not free.any():
-            return []
-        given: dict[str, Any] = {"triangles": self.mesh.triangles[free], "collider": c}
-        given["areas"] = np.nan_to_num(self.mesh.triangle_areas[free])
-        given |= {"stiffness": contact.stiffness, "distance": contact.distance}
-        names = f"contact of triangles with {collider.label}", f"friction of triangles on {collider.label}"
-        found = [FaceContact(name=names[0], facet=pair, **given) for pair in range(PAIRS)]
-        return found + ([FaceFriction(name=names[1], law=law_of(collider.friction), **given)] if collider.friction else [])
 
     def _check_air(self):
         if not (self.air is None or isinstance(self.air, Air)):
@@ -404,6 +389,16 @@ class Scene:
     def rubbing(self) -> list[int]:
         """Indices of the colliders that have friction."""
         return [c for c, collider in enumerate(self.colliders) if collider.friction]
+
+    @property
+    def meshes(self) -> list[int]:
+        """Indices of the colliders that are meshes."""
+        return [c for c, collider in enumerate(self.colliders) if collider.is_mesh]
+
+    @property
+    def has_pairs(self) -> bool:
+        """Whether contact is pairs of vertices, edges and triangles: of cloth with itself, or with a mesh."""
+        return self.self_contact is not None or len(self.meshes) > 0
 
     def refuse_inside(self, positions: np.ndarray, copy: str = "") -> None:
         """Checks that no free vertex is inside a collider at ``positions`` (n, 3) [m].
@@ -519,7 +514,7 @@ class Scene:
         edge = self.mesh.edge_lengths.max()
         if self.contact is None or not len(self.mesh.triangles):
             return
-        shapes = [each for each in self.colliders if not isinstance(each, MeshCollider)]
+        shapes = [each for each in self.colliders if not each.is_mesh]
         gaps = {each.label: each.clearing_gap(edge) for each in shapes}
         found = [f"{gap:.3g} m of {name}" for name, gap in gaps.items() if gap > self.contact.distance]
         if found:

@@ -166,7 +166,7 @@ def step_limits(model):
     maximum over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is 2·Σk/m, a bound in
     any motion, as it is for quadratic bending. The Hessian of dihedral bending grows as the cloth folds or is compressed, and
     that of membranes as they stretch. Both are taken at rest, so the second limit is no bound for scenes with them. Both limits
-    include self-contact, and strain and spring limits with their stiffness beyond the range.
+    include contact, and strain and spring limits with their stiffness beyond the range.
 
     Returns:
         (rest, motion); infinite if nothing is stiff.
@@ -244,7 +244,7 @@ class _Linearised:
     """The stiffness and the damping of a model of one copy about the rest shape."""
 
     def __init__(self, model):
-        self._model, self._x = model, model.array(model.rest_points, model.vec3)
+        self._model, self._x, self._pushes = model, model.array(model.rest_points, model.vec3), _of_meshes(model)
         self._stiff = [elements.at_limit(model.rest_points) for elements in model.terms]
         self._damping = dissipations(model, 1.0)  # with stiffness β; at rest the Hessian is that of a linear damper
         if self._damping:
@@ -255,11 +255,28 @@ class _Linearised:
         """The second of :func:`step_limits`."""
         w = self._model.inverse_mass.numpy()
         k, c = (norms(self._model, terms, self._x) * w if terms else 0.0 for terms in (self._stiff, self._damping))
-        return float(_root(k, c).min(initial=np.inf))
+        return float(np.min(_root(k + self._pushes * w, c), initial=np.inf))
 
     def matrices(self):
         """Returns M^-½ A M^-½ of the stiffness, and of the damping, (3n, 3n) [1/s²], [1/s]; None for what is absent."""
-        return [over_mass(self._model, terms, self._x) if terms else None for terms in (self._stiff, self._damping)]
+        K, C = (over_mass(self._model, terms, self._x) if terms else None for terms in (self._stiff, self._damping))
+        if self._pushes.any():
+            from scipy.sparse import diags, issparse
+            from scipy.sparse.linalg import aslinearoperator
+
+            pushes = diags(np.repeat(self._pushes, 3) * self._model.coordinate_mobility()).tocsr()
+            K = pushes if K is None else K + (pushes if issparse(K) else aslinearoperator(pushes))
+        return K, C
+
+
+def _of_meshes(model):
+    """Returns kA of each vertex of a copy (n,) [N/m], once for each mesh among the colliders, as other colliders have it.
+
+    The contact of meshes is pairs, not terms.
+    """
+    scene, count = model.scene, len(model.scene.meshes) if model.colliders is not None else 0
+    areas = scene.mesh.vertex_areas if model.order is None else scene.mesh.vertex_areas[model.order]
+    return count * scene.contact.stiffness * areas if count else np.zeros(len(areas))
 
 
 def _at_rest(K, C):

@@ -113,9 +113,8 @@ class HierarchicalPBDStepper(LaunchedStepper):
     def _on_level(self, level):
         """Returns the sweep over a level, and the arguments of the launch that interpolates to the vertices that it drops."""
         model, d = self.model, self.sweep.correction
-        sweep = GaussSeidelSweep(
-            on_device(model, level), self.state.x, self.h, "coloured", self.options.relaxation, correction=d, pool=self.pool
-        )
+        given = on_device(model, level), self.state.x, self.h, "coloured", self.options.relaxation
+        sweep = GaussSeidelSweep(*given, correction=d, pool=self.pool, follows=False)
         dropped, offsets, parents = (
             wp.array(each, dtype=wp.int32, device=model.device) for each in (level.dropped, level.offsets, level.parents)
         )

@@ -74,7 +74,7 @@ class Stepper:
             self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
             self.model = model = model.with_terms(self.colliders.terms)
         self.pairs, self._kept = None, None
-        if model.scene.self_contact is not None:
+        if model.has_pairs:
             self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
             self.model = model = model.with_dynamic(self.pairs.forces.terms)
         if integrator is not None:

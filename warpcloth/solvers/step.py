@@ -161,31 +161,36 @@ class Step:
                 f"{cls.__name__} cannot take a vertex that is locked along some axes, by free_axes or its pin; "
                 f"{listed(able)} can"
             )
-        if model.scene.self_contact is not None:
-            cls._refuse_self_contact(model)
+        if model.has_pairs:
+            cls._refuse_pairs(model)
         if needs is None:
             refuse_unmet(model.terms, cls.__name__, cls.needs, {record.__name__: record.needs for record in SOLVERS.values()})
         else:
             refuse_unmet(model.terms, f"{cls.__name__} with {options}", needs, {instead: ()})
 
     @classmethod
-    def _refuse_self_contact(cls, model):
+    def _refuse_pairs(cls, model):
+        scene, meshes = model.scene, [collider for collider in model.scene.colliders if collider.is_mesh]
+        what = "self_contact" if scene.self_contact is not None else f"the mesh collider {meshes[0].label}"
         if not cls.touches_itself:
             able = [record.__name__ for record in SOLVERS.values() if record.touches_itself]
-            raise ValueError(f"{cls.__name__} cannot take self_contact; {listed(able)} can")
-        if model.scene.self_contact.friction and NORMAL_FORCE in cls.needs:
+            raise ValueError(f"{cls.__name__} cannot take {what}; {listed(able)} can")
+        rubbing = [f"friction on {collider.label}" for collider in meshes if collider.friction]
+        if scene.self_contact is not None and scene.self_contact.friction:
+            rubbing.insert(0, "friction of self_contact")
+        if rubbing and NORMAL_FORCE in cls.needs:
             able = [
                 record.__name__ for record in SOLVERS.values() if record.touches_itself and NORMAL_FORCE not in record.needs
             ]
-            lack = NORMAL_FORCE.lack.format(label="friction of self_contact")
+            lack = NORMAL_FORCE.lack.format(label=rubbing[0])
             raise ValueError(f"{cls.__name__} cannot take {lack}; {listed(able)} can, or {NORMAL_FORCE.remedy}")
-        if model.mobility is not None and any(collider.moves or collider.facets for collider in model.scene.colliders):
+        if model.mobility is not None and any(each.moves and not each.is_mesh for each in scene.colliders):
             raise ValueError(
-                "self_contact is given with vertices that are locked along some axes and a collider that moves or is a mesh, "
+                f"{what} is given with vertices that are locked along some axes and a collider that moves and is no mesh, "
                 "which it cannot take together"
             )
         if model.threads > 1:
-            raise ValueError(f"threads is {model.threads} with self_contact, which takes 1")
+            raise ValueError(f"threads is {model.threads} with {what}, which takes 1")
 
     @classmethod
     def step_limits(cls, model: Model) -> tuple[float, float]:

@@ -69,6 +69,9 @@ class Attribute:
         return self.field.startswith("terms.") or self.field in _INFINITE
 
 
+# An attribute of earlier versions.
+ELEMENTS = "warpcloth:contact:elements"
+
 _INFINITE = ("(gravity magnitude)", "contact.stiffness", "(attachment stiffness)", "(shell thickness)")
 
 ATTRIBUTES = (
@@ -91,7 +94,6 @@ ATTRIBUTES = (
     # Contact with colliders.
     Attribute("contact.distance", "warpcloth:contact:distance", "cloth", ("double",)),
     Attribute("contact.stiffness", "warpcloth:contact:stiffness", "cloth", ("double",)),
-    Attribute("contact.elements", "warpcloth:contact:elements", "cloth", ("token",)),
     # Self-contact.
     Attribute("self_contact.distance", "warpcloth:selfContact:distance", "cloth", ("double",)),
     Attribute("self_contact.stiffness", "warpcloth:selfContact:stiffness", "cloth", ("double",)),
@@ -223,6 +225,8 @@ class Values:
         rows = [row for row in attributes() if row.location in self.locations]
         known = {row.name.replace("<name>", key) for row in rows for key in (*self.terms, *self.loads, "")}
         unknown = sorted(set(names) - known)
+        if ELEMENTS in unknown:
+            raise ValueError(f"{ELEMENTS} is not needed, as meshes always touch vertices, edges and faces of cloth; remove it")
         if unknown:
             for key in self.terms:  # an unknown type of a term may be the reason
                 kind_of(self, key)

@@ -573,8 +573,6 @@ def _scene_values(scene):
             given[f"{name}.distance"] = contact.distance
         if contact is not None and contact.stiffness is not None:
             given[f"{name}.stiffness"] = contact.stiffness
-    if scene.contact is not None and scene.contact.elements != Contact.elements:
-        given["contact.elements"] = scene.contact.elements
     for name in ("friction", "held_pins"):
         if scene.self_contact is not None and (value := getattr(scene.self_contact, name)) != getattr(SelfContact, name):
             given[f"self_contact.{name}"] = value

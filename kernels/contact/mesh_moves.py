@@ -1,0 +1,229 @@
+"""Factories of the kernels that move meshes in a step and carry near cloth along, so that it does not get in their way.
+
+A vertex of the cloth that is listed with a mesh makes the move of the point of the mesh that is nearest to it, and one that is
+listed with such cloth makes the move of that. Then continuous collision detection says how far all of these may move together.
+Where that is not the whole way, pairs are listed anew, and the rest follows.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ..vectors import types
+from .gap_notes import FIRST
+from .obstacles import Layout, copy_of, has_obstacle
+from .self_gaps import ONE, ZERO, vertex_of
+from .self_pairs import StepPairs, near_pairs
+
+# Gaps are compared in this many parts of the contact distance and the skin.
+PARTS = wp.constant(wp.float64(2.0**20))
+SMALL = wp.constant(wp.float64(1e-9))  # a weight, so that their sum is not 0
+
+
+@cache
+def are_away(dtype):
+    """Kernel over obstacles: away = 1 if one is not at its ``goal``."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
+    def is_each_away(
+        # state in
+        goal: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
+        # out
+        away: wp.array(dtype=wp.int32),
+    ):
+        t = wp.tid()
+        if wp.length_sq(goal[t] - x[t]) > dtype(0.0) or wp.isfinite(goal[t]) != wp.isfinite(x[t]):
+            away[0] = 1
+
+    return is_each_away
+
+
+@cache
+def aim_obstacles(dtype):
+    """Kernel over obstacles: their moves p to ``goal``. Those that appear or vanish go there at once."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
+    def aim_each_obstacle(
+        # state in
+        goal: wp.array(dtype=vec3),
+        # in and out
+        x: wp.array(dtype=vec3),
+        # out
+        p: wp.array(dtype=vec3),
+    ):
+        t = wp.tid()
+        move = goal[t] - x[t]
+        if not wp.isfinite(wp.length_sq(move)):
+            x[t] = goal[t]
+            move = vec3()
+        p[t] = move
+
+    return aim_each_obstacle
+
+
+@cache
+def find_carriers(dtype, of_meshes: bool):
+    """Kernel over pairs: the pair that carries each vertex of the cloth, from the key of the nearest, for ``of_meshes`` a mesh.
+
+    Else it is one with cloth that is carried already. First are pairs of the vertex itself with a triangle, whose nearest point
+    moves as the vertex should where the mesh turns, then those with the smallest gap.
+    """
+
+    # Separate modules: graphs on the CPU find kernels of a module by name.
+    @wp.kernel(module=f"warpcloth.carriers.{dtype.__name__}.{of_meshes}", enable_backward=False)
+    def find_each_carrier(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        step: StepPairs,
+        carried: wp.array(dtype=wp.int64),
+        # parameters
+        max_distance: wp.float64,
+        # out
+        keys: wp.array(dtype=wp.int64),
+        changed: wp.array(dtype=wp.int32),
+    ):
+        e = wp.tid()
+        if e >= wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0]):
+            return
+        s = pairs.stencils[e]
+        if wp.static(of_meshes):
+            if not has_obstacle(pairs.layout, s):
+                return
+        elif has_obstacle(pairs.layout, s):
+            return
+        near = wp.clamp(ONE - step.gap[e] / max_distance, ZERO, ONE)
+        sides = wp.where(e < pairs.counts[0], 1, 2)
+        for i in range(4):
+            order = wp.int64(PARTS * wp.where(i < 2 - sides, ONE + near, near))
+            key = order * wp.int64(2147483648) + wp.int64(e) + wp.int64(1)
+            if wp.static(of_meshes):
+                if s[i] < pairs.layout.cloth:
+                    wp.atomic_max(keys, s[i], key)
+            else:
+                by = wp.bool(False)
+                for j in range(4):
+                    if (i < sides) != (j < sides) and carried[s[j]] > wp.int64(0):
+                        by = True
+                if by and carried[s[i]] == wp.int64(0):
+                    wp.atomic_max(keys, s[i], key)
+                    changed[0] = 1
+
+    return find_each_carrier
+
+
+@cache
+def carry_vertices(dtype):
+    """Kernel over vertices of the cloth: p, the move of what carries them on the other side of the pair of their new key.
+
+    Pins have none.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
+    def carry_each_vertex(
+        # elements
+        pairs: near_pairs(dtype),
+        inverse_mass: wp.array(dtype=dtype),
+        mobility: wp.array(dtype=vec3),
+        # state in
+        step: StepPairs,
+        keys: wp.array(dtype=wp.int64),
+        carried: wp.array(dtype=wp.int64),
+        # in and out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        key = keys[i]
+        if key == carried[i]:
+            return
+        if inverse_mass[i] == dtype(0.0):
+            return
+        e = wp.int32((key - wp.int64(1)) % wp.int64(2147483648))
+        s = pairs.stencils[e]
+        w = step.weights[e]
+        sides = wp.where(e < pairs.counts[0], 1, 2)
+        own = wp.int32(1)
+        for k in range(sides):
+            if s[k] == i:
+                own = 0
+        move = wp.vec3d()  # relative to that of one vertex, so that a translation is exact
+        one = wp.int32(-1)
+        weight = ZERO
+        for k in range(4):
+            if (k < sides) != (own == 0):
+                carries = s[k] >= pairs.layout.cloth
+                if not carries:
+                    carries = carried[s[k]] > wp.int64(0)
+                if carries:
+                    if one < 0:
+                        one = s[k]
+                    near = wp.max(wp.abs(w[k]), SMALL)
+                    move += near * (exact(p[s[k]]) - exact(p[one]))
+                    weight += near
+        move = exact(p[one]) + move / weight
+        if mobility:
+            for axis in range(3):
+                if mobility[i][axis] == dtype(0.0):
+                    move[axis] = ZERO
+        p[i] = vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+
+    return carry_each_vertex
+
+
+@cache
+def end_move(dtype):
+    """Kernel over copies: ``proceed`` is 1 if one has not moved the whole way after fewer than ``most`` rounds.
+
+    After these, meshes go through what is in their way, and ``first`` is FIRST − frame for the first frame with such a step.
+    """
+
+    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
+    def end_each_move(
+        # state in
+        fraction: wp.array(dtype=wp.float64),
+        rounds: wp.array(dtype=wp.int32),
+        steps: wp.array(dtype=wp.int32),
+        # parameters
+        most: int,
+        per_frame: int,
+        # out
+        proceed: wp.array(dtype=wp.int32),
+        first: wp.array(dtype=wp.int64),
+    ):
+        c = wp.tid()
+        if fraction[c] < ONE:
+            if rounds[0] < most:
+                proceed[0] = 1
+            else:
+                wp.atomic_max(first, c, FIRST - wp.int64(steps[c] // per_frame + 1))
+
+    return end_each_move
+
+
+@cache
+def return_obstacles(dtype):
+    """Kernel over obstacles: x = ``before``, in copies whose colliders have cut a move since ``cut_before``."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
+    def return_each_obstacle(
+        # elements
+        layout: Layout,
+        # state in
+        before: wp.array(dtype=vec3),
+        cut_before: wp.array(dtype=wp.int64),
+        cut: wp.array(dtype=wp.int64),
+        # out
+        x: wp.array(dtype=vec3),
+    ):
+        t = wp.tid()
+        copy = copy_of(layout, layout.cloth + t)
+        if cut[copy] > cut_before[copy]:
+            x[t] = before[t]
+
+    return return_each_obstacle

@@ -1,0 +1,159 @@
+"""The surface of contact: the vertices of the cloth, and behind them those of mesh colliders, the *obstacles*.
+
+All copies have N = B·n vertices of cloth, then B·m obstacles. Positions of both are in one array (N + B·m,).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ..memory import load
+from ..vectors import types
+from .colliders import of_pose, pose_types
+from .mesh_geometry import meshes, point_at
+
+# Groups of elements: cloth, cloth with a vertex that cannot move, and obstacles.
+CLOTH, HELD, OBSTACLE = wp.constant(0), wp.constant(1), wp.constant(2)
+
+
+@wp.struct
+class Layout:
+    """The numbers of vertices: N of all cloth, n of that of a copy, and m obstacles of a copy."""
+
+    cloth: wp.int32
+    per_copy: wp.int32
+    obstacles: wp.int32
+
+
+@wp.func
+def copy_of(layout: Layout, i: int):
+    """The copy of a vertex."""
+    found = wp.int32(0)
+    if i < layout.cloth:
+        found = i // layout.per_copy
+    else:
+        found = (i - layout.cloth) // layout.obstacles
+    return found
+
+
+@wp.func
+def in_copy(layout: Layout, i: int):
+    """The index of a vertex in its copy, where obstacles follow the cloth."""
+    found = wp.int32(0)
+    if i < layout.cloth:
+        found = i % layout.per_copy
+    else:
+        found = layout.per_copy + (i - layout.cloth) % layout.obstacles
+    return found
+
+
+@wp.func
+def cloth_vertex(layout: Layout, s: wp.vec4i):
+    """The first vertex of a pair that belongs to the cloth."""
+    found = s[0]
+    for k in range(1, 4):
+        if found >= layout.cloth:
+            found = s[k]
+    return found
+
+
+@wp.func
+def has_obstacle(layout: Layout, s: wp.vec4i):
+    """Whether one side of a pair belongs to a mesh."""
+    return s[0] >= layout.cloth or s[3] >= layout.cloth
+
+
+@cache
+def vector_within(dtype):
+    """Device function (p, i) → the move of vertex i, which is 0 beyond the array, where p is for the cloth alone."""
+    vec3, _ = types(dtype)
+    vector = load(vec3)
+
+    @wp.func
+    def vector_or_zero(p: wp.array(dtype=vec3), i: int):
+        found = vec3()
+        if i < p.shape[0]:
+            found = vector(p, i)
+        return found
+
+    return vector_or_zero
+
+
+@wp.struct
+class Obstacles:
+    """The obstacles of a copy: the collider of each and its vertex there, (m,), and which frames of colliders are present.
+
+    ``first_frame`` of each collider is an index into ``present``.
+    """
+
+    collider: wp.array(dtype=wp.int32)
+    vertex: wp.array(dtype=wp.int32)
+    first_frame: wp.array(dtype=wp.int32)
+    present: wp.array(dtype=wp.int32)
+
+
+@cache
+def find_obstacles(dtype):
+    """Kernel over obstacles of all copies: their positions in a step at the ``poses`` after ``halves`` half steps.
+
+    A frame has ``per_frame`` half steps. Positions are NaN while a collider is absent, that is at one point for a whole step.
+    """
+    vec3, _ = types(dtype)
+    _local, to_space = of_pose(dtype)
+    pose_type, _anchor = pose_types(dtype)
+    at = point_at(dtype)
+
+    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
+    def find_each_obstacle(
+        # elements
+        layout: Layout,
+        obstacles: Obstacles,
+        mesh: meshes(dtype),
+        # state in
+        poses: wp.array2d(dtype=pose_type),
+        steps: wp.array(dtype=wp.int32),
+        # parameters
+        per_frame: int,
+        halves: int,
+        # out
+        out: wp.array(dtype=vec3),
+    ):
+        t = wp.tid()
+        copy = t // layout.obstacles
+        j = t - copy * layout.obstacles
+        c = obstacles.collider[j]
+        when = wp.max(2 * steps[copy] + halves, 0)
+        frame = wp.min(wp.max(2 * steps[copy], 0) // per_frame, mesh.frames[c] - 1)
+        last = wp.min(frame + 1, mesh.frames[c] - 1)  # of this step, which ends at this frame or before
+        first = obstacles.first_frame[c]
+        present = wp.max(obstacles.present[first + frame], obstacles.present[first + last])
+        found = vec3(dtype(wp.nan), dtype(wp.nan), dtype(wp.nan))
+        if present != 0:
+            found = to_space(poses[copy, c], at(mesh, c, obstacles.vertex[j], when, per_frame))
+        out[t] = found
+
+    return find_each_obstacle
+
+
+@cache
+def find_moves(dtype):
+    """Kernel over obstacles of all copies: their moves in a step [m]; 0 for those that appear or vanish."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
+    def find_each_move(
+        # state in
+        before: wp.array(dtype=vec3),
+        after: wp.array(dtype=vec3),
+        # out
+        moves: wp.array(dtype=wp.vec3d),
+    ):
+        t = wp.tid()
+        found = wp.vec3d()
+        for k in range(3):
+            move = wp.float64(after[t][k]) - wp.float64(before[t][k])
+            if wp.isfinite(move):
+                found[k] = move
+        moves[t] = found
+
+    return find_each_move
