@@ -104,9 +104,12 @@ def sum_of_lanes(dtype, lanes: int):
         return itself
     shuffle = "value.c[{0}] += __shfl_xor_sync(mask, value.c[{0}], n);"
 
+    # A module with such kernels is also built for the CPU, in processes that use both devices.
     @wp.func_native(
+        "\n#if defined(__CUDA_ARCH__)\n"
         f"const unsigned mask = {(1 << lanes) - 1}u << (threadIdx.x & 31 & ~{lanes - 1}); "
-        f"for (int n = 1; n < {lanes}; n *= 2) {{ {' '.join(shuffle.format(c) for c in range(3))} }} return value;"
+        f"for (int n = 1; n < {lanes}; n *= 2) {{ {' '.join(shuffle.format(c) for c in range(3))} }}"
+        "\n#endif\nreturn value;"
     )
     def sum_over_lanes(value: vec3) -> vec3: ...
 

@@ -217,7 +217,7 @@ def test_steps_that_do_not_converge_have_works_of_the_same_size(device):
     """ADMM leaves vertices so deep inside that ∇U there, times the way of the ball, is 10 000 times the work of the ball."""
     found = []
     for solver in (wc.Newton(substeps=4), wc.ADMM(substeps=4, iterations=10)):
-        run = wc.simulate(jumping("sphere"), solver, device=device, dtype="float64", frames=11, record="energies")
+        run = wc.simulate(jumping(), solver, device=device, dtype="float64", frames=11, record="energies")
         found.append(run.energies["work of colliders"][-1] + run.energies["work of the filter"][-1])
     assert "used up" in run.status.message
     assert found[1] == pytest.approx(found[0], rel=0.5)

@@ -11,6 +11,7 @@ from support.continuum import flat, hill, jittered
 from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.core.hessian import Hessian
+from warpcloth.kernels.linear import turn_and_multiply
 from warpcloth.kernels.multigrid import OMEGA, SPARED
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.numerics import minimise
@@ -292,3 +293,10 @@ def test_a_negative_curvature_changes_no_choice(device):
         solver.solve(b, x, wp.ones(1, dtype=wp.int32, device=device))
         assert solver.negative.numpy()[0] == 1 and choice.used.numpy()[0] == used
         assert (choice.rates.numpy() == rates).all() and choice.outdated.numpy()[0] == 1
+
+
+def test_kernels_of_both_devices_build_for_the_cpu():
+    """A module has those of all numbers of threads, in a process that uses both devices."""
+    kernels = [turn_and_multiply(wp.float64, block) for block in (0, 256)]
+    assert kernels[0].module is kernels[1].module
+    wp.load_module(kernels[0].module, device="cpu")
