@@ -204,15 +204,16 @@ class Multigrid:
     def _cost_of_cycle(self):
         """Returns the cost of an iteration with a cycle over that of one with diagonal blocks.
 
-        It counts the blocks that both read, vectors as blocks of a third each, and launches on CUDA.
+        It counts the blocks that both read, vectors as blocks of a third each, and launches on CUDA, all of one copy, so that a
+        copy of a batch has the bits of a single one.
         """
-        copies, launch = self.model.copies, LAUNCH if self.model.device.is_cuda else 0
-        of_levels = [len(level.columns) // copies for level in self._levels]
-        plain = of_levels[0] + 4 * self.sizes[0] + 2 * launch / copies
+        launch = LAUNCH if self.model.device.is_cuda else 0
+        of_levels = [len(level.columns) // self.model.copies for level in self._levels]
+        plain = of_levels[0] + 4 * self.sizes[0] + 2 * launch
         products = 2 * sum(of_levels[:-1]) + of_levels[-1] * (1 if self._dense else 0)
         vectors = sum(4 * n for n in self.sizes[:-1])
         launches = 4 * len(self._transfers) + self._dense + 1
-        return max(round((plain + products + vectors + launches * launch / copies) / plain), 1)
+        return max(round((plain + products + vectors + launches * launch) / plain), 1)
 
     def update(self):
         """Launches the sweeps of the finest level for the present A, and the coarse matrices if they are ``outdated``."""
