@@ -1,8 +1,9 @@
 """Factories of the kernels that move meshes in a step and carry near cloth along, so that it does not get in their way.
 
 A vertex of the cloth that is listed with a mesh makes the move of the point of the mesh that is nearest to it, and one that is
-listed with such cloth makes the move of that. Then continuous collision detection says how far all of these may move together.
-Where that is not the whole way, pairs are listed anew, and the rest follows.
+listed with such cloth makes the move of that. Pairs that would still approach are pushed apart, by
+:func:`.self_filter.push_pairs`. Then continuous collision detection says how far all of a copy may move together. Where that is
+not the whole way, pairs are listed anew, and the rest follows.
 """
 
 from functools import cache
@@ -177,9 +178,10 @@ def carry_vertices(dtype):
 
 @cache
 def end_move(dtype):
-    """Kernel over copies: ``proceed`` is 1 if one has not moved the whole way after fewer than ``most`` rounds.
+    """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
 
-    After these, meshes go through what is in their way, and ``first`` is FIRST − frame for the first frame with such a step.
+    After ``most`` rounds meshes go through what is in their way, and ``first`` is FIRST − frame for the first frame with such a
+    step.
     """
 
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
@@ -191,12 +193,16 @@ def end_move(dtype):
         # parameters
         most: int,
         per_frame: int,
+        # in and out
+        active: wp.array(dtype=wp.int32),
         # out
         proceed: wp.array(dtype=wp.int32),
         first: wp.array(dtype=wp.int64),
     ):
         c = wp.tid()
-        if fraction[c] < ONE:
+        if fraction[c] == ONE:
+            active[c] = 0
+        elif active[c] != 0:
             if rounds[0] < most:
                 proceed[0] = 1
             else:

@@ -460,13 +460,13 @@ def add_positions(dtype):
         # parameters
         sign: dtype,
         active: wp.array(dtype=wp.int32),
-        per_copy: int,
+        layout: Layout,
         # out
         out: wp.array(dtype=vec3),
     ):
         i = wp.tid()
         if active:
-            if active[i // per_copy] == 0:
+            if active[copy_of(layout, i)] == 0:
                 return
         out[i] = a[i] + sign * vector_or_zero(b, i)
 

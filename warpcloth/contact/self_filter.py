@@ -257,6 +257,7 @@ class SelfFilter:
         x = self._contact.x_before
         for array in (self._rounds, self._proceed):
             array.zero_()
+        self._walking.fill_(1)
         self._launch_move(mesh_moves.are_away, [goal, self._surface.behind(x)], [self._proceed])
         wp.capture_while(self._proceed, self._launch_meshes_on, x=x, goal=goal)
 
@@ -273,11 +274,11 @@ class SelfFilter:
         self._launch_pushes(model.inverse_mass, p, opens=True)
         model.lock(p)
         self.launch_limit(p)
-        self._add(x, p, 1.0, x)
+        self._add(x, p, 1.0, x, self._walking)
         model.launch(self._count, 1, [], [self._rounds])
         self._proceed.zero_()
         given = [self.fraction, self._rounds, contact.steps, ROUNDS, contact.per_frame]
-        self._launch(mesh_moves.end_move, model.copies, given, [self._proceed, contact.first_forced])
+        self._launch(mesh_moves.end_move, model.copies, given, [self._walking, self._proceed, contact.first_forced])
         wp.capture_if(self._proceed, lambda: None, lambda: self._launch_arrived(x, goal))
 
     def _launch_arrived(self, x, goal):
@@ -404,4 +405,4 @@ class SelfFilter:
 
     def _add(self, a, b, sign, out, active=None):
         count = min(len(a), len(out))
-        self._launch(self_filter.add_positions, count, [a, b, sign, active, self.model.per_copy], [out])
+        self._launch(self_filter.add_positions, count, [a, b, sign, active, self._surface.layout], [out])
