@@ -184,7 +184,7 @@ class Contacts:
     There are 2C slots. Slot e < C is that of the pair e: of the nearest point of a face, or of two edges. Those from
     C + 3·rows[i] on are for terms of vertex i whose faces have their nearest points elsewhere. That is enough, because F
     faces share at most 1.5 F edges, and as many vertices. kA is 0 in slots without a contact. ``code`` says where the nearest
-    point of a face is.
+    point of a face is. ``near`` (C,) lists the near faces of vertex i from rows[i] on.
 
     ``parts`` has the vertices of the surface between which a contact is. The stencil of its slot has those of the cloth, and
     the first of them with w = 0 in place of each obstacle. With obstacles there is the ``offset`` o = Σ wⱼXⱼ [m] of their
@@ -205,6 +205,7 @@ class Contacts:
     ratio: wp.array(dtype=wp.float64)
     fixed: wp.array(dtype=wp.float64)
     code: wp.array(dtype=wp.int32)
+    near: wp.array(dtype=wp.int32)
     parts: wp.array(dtype=wp.vec4i)
     offset: wp.array(dtype=wp.vec3d)
     travel: wp.array(dtype=wp.vec3d)
@@ -239,7 +240,7 @@ def edge_between(i: int, j: int):
 
 @cache
 def counts_of(dtype):
-    """Device functions (lists, codes, first, end, …) that count the near faces of a vertex at an edge pq, or at a vertex p.
+    """Device functions (lists, contacts, first, end, …) that count near faces of a vertex at an edge pq, or at a vertex p.
 
     Both return the face that owns the term, which is the first whose nearest point is there or else the first; the number of
     faces; and of those whose nearest point is there. That of edges also returns the first face.
@@ -247,42 +248,40 @@ def counts_of(dtype):
     stencil, number = load(wp.vec4i), load(wp.int32)
 
     @wp.func
-    def at_edge(lists: near_pairs(dtype), codes: wp.array(dtype=wp.int32), first: int, end: int, p: int, q: int):
+    def at_edge(lists: near_pairs(dtype), contacts: Contacts, first: int, end: int, p: int, q: int):
         lowest = wp.int32(-1)
         owner = wp.int32(-1)
         faces = wp.int32(0)
         on = wp.int32(0)
-        for f in range(first, end):
-            code = number(codes, f)
-            if code != NONE:
-                s = stencil(lists.stencils, f)
-                i = corner_of(s, p)
-                j = corner_of(s, q)
-                if i > 0 and j > 0:
-                    here = code == edge_between(i, j)
-                    if faces == 0:
-                        lowest = f
-                    if faces == 0 or (here and on == 0):
-                        owner = f
-                    faces += 1
-                    on += wp.where(here, 1, 0)
+        for k in range(first, end):
+            f = number(contacts.near, k)
+            s = stencil(lists.stencils, f)
+            i = corner_of(s, p)
+            j = corner_of(s, q)
+            if i > 0 and j > 0:
+                here = number(contacts.code, f) == edge_between(i, j)
+                if faces == 0:
+                    lowest = f
+                if faces == 0 or (here and on == 0):
+                    owner = f
+                faces += 1
+                on += wp.where(here, 1, 0)
         return owner, faces, on, lowest
 
     @wp.func
-    def at_vertex(lists: near_pairs(dtype), codes: wp.array(dtype=wp.int32), first: int, end: int, p: int):
+    def at_vertex(lists: near_pairs(dtype), contacts: Contacts, first: int, end: int, p: int):
         owner = wp.int32(-1)
         faces = wp.int32(0)
         on = wp.int32(0)
-        for f in range(first, end):
-            code = number(codes, f)
-            if code != NONE:
-                i = corner_of(stencil(lists.stencils, f), p)
-                if i > 0:
-                    here = code == CORNER + i - 1
-                    if faces == 0 or (here and on == 0):
-                        owner = f
-                    faces += 1
-                    on += wp.where(here, 1, 0)
+        for k in range(first, end):
+            f = number(contacts.near, k)
+            i = corner_of(stencil(lists.stencils, f), p)
+            if i > 0:
+                here = number(contacts.code, f) == CORNER + i - 1
+                if faces == 0 or (here and on == 0):
+                    owner = f
+                faces += 1
+                on += wp.where(here, 1, 0)
         return owner, faces, on
 
     return at_edge, at_vertex
@@ -339,15 +338,23 @@ def put_contact(dtype):
 
 
 @wp.func
+def slot_of(contacts: Contacts, first: int, count: int, extra: int, i: int):
+    """The slot of contact i of a vertex: the first ``count`` are those of its near faces, others lie from ``extra`` on."""
+    if i < count:
+        return contacts.near[first + i]
+    return extra + i - count
+
+
+@wp.func
 def set_shares(contacts: Contacts, first: int, count: int, extra: int, extras: int):
-    """Sets the shares of the contacts in ``count`` slots from ``first`` on, and in ``extras`` slots from ``extra`` on."""
+    """Sets the shares of the contacts of a vertex with ``count`` near faces and ``extras`` other slots."""
     for i in range(count + extras):
-        one = wp.where(i < count, first + i, extra + i - count)
+        one = slot_of(contacts, first, count, extra, i)
         if contacts.stiffness[one] > ZERO:
             total = ZERO
             positive = ZERO
             for j in range(count + extras):
-                other = wp.where(j < count, first + j, extra + j - count)
+                other = slot_of(contacts, first, count, extra, j)
                 k = contacts.stiffness[other]
                 # Contacts beyond r have no force, so that others have the same share with a goal as without.
                 beyond = contacts.gap[other] >= contacts.distance[other] and contacts.gap[one] < contacts.distance[one]
@@ -390,14 +397,64 @@ def lowest_gap(dtype, of_vertex: bool):
 
 
 @cache
-def find_vertex_contacts(dtype):
-    """Kernel over vertices: their contacts with faces at x, or x + correction.
+def find_near_faces(dtype):
+    """Kernel over the listed pairs of a vertex and a face: where the nearest point is at x, or x + correction.
 
-    These have a force there, or may have one at goal + move if that is given.
+    A face is near if it has a force there, or may have one at goal + move if that is given. Only the first ``vertices`` count.
     """
     vec3, _ = types(dtype)
     at, _exact = vertex_of(dtype)
-    (at_edge, at_vertex), put, lowest = counts_of(dtype), put_contact(dtype), lowest_gap(dtype, True)
+    lowest, stencil = lowest_gap(dtype, True), load(wp.vec4i)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def find_each_near_face(
+        # elements
+        lists: near_pairs(dtype),
+        # state in
+        normals: wp.array(dtype=wp.vec3d),
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        goal: wp.array(dtype=vec3),
+        move: wp.array(dtype=vec3),
+        # parameters
+        laws: Laws,
+        vertices: int,
+        # out
+        contacts: Contacts,
+    ):
+        e = wp.tid()
+        if e >= lists.counts[0]:
+            return
+        s = stencil(lists.stencils, e)
+        v = s[0]
+        found = NONE
+        r = laws.distance[wp.where(has_obstacle(lists.layout, s), 1, 0)]
+        if v < vertices and lists.distances[e] == dtype(r):  # else the rest distance is below 2r
+            r = wp.where(v < lists.layout.cloth, r, CLOSE * r)
+            a = at(x, correction, v)
+            b = at(x, correction, s[1]) - a
+            c = at(x, correction, s[2]) - a
+            d = at(x, correction, s[3]) - a
+            if lowest(s, normals[e], b, c, d, goal, move) < r:
+                code, w = nearest_of_face(b, c, d)
+                y = w[0] * b + w[1] * c + w[2] * d
+                if goal or wp.length(y) < r:
+                    found = code
+                    contacts.weights[e] = wp.vec4d(ONE, -w[0], -w[1], -w[2])
+        contacts.code[e] = found
+
+    return find_each_near_face
+
+
+@cache
+def find_vertex_contacts(dtype):
+    """Kernel over vertices: their contacts at x, or x + correction, with the faces of :func:`find_near_faces`.
+
+    ``distant`` contacts may have no force.
+    """
+    vec3, _ = types(dtype)
+    at, _exact = vertex_of(dtype)
+    (at_edge, at_vertex), put = counts_of(dtype), put_contact(dtype)
     stencil, number = load(wp.vec4i), load(wp.int32)
 
     @wp.func
@@ -412,7 +469,7 @@ def find_vertex_contacts(dtype):
         Q: wp.vec3d,
     ):
         """m of the edge pq, and the owner of its term."""
-        owner, faces, m, _lowest = at_edge(lists, contacts.code, first, end, p, q)
+        owner, faces, m, _lowest = at_edge(lists, contacts, first, end, p, q)
         if along(P, Q) > ZERO and along(Q, P) > ZERO:
             m -= faces - 1
         return m, owner
@@ -430,22 +487,22 @@ def find_vertex_contacts(dtype):
         e: int,
     ):
         """m of the vertex p, and the owner of its term; only if that is e."""
-        owner, faces, m = at_vertex(lists, contacts.code, first, end, p)
+        owner, faces, m = at_vertex(lists, contacts, first, end, p)
         edges = wp.int32(0)
         if owner == e:
             P = at(x, correction, p) - a
-            for f in range(first, end):
-                if number(contacts.code, f) != NONE:
-                    s = stencil(lists.stencils, f)
-                    i = corner_of(s, p)
-                    if i > 0:
-                        for j in range(1, 4):
-                            if j != i:
-                                _owner, count, _on, lowest = at_edge(lists, contacts.code, first, end, p, s[j])
-                                if lowest == f:
-                                    edges += 1
-                                    if along(P, at(x, correction, s[j]) - a) <= ZERO:
-                                        m -= count - 1
+            for k in range(first, end):
+                f = number(contacts.near, k)
+                s = stencil(lists.stencils, f)
+                i = corner_of(s, p)
+                if i > 0:
+                    for j in range(1, 4):
+                        if j != i:
+                            _owner, count, _on, lowest = at_edge(lists, contacts, first, end, p, s[j])
+                            if lowest == f:
+                                edges += 1
+                                if along(P, at(x, correction, s[j]) - a) <= ZERO:
+                                    m -= count - 1
             m += 1 + faces - edges
         return m, owner
 
@@ -455,13 +512,11 @@ def find_vertex_contacts(dtype):
         lists: near_pairs(dtype),
         areas: Areas,
         # state in
-        normals: wp.array(dtype=wp.vec3d),
         x: wp.array(dtype=vec3),
         correction: wp.array(dtype=vec3),
-        goal: wp.array(dtype=vec3),
-        move: wp.array(dtype=vec3),
         # parameters
         laws: Laws,
+        distant: int,
         # out
         pairs: near_pairs(dtype),
         contacts: Contacts,
@@ -472,33 +527,20 @@ def find_vertex_contacts(dtype):
         extra = contacts.code.shape[0] // 2 + 3 * first
         if first == end or extra + 3 * (end - first) > contacts.code.shape[0]:  # the latter where the list has overflowed
             return
-        cloth = lists.layout.cloth
-        a = at(x, correction, v)
         near = wp.int32(0)
         for e in range(first, end):
-            code = NONE
-            s = stencil(lists.stencils, e)
-            r = laws.distance[wp.where(has_obstacle(lists.layout, s), 1, 0)]
-            if lists.distances[e] == dtype(r):  # else the rest distance is below 2r
-                r = wp.where(v < cloth, r, CLOSE * r)
-                b = at(x, correction, s[1]) - a
-                c = at(x, correction, s[2]) - a
-                d = at(x, correction, s[3]) - a
-                if lowest(s, normals[e], b, c, d, goal, move) < r:
-                    of_face, w = nearest_of_face(b, c, d)
-                    y = w[0] * b + w[1] * c + w[2] * d
-                    if goal or wp.length(y) < r:
-                        code = of_face
-                        contacts.weights[e] = wp.vec4d(ONE, -w[0], -w[1], -w[2])
-                        near += 1
-            contacts.code[e] = code
+            if number(contacts.code, e) != NONE:
+                contacts.near[first + near] = e
+                near += 1
         if near == 0:
             return
+        cloth = lists.layout.cloth
+        a = at(x, correction, v)
+        end = first + near
         extras = wp.int32(0)
-        for e in range(first, end):
+        for k in range(first, end):
+            e = contacts.near[k]
             code = number(contacts.code, e)
-            if code == NONE:
-                continue
             s = stencil(lists.stencils, e)
             r = laws.distance[0]
             kA = SIDE * laws.stiffness[0] * areas.of_vertices[v]
@@ -526,7 +568,7 @@ def find_vertex_contacts(dtype):
                 if owner == e and m != 0:
                     t = along(P, Q) / (along(P, Q) + along(Q, P))
                     y = (t - ONE) * P - t * Q
-                    if goal or wp.length(y) < r:
+                    if distant == 1 or wp.length(y) < r:
                         w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                         w4[i] = t - ONE
                         w4[j] = -t
@@ -534,14 +576,14 @@ def find_vertex_contacts(dtype):
                         extras += wp.where(slot == e, 0, 1)
                         put(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
                 m, owner = multiplicity_of_vertex(lists, contacts, first, end, s[i], a, x, correction, e)
-                if owner == e and m != 0 and (goal or wp.length(P) < r):
+                if owner == e and m != 0 and (distant == 1 or wp.length(P) < r):
                     w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                     w4[i] = -ONE
                     slot = wp.where(code == CORNER + i - 1, e, extra + extras)
                     extras += wp.where(slot == e, 0, 1)
                     put(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
         if extras > 0:
-            set_shares(contacts, first, end - first, extra, extras)
+            set_shares(contacts, first, near, extra, extras)
 
     return find_contacts_of_vertex
 

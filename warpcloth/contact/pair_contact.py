@@ -45,8 +45,8 @@ class PairContact(DynamicElements):
         self.obstacles, self._goal = (surface.vectors() for _ in range(2)) if surface.obstacles else (None, None)
         self._of_edges = not bounded  # the filter alone keeps edges, and vertices of meshes, apart in explicit steps
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
-        made = potential.find_vertex_contacts, potential.find_edge_contacts, fill_corners, sort_corners
-        self._launch = model.launcher((made, model.dtype))
+        made = potential.find_near_faces, potential.find_vertex_contacts, potential.find_edge_contacts
+        self._launch = model.launcher(((*made, fill_corners, sort_corners), model.dtype))
         self._corners = model.device.is_cuda
         self._vertices = Scan(model, model.count)
 
@@ -67,6 +67,7 @@ class PairContact(DynamicElements):
             setattr(contacts, name, wp.zeros(slots, dtype=kind, device=device))
         for name in ("gap", "distance", "stiffness", "share", "ratio", "fixed"):
             setattr(contacts, name, wp.zeros(slots, dtype=wp.float64, device=device))
+        contacts.near = wp.zeros(len(lists.stencils), dtype=wp.int32, device=device)
         contacts.followed.mode = wp.zeros(1, dtype=wp.int32, device=device)
         contacts.parts = pairs.stencils
         if self.surface.obstacles:
@@ -98,11 +99,14 @@ class PairContact(DynamicElements):
             wp.copy(self.surface.behind(whole), positions)
 
     def _launch_listed(self, x, correction, goal, move):
-        given = [self.lists, self._areas, self._normals, x, correction, goal, move, self._laws]
+        listed = len(self.lists.stencils)
+        positions = [self._normals, x, correction, goal, move, self._laws]
         vertices = self.surface.count if self._of_edges else self.model.count
+        self._launch(potential.find_near_faces, listed, [self.lists, *positions, vertices], [self.data])
+        given = [self.lists, self._areas, x, correction, self._laws, goal is not None]
         self._launch(potential.find_vertex_contacts, vertices, given, [self.pairs, self.data])
         if self._of_edges:
-            self._launch(potential.find_edge_contacts, len(self.lists.stencils), given, [self.pairs, self.data])
+            self._launch(potential.find_edge_contacts, listed, [self.lists, self._areas, *positions], [self.pairs, self.data])
         if self._corners:
             self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
             self._launch(fill_corners, self.capacity, [], [self.pairs])
