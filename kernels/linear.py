@@ -270,10 +270,10 @@ def _unknowns(dtype, numbers):
 
 @wp.struct
 class Solves:
-    """The conjugate gradients of each copy, (B,) arrays, and of all, (1,).
+    """The conjugate gradients of each copy, (B,) arrays.
 
     ``rz`` is rᵀz, ``first`` its first value; ``negative`` is 1 after a direction of negative curvature. ``iteration`` counts
-    iterations from 1, up to ``most``; ``proceed`` is 1 if a copy is active.
+    iterations from 1, up to ``most``; ``proceed`` (1,) is 1 if a copy is active.
 
     A launch that turns directions writes the values ``next``, from which the launch that advances takes them over. So no
     thread reads what another one of the same launch writes.
@@ -325,7 +325,7 @@ def begin_iteration(solves: Solves, copy: int, lane: int, rz: wp.float64):
     if done > 0:
         ratio = rz / solves.rz[copy]
         left = solves.tolerance[copy] * solves.tolerance[copy] * solves.first[copy]
-        going = rz > left and done < solves.most[0]
+        going = rz > left and done < solves.most[copy]
     if lane == 0:
         if done == 0:
             solves.first[copy] = rz
@@ -376,12 +376,11 @@ def start_solves(dtype, numbers: bool, block: int):
         store(lane, total, parts, copy)
         if lane == 0:
             solves.active[copy] = wanted[copy]
-            solves.negative[copy] = 0
-            solves.iteration[copy] = 0
-            solves.next_iteration[copy] = 0
-            solves.first[copy] = wp.float64(0.0)
-            solves.next_rz[copy] = wp.float64(0.0)
             if wanted[copy] == 1:
+                solves.iteration[copy] = 0
+                solves.next_iteration[copy] = 0
+                solves.first[copy] = wp.float64(0.0)
+                solves.next_rz[copy] = wp.float64(0.0)
                 solves.proceed[0] = 1  # it is 0 after a solve
 
     return start

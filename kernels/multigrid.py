@@ -2,7 +2,7 @@
 
 A level has block compressed rows A, the diagonal blocks S of its Jacobi sweeps, and vectors r, x and d. P interpolates vectors
 of the next coarser level. It has one weight for all coordinates, and all copies have the same. ``active[copy]`` is 1 while a
-copy iterates.
+copy iterates, and ``due[copy]`` where its matrices are computed; None means all copies.
 """
 
 from functools import cache
@@ -12,7 +12,7 @@ import warp as wp
 from .block_pattern import find_column
 from .block_rows import block_rows, lanes_of_rows, product_of_row
 from .linear import Solves
-from .reduce import sum_of_lanes
+from .reduce import stands_aside, sum_of_lanes
 from .vectors import types
 
 MODULE = "warpcloth.multigrid"
@@ -179,12 +179,15 @@ def multiply_by_transfers(dtype):
         # state in
         values: wp.array(dtype=mat33),
         # parameters
+        due: wp.array(dtype=wp.int32),
         per_copy: int,
         coarse_per_copy: int,
         # out
         coarse: wp.array(dtype=mat33),
     ):
         copy, t = wp.tid()
+        if stands_aside(due, copy):
+            return
         block = blocks[t]
         total = mat33()
         for s in range(offsets[block[0]], offsets[block[0] + 1]):
@@ -210,6 +213,7 @@ def eliminate(dtype):
         # state in
         before: wp.array(dtype=mat33),
         # parameters
+        due: wp.array(dtype=wp.int32),
         p: int,
         m: int,
         # out
@@ -217,6 +221,9 @@ def eliminate(dtype):
     ):
         copy, i, j = wp.tid()
         first = copy * m * m
+        if stands_aside(due, copy):
+            after[first + i * m + j] = before[first + i * m + j]
+            return
         pivot = before[first + p * m + p]
         minor = pivot[0, 0] * pivot[1, 1] - pivot[0, 1] * pivot[1, 0]
         inverse = mat33()
@@ -248,10 +255,15 @@ def factorise_diagonal(dtype):
         diagonal: wp.array(dtype=wp.int32),
         # state in
         values: wp.array(dtype=mat33),
+        # parameters
+        due: wp.array(dtype=wp.int32),
+        per_copy: int,
         # out
         factor: wp.array(dtype=mat33),
     ):
         i = wp.tid()
+        if stands_aside(due, i // per_copy):
+            return
         zero = wp.float64(0.0)
         block = wp.mat33d(values[diagonal[i]])
         size = wp.sqrt(wp.ddot(block, block))
@@ -299,11 +311,15 @@ def scale_sweeps(dtype):
         values: wp.array(dtype=mat33),
         factor: wp.array(dtype=mat33),
         # parameters
+        due: wp.array(dtype=wp.int32),
+        per_copy: int,
         own: dtype,
         # out
         sweep: wp.array(dtype=mat33),
     ):
         i = wp.tid()
+        if stands_aside(due, i // per_copy):
+            return
         left = factor[i]
         total = own
         for s in range(offsets[i], offsets[i + 1]):
@@ -321,151 +337,129 @@ def scale_sweeps(dtype):
     return scale
 
 
+# Indices of what a ChoiceState has of each copy.
+BLOCKS, TRIAL, LIMIT, WAIT = (wp.constant(k) for k in range(4))
+GAINED, COSTS = wp.constant(0), wp.constant(2)
+
+
 @wp.struct
-class PreconditionerChoice:
-    """Which preconditioner solves use, (1,) arrays; of ``rates`` the first is that of diagonal blocks.
+class ChoiceState:
+    """Which preconditioner solves use, of each copy (B,).
 
-    ``used`` is 1 for multigrid, ``outdated`` 1 if its coarse matrices must be computed again. ``fresh`` is the number of
-    iterations of the first solve with these, or −1 before it. ``progress`` and ``count`` are those of the last solve, see
-    :func:`measure_progress`. ``rates``, (2,), are decades of √(rᵀPr) for the cost of an iteration with diagonal blocks: those
-    ``gained`` over ``costs``, (2,), sums over past solves of which those count less that are longer ago. ``trial`` is 1 if a
-    solve tries the other preconditioner, ``age`` the number of solves since the last trial.
+    ``present`` has BLOCKS, 1 if the next solve uses diagonal blocks and 0 for multigrid; TRIAL, 1 if it tries that one, with up
+    to LIMIT iterations; and WAIT, the number of solves before the next trial. ``past`` has the decades of √(rᵀPr) that diagonal
+    blocks and multigrid GAINED, and their COSTS in iterations with diagonal blocks, sums over past solves of which those count
+    less that are longer ago. ``by_blocks`` and ``by_cycles`` are the copies of a solve by preconditioner; ``any_blocks`` and
+    ``any_cycles``, (1,), say whether there are any. Coarse matrices that are ``outdated`` are ``due`` where a solve uses them.
     """
 
-    used: wp.array(dtype=wp.int32)
+    present: wp.array(dtype=wp.vec4i)
+    past: wp.array(dtype=wp.vec4d)
+    by_blocks: wp.array(dtype=wp.int32)
+    by_cycles: wp.array(dtype=wp.int32)
+    any_blocks: wp.array(dtype=wp.int32)
+    any_cycles: wp.array(dtype=wp.int32)
     outdated: wp.array(dtype=wp.int32)
-    fresh: wp.array(dtype=wp.int32)
-    progress: wp.array(dtype=wp.float64)
-    count: wp.array(dtype=wp.int32)
-    rates: wp.array(dtype=wp.float64)
-    gained: wp.array(dtype=wp.float64)
-    costs: wp.array(dtype=wp.float64)
-    trial: wp.array(dtype=wp.int32)
-    age: wp.array(dtype=wp.int32)
+    due: wp.array(dtype=wp.int32)
+    any_due: wp.array(dtype=wp.int32)
 
 
 @cache
-def measure_progress():
-    """Kernel over copies: progress = the largest fall of √(rᵀPr) in a solve, in decades; count = its iterations.
+def begin_choice():
+    """Kernel over copies: divides those that are ``wanted`` by preconditioner, and sets their largest number of iterations.
 
-    A solve that ends at a negative curvature does not count: its few iterations say nothing of the many that others take.
+    A solve with diagonal blocks has at most the iterations of ``PATIENCE`` times the cost of multigrid, which follows from the
+    decades that this gained for its cost, and from the tolerance. Trials have their own limit.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
-    def measure(
-        # state in
-        solves: Solves,
-        # in and out
-        choice: PreconditionerChoice,
-    ):
-        copy = wp.tid()
-        wp.atomic_max(choice.count, 0, solves.iteration[copy])
-        if solves.negative[copy] == 1:
-            return
-        if solves.first[copy] > wp.float64(0.0) and solves.next_rz[copy] > wp.float64(0.0):
-            decades = wp.float64(0.5) * wp.log10(solves.first[copy] / solves.next_rz[copy])
-            wp.atomic_max(choice.progress, 0, decades)
-
-    return measure
-
-
-@cache
-def choose():
-    """Kernel over one thread: chooses the preconditioner of the next solve by the decades that each gained for its cost.
-
-    The first solve is by multigrid. The other preconditioner is tried in the second one. It is tried again ``AGED`` solves
-    after the last trial, or sooner if it has gained more for its cost than this one. Solves of different matrices differ, so
-    both are means, in which a solve counts 1/e after ``AGED`` others. A solve that is cut off, as a trial that costs twice as
-    much as the solve before, has gained nothing. The better one stays. The coarse matrices are outdated if a solve takes 3/2
-    times as many iterations as the first with them. After a negative curvature in every copy they are outdated too, because the
-    matrix will differ, and the preconditioner stays. ``most`` becomes 0 before a solve with diagonal blocks that is no trial,
-    see :func:`limit_iterations`. An iteration with a cycle costs as much as ``cycle`` with diagonal blocks.
-    """
-
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def choose_next(
-        # parameters
-        most: int,
-        cycle: int,
-        # in and out
-        solves: Solves,
-        choice: PreconditionerChoice,
-    ):
-        used = choice.used[0]
-        other = 1 - used
-        count = choice.count[0]
-        choice.count[0] = 0
-        if choice.progress[0] <= wp.float64(0.0) and count < solves.most[0]:
-            if used == 1:
-                choice.outdated[0] = 1
-            elif choice.trial[0] == 0:
-                solves.most[0] = 0
-            return
-        cost = count + 1
-        if used == 1:
-            cost = cycle * (count + wp.static(SPARED))
-            choice.outdated[0] = 0
-            if choice.fresh[0] < 0:
-                choice.fresh[0] = count
-            elif 2 * count > 3 * choice.fresh[0] + wp.static(2 * SPARED):
-                choice.outdated[0] = 1
-        for k in range(2):
-            choice.gained[k] = FADE * choice.gained[k]
-            choice.costs[k] = FADE * choice.costs[k]
-        choice.costs[used] = choice.costs[used] + wp.float64(cost)
-        if count < solves.most[0]:
-            choice.gained[used] = choice.gained[used] + choice.progress[0]
-        choice.rates[used] = choice.gained[used] / choice.costs[used]
-        choice.progress[0] = wp.float64(0.0)
-        solves.most[0] = most
-        if choice.trial[0] == 1:
-            choice.trial[0] = 0
-            choice.age[0] = 0
-            if choice.rates[used] <= choice.rates[other]:
-                choice.used[0] = other
-        else:
-            choice.age[0] = choice.age[0] + 1
-            if choice.age[0] >= wp.static(AGED) or choice.rates[other] > choice.rates[used]:
-                choice.trial[0] = 1
-                choice.used[0] = other
-                limit = 2 * cost
-                if other == 1:
-                    choice.outdated[0] = 1
-                    limit = limit / cycle + 1
-                solves.most[0] = wp.min(most, limit)
-        if choice.used[0] == 0 and choice.trial[0] == 0:
-            solves.most[0] = 0
-
-    return choose_next
-
-
-@cache
-def limit_iterations():
-    """Kernel over copies: a solve with diagonal blocks has at most the iterations of ``PATIENCE`` times the cost of multigrid.
-
-    That cost follows from the rate of the last one and from the tolerance of each copy. The caller sets ``most`` to 0 first,
-    because copies take the maximum. Trials have their own limit.
-    """
-
-    @wp.kernel(module=MODULE, enable_backward=False)
-    def limit_each(
+    def begin(
         # parameters
         wanted: wp.array(dtype=wp.int32),
         iterations: int,
         # in and out
+        choice: ChoiceState,
         solves: Solves,
-        choice: PreconditionerChoice,
     ):
         copy = wp.tid()
-        if wanted[copy] == 0 or choice.trial[0] == 1:
-            return
-        most = wp.float64(iterations)
-        if choice.rates[1] > wp.float64(0.0):
+        now = choice.present[copy]
+        past = choice.past[copy]
+        by_blocks = wanted[copy] * now[BLOCKS]
+        by_cycles = wanted[copy] - by_blocks
+        choice.by_cycles[copy] = by_cycles
+        choice.by_blocks[copy] = by_blocks
+        choice.due[copy] = by_cycles * choice.outdated[copy]
+        if choice.due[copy] == 1:
+            choice.outdated[copy] = 0
+            choice.any_due[0] = 1
+        if by_cycles == 1:
+            choice.any_cycles[0] = 1
+        if by_blocks == 1:
+            choice.any_blocks[0] = 1
+        most = iterations
+        if now[TRIAL] == 1:
+            most = wp.min(most, now[LIMIT])
+        elif now[BLOCKS] == 1 and past[GAINED + 1] > wp.float64(0.0):
             decades = wp.max(-wp.log10(solves.tolerance[copy]), wp.float64(1.0))
-            most = wp.min(most, wp.ceil(wp.float64(PATIENCE) * decades / choice.rates[1]))
-        wp.atomic_max(solves.most, 0, int(most))
+            cost = wp.float64(PATIENCE) * decades * past[COSTS + 1] / past[GAINED + 1]
+            most = wp.int32(wp.min(wp.float64(most), wp.ceil(cost)))
+        solves.most[copy] = most
 
-    return limit_each
+    return begin
+
+
+@cache
+def end_choice():
+    """Kernel over copies: chooses the preconditioner of the next solve by the decades that each gained for its cost.
+
+    The first solve is by multigrid. The other preconditioner is tried in the second one. It is tried again ``AGED`` solves
+    after the last trial, or sooner if it has gained more for its cost than this one. Solves of different matrices differ, so
+    both are means, in which a solve counts 1/e after ``AGED`` others. A solve that is cut off, as a trial that costs twice as
+    much as the solve before, has gained nothing. The better one stays. A solve that ends at a negative curvature does not
+    count: its few iterations say nothing of the many that others take. An iteration with a cycle costs as much as ``cycle``
+    with diagonal blocks.
+    """
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def end(
+        # state in
+        solves: Solves,
+        # parameters
+        wanted: wp.array(dtype=wp.int32),
+        cycle: int,
+        # in and out
+        choice: ChoiceState,
+    ):
+        copy = wp.tid()
+        count = solves.iteration[copy]
+        first, last = solves.first[copy], solves.next_rz[copy]
+        if wanted[copy] == 0 or solves.negative[copy] == 1 or not (first > wp.float64(0.0) and last > wp.float64(0.0)):
+            return
+        now = choice.present[copy]
+        used = 1 - now[BLOCKS]
+        other = 1 - used
+        cost = wp.where(used == 1, cycle * (count + wp.static(SPARED)), count + 1)
+        past = FADE * choice.past[copy]
+        past[COSTS + used] += wp.float64(cost)
+        if count < solves.most[copy]:
+            past[GAINED + used] += wp.float64(0.5) * wp.log10(first / last)
+        choice.past[copy] = past
+        better = past[GAINED + used] * past[COSTS + other] > past[GAINED + other] * past[COSTS + used]
+        if now[TRIAL] == 1:
+            now[TRIAL] = 0
+            now[WAIT] = wp.static(AGED)
+            if not better:
+                now[BLOCKS] = used
+        else:
+            now[WAIT] -= 1
+            worse = past[GAINED + other] * past[COSTS + used] > past[GAINED + used] * past[COSTS + other]
+            if now[WAIT] <= 0 or worse:
+                now[TRIAL] = 1
+                now[BLOCKS] = used
+                now[LIMIT] = wp.where(other == 1, 2 * cost / cycle + 1, 2 * cost)
+        choice.present[copy] = now
+
+    return end
 
 
 @cache

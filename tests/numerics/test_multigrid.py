@@ -14,10 +14,10 @@ from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.linear import turn_and_multiply
 from warpcloth.kernels.multigrid import OMEGA, SPARED
 from warpcloth.kernels.term import HessianPolicy
-from warpcloth.numerics import minimise
 from warpcloth.numerics.interpolation import interpolations, neighbours
 from warpcloth.numerics.linear import ConjugateGradients
 from warpcloth.numerics.multigrid import COARSEST, Multigrid
+from warpcloth.numerics.preconditioner_choice import PreconditionerChoice
 
 FAN = wc.Mesh([[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, 1]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
 MESHES = {
@@ -93,7 +93,7 @@ def applied(multigrid, count, copies):
 def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels(device):
     """x ← x + S(b − Ax), coarse correction P(PᵀAP)⁻¹Pᵀ, sweep, by dense matrices; A has negative eigenvalues."""
     hessian = compressed(device)
-    multigrid = Multigrid(hessian, 100)
+    multigrid = Multigrid(hessian)
     multigrid.update()
     B, n = 2, hessian.per_copy
     cycles = applied(multigrid, n, B)
@@ -123,7 +123,7 @@ def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels(device):
 def test_coarse_matrices_are_products_with_the_interpolation(device):
     """PᵀAP of each copy, and on the coarsest level its inverse, in float64."""
     hessian = compressed(device)
-    multigrid = Multigrid(hessian, 100)
+    multigrid = Multigrid(hessian)
     multigrid.update()
     found = interpolations(
         hessian.model.rest_points,
@@ -149,29 +149,21 @@ def test_coarse_matrices_are_products_with_the_interpolation(device):
                 np.testing.assert_allclose(dense, A, atol=1e-10 * np.abs(A).max())
 
 
-def has_gained(multigrid, rates):
-    """Sets what diagonal blocks and multigrid have gained for their cost."""
-    multigrid._choice.gained.assign(rates)
-    multigrid._choice.costs.fill_(1.0)
-    multigrid._choice.rates.assign(rates)
+def set_choice(choice, blocks, gained, wait=1 << 30):
+    """Sets whether the next solve uses diagonal blocks, what these and multigrid gained for a cost of 1, and the next trial."""
+    present, past = choice.kept.values()
+    present.assign([[blocks, 0, 0, wait]])
+    past.assign([[*gained, 1.0, 1.0]])
 
 
-def keep(multigrid, used):
-    """Lets all solves use multigrid, or diagonal blocks."""
-    has_gained(multigrid, [0.0, 1e9] if used else [1e9, 0.0])
-    multigrid._choice.age.fill_(-1_000_000)
-    multigrid.used.fill_(int(used))
-
-
-def weighed(n, stiffness, device, used):
-    """Conjugate gradients after a solve to 1e-3 for the weight, at the start of ``hanging``; ``used`` prepares them."""
+def weighed(n, stiffness, device, make):
+    """Conjugate gradients after a solve to 1e-3 for the weight, at the start of ``hanging``; ``make`` makes them."""
     declared = scene("hanging", n=n, stiffness=stiffness)
     bent = declared.mesh.points + np.outer(np.sin(np.pi * declared.mesh.points[:, 0]), [0.0, 0.1, 0.0])
     model = replace(declared, positions=bent).build(device=device, dtype="float64")
     hessian = Hessian(model, HessianPolicy.CLAMP)
     hessian.assemble(model.positions, 240.0**2)
-    solver = ConjugateGradients(hessian, 10_000, Multigrid(hessian, 10_000))
-    used(solver)
+    solver = make(hessian)
     solver.tolerance.fill_(1e-3)
     b, x = model.vectors(), model.vectors()
     b.assign(model.mass.numpy()[:, None] * [0.0, -9.81, 0.0] * (model.inverse_mass.numpy() > 0.0)[:, None])
@@ -179,9 +171,19 @@ def weighed(n, stiffness, device, used):
     return solver
 
 
+def chosen(hessian):
+    """Conjugate gradients that choose their preconditioner."""
+    multigrid = Multigrid(hessian)
+    return ConjugateGradients(hessian, 10_000, multigrid, PreconditionerChoice(multigrid, 10_000))
+
+
 def iterations(n, stiffness, device, used):
     """Of such a solve by multigrid if ``used``, or else with diagonal blocks."""
-    return int(weighed(n, stiffness, device, lambda solver: keep(solver.multigrid, used)).iteration.numpy()[0])
+
+    def make(hessian):
+        return ConjugateGradients(hessian, 10_000, Multigrid(hessian) if used else None)
+
+    return int(weighed(n, stiffness, device, make).iteration.numpy()[0])
 
 
 @pytest.mark.parametrize("stiffness, most", [(1e3, 40), (1e5, 120)])
@@ -213,53 +215,64 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", slow_but(["hanging", "locked", "copies"], SCENES))
-def test_the_minimiser_does_not_depend_on_the_preconditioner(device, name, monkeypatch):
+def test_the_minimiser_does_not_depend_on_the_preconditioner(device, name):
     """After three frames, to the tolerance of Newton's iteration."""
     declared, build = SCENES[name]
-    found = {}
-    for used in (True, False):
-        monkeypatch.setattr(minimise, "LEAST", 200)
+    found = []
+    for blocks in (0, 1):
         stepper = wc.Newton(substeps=2, tolerance=1e-9).bind(declared.build(device=device, dtype="float64", **build))
-        keep(stepper.minimiser.linear.multigrid, used)
+        present, past = stepper.minimiser.kept.values()
+        present.assign([[blocks, 0, 0, 1 << 30]] * len(present))
+        past.assign([[blocks, 1.0 - blocks, 1.0, 1.0]] * len(past))
         for _ in range(3):
             stepper.frame()
-        assert int(stepper.minimiser.linear.multigrid.used.numpy()[0]) == used
-        found[used] = stepper.state.x.numpy()
-    np.testing.assert_allclose(found[True], found[False], atol=1e-8)
+        assert (present.numpy()[:, 0] == blocks).all()
+        found.append(stepper.state.x.numpy())
+    np.testing.assert_allclose(*found, atol=1e-8)
 
 
-def test_solves_choose_what_costs_less(device):
-    """Soft cloth in short steps needs few iterations with diagonal blocks; stiff cloth in long steps needs many."""
-    for stiffness, substeps, used in ((1.0, 64, 0), (1e5, 1, 1)):
-        stepper = wc.Newton(substeps=substeps).bind(
-            scene("hanging", n=24, stiffness=stiffness).build(device=device, dtype="float64")
-        )
+def test_each_copy_chooses_what_costs_less(device):
+    """Soft cloth in short steps needs few iterations with diagonal blocks; stiff cloth needs many. Bits are those of one."""
+    declared, stiffness = scene("hanging", n=24), [1.0, 1e5]
+
+    def ends(**build):
+        stepper = wc.Newton(substeps=8).bind(declared.build(device=device, dtype="float64", **build))
         for _ in range(2):
             stepper.frame()
-        assert int(stepper.minimiser.linear.multigrid.used.numpy()[0]) == used
+        first = stepper.state.x.numpy()
+        stepper.reset()
+        for _ in range(2):
+            stepper.frame()
+        assert (stepper.state.x.numpy() == first).all()
+        blocks = [bool(now[0]) for now in stepper.minimiser.kept["preconditioner"].numpy()]
+        return blocks, first.reshape(len(blocks), -1, 3)
+
+    blocks, both = ends(copies=2, vary={"Spring.stiffness": stiffness})
+    assert blocks == [True, False]
+    for k, one in enumerate(stiffness):
+        assert (ends(copies=1, vary={"Spring.stiffness": [one]})[1][0] == both[k]).all()
 
 
 @pytest.mark.parametrize("blocks, cycles", [(500, 5), (20, 40), (4000, 200)])
 def test_trials_cost_little(device, blocks, cycles):
     """Most of the gain of a solve comes early, so that a trial that is cut off looks good; it may not win."""
-    hessian = Hessian(scene("hanging", n=3).build(device=device), HessianPolicy.CLAMP)
-    solver = ConjugateGradients(hessian, 10_000, Multigrid(hessian, 10_000))
-    solves, choose, used, cycle = solver._solves, solver.multigrid.choose, solver.multigrid.used, 4
+    solver = chosen(Hessian(scene("hanging", n=3).build(device=device), HessianPolicy.CLAMP))
+    solves, cycle = solver._solves, 4
     solver.multigrid.cycle = cycle
+    choice = PreconditionerChoice(solver.multigrid, 10_000)
     solves.first.fill_(1.0)
     solves.tolerance.fill_(1e-3)
     wanted = wp.ones(1, dtype=wp.int32, device=device)
     total, count = 0, 300
     for _ in range(count):
-        multigrid = bool(used.numpy()[0])
-        if not multigrid:
-            solver.multigrid.limit(solves, wanted)
+        choice.launch_begin(solves, wanted)
+        multigrid = bool(choice.by_cycles.numpy()[0])
         needed = cycles if multigrid else blocks
         taken = min(needed, int(solves.most.numpy()[0]))
         solves.iteration.fill_(taken)
         solves.next_rz.fill_(10.0 ** (-3.0 * np.sqrt(taken / needed)))
         total += cycle * (taken + SPARED) if multigrid else taken + 1
-        choose(solves)
+        choice.launch_end(solves, wanted)
     best = min(blocks + 1, cycle * (cycles + SPARED))
     assert total <= 1.1 * count * best
 
@@ -267,32 +280,31 @@ def test_trials_cost_little(device, blocks, cycles):
 def test_diagonal_blocks_stop_where_multigrid_costs_less(device):
     """Three decades cost multigrid 30 iterations with diagonal blocks; these may take half as many more, and lose."""
 
-    def use(solver):
-        solver._solves.most.zero_()
-        solver.multigrid.used.zero_()
-        has_gained(solver.multigrid, [1.0, 0.1])
+    def make(hessian):
+        solver = chosen(hessian)
+        set_choice(solver.choice, 1, [1.0, 0.1])
+        return solver
 
     assert iterations(16, 1e5, device, False) > 60
-    solver = weighed(16, 1e5, device, use)
+    solver = weighed(16, 1e5, device, make)
     assert int(solver.iteration.numpy()[0]) == 45
-    assert int(solver.multigrid.used.numpy()[0]) == 1
+    assert solver.choice.kept["preconditioner"].numpy()[0, 0] == 0
 
 
 def test_a_negative_curvature_changes_no_choice(device):
-    """A solve that it ends early has no rate; the coarse matrices are computed again for the matrix that follows."""
-    hessian, rates = compressed(device, copies=1), [1e-3, 1e-3]
+    """A solve that it ends early has no rate."""
+    hessian = compressed(device, copies=1)
     model = hessian.model
     hessian.assemble(model.positions, 7e5)
-    solver = ConjugateGradients(hessian, 1000, Multigrid(hessian, 1000))
-    choice = solver.multigrid._choice
+    solver = chosen(hessian)
     solver.tolerance.fill_(1e-6)
     b, x = (model.array(np.random.default_rng(k).normal(size=(model.count, 3)), model.vec3) for k in range(2))
-    for used in (1, 0):
-        choice.used.fill_(used)
-        has_gained(solver.multigrid, rates)
+    for blocks in (0, 1):
+        set_choice(solver.choice, blocks, [1e-3, 1e-3], wait=1)
+        before = [array.numpy().tolist() for array in solver.choice.kept.values()]
         solver.solve(b, x, wp.ones(1, dtype=wp.int32, device=device))
-        assert solver.negative.numpy()[0] == 1 and choice.used.numpy()[0] == used
-        assert (choice.rates.numpy() == rates).all() and choice.outdated.numpy()[0] == 1
+        assert solver.negative.numpy()[0] == 1
+        assert [array.numpy().tolist() for array in solver.choice.kept.values()] == before
 
 
 def test_kernels_of_both_devices_build_for_the_cpu():

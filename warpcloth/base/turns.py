@@ -4,8 +4,9 @@ Graph capture, loaded modules and kernel overloads belong to the whole process. 
 wrong arrays or crash. So every call that captures, launches or allocates holds the lock: building a model, binding, each step
 or frame, each solve of :class:`warpcloth.Arap`, each measure of a frame, :func:`warpcloth.equilibrium`, :func:`warpcloth.svd`
 and the like. Several calls of :func:`warpcloth.simulate` alternate frame by frame. Work between frames, such as writing a file
-or calling ``progress``, does not hold it. The lock is re-entrant. Other libraries that use Warp in this process do not take it. Nor does
-``numpy()`` of an array on CUDA, which sets another stream for the device meanwhile: a capture in another thread would fail.
+or calling ``progress``, does not hold it. The lock is re-entrant. Other libraries that use Warp in this process do not take
+it. Nor does ``numpy()`` of an array on CUDA, which sets another stream for the device meanwhile, so that a capture in another
+thread fails.
 """
 
 import os

@@ -23,7 +23,7 @@ AT_ONCE = 4
 class ConjugateGradients:
     """Solves A x = b for each copy by conjugate gradients.
 
-    The preconditioner P is the inverse diagonal blocks, or a cycle of ``multigrid`` where solves take less work with it.
+    The preconditioner P is the inverse diagonal blocks, a cycle of ``multigrid``, or for each copy what a ``choice`` says.
     It runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) has fallen to its tolerance times the first
     value, or at a direction of negative curvature. In that case x is still a descent direction of ½xᵀAx − bᵀx, and ``negative``
     is 1 (Steihaug 1983).
@@ -33,6 +33,7 @@ class ConjugateGradients:
             ``invert_diagonal``, such as :class:`warpcloth.core.hessian.Hessian`. ``block_rows`` is None if it has none.
         iterations: Maximum number of iterations of one solve.
         multigrid: A :class:`warpcloth.numerics.multigrid.Multigrid` of the matrix, or None.
+        choice: A :class:`warpcloth.numerics.preconditioner_choice.PreconditionerChoice`, or None.
 
     Attributes:
         iteration: Number of iterations of the last solve, (B,) int32.
@@ -40,9 +41,9 @@ class ConjugateGradients:
 
     capturable = True
 
-    def __init__(self, matrix, iterations, multigrid=None):
+    def __init__(self, matrix, iterations, multigrid=None, choice=None):
         model = self.model = matrix.model
-        self.matrix, self.multigrid = matrix, multigrid
+        self.matrix, self.multigrid, self.choice = matrix, multigrid, choice
         matrix.prepare()
 
         def per_unknown(dtype):
@@ -57,7 +58,8 @@ class ConjugateGradients:
         for name in ("rz", "next_rz", "first", "tolerance"):
             setattr(solves, name, model.scalars())
         solves.proceed = wp.zeros(1, dtype=wp.int32, device=model.device)
-        solves.most = wp.full(1, iterations, dtype=wp.int32, device=model.device)
+        solves.most = model.scalars(wp.int32)
+        solves.most.fill_(iterations)
         self.active, self.negative, self.tolerance = solves.active, solves.negative, solves.tolerance
         self.iteration = solves.iteration
 
@@ -74,32 +76,52 @@ class ConjugateGradients:
                 self._other = per_unknown(matrix.vector)
         self._row_threads, self._row_dim, self._pq_parts = lanes.count, lanes.dim, lanes.parts()
 
+    def outdate(self):
+        """Launches that the next solve with coarse matrices computes them again."""
+        if self.choice is not None:
+            self.choice.launch_outdated()
+
+    def update(self):
+        """Launches the preconditioner of :meth:`solve_again` for the present A."""
+        if self.multigrid is None:
+            self.matrix.invert_diagonal(self.preconditioner)
+        else:
+            self.multigrid.update()
+
     def solve(self, b, x, wanted):
         """Solves for x = A⁻¹ b to the relative ``tolerance`` (B,), for the copies that are ``wanted`` (B,); others keep x."""
-        given = {"b": b, "x": x, "wanted": wanted}
-        if self.multigrid is None:
-            self._solve_with_blocks(**given)
-        else:
-            wp.capture_if(self.multigrid.used, self._solve_with_cycles, self._solve_with_blocks, **given)
-            self.multigrid.choose(self._solves)
+        choice = self.choice
+        if choice is None:
+            self.update()
+            self.solve_again(b, x, wanted)
+            return
+        self.negative.zero_()
+        choice.launch_begin(self._solves, wanted)
+        wp.capture_if(choice.any_blocks, self._solve_with_blocks, b=b, x=x, wanted=choice.by_blocks)
+        wp.capture_if(choice.any_cycles, self._solve_with_cycles, b=b, x=x, wanted=choice.by_cycles)
+        choice.launch_end(self._solves, wanted)
 
-    def outdate(self):
-        """Launches that the next solve with multigrid computes all of it again."""
-        if self.multigrid is not None:
-            self.multigrid.outdate()
+    def solve_again(self, b, x, wanted):
+        """As :meth:`solve`, with the preconditioner of the last :meth:`update`."""
+        self.negative.zero_()
+        self._solve_as_updated(b, x, wanted, self.multigrid is not None)
 
     def _solve_with_blocks(self, b, x, wanted):
         self.matrix.invert_diagonal(self.preconditioner)
-        if self.multigrid is not None:
-            self.multigrid.limit(self._solves, wanted)
-        self._launch_start(b, x, wanted)
-        wp.capture_while(self._solves.proceed, self._iterate, x=x, count=self._at_once)
+        self._solve_as_updated(b, x, wanted, False)
 
     def _solve_with_cycles(self, b, x, wanted):
-        self.multigrid.update()
+        self.multigrid.update_sweeps()
+        wp.capture_if(self.choice.any_due, self.multigrid.update_coarse, due=self.choice.due)
+        self._solve_as_updated(b, x, wanted, True)
+
+    def _solve_as_updated(self, b, x, wanted, refine):
         self._launch_start(b, x, wanted)
-        self._refine(wanted)
-        wp.capture_while(self._solves.proceed, self._iterate, x=x, count=min(self._at_once, 2), refine=True)
+        count = self._at_once
+        if refine:
+            self._refine(wanted)
+            count = min(count, 2)
+        wp.capture_while(self._solves.proceed, self._iterate, x=x, count=count, refine=refine)
 
     def _launch_start(self, b, x, wanted):
         given = [self.preconditioner, b, wanted, self.matrix.per_copy, self._lanes]
@@ -110,7 +132,7 @@ class ConjugateGradients:
         self.multigrid.refine(self.r, self.z, active)
         self._launch_dot(self.r, self.z, active, self._parts)
 
-    def _iterate(self, x, count, refine=False):
+    def _iterate(self, x, count, refine):
         """Launches ``count`` iterations, an even number if directions have two arrays that take turns."""
         for k in range(count):
             before, p = (self._other, self.p) if k % 2 else (self.p, self._other)
@@ -159,6 +181,9 @@ class Factorised:
         self.values = Mirror(hessian.values)
         self.negative, self.tolerance = model.scalars(wp.int32), model.scalars()
         self._mirrors = {}
+
+    def outdate(self):
+        """Does nothing: each solve factorises."""
 
     def solve(self, b, x, wanted):
         """Solves for x = A⁻¹ b in float64; 0 if A is singular or not finite. Copies that are not ``wanted`` keep x."""

@@ -15,6 +15,7 @@ from ..kernels.term import HessianPolicy
 from ..kernels.terms.air import AIR
 from .linear import ConjugateGradients, Factorised
 from .multigrid import LEAST, Multigrid
+from .preconditioner_choice import PreconditionerChoice
 from .search import Search
 
 POLICIES = {
@@ -70,6 +71,7 @@ class Minimiser:
     Attributes:
         correction: d (N,) [m].
         residual: The largest unbalanced acceleration of each copy divided by ``scale``, (B,), after :meth:`minimise`.
+        kept: Arrays (B,) by name that one :meth:`minimise` passes to the next, besides ``last``.
         scale: The acceleration by which the residual of each copy is divided, (B,) [m/s²], as last given.
         iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
@@ -83,10 +85,12 @@ class Minimiser:
         self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
         if linear == "cg":
-            multigrid = Multigrid(self.hessian, linear_iterations) if model.per_copy >= LEAST else None
-            self.linear = ConjugateGradients(self.hessian, linear_iterations, multigrid)
+            multigrid = Multigrid(self.hessian) if model.per_copy >= LEAST else None
+            choice = multigrid and PreconditionerChoice(multigrid, linear_iterations)
+            self.linear = ConjugateGradients(self.hessian, linear_iterations, multigrid, choice)
+            self.kept = choice.kept if choice else {}
         else:
-            self.linear = Factorised(self.hessian)
+            self.linear, self.kept = Factorised(self.hessian), {}
         self.right = model.vectors()
         lanes = self.search.lanes
         self._roundings = lanes.parts(3)
@@ -221,6 +225,7 @@ class Minimiser:
         if self.warm:
             wp.copy(self.right, self.correction)
         self.clear()
+        self.linear.outdate()
         self._progress.proceed.zero_()
         given = [self.search.acceleration, self._limits]
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])

@@ -141,21 +141,19 @@ def _sums(values, offsets):
 class Multigrid:
     """Approximates A⁻¹ in each copy by a V-cycle with a Jacobi sweep before and one after the coarser levels.
 
-    The coarse matrices are PᵀAP (Galerkin) with P of :mod:`warpcloth.numerics.interpolation`. They are computed again after
-    :meth:`outdate`, or if a solve was slow. The result is symmetric and positive definite for every A, so conjugate gradients
-    may use it even if A is indefinite.
+    The coarse matrices are PᵀAP (Galerkin) with P of :mod:`warpcloth.numerics.interpolation`. The result is symmetric and
+    positive definite for every A, so conjugate gradients may use it even if A is indefinite.
 
     Args:
         hessian: A, a :class:`warpcloth.core.hessian.Hessian`.
-        iterations: Maximum number of iterations of one solve.
 
     Attributes:
         sweep: S of the finest level (N,). The first sweep is z = S r, which the caller does.
         sizes: Vertices of each level of a copy, finer ones first.
-        used: Whether the next solve uses multigrid, (1,) int32 on the device.
+        cycle: The cost of an iteration with a cycle over that of one with diagonal blocks.
     """
 
-    def __init__(self, hessian, iterations):
+    def __init__(self, hessian):
         model = self.model = hessian.model
         self.hessian, n = hessian, model.per_copy
         blocks = len(hessian.columns) // model.copies
@@ -176,15 +174,7 @@ class Multigrid:
         self.sweep = self._levels[0].sweep
         self._factor = wp.zeros(model.count, dtype=model.mat33, device=model.device)
         self._further = None if hessian.apart is None else model.vectors()
-        self._choice, self._iterations = kernels.PreconditionerChoice(), iterations
-        choice = self._choice
-        choice.used, choice.outdated, choice.fresh = (wp.ones(1, dtype=wp.int32, device=model.device) for _ in range(3))
-        choice.progress = wp.zeros(1, dtype=wp.float64, device=model.device)
-        for name in ("rates", "gained", "costs"):
-            setattr(choice, name, wp.zeros(2, dtype=wp.float64, device=model.device))
-        choice.trial, choice.count = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
-        choice.age = wp.full(1, kernels.AGED, dtype=wp.int32, device=model.device)
-        self.used, self.cycle = choice.used, self._cost_of_cycle()
+        self.cycle = self._cost_of_cycle()
 
     def _make_kernels(self):
         model = self.model
@@ -193,9 +183,11 @@ class Multigrid:
         of_matrix = kernels.list_multiples, kernels.multiply_by_transfers, kernels.factorise_diagonal, kernels.scale_sweeps
         products = kernels.subtract_product, kernels.sweep_after
         of_vectors = kernels.eliminate, kernels.restrict, kernels.prolong
-        choices = kernels.find_slots, kernels.measure_progress, kernels.choose, kernels.limit_iterations
         self._launch = model.launcher(
-            ((*of_matrix, *of_vectors), model.dtype), (products, model.dtype, block), ((multiply,), model.dtype), (choices,)
+            ((*of_matrix, *of_vectors), model.dtype),
+            (products, model.dtype, block),
+            ((multiply,), model.dtype),
+            ((kernels.find_slots,),),
         )
         self._launch_finest, terms = self._launch, self.hessian.terms_in_rows
         if terms:
@@ -216,23 +208,24 @@ class Multigrid:
         return max(round((plain + products + vectors + launches * launch) / plain), 1)
 
     def update(self):
-        """Launches the sweeps of the finest level for the present A, and the coarse matrices if they are ``outdated``."""
-        self._set_sweeps(self._levels[0], PAIRED if self.hessian.dynamic else 1.0)
-        if self._transfers:
-            wp.capture_if(self._choice.outdated, self._update_coarse)
+        """Launches the sweeps and the coarse matrices for the present A."""
+        self.update_sweeps()
+        self.update_coarse(None)
 
-    def outdate(self):
-        """Launches that the next :meth:`update` computes the coarse matrices."""
-        self._choice.outdated.fill_(1)
+    def update_sweeps(self):
+        """Launches the sweeps of the finest level for the present A."""
+        self._set_sweeps(self._levels[0], PAIRED if self.hessian.dynamic else 1.0, None)
 
-    def choose(self, solves):
-        """Launches the choice whether the next solve uses multigrid, see :func:`warpcloth.kernels.multigrid.choose`."""
-        self._launch(kernels.measure_progress, self.model.copies, [solves], [self._choice])
-        self._launch(kernels.choose, 1, [self._iterations, self.cycle], [solves, self._choice])
-
-    def limit(self, solves, wanted):
-        """Launches the limit of iterations of a solve with diagonal blocks, see `limit_iterations` of the kernels."""
-        self._launch(kernels.limit_iterations, self.model.copies, [wanted, self._iterations], [solves, self._choice])
+    def update_coarse(self, due):
+        """Launches the coarse matrices for the present A in the copies that are ``due`` (B,), or in all if that is None."""
+        B = self.model.copies
+        for finer, level, transfer in zip(self._levels, self._levels[1:], self._transfers, strict=False):
+            given = [*transfer.sums, transfer.blocks, finer.values, due, len(finer.values) // B, len(level.values) // B]
+            self._launch(kernels.multiply_by_transfers, (B, len(transfer.blocks)), given, [level.values])
+            if level is not self._levels[-1] or not self._dense:
+                self._set_sweeps(level, 1.0, due)
+        if self._dense:
+            self._invert(self._levels[-1], due)
 
     def refine(self, r, z, active):
         """Launches the rest of a cycle: from z = S r to z ≈ A⁻¹ r, in the copies that are ``active`` (B,)."""
@@ -269,29 +262,18 @@ class Multigrid:
             self.hessian.apart.add_products(x, self._further, active)
         return self._launch_finest, self._further
 
-    def _update_coarse(self):
-        B = self.model.copies
-        for finer, level, transfer in zip(self._levels, self._levels[1:], self._transfers, strict=False):
-            given = [*transfer.sums, transfer.blocks, finer.values, len(finer.values) // B, len(level.values) // B]
-            self._launch(kernels.multiply_by_transfers, (B, len(transfer.blocks)), given, [level.values])
-            if level is not self._levels[-1] or not self._dense:
-                self._set_sweeps(level, 1.0)
-        if self._dense:
-            self._invert(self._levels[-1])
-        self._choice.fresh.fill_(-1)
-
-    def _set_sweeps(self, level, own):
+    def _set_sweeps(self, level, own, due):
         count = self.model.copies * level.n
         factor = self._factor[:count]
-        self._launch(kernels.factorise_diagonal, count, [level.diagonal, level.values], [factor])
-        given = [level.offsets, level.columns, level.values, factor, own]
+        self._launch(kernels.factorise_diagonal, count, [level.diagonal, level.values, due, level.n], [factor])
+        given = [level.offsets, level.columns, level.values, factor, due, level.n, own]
         self._launch(kernels.scale_sweeps, count, given, [level.sweep])
 
-    def _invert(self, level):
+    def _invert(self, level, due):
         """Launches the inversion of the dense matrices of the coarsest level."""
         before, after = level.values, self._other
         for p in range(level.n):
-            self._launch(kernels.eliminate, (self.model.copies, level.n, level.n), [before, p, level.n], [after])
+            self._launch(kernels.eliminate, (self.model.copies, level.n, level.n), [before, due, p, level.n], [after])
             before, after = after, before
         if before is not level.values:
             wp.copy(level.values, before)

@@ -65,14 +65,6 @@ class PrimalMatrix(BlockMatrix):
         self.launch_locks()
 
 
-class _Cycles(Multigrid):
-    """Multigrid that all solves use, so that a solve does not depend on those before it."""
-
-    def choose(self, solves):
-        """Launches that the coarse matrices stay until the next :meth:`outdate`."""
-        self._choice.outdated.zero_()
-
-
 class PrimalSolver:
     """Solves (J W Jᵀ + α̃)x = b of each copy, see the module.
 
@@ -92,7 +84,7 @@ class PrimalSolver:
     def __init__(self, constraints, iterations):
         model, self._constraints = constraints.model, constraints
         self.model, self._matrix = model, PrimalMatrix(constraints)
-        self._linear = ConjugateGradients(self._matrix, iterations, _Cycles(self._matrix, iterations))
+        self._linear = ConjugateGradients(self._matrix, iterations, Multigrid(self._matrix))
         self._sums = RowSums(model, constraints.per_copy)
 
         def rows(dtype=model.dtype):
@@ -123,7 +115,7 @@ class PrimalSolver:
         passes.softened.zero_()
         self._launch(kernels.set_penalties, constraints.count, given, [self._matrix.penalties, passes])
         self._matrix.assemble()
-        self._linear.outdate()
+        self._linear.update()
         given = [constraints.inverse, b, wanted, constraints.per_copy]
         self._launch(kernels.begin_rows, constraints.count, given, [x, self._r, self._one, passes])
         self._sums.sum(self._one, constraints.per_copy, passes.square)
@@ -147,7 +139,7 @@ class PrimalSolver:
             part.launch_transpose(z, force, active)
         self._launch(kernels.clear_pins, model.count, [model.inverse_mass], [force])
         model.lock(force)
-        self._linear.solve(force, y, active)
+        self._linear.solve_again(force, y, active)
         constraints.launch_apply(y, opposite, active)
         self._launch(kernels.pull_rows, count, [penalties, opposite, per_copy, passes], [z])
         constraints.multiply(z, q, active)

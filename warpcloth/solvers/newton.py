@@ -109,6 +109,8 @@ class NewtonStepper(ImplicitStepper):
         near = None if self.colliders is None else self.colliders.near
         given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "near": near, "last": last}
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, **given)
+        for name, array in self.minimiser.kept.items():
+            self.state.add(name, array)
         self.correction, self._scale = self.minimiser.correction, ResidualScale(model).acceleration
         self._predict = Segment(model.device, self.launch_prediction)
         self.ready()
