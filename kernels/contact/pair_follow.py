@@ -11,11 +11,15 @@ import warp as wp
 from ..memory import load
 from ..terms import contact
 from .pair_potential import Contacts
-from .self_friction import equal
 from .self_gaps import ONE, SIDE, ZERO
 from .self_pairs import module_of, near_pairs
 
 slope = contact.slope
+
+
+@wp.func
+def equal(s: wp.vec4i, q: wp.vec4i):
+    return s[0] == q[0] and s[1] == q[1] and s[2] == q[2] and s[3] == q[3]
 
 
 @cache

@@ -188,7 +188,8 @@ class Contacts:
 
     ``parts`` has the vertices of the surface between which a contact is. The stencil of its slot has those of the cloth, and
     the first of them with w = 0 in place of each obstacle. With obstacles there is the ``offset`` o = Σ wⱼXⱼ [m] of their
-    positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,).
+    positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,). Bit i of ``touching`` is 1 if wᵢ of
+    the parts is not 0.
 
     The ``share`` of a contact is the sum of m over its side of the vertex, divided by that of positive m. Sweeps compute this
     share of its force anew, and leave the rest ``fixed``, see :mod:`.pair_follow`.
@@ -207,6 +208,7 @@ class Contacts:
     code: wp.array(dtype=wp.int32)
     near: wp.array(dtype=wp.int32)
     parts: wp.array(dtype=wp.vec4i)
+    touching: wp.array(dtype=wp.int32)
     offset: wp.array(dtype=wp.vec3d)
     travel: wp.array(dtype=wp.vec3d)
     moves: wp.array(dtype=wp.vec3d)
@@ -307,6 +309,11 @@ def put_contact(dtype):
     ):
         gap = wp.length(y)
         contacts.parts[slot] = s
+        touching = wp.int32(0)
+        for i in range(4):
+            if w[i] != ZERO:
+                touching += 1 << i
+        contacts.touching[slot] = touching
         if pairs.layout.obstacles > 0:
             own = cloth_vertex(pairs.layout, s)
             o = wp.vec3d()

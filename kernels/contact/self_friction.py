@@ -5,8 +5,9 @@ n, kA and N = −kAφ′ times their share are those at the start of the step, a
 there. A step updates it, ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of
 a sliding pair slides along.
 
-ξ is stored relative to the edge between the last two vertices of a pair, so that it rotates with the cloth. A new pair starts
-with the mean ξ of the touching pairs between the same parts, which have a common vertex with it on each side.
+At the end of a step ξ turns about n with the edges of the pair, so that it rotates with the cloth. A pair takes the ξ of the
+contact between the same vertices, those of nonzero w, in the last step. Without one it takes the mean of those that the vertex
+had with a part of the same face, or else the mean of the contacts with a common vertex on each side.
 """
 
 from functools import cache, partial
@@ -27,8 +28,8 @@ from .self_pairs import near_pairs
 class RubbedPairs:
     """Values of contacts at the start of the step: n, w, kA [N/m], ε [m], the anchor a [m], and the vertices on the first side.
 
-    t is the direction of the edge of the last two vertices in the plane normal to n. ``parts`` are the vertices of the surface,
-    and ``travel`` the part of y that obstacles add by the end of the step, of which forces see the fraction ``ahead``.
+    ``parts`` are the vertices of the surface, −1 where w is 0. ``travel`` is the part of y that obstacles add by the end of the
+    step, of which forces see the fraction ``ahead``.
     """
 
     normal: wp.array(dtype=wp.vec3d)
@@ -37,30 +38,19 @@ class RubbedPairs:
     limit: wp.array(dtype=wp.float64)
     sides: wp.array(dtype=wp.int32)
     anchor: wp.array(dtype=wp.vec3d)
-    tangent: wp.array(dtype=wp.vec3d)
     parts: wp.array(dtype=wp.vec4i)
     travel: wp.array(dtype=wp.vec3d)
     ahead: wp.float64
 
 
+# ξ [m], kA [N/m], and the number of vertices on the first side, of a contact that the next step takes over.
+SLIP = wp.types.vector(5, wp.float64)
 MODULE = "warpcloth.self_friction"
 
 
 def friction_module(dtype, law=None):
     """Returns the name of the module of kernels, of those for a law if that is given."""
     return ".".join([MODULE, *([law.name] if law else []), dtype.__name__])
-
-
-@wp.func
-def edge_tangent(edge: wp.vec3d, n: wp.vec3d):
-    """Direction of an edge in the plane normal to n; 0 for an edge along n."""
-    t = edge - wp.dot(n, edge) * n
-    return t / wp.max(wp.length(t), wp.float64(1e-300))
-
-
-@wp.func
-def equal(s: wp.vec4i, q: wp.vec4i):
-    return s[0] == q[0] and s[1] == q[1] and s[2] == q[2] and s[3] == q[3]
 
 
 @wp.func
@@ -77,9 +67,78 @@ def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_la
     """Whether two sides, given by their ranges of corners, have a common vertex."""
     found = wp.bool(False)
     for i in range(s_first, s_last):
-        if has(q, s[i], q_first, q_last):
+        if s[i] >= 0 and has(q, s[i], q_first, q_last):
             found = True
     return found
+
+
+@wp.func
+def same_vertices(s: wp.vec4i, q: wp.vec4i, sides: int):
+    """Whether two contacts are between the same vertices on each side, in any order."""
+    found = wp.bool(True)
+    for i in range(4):
+        first = wp.where(i < sides, 0, sides)
+        last = wp.where(i < sides, sides, 4)
+        found = found and (s[i] < 0 or has(q, s[i], first, last)) and (q[i] < 0 or has(s, q[i], first, last))
+    return found
+
+
+@wp.func
+def joins(s: wp.vec4i, sides: int, i: int, j: int):
+    """Whether corners i < j of a pair are on one side, which has an edge between them."""
+    return (i < sides) == (j < sides)
+
+
+@cache
+def turned(dtype):
+    """Device function (layout, s, t, sides, n, u, start, moves, x) → u of a pair turned about n by the edges of its sides.
+
+    The turn from ``start`` to x is that which fits the edges best. ``moves`` are those of obstacles. s has −1 for vertices that
+    do not touch; t has all. A contact of two vertices has no edge but those of t.
+    """
+    vec3, _ = types(dtype)
+    _at, exact = vertex_of(dtype)
+
+    @wp.func
+    def turn(
+        layout: Layout,
+        s: wp.vec4i,
+        t: wp.vec4i,
+        sides: int,
+        n: wp.vec3d,
+        u: wp.vec3d,
+        start: wp.array(dtype=vec3),
+        moves: wp.array(dtype=wp.vec3d),
+        x: wp.array(dtype=vec3),
+    ):
+        q = s
+        some = wp.bool(False)
+        for i in range(4):
+            for j in range(i + 1, 4):
+                some = some or (joins(s, sides, i, j) and wp.min(s[i], s[j]) >= 0)
+        if not some:
+            q = t
+        cosine = ZERO
+        sine = ZERO
+        for i in range(4):
+            for j in range(i + 1, 4):
+                if joins(q, sides, i, j) and wp.min(q[i], q[j]) >= 0:
+                    before = exact(start[q[j]]) - exact(start[q[i]])
+                    after = before
+                    if q[i] < layout.cloth and q[j] < layout.cloth:
+                        after = exact(x[q[j]]) - exact(x[q[i]])
+                    elif q[i] >= layout.cloth and q[j] >= layout.cloth:
+                        after += moves[q[j] - layout.cloth] - moves[q[i] - layout.cloth]
+                    before -= wp.dot(n, before) * n
+                    cosine += wp.dot(before, after)
+                    sine += wp.dot(n, wp.cross(before, after))
+        size = wp.sqrt(cosine * cosine + sine * sine)
+        found = u
+        if size > ZERO:
+            found = (cosine * u + sine * wp.cross(n, u)) / size
+        return found
+
+    return turn
 
 
 @cache
@@ -161,7 +220,11 @@ def begin_friction(dtype, law: Law, bounded: bool):
         if limit == ZERO:
             return
         s = touching.stencils[e]
-        rubbed.parts[e] = contacts.parts[e]
+        parts = contacts.parts[e]
+        for i in range(4):
+            if (contacts.touching[e] & (1 << i)) == 0:
+                parts[i] = -1
+        rubbed.parts[e] = parts
         pairs.stencils[e] = s
         rubbed.limit[e] = limit
         if touching.layout.obstacles > 0:
@@ -179,9 +242,9 @@ def begin_friction(dtype, law: Law, bounded: bool):
 
 @cache
 def set_anchors(dtype, law: Law):
-    """Kernel over acting pairs at the start of a step: a and t; ξ is from ``kept`` of the last step, if there are ``steps``."""
+    """Kernel over acting pairs at the start of a step: a; ξ is from ``kept`` of the last step, if there are ``steps``."""
     vec3, _ = types(dtype)
-    (_at, exact), y_of, kept_of = vertex_of(dtype), difference_of(dtype), law.kept
+    y_of, kept_of = difference_of(dtype), law.kept
 
     @wp.kernel(module=friction_module(dtype, law), enable_backward=False)
     def set_anchor_of_pairs(
@@ -190,7 +253,7 @@ def set_anchors(dtype, law: Law):
         # state in
         x: wp.array(dtype=vec3),
         kept: near_pairs(dtype),
-        slips: wp.array(dtype=wp.vec4d),
+        slips: wp.array(dtype=SLIP),
         steps: wp.array(dtype=wp.int32),
         # in and out
         rubbed: RubbedPairs,
@@ -199,46 +262,50 @@ def set_anchors(dtype, law: Law):
         if turn >= pairs.number[0]:
             return
         e = pairs.acting[turn]
-        limit = rubbed.limit[e]
         s = rubbed.parts[e]
         n = rubbed.normal[e]
         sides = rubbed.sides[e]
         total = wp.vec3d()
         weight = ZERO
-        own = wp.bool(False)
-        side = wp.where(s[0] < pairs.layout.cloth, 0, sides)
-        end = wp.where(s[0] < pairs.layout.cloth, sides, 4)
-        if steps[copy_of(pairs.layout, s[0])] == 0:
-            end = side
-        while side < end:
-            side += 1
-            for j in range(kept.first[s[side - 1]], kept.first[s[side - 1] + 1]):
-                e_kept = kept.corners[j] // 4
-                kept_slip = slips[e_kept]
-                if kept_slip[2] > ZERO and not own:
-                    q = kept.stencils[e_kept]
-                    kept_sides = wp.int32(kept_slip[3])
+        best = wp.int32(0)
+        for i in range(4):
+            v = s[i]
+            if v < 0 or v >= pairs.layout.cloth:
+                continue
+            end = kept.first[v + 1]
+            if steps[copy_of(pairs.layout, v)] == 0:
+                end = 0
+            for j in range(kept.first[v], end):
+                code = kept.corners[j]
+                slip = slips[code // 4]
+                q = kept.stencils[code // 4]
+                if slip[3] > ZERO and q[code % 4] == v:
+                    kept_sides = wp.int32(slip[4])
                     # Some of the other pairs have their sides in the opposite order.
                     way = ZERO
                     if meet(s, 0, sides, q, 0, kept_sides) and meet(s, sides, 4, q, kept_sides, 4):
                         way = ONE
                     elif meet(s, 0, sides, q, kept_sides, 4) and meet(s, sides, 4, q, 0, kept_sides):
                         way = -ONE
+                    rank = wp.int32(0)
                     if way != ZERO:
-                        m = way * n
-                        t = edge_tangent(exact(x[q[3]]) - exact(x[q[2]]), m)
-                        stretch = way * (kept_slip[0] * t + kept_slip[1] * wp.cross(m, t))
-                        if kept_sides == sides and equal(s, q):
-                            own = True
-                            total = stretch
-                        else:
-                            weight += kept_slip[2]
-                            total += kept_slip[2] * stretch
-        if not own and weight > ZERO:
+                        rank = 1
+                        if sides == kept_sides and way > ZERO and same_vertices(s, q, sides):
+                            rank = 3
+                        elif sides == 1 and kept_sides == 1 and s[0] == q[0]:
+                            rank = 2
+                    if rank > best:
+                        best = rank
+                        weight = ZERO
+                        total = wp.vec3d()
+                    if rank > 0 and rank == best:
+                        weight += slip[3]
+                        total += slip[3] * way * wp.vec3d(slip[0], slip[1], slip[2])
+        if weight > ZERO:
             total = total / weight
-        total = kept_of(wp.length(total), limit) * total
+        total -= wp.dot(n, total) * n
+        total = kept_of(wp.length(total), rubbed.limit[e]) * total
         rubbed.anchor[e] = y_of(pairs.layout, pairs.stencils[e], rubbed.weights[e], x) - total
-        rubbed.tangent[e] = edge_tangent(exact(x[s[3]]) - exact(x[s[2]]), n)
 
     return set_anchor_of_pairs
 
@@ -291,12 +358,9 @@ def find_friction(dtype, law: Law):
 
 @cache
 def end_friction(dtype):
-    """Kernel over acting pairs at the end x of a step: values for the next step.
-
-    These are the components of ξ along t and n × t, kA, and the number of vertices on the first side.
-    """
+    """Kernel over acting pairs at the end x of a step: what the next step takes over."""
     vec3, _ = types(dtype)
-    y_of = difference_of(dtype)
+    y_of, turn_of = difference_of(dtype), turned(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def end_friction_of_pairs(
@@ -304,19 +368,21 @@ def end_friction(dtype):
         pairs: near_pairs(dtype),
         # state in
         rubbed: RubbedPairs,
+        start: wp.array(dtype=vec3),
+        moves: wp.array(dtype=wp.vec3d),
         x: wp.array(dtype=vec3),
         # out
-        slips: wp.array(dtype=wp.vec4d),
+        slips: wp.array(dtype=SLIP),
     ):
         turn = wp.tid()
         if turn >= pairs.number[0]:
             return
         e = pairs.acting[turn]
-        u = slip_from(pairs.layout, rubbed, e, y_of(pairs.layout, pairs.stencils[e], rubbed.weights[e], x), ONE)
-        t = rubbed.tangent[e]
-        slips[e] = wp.vec4d(
-            wp.dot(u, t), wp.dot(u, wp.cross(rubbed.normal[e], t)), rubbed.stiffness[e], wp.float64(rubbed.sides[e])
-        )
+        s = pairs.stencils[e]
+        sides = rubbed.sides[e]
+        u = slip_from(pairs.layout, rubbed, e, y_of(pairs.layout, s, rubbed.weights[e], x), ONE)
+        u = turn_of(pairs.layout, rubbed.parts[e], s, sides, rubbed.normal[e], u, start, moves, x)
+        slips[e] = SLIP(u[0], u[1], u[2], rubbed.stiffness[e], wp.float64(sides))
 
     return end_friction_of_pairs
 
@@ -373,7 +439,7 @@ def push_friction(dtype, law: Law):
 
 @cache
 def row_of_friction(dtype, law: Law):
-    """The ``row`` of friction: C = (u·t, u·(n × t)). Those of a sliding pair are of a softer spring with the same force."""
+    """The ``row`` of friction: C = (u·t, u·(n × t)), t normal to n. A sliding pair has a softer spring with the same force."""
     vec3, _ = types(dtype)
     slip_of, secant = slip_at(dtype), law.secant
 
@@ -383,8 +449,8 @@ def row_of_friction(dtype, law: Law):
         if rubbed.limit[e] > ZERO:
             u = slip_of(pairs, rubbed, e, x, d)
             found.weights = rubbed.weights[e]
-            found.first = rubbed.tangent[e]
-            found.second = wp.cross(rubbed.normal[e], rubbed.tangent[e])
+            found.first = perpendicular(rubbed.normal[e])
+            found.second = wp.cross(rubbed.normal[e], found.first)
             found.C = wp.vec2d(wp.dot(u, found.first), wp.dot(u, found.second))
             found.size = wp.length(u)
             found.stiffness = rubbed.stiffness[e] * secant(found.size, rubbed.limit[e])

@@ -298,18 +298,13 @@ BY_NATURE = {
     *((name, solver, "shuffled") for name in ("cone", "two sheets") for solver in SWEEPING),
 }
 REFUSED = {("rubbing sheets", solver) for solver in SWEEPING}
-MINIMISERS = ("newton", "projective dynamics", "admm", "constrained dynamics", "xpbd")
 AT_REST = (
     "pins are at rest before the start, for every observer, and air and explicit damping see that in the first step: 0.1 mm"
 )
-NEW_PAIRS = "friction of a new pair starts with a mean that its first side weights, and turns with one edge"
-# Failures of contact, and one of pins: scenes, solvers and relations, and why.
+# Scenes, solvers and relations that fail, and why.
 FAILING = (
     (["hanging"], ["explicit", "newton", "projective dynamics", "admm", "xpbd"], ["boosted"], AT_REST),
     (["two sheets", "rubbing sheets"], ["explicit"], ["boosted"], AT_REST),
-    (["rubbing sheets"], MINIMISERS, ["shuffled", "numbered anew"], f"{NEW_PAIRS}: 0.04 mm"),
-    (["cone"], MINIMISERS, ["mirrored"], f"{NEW_PAIRS}: 0.8 µm; without friction 2e-16 m"),
-    (["cone"], MINIMISERS[:4], ["shuffled"], f"{NEW_PAIRS}: 0.02 mm; without friction 4e-16 m"),
 )
 XFAILS = {
     (name, solver, relation): reason

@@ -63,7 +63,7 @@ class PairContact(DynamicElements):
         for name, size in acting_sizes(self.model, slots, self._corners).items():
             setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
         contacts = potential.Contacts()
-        for name, kind in (("weights", wp.vec4d), ("normal", wp.vec3d), ("code", wp.int32)):
+        for name, kind in (("weights", wp.vec4d), ("normal", wp.vec3d), ("code", wp.int32), ("touching", wp.int32)):
             setattr(contacts, name, wp.zeros(slots, dtype=kind, device=device))
         for name in ("gap", "distance", "stiffness", "share", "ratio", "fixed"):
             setattr(contacts, name, wp.zeros(slots, dtype=wp.float64, device=device))

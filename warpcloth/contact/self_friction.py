@@ -41,7 +41,7 @@ class Slips:
     def hold(self, room):
         """Allocates memory for ``room`` contacts, and keeps those that it has."""
         before, self.room = self.to_host() if "slips" in self._arrays else None, room
-        for (name, rows), dtype in zip(ROWS.items(), (wp.vec4i, wp.int32, wp.vec4d), strict=True):
+        for (name, rows), dtype in zip(ROWS.items(), (wp.vec4i, wp.int32, kernels.SLIP), strict=True):
             self._arrays[name] = wp.zeros(rows * room, dtype=dtype, device=self.model.device)
         if before is not None:
             self._write(before)
@@ -107,7 +107,7 @@ class SelfFriction(DynamicElements):
         ahead: The fraction of the step after which it evaluates forces.
 
     Attributes:
-        start: Positions at the start of the step, (N,) [m].
+        start: Positions at the start of the step, (V,) [m].
     """
 
     stored = True
@@ -118,7 +118,7 @@ class SelfFriction(DynamicElements):
         super().__init__(model, kernels.friction_of_pairs(law), wp.zeros(1, dtype=wp.int32, device=model.device))
         self._kept, self._steps, self._ahead = slips, steps, ahead
         self._friction = wp.array(friction, dtype=wp.float64, device=model.device)
-        self.start, self._step = model.vectors(), Slips(model, slips.room)
+        self.start, self._step = surface.vectors(), Slips(model, slips.room)
         self._vertices = Scan(model, model.count)
         self._launch = model.launcher(
             ((kernels.end_friction, fill_corners, sort_corners), model.dtype),
@@ -137,11 +137,10 @@ class SelfFriction(DynamicElements):
             setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=self.model.device))
         pairs.layout, slots = self.surface.layout, len(pairs.stencils)
         self.hold_pairs(pairs, kernels.RubbedPairs())
-        self.data.parts, self.data.ahead = pairs.stencils, self._ahead
+        self.data.parts, self.data.ahead = wp.zeros(slots, dtype=wp.vec4i, device=self.model.device), self._ahead
         if self.surface.obstacles:
-            self.data.parts = wp.zeros(slots, dtype=wp.vec4i, device=self.model.device)
             self.data.travel = self.room(wp.vec3d)
-        for name in ("normal", "anchor", "tangent"):
+        for name in ("normal", "anchor"):
             setattr(self.data, name, self.room(wp.vec3d))
         for name in ("stiffness", "limit"):
             setattr(self.data, name, self.room(wp.float64))
@@ -151,7 +150,7 @@ class SelfFriction(DynamicElements):
         """At the start of a step, at x (V,): takes the contacts there, and the slips of the last step."""
         model, kept = self.model, self._kept
         self.present.fill_(1)
-        wp.copy(self.start, x, count=model.count)
+        wp.copy(self.start, x)
         self.pairs.number.zero_()
         self.data.limit.zero_()
         self._launch(kernels.begin_friction, kept.room, [touching, contacts, self._friction], [self.pairs, self.data])
@@ -178,5 +177,7 @@ class SelfFriction(DynamicElements):
 
     def launch_end(self, x):
         """Stores the pairs of the step and the stretch of their springs at x, for the next step."""
-        self._launch(kernels.end_friction, self._kept.room, [self.pairs, self.data, x], [self._kept.slips])
+        moves = self.surface.moves_of_step if self.surface.obstacles else None
+        given = [self.pairs, self.data, self.start, moves, x]
+        self._launch(kernels.end_friction, self._kept.room, given, [self._kept.slips])
         self._kept.launch_lists(self.pairs, self.data.parts)
