@@ -1,0 +1,108 @@
+"""Sheets above one another, and what the pairs of their self-contact give at any positions."""
+
+import numpy as np
+
+import warpcloth as wc
+from warpcloth.contact.self_steps import SelfSteps
+from warpcloth.core.sums import Sums
+
+DENSITY, GRAVITY = 0.15, 9.81
+
+
+def turned(points, angle):
+    """Points (n, 3), turned about the y axis through their middle [rad], which goes to the origin."""
+    c, s = np.cos(angle), np.sin(angle)
+    return (points - points.mean(axis=0)) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def stack(count, n, size, gap=0.0, turn=0.0, shrink=1.0, **grid):
+    """A mesh of ``count`` square grids, each raised by ``gap`` over the last, turned by ``turn`` [rad] more, and smaller."""
+    sheet = wc.Mesh.grid(n, n, size=size, **grid)
+    points = [shrink**k * turned(sheet.points, turn * k) + [0.0, gap * k, 0.0] for k in range(count)]
+    return wc.Mesh(np.concatenate(points), np.concatenate([sheet.triangles + k * n * n for k in range(count)]))
+
+
+def layers(count=2, n=6, gap=0.02, speed=0.0, turn=0.0, distance=5e-3, stiffness=1e5, size=0.5, shrink=1.0, **fields):
+    """A :func:`stack`, ``turn`` in degrees, without gravity: the first sheet moves up at ``speed`` [m/s], the others down."""
+    velocities = np.zeros((count * n * n, 3))
+    velocities[:, 1] = np.where(np.arange(count * n * n) < n * n, speed, -speed)
+    given = {
+        "density": DENSITY,
+        "terms": [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)],
+        "velocities": velocities,
+        "gravity": np.zeros(3),
+        "fps": 24.0,
+        "duration": 1.0,
+        "self_contact": wc.SelfContact(distance=distance, stiffness=stiffness),
+    }
+    return wc.Scene(stack(count, n, size, gap, np.radians(turn), shrink), **given | fields)
+
+
+def rubbing(gap=2.2e-3, speed=0.05, friction=0.3, **fields):
+    """Two free sheets, pressed together at a gap below the contact distance of 5 mm, that rub against each other."""
+    velocities = np.where(np.arange(32)[:, None] < 16, speed, -speed) * [1.0, 0.0, 0.0]
+    contact = wc.SelfContact(distance=5e-3, stiffness=1e3, friction=friction)
+    return layers(n=4, gap=gap, turn=np.degrees(0.3), velocities=velocities, self_contact=contact, **fields)
+
+
+def slope(tangent, friction=0.3, layers=1, distance=2e-3, **fields):
+    """Free sheets of 3 × 3 vertices, each turned against the last, on two pinned triangles, in gravity that is tilted."""
+    angle, grid, ground = np.arctan(tangent), wc.Mesh.grid(3, 3, size=0.25), wc.Mesh.grid(2, 2, size=1.0)
+    weight = DENSITY * GRAVITY * np.cos(angle)
+    stiffness, y, points, triangles = 10.0 * DENSITY * GRAVITY / distance, 0.0, [ground.points], [ground.triangles]
+    for layer in range(layers):
+        y += distance - (layers - layer) * weight / stiffness  # where it rests
+        points.append(turned(grid.points, 0.3 * layer + 0.3) + ground.points.mean(axis=0) + [-0.2, y, 0.013])
+        triangles.append(grid.triangles + 4 + 9 * layer)
+    return wc.Scene(
+        wc.Mesh(np.concatenate(points), np.concatenate(triangles)),
+        density=DENSITY,
+        terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-4)],
+        pins=np.arange(4),
+        gravity=GRAVITY * np.array([np.sin(angle), -np.cos(angle), 0.0]),
+        fps=24.0,
+        self_contact=wc.SelfContact(distance=distance, stiffness=stiffness, friction=friction),
+        **fields,
+    )
+
+
+def pairs_of(scene, device, bounded=False, h=1.0 / 24.0, dtype="float64", **build):
+    """The :class:`SelfSteps` of a scene, in no solver; they begin at its positions."""
+    model = scene.build(device=device, dtype=dtype, **build)
+    state = wc.Explicit(substeps=1000, above_limit="allow").bind(model).state
+    pairs = SelfSteps(model, state, h, 1, bounded, None)
+    begin(pairs, scene.positions)
+    return pairs
+
+
+def begin(pairs, x):
+    """Begins a step at x (N, 3), with as much room as its pairs take."""
+    x = pairs.model.array(x, pairs.model.vec3)
+    pairs.launch_begin(x)
+    while pairs.overflowed:
+        pairs.grow()
+        pairs.launch_begin(x)
+
+
+def energy(pairs, x, term=None, stored=False):
+    """U [J] at x (N, 3) in the step that was begun last, with the contacts, or those of one term alone, found anew there."""
+    (term or pairs.forces).launch(pairs.model.array(x, pairs.model.vec3))
+    out = pairs.model.scalars()
+    pairs.forces.add_energy(Sums(pairs.model), out, stored=stored)
+    return out.numpy()[0]
+
+
+def gradient(pairs, x, term=None):
+    """∂U/∂x (N, 3) [N] at x (N, 3) in the step that was begun last, of all terms or of one."""
+    (term or pairs.forces).launch(pairs.model.array(x, pairs.model.vec3))
+    out = pairs.model.vectors()
+    (term or pairs.forces).add_gradient(out)
+    return out.numpy()
+
+
+def after_frames(scene, solver, frames=0, **build):
+    """A stepper after some frames."""
+    stepper = solver.bind(scene.build(**build))
+    for _ in range(frames):
+        stepper.frame()
+    return stepper
