@@ -1,6 +1,5 @@
 """Colliders: their shapes and motion, the energies of contact and friction, and that no step ends inside or crosses one."""
 
-import importlib
 import json
 from dataclasses import replace
 from functools import cache
@@ -12,6 +11,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.rows import slow_but
+from support.scenes import scene
 from support.shapes import Torus
 from warpcloth.cli import main
 from warpcloth.contact.clearance import Clearance
@@ -22,10 +22,9 @@ from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.lab.counts import launches_of
-from warpcloth.scenes import drape
+from warpcloth.usd import write_scene
 
 R = 1e-3
-SLOW = pytest.mark.slow
 TILTED = (0.18257419, 0.36514837, 0.54772256, 0.73029674)
 SHAPES = {
     "plane": wc.Plane(normal=(0.2, 1.0, 0.1), position=(0.0, -0.11, 0.0)),
@@ -84,42 +83,49 @@ def near(shape, count=50):
     return (points[good] + gaps[:, None] * normals[good])[:count]
 
 
+def beads(points, stiffness, mass=1e-3, **fields):
+    """Points that pairs of the softest springs join, so that contact alone moves them."""
+    return wc.Scene(
+        wc.Mesh(points, edges=np.arange(len(points)).reshape(-1, 2)),
+        masses=np.full(len(points), mass),
+        terms=[wc.Spring(stiffness=1e-9)],
+        contact=wc.Contact(distance=R, stiffness=stiffness),
+        **fields,
+    )
+
+
 def touching(shape):
     """A model of points about a collider, by the contact with which alone they have energy."""
-    points = near(shape)
-    mesh = wc.Mesh(points, edges=np.stack([np.arange(len(points) - 1), np.arange(1, len(points))], axis=1))
-    contact = wc.Contact(distance=R, stiffness=1e4)
-    scene = wc.Scene(mesh, masses=np.ones(len(points)), colliders=[SHAPES[shape]], contact=contact)
-    return scene.build(dtype="float64")
+    scene = beads(near(shape), 1e4, mass=1.0, colliders=[SHAPES[shape]])
+    return replace(scene, terms=[]).build(dtype="float64")
 
 
 @each_shape
 def test_gradient_and_hessian_are_derivatives(shape):
     """By central differences of 1e-8 m, of φ′ and φ″ that change over 1e-5 m and more."""
     model = touching(shape)
-    x, e = model.positions.numpy(), 1e-8
+    x, e, energy = model.positions.numpy(), 1e-8, Energy(model, Sums(model))
 
     def energies(x):
-        energy = Energy(model, Sums(model))
         energy.add(model.array(x, model.vec3), wp.zeros(1, dtype=wp.float64))
-        return energy.of_elements[0].numpy()
+        return energy.of_elements[0].numpy().copy()
 
     def gradients(x):
         out = model.vectors()
         Gradient(model).add(model.array(x, model.vec3), out)
         return out.numpy()
 
+    def slopes(f, axis):
+        return np.stack([(f(x + d) - f(x - d)) / (2.0 * e) for d in e * np.eye(3)], axis=axis)
+
     hessian = Hessian(model, policy=HessianPolicy.RAW)
     hessian.assemble(model.positions, 0.0)
-    blocks = hessian.values.numpy()[hessian.diagonal.numpy()]
-    slopes = np.stack([(energies(x + d) - energies(x - d)) / (2.0 * e) for d in e * np.eye(3)], axis=1)
-    curvatures = np.stack([(gradients(x + d) - gradients(x - d)) / (2.0 * e) for d in e * np.eye(3)], axis=2)
+    found, blocks = gradients(x), hessian.values.numpy()[hessian.diagonal.numpy()]
     gaps = SHAPES[shape].distances(x)
     smooth = (np.abs(gaps - R) > 2.0 * e) & (np.abs(gaps - 0.5 * R) > 2.0 * e)
     assert (gaps < 0.5 * R).sum() > 10 and ((gaps > 0.5 * R) & (gaps < R)).sum() > 10
-    found = gradients(x)
-    np.testing.assert_allclose(slopes, found, atol=1e-4 * np.abs(found).max())
-    np.testing.assert_allclose(curvatures[smooth], blocks[smooth], atol=1e-4 * np.abs(blocks).max())
+    np.testing.assert_allclose(slopes(energies, 1), found, atol=1e-4 * np.abs(found).max())
+    np.testing.assert_allclose(slopes(gradients, 2)[smooth], blocks[smooth], atol=1e-4 * np.abs(blocks).max())
 
 
 def local_steps(term):
@@ -279,17 +285,10 @@ def test_what_slides_stays_outside(what, dtype, device):
     """Points that go in all directions at 100 m/s, by 0.1 m a step, so that what slides along one surface meets another."""
     random = np.random.default_rng(0)
     points, velocities = random.uniform((-0.3, -0.4, -0.3), (0.3, 1.0, 0.3), size=(2000, 3)), random.normal(size=(300, 3))
+    velocities *= 100.0 / np.linalg.norm(velocities, axis=1)[:, None]
     walls = GROOVE if what == "groove of triangles" else SLIDING[what]  # an open mesh has no inside
     points = points[np.min([each.distances(points) for each in walls], axis=0) > 2.0 * R][:300]
-    scene = wc.Scene(
-        wc.Mesh(points, edges=np.arange(300).reshape(-1, 2)),
-        masses=np.full(300, 1e-3),
-        terms=[wc.Spring(stiffness=1e-9)],  # which have the kernels of other tests
-        velocities=100.0 * velocities / np.linalg.norm(velocities, axis=1)[:, None],
-        colliders=SLIDING[what],
-        contact=wc.Contact(distance=R, stiffness=1.0),
-        fps=1000.0,
-    )
+    scene = beads(points, 1.0, velocities=velocities, colliders=SLIDING[what], fps=1000.0)
     stepper = wc.Explicit(substeps=1).bind(scene.build(dtype=dtype, device=device))
     for step in range(1, 41):
         stepper.step()
@@ -326,155 +325,12 @@ def test_points_rest_on_a_shape_from_outside(name, device):
     off, angle = np.linspace(-0.04, 0.04, 12), np.linspace(0.0, 6.0, 12)
     height = np.sqrt(0.05**2 - off**2)
     points = np.stack([(0.15 + off) * np.cos(angle), height + 0.8 * R, (0.15 + off) * np.sin(angle)], axis=1)
-    scene = wc.Scene(
-        wc.Mesh(points, edges=np.arange(12).reshape(-1, 2)),
-        masses=np.full(12, 1e-3),
-        terms=[wc.Spring(stiffness=1e-9)],
-        pins=wc.Pins(np.arange(12), axes="xz"),
-        colliders=[Torus(radius=0.15, tube=0.05)],
-        contact=wc.Contact(distance=R, stiffness=1e6),
-        fps=60.0,
-        duration=1.0,
-    )
+    pins, torus = wc.Pins(np.arange(12), axes="xz"), Torus(radius=0.15, tube=0.05)
+    scene = beads(points, 1e6, pins=pins, colliders=[torus], fps=60.0, duration=1.0)
     upwards = height / 0.05
     gaps = R - 1e-3 * 9.81 / (1e6 * scene.contact_terms[0].areas * upwards)
     found = wc.simulate(scene, SOLVERS[name], dtype="float64", device=device).points[-1, :, 1]
     np.testing.assert_allclose((found - height) * upwards, gaps, atol=R / 500)
-
-
-def stretched(gravity, friction):
-    """A sheet in tension over a ball and on a plane, which it enters in the step that follows."""
-    grid = wc.Mesh.grid(8, 8, size=0.5)
-    x, _, z = grid.points.T
-    height = np.sqrt(np.maximum(0.2004**2 - (x - 0.25) ** 2 - (z - 0.25) ** 2, 0.0)) - 0.2
-    positions = np.stack([x, np.maximum(height, -0.1494), z], axis=1)
-    colliders = [
-        wc.Sphere(radius=0.2, position=(0.25, -0.2, 0.25), friction=friction),
-        wc.Plane(position=(0.0, -0.15, 0.0), friction=friction),
-    ]
-    return wc.Scene(
-        wc.Mesh(0.8 * grid.points, grid.triangles),
-        density=0.15,
-        terms=[wc.Spring(stiffness=20.0), wc.QuadraticBending(stiffness=1e-5)],
-        positions=positions,
-        velocities=np.tile([0.3, -0.2, 0.1], (64, 1)),
-        gravity=(0.0, -gravity, 0.0),
-        colliders=colliders,
-        contact=wc.Contact(distance=R, stiffness=1.47e4),
-    )
-
-
-def roofed(gravity, friction):
-    """A sheet in tension, bent along the two edges of a flat roof of triangles, on its top and slopes and on a plane.
-
-    Cloth that slides over many edges of a mesh, as over a ball, has several minima, 1e-4 m apart, and methods end at different
-    ones. Here it slides by up to 3 mm.
-    """
-    grid, slope = wc.Mesh.grid(8, 8, size=0.5), 0.1
-    x, _, z = grid.points.T
-    top, foot = 0.5 / 7.0 * 1.5, 1.0
-
-    def height(x):
-        return -slope * np.maximum(np.abs(x - 0.25) - top, 0.0)
-
-    corners = [(0.25 + side, height(0.25 + side), end) for side in (-foot, -top, top, foot) for end in (-0.2, 0.7)]
-    roof = trimesh.convex.convex_hull(corners)
-    return replace(
-        stretched(gravity, friction),
-        mesh=wc.Mesh(0.99 * grid.points, grid.triangles),
-        positions=np.stack([x, height(x) + 0.4 * R * np.hypot(1.0, slope), z], axis=1),
-        colliders=[
-            wc.MeshCollider(roof.vertices, roof.faces, friction=friction),
-            wc.Plane(position=(0.0, height(0.0), 0.0), friction=friction),
-        ],
-    )
-
-
-@cache
-def minimiser(gravity, friction, mesh=False, device="cpu", dtype="float64"):
-    """Where a step of Newton's method ends, which no vertex cuts in float64."""
-    scene = (roofed if mesh else stretched)(gravity, friction)
-    stepper = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised").bind(scene.build(device=device, dtype=dtype))
-    stepper.step()
-    assert dtype == "float32" or (stepper.cut[0] == 0.0 and stepper.results[0] in (Result.CONVERGED, Result.ROUNDED))
-    return stepper.state.x.numpy().copy()
-
-
-EXACT = {
-    "newton clamp": wc.Newton(substeps=1, tolerance=1e-12, hessian="clamp"),
-    "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-8, iterations=1000),
-    "xpbd": wc.XPBD(substeps=1, iterations=30_000),
-    "admm": wc.ADMM(substeps=1, tolerance=1e-9, iterations=20_000),
-    "constrained dynamics": wc.ConstrainedDynamics(substeps=1, tolerance=1e-9, iterations=60, linear="factorised"),
-}
-# Without acceleration projective dynamics takes hundreds of iterations, which differ by one kernel.
-PLAIN = {
-    "projective dynamics none": wc.ProjectiveDynamics(substeps=1, tolerance=1e-8, iterations=3000, acceleration="none"),
-}
-
-
-@pytest.mark.parametrize(
-    ("name", "gravity", "friction", "mesh"),
-    [
-        *slow_but(
-            [(name, 981.0, 0.3, False) for name in ("newton clamp", "xpbd")], [(name, 981.0, 0.3, False) for name in EXACT]
-        ),
-        *slow_but(
-            [("newton clamp", 250.0, 0.3, True)],
-            [(name, *load) for name in EXACT for load in [(300.0, 0.0, False), (250.0, 0.3, True)]],
-        ),
-        pytest.param("projective dynamics none", 981.0, 0.3, False, marks=SLOW),
-        *(pytest.param(name, 981.0, 30.0, False, marks=SLOW) for name in EXACT),
-    ],
-)
-def test_all_meet_at_one_minimiser(name, friction, gravity, mesh):
-    """1e-8 m, with gaps down to r/45, deep in the logarithmic range, sliding and, with a friction of 30, sticking.
-
-    Contact alone would move a vertex by 0.26 m in the step, beyond the middle of the ball, whose far side is then nearer.
-    """
-    scene, expected = (roofed if mesh else stretched)(gravity, friction), minimiser(gravity, friction, mesh)
-    stepper = (EXACT | PLAIN)[name].bind(scene.build(dtype="float64"))
-    stepper.step()
-    assert stepper.cut[0] == 0.0
-    gaps = np.min([collider.distances(expected) for collider in scene.colliders], axis=0)
-    assert (gaps < R).sum() > (50 if mesh else 30) and gaps.min() < R / 10.0
-    assert np.abs(stepper.state.x.numpy() - expected).max() < 1e-8
-
-
-@pytest.mark.parametrize("acceleration", slow_but(["l-bfgs"], ["chebyshev", "anderson", "l-bfgs"]))
-def test_iterations_of_projective_dynamics_lower_the_objective(acceleration, device):
-    """φ = ‖d‖²_M/2h² + U, deep in contact, where rough solutions alone raise it; to the rounding that a `Search` takes, √ε."""
-    solver = wc.ProjectiveDynamics(substeps=1, iterations=40, tolerance=1e-12, acceleration=acceleration)
-    stepper = solver.bind(stretched(981.0, 0.3).build(device=device, dtype="float64"))
-    energy_of, energy = Energy(stepper.model, stepper.sums, corrected=True), stepper.model.scalars()
-    measure, found = stepper.measure, []
-
-    def note():
-        d = stepper.correction.numpy()
-        energy.zero_()
-        energy_of.add(stepper.state.x, energy, stepper.correction)
-        found.append(energy.numpy()[0] + 0.5 * (stepper.model.mass.numpy()[:, None] * d**2).sum() / stepper.h**2)
-        return measure()
-
-    stepper.measure = note
-    stepper.step()
-    assert len(found) == 41 and (np.diff(found) <= 1.5e-8 * np.abs(found[:-1])).all() and found[-1] < 1e-3 * found[0]
-
-
-@pytest.mark.parametrize(
-    "name",
-    (
-        *("newton clamp", "xpbd", "admm"),
-        *(pytest.param(f"{each} dynamics", marks=SLOW) for each in ("projective", "constrained")),
-    ),
-)
-def test_all_meet_as_far_as_float32_allows(name, device):
-    """0.5 m are known to 3e-8 m, a gap of r/45 and its force to 1.4e-3: 4e-4 m of the 0.27 m that gravity moves in the step."""
-    most = {"newton clamp": 100, "projective dynamics": 100, "xpbd": 1000, "admm": 300, "constrained dynamics": 40}
-    stepper = replace(EXACT[name], iterations=most[name]).bind(stretched(981.0, 0.0).build(device=device, dtype="float32"))
-    stepper.step()
-    exact, rounded = (minimiser(981.0, 0.0, False, device, dtype) for dtype in ("float64", "float32"))
-    assert np.abs(stepper.state.x.numpy() - exact).max() < 4e-4 and np.abs(rounded - exact).max() < 4e-4
 
 
 @each_solver
@@ -539,16 +395,8 @@ def test_a_record_does_not_change_friction_on_a_mesh():
     corners = np.array([[-2.0, 0.0, -2.0], [2.0, 0.0, -2.0], [2.0, 0.0, 2.0], [-2.0, 0.0, 2.0]])
     widening = [corners * [1.0 + 0.02 * frame, 1.0, 1.0] for frame in range(13)]
     floor = wc.MeshCollider(widening, [[0, 2, 1], [0, 3, 2]], friction=0.5)
-    grid = wc.Mesh.grid(4, 4, size=0.3)
-    scene = wc.Scene(
-        grid,
-        density=0.15,
-        terms=[wc.Spring(stiffness=100.0)],
-        positions=grid.points + np.array([0.2, 0.03, 0.0]),
-        colliders=[floor],
-        contact=wc.Contact(distance=R, stiffness=1e5),
-        duration=0.2,
-    )
+    contact = wc.Contact(distance=R, stiffness=1e5)
+    scene = falling([floor], speed=0.0, height=0.03, n=4, fps=60.0, duration=0.2, contact=contact)
     solver = wc.XPBD(substeps=4, iterations=5)
     plain, recorded = (wc.simulate(scene, solver, record=record) for record in ((), "energies"))
     assert (plain.points == recorded.points).all() and plain.points[-1, :, 1].max() < 0.03
@@ -560,7 +408,7 @@ def test_sweeps_over_lists_are_those_over_all(device):
     if device != "cpu":
         pytest.skip("lists are for one thread of the CPU")
     record = wc.XPBD(substeps=2, iterations=20)
-    steppers = [record.bind(drape.scene(n=10).build(threads=threads)) for threads in (1, 2)]
+    steppers = [record.bind(scene("drape", n=10).build(threads=threads)) for threads in (1, 2)]
     busy = [each[3] for each in steppers[0].sweep._lists if each]
     assert len(busy) == 4 and not any(steppers[1].sweep._lists)
     for _ in range(14):
@@ -591,18 +439,8 @@ def test_what_falls_again_leaves_its_anchors(name, monkeypatch):
 @pytest.mark.parametrize("integrator", slow_but(["bdf2"], ["euler", "midpoint", "bdf2"]))
 def test_a_plane_that_moves_carries_a_sheet(integrator):
     """After half a second by 0.2 m/s the sheet goes as fast as the plane, and has not left it."""
-    frames = 60
-    moving = wc.Plane(friction=0.5, position=[(0.2 * k / 60.0, 0.0, 0.0) for k in range(frames + 1)])
-    grid = wc.Mesh.grid(3, 3, size=0.1)
-    scene = wc.Scene(
-        grid,
-        density=0.15,
-        terms=[wc.Spring(stiffness=1000.0)],
-        positions=grid.points + np.array([0.0, 0.9e-3, 0.0]),
-        colliders=[moving],
-        contact=wc.Contact(distance=R, stiffness=10.0 * 0.15 * 9.81 / R),
-        duration=1.0,
-    )
+    moving = wc.Plane(friction=0.5, position=[(0.2 * k / 60.0, 0.0, 0.0) for k in range(61)])
+    scene = falling([moving], speed=0.0, height=0.9e-3, n=3, stiffness=1000.0, fps=60.0, duration=1.0)
     animation = wc.simulate(scene, wc.Newton(substeps=4, integrator=integrator, tolerance=1e-6), dtype="float64")
     assert animation.status.ok
     tail = (animation.points[-1] - animation.points[30]).mean(axis=0) / 0.5
@@ -666,53 +504,44 @@ def test_resets_into_colliders_are_refused(threads, device):
     assert not stepper.inside and np.isfinite(stepper.state.x.numpy()).all()
 
 
-def test_an_equilibrium_rests_on_a_plane():
-    scene = falling([wc.Plane()], n=3, height=0.9e-3)
-    rest = wc.equilibrium(scene)
-    assert rest.status.ok
-    np.testing.assert_allclose(rest.points[:, 1], R - 0.15 * 9.81 / scene.contact.stiffness, rtol=1e-6)
+GRID = wc.Mesh.grid(5, 5, size=4.0)
+# Shapes, meshes of them, and how far these are from the shape at most: of a ball the sagitta of a circumscribed circle, L/√3.
+FINE = trimesh.creation.icosphere(subdivisions=4, radius=0.2)
+SAGITTA = FINE.edges_unique_length.max() ** 2 / (6.0 * 0.2)
+MESHED = {
+    "plane": (wc.Plane(), wc.MeshCollider(GRID.points - [1.75, 0.0, 1.75], GRID.triangles), 0.0),
+    "box": (
+        wc.Box(size=(0.2, 0.1, 0.3), position=(0.25, -0.1, 0.25)),
+        wc.MeshCollider(CUBE.vertices, CUBE.faces, position=(0.25, -0.1, 0.25)),
+        0.0,
+    ),
+    "ball": (
+        wc.Sphere(radius=0.2, position=(0.25, -0.205, 0.25)),
+        wc.MeshCollider(FINE.vertices, FINE.faces, position=(0.25, -0.205, 0.25)),
+        SAGITTA,
+    ),
+}
 
 
-def meshed(shape):
-    """A collider as triangles, and how far these are from its surface at most."""
-    if isinstance(shape, wc.Sphere):
-        ball = trimesh.creation.icosphere(subdivisions=4, radius=shape.radius)
-        sagitta = ball.edges_unique_length.max() ** 2 / (6.0 * shape.radius)  # of a circumscribed circle, L/√3 in radius
-        return wc.MeshCollider(ball.vertices, ball.faces, position=shape.position), sagitta
-    if isinstance(shape, wc.Box):
-        box = trimesh.creation.box(shape.size)
-        return wc.MeshCollider(box.vertices, box.faces, position=shape.position), 0.0
-    grid = wc.Mesh.grid(5, 5, size=4.0)
-    return wc.MeshCollider(grid.points - [1.75, 0.0, 1.75], grid.triangles), 0.0
+@pytest.mark.parametrize("name", MESHED)
+def test_an_equilibrium_on_a_mesh_is_that_on_its_shape(name):
+    """A sheet that lies on it, at r − w/k, or hangs over it by its corners.
 
-
-@pytest.mark.parametrize(
-    ("shape", "height", "pins"),
-    [
-        pytest.param(wc.Plane(), 0.02, None, id="plane"),
-        pytest.param(wc.Box(size=(0.2, 0.1, 0.3), position=(0.25, -0.1, 0.25)), 0.0, [0, 6, 42, 48], id="box"),
-    ],
-)
-def test_an_equilibrium_on_a_mesh_is_that_on_its_shape(shape, height, pins):
-    """A sheet that lies on it, or hangs over it by its corners."""
-    mesh, off = meshed(shape)
-    fields = {"n": 7, "height": height} | ({} if pins is None else {"pins": pins})
-    one, two = (wc.equilibrium(falling([each], **fields)) for each in (shape, mesh))
-    for each in (one, two):
-        assert each.status.result is Result.CONVERGED and each.stable
-        assert (shape.distances(each.points) < R).sum() >= 3
-    assert np.abs(one.points - two.points).max() < off + 1e-9
-
-
-def test_an_equilibrium_on_a_ball_keeps_triangles_out_of_its_mesh():
-    """With contact of vertices alone, the middles of flat triangles of this size dip 2 mm into the ball and more."""
-    ball = wc.Sphere(radius=0.2, position=(0.25, -0.205, 0.25))
-    mesh, off = meshed(ball)
-    rests = [wc.equilibrium(falling([each], n=7, height=0.0, pins=[0, 6, 42, 48])) for each in (ball, mesh)]
-    assert all(each.status.result is Result.CONVERGED and each.stable for each in rests)
-    grid = wc.Mesh.grid(7, 7)
-    dips, out = (ball.distances(each.points[grid.triangles].mean(axis=1)).min() for each in rests)
-    assert dips < -2e-3 and out > -off
+    By contact of vertices alone, the middles of flat triangles of this size dip 2 mm into the ball and more.
+    """
+    shape, mesh, off = MESHED[name]
+    fields = {"height": 0.02} if name == "plane" else {"height": 0.0, "pins": [0, 6, 42, 48]}
+    scenes = [falling([each], n=7, **fields) for each in (shape, mesh)]
+    one, two = (wc.equilibrium(scene) for scene in scenes)
+    assert all(each.status.result is Result.CONVERGED and each.stable for each in (one, two))
+    if name == "ball":
+        dips, out = (shape.distances(each.points[scenes[0].mesh.triangles].mean(axis=1)).min() for each in (one, two))
+        assert dips < -2e-3 and out > -off
+    else:
+        assert all((shape.distances(each.points) < R).sum() >= 3 for each in (one, two))
+        assert np.abs(one.points - two.points).max() < off + 1e-9
+    if name == "plane":
+        np.testing.assert_allclose(one.points[:, 1], R - 0.15 * 9.81 / scenes[0].contact.stiffness, rtol=1e-6)
 
 
 def test_an_equilibrium_in_a_groove():
@@ -826,8 +655,8 @@ def test_distances_to_a_mesh_are_those_to_its_box(weld):
     assert not sheet.closed and sheet.distances(points).min() > 0.0
 
 
-def leaf(height, other_diagonals, thickness=0.0, n=6):
-    """A grid whose height is given by a function, with a back below it."""
+def leaf(height, other_diagonals=False, n=6):
+    """A grid whose height is given by a function, with a back at the same points."""
     front = wc.Mesh.grid(n, n, pattern="diagonal")
     points = np.array(front.points) - [0.5, 0.0, 0.5]
     points[:, 1] = height(points[:, 0], points[:, 2])
@@ -836,7 +665,7 @@ def leaf(height, other_diagonals, thickness=0.0, n=6):
         quads = back.reshape(-1, 2, 3)
         a, c, d, b = quads[:, 0, 2], quads[:, 0, 1], quads[:, 0, 0], quads[:, 1, 0]
         back = np.stack([a, b, c, b, d, c], axis=1).reshape(-1, 3)
-    return np.concatenate([points, points - [0.0, thickness, 0.0]]), np.concatenate([front.triangles, back + len(points)])
+    return np.concatenate([points, points]), np.concatenate([front.triangles, back + len(points)])
 
 
 def disc(n, first):
@@ -847,46 +676,48 @@ def disc(n, first):
     return np.concatenate([points, points]), np.concatenate([fan, around[fan][:, ::-1] + n])
 
 
-def with_leaf():
-    points, triangles = leaf(lambda x, z: 0.0 * x + 0.2, False)
-    return np.concatenate([0.1 * CUBE.vertices, points]), np.concatenate([CUBE.faces, triangles + len(CUBE.vertices)])
+def joined(*parts):
+    firsts = np.cumsum([0, *(len(points) for points, _ in parts)])
+    triangles = [triangles + first for (_, triangles), first in zip(parts, firsts, strict=False)]
+    return np.concatenate([points for points, _ in parts]), np.concatenate(triangles)
 
 
 DOUBLED = {
     "square, other diagonal": disc(4, 1),
     "pentagon": disc(5, 0),
     "disc": disc(12, 5),
-    "card": leaf(lambda x, z: 0.0 * x, False),
+    "card": leaf(lambda x, z: 0.0 * x),
     "card, other diagonals": leaf(lambda x, z: 0.0 * x, True),
-    "dome": leaf(lambda x, z: 0.4 - x**2 - z**2, False),
+    "dome": leaf(lambda x, z: 0.4 - x**2 - z**2),
     "dome, other diagonals": leaf(lambda x, z: 0.4 - x**2 - 2.0 * z**2 + x * z**2, True),
-    "leaf": leaf(lambda x, z: 0.5 * x * z, False),
+    "leaf": leaf(lambda x, z: 0.5 * x * z),
     "leaf, other diagonals": leaf(lambda x, z: 0.5 * x * z, True),
     "leaf, other diagonals, turned": leaf(lambda x, z: -0.5 * x * z, True),
-    "cube with a leaf": with_leaf(),
 }
+# A cube with a sheet beside it, and one that is there three times with other first corners.
+CUBES = {
+    "with a leaf": (0.1, joined((0.1 * CUBE.vertices, CUBE.faces), leaf(lambda x, z: 0.0 * x + 0.2))),
+    "three times": (1.0, joined(*((CUBE.vertices, np.roll(CUBE.faces, k, axis=1)) for k in range(3)))),
+}
+PROBES = np.random.default_rng(0).uniform(-0.7, 0.7, size=(2000, 3))
 
 
 @pytest.mark.parametrize("name", DOUBLED)
 def test_front_and_back_that_coincide_are_a_sheet(name):
-    """Nothing is inside, a few points between diagonals of a twisted leaf aside; a cube beside it keeps its inside."""
-    points, triangles = DOUBLED[name]
-    collider = wc.MeshCollider(points, triangles)
-    probes = np.random.default_rng(0).uniform(-0.7, 0.7, size=(2000, 3))
-    inside = collider.distances(probes) < 0.0
-    if name.startswith("cube"):
-        np.testing.assert_array_equal(inside, (np.abs(probes) < 0.1 * np.abs(CUBE.vertices).max()).all(axis=1))
-    else:
-        assert not collider.faces_inwards and not inside[collider.distances(probes) < -0.01].any() and inside.mean() < 0.01
-        assert "diagonal" in name or not collider.closed
+    """Nothing is inside, a few points between diagonals of a twisted leaf aside."""
+    collider = wc.MeshCollider(*DOUBLED[name])
+    distances = collider.distances(PROBES)
+    assert not collider.faces_inwards and distances.min() > -0.01 and (distances < 0.0).mean() < 0.01
+    assert "diagonal" in name or not collider.closed
 
 
-def test_a_cube_that_is_there_three_times_with_other_first_corners():
-    copies = [np.roll(CUBE.faces, k, axis=1) + 8 * k for k in range(3)]
-    collider = wc.MeshCollider(np.tile(CUBE.vertices, (3, 1)), np.concatenate(copies))
-    probes = np.random.default_rng(0).uniform(-0.3, 0.3, size=(500, 3))
-    inside = (np.abs(probes) < CUBE.vertices.max(axis=0)).all(axis=1)
-    np.testing.assert_array_equal(collider.distances(probes) < 0.0, inside)
+@pytest.mark.parametrize("name", CUBES)
+def test_the_inside_of_cubes(name):
+    scale, mesh = CUBES[name]
+    probes = np.concatenate([PROBES, PROBES * scale / 2.0])
+    inside = (np.abs(probes) < scale * CUBE.vertices.max(axis=0)).all(axis=1)
+    assert inside.sum() > 20
+    np.testing.assert_array_equal(wc.MeshCollider(*mesh).distances(probes) < 0.0, inside)
 
 
 @pytest.mark.parametrize("size", [(10, 0.1, 10), (10, 3, 10), (20, 0.02, 20)])
@@ -902,14 +733,13 @@ def test_a_card_of_two_quads_is_no_room(lift):
     assert not wc.MeshCollider(points, [[0, 1, 2], [0, 2, 3], [3, 2, 1], [3, 1, 0]]).faces_inwards
 
 
-@pytest.mark.parametrize("name", slow_but(["square, other diagonal", "card"], [*DOUBLED][:-1]))
+@pytest.mark.parametrize("name", slow_but(["square, other diagonal", "card"], DOUBLED))
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_front_and_back_that_coincide_hold_cloth_on_both_sides(name, side):
     points, triangles = DOUBLED[name]
     grid = wc.Mesh.grid(7, 7, size=0.3)
-    mesh = wc.Mesh(grid.points + np.array([-0.15, side * 0.45, -0.15]), grid.triangles)
     scene = wc.Scene(
-        mesh,
+        wc.Mesh(grid.points + np.array([-0.15, side * 0.45, -0.15]), grid.triangles),
         density=0.2,
         terms=[wc.Spring(stiffness=500.0)],
         colliders=[wc.MeshCollider(points - [0.0, points[:, 1].max() * (side > 0), 0.0], triangles)],
@@ -936,16 +766,17 @@ def test_the_default_stiffness_is_said():
     assert chain.contact.stiffness == pytest.approx(2.0 / R * 0.1 * 9.81 / (2.0 * R) * 2.0 / R)  # as a strip of width 2 R
 
 
-@pytest.mark.parametrize("name", ["sphere", "capsule", "box"])
-def test_gaps_that_keep_triangles_out(name):
-    """No triangle with vertices at this gap or farther is cut, of any shape; and one that is just as near touches a ball."""
-    random, edge = np.random.default_rng(0), 0.2
-    shape = {
-        "sphere": wc.Sphere(radius=0.05),
-        "capsule": wc.Capsule(radius=0.03, length=0.1),
-        "box": wc.Box(size=(0.3, 0.04, 0.1), rotation=TILTED),
-    }[name]
-    gap = shape.clearing_gap(edge)
+ROUND = {
+    "sphere": wc.Sphere(radius=0.05),
+    "capsule": wc.Capsule(radius=0.03, length=0.1),
+    "box": wc.Box(size=(0.3, 0.04, 0.1), rotation=TILTED),
+}
+
+
+@pytest.mark.parametrize("shape", ROUND.values(), ids=ROUND)
+def test_gaps_that_keep_triangles_out(shape, edge=0.2):
+    """No triangle with vertices at this gap or farther is cut, of any shape."""
+    random, gap = np.random.default_rng(0), shape.clearing_gap(edge)
     triangles = random.normal(scale=0.2, size=(200000, 1, 3)) + random.uniform(-0.15, 0.15, size=(200000, 3, 3))
     longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
     triangles = triangles[(longest <= edge) & (shape.distances(triangles).min(axis=1) >= gap)]
@@ -953,20 +784,17 @@ def test_gaps_that_keep_triangles_out(name):
     for _ in range(100):
         nearest = np.minimum(nearest, shape.distances(random.dirichlet(np.ones(3), len(triangles))[:, None] @ triangles))
     assert len(triangles) > 1000 and nearest.min() > 0.0
+
+
+def test_gaps_of_triangles_that_touch(edge=0.2):
+    """A triangle whose vertices are just as near touches a ball, or a point. ``print`` says the gaps of a scene."""
     angles = 2.0 * np.pi / 3.0 * np.arange(3)
     corners = edge / np.sqrt(3.0) * np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1)
     for touched in (wc.Sphere(radius=0.05, position=(0.0, -0.05, 0.0)), wc.Box(size=(1e-9, 1e-9, 1e-9))):
         assert touched.distances(corners) == pytest.approx(touched.clearing_gap(edge))
     assert wc.Plane().clearing_gap(edge) == 0.0
-    text = str(
-        falling(
-            [
-                wc.Plane(position=(0, -1, 0)),
-                wc.Box(name="chest", position=(0.0, -1.0, 0.0)),
-                wc.Sphere(radius=9.0, position=(0, -9.3, 0)),
-            ]
-        )
-    )
+    large = wc.Sphere(radius=9.0, position=(0, -9.3, 0))
+    text = str(falling([wc.Plane(position=(0, -1, 0)), wc.Box(name="chest", position=(0.0, -1.0, 0.0)), large]))
     assert "as edges are up to 0.141 m; gaps that prevent it: 0.0816 m of chest" in text
 
 
@@ -998,26 +826,19 @@ def test_an_animation_has_colliders_as_primitives(tmp_path):
             assert collider.distances(surface[:3], frame) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_scene_incline_slides():
-    scene = importlib.import_module("warpcloth.scenes.incline").scene(angle=30.0, friction=0.3, n=4, duration=0.5)
-    animation = wc.simulate(scene, wc.Newton(substeps=2, tolerance=1e-6), dtype="float64")
-    speeds = (animation.velocities @ [np.sqrt(0.75), -0.5, 0.0]).mean(axis=1)
-    assert (speeds[-1] - speeds[15]) / 0.25 == pytest.approx(9.81 * (0.5 - 0.3 * np.sqrt(0.75)), rel=1e-3)
+@pytest.mark.parametrize("n", (3, 4, 7))
+def test_the_scene_drape_starts_without_contact(n):
+    declared = scene("drape", n=n)
+    assert all(collider.distances(declared.positions).min() > declared.contact.distance for collider in declared.colliders)
 
 
 def test_the_scene_drape_stays_outside():
-    scene = importlib.import_module("warpcloth.scenes.drape").scene(n=12, duration=1.0)
-    animation = wc.simulate(scene, wc.Newton(substeps=2))
+    declared = scene("drape", n=12, duration=1.0)
+    animation = wc.simulate(declared, wc.Newton(substeps=2))
     assert animation.status.ok
     points = animation.points.astype(np.float64)
-    assert min(collider.distances(points).min() for collider in scene.colliders) > 0.0
-    assert scene.colliders[0].distances(points[-1]).min() < scene.contact.distance < points[-1][:, 1].max()
-
-
-@pytest.mark.parametrize("n", (3, 4, 7))
-def test_the_scene_drape_starts_without_contact(n):
-    scene = importlib.import_module("warpcloth.scenes.drape").scene(n=n)
-    assert all(collider.distances(scene.positions).min() > scene.contact.distance for collider in scene.colliders)
+    assert min(collider.distances(points).min() for collider in declared.colliders) > 0.0
+    assert declared.colliders[0].distances(points[-1]).min() < declared.contact.distance < points[-1][:, 1].max()
 
 
 @pytest.mark.parametrize("name", slow_but(["newton"], ["explicit", "newton"]))
@@ -1042,39 +863,39 @@ def test_a_resumed_run_has_its_anchors(name, tmp_path):
         assert found.keys() == expected.keys() and all((found[name] == expected[name]).all() for name in found)
 
 
+PLATES = {
+    name: wc.Box(
+        size=(0.1, 0.1, 0.5), position=[(0.0, -side * (0.09 - min(0.01 * k, 0.05)), 0.15) for k in range(9)], name=name
+    )
+    for name, side in (("lower", 1.0), ("upper", -1.0))
+}
+
+
 def closing(between):
-    """A sheet of which one side is pinned, and two plates that close on what is ``between``: 'pins', 'rollers' or 'free'."""
-    grid = wc.Mesh.grid(4, 4, size=0.3)
-    middle = 0.3 if between == "free" else 0.0
-    pins = wc.Pins([0, 4, 8, 12], axes="xyz" if between == "pins" else "y")
-    rise = np.minimum(np.arange(9) * 0.01, 0.05)
-    plates = [
-        wc.Box(size=(0.1, 0.1, 0.5), position=[(middle, -0.09 + up, 0.15) for up in rise], name="lower"),
-        wc.Box(size=(0.1, 0.1, 0.5), position=[(middle, 0.09 - up, 0.15) for up in rise], name="upper"),
-    ]
-    return wc.Scene(
-        grid,
-        density=0.15,
-        terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)],
-        pins=None if between == "free" else pins,
+    """A sheet of which one side is pinned, or its axis y, and a plate that comes over it; or two plates on the other side."""
+    shift = np.array([0.3, 0.0, 0.0])
+    plates = [replace(plate, position=plate.position + shift) for plate in PLATES.values()]
+    return falling(
+        plates if between == "free" else [PLATES["lower"]],
+        speed=0.0,
+        height=0.0,
+        n=4,
+        fps=60.0,
+        pins=None if between == "free" else wc.Pins([0, 4, 8, 12], axes="xyz" if between == "pins" else "y"),
         gravity=(0.0, 0.0, 0.0),
-        colliders=plates if between == "free" else plates[:1],
         contact=wc.Contact(stiffness=1e4),
-        duration=8.0 / 60.0,
     )
 
 
-CLOSING = {"explicit": wc.Explicit(substeps=80), "newton": wc.Newton(substeps=4), "by error": wc.Newton(error=0.01)}
-
-
-@pytest.mark.parametrize("name", CLOSING)
+@pytest.mark.parametrize(
+    "solver", [wc.Explicit(substeps=80), wc.Newton(substeps=4), wc.Newton(error=0.01)], ids=["explicit", "newton", "by error"]
+)
 @pytest.mark.parametrize("between", ("pins", "rollers", "free"))
-def test_what_has_nowhere_to_go_is_named(name, between, device):
+def test_what_has_nowhere_to_go_is_named(solver, between, device):
     """The plates are 0.04 m away, less 0.01 m a frame: they touch the sheet where frame 4 ends.
 
     By error the first frame has 8 steps and the next ones 2.
     """
-    solver = CLOSING[name]
     run = wc.simulate(closing(between), solver, device=device, copies=2)
     found = [(each.frame, each.collider, each.other, each.copy) for each in run.inside]
     if between != "free":
@@ -1086,29 +907,18 @@ def test_what_has_nowhere_to_go_is_named(name, between, device):
         assert {frozenset(each[1:3]) for each in found} == {frozenset(("lower", "upper"))}
         assert {each[0] for each in found} <= {4, 5} and {each[3] for each in found} == {0, 1}
         assert "is caught between" in str(run.inside[0])
-    assert wc.simulate(falling(list(SHAPES.values())[:1]), wc.Newton(substeps=1), device=device).inside == ()
+    assert wc.simulate(falling([SHAPES["plane"]]), wc.Newton(substeps=1), device=device).inside == ()
 
 
-SINKING = """
-import numpy as np
-import warpcloth as wc
-
-def scene():
-    grid = wc.Mesh.grid(3, 3, size=0.2)
-    ends = np.stack([grid.points[[0, 1, 2]] - [0.0, 0.02 * k, 0.0] for k in range(5)])
-    plate = wc.Box(size=(1.0, 1e-4, 1.0), position=(0.0, -0.05, 0.0), name="plate")
-    pins, terms = wc.Pins([0, 1, 2], ends), [wc.Spring(stiffness=50.0)]
-    return wc.Scene(grid, density=0.15, terms=terms, pins=pins, colliders=[plate], duration=0.1)
-"""
-
-
-def test_pins_that_pass_through_are_named(device, tmp_path, monkeypatch, capsys):
+def test_pins_that_pass_through_are_named(device, tmp_path, capsys):
     """A thin plate, which the pins cross from one step to the next; the command line says so too."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "sinking.py").write_text(SINKING)
-    command = ["run", "sinking.py", "-s", "substeps=1", "--solver", "newton", "--frames", "4", "--device", device]
-    assert main([*command, "-o", "a.usda"]) == 0
+    plate = wc.Box(size=(1.0, 1e-4, 1.0), position=(0.0, -0.05, 0.0), name="plate")
+    sheet = falling([plate], speed=0.0, height=0.0, n=3, fps=60.0, duration=0.1, contact=None)
+    ends = sheet.positions[[0, 1, 2]] - 0.02 * np.arange(5)[:, None, None] * [0.0, 1.0, 0.0]
+    stage = write_scene(replace(sheet, pins=wc.Pins([0, 1, 2], ends)), tmp_path / "sinking.usda")
+    command = ["run", str(stage), "-s", "substeps=1", "--solver", "newton", "--frames", "4", "--device", device]
+    assert main([*command, "-o", str(tmp_path / "a.usda")]) == 0
     assert "inside        plate comes over vertex 0, which is not free to move, in frame 3" in capsys.readouterr().out
-    assert main([*command, "-o", "b.usda", "--json"]) == 0
+    assert main([*command, "-o", str(tmp_path / "b.usda"), "--json"]) == 0
     expected = {"vertex": 0, "frame": 3, "collider": "plate", "other": None, "copy": 0}
     assert json.loads(capsys.readouterr().out)["inside"] == [expected]
