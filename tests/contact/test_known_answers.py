@@ -12,11 +12,12 @@ from scipy.optimize import brentq
 import warpcloth as wc
 from support.laws import EXTRA, SOFTNESS, Sticky
 from support.rows import slow_but
-from support.scenes import scene
+from support.scenes import incline, scene
 from warpcloth.core.status import Grade, Result
 from warpcloth.scenes import ring
 
 G, DENSITY = 9.81, 0.15
+SLOW = pytest.mark.slow
 # Steps a frame are added; what is tested has little else that moves.
 SOLVERS = {
     "explicit": wc.Explicit(substeps=1),
@@ -34,6 +35,15 @@ def of_solvers(*left_out):
     return pytest.mark.parametrize("name", [pytest.param(name, marks=HOST.get(name, ())) for name in names])
 
 
+def methods(*slow, **solvers):
+    """Runs a test with solvers, of which those that are named take long."""
+
+    def mark(name):
+        return pytest.mark.slow if name in slow else HOST.get(name, ())
+
+    return pytest.mark.parametrize("solver", [pytest.param(each, id=name, marks=mark(name)) for name, each in solvers.items()])
+
+
 each_solver, sticky, implicit = of_solvers(), of_solvers("constrained dynamics"), of_solvers("explicit")
 
 
@@ -45,38 +55,33 @@ def of_triangles(plane):
     return wc.MeshCollider((grid.points - [3.9, 0.0, 3.95]) @ frame, grid.triangles, friction=plane.friction)
 
 
-def sheet(gap, collider=None, stiffness=1000.0, size=0.1, turn=None, **fields):
-    """A square of nine vertices at a distance ``gap`` [m] above a plane, turned by a matrix with it."""
-    grid = wc.Mesh.grid(3, 3, size=size)
-    turn = np.eye(3) if turn is None else turn
-    mesh = wc.Mesh((grid.points + np.array([0.0, gap, 0.0])) @ turn.T, grid.triangles)
-    terms = [wc.Spring(stiffness=stiffness)]
-    return wc.Scene(mesh, density=DENSITY, terms=terms, colliders=[collider or wc.Plane()], **fields)
+def on_triangles(scene):
+    return replace(scene, colliders=[of_triangles(scene.colliders[0])])
+
+
+def sheet(gap, stiffness=1000.0, **fields):
+    """A square of nine vertices at a distance ``gap`` [m] above a plane."""
+    grid = wc.Mesh.grid(3, 3, size=0.1)
+    mesh, terms = wc.Mesh(grid.points + np.array([0.0, gap, 0.0]), grid.triangles), [wc.Spring(stiffness=stiffness)]
+    return wc.Scene(mesh, density=DENSITY, terms=terms, colliders=[wc.Plane()], **fields)
 
 
 def run(scene, name, substeps, device):
     return wc.simulate(scene, replace(SOLVERS[name], substeps=substeps), dtype="float64", device=device)
 
 
-def incline(degrees, friction, duration=1.0, mesh=False):
-    """A sheet at rest on a slope, pressed in by its weight, and the direction down the slope."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    plane = wc.Plane(normal=turn[:, 1], friction=friction)
-    contact = wc.Contact(distance=1e-3, stiffness=10.0 * DENSITY * G / 1e-3)
-    plane = of_triangles(plane) if mesh else plane
-    return sheet(1e-3 - 1e-4 * c, plane, turn=turn, contact=contact, duration=duration), turn[:, 0]
-
-
-SLIDES = [(float, 0.1, False), (float, 0.3, False), (float, 0.3, True), (Sticky, 0.1, False), (Sticky, 0.1, True)]
-
-
 @sticky
-@pytest.mark.parametrize(("law", "friction", "mesh"), slow_but([(float, 0.3, False), (Sticky, 0.1, False)], SLIDES))
+@pytest.mark.parametrize(
+    ("law", "friction", "mesh"),
+    slow_but(
+        [(float, 0.3, False), (Sticky, 0.1, False)],
+        [(float, 0.1, False), (float, 0.3, False), (float, 0.3, True), (Sticky, 0.1, False), (Sticky, 0.1, True)],
+    ),
+)
 def test_a_sheet_slides_down_a_slope(name, law, friction, mesh, device):
     """a = g(sin θ − μ cos θ), of the second half, when anchors are dragged along; less ke/ρ if each spring bears e more."""
-    scene, down = incline(30.0, law(friction), duration=0.5, mesh=mesh)
-    animation = run(scene, name, 60 if name == "explicit" else 2, device)
+    scene, _, down = incline(30.0, law(friction), duration=0.5)
+    animation = run(on_triangles(scene) if mesh else scene, name, 60 if name == "explicit" else 2, device)
     along = (animation.velocities @ down).mean(axis=1)
     expected = G * (0.5 - friction * np.sqrt(0.75)) - (law is Sticky) * 10.0 * G / 1e-3 * EXTRA
     assert (along[-1] - along[15]) / 0.25 == pytest.approx(expected, rel=1e-4)
@@ -89,9 +94,9 @@ def test_what_only_the_filter_holds_slides_down_a_slope(friction, dtype, device)
 
     In float32 the forces of the springs, of distances between coordinates, are known less.
     """
-    scene, down = incline(30.0, friction)
-    pressed = replace(scene, loads=[wc.Pressure(vertices="all", pressure=-12.0 * DENSITY * G)])
-    animation = wc.simulate(pressed, wc.Explicit(substeps=80), device=device, dtype=dtype)
+    loads = [wc.Pressure(vertices="all", pressure=-12.0 * DENSITY * G)]
+    scene, _, down = incline(30.0, friction, duration=1.0, loads=loads)
+    animation = wc.simulate(scene, wc.Explicit(substeps=80), device=device, dtype=dtype)
     along = (animation.velocities.astype(float) @ down).mean(axis=1)
     expected = G * (0.5 - friction * (np.sqrt(0.75) + 12.0))
     assert (along[-1] - along[30]) / 0.5 == pytest.approx(expected, rel=1e-4 if dtype == "float64" else 2e-3)
@@ -118,25 +123,24 @@ def test_what_hits_a_ball_slides_off(friction, device):
 
 
 @sticky
-@pytest.mark.parametrize("mesh", (False, pytest.param(True, marks=pytest.mark.slow)))
-def test_a_sheet_sticks_to_a_slope(name, mesh, device):
-    """tan θ = 0.95 μ. Anchored friction does not creep; explicit steps swing about the anchor, and no farther than it holds."""
-    scene, down = incline(np.degrees(np.arctan(0.95 * 0.3)), 0.3, duration=1.0, mesh=mesh)
-    animation = run(scene, name, 60 if name == "explicit" else 2, device)
+@pytest.mark.parametrize(
+    ("law", "tangent", "mesh"),
+    slow_but(
+        [(float, 0.95 * 0.3, False), (Sticky, 0.45, False)],
+        [(float, 0.95 * 0.3, False), (float, 0.95 * 0.3, True), (Sticky, 0.45, False)],
+    ),
+)
+def test_a_sheet_sticks_to_a_slope(name, law, tangent, mesh, device):
+    """Anchored friction of μ = 0.3 does not creep; explicit steps swing about the anchor, no farther than a law holds.
+
+    That is ε = μN/(kA), with N = wA and w = kr/10. Springs of the law from outside are stretched by ρg sin θ/(ks).
+    """
+    scene, _, down = incline(np.degrees(np.arctan(tangent)), law(0.3), duration=1.0)
+    animation = run(on_triangles(scene) if mesh else scene, name, 60 if name == "explicit" else 2, device)
     along = ((animation.points - animation.points[0]) @ down).mean(axis=1)
-    held = 0.3 * 1e-4  # ε = μN/(kA) with N = wA and w = k r/10
-    assert abs(along[-1] - along[30]) < (held if name == "explicit" else 1e-9)
+    held, swings = ((0.3e-4 + EXTRA) / SOFTNESS, 1e-4) if law is Sticky else (0.3e-4, 0.3e-4)
+    assert abs(along[-1] - along[30]) < (swings if name == "explicit" else 1e-9)
     assert 0.0 < along[-1] < 20.0 * held
-
-
-@sticky
-def test_a_sheet_sticks_by_a_law_from_outside(name, device):
-    """At tan θ = 0.45, of which μ is a third, springs are stretched by ρg sin θ/(ks) and do not creep."""
-    scene, down = incline(np.degrees(np.arctan(0.45)), Sticky(0.3), duration=1.0)
-    animation = run(scene, name, 60 if name == "explicit" else 2, device)
-    along = ((animation.points - animation.points[0]) @ down).mean(axis=1)
-    assert abs(along[-1] - along[30]) < (1e-4 if name == "explicit" else 1e-9)
-    assert 0.0 < along[-1] < 20.0 * (0.3 * 1e-4 + EXTRA) / SOFTNESS
 
 
 @each_solver
@@ -151,36 +155,35 @@ def test_the_gap_under_a_pressure(name, pressure, gap, mesh, device):
     """r − p/k above half of r, r²k/(4p) below, at r = 1 mm and k = 1e7 Pa/m."""
     if name == "explicit" and pressure > 5e3:
         pytest.skip("explicit steps have the first of the two stages alone")
-    contact, gravity = wc.Contact(distance=1e-3, stiffness=1e7), (0.0, -pressure / DENSITY, 0.0)
     start = gap if name == "explicit" else 1e-3  # what nothing damps does not come to rest
-    collider = of_triangles(wc.Plane()) if mesh else None
-    scene = sheet(start, collider, contact=contact, gravity=gravity, duration=0.25)
-    animation = run(scene, name, 100 if name == "explicit" else 2, device)
+    contact = wc.Contact(distance=1e-3, stiffness=1e7)
+    scene = sheet(start, contact=contact, gravity=(0.0, -pressure / DENSITY, 0.0), duration=0.25)
+    animation = run(on_triangles(scene) if mesh else scene, name, 100 if name == "explicit" else 2, device)
     np.testing.assert_allclose(animation.points[-1][:, 1], gap, rtol=1e-3)
     assert animation.cut == 0.0
 
 
-# As users run them, with iterations that suffice.
-PRESSED = {
-    "newton": wc.Newton(substeps=4),
-    "newton bdf2": wc.Newton(substeps=4, integrator="bdf2"),
-    "newton midpoint": wc.Newton(substeps=4, integrator="midpoint"),
-    "projective dynamics": wc.ProjectiveDynamics(substeps=4),
-    "admm": wc.ADMM(substeps=4, iterations=500),
-    "xpbd": wc.XPBD(substeps=4),
-    "constrained dynamics": wc.ConstrainedDynamics(substeps=4),
-}
-
-
 @pytest.mark.parametrize("gravity", (0.0, 1e-3))
-@pytest.mark.parametrize("name", [pytest.param(name, marks=HOST.get(name, ())) for name in PRESSED])
-def test_a_pressure_holds_a_sheet_where_it_balances(name, gravity, device, pressure=14.715, k=1e7, r=1e-3):
-    """The gap r − p/k and the force pA, with hardly any gravity or none: x̃ is 0.7 mm deep in the plane, where contact gives 1e7
-    m/s², but the residual is relative to p/ρ. The stiffness k/ρ is above the inertia 1/h², so that a residual of 1e-3 p/ρ
-    leaves 1e-3 p/k at the most, and as much again of velocity from the step before."""
+@methods(
+    # As users run them, with iterations that suffice.
+    newton=wc.Newton(substeps=4),
+    newton_bdf2=wc.Newton(substeps=4, integrator="bdf2"),
+    newton_midpoint=wc.Newton(substeps=4, integrator="midpoint"),
+    projective_dynamics=wc.ProjectiveDynamics(substeps=4),
+    admm=wc.ADMM(substeps=4, iterations=500),
+    xpbd=wc.XPBD(substeps=4),
+    constrained_dynamics=wc.ConstrainedDynamics(substeps=4),
+)
+def test_a_pressure_holds_a_sheet_where_it_balances(solver, gravity, device, pressure=14.715, k=1e7, r=1e-3):
+    """The gap r − p/k and the force pA, with hardly any gravity or none.
+
+    x̃ is 0.7 mm deep in the plane, where contact gives 1e7 m/s², but the residual is relative to p/ρ. The stiffness k/ρ is above
+    the inertia 1/h², so that a residual of 1e-3 p/ρ leaves 1e-3 p/k at the most, and as much again of velocity from the step
+    before.
+    """
     fields = {"gravity": (0.0, -gravity, 0.0), "loads": [wc.Pressure(vertices="all", pressure=-pressure)], "duration": 0.2}
     scene = sheet(r - pressure / k, contact=wc.Contact(distance=r, stiffness=k), **fields)
-    animation = wc.simulate(scene, PRESSED[name], dtype="float64", device=device, record="reactions")
+    animation = wc.simulate(scene, solver, dtype="float64", device=device, record="reactions")
     whole = pressure + DENSITY * gravity
     np.testing.assert_allclose(r - animation.points[1:, :, 1], whole / k, rtol=2e-3)
     (force,) = animation.collider_forces.values()
@@ -188,33 +191,26 @@ def test_a_pressure_holds_a_sheet_where_it_balances(name, gravity, device, press
     assert animation.status.ok, animation.status.message
 
 
-RESTITUTION = {0.05: 0.92, 0.3: 0.63, 1.0: 0.25, 10.0: 0.01}
-
-
 def bounce(name, rate, phase, device):
     """Speeds after an impact over that before, without gravity: ω = √(k/ρ), ωh = ``rate``, from d = r + ``phase`` steps."""
     h = 1.0 / 240.0
     omega = rate / h
     speed = 0.05 * omega * 1e-3 / max(rate, 1.0)
-    contact = wc.Contact(distance=1e-3, stiffness=DENSITY * omega**2)
-    velocities = np.tile([0.0, -speed, 0.0], (9, 1))
-    frames = int(np.ceil((8.0 / omega + 4.0 * h) * 60.0))
     scene = sheet(
         1e-3 + phase * h * speed,
-        contact=contact,
-        gravity=(0.0, 0.0, 0.0),
-        velocities=velocities,
-        duration=frames / 60.0,
         stiffness=0.1,
+        contact=wc.Contact(distance=1e-3, stiffness=DENSITY * omega**2),
+        gravity=(0.0, 0.0, 0.0),
+        velocities=np.tile([0.0, -speed, 0.0], (9, 1)),
+        duration=np.ceil((8.0 / omega + 4.0 * h) * 60.0) / 60.0,
     )
-    animation = run(scene, name, 4, device)
-    return animation.velocities[-1][:, 1].mean() / speed
+    return run(scene, name, 4, device).velocities[-1][:, 1].mean() / speed
 
 
 @implicit
-@pytest.mark.parametrize("rate", slow_but([0.3], RESTITUTION))
-def test_restitution_of_implicit_euler(name, rate, device):
-    assert bounce(name, rate, 0.0, device) == pytest.approx(RESTITUTION[rate], abs=0.005)
+@pytest.mark.parametrize(("rate", "left"), slow_but([(0.3, 0.63)], [(0.05, 0.92), (0.3, 0.63), (1.0, 0.25), (10.0, 0.01)]))
+def test_restitution_of_implicit_euler(name, rate, left, device):
+    assert bounce(name, rate, 0.0, device) == pytest.approx(left, abs=0.005)
 
 
 @pytest.mark.parametrize("rate", slow_but([0.3], [0.05, 0.3, 1.0]))
@@ -225,12 +221,6 @@ def test_restitution_of_symplectic_euler(rate, phase, device):
     assert least - 1e-3 < bounce("explicit", rate, phase, device) < 1.0 / least + 1e-3
 
 
-def methods(*slow, **solvers):
-    """Runs a test with solvers, of which those that are named take long."""
-    marks = [pytest.param(each, id=name, marks=pytest.mark.slow if name in slow else ()) for name, each in solvers.items()]
-    return pytest.mark.parametrize("solver", marks)
-
-
 def tensions(capstan, points):
     """Of the belt at each edge, mean of both sides (…, edges) [N/m]."""
     threads = points.reshape(*points.shape[:-2], 2, -1, 3)
@@ -239,41 +229,29 @@ def tensions(capstan, points):
     return 2.0 * capstan.terms[0].stiffness * (lengths - rest) / np.ptp(capstan.mesh.points[:, 2])
 
 
-def polygon(friction, turn, turns):
-    """Ratio of the tensions of a belt that slides over a polygon."""
-    half = friction * np.tan(0.5 * turn)
-    return ((1.0 + half) / (1.0 - half)) ** turns
-
-
-@methods(
-    "newton",
-    "xpbd",
-    explicit=wc.Explicit(substeps=600),
-    newton=wc.Newton(substeps=1, linear="factorised"),
-    xpbd=wc.XPBD(substeps=150, iterations=10),
+@pytest.mark.parametrize(
+    ("solver", "mesh", "error"),
+    [
+        pytest.param(wc.Explicit(substeps=600), False, 0.01, id="explicit"),
+        pytest.param(wc.Newton(substeps=1, linear="factorised"), False, 0.01, id="newton", marks=SLOW),
+        pytest.param(wc.XPBD(substeps=150, iterations=10), False, 0.01, id="xpbd", marks=SLOW),
+        pytest.param(wc.Newton(substeps=1, linear="factorised"), True, 0.012, id="newton-triangles", marks=SLOW),
+    ],
 )
-def test_a_belt_slides_over_a_drum(solver, device, friction=0.3):
-    """e^{μφ}, to 1 %; of that a belt of 12 edges differs by 0.6 %."""
-    capstan = scene("capstan", friction=friction, turns=12, duration=0.25)
-    found = tensions(capstan, wc.simulate(capstan, solver, dtype="float64", device=device).points[11:]).mean(axis=0)
-    assert found[-1] / found[0] == pytest.approx(np.exp(np.pi * friction), rel=0.01)
-    assert found[0] == pytest.approx(20.0, rel=0.01)
-
-
-@pytest.mark.slow
-def test_a_belt_slides_over_a_drum_of_triangles(device, friction=0.3):
-    """As over a round one, to 1.2 %; the watch of energy knows that the belt is pressed on it at the start."""
-    capstan = scene("capstan", friction=friction, turns=12, duration=0.35)
-    drum = trimesh.creation.cylinder(radius=0.1, height=0.4, sections=512)
-    points = drum.vertices[:, [1, 2, 0]]
-    capstan = replace(capstan, colliders=[wc.MeshCollider(points, drum.faces, position=(0.0, 0.05, 0.0), friction=friction)])
-    animation = wc.simulate(capstan, wc.Newton(substeps=1, linear="factorised"), dtype="float64", device=device)
-    assert animation.status.ok
+def test_a_belt_slides_over_a_drum(solver, mesh, error, device, friction=0.3):
+    """e^{μφ}, of which a belt of 12 edges differs by 0.6 %. The watch of energy knows that it is pressed on at the start."""
+    capstan = scene("capstan", friction=friction, turns=12, duration=0.35 if mesh else 0.25)
+    if mesh:
+        drum = trimesh.creation.cylinder(radius=0.1, height=0.4, sections=512)
+        points = drum.vertices[:, [1, 2, 0]] + [0.0, 0.05, 0.0]
+        capstan = replace(capstan, colliders=[wc.MeshCollider(points, drum.faces, friction=friction)])
+    animation = wc.simulate(capstan, solver, dtype="float64", device=device)
     found = tensions(capstan, animation.points[11:]).mean(axis=0)
-    assert found[-1] / found[0] == pytest.approx(np.exp(np.pi * friction), rel=0.012)
+    assert found[-1] / found[0] == pytest.approx(np.exp(np.pi * friction), rel=error)
+    assert animation.status.ok if mesh else found[0] == pytest.approx(20.0, rel=0.01)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_belt_slides_over_a_polygon(device, friction=0.3):
     """The exact ratio at the vertices between the first and the last on the drum, to 1e-4 of all six of them."""
     capstan = scene("capstan", friction=friction, turns=8, speed=0.005, stretching=5e4, distance=1e-4, duration=0.5)
@@ -283,11 +261,11 @@ def test_a_belt_slides_over_a_polygon(device, friction=0.3):
     turns = np.diff(np.unwrap(np.arctan2(edges[..., 2], edges[..., 0])), axis=1)
     middle = edges.shape[1] // 2
     inner = slice(middle - 3, middle + 3)  # vertex i + 1 is between the edges i and i + 1
-    expected = np.prod(polygon(friction, turns[:, inner], 1), axis=1)
+    half = friction * np.tan(0.5 * turns[:, inner])
     found = tensions(capstan, points)
-    ratio = found[:, inner.stop] / found[:, inner.start]
+    ratio = found[:, inner.stop] / found[:, inner.start] / np.prod((1.0 + half) / (1.0 - half), axis=1)
     assert (turns[:, inner] > 0.99 * np.pi / 8).all()
-    assert np.mean(ratio / expected) == pytest.approx(1.0, abs=1e-4)
+    assert np.mean(ratio) == pytest.approx(1.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("softer", (1.0, 20.0))
@@ -346,31 +324,27 @@ def test_an_overhang_slips_or_sticks(solver, device):
         assert moved > 0.02 if slips else abs(moved) < 0.005, more
 
 
-# The stretching of the chain below, 100 N, is what projective dynamics converges with in each step: where a step uses up its
-# iterations, the motion depends on rounding, and so on the processor. L-BFGS takes 0.8 of the time of Anderson acceleration.
-FALLING = {
-    "explicit": wc.Explicit(substeps=300),
-    "newton": wc.Newton(substeps=4, integrator="bdf2", tolerance=1e-6),
-    "projective_dynamics": wc.ProjectiveDynamics(
-        substeps=4, integrator="bdf2", tolerance=1e-2, iterations=200, acceleration="l-bfgs"
-    ),
-    "xpbd": wc.XPBD(substeps=50, iterations=10),
-}
-
-
 def deeper(solver, duration, device, **fields):
-    """How deep the tip of a chain over an edge is in the end, over what it should be."""
-    chain = scene("chain_over_edge", duration=duration, **fields)
-    animation = wc.simulate(chain, solver, dtype="float64", device=device)
+    """How deep the tip of a chain over an edge is in the end, over what it should be, a₀ cosh(t√(g/L))."""
+    animation = wc.simulate(scene("chain_over_edge", duration=duration, **fields), solver, dtype="float64", device=device)
     assert animation.status.result is not Result.ITERATIONS_USED_UP, animation.status.message
-    points = animation.points
-    depths = points[0, :, 1].max() - points[:, -1, 1]
+    depths = animation.points[0, :, 1].max() - animation.points[:, -1, 1]
     return depths[-1] / (depths[0] * np.cosh(duration * np.sqrt(G)))
 
 
-@methods("projective_dynamics", "explicit", "xpbd", **FALLING)
+@methods(
+    "projective_dynamics",
+    "explicit",
+    "xpbd",
+    explicit=wc.Explicit(substeps=300),
+    newton=wc.Newton(substeps=4, integrator="bdf2", tolerance=1e-6),
+    projective_dynamics=wc.ProjectiveDynamics(
+        substeps=4, integrator="bdf2", tolerance=1e-2, iterations=200, acceleration="l-bfgs"
+    ),
+    xpbd=wc.XPBD(substeps=50, iterations=10),
+)
 def test_a_chain_slides_over_an_edge(solver, device):
-    """a₀ cosh(t√(g/L)), to 0.5 %."""
+    """To 0.5 %. At 100 N projective dynamics converges in each step; else the motion depends on rounding, and the processor."""
     assert deeper(solver, 0.7, device, links=30, stretching=100.0) == pytest.approx(1.0, abs=0.005)
 
 
@@ -400,28 +374,20 @@ def beads_on_a_ball(friction):
     )
 
 
-SLOW = pytest.mark.slow
-
-
 @pytest.mark.parametrize(
-    ("name", "friction", "order"),
-    [
-        ("explicit", 0.0, 1),
-        ("explicit", 0.3, 1),
-        ("newton midpoint", 0.0, 2),
-        pytest.param("newton bdf2", 0.0, 2, marks=SLOW),
-        pytest.param("newton euler", 0.0, 1, marks=SLOW),
-        pytest.param("newton euler", 0.3, 1, marks=SLOW),
-    ],
+    ("integrator", "friction", "order"),
+    slow_but(
+        [(None, 0.0, 1), (None, 0.3, 1), ("midpoint", 0.0, 2)],
+        [(None, 0.0, 1), (None, 0.3, 1), ("midpoint", 0.0, 2), ("bdf2", 0.0, 2), ("euler", 0.0, 1), ("euler", 0.3, 1)],
+    ),
 )
-def test_order_of_convergence_on_a_curve(name, friction, order, device):
-    """By runs at three steps: contact keeps the order of the integrator, friction, whose N and n are lagged, is of first order.
+def test_order_of_convergence_on_a_curve(integrator, friction, order, device):
+    """By runs at three steps, explicit or of Newton's method: contact keeps the order of the integrator.
 
-    With friction BDF2 is still a little better than that at these steps.
+    Friction, whose N and n are lagged, is of first order. With it BDF2 is still a little better than that at these steps.
     """
-    solver = wc.Explicit(substeps=1)
-    if name != "explicit":
-        solver = wc.Newton(substeps=1, integrator=name.split()[1], tolerance=1e-11, linear="factorised")
+    newton = wc.Newton(substeps=1, integrator=integrator or "euler", tolerance=1e-11, linear="factorised")
+    solver = wc.Explicit(substeps=1) if integrator is None else newton
     steppers = [replace(solver, substeps=substeps) for substeps in ((32, 64, 128) if friction else (12, 24, 48))]
     runs = [wc.simulate(beads_on_a_ball(friction), each, device=device, dtype="float64").points for each in steppers]
     coarse, fine = (np.abs(one - other).max() for one, other in pairwise(runs))
@@ -438,8 +404,7 @@ def borne(declared, points):
 @pytest.mark.parametrize("load", slow_but([4.0], [1.0, 2.0, 4.0]))
 def test_a_ring_bears_a_load_between_plates(load, device):
     """H of the load that it bears, to 0.5 %, and the load of H, to 1 %, touching along a line and flat."""
-    declared = ring.scene(load, elements=64)
-    part = ring.height(load)
+    declared, part = ring.scene(load, elements=64), ring.height(load)
     fixed, moving = declared.colliders
     plates = [fixed, replace(moving, position=moving.position[-1])]
     start = declared.mesh.points * [2.0 - part, 1.0, part] - [0.0, 0.0, 0.1 * (1.0 - part)]
@@ -451,13 +416,34 @@ def test_a_ring_bears_a_load_between_plates(load, device):
     assert found == pytest.approx(brentq(lambda each: ring.height(each) - high, 0.1, 10.0), rel=0.01)
 
 
-@pytest.mark.parametrize("load", slow_but([2.0], [0.5, 2.0, 8.0]))
-def test_a_ring_bears_its_load(load, device):
-    """To 0.5 % with the default number of edges, whether it touches along a line or lies flat on the plates."""
-    declared = ring.scene(load)
-    found, high = borne(declared, wc.simulate(declared, wc.Newton(substeps=2), dtype="float64", device=device).points[-1])
-    assert found == pytest.approx(load, rel=5e-3)
-    assert high == pytest.approx(ring.height(load), rel=2e-4)
+# Of 24 edges, which are wrong by 2 %, and half a second.
+COARSE = {"elements": 24, "duration": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("solver", "load", "fields", "errors"),
+    [
+        *(
+            pytest.param(wc.Newton(substeps=2), load, {}, (5e-3, 2e-4), id=f"{load}", marks=() if load == 2.0 else SLOW)
+            for load in (0.5, 2.0, 8.0)
+        ),
+        pytest.param(wc.Newton(substeps=2), 2.0, COARSE, (0.03, 2e-3), id="newton"),
+        *(
+            pytest.param(solver, 2.0, COARSE, (0.03, 2e-3), id=name, marks=SLOW)
+            for name, solver in (
+                ("explicit", wc.Explicit(substeps=2500)),
+                ("projective_dynamics", wc.ProjectiveDynamics(substeps=1, tolerance=3.0, iterations=100)),
+                ("xpbd", wc.XPBD(substeps=200, iterations=10)),
+            )
+        ),
+    ],
+)
+def test_a_ring_bears_its_load(solver, load, fields, errors, device):
+    """The load and H when a plate has pressed it, whether it touches along a line or lies flat on the plates."""
+    declared = ring.scene(load, **fields)
+    found, high = borne(declared, wc.simulate(declared, solver, dtype="float64", device=device).points[-1])
+    assert found == pytest.approx(load, rel=errors[0])
+    assert high == pytest.approx(ring.height(load), rel=errors[1])
 
 
 def test_the_answers_of_a_ring():
@@ -466,23 +452,6 @@ def test_the_answers_of_a_ring():
         [0.9165281, 0.8132354, 0.717770], abs=1e-6
     )
     assert 4.0 * ring.height(4.0) ** 2 == pytest.approx(5.7421601 / 4.0, rel=1e-6)
-
-
-@methods(
-    "explicit",
-    "projective_dynamics",
-    "xpbd",
-    explicit=wc.Explicit(substeps=2500),
-    newton=wc.Newton(substeps=2),
-    projective_dynamics=wc.ProjectiveDynamics(substeps=1, tolerance=3.0, iterations=100),
-    xpbd=wc.XPBD(substeps=200, iterations=10),
-)
-def test_a_ring_is_pressed_by_a_plate(solver, device):
-    """The load, to 3 %, of which 2 % are those of 24 edges, and H, to 0.2 %."""
-    declared = ring.scene(elements=24, duration=0.5)
-    found, high = borne(declared, wc.simulate(declared, solver, dtype="float64", device=device).points[-1])
-    assert found == pytest.approx(2.0, rel=0.03)
-    assert high == pytest.approx(ring.height(2.0), rel=2e-3)
 
 
 @pytest.mark.parametrize(("soft", "gap", "held"), [(True, 1e-3, False), (False, 3e-3, True), (False, 1e-3, True)])

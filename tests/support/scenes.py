@@ -14,6 +14,13 @@ def scene(name, **parameters):
     return import_module(f"warpcloth.scenes.{name}").scene(**parameters)
 
 
+def incline(angle, friction, duration=0.1, n=3, size=0.1, **fields):
+    """The scene ``incline`` at so many degrees with some fields replaced, the normal of its slope, and the direction down."""
+    declared = scene("incline", angle=angle, friction=friction, n=n, size=size, duration=duration)
+    normal = declared.colliders[0].normal
+    return replace(declared, **fields), normal, np.array([normal[1], -normal[0], 0.0])
+
+
 def noisy(declared, size):
     """A scene whose free vertices start with noise [m]."""
     noise = size * np.random.default_rng(0).normal(size=declared.positions.shape)
