@@ -1,9 +1,10 @@
-"""One step of a solver from a state in motion, and what it minimises."""
+"""One step of a solver from a state in motion, and what it minimises; a run that is resumed."""
 
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 import warp as wp
 
 import warpcloth as wc
@@ -62,3 +63,15 @@ def objective(declared, x, device):
     predicted = declared.positions + h * declared.velocities + h**2 * declared.gravity
     moved = np.where(model.inverse_mass.numpy()[:, None] > 0.0, x - predicted, 0.0)
     return 0.5 / h**2 * float((declared.vertex_masses[:, None] * moved**2).sum()) + float(U.numpy()[0])
+
+
+def stopped_and_resumed(frame, declared, solver, **run):
+    """The animation of a run with an output that stops at a frame and is resumed."""
+
+    def stop(now, _frames):
+        if now == frame:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        wc.simulate(declared, solver, progress=stop, **run)
+    return wc.simulate(declared, solver, resume=True, **run)
