@@ -4,67 +4,46 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 import warpcloth as wc
-from support.pairs import all_pairs, from_segment
+from support.layers import begin, energy, gradient, pairs_of, stack
+from support.pairs import all_pairs, from_segment, pieces
 from support.rows import slow_but
-from warpcloth.core.sums import Sums
 
 STIFFNESS = 1e4
 
 
 def crumpled(size, n=7, ridges=0.3, seed=0):
-    """Two sheets with n² vertices at edges of ``size`` above one another, both with ridges and valleys, one of them turned."""
-    rng, grid = np.random.default_rng(seed), wc.Mesh.grid(n, n, size=size * (n - 1), pattern="alternating")
-    c, s = np.cos(0.4), np.sin(0.4)
-    middle = grid.points.mean(axis=0)
-    above = (grid.points - middle) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) + middle
-    points = np.concatenate([grid.points, above])
+    """Two sheets of n² vertices, 1 m apart at rest, and where they are above one another, both with ridges and valleys."""
+    rng, mesh = np.random.default_rng(seed), stack(2, n, size * (n - 1), gap=1.0, turn=0.4, pattern="alternating")
+    points = mesh.points + 0.5 * size * (n - 1) * np.array([1.0, 0.0, 1.0])
     points[:, 1] = ridges * size * np.sin(2.5 / size * points[:, 0]) * np.cos(1.8 / size * points[:, 2])
-    points += rng.uniform(-0.05, 0.05, points.shape) * size
-    return wc.Mesh(np.concatenate([grid.points, above]), np.concatenate([grid.triangles, grid.triangles + n * n])), points
+    return mesh, points + rng.uniform(-0.05, 0.05, points.shape) * size
 
 
 class Potential:
-    """U and ∂U/∂x of a scene's self-contact at positions (N, 3)."""
+    """U and ∂U/∂x of the self-contact of a mesh at positions (N, 3)."""
 
     def __init__(self, mesh, distance, device, bounded=False):
         contact = wc.SelfContact(distance=distance, stiffness=STIFFNESS)
         scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)], gravity=np.zeros(3), self_contact=contact)
-        self.model = scene.build(device=device, dtype="float64")
-        solver = wc.Explicit(substeps=1000, above_limit="allow") if bounded else wc.XPBD(substeps=1)
-        self.steps = solver.bind(self.model).pairs
+        self.steps = pairs_of(scene, device, bounded)
         self.steps.contact.least = 0.0
-        self._sums = Sums(self.model)
-
-    def launch(self, x):
-        x = self.model.array(x, self.model.vec3)
-        self.steps.launch_begin(x)
-        while self.steps.overflowed:
-            self.steps.grow()
-            self.steps.launch_begin(x)
-        self.steps.contact.launch(x)
 
     def energy(self, x):
-        self.launch(x)
-        out = self.model.scalars()
-        self.steps.forces.add_energy(self._sums, out)
-        return out.numpy()[0]
+        begin(self.steps, x)
+        return energy(self.steps, x)
 
     def gradient(self, x):
-        self.launch(x)
-        out = self.model.vectors()
-        self.steps.forces.add_gradient(out)
-        return out.numpy()
+        begin(self.steps, x)
+        return gradient(self.steps, x)
 
     def multiplicities(self):
         """Of the contacts of vertices at the last positions, m."""
         found, (faces, _) = self.steps.contact, self.steps.proximity.counts.numpy()
         acting = found.pairs.acting.numpy()[: found.pairs.number.numpy()[0]]
         acting = acting[(acting < faces) | (acting >= found.capacity // 2)]
-        areas = self.model.scene.mesh.vertex_areas[found.pairs.stencils.numpy()[acting, 0]]
+        areas = self.steps.model.scene.mesh.vertex_areas[found.pairs.stencils.numpy()[acting, 0]]
         return found.data.stiffness.numpy()[acting] / (0.5 * STIFFNESS * areas)
 
 
@@ -98,9 +77,12 @@ def of_two_edges(a, b, c, d):
 def energies(mesh, x, r):
     """U of vertices and of pairs of edges [J]: plain sums over all faces, edges and vertices, without their cancellation."""
     area, (of_faces, of_edges) = mesh.vertex_areas, all_pairs(mesh, x)
-    joined = coo_array((np.ones(len(mesh.edges)), tuple(mesh.edges.T)), shape=(len(x), len(x)))
-    piece = connected_components(joined, directed=False)[1]
-    total, at_edges, at_vertices = 0.0, {}, {}  # the numbers of faces at each edge, and of faces minus edges at each vertex
+    piece, total, at_edges, at_vertices = (
+        pieces(mesh),
+        0.0,
+        {},
+        {},
+    )  # the numbers of faces at each edge, and of faces minus edges at each vertex
     s, now, rest = of_faces
     acts = (piece[s[:, 0]] != piece[s[:, 1]]) | (rest >= 2.0 * r)
     for (v, *face), d in zip(s[acts], now[acts], strict=True):
@@ -154,11 +136,11 @@ def test_energy_is_the_sum(ratio, gap, device):
 def test_energy_of_a_book(pages, device):
     """As above, where an edge of the lower sheet has more than two faces: pages hang from a row of its vertices."""
     mesh, x = pair_of(1.0, 0.4)
-    row, size, triangles, points, places = np.arange(6) + 12, R, [mesh.triangles], [mesh.points], [x]
+    row, triangles, points, places = np.arange(6) + 12, [mesh.triangles], [mesh.points], [x]
     for page in range(pages):
         new = len(x) + 6 * page + np.arange(6)
         triangles += [np.column_stack([row[:-1], row[1:], new[:-1]]), np.column_stack([row[1:], new[1:], new[:-1]])]
-        down = size * np.array([0.0, -1.0, 0.5 - page])
+        down = R * np.array([0.0, -1.0, 0.5 - page])
         points.append(mesh.points[row] + down)
         places.append(x[row] + down)
     mesh, x = wc.Mesh(np.concatenate(points), np.concatenate(triangles)), np.concatenate(places)
@@ -228,10 +210,10 @@ def test_gradient_is_continuous(ratio, bounded, device):
 
 ALIGNED, SHIFTED, TURNED = (0.0, (0.0, 0.0)), (0.0, (0.31, 0.17)), (0.4, (0.31, 0.17))
 PRESSED = [
-    (ratio, place, count, gap)
+    (ratio, place, *layers)
     for ratio in (0.1, 1.0, 3.0)
     for place in (ALIGNED, SHIFTED, TURNED)
-    for count, gap in ((2, 0.3), (2, 0.7), (3, 0.4))
+    for layers in ((2, 0.3), (2, 0.7), (3, 0.4))
 ]
 
 
@@ -244,19 +226,12 @@ def test_pressure_of_flat_sheets(ratio, place, count, gap, device):
 
     The mean is weighted by a smooth function, because half of the force comes at the vertices of the other sheets.
     """
-    n, size, (angle, shift) = 13, R / ratio, place
-    grid, parts = wc.Mesh.grid(n, n, size=size * (n - 1), pattern="alternating"), []
-    middle = grid.points.mean(axis=0)
-    for layer in range(count):
-        c, s = np.cos(angle * layer), np.sin(angle * layer)
-        parts.append((grid.points - middle) @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
-        parts[-1] += layer * np.array([shift[0] * size, gap * R, shift[1] * size])
-    mesh = wc.Mesh(np.concatenate(parts), np.concatenate([grid.triangles + layer * n * n for layer in range(count)]))
-    force = -Potential(mesh, R, device).gradient(mesh.points)[-n * n :, 1]
-    away = ((parts[-1] - parts[-1].mean(axis=0))[:, [0, 2]] ** 2).sum(axis=1) / (4.0 * size) ** 2
+    n, size, (turn, shift) = 13, R / ratio, place
+    mesh = stack(count, n, size * (n - 1), gap * R, turn, pattern="alternating")
+    points = mesh.points + np.arange(count).repeat(n * n)[:, None] * size * np.array([shift[0], 0.0, shift[1]])
+    force = -Potential(wc.Mesh(points, mesh.triangles), R, device).gradient(points)[-n * n :, 1]
+    away = (mesh.points[: n * n, [0, 2]] ** 2).sum(axis=1) / (4.0 * size) ** 2
     weights = np.maximum(1.0 - away, 0.0) ** 2
-    pressure = weights @ force / (weights @ grid.vertex_areas)
-    d = gap * R * np.arange(1, count)
-    assert pressure == pytest.approx(
-        STIFFNESS * np.where(d < 0.5 * R, 0.25 * R * R / d, np.maximum(R - d, 0.0)).sum(), rel=1e-2
-    )
+    pressure, d = weights @ force / (weights @ mesh.vertex_areas[-n * n :]), gap * R * np.arange(1, count)
+    expected = STIFFNESS * np.where(d < 0.5 * R, 0.25 * R * R / d, np.maximum(R - d, 0.0)).sum()
+    assert pressure == pytest.approx(expected, rel=1e-2)

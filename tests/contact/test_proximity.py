@@ -5,23 +5,11 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from support.pairs import all_pairs
+from support.pairs import all_pairs, pieces
 from support.rows import slow_but
 from warpcloth.contact.proximity import Proximity
 from warpcloth.contact.surface import ContactSurface
 from warpcloth.model.model import Model
-
-
-def pieces(mesh):
-    """A number for each connected piece, of each vertex."""
-    piece = np.arange(len(mesh.points))
-    while True:
-        low = piece[mesh.edges].min(axis=1)
-        new = piece.copy()
-        np.minimum.at(new, mesh.edges.ravel(), np.repeat(low, 2))
-        if (new == piece).all():
-            return piece
-        piece = new
 
 
 def proximity(mesh, distance, skin, device, **options):
@@ -45,15 +33,6 @@ def rows(stencils):
     return {tuple(row) for row in stencils.tolist()}
 
 
-def found_by(found, x):
-    """The stencils and distances of either kind, with the rows of vertices as they must be."""
-    kinds, N = detect(found, x), found.model.count
-    vt = len(kinds[0])
-    stencils, starts = np.concatenate(kinds), found.rows.numpy()[: N + 1]
-    np.testing.assert_array_equal(stencils[:vt, 0], np.repeat(np.arange(N), np.diff(starts)))
-    return zip(kinds, np.split(found.distances.numpy()[: len(stencils)], [vt]), strict=True)
-
-
 def check(mesh, x, distance, skin, dtype="float32", device="cpu", **options):
     """That a model finds the pairs of ``x`` and no others, in order, but those at the limit to rounding; how many there are."""
     model, found = proximity(mesh, distance, skin, device, dtype=dtype, **options)
@@ -61,7 +40,10 @@ def check(mesh, x, distance, skin, dtype="float32", device="cpu", **options):
     order = np.arange(n) if model.order is None else model.order
     rounding = 64 * np.finfo(model.numpy_dtype).eps * (np.abs(x).max() + np.ptp(mesh.points, axis=0).max())
     piece, counts = pieces(mesh), []
-    lists = found_by(found, np.tile(x[order], (model.copies, 1)))
+    kinds = detect(found, np.tile(x[order], (model.copies, 1)))
+    of_vertices = np.repeat(np.arange(model.count), np.diff(found.rows.numpy()[: model.count + 1]))
+    np.testing.assert_array_equal(kinds[0][:, 0], of_vertices)
+    lists = zip(kinds, np.split(found.distances.numpy()[: sum(map(len, kinds))], [len(kinds[0])]), strict=True)
     for (stencils, distances), (s, now, rest) in zip(lists, all_pairs(mesh, x), strict=True):
         cutoff = np.where(piece[s[:, 0]] == piece[s[:, 3]], np.minimum(distance, rest / 2), distance)
         gap = now - cutoff - skin
@@ -80,6 +62,20 @@ def check(mesh, x, distance, skin, dtype="float32", device="cpu", **options):
             assert (np.diff(index) > 0).all()
         counts.append(count)
     return counts
+
+
+def lists_of(found, count=None):
+    """The arrays of a detection, on the host, as far as they have pairs."""
+    count = found.counts.numpy().sum() if count is None else count
+    return [
+        *(each.numpy().copy() for each in (found.counts, found.rows)),
+        *(each.numpy()[:count].copy() for each in (found.stencils, found.distances)),
+    ]
+
+
+def assert_same(lists, others):
+    for one, other in zip(lists, others, strict=True):
+        assert one.tobytes() == other.tobytes()
 
 
 def folded(mesh, rng, gap, times=3):
@@ -159,20 +155,17 @@ def test_lists_grow_and_repeat_their_bits(device):
     x = model.array(np.tile(points, (2, 1)), model.vec3)
     found.launch(x)
     assert found.overflowed and found.counts.numpy().sum() > 2 * found.capacity
-    full = found.stencils.numpy()
-    counts = found.counts.numpy()
+    counts, _, full, _ = lists_of(found)
     found.grow()
     with wp.ScopedCapture(device=device) as capture:
         found.launch(x)
     lists = []
     for _ in range(10):
         wp.capture_launch(capture.graph)
-        lists.append([each.numpy().copy() for each in (found.counts, found.stencils, found.distances, found.rows)])
+        lists.append(lists_of(found))
+        assert_same(lists[0], lists[-1])
     assert not found.overflowed and (lists[0][0] == counts).all()
-    for others in lists[1:]:
-        for one, other in zip(lists[0], others, strict=True):
-            assert one.tobytes() == other.tobytes()
-    assert rows(full) <= rows(lists[0][1])
+    assert rows(full) <= rows(lists[0][2])
 
 
 def test_lists_do_not_depend_on_the_threads_of_an_element(device):
@@ -181,13 +174,9 @@ def test_lists_do_not_depend_on_the_threads_of_an_element(device):
     for shares in (1, 8):
         _, found = proximity(SHEETS, 0.02, 0.01, device, copies=2)
         found._shares = shares
-        count = sum(map(len, detect(found, points)))
-        lists.append(
-            [found.counts.numpy(), found.rows.numpy(), found.stencils.numpy()[:count], found.distances.numpy()[:count]]
-        )
-    assert count > 80
-    for one, eight in zip(*lists, strict=True):
-        assert one.tobytes() == eight.tobytes()
+        assert sum(map(len, detect(found, points))) > 80
+        lists.append(lists_of(found))
+    assert_same(*lists)
 
 
 @pytest.mark.parametrize("mesh", [UNEVEN, wc.Mesh.chain(40)], ids=["triangles", "edges"])
@@ -196,8 +185,7 @@ def test_lists_of_what_has_moved_are_those_of_all(mesh, device):
     rng, skin = np.random.default_rng(5), 0.03
     model, found = proximity(mesh, 0.02, skin, device, copies=2)
     other, lost = (Proximity(ContactSurface(model), 0.02, skin) for _ in range(2))
-    lift = np.array([0.0, 1.0, 0.0])
-    x = np.concatenate([folded(mesh, rng, 0.02) + each * lift for each in (0.0, 2.0)])
+    x = np.concatenate([folded(mesh, rng, 0.02) + each * np.array([0.0, 1.0, 0.0]) for each in (0.0, 2.0)])
     detect(found, x)
     detect(lost, x)
     for moving in (0.05, 0.1, 1.0, 0.0, 0.1):
@@ -212,12 +200,8 @@ def test_lists_of_what_has_moved_are_those_of_all(mesh, device):
                 each.launch(each.found)
         assert (found.found.numpy() == lost.found.numpy()).all()
         detect(other, found.found.numpy())
-        count = other.counts.numpy().sum()
-        for one, same in zip((found.counts, found.rows), (other.counts, other.rows), strict=True):
-            np.testing.assert_array_equal(one.numpy(), same.numpy())
-        for one, same in zip((found.stencils, found.distances), (other.stencils, other.distances), strict=True):
-            np.testing.assert_array_equal(one.numpy()[:count], same.numpy()[:count])
-        assert count > 20 and not found.moved(positions, 0.25).numpy()[0]
+        assert_same(lists_of(found), lists_of(other))
+        assert other.counts.numpy().sum() > 20 and not found.moved(positions, 0.25).numpy()[0]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 3e38])
@@ -237,16 +221,15 @@ def test_coordinates_that_are_lost_give_no_pairs(value, device):
 
 def test_no_pair_is_missing_while_nothing_has_moved(device):
     """Sheets that fall together, or far from one another, need no detection; others need one before a pair is missing."""
-    rng = np.random.default_rng(1)
-    distance, skin = 0.02, 0.03
+    rng, distance, skin = np.random.default_rng(1), 0.02, 0.03
     model, found = proximity(SHEETS, distance, skin, device, dtype="float64")
-    one, flags = len(SMALL.points), []
+    one, flags, up = len(SMALL.points), [], np.array([0.0, 1.0, 0.0])
 
-    def moved(y):
-        return bool(found.moved(model.array(y, model.vec3)).numpy()[0])
+    def moved(y, part=0.5):
+        return bool(found.moved(model.array(y, model.vec3), part).numpy()[0])
 
     for trial in range(40):
-        x = np.concatenate([folded(SMALL, rng, 0.02), folded(SMALL, rng, 0.02) + np.array([0.0, 0.1 * (trial % 2), 0.0])])
+        x = np.concatenate([folded(SMALL, rng, 0.02), folded(SMALL, rng, 0.02) + 0.1 * (trial % 2) * up])
         listed = [rows(stencils) for stencils in detect(found, x)]
         assert not moved(x + rng.uniform(-100.0, 100.0, 3))  # float64 keeps the differences
         y = x + rng.uniform(-5.0, 5.0, 3) + rng.uniform(-0.1, 0.1, x.shape) * skin
@@ -258,22 +241,19 @@ def test_no_pair_is_missing_while_nothing_has_moved(device):
                 near = now < np.where(same, np.minimum(distance, rest / 2), distance)
                 assert rows(s[near]) <= have and near.any()
     assert 5 < sum(flags) < 35
-    x[one:] += np.array([0.0, 3.0, 0.0])
+    x[one:] += 3.0 * up
     found.launch(model.array(x, model.vec3))
-    x[one:] -= np.array([0.0, 2.0, 0.0])
-    assert not moved(x)
-    x[one:] -= np.array([0.0, 1.15, 0.0])
-    assert moved(x)
-    x[one:] += np.array([0.0, 1.15, 0.0])
-    assert not moved(x)
+    for rise, far in ((-2.0, False), (-1.15, True), (1.15, False)):
+        x[one:] += rise * up
+        assert moved(x) == far
     x[3, 0] += 0.4 * skin
-    assert not moved(x) and found.moved(model.array(x, model.vec3), 0.25).numpy()[0]
+    assert not moved(x) and moved(x, 0.25)
     x[3, 0] += 0.2 * skin
     assert moved(x)
-    batch, found = proximity(SHEETS, distance, skin, device, copies=2)
+    model, found = proximity(SHEETS, distance, skin, device, copies=2)
     both = np.concatenate([x, x])
-    found.launch(batch.array(both, batch.vec3))
-    both[len(x) :] += np.array([0.0, 5.0, 0.0])
-    assert not found.moved(batch.array(both, batch.vec3)).numpy()[0]
+    found.launch(model.array(both, model.vec3))
+    both[len(x) :] += 5.0 * up
+    assert not moved(both)
     both[-1, 0] += 0.6 * skin
-    assert found.moved(batch.array(both, batch.vec3)).numpy()[0]
+    assert moved(both)

@@ -1,6 +1,8 @@
 """All pairs of a vertex and a triangle, and of two edges, with their distances, in NumPy."""
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 
 def from_segment(p, a, b):
@@ -53,6 +55,12 @@ def _at_rest(mesh):
         s = s[apart]
         kinds.append((s, measure, measure(*points[s.T])))
     return kinds
+
+
+def pieces(mesh):
+    """The number of the connected piece of each vertex."""
+    joined = coo_array((np.ones(len(mesh.edges)), tuple(mesh.edges.T)), shape=(len(mesh.points),) * 2)
+    return connected_components(joined, directed=False)[1]
 
 
 def all_pairs(mesh, x):
