@@ -10,9 +10,11 @@ import trimesh
 import warp as wp
 
 import warpcloth as wc
+from support.layers import after_frames
 from support.rows import slow_but
 from support.scenes import scene
 from support.shapes import Torus
+from support.steps import stopped_and_resumed
 from warpcloth.cli import main
 from warpcloth.contact.clearance import Clearance
 from warpcloth.core.energy import Energy
@@ -455,16 +457,11 @@ def test_copies_resets_and_states(name):
         wc.Sphere(radius=0.1, position=[(0.25, -0.08 + 0.02 * k, 0.25) for k in range(9)], friction=friction),
         wc.MeshCollider(BREATHING, BALL.faces, position=(0.0, -0.12, 0.0), friction=friction),
     ]
-    contact = wc.Contact(distance=R, stiffness=1.5e4)  # which coarse explicit steps bear
-    scene, solver = falling(colliders, n=4, contact=contact), SOLVERS[name]
-    single = solver.bind(scene.build(dtype="float64"))
-    batch = solver.bind(scene.build(dtype="float64", copies=2))
-    for stepper in (single, batch):
-        for _ in range(3):
-            stepper.frame()
-    x = single.state.x.numpy()
+    # A stiffness that coarse explicit steps bear.
+    scene = falling(colliders, n=4, contact=wc.Contact(distance=R, stiffness=1.5e4))
+    single, batch = (after_frames(scene, SOLVERS[name], 3, dtype="float64", copies=copies) for copies in (1, 2))
+    x, kept = single.state.x.numpy().copy(), single.state.copy()
     np.testing.assert_allclose(batch.state.x.numpy().reshape(2, -1, 3), [x, x], rtol=0.0, atol=1e-9)
-    kept = single.state.copy()
     single.frame()
     after = single.state.copy()
     single.state.assign(kept)
@@ -492,7 +489,7 @@ def test_resets_into_colliders_are_refused(threads, device):
     start = np.tile(scene.positions, (3, 1, 1))
     start[:, 2, 1] = -0.5
     start[1, 4], start[2, 5, 1] = [0.0, 1.0, 0.0], -0.25
-    before = stepper.state.x.numpy()
+    before = stepper.state.x.numpy().copy()
     for given in (start, wp.array(start.reshape(-1, 3), dtype=model.vec3, device=device)):
         with pytest.raises(ValueError, match=r"^vertex 4 starts 0.1 m inside the collider ball in copy 1; it"):
             stepper.reset(positions=given)
@@ -504,21 +501,17 @@ def test_resets_into_colliders_are_refused(threads, device):
     assert not stepper.inside and np.isfinite(stepper.state.x.numpy()).all()
 
 
-GRID = wc.Mesh.grid(5, 5, size=4.0)
-# Shapes, meshes of them, and how far these are from the shape at most: of a ball the sagitta of a circumscribed circle, L/√3.
-FINE = trimesh.creation.icosphere(subdivisions=4, radius=0.2)
-SAGITTA = FINE.edges_unique_length.max() ** 2 / (6.0 * 0.2)
+# Shapes, and meshes of them.
+GRID, FINE = wc.Mesh.grid(5, 5, size=4.0), trimesh.creation.icosphere(subdivisions=4, radius=0.2)
 MESHED = {
-    "plane": (wc.Plane(), wc.MeshCollider(GRID.points - [1.75, 0.0, 1.75], GRID.triangles), 0.0),
+    "plane": (wc.Plane(), wc.MeshCollider(GRID.points - [1.75, 0.0, 1.75], GRID.triangles)),
     "box": (
         wc.Box(size=(0.2, 0.1, 0.3), position=(0.25, -0.1, 0.25)),
         wc.MeshCollider(CUBE.vertices, CUBE.faces, position=(0.25, -0.1, 0.25)),
-        0.0,
     ),
     "ball": (
         wc.Sphere(radius=0.2, position=(0.25, -0.205, 0.25)),
         wc.MeshCollider(FINE.vertices, FINE.faces, position=(0.25, -0.205, 0.25)),
-        SAGITTA,
     ),
 }
 
@@ -527,19 +520,20 @@ MESHED = {
 def test_an_equilibrium_on_a_mesh_is_that_on_its_shape(name):
     """A sheet that lies on it, at r − w/k, or hangs over it by its corners.
 
-    By contact of vertices alone, the middles of flat triangles of this size dip 2 mm into the ball and more.
+    By contact of vertices alone, the middles of flat triangles of this size dip 2 mm into the ball and more; those of its mesh
+    lie deeper than the ball by the sagitta of a circumscribed circle, L/√3 in radius.
     """
-    shape, mesh, off = MESHED[name]
+    shape, mesh = MESHED[name]
     fields = {"height": 0.02} if name == "plane" else {"height": 0.0, "pins": [0, 6, 42, 48]}
     scenes = [falling([each], n=7, **fields) for each in (shape, mesh)]
     one, two = (wc.equilibrium(scene) for scene in scenes)
     assert all(each.status.result is Result.CONVERGED and each.stable for each in (one, two))
     if name == "ball":
         dips, out = (shape.distances(each.points[scenes[0].mesh.triangles].mean(axis=1)).min() for each in (one, two))
-        assert dips < -2e-3 and out > -off
+        assert dips < -2e-3 and out > -(FINE.edges_unique_length.max() ** 2) / (6.0 * 0.2)
     else:
         assert all((shape.distances(each.points) < R).sum() >= 3 for each in (one, two))
-        assert np.abs(one.points - two.points).max() < off + 1e-9
+        assert np.abs(one.points - two.points).max() < 1e-9
     if name == "plane":
         np.testing.assert_allclose(one.points[:, 1], R - 0.15 * 9.81 / scenes[0].contact.stiffness, rtol=1e-6)
 
@@ -844,17 +838,9 @@ def test_the_scene_drape_stays_outside():
 @pytest.mark.parametrize("name", slow_but(["newton"], ["explicit", "newton"]))
 def test_a_resumed_run_has_its_anchors(name, tmp_path):
     colliders = [wc.Sphere(radius=0.1, position=[(0.25, -0.08 + 0.002 * k, 0.25) for k in range(25)], friction=0.3)]
-    scene = falling(colliders, fps=120.0, n=4, duration=0.2)
-
-    def stop(frame, frames):
-        if frame == 13:
-            raise KeyboardInterrupt
-
-    paths, record = [str(tmp_path / f"{each}.usdc") for each in ("whole", "resumed")], ("energies", "reactions")
-    whole = wc.simulate(scene, SOLVERS[name], output=paths[0], record=record)
-    with pytest.raises(KeyboardInterrupt):
-        wc.simulate(scene, SOLVERS[name], output=paths[1], progress=stop, record=record)
-    resumed = wc.simulate(scene, SOLVERS[name], output=paths[1], resume=True, record=record)
+    scene, record = falling(colliders, fps=120.0, n=4, duration=0.2), ("energies", "reactions")
+    whole = wc.simulate(scene, SOLVERS[name], output=str(tmp_path / "whole.usdc"), record=record)
+    resumed = stopped_and_resumed(13, scene, SOLVERS[name], output=str(tmp_path / "resumed.usdc"), record=record)
     assert np.asarray(resumed.points).tobytes() == np.asarray(whole.points).tobytes()
     assert resumed.cut == whole.cut == pytest.approx(whole.cuts.mean() * len(whole.cuts) / (len(whole.cuts) - 1))
     assert (resumed.cuts == whole.cuts).all()
@@ -863,20 +849,17 @@ def test_a_resumed_run_has_its_anchors(name, tmp_path):
         assert found.keys() == expected.keys() and all((found[name] == expected[name]).all() for name in found)
 
 
-PLATES = {
-    name: wc.Box(
-        size=(0.1, 0.1, 0.5), position=[(0.0, -side * (0.09 - min(0.01 * k, 0.05)), 0.15) for k in range(9)], name=name
-    )
-    for name, side in (("lower", 1.0), ("upper", -1.0))
-}
-
-
 def closing(between):
     """A sheet of which one side is pinned, or its axis y, and a plate that comes over it; or two plates on the other side."""
-    shift = np.array([0.3, 0.0, 0.0])
-    plates = [replace(plate, position=plate.position + shift) for plate in PLATES.values()]
+    middle = 0.3 if between == "free" else 0.0
+    plates = [
+        wc.Box(
+            size=(0.1, 0.1, 0.5), position=[(middle, side * (0.09 - min(0.01 * k, 0.05)), 0.15) for k in range(9)], name=name
+        )
+        for name, side in (("lower", -1.0), ("upper", 1.0))
+    ]
     return falling(
-        plates if between == "free" else [PLATES["lower"]],
+        plates if between == "free" else plates[:1],
         speed=0.0,
         height=0.0,
         n=4,

@@ -77,12 +77,8 @@ def of_two_edges(a, b, c, d):
 def energies(mesh, x, r):
     """U of vertices and of pairs of edges [J]: plain sums over all faces, edges and vertices, without their cancellation."""
     area, (of_faces, of_edges) = mesh.vertex_areas, all_pairs(mesh, x)
-    piece, total, at_edges, at_vertices = (
-        pieces(mesh),
-        0.0,
-        {},
-        {},
-    )  # the numbers of faces at each edge, and of faces minus edges at each vertex
+    piece, total = pieces(mesh), 0.0
+    at_edges, at_vertices = {}, {}  # the numbers of faces at each edge, and of faces minus edges at each vertex
     s, now, rest = of_faces
     acts = (piece[s[:, 0]] != piece[s[:, 1]]) | (rest >= 2.0 * r)
     for (v, *face), d in zip(s[acts], now[acts], strict=True):

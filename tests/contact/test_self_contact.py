@@ -68,13 +68,13 @@ def crossed(points, triangles):
 def contacts_at(pairs, x):
     """F·n and kAφ″ of all slots at x, 0 without contact, their n and weights, and their stencils."""
     pairs.forces.launch(pairs.model.array(x, pairs.model.vec3))
-    found, forces, n = pairs.contact, pairs.contact.forces, pairs.contact.data.normal.numpy()
+    found, forces, n = pairs.contact, pairs.contact.forces, pairs.contact.data.normal.numpy().copy()
     acting = np.zeros(found.capacity, dtype=bool)
     acting[found.pairs.acting.numpy()[: found.pairs.number.numpy()[0]]] = True
     pull = np.where(acting, (forces.force.numpy() * n).sum(axis=1), 0.0)
     share = np.maximum(found.data.share.numpy(), 1e-300)
     bend = np.where(acting & (found.data.stiffness.numpy() > 0.0), forces.bend.numpy()[:, 0] / share, 0.0)
-    return pull, bend, n, found.data.weights.numpy(), found.pairs.stencils.numpy()
+    return pull, bend, n, found.data.weights.numpy().copy(), found.pairs.stencils.numpy().copy()
 
 
 @pytest.mark.parametrize(
