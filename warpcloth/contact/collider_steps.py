@@ -103,6 +103,11 @@ class ColliderSteps:
             c = elements.collider
             self.terms.append(elements if c is None else self._bound(elements, c, state))
 
+    @property
+    def solid(self):
+        """The elements of contact, which keep vertices out of colliders."""
+        return [elements for elements in self.terms if elements.term.gap]
+
     def _bound(self, elements, c, state):
         """Returns the elements of contact or friction with collider c, with rest states of their own."""
         model, declared = self.model, self.model.colliders

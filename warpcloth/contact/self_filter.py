@@ -300,8 +300,7 @@ class SelfFilter:
 
     def iterates(self):
         """Prepares the methods below for a solver whose iterates stay apart."""
-        terms = () if self._colliders is None else self._colliders.terms
-        self._touching = [elements for elements in terms if elements.term.gap]
+        self._touching = () if self._colliders is None else self._colliders.solid
         self._iterates, model = True, self.model
         self._contact.contact.least = self._contact.least
         self._prepare_advance()

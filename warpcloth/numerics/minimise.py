@@ -10,6 +10,8 @@ from ..core.hessian import Hessian
 from ..core.status import Result
 from ..core.sums import Sums
 from ..kernels import minimise as kernels
+from ..kernels.contact.clear_elements import move_clear
+from ..kernels.elementwise import mismatch
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
 from ..kernels.terms.air import AIR
@@ -67,6 +69,8 @@ class Minimiser:
         last: The array for d (N,) [m], which holds that of the last step. Without contact a descent starts there if φ is lower
             than at d = 0. None: every descent starts from d = 0. With pairs a descent starts where
             :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says.
+        solid: Elements of contact with colliders. A descent without pairs starts at their contact distance if φ is lower there
+            than at d = 0, which may be so deep inside that rounding of the way out moves cloth along the collider.
 
     Attributes:
         correction: d (N,) [m].
@@ -76,8 +80,8 @@ class Minimiser:
         iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
 
-    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, near=None, last=None):
-        self.model, self.base, self.pairs, self._near = model, base, pairs, near
+    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, near=None, last=None, solid=()):
+        self.model, self.base, self.pairs, self._near, self._solid = model, base, pairs, near, () if pairs else solid
         self.warm = last is not None and _resembles_the_last_step(model)
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
@@ -221,9 +225,11 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        """Launches the start from d = 0, or from the last d where φ is lower there."""
+        """Launches the start from d = 0, or from the last d, or outside of colliders, where φ is lower there."""
         if self.warm:
             wp.copy(self.right, self.correction)
+        elif self._solid:
+            self._launch_clear(self.right)
         self.clear()
         self.linear.outdate()
         self._progress.proceed.zero_()
@@ -231,9 +237,20 @@ class Minimiser:
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
         if self.warm:
             self._launch_mean(self.right)
+        if self.warm or self._solid:
             self.search.launch_guess(self.right, self.active)
             self._progress.proceed.zero_()
             self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
+
+    def _launch_clear(self, d):
+        """Launches the d (N,) that moves vertices out of colliders, to the contact distance."""
+        model, x = self.model, self.search.trial
+        wp.copy(x, self.base)
+        for elements in self._solid:
+            given = [elements.stencil, elements.rest, model.inverse_mass]
+            model.launch(model.kernel(move_clear, elements.term, model.dtype), elements.count, given, [x])
+        model.launch(model.kernel(mismatch, model.dtype), model.count, [x, self.base], [d])
+        model.lock(d)
 
     def _launch_iterations(self):
         """Launches iterations until no copy is active, but at most ``AT_ONCE``."""

@@ -106,8 +106,8 @@ class NewtonStepper(ImplicitStepper):
         super().__init__(options, model)
         model = self.model
         last = self.state.add("correction", model.vectors())
-        near = None if self.colliders is None else self.colliders.near
-        given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "near": near, "last": last}
+        near, solid = (None, ()) if self.colliders is None else (self.colliders.near, self.colliders.solid)
+        given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "near": near, "last": last, "solid": solid}
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, **given)
         for name, array in self.minimiser.kept.items():
             self.state.add(name, array)
