@@ -447,6 +447,90 @@ def turn_where_blocked(dtype):
 
 
 @cache
+def copies_near_colliders():
+    """Kernel over copies: ``touching`` is 1 for ``active`` copies that are ``near`` colliders, else 0; then ``some`` becomes 1.
+
+    ``near`` (B,) is None if it holds ``always`` or never.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_copies(
+        # state in
+        near: wp.array(dtype=wp.int32),
+        active: wp.array(dtype=wp.int32),
+        # parameters
+        always: bool,
+        # out
+        touching: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
+    ):
+        copy = wp.tid()
+        is_near = always
+        if near:
+            is_near = near[copy] != 0
+        touching[copy] = wp.where(is_near, active[copy], 0)
+        if touching[copy] != 0:
+            some[0] = 1
+
+    return find_copies
+
+
+@cache
+def copies_in_contact(dtype):
+    """Kernel over contacts: ``touching`` becomes 1 for their copies if these are ``active``, and then ``some``."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_copy(
+        # elements
+        pairs: near_pairs(dtype),
+        # state in
+        active: wp.array(dtype=wp.int32),
+        # parameters
+        per_copy: int,
+        # out
+        touching: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
+    ):
+        t = wp.tid()
+        if t >= pairs.number[0]:
+            return
+        copy = pairs.stencils[pairs.acting[t]][0] // per_copy
+        if active[copy] != 0:
+            touching[copy] = 1
+            some[0] = 1
+
+    return find_copy
+
+
+@cache
+def aim_back(dtype):
+    """Kernel over vertices: p = goal − d, 0 along pinned axes, which are already where they must be."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def aim_each(
+        # state in
+        inverse_mass: wp.array(dtype=dtype),
+        mobility: wp.array(dtype=vec3),
+        goal: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
+        # out
+        p: wp.array(dtype=vec3),
+    ):
+        i = wp.tid()
+        free = vec3(inverse_mass[i])
+        if mobility:
+            free = mobility[i]
+        move = goal[i] - d[i]
+        for axis in range(3):
+            if free[axis] == dtype(0.0):
+                move[axis] = dtype(0.0)
+        p[i] = move
+
+    return aim_each
+
+
+@cache
 def add_positions(dtype):
     """Kernel over vertices: out = a + sign·b in the copies that are ``active``, or in all; b is 0 beyond its end."""
     vec3, _ = types(dtype)

@@ -307,7 +307,10 @@ class SelfFilter:
         if model.keyframes is not None:
             turn = self_filter.turn_where_blocked
             self._kernels[turn] = model.kernel(turn, model.dtype)
-        self._direction = model.vectors()
+        self._direction, self._back = model.vectors(), model.vectors()
+        self._near_colliders = model.kernel(self_filter.copies_near_colliders)
+        made = self_filter.copies_in_contact, self_filter.aim_back
+        self._kernels |= {factory: model.kernel(factory, model.dtype) for factory in made}
         if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
@@ -327,6 +330,7 @@ class SelfFilter:
             given = [elements.stencil, elements.rest, self.model.inverse_mass]
             self.model.launch(kernel, elements.count, given, [self._target])
         self._add(self._target, x, -1.0, direction)
+        self._add(x, base, -1.0, self._back)
         self.launch_limit(direction, whole=True)
         if self.model.keyframes is not None:
             self._turn(direction, pins=True)
@@ -338,6 +342,32 @@ class SelfFilter:
             wp.capture_if(self._proceed, self._launch_walk_of_pins, x=x)
         self._add(x, base, -1.0, d)
         self._add(d, direction, 1.0, d)
+
+    def launch_touching(self, active, touching, some):
+        """Sets ``touching`` (B,) to 1 for ``active`` copies (B,) near colliders, or with contacts where forces were last found.
+
+        It is 0 for others, and ``some`` (1,) is 1 if there are any such copies.
+        """
+        model, contact, colliders = self.model, self._contact.contact, self._colliders
+        near = None if colliders is None else colliders.near
+        always = colliders is not None and near is None
+        some.zero_()
+        model.launch(self._near_colliders, model.copies, [near, active, always], [touching, some])
+        given = [active, model.per_copy]
+
+        def in_contact():
+            self._launch(self_filter.copies_in_contact, contact.capacity, [contact.pairs, *given], [touching, some])
+
+        wp.capture_if(self._contact.listed, in_contact)
+
+    def launch_back(self, d, direction):
+        """Sets the direction from d to the start of the step, of free vertices; or 0 if pairs do not stay apart on this way.
+
+        Call it after :meth:`launch_start`, with pairs listed at d.
+        """
+        given = [self.model.inverse_mass, self.model.mobility, self._back, d]
+        self._launch(self_filter.aim_back, self.model.count, given, [direction])
+        self.launch_limit(direction, whole=True)
 
     def _turn(self, direction, pins):
         model, filtered = self.model, [self._contact.x_before, self._target]

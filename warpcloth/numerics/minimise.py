@@ -68,7 +68,7 @@ class Minimiser:
         near: 1 for copies that may come near colliders in a step, (B,) int32 on the device; None if all may.
         last: The array for d (N,) [m], which holds that of the last step. Without contact a descent starts there if φ is lower
             than at d = 0. None: every descent starts from d = 0. With pairs a descent starts where
-            :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says.
+            :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says, or at the start of the step if φ is lower there.
         solid: Elements of contact with colliders. A descent without pairs starts at their contact distance if φ is lower there
             than at d = 0, which may be so deep inside that rounding of the way out moves cloth along the collider.
 
@@ -225,7 +225,7 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        """Launches the start from d = 0, or from the last d, or outside of colliders, where φ is lower there."""
+        """Launches the start from d = 0, or where φ is lower from the last d, outside of colliders, or the start of the step."""
         if self.warm:
             wp.copy(self.right, self.correction)
         elif self._solid:
@@ -238,9 +238,27 @@ class Minimiser:
         if self.warm:
             self._launch_mean(self.right)
         if self.warm or self._solid:
-            self.search.launch_guess(self.right, self.active)
-            self._progress.proceed.zero_()
-            self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
+            wp.copy(self.search.direction, self.right)
+            self._launch_guess(self.active)
+        elif self.pairs is not None:
+            self.pairs.filter.launch_touching(self.active, self._wanted, self._unsolved)
+            wp.capture_if(self._unsolved, self._launch_stay)
+
+    def _launch_stay(self):
+        """Launches the start from the start of the step where φ is lower there.
+
+        So φ does not exceed its value there, and the energy of the cloth does not grow in the step. Cloth at rest is almost in
+        balance there, while x̃ is h²g below, from where contact would push it back.
+        """
+        self.pairs.filter.launch_back(self.correction, self.search.direction)
+        self._launch_guess(self._wanted)
+
+    def _launch_guess(self, active):
+        """Launches the move along the direction where it lowers φ, for the copies that are ``active`` (B,)."""
+        self.search.launch_guess(active)
+        self._progress.proceed.zero_()
+        given = [self.search.acceleration, self._limits]
+        self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
     def _launch_clear(self, d):
         """Launches the d (N,) that moves vertices out of colliders, to the contact distance."""
