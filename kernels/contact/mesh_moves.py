@@ -12,7 +12,7 @@ import warp as wp
 
 from ..vectors import types
 from .gap_notes import FIRST
-from .obstacles import Layout, copy_of, has_obstacle
+from .obstacles import has_obstacle
 from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import StepPairs, near_pairs
 
@@ -209,27 +209,3 @@ def end_move(dtype):
                 wp.atomic_max(first, c, FIRST - wp.int64(steps[c] // per_frame + 1))
 
     return end_each_move
-
-
-@cache
-def return_obstacles(dtype):
-    """Kernel over obstacles: x = ``before``, in copies whose colliders have cut a move since ``cut_before``."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
-    def return_each_obstacle(
-        # elements
-        layout: Layout,
-        # state in
-        before: wp.array(dtype=vec3),
-        cut_before: wp.array(dtype=wp.int64),
-        cut: wp.array(dtype=wp.int64),
-        # out
-        x: wp.array(dtype=vec3),
-    ):
-        t = wp.tid()
-        copy = copy_of(layout, layout.cloth + t)
-        if cut[copy] > cut_before[copy]:
-            x[t] = before[t]
-
-    return return_each_obstacle

@@ -40,25 +40,6 @@ def pieces(dtype):
 
 
 @cache
-def begin_boxes(dtype):
-    """Kernel over pieces: sets the box to a vertex."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
-    def begin_each_box(
-        # state in
-        x: wp.array(dtype=vec3),
-        # in and out
-        pieces: pieces(dtype),
-    ):
-        p = wp.tid()
-        pieces.lower[p] = x[pieces.samples[p * SAMPLES]]
-        pieces.upper[p] = x[pieces.samples[p * SAMPLES]]
-
-    return begin_each_box
-
-
-@cache
 def extend_boxes(dtype):
     """Kernel over vertices: extends the boxes of their pieces."""
     vec3, _ = types(dtype)

@@ -7,8 +7,8 @@ import warp as wp
 from ..memory import load
 from ..vectors import types
 from .mesh_geometry import nearest_on_triangle
-from .obstacles import OBSTACLE, copy_of, has_obstacle, in_copy
-from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, grids, groups_meet, surfaces
+from .obstacles import CLOTH, OBSTACLE, copy_of, has_obstacle, in_copy
+from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, code_of, grids, surfaces
 
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 
@@ -193,68 +193,78 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
         if level < 0:
             return
         if group == OBSTACLE:
-            if not meet(low, high, surface.region[2 * copy], surface.region[2 * copy + 1]):
+            if not meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 return
         lowest = level
         layer = cell_at(grid.size, low, high, level)[2]
         buckets = grid.counts.shape[0]
         if wp.static(not of_edges):
             if p:
-                level = 0
-        present = grid.levels[KIND] >> level
-        while present != 0:
-            if (present & 1) != 0:
-                code = (2 * copy + KIND) * 32 + level
-                one, two = cells_about(grid.size, low, high, level)
-                if wp.static(of_edges):
-                    if level == lowest:
-                        one[2] = layer
-                width = wp.min(two[0] - one[0] + 1, buckets)
-                height = two[1] - one[1] + 1
-                rows = wp.int64(height) * wp.int64(two[2] - one[2] + 1)
-                everywhere = rows > wp.int64(buckets)
-                if everywhere:
-                    width = 1
-                for line in range(share, wp.int32(wp.min(rows, wp.int64(buckets))), shares):
-                    cz = one[2] + line // height
-                    cy = one[1] + line - height * (cz - one[2])
-                    run = line
-                    if not everywhere:
-                        run = bucket_of(one[0], cy, cz, code, buckets)
-                    begin = number(grid.first, run)
-                    end = number(grid.first, wp.min(run + width, buckets))
-                    # A sequence beyond the last bucket continues at the first.
-                    for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
-                        slot = wp.where(at < end, at, at - end)
-                        if not meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
-                            continue
-                        entry = four(grid.entries, slot)
-                        if everywhere:
-                            cy = entry[1]
-                            cz = entry[2]
-                            if cz < one[2]:
+                lowest = 0
+        for kind in range(KIND, KIND + 4, 2):
+            # Among edges of one level, those of cloth find those of obstacles, and one of two of the cloth finds the other.
+            ordered = kind == KIND and group != OBSTACLE
+            if (kind != KIND and group != CLOTH) or (ordered and not surface.itself):
+                continue
+            level = lowest
+            if wp.static(of_edges):
+                if group == OBSTACLE:
+                    level += 1
+            present = grid.levels[kind] >> level
+            while present != 0:
+                if (present & 1) != 0:
+                    code = code_of(copy, kind, level)
+                    one, two = cells_about(grid.size, low, high, level)
+                    if wp.static(of_edges):
+                        within = ordered and level == lowest
+                        if within:
+                            one[2] = layer
+                    width = wp.min(two[0] - one[0] + 1, buckets)
+                    height = two[1] - one[1] + 1
+                    rows = wp.int64(height) * wp.int64(two[2] - one[2] + 1)
+                    everywhere = rows > wp.int64(buckets)
+                    if everywhere:
+                        width = 1
+                    for line in range(share, wp.int32(wp.min(rows, wp.int64(buckets))), shares):
+                        cz = one[2] + line // height
+                        cy = one[1] + line - height * (cz - one[2])
+                        run = line
+                        if not everywhere:
+                            run = bucket_of(one[0], cy, cz, code, buckets)
+                        begin = number(grid.first, run)
+                        end = number(grid.first, wp.min(run + width, buckets))
+                        # A sequence beyond the last bucket continues at the first.
+                        for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
+                            slot = wp.where(at < end, at, at - end)
+                            if not meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
                                 continue
-                        if not groups_meet(group, number(surface.groups, entry[0]), surface.itself):
-                            continue
-                        other = four(surface.items, entry[0])
-                        if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
-                            continue
-                        s = wp.vec4i(own[0], own[1], other[0], other[1])
-                        k = entry[0] - triangles
-                        if wp.static(of_edges):
-                            if level == lowest and cz == layer and k <= i:
+                            entry = four(grid.entries, slot)
+                            if everywhere:
+                                cy = entry[1]
+                                cz = entry[2]
+                                if cz < one[2]:
+                                    continue
+                            if entry[1] != cy or entry[2] != cz or entry[3] != code:
                                 continue
-                            if k < i:
-                                s = wp.vec4i(other[0], other[1], own[0], own[1])
-                        elif other[2] == own[0]:
-                            continue
-                        else:
-                            s = wp.vec4i(own[0], other[0], other[1], other[2])
-                        if entry[1] != cy or entry[2] != cz or entry[3] != code:
-                            continue
-                        visit(surface, x, s, i, k, triangles, out)
-            present = present >> 1
-            level += 1
+                            if group == OBSTACLE and number(surface.groups, entry[0]) != CLOTH:
+                                continue
+                            other = four(surface.items, entry[0])
+                            if other[0] == own[0] or other[1] == own[0] or other[0] == own[1] or other[1] == own[1]:
+                                continue
+                            s = wp.vec4i(own[0], own[1], other[0], other[1])
+                            k = entry[0] - triangles
+                            if wp.static(of_edges):
+                                if within and cz == layer and k <= i:
+                                    continue
+                                if k < i:
+                                    s = wp.vec4i(other[0], other[1], own[0], own[1])
+                            elif other[2] == own[0]:
+                                continue
+                            else:
+                                s = wp.vec4i(own[0], other[0], other[1], other[2])
+                            visit(surface, x, s, i, k, triangles, out)
+                present = present >> 1
+                level += 1
 
     return find_each_pair
 

@@ -28,7 +28,7 @@ def surfaces(dtype):
     ``groups`` of items and ``vertex_groups`` say which elements meet, and ``itself`` whether cloth meets cloth. ``distance`` is
     the contact distance of cloth with cloth, ``of_meshes`` that with meshes, ``max_distance`` the larger one, and ``skin`` the
     skin [m]. Elements whose first vertices are more than ``far`` apart at rest are surely at least twice the contact distance
-    apart [m]. ``region`` has the lowest and the highest corner of the cloth of each copy; without obstacles it is empty.
+    apart [m]. ``lowest`` and ``highest`` are the corners of a box of the cloth of each copy; without obstacles they are empty.
     """
     vec3, _ = types(dtype)
 
@@ -46,27 +46,19 @@ def surfaces(dtype):
         max_distance: dtype
         skin: dtype
         far: dtype
-        region: wp.array(dtype=vec3)
+        lowest: wp.array(dtype=vec3)
+        highest: wp.array(dtype=vec3)
 
     return ContactSurface
-
-
-@wp.func
-def groups_meet(a: int, b: int, itself: bool):
-    """Whether elements of two groups meet: cloth and obstacles, and cloth with cloth if it meets ``itself``."""
-    found = itself
-    if wp.max(a, b) == OBSTACLE:
-        found = a + b == OBSTACLE and a != b
-    return found
 
 
 @cache
 def grids(dtype):
     """Struct of the grid: ``size``, the half size of the largest boxes of level 0 [m], and 2ᵏ buckets of entries.
 
-    Bucket b has the entries first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell; the
-    code combines kind, copy and level. ``counts`` and ``keys`` are scratch. ``levels`` has a bit for each level with triangles,
-    and one for each level with edges.
+    Bucket b has the entries first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell, see
+    :func:`code_of`. ``counts`` and ``keys`` are scratch. ``levels`` (4,) has a bit for each level with triangles of the cloth,
+    with edges of it, with triangles of obstacles, and with edges of them.
     """
     vec3, _ = types(dtype)
 
@@ -171,6 +163,17 @@ def boxes_meet(dtype):
 
 
 @wp.func
+def kind_in_grid(v: wp.vec4i, group: int):
+    """The kind of an item with the vertices v: 0 for triangles, 1 for edges, and 2 more for those of obstacles."""
+    return (v[3] & 1) + wp.where(group == OBSTACLE, 2, 0)
+
+
+@wp.func
+def code_of(copy: int, kind: int, level: int):
+    return (4 * copy + kind) * 32 + level
+
+
+@wp.func
 def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
     key = wp.uint32(x) + wp.uint32(y) * wp.uint32(73856093) + wp.uint32(z) * wp.uint32(19349663)
     return wp.int32((key + wp.uint32(code) * wp.uint32(83492791)) & wp.uint32(buckets - 1))
@@ -178,10 +181,7 @@ def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
 
 @cache
 def bound_cloth(dtype):
-    """Kernel over vertices of the cloth: extends the ``region`` of their copy, which holds their boxes along p.
-
-    With ``begins`` it sets the region to that of the first vertex of the copy, as a kernel over copies.
-    """
+    """Kernel over vertices of the cloth: extends the box of their copy, which holds their boxes along p."""
     vec3, _ = types(dtype)
     box_along, _level_of, _cell_at, _about = boxes(dtype)
 
@@ -192,22 +192,13 @@ def bound_cloth(dtype):
         # state in
         x: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
-        # parameters
-        begins: bool,
     ):
         i = wp.tid()
-        copy = i
-        if begins:
-            i = copy * surface.layout.per_copy
-        else:
-            copy = i // surface.layout.per_copy
+        copy = i // surface.layout.per_copy
         low, high = box_along(surface, x, p, i, i, i)
-        if begins:
-            surface.region[2 * copy] = low
-            surface.region[2 * copy + 1] = high
-        elif wp.max(wp.max(surface.region[2 * copy] - low, high - surface.region[2 * copy + 1])) > dtype(0.0):
-            wp.atomic_min(surface.region, 2 * copy, low)
-            wp.atomic_max(surface.region, 2 * copy + 1, high)
+        if wp.max(wp.max(surface.lowest[copy] - low, high - surface.highest[copy])) > dtype(0.0):
+            wp.atomic_min(surface.lowest, copy, low)
+            wp.atomic_max(surface.highest, copy, high)
 
     return bound_each_vertex
 
@@ -216,7 +207,7 @@ def bound_cloth(dtype):
 def count_items(dtype):
     """Kernel over items: counts of buckets, the bucket of each item or −1, and the levels that exist.
 
-    Obstacles count where they meet the region of the cloth.
+    Obstacles count where they meet the box of the cloth.
     """
     vec3, _ = types(dtype)
     box_along, level_of, cell_at, _about = boxes(dtype)
@@ -238,14 +229,15 @@ def count_items(dtype):
         level = level_of(grid.size, low, high)
         if surface.groups[item] == OBSTACLE:
             copy = v[3] >> 1
-            if not meet(low, high, surface.region[2 * copy], surface.region[2 * copy + 1]):
+            if not meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 level = -1
         key = wp.int32(-1)
         if level >= 0:
-            if (grid.levels[v[3] & 1] & (1 << level)) == 0:
-                wp.atomic_or(grid.levels, v[3] & 1, 1 << level)
+            kind = kind_in_grid(v, surface.groups[item])
+            if (grid.levels[kind] & (1 << level)) == 0:
+                wp.atomic_or(grid.levels, kind, 1 << level)
             cell = cell_at(grid.size, low, high, level)
-            key = bucket_of(cell[0], cell[1], cell[2], v[3] * 32 + level, grid.counts.shape[0])
+            key = bucket_of(cell[0], cell[1], cell[2], code_of(v[3] >> 1, kind, level), grid.counts.shape[0])
             wp.atomic_add(grid.counts, key, 1)
         grid.keys[item] = key
 
@@ -277,7 +269,7 @@ def fill_buckets(dtype):
         level = level_of(grid.size, low, high)
         cell = cell_at(grid.size, low, high, level)
         slot = grid.first[key] + wp.atomic_sub(grid.counts, key, 1) - 1
-        grid.entries[slot] = wp.vec4i(item, cell[1], cell[2], v[3] * 32 + level)
+        grid.entries[slot] = wp.vec4i(item, cell[1], cell[2], code_of(v[3] >> 1, kind_in_grid(v, surface.groups[item]), level))
         grid.lower[slot] = low
         grid.upper[slot] = high
 

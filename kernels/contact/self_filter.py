@@ -290,7 +290,10 @@ def end_filter(dtype):
 
 @cache
 def walk_from_start(dtype):
-    """Kernel over vertices: x = x_before, the start of the step, in copies whose colliders have cut a move since ``before``."""
+    """Kernel over vertices from ``first`` on: x = x_before, the start of the step, in copies with cuts since ``before``.
+
+    Those are cuts of moves by colliders.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -300,12 +303,14 @@ def walk_from_start(dtype):
         before: wp.array(dtype=wp.int64),
         cut: wp.array(dtype=wp.int64),
         # parameters
-        per_copy: int,
+        layout: Layout,
+        first: int,
         # out
         x: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        if cut[i // per_copy] > before[i // per_copy]:
+        copy = copy_of(layout, first + i)
+        if cut[copy] > before[copy]:
             x[i] = x_before[i]
 
     return walk_each_from_start

@@ -5,9 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 import warpcloth as wc
 from support.layers import after_frames, energy, gradient, stack
+from support.pairs import between_edges, from_triangle
+from warpcloth.contact.proximity import Proximity
+from warpcloth.contact.surface import ContactSurface
+from warpcloth.kernels.contact.obstacles import CLOTH, OBSTACLE
 
 R = 3e-3
 
@@ -199,3 +204,39 @@ def test_a_copy_that_needs_more_rounds_changes_no_other(device):
         for each in (both, single):
             each.frame()
     np.testing.assert_array_equal(both.state.x.numpy()[:36], single.state.x.numpy())
+
+
+@pytest.mark.parametrize("itself", [False, True])
+def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
+    """Triangles of two sizes, which are in several levels of the grid, two copies, and pins, which meet no mesh."""
+    scene = sheet([plate(0.2, 14), plate(0.4, 2, position=(0.0, -0.02, 0.0))], pins=[0, 1, 6, 7])
+    model, skin = scene.build(copies=2, dtype="float64", device=device), 0.01
+    surface = ContactSurface(model, itself)
+    x = surface.of_model(surface.rest)
+    x[: model.count] += np.random.default_rng(0).normal(scale=0.02, size=(model.count, 3))
+    found = Proximity(surface, R, skin, R)
+    positions = wp.array(x, dtype=model.vec3, device=device)
+    found.launch(positions)
+    while found.overflowed:
+        found.grow()
+        found.launch(positions)
+    stencils = found.stencils.numpy()[: found.counts.numpy().sum()]
+    listed = [tuple(s) for s in stencils if (s >= model.count).any()]
+    copies = np.concatenate([np.repeat(np.arange(2), len(x) // 2) for x in np.split(x, [model.count])])
+    vertices, groups = np.arange(len(x)), surface.of_model(surface.vertex_groups)
+    items, edges = np.split(surface.items, [surface.triangles])
+    of_items, of_edges = np.split(surface.groups, [surface.triangles])
+    wanted = []
+    for own, own_groups, others, other_groups, measure in (
+        (vertices[:, None], groups, items[:, :3], of_items, from_triangle),
+        (edges[:, :2], of_edges, edges[:, :2], of_edges, between_edges),
+    ):
+        meet = (own_groups[:, None] == int(CLOTH)) & (other_groups == int(OBSTACLE))
+        meet |= (own_groups[:, None] == int(OBSTACLE)) & (other_groups == int(CLOTH))
+        meet &= copies[own[:, :1]] == copies[others[:, 0]]
+        meet = np.triu(meet) if own.shape[1] == 2 else meet
+        i, j = np.nonzero(meet)
+        s = np.column_stack([own[i], others[j]])
+        wanted += map(tuple, s[measure(*x[s.T]) < R + skin])
+    assert len(wanted) > 1000
+    assert sorted(listed) == sorted(wanted)

@@ -50,13 +50,15 @@ class Proximity:
         self.pieces, points = self._connected(model.in_model(model.scene.mesh.edges))
         piece = surface.pieces(self.pieces)
         rest = np.concatenate([points, surface.rest[len(points) :]])
+        boxes = model.copies if surface.obstacles else 0
         self._kept = {  # the struct holds no references
             "items": wp.array(surface.items, dtype=wp.vec4i, device=device),
             "groups": wp.array(surface.groups, dtype=wp.int32, device=device),
             "vertex_groups": wp.array(surface.vertex_groups, dtype=wp.int32, device=device),
             "rest": model.array(rest, model.vec3),
             "piece": wp.array(piece, dtype=wp.int32, device=device),
-            "region": wp.zeros(2 * model.copies if surface.obstacles else 0, dtype=model.vec3, device=device),
+            "lowest": wp.zeros(boxes, dtype=model.vec3, device=device),
+            "highest": wp.zeros(boxes, dtype=model.vec3, device=device),
         }
         values = {"layout": surface.layout, "itself": surface.meets_itself, "distance": distance, "of_meshes": of_meshes}
         values |= {"max_distance": self._max_distance, "skin": skin, "far": 2.0 * (distance + surface.edge_lengths.max())}
@@ -77,7 +79,7 @@ class Proximity:
         self._launch = model.launcher(
             ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
             ((kernels.fill_rows, kernels.write_pairs), model.dtype),
-            ((piece_motion.begin_boxes, piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
+            ((piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.take_moved), model.dtype),
             ((piece_motion.find_motion_of_pieces,), model.dtype),
         )
@@ -129,7 +131,7 @@ class Proximity:
         model, items, lengths = self.model, self._triangles + self._edges, self.surface.edge_lengths
         size = 0.5 * (min(1.05 * lengths.max(), 2.0 * np.median(lengths)) + self._max_distance + self.skin)
         buckets = 1 << max(4, (items - 1).bit_length())
-        count = {"levels": 2, "counts": buckets, "keys": items, "first": buckets + 1}
+        count = {"levels": 4, "counts": buckets, "keys": items, "first": buckets + 1}
         self._grid_arrays = {k: wp.zeros(size, dtype=wp.int32, device=model.device) for k, size in count.items()}
         for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("entries", wp.vec4i)):
             self._grid_arrays[name] = wp.zeros(items, dtype=kind, device=model.device)
@@ -205,8 +207,9 @@ class Proximity:
         grid, items, model = self._grid, self._triangles + self._edges, self.model
         self._grid_arrays["levels"].zero_()
         if self.surface.obstacles:
-            for count, begins in ((model.copies, True), (model.count, False)):
-                self._launch(proximity_grid.bound_cloth, count, [surface, x, p, begins], [])
+            self._kept["lowest"].fill_(np.inf)
+            self._kept["highest"].fill_(-np.inf)
+            self._launch(proximity_grid.bound_cloth, model.count, [surface, x, p], [])
         self._launch(proximity_grid.count_items, items, [surface, x, p], [grid])
         self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
         self._launch(proximity_grid.fill_buckets, items, [surface, x, p], [grid])
@@ -216,7 +219,8 @@ class Proximity:
                 self.model.launch(search, (count, self._shares), given, [out])
 
     def _launch_boxes(self, x):
-        self._launch(piece_motion.begin_boxes, len(self.drift), [x], [self._pieces])
+        self._piece_arrays["lower"].fill_(np.inf)
+        self._piece_arrays["upper"].fill_(-np.inf)
         self._launch(piece_motion.extend_boxes, self._vertices, [x], [self._pieces])
 
     def launch_kept(self, x, part, launch):

@@ -86,11 +86,11 @@ class SelfFilter:
         model = self.model
         if self._cut_before is not None:
             colliders = self._colliders
-            given = [colliders.x_before, self._cut_before, colliders.notes.cut, model.per_copy]
-            self._launch(self_filter.walk_from_start, model.count, given, [self._contact.x_before])
+            given, x_before = [self._cut_before, colliders.notes.cut, self._surface.layout], self._contact.x_before
+            self._launch(self_filter.walk_from_start, model.count, [colliders.x_before, *given, 0], [x_before])
             if self._moves is not None:
-                given = [self._surface.layout, self._contact.placed[0], self._cut_before, colliders.notes.cut]
-                self._launch_move(mesh_moves.return_obstacles, given, [self._surface.behind(self._contact.x_before)])
+                given = [self._contact.placed[0], *given, model.count]
+                self._launch_move(self_filter.walk_from_start, given, [self._surface.behind(x_before)])
             self.launch_fresh(self._contact.x_before, self._contact.relist)
             if self._moves is not None:
                 self._contact.launch_sides(self._contact.x_before)
@@ -239,7 +239,7 @@ class SelfFilter:
         self._moves = self._surface.vectors()
         self._carried, self._keys = (wp.zeros(model.count, dtype=wp.int64, device=device) for _ in range(2))
         made = mesh_moves.are_away, mesh_moves.aim_obstacles, mesh_moves.carry_vertices, mesh_moves.end_move
-        made += mesh_moves.return_obstacles, self_filter.push_pairs
+        made += (self_filter.push_pairs,)
         self._kernels |= {factory: model.kernel(factory, model.dtype) for factory in made}
         self._carriers = [model.kernel(mesh_moves.find_carriers, model.dtype, each) for each in (True, False)]
 

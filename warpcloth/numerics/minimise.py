@@ -225,7 +225,7 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        """Launches the start from d = 0, or where φ is lower from the last d, outside of colliders, or the start of the step."""
+        """Launches the start from d = 0, or where φ is lower from the last d, outside colliders, or the start of the step."""
         if self.warm:
             wp.copy(self.right, self.correction)
         elif self._solid:
