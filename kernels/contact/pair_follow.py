@@ -35,8 +35,7 @@ def carry_forces(dtype):
         # in and out
         contacts: Contacts,
     ):
-        t = wp.tid()
-        if t < pairs.number[0]:
+        for t in range(wp.tid(), pairs.number[0], pairs.threads):
             e = pairs.acting[t]
             contacts.followed.carried[e] = wp.dot(multipliers[e], contacts.normal[e])
             contacts.followed.stencils[e] = contacts.parts[e]
@@ -60,36 +59,34 @@ def start_forces(dtype):
         # in and out
         contacts: Contacts,
     ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
-            return
-        e = pairs.acting[t]
-        gap = contacts.gap[e]
-        r = contacts.distance[e]
-        found = ZERO
-        if gap >= SIDE * r:
-            found = -contacts.stiffness[e] * slope(gap, r) * h * h
-        # The list may have been made anew, so that the contact is now in another slot of its row.
-        half = contacts.code.shape[0] // 2
-        row = contacts.parts[e][0]
-        if e >= lists.counts[0] and e < half:
-            row = vertices
-            above = lists.rows.shape[0] - 1
-            while above - row > 1:
-                middle = (row + above) // 2
-                if number(lists.rows, middle) <= e:
-                    row = middle
-                else:
-                    above = middle
-        first = contacts.followed.rows[row]
-        end = wp.min(contacts.followed.rows[row + 1], half)
-        if e >= half:
-            first = half + 3 * first
-            end = wp.min(half + 3 * end, 2 * half)
-        for k in range(first, end):
-            if contacts.followed.carried[k] > ZERO and equal(contacts.parts[e], contacts.followed.stencils[k]):
-                found = contacts.followed.carried[k]
-        contacts.followed.start[e] = wp.where(contacts.stiffness[e] > ZERO, found, ZERO)
+        for t in range(wp.tid(), pairs.number[0], pairs.threads):
+            e = pairs.acting[t]
+            gap = contacts.gap[e]
+            r = contacts.distance[e]
+            found = ZERO
+            if gap >= SIDE * r:
+                found = -contacts.stiffness[e] * slope(gap, r) * h * h
+            # The list may have been made anew, so that the contact is now in another slot of its row.
+            half = contacts.code.shape[0] // 2
+            row = contacts.parts[e][0]
+            if e >= lists.counts[0] and e < half:
+                row = vertices
+                above = lists.rows.shape[0] - 1
+                while above - row > 1:
+                    middle = (row + above) // 2
+                    if number(lists.rows, middle) <= e:
+                        row = middle
+                    else:
+                        above = middle
+            first = contacts.followed.rows[row]
+            end = wp.min(contacts.followed.rows[row + 1], half)
+            if e >= half:
+                first = half + 3 * first
+                end = wp.min(half + 3 * end, 2 * half)
+            for k in range(first, end):
+                if contacts.followed.carried[k] > ZERO and equal(contacts.parts[e], contacts.followed.stencils[k]):
+                    found = contacts.followed.carried[k]
+            contacts.followed.start[e] = wp.where(contacts.stiffness[e] > ZERO, found, ZERO)
 
     return start_each_force
 

@@ -184,7 +184,7 @@ class Contacts:
     There are 2C slots. Slot e < C is that of the pair e: of the nearest point of a face, or of two edges. Those from
     C + 3·rows[i] on are for terms of vertex i whose faces have their nearest points elsewhere. That is enough, because F
     faces share at most 1.5 F edges, and as many vertices. kA is 0 in slots without a contact. ``code`` says where the nearest
-    point of a face is. ``near`` (C,) lists the near faces of vertex i from rows[i] on.
+    point of a face is. ``near`` (C,) lists the pairs of the near faces of vertex i from rows[i] on.
 
     ``parts`` has the vertices of the surface between which a contact is. The stencil of its slot has those of the cloth, and
     the first of them with w = 0 in place of each obstacle. With obstacles there is the ``offset`` o = Σ wⱼXⱼ [m] of their
@@ -242,26 +242,35 @@ def edge_between(i: int, j: int):
 
 @cache
 def counts_of(dtype):
-    """Device functions (lists, contacts, first, end, …) that count near faces of a vertex at an edge pq, or at a vertex p.
+    """Device functions (stencils, codes, near, first, end, …) that count near faces of a vertex at an edge pq, or a vertex p.
 
-    Both return the face that owns the term, which is the first whose nearest point is there or else the first; the number of
-    faces; and of those whose nearest point is there. That of edges also returns the first face.
+    The pairs of the near faces are in ``near`` from ``first`` to ``end``, in order. Both return the face that owns the term,
+    which is the first whose nearest point is there or else the first; the number of faces; and of those whose nearest point is
+    there. That of edges also returns the first face. On the CPU a function that takes a struct copies it.
     """
     stencil, number = load(wp.vec4i), load(wp.int32)
 
     @wp.func
-    def at_edge(lists: near_pairs(dtype), contacts: Contacts, first: int, end: int, p: int, q: int):
+    def at_edge(
+        stencils: wp.array(dtype=wp.vec4i),
+        codes: wp.array(dtype=wp.int32),
+        near: wp.array(dtype=wp.int32),
+        first: int,
+        end: int,
+        p: int,
+        q: int,
+    ):
         lowest = wp.int32(-1)
         owner = wp.int32(-1)
         faces = wp.int32(0)
         on = wp.int32(0)
         for k in range(first, end):
-            f = number(contacts.near, k)
-            s = stencil(lists.stencils, f)
+            f = number(near, k)
+            s = stencil(stencils, f)
             i = corner_of(s, p)
             j = corner_of(s, q)
             if i > 0 and j > 0:
-                here = number(contacts.code, f) == edge_between(i, j)
+                here = number(codes, f) == edge_between(i, j)
                 if faces == 0:
                     lowest = f
                 if faces == 0 or (here and on == 0):
@@ -271,15 +280,22 @@ def counts_of(dtype):
         return owner, faces, on, lowest
 
     @wp.func
-    def at_vertex(lists: near_pairs(dtype), contacts: Contacts, first: int, end: int, p: int):
+    def at_vertex(
+        stencils: wp.array(dtype=wp.vec4i),
+        codes: wp.array(dtype=wp.int32),
+        near: wp.array(dtype=wp.int32),
+        first: int,
+        end: int,
+        p: int,
+    ):
         owner = wp.int32(-1)
         faces = wp.int32(0)
         on = wp.int32(0)
         for k in range(first, end):
-            f = number(contacts.near, k)
-            i = corner_of(stencil(lists.stencils, f), p)
+            f = number(near, k)
+            i = corner_of(stencil(stencils, f), p)
             if i > 0:
-                here = number(contacts.code, f) == CORNER + i - 1
+                here = number(codes, f) == CORNER + i - 1
                 if faces == 0 or (here and on == 0):
                     owner = f
                 faces += 1
@@ -429,26 +445,24 @@ def find_near_faces(dtype):
         # out
         contacts: Contacts,
     ):
-        e = wp.tid()
-        if e >= lists.counts[0]:
-            return
-        s = stencil(lists.stencils, e)
-        v = s[0]
-        found = NONE
-        r = laws.distance[wp.where(has_obstacle(lists.layout, s), 1, 0)]
-        if v < vertices and lists.distances[e] == dtype(r):  # else the rest distance is below 2r
-            r = wp.where(v < lists.layout.cloth, r, CLOSE * r)
-            a = at(x, correction, v)
-            b = at(x, correction, s[1]) - a
-            c = at(x, correction, s[2]) - a
-            d = at(x, correction, s[3]) - a
-            if lowest(s, normals[e], b, c, d, goal, move) < r:
-                code, w = nearest_of_face(b, c, d)
-                y = w[0] * b + w[1] * c + w[2] * d
-                if goal or wp.length(y) < r:
-                    found = code
-                    contacts.weights[e] = wp.vec4d(ONE, -w[0], -w[1], -w[2])
-        contacts.code[e] = found
+        for e in range(wp.tid(), wp.min(lists.counts[0], lists.stencils.shape[0]), lists.threads):
+            s = stencil(lists.stencils, e)
+            v = s[0]
+            found = NONE
+            r = laws.distance[wp.where(has_obstacle(lists.layout, s), 1, 0)]
+            if v < vertices and lists.distances[e] == dtype(r):  # else the rest distance is below 2r
+                r = wp.where(v < lists.layout.cloth, r, CLOSE * r)
+                a = at(x, correction, v)
+                b = at(x, correction, s[1]) - a
+                c = at(x, correction, s[2]) - a
+                d = at(x, correction, s[3]) - a
+                if lowest(s, normals[e], b, c, d, goal, move) < r:
+                    code, w = nearest_of_face(b, c, d)
+                    y = w[0] * b + w[1] * c + w[2] * d
+                    if goal or wp.length(y) < r:
+                        found = code
+                        contacts.weights[e] = wp.vec4d(ONE, -w[0], -w[1], -w[2])
+            contacts.code[e] = found
 
     return find_each_near_face
 
@@ -466,8 +480,9 @@ def find_vertex_contacts(dtype):
 
     @wp.func
     def multiplicity_of_edge(
-        lists: near_pairs(dtype),
-        contacts: Contacts,
+        stencils: wp.array(dtype=wp.vec4i),
+        codes: wp.array(dtype=wp.int32),
+        near: wp.array(dtype=wp.int32),
         first: int,
         end: int,
         p: int,
@@ -476,15 +491,16 @@ def find_vertex_contacts(dtype):
         Q: wp.vec3d,
     ):
         """m of the edge pq, and the owner of its term."""
-        owner, faces, m, _lowest = at_edge(lists, contacts, first, end, p, q)
+        owner, faces, m, _lowest = at_edge(stencils, codes, near, first, end, p, q)
         if along(P, Q) > ZERO and along(Q, P) > ZERO:
             m -= faces - 1
         return m, owner
 
     @wp.func
     def multiplicity_of_vertex(
-        lists: near_pairs(dtype),
-        contacts: Contacts,
+        stencils: wp.array(dtype=wp.vec4i),
+        codes: wp.array(dtype=wp.int32),
+        near: wp.array(dtype=wp.int32),
         first: int,
         end: int,
         p: int,
@@ -494,18 +510,18 @@ def find_vertex_contacts(dtype):
         e: int,
     ):
         """m of the vertex p, and the owner of its term; only if that is e."""
-        owner, faces, m = at_vertex(lists, contacts, first, end, p)
+        owner, faces, m = at_vertex(stencils, codes, near, first, end, p)
         edges = wp.int32(0)
         if owner == e:
             P = at(x, correction, p) - a
             for k in range(first, end):
-                f = number(contacts.near, k)
-                s = stencil(lists.stencils, f)
+                f = number(near, k)
+                s = stencil(stencils, f)
                 i = corner_of(s, p)
                 if i > 0:
                     for j in range(1, 4):
                         if j != i:
-                            _owner, count, _on, lowest = at_edge(lists, contacts, first, end, p, s[j])
+                            _owner, count, _on, lowest = at_edge(stencils, codes, near, first, end, p, s[j])
                             if lowest == f:
                                 edges += 1
                                 if along(P, at(x, correction, s[j]) - a) <= ZERO:
@@ -523,74 +539,78 @@ def find_vertex_contacts(dtype):
         correction: wp.array(dtype=vec3),
         # parameters
         laws: Laws,
-        distant: int,
+        distant: bool,
+        vertices: int,
+        threads: int,
         # out
         pairs: near_pairs(dtype),
         contacts: Contacts,
     ):
-        v = wp.tid()
-        first = lists.rows[v]
-        end = lists.rows[v + 1]
-        extra = contacts.code.shape[0] // 2 + 3 * first
-        if first == end or extra + 3 * (end - first) > contacts.code.shape[0]:  # the latter where the list has overflowed
-            return
-        near = wp.int32(0)
-        for e in range(first, end):
-            if number(contacts.code, e) != NONE:
-                contacts.near[first + near] = e
-                near += 1
-        if near == 0:
-            return
-        cloth = lists.layout.cloth
-        a = at(x, correction, v)
-        end = first + near
-        extras = wp.int32(0)
-        for k in range(first, end):
-            e = contacts.near[k]
-            code = number(contacts.code, e)
-            s = stencil(lists.stencils, e)
-            r = laws.distance[0]
-            kA = SIDE * laws.stiffness[0] * areas.of_vertices[v]
-            if has_obstacle(lists.layout, s):
-                r = laws.distance[1]
-                kA = laws.stiffness[1] * areas.of_vertices[v]
-                if v >= cloth:
-                    r *= CLOSE
-                    kA /= CLOSE * CLOSE
-            b = at(x, correction, s[1]) - a
-            c = at(x, correction, s[2]) - a
-            d = at(x, correction, s[3]) - a
-            corners = wp.matrix_from_rows(b, c, d)
-            w4 = contacts.weights[e]
-            if code == INSIDE or near == 1:
-                y = in_plane(code == INSIDE, w4[1] * b + w4[2] * c + w4[3] * d, wp.cross(c - b, d - b), b)
-                put(e, s, w4, y, r, kA, x, pairs, contacts)
-            if near == 1:
+        for v in range(wp.tid(), vertices, threads):
+            first = lists.rows[v]
+            end = lists.rows[v + 1]
+            extra = contacts.code.shape[0] // 2 + 3 * first
+            if first == end or extra + 3 * (end - first) > contacts.code.shape[0]:  # the latter where the list has overflowed
                 continue
-            for i in range(1, 4):
-                j = wp.where(i == 3, 1, i + 1)
-                P = corners[i - 1]
-                Q = corners[j - 1]
-                m, owner = multiplicity_of_edge(lists, contacts, first, end, s[i], s[j], P, Q)
-                if owner == e and m != 0:
-                    t = along(P, Q) / (along(P, Q) + along(Q, P))
-                    y = (t - ONE) * P - t * Q
-                    if distant == 1 or wp.length(y) < r:
+            near = wp.int32(0)
+            for e in range(first, end):
+                if number(contacts.code, e) != NONE:
+                    contacts.near[first + near] = e
+                    near += 1
+            if near == 0:
+                continue
+            cloth = lists.layout.cloth
+            a = at(x, correction, v)
+            end = first + near
+            extras = wp.int32(0)
+            for k in range(first, end):
+                e = number(contacts.near, k)
+                code = number(contacts.code, e)
+                s = stencil(lists.stencils, e)
+                r = laws.distance[0]
+                kA = SIDE * laws.stiffness[0] * areas.of_vertices[v]
+                if has_obstacle(lists.layout, s):
+                    r = laws.distance[1]
+                    kA = laws.stiffness[1] * areas.of_vertices[v]
+                    if v >= cloth:
+                        r *= CLOSE
+                        kA /= CLOSE * CLOSE
+                b = at(x, correction, s[1]) - a
+                c = at(x, correction, s[2]) - a
+                d = at(x, correction, s[3]) - a
+                corners = wp.matrix_from_rows(b, c, d)
+                w4 = contacts.weights[e]
+                if code == INSIDE or near == 1:
+                    y = in_plane(code == INSIDE, w4[1] * b + w4[2] * c + w4[3] * d, wp.cross(c - b, d - b), b)
+                    put(e, s, w4, y, r, kA, x, pairs, contacts)
+                if near == 1:
+                    continue
+                for i in range(1, 4):
+                    j = wp.where(i == 3, 1, i + 1)
+                    P = corners[i - 1]
+                    Q = corners[j - 1]
+                    m, owner = multiplicity_of_edge(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[j], P, Q)
+                    if owner == e and m != 0:
+                        t = along(P, Q) / (along(P, Q) + along(Q, P))
+                        y = (t - ONE) * P - t * Q
+                        if distant or wp.length(y) < r:
+                            w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
+                            w4[i] = t - ONE
+                            w4[j] = -t
+                            slot = wp.where(code == edge_between(i, j), e, extra + extras)
+                            extras += wp.where(slot == e, 0, 1)
+                            put(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
+                    m, owner = multiplicity_of_vertex(
+                        lists.stencils, contacts.code, contacts.near, first, end, s[i], a, x, correction, e
+                    )
+                    if owner == e and m != 0 and (distant or wp.length(P) < r):
                         w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
-                        w4[i] = t - ONE
-                        w4[j] = -t
-                        slot = wp.where(code == edge_between(i, j), e, extra + extras)
+                        w4[i] = -ONE
+                        slot = wp.where(code == CORNER + i - 1, e, extra + extras)
                         extras += wp.where(slot == e, 0, 1)
-                        put(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
-                m, owner = multiplicity_of_vertex(lists, contacts, first, end, s[i], a, x, correction, e)
-                if owner == e and m != 0 and (distant == 1 or wp.length(P) < r):
-                    w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
-                    w4[i] = -ONE
-                    slot = wp.where(code == CORNER + i - 1, e, extra + extras)
-                    extras += wp.where(slot == e, 0, 1)
-                    put(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
-        if extras > 0:
-            set_shares(contacts, first, near, extra, extras)
+                        put(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
+            if extras > 0:
+                set_shares(contacts, first, near, extra, extras)
 
     return find_contacts_of_vertex
 
@@ -612,6 +632,7 @@ def find_edge_contacts(dtype):
     at, _exact = vertex_of(dtype)
 
     put, lowest = put_contact(dtype), lowest_gap(dtype, False)
+    stencil = load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_contact_of_edges(
@@ -630,31 +651,30 @@ def find_edge_contacts(dtype):
         pairs: near_pairs(dtype),
         contacts: Contacts,
     ):
-        e = lists.counts[0] + wp.tid()
-        if e >= wp.min(lists.counts[0] + lists.counts[1], lists.stencils.shape[0]):
-            return
-        contacts.code[e] = TWO_EDGES
-        s = lists.stencils[e]
-        law = wp.where(has_obstacle(lists.layout, s), 1, 0)
-        if lists.distances[e] != dtype(laws.distance[law]):
-            return
-        a = at(x, correction, s[0])
-        zero = wp.vec3d()
-        b = at(x, correction, s[1]) - a
-        c = at(x, correction, s[2]) - a
-        d = at(x, correction, s[3]) - a
-        r = CLOSE * laws.distance[law]
-        if lowest(s, normals[e], b, c, d, goal, move) >= r:
-            return
-        u, t, factor = on_two_edges(zero, b, c, d)
-        y = u * b - (c + t * (d - c))
-        if not goal and factor * wp.length(y) >= r:
-            return
-        ratio = factor
-        factor /= CLOSE
-        A = HALF_PI * width_of(areas, lists.layout, laws, s[0], s[1]) * width_of(areas, lists.layout, laws, s[2], s[3])
-        w = wp.vec4d(ONE - u, u, t - ONE, -t)
-        put(e, s, w, y, laws.distance[law] / factor, factor * factor * laws.stiffness[law] * A, x, pairs, contacts)
-        contacts.ratio[e] = ratio
+        end = wp.min(lists.counts[0] + lists.counts[1], lists.stencils.shape[0])
+        for e in range(lists.counts[0] + wp.tid(), end, lists.threads):
+            contacts.code[e] = TWO_EDGES
+            s = stencil(lists.stencils, e)
+            law = wp.where(has_obstacle(lists.layout, s), 1, 0)
+            if lists.distances[e] != dtype(laws.distance[law]):
+                continue
+            r = CLOSE * laws.distance[law]
+            a = at(x, correction, s[0])
+            zero = wp.vec3d()
+            b = at(x, correction, s[1]) - a
+            c = at(x, correction, s[2]) - a
+            d = at(x, correction, s[3]) - a
+            if lowest(s, normals[e], b, c, d, goal, move) >= r:
+                continue
+            u, t, factor = on_two_edges(zero, b, c, d)
+            y = u * b - (c + t * (d - c))
+            if not goal and factor * wp.length(y) >= r:
+                continue
+            ratio = factor
+            factor /= CLOSE
+            A = HALF_PI * width_of(areas, lists.layout, laws, s[0], s[1]) * width_of(areas, lists.layout, laws, s[2], s[3])
+            w = wp.vec4d(ONE - u, u, t - ONE, -t)
+            put(e, s, w, y, laws.distance[law] / factor, factor * factor * laws.stiffness[law] * A, x, pairs, contacts)
+            contacts.ratio[e] = ratio
 
     return find_contact_of_edges

@@ -24,8 +24,8 @@ class PairForces:
     """Values of each pair at some positions, in float64: w, U [J] and ∂U/∂y [N].
 
     ∂²U/∂y² = bend[0]·along alongᵀ + bend[1]·across acrossᵀ [N/m], where ``across`` is for friction and negative contacts. Both
-    ``bend`` are 0 for pairs without a force. ``pressing`` lists the ``count`` (1,) pairs with a force, in order, for kernels
-    that scatter.
+    ``bend`` are 0 for pairs without a force. ``pressing`` lists the ``count`` [0] pairs with a force, in order, for kernels
+    that scatter, and ``joining`` the ``count`` [1] ones among them that join vertices: those with a mesh may have only one.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -35,7 +35,23 @@ class PairForces:
     along: wp.array(dtype=wp.vec3d)
     across: wp.array(dtype=wp.vec3d)
     pressing: wp.array(dtype=wp.int32)
+    joining: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def is_single(s: wp.vec4i):
+    """Whether a pair has only one vertex of the cloth, which is the first; others are obstacles, with w = 0."""
+    return s[1] == s[0] and s[2] == s[0] and s[3] == s[0]
+
+
+@wp.func
+def note_pressing(forces: PairForces, e: int, s: wp.vec4i):
+    """Lists a pair with a force, if kernels scatter."""
+    if forces.pressing:
+        forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
+        if not is_single(s):
+            forces.joining[wp.atomic_add(forces.count, 1, 1)] = e
 
 
 @cache
@@ -291,8 +307,12 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
         v = wp.tid()
         total = wp.vec3d()
         first, end = range_of(pairs, forces, v)
+        if wp.static(scatters):
+            end = forces.count[1]
         for k in range(first, end):
             e, corner, end_corner = corners_at(pairs, forces, k)
+            if wp.static(scatters):
+                e = forces.joining[k]
             s = pairs.stencils[e]
             if end_corner > 0 and active[s[0] // per_copy] != 0:
                 w = forces.weights[e]

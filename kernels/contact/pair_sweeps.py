@@ -14,7 +14,7 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
-from .pair_sums import PairForces, PairTerm
+from .pair_sums import PairForces, PairTerm, is_single
 from .self_gaps import ONE, ZERO, vertex_of
 from .self_pairs import near_pairs
 
@@ -109,7 +109,8 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
                 s = stencil(pairs.stencils, e)
                 D = ZERO
                 whole = ZERO
-                for i in range(4):
+                corners = wp.where(is_single(s), 1, 4)
+                for i in range(corners):
                     D += w[i] * w[i] * wp.dot(n, respond(inverse_mass, s[i], n))
                     whole += w[i] * w[i] * greatest(inverse_mass, s[i])
                     if held:
@@ -118,7 +119,7 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
                     v -= (whole - D) * before
                     D = whole
                 after = push(pairs, data, e, v, n, D, LOCKED * whole, h, hard)
-                for i in range(4):
+                for i in range(corners):
                     move = w[i] * after
                     if held:
                         move -= forces.weights[e][i] * before

@@ -15,7 +15,7 @@ from ..memory import load
 from ..terms import contact
 from ..vectors import types
 from .pair_potential import ENDING, STARTING, Contacts
-from .pair_sums import PairForces, PairRow, PairTerm
+from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
 from .self_gaps import ONE, SIDE, ZERO, perpendicular, vertex_of
 from .self_pairs import MODULE, module_of, near_pairs
 from .self_planes import margin_of, ulp_of
@@ -67,44 +67,41 @@ def find_forces(dtype, bounded: bool):
         # out
         forces: PairForces,
     ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
-            return
-        e = pairs.acting[t]
-        k = contacts.stiffness[e]
-        r = contacts.distance[e]
-        gap = contacts.gap[e]
-        n = contacts.normal[e]
-        energy = SIDE * k * (r - gap) * (r - gap)
-        pull = k * (gap - r)
-        curvature = k
-        if wp.static(not bounded):
-            energy = k * potential(gap, r)
-            pull = k * slope(gap, r)
-            curvature = k * bend(gap, r)
-            if least > ZERO:
-                f = least_gap_of(pairs.stencils[e], x, least) / contacts.ratio[e]  # ψ is a function of D, as φ is
-                width = wp.min(f, r - f)
-                below = (f + width) / width - gap / width
-                if width > ZERO and below > ZERO:
-                    more = STEEP * SIDE * SIDE * k * r * r * below
-                    energy += more * below * below / wp.float64(3.0)
-                    pull -= more * below / width
-                    curvature += wp.float64(2.0) * more / (width * width)
-        forces.weights[e] = contacts.weights[e]
-        forces.energy[e] = energy
-        forces.force[e] = pull * n
-        if k > ZERO:
-            forces.bend[e] = wp.vec2d(curvature * contacts.share[e], ZERO)
-            forces.along[e] = n
-        else:
-            q = SIDE * pull / wp.max(gap, wp.float64(1e-300))
-            u = perpendicular(n)
-            forces.bend[e] = wp.vec2d(q, q)
-            forces.along[e] = u
-            forces.across[e] = wp.cross(n, u)
-        if forces.pressing:
-            forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
+        for t in range(wp.tid(), pairs.number[0], pairs.threads):
+            e = pairs.acting[t]
+            k = contacts.stiffness[e]
+            r = contacts.distance[e]
+            gap = contacts.gap[e]
+            n = contacts.normal[e]
+            energy = SIDE * k * (r - gap) * (r - gap)
+            pull = k * (gap - r)
+            curvature = k
+            if wp.static(not bounded):
+                energy = k * potential(gap, r)
+                pull = k * slope(gap, r)
+                curvature = k * bend(gap, r)
+                if least > ZERO:
+                    f = least_gap_of(pairs.stencils[e], x, least) / contacts.ratio[e]  # ψ is a function of D, as φ is
+                    width = wp.min(f, r - f)
+                    below = (f + width) / width - gap / width
+                    if width > ZERO and below > ZERO:
+                        more = STEEP * SIDE * SIDE * k * r * r * below
+                        energy += more * below * below / wp.float64(3.0)
+                        pull -= more * below / width
+                        curvature += wp.float64(2.0) * more / (width * width)
+            forces.weights[e] = contacts.weights[e]
+            forces.energy[e] = energy
+            forces.force[e] = pull * n
+            if k > ZERO:
+                forces.bend[e] = wp.vec2d(curvature * contacts.share[e], ZERO)
+                forces.along[e] = n
+            else:
+                q = SIDE * pull / wp.max(gap, wp.float64(1e-300))
+                u = perpendicular(n)
+                forces.bend[e] = wp.vec2d(q, q)
+                forces.along[e] = u
+                forces.across[e] = wp.cross(n, u)
+            note_pressing(forces, e, pairs.stencils[e])
 
     return find_forces_of_pairs
 

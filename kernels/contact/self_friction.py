@@ -19,7 +19,7 @@ from ..terms import contact
 from ..vectors import types
 from .obstacles import Layout, copy_of, in_copy
 from .pair_potential import TWO_EDGES, Contacts
-from .pair_sums import PairForces, PairRow, PairTerm
+from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
 from .self_gaps import ONE, ZERO, perpendicular, vertex_of
 from .self_pairs import near_pairs
 
@@ -205,37 +205,35 @@ def begin_friction(dtype, law: Law, bounded: bool):
         pairs: near_pairs(dtype),
         rubbed: RubbedPairs,
     ):
-        t = wp.tid()
-        if t >= touching.number[0]:
-            return
-        e = touching.acting[t]
-        k = contacts.share[e] * contacts.stiffness[e]
-        if not (k > ZERO and contacts.gap[e] < contacts.distance[e]):
-            return
-        own = wp.int32(0)
-        for i in range(4):
-            if contacts.parts[e][i] >= touching.layout.cloth:
-                own = 1 + in_copy(touching.layout, contacts.parts[e][i]) - touching.layout.per_copy
-        limit = limit_of(-slope(contacts.gap[e], contacts.distance[e]), friction[own])
-        if limit == ZERO:
-            return
-        s = touching.stencils[e]
-        parts = contacts.parts[e]
-        for i in range(4):
-            if (contacts.touching[e] & (1 << i)) == 0:
-                parts[i] = -1
-        rubbed.parts[e] = parts
-        pairs.stencils[e] = s
-        rubbed.limit[e] = limit
-        if touching.layout.obstacles > 0:
-            rubbed.travel[e] = contacts.travel[e]
-        rubbed.normal[e] = contacts.normal[e]
-        rubbed.weights[e] = contacts.weights[e]
-        rubbed.stiffness[e] = k
-        rubbed.sides[e] = wp.where(contacts.code[e] == TWO_EDGES, 2, 1)
-        pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
-        for i in range(4):
-            wp.atomic_add(pairs.corner_counts, s[i], 1)
+        for t in range(wp.tid(), touching.number[0], touching.threads):
+            e = touching.acting[t]
+            k = contacts.share[e] * contacts.stiffness[e]
+            if not (k > ZERO and contacts.gap[e] < contacts.distance[e]):
+                continue
+            own = wp.int32(0)
+            for i in range(4):
+                if contacts.parts[e][i] >= touching.layout.cloth:
+                    own = 1 + in_copy(touching.layout, contacts.parts[e][i]) - touching.layout.per_copy
+            limit = limit_of(-slope(contacts.gap[e], contacts.distance[e]), friction[own])
+            if limit == ZERO:
+                continue
+            s = touching.stencils[e]
+            parts = contacts.parts[e]
+            for i in range(4):
+                if (contacts.touching[e] & (1 << i)) == 0:
+                    parts[i] = -1
+            rubbed.parts[e] = parts
+            pairs.stencils[e] = s
+            rubbed.limit[e] = limit
+            if touching.layout.obstacles > 0:
+                rubbed.travel[e] = contacts.travel[e]
+            rubbed.normal[e] = contacts.normal[e]
+            rubbed.weights[e] = contacts.weights[e]
+            rubbed.stiffness[e] = k
+            rubbed.sides[e] = wp.where(contacts.code[e] == TWO_EDGES, 2, 1)
+            pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
+            for i in range(4):
+                wp.atomic_add(pairs.corner_counts, s[i], 1)
 
     return begin_friction_of_pairs
 
@@ -258,54 +256,52 @@ def set_anchors(dtype, law: Law):
         # in and out
         rubbed: RubbedPairs,
     ):
-        turn = wp.tid()
-        if turn >= pairs.number[0]:
-            return
-        e = pairs.acting[turn]
-        s = rubbed.parts[e]
-        n = rubbed.normal[e]
-        sides = rubbed.sides[e]
-        total = wp.vec3d()
-        weight = ZERO
-        best = wp.int32(0)
-        for i in range(4):
-            v = s[i]
-            if v < 0 or v >= pairs.layout.cloth:
-                continue
-            end = kept.first[v + 1]
-            if steps[copy_of(pairs.layout, v)] == 0:
-                end = 0
-            for j in range(kept.first[v], end):
-                code = kept.corners[j]
-                slip = slips[code // 4]
-                q = kept.stencils[code // 4]
-                if slip[3] > ZERO and q[code % 4] == v:
-                    kept_sides = wp.int32(slip[4])
-                    # Some of the other pairs have their sides in the opposite order.
-                    way = ZERO
-                    if meet(s, 0, sides, q, 0, kept_sides) and meet(s, sides, 4, q, kept_sides, 4):
-                        way = ONE
-                    elif meet(s, 0, sides, q, kept_sides, 4) and meet(s, sides, 4, q, 0, kept_sides):
-                        way = -ONE
-                    rank = wp.int32(0)
-                    if way != ZERO:
-                        rank = 1
-                        if sides == kept_sides and way > ZERO and same_vertices(s, q, sides):
-                            rank = 3
-                        elif sides == 1 and kept_sides == 1 and s[0] == q[0]:
-                            rank = 2
-                    if rank > best:
-                        best = rank
-                        weight = ZERO
-                        total = wp.vec3d()
-                    if rank > 0 and rank == best:
-                        weight += slip[3]
-                        total += slip[3] * way * wp.vec3d(slip[0], slip[1], slip[2])
-        if weight > ZERO:
-            total = total / weight
-        total -= wp.dot(n, total) * n
-        total = kept_of(wp.length(total), rubbed.limit[e]) * total
-        rubbed.anchor[e] = y_of(pairs.layout, pairs.stencils[e], rubbed.weights[e], x) - total
+        for turn in range(wp.tid(), pairs.number[0], pairs.threads):
+            e = pairs.acting[turn]
+            s = rubbed.parts[e]
+            n = rubbed.normal[e]
+            sides = rubbed.sides[e]
+            total = wp.vec3d()
+            weight = ZERO
+            best = wp.int32(0)
+            for i in range(4):
+                v = s[i]
+                if v < 0 or v >= pairs.layout.cloth:
+                    continue
+                end = kept.first[v + 1]
+                if steps[copy_of(pairs.layout, v)] == 0:
+                    end = 0
+                for j in range(kept.first[v], end):
+                    code = kept.corners[j]
+                    slip = slips[code // 4]
+                    q = kept.stencils[code // 4]
+                    if slip[3] > ZERO and q[code % 4] == v:
+                        kept_sides = wp.int32(slip[4])
+                        # Some of the other pairs have their sides in the opposite order.
+                        way = ZERO
+                        if meet(s, 0, sides, q, 0, kept_sides) and meet(s, sides, 4, q, kept_sides, 4):
+                            way = ONE
+                        elif meet(s, 0, sides, q, kept_sides, 4) and meet(s, sides, 4, q, 0, kept_sides):
+                            way = -ONE
+                        rank = wp.int32(0)
+                        if way != ZERO:
+                            rank = 1
+                            if sides == kept_sides and way > ZERO and same_vertices(s, q, sides):
+                                rank = 3
+                            elif sides == 1 and kept_sides == 1 and s[0] == q[0]:
+                                rank = 2
+                        if rank > best:
+                            best = rank
+                            weight = ZERO
+                            total = wp.vec3d()
+                        if rank > 0 and rank == best:
+                            weight += slip[3]
+                            total += slip[3] * way * wp.vec3d(slip[0], slip[1], slip[2])
+            if weight > ZERO:
+                total = total / weight
+            total -= wp.dot(n, total) * n
+            total = kept_of(wp.length(total), rubbed.limit[e]) * total
+            rubbed.anchor[e] = y_of(pairs.layout, pairs.stencils[e], rubbed.weights[e], x) - total
 
     return set_anchor_of_pairs
 
@@ -327,38 +323,38 @@ def find_friction(dtype, law: Law):
         # out
         forces: PairForces,
     ):
-        turn = wp.tid()
-        if turn >= pairs.number[0]:
-            return
-        e = pairs.acting[turn]
-        limit = rubbed.limit[e]
-        forces.bend[e] = wp.vec2d()
-        if limit == ZERO:
-            return
-        n = rubbed.normal[e]
-        w = rubbed.weights[e]
-        k = rubbed.stiffness[e]
-        u = slip_of(pairs, rubbed, e, x, correction)
-        l = wp.length(u)
-        across = k * secant(l, limit)
-        along = perpendicular(n)
-        if l > ZERO:
-            along = u / l
-        forces.weights[e] = w
-        forces.energy[e] = k * energy(l, limit)
-        forces.force[e] = across * u
-        forces.bend[e] = wp.vec2d(k * bend(l, limit), across)
-        forces.along[e] = along
-        forces.across[e] = wp.cross(n, along)
-        if forces.pressing:
-            forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
+        for turn in range(wp.tid(), pairs.number[0], pairs.threads):
+            e = pairs.acting[turn]
+            limit = rubbed.limit[e]
+            forces.bend[e] = wp.vec2d()
+            if limit == ZERO:
+                continue
+            n = rubbed.normal[e]
+            w = rubbed.weights[e]
+            k = rubbed.stiffness[e]
+            u = slip_of(pairs, rubbed, e, x, correction)
+            l = wp.length(u)
+            across = k * secant(l, limit)
+            along = perpendicular(n)
+            if l > ZERO:
+                along = u / l
+            forces.weights[e] = w
+            forces.energy[e] = k * energy(l, limit)
+            forces.force[e] = across * u
+            forces.bend[e] = wp.vec2d(k * bend(l, limit), across)
+            forces.along[e] = along
+            forces.across[e] = wp.cross(n, along)
+            note_pressing(forces, e, pairs.stencils[e])
 
     return find_friction_of_pairs
 
 
 @cache
 def end_friction(dtype):
-    """Kernel over acting pairs at the end x of a step: what the next step takes over."""
+    """Kernel over acting pairs at the end x of a step: what the next step takes over.
+
+    The pairs ``kept`` are those of the step, with the vertices of the surface, but for ``first``.
+    """
     vec3, _ = types(dtype)
     y_of, turn_of = difference_of(dtype), turned(dtype)
 
@@ -372,17 +368,19 @@ def end_friction(dtype):
         moves: wp.array(dtype=wp.vec3d),
         x: wp.array(dtype=vec3),
         # out
+        kept: near_pairs(dtype),
         slips: wp.array(dtype=SLIP),
     ):
-        turn = wp.tid()
-        if turn >= pairs.number[0]:
-            return
-        e = pairs.acting[turn]
-        s = pairs.stencils[e]
-        sides = rubbed.sides[e]
-        u = slip_from(pairs.layout, rubbed, e, y_of(pairs.layout, s, rubbed.weights[e], x), ONE)
-        u = turn_of(pairs.layout, rubbed.parts[e], s, sides, rubbed.normal[e], u, start, moves, x)
-        slips[e] = SLIP(u[0], u[1], u[2], rubbed.stiffness[e], wp.float64(sides))
+        for turn in range(wp.tid(), pairs.number[0], pairs.threads):
+            e = pairs.acting[turn]
+            kept.stencils[e] = rubbed.parts[e]
+            for i in range(4 * turn, 4 * turn + 4):
+                kept.corners[i] = pairs.corners[i]
+            s = pairs.stencils[e]
+            sides = rubbed.sides[e]
+            u = slip_from(pairs.layout, rubbed, e, y_of(pairs.layout, s, rubbed.weights[e], x), ONE)
+            u = turn_of(pairs.layout, rubbed.parts[e], s, sides, rubbed.normal[e], u, start, moves, x)
+            slips[e] = SLIP(u[0], u[1], u[2], rubbed.stiffness[e], wp.float64(sides))
 
     return end_friction_of_pairs
 

@@ -17,7 +17,7 @@ def near_pairs(dtype):
     Near pairs have the fields up to ``distances``. ``counts`` has the numbers of vertex–triangle pairs, which come first, and
     of edge–edge pairs. The triangles near vertex i are in rows ``rows`` [i] to rows[i+1]. ``distances`` [m] is r, or half the
     rest distance if that is less. Their vertices are those of the surface with this ``layout``; an energy has vertices of the
-    cloth alone.
+    cloth alone. Kernels over pairs have so many ``threads``: on the CPU one, because each thread there copies all structs.
 
     An energy has ``stencils`` and the others. ``acting`` lists the slots that act; ``number`` has their number. ``corners``
     lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is scratch, 0
@@ -27,6 +27,7 @@ def near_pairs(dtype):
     @wp.struct
     class Pairs:
         layout: Layout
+        threads: wp.int32
         stencils: wp.array(dtype=wp.vec4i)
         counts: wp.array(dtype=wp.int32)
         rows: wp.array(dtype=wp.int32)
@@ -90,6 +91,27 @@ def begin_pairs(dtype):
 
 
 @cache
+def forget_contacts(dtype):
+    """Kernel over acting contacts: their ``marks``, 0 in slots without a contact, and λ become 0; either may be None."""
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def forget_each_contact(
+        # elements
+        pairs: near_pairs(dtype),
+        # out
+        marks: wp.array(dtype=wp.float64),
+        multipliers: wp.array(dtype=wp.vec3d),
+    ):
+        for t in range(wp.tid(), pairs.number[0], pairs.threads):
+            if marks:
+                marks[pairs.acting[t]] = wp.float64(0.0)
+            if multipliers:
+                multipliers[pairs.acting[t]] = wp.vec3d()
+
+    return forget_each_contact
+
+
+@cache
 def fill_corners(dtype):
     """Kernel over pairs: lists the corners of acting pairs at each vertex, and counts ``corner_counts`` down to 0."""
 
@@ -98,9 +120,8 @@ def fill_corners(dtype):
         # in and out
         pairs: near_pairs(dtype),
     ):
-        t = pairs.number[0] - 1 - wp.tid()
-        if t >= 0:
-            e = pairs.acting[t]
+        for t in range(wp.tid(), pairs.number[0], pairs.threads):
+            e = pairs.acting[pairs.number[0] - 1 - t]
             s = pairs.stencils[e]
             for i in range(4):
                 pairs.corners[pairs.first[s[i]] + wp.atomic_sub(pairs.corner_counts, s[i], 1) - 1] = 4 * e + i

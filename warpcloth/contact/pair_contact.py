@@ -74,14 +74,13 @@ class PairContact(DynamicElements):
             contacts.parts = wp.zeros(slots, dtype=wp.vec4i, device=device)
             contacts.offset, contacts.travel = (wp.zeros(slots, dtype=wp.vec3d, device=device) for _ in range(2))
             contacts.moves = self.surface.moves_of_step
-        self.hold_pairs(pairs, contacts)
+        self.hold_pairs(pairs, contacts, contacts.stiffness)
         if self._in_turn is not None:
             self._hold_followed()
 
     def _launch_found(self, x, correction=None, goal=None, move=None):
         """Finds the contacts with a force at x, or x + correction, and those that may have one at goal + move."""
         self.launch_none()
-        self.data.stiffness.zero_()
         x, goal = self._whole(x, self.obstacles), self._whole(goal, self._goal)
         given = {"x": x, "correction": correction, "goal": goal, "move": move}
         wp.capture_if(self.present, self._launch_listed, **given)
@@ -99,17 +98,18 @@ class PairContact(DynamicElements):
             wp.copy(self.surface.behind(whole), positions)
 
     def _launch_listed(self, x, correction, goal, move):
-        listed = len(self.lists.stencils)
         positions = [self._normals, x, correction, goal, move, self._laws]
         vertices = self.surface.count if self._of_edges else self.model.count
-        self._launch(potential.find_near_faces, listed, [self.lists, *positions, vertices], [self.data])
-        given = [self.lists, self._areas, x, correction, self._laws, goal is not None]
-        self._launch(potential.find_vertex_contacts, vertices, given, [self.pairs, self.data])
+        self._launch(potential.find_near_faces, self.lists.threads, [self.lists, *positions, vertices], [self.data])
+        threads = 1 if self.model.device.is_cpu else vertices
+        given = [self.lists, self._areas, x, correction, self._laws, goal is not None, vertices, threads]
+        self._launch(potential.find_vertex_contacts, threads, given, [self.pairs, self.data])
         if self._of_edges:
-            self._launch(potential.find_edge_contacts, listed, [self.lists, self._areas, *positions], [self.pairs, self.data])
+            given = [self.lists, self._areas, *positions]
+            self._launch(potential.find_edge_contacts, self.lists.threads, given, [self.pairs, self.data])
         if self._corners:
             self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
-            self._launch(fill_corners, self.capacity, [], [self.pairs])
+            self._launch(fill_corners, self.pairs.threads, [], [self.pairs])
             self._launch(sort_corners, self.model.count, [], [self.pairs])
 
     def launch_begin(self, x):
@@ -121,7 +121,7 @@ class PairContact(DynamicElements):
 
     def launch_forces(self, x, correction):
         self._launch_found(x, correction)
-        self.model.launch(self._find, self.capacity, [self.pairs, self.data, x, self.least], [self.forces])
+        self.model.launch(self._find, self.pairs.threads, [self.pairs, self.data, x, self.least], [self.forces])
 
     # Sweeps, see :mod:`warpcloth.kernels.contact.pair_follow`.
 
@@ -165,14 +165,14 @@ class PairContact(DynamicElements):
         self._follow(x, correction)
         if adds:
             self.data.followed.carried.zero_()
-            self._take_over(pair_follow.carry_forces, self.capacity, [self.pairs, self.multipliers], [self.data])
+            self._take_over(pair_follow.carry_forces, self.pairs.threads, [self.pairs, self.multipliers], [self.data])
             self._launch_all(potential.ENDING, x, correction, h)
         self._launch_found(self._positions, None, x, correction)
         if not self._in_turn:
             self.launch_corner_slots()
         if adds:
             vertices = self.surface.count
-            self._take_over(pair_follow.start_forces, self.capacity, [self.lists, self.pairs, h, vertices], [self.data])
+            self._take_over(pair_follow.start_forces, self.pairs.threads, [self.lists, self.pairs, h, vertices], [self.data])
             self._take_over(pair_follow.fix_forces, vertices, [self.lists, h], [self.data])
             self._launch_all(potential.STARTING, x, correction, h)
 

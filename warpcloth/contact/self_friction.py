@@ -50,11 +50,6 @@ class Slips:
         for name in LISTS:
             setattr(self.pairs, name, self._arrays[name])
 
-    def launch_lists(self, pairs, parts):
-        """Copies the lists of other contacts, which have the same capacity, with the vertices of the surface of each."""
-        for name, array in (("stencils", parts), ("first", pairs.first), ("corners", pairs.corners)):
-            wp.copy(getattr(self.pairs, name), array)
-
     # As a part of a state.
 
     def copy(self):
@@ -136,29 +131,28 @@ class SelfFriction(DynamicElements):
             size = acting_sizes(self.model, room)[name]
             setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=self.model.device))
         pairs.layout, slots = self.surface.layout, len(pairs.stencils)
-        self.hold_pairs(pairs, kernels.RubbedPairs())
-        self.data.parts, self.data.ahead = wp.zeros(slots, dtype=wp.vec4i, device=self.model.device), self._ahead
+        data = kernels.RubbedPairs()
+        data.limit = wp.zeros(slots, dtype=wp.float64, device=self.model.device)
+        self.hold_pairs(pairs, data, data.limit)
+        data.parts, data.ahead = self.room(wp.vec4i), self._ahead
         if self.surface.obstacles:
-            self.data.travel = self.room(wp.vec3d)
+            data.travel = self.room(wp.vec3d)
         for name in ("normal", "anchor"):
-            setattr(self.data, name, self.room(wp.vec3d))
-        for name in ("stiffness", "limit"):
-            setattr(self.data, name, self.room(wp.float64))
-        self.data.weights, self.data.sides = self.room(wp.vec4d), self.room(wp.int32)
+            setattr(data, name, self.room(wp.vec3d))
+        data.stiffness, data.weights, data.sides = map(self.room, (wp.float64, wp.vec4d, wp.int32))
 
     def launch_begin(self, touching, contacts, x):
         """At the start of a step, at x (V,): takes the contacts there, and the slips of the last step."""
         model, kept = self.model, self._kept
         self.present.fill_(1)
         wp.copy(self.start, x)
-        self.pairs.number.zero_()
-        self.data.limit.zero_()
-        self._launch(kernels.begin_friction, kept.room, [touching, contacts, self._friction], [self.pairs, self.data])
+        super().launch_none()
+        self._launch(kernels.begin_friction, self.pairs.threads, [touching, contacts, self._friction], [self.pairs, self.data])
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
-        self._launch(fill_corners, kept.room, [], [self.pairs])
+        self._launch(fill_corners, self.pairs.threads, [], [self.pairs])
         self._launch(sort_corners, model.count, [], [self.pairs])
         given = [self.pairs, x, kept.pairs, kept.slips, self._steps]
-        self._launch(kernels.set_anchors, kept.room, given, [self.data])
+        self._launch(kernels.set_anchors, self.pairs.threads, given, [self.data])
 
     def launch_none(self):
         """Empties the lists of this step and of the last one, at the start of a step without pairs."""
@@ -167,7 +161,7 @@ class SelfFriction(DynamicElements):
         self._kept.pairs.first.zero_()
 
     def launch_forces(self, x, correction):
-        self._launch(kernels.find_friction, self._kept.room, [self.pairs, self.data, x, correction], [self.forces])
+        self._launch(kernels.find_friction, self.pairs.threads, [self.pairs, self.data, x, correction], [self.forces])
 
     def launch_acting(self, x, out):
         """Sets out (N,) to ∂U/∂x at the positions x (N,) at which the step evaluated its forces."""
@@ -177,7 +171,7 @@ class SelfFriction(DynamicElements):
 
     def launch_end(self, x):
         """Stores the pairs of the step and the stretch of their springs at x, for the next step."""
-        moves = self.surface.moves_of_step if self.surface.obstacles else None
+        kept, moves = self._kept, self.surface.moves_of_step if self.surface.obstacles else None
         given = [self.pairs, self.data, self.start, moves, x]
-        self._launch(kernels.end_friction, self._kept.room, given, [self._kept.slips])
-        self._kept.launch_lists(self.pairs, self.data.parts)
+        self._launch(kernels.end_friction, self.pairs.threads, given, [kept.pairs, kept.slips])
+        wp.copy(kept.pairs.first, self.pairs.first)

@@ -217,7 +217,7 @@ class SelfSteps:
         self.begun = self_pairs.StepPairs()
         self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
         self.begun.gap = room(wp.float64)
-        self.pairs.layout = self.surface.layout
+        self.pairs.layout, self.pairs.threads = self.surface.layout, 1 if device.is_cpu else capacity
         self.contact.hold(self.pairs, self.begun.normal)
 
     def grow(self):

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.contact import pair_sums, pair_sweeps
+from ..kernels.contact.self_pairs import forget_contacts
 
 SUMS = pair_sums.pair_forces, pair_sums.pair_energies, pair_sums.pair_diagonal, pair_sums.pair_products
 
@@ -27,7 +28,7 @@ class DynamicElements:
         data: The ``data`` of the term.
         forces: :class:`warpcloth.kernels.contact.pair_sums.PairForces`.
         blocks: :func:`warpcloth.kernels.contact.pair_sums.pair_blocks`, empty if sums are scattered.
-        multipliers: λ of sweeps [kg·m].
+        multipliers: λ of sweeps [kg·m], 0 in slots without a pair; None without sweeps.
         stored: Whether its energy is not a function of positions alone, but stored in the state.
         scatters: Whether sums are scattered.
     """
@@ -36,7 +37,8 @@ class DynamicElements:
 
     def __init__(self, model, term, present):
         self.model, self.term, self.present = model, term, present
-        self._swept, self._in_turn, self.pairs = None, None, None
+        self._swept, self._in_turn, self.pairs, self.multipliers = None, None, None, None
+        self._forget = model.kernel(forget_contacts, model.dtype)
         self.set_sums(model.device.is_cpu)
 
     def set_sums(self, scatters):
@@ -50,9 +52,10 @@ class DynamicElements:
         if self.pairs is not None:
             self._hold_blocks()
 
-    def hold_pairs(self, pairs, data):
-        """Takes the arrays of pairs, and allocates arrays for their forces and sweeps."""
-        self.pairs, self.data = pairs, data
+    def hold_pairs(self, pairs, data, marks):
+        """Takes the arrays of pairs, with ``marks``, 0 in slots without one, and allocates those of forces and sweeps."""
+        self.pairs, self.data, self._marks = pairs, data, marks
+        pairs.threads = 1 if self.model.device.is_cpu else self.capacity
         model, room = self.model, self.room
         self.forces = pair_sums.PairForces()
         kinds = {
@@ -64,7 +67,8 @@ class DynamicElements:
             "across": wp.vec3d,
         }
         if model.device.is_cpu:
-            kinds["pressing"], self.forces.count = wp.int32, wp.zeros(1, dtype=wp.int32, device=model.device)
+            kinds["pressing"] = kinds["joining"] = wp.int32
+            self.forces.count = wp.zeros(2, dtype=wp.int32, device=model.device)
         for name, kind in kinds.items():
             setattr(self.forces, name, room(kind))
         self._hold_blocks()
@@ -97,7 +101,8 @@ class DynamicElements:
         """Prepares the lists of the corners of pairs at each vertex, which sweeps and rows need, if they are not there."""
 
     def launch_none(self):
-        """Empties the list of acting pairs."""
+        """Empties the list of acting pairs. Only their slots are cleared, for there may be a thousand times as many."""
+        self.model.launch(self._forget, self.pairs.threads, [self.pairs], [self._marks, self.multipliers])
         self.pairs.number.zero_()
         if self.pairs.first:
             self.pairs.first.zero_()
@@ -159,11 +164,11 @@ class DynamicElements:
             self._touch = model.kernel(pair_sweeps.touch_pairs, self.term, model.dtype)
             self._press = model.kernel(pair_sweeps.press_pairs, self.term, model.dtype, axes)
             self._move = model.kernel(pair_sweeps.move_by_pairs, model.dtype, axes)
-        self.hold_pairs(self.pairs, self.data)
+        self.hold_pairs(self.pairs, self.data, self._marks)
 
     def launch_sweep_start(self, x):
         """Launches λ = 0 for all pairs before the first sweep, at x̃ (N,)."""
-        self.multipliers.zero_()
+        self.model.launch(self._forget, self.pairs.threads, [self.pairs], [None, self.multipliers])
         if not self._in_turn:
             self.launch_corner_slots()
 
