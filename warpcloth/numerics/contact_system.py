@@ -132,6 +132,7 @@ class ContactSystem(CorrectedSystem):
         self._diagonal = wp.array(np.where(held, -1, self.matrix.diagonal.numpy()), dtype=wp.int32, device=model.device)
         self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
         self._search, self._pairs = Search(model, x, sums, s, pairs), pairs
+        self._listed = None if pairs is None else Mirror(pairs.listed)
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
         self._active = Mirror(model.scalars(wp.int32))
         self.careful, self._marked = np.ones(model.copies, dtype=bool), np.zeros(model.copies, dtype=bool)
@@ -179,6 +180,8 @@ class ContactSystem(CorrectedSystem):
 
     def correct(self, d, w, active):
         """Replaces w = A⁻¹ ∇φ by (A + D)⁻¹ ∇φ at d, for careful copies times a step length."""
+        if not (self._touching or self.careful.any() or self._listed.read()[0]):
+            return  # D is 0
         wp.copy(self._search.correction, d)
         if (self.careful != self._marked).any():
             self._marked[:] = self.careful
