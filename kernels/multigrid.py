@@ -18,8 +18,8 @@ from .vectors import types
 MODULE = "warpcloth.multigrid"
 # Weight of Jacobi sweeps. All below 2 converge, because S/ω is at most A⁻¹.
 OMEGA = 1.8
-# New coarse matrices cost about as much as so many iterations.
-SPARED = 2
+# New coarse matrices cost about as much as so many cycles, and the sweeps of the finest level as one.
+SPARED = 3
 # The other preconditioner is tried again after so many solves.
 AGED = 64
 # A solve with diagonal blocks ends once it has cost this many times a solve with multigrid.
@@ -438,7 +438,7 @@ def end_choice():
         now = choice.present[copy]
         used = 1 - now[BLOCKS]
         other = 1 - used
-        cost = wp.where(used == 1, cycle * (count + wp.static(SPARED)), count + 1)
+        cost = wp.where(used == 1, cycle * (count + 1 + wp.static(SPARED) * choice.due[copy]), count + 1)
         past = FADE * choice.past[copy]
         past[COSTS + used] += wp.float64(cost)
         if count < solves.most[copy]:

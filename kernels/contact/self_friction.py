@@ -5,9 +5,10 @@ n, kA and N = −kAφ′ times their share are those at the start of the step, a
 there. A step updates it, ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of
 a sliding pair slides along.
 
-At the end of a step ξ turns about n with the edges of the pair, so that it rotates with the cloth. A pair takes the ξ of the
-contact between the same vertices, those of nonzero w, in the last step. Without one it takes the mean of those that the vertex
-had with a part of the same face, or else the mean of the contacts with a common vertex on each side.
+At the end of a step ξ turns about n with the edges of the pair, so that it rotates with the cloth about n. Where the cloth
+turns n itself by an angle, a contact that sticks slips by that angle times its gap. A pair takes the ξ of the contact between
+the same vertices, those of nonzero w, in the last step. Without one it takes the mean of those that the vertex had with a part
+of the same face, or else the mean of the contacts with a common vertex on each side.
 """
 
 from functools import cache, partial
@@ -94,7 +95,7 @@ def turned(dtype):
     """Device function (layout, s, t, sides, n, u, start, moves, x) → u of a pair turned about n by the edges of its sides.
 
     The turn from ``start`` to x is that which fits the edges best. ``moves`` are those of obstacles. s has −1 for vertices that
-    do not touch; t has all. A contact of two vertices has no edge but those of t.
+    do not touch. A contact of two vertices turns with the edges of all vertices t of its pair.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
@@ -286,7 +287,9 @@ def set_anchors(dtype, law: Law):
                         rank = wp.int32(0)
                         if way != ZERO:
                             rank = 1
-                            if sides == kept_sides and way > ZERO and same_vertices(s, q, sides):
+                            if sides == 2 and way < ZERO:
+                                q = wp.vec4i(q[2], q[3], q[0], q[1])
+                            if sides == kept_sides and (sides == 2 or way > ZERO) and same_vertices(s, q, sides):
                                 rank = 3
                             elif sides == 1 and kept_sides == 1 and s[0] == q[0]:
                                 rank = 2

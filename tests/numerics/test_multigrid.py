@@ -12,7 +12,7 @@ from support.rows import slow_but
 from support.scenes import scene
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.linear import turn_and_multiply
-from warpcloth.kernels.multigrid import OMEGA, SPARED
+from warpcloth.kernels.multigrid import OMEGA
 from warpcloth.kernels.term import HessianPolicy
 from warpcloth.numerics.interpolation import interpolations, neighbours
 from warpcloth.numerics.linear import ConjugateGradients
@@ -271,9 +271,9 @@ def test_trials_cost_little(device, blocks, cycles):
         taken = min(needed, int(solves.most.numpy()[0]))
         solves.iteration.fill_(taken)
         solves.next_rz.fill_(10.0 ** (-3.0 * np.sqrt(taken / needed)))
-        total += cycle * (taken + SPARED) if multigrid else taken + 1
+        total += cycle * (taken + 1) if multigrid else taken + 1
         choice.launch_end(solves, wanted)
-    best = min(blocks + 1, cycle * (cycles + SPARED))
+    best = min(blocks + 1, cycle * (cycles + 1))
     assert total <= 1.1 * count * best
 
 

@@ -11,6 +11,7 @@ from ..core.status import Result
 from ..core.sums import Sums
 from ..kernels import minimise as kernels
 from ..kernels.contact.clear_elements import move_clear
+from ..kernels.contact.self_filter import copies_near_colliders
 from ..kernels.elementwise import mismatch
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
@@ -110,7 +111,9 @@ class Minimiser:
         of_means = (kernels.mean_parts, kernels.take_mean) if axes.any() else ()
         of_copies = kernels.begin_descent, kernels.begin_at_guess, kernels.begin_newton, kernels.find_indefinite
         self._launch = model.launcher(
-            ((rounding, *of_means), model.dtype, lanes.block), (of_copies,), ((kernels.end_newton,), lanes.block)
+            ((rounding, *of_means), model.dtype, lanes.block),
+            ((*of_copies, copies_near_colliders),),
+            ((kernels.end_newton,), lanes.block),
         )
         self.record()
         self.residual, self.iterations = np.zeros(model.copies), 0
@@ -228,8 +231,6 @@ class Minimiser:
         """Launches the start from d = 0, or where φ is lower from the last d, outside colliders, or the start of the step."""
         if self.warm:
             wp.copy(self.right, self.correction)
-        elif self._solid:
-            self._launch_clear(self.right)
         self.clear()
         self.linear.outdate()
         self._progress.proceed.zero_()
@@ -237,9 +238,13 @@ class Minimiser:
         self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
         if self.warm:
             self._launch_mean(self.right)
-        if self.warm or self._solid:
             wp.copy(self.search.direction, self.right)
             self._launch_guess(self.active)
+        elif self._solid:
+            self._unsolved.zero_()
+            given = [self._near, self.active, self._near is None]
+            self._launch(copies_near_colliders, self.model.copies, given, [self._wanted, self._unsolved])
+            wp.capture_if(self._unsolved, self._launch_outside)
         elif self.pairs is not None:
             self.pairs.filter.launch_touching(self.active, self._wanted, self._unsolved)
             wp.capture_if(self._unsolved, self._launch_stay)
@@ -260,15 +265,16 @@ class Minimiser:
         given = [self.search.acceleration, self._limits]
         self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
-    def _launch_clear(self, d):
-        """Launches the d (N,) that moves vertices out of colliders, to the contact distance."""
-        model, x = self.model, self.search.trial
+    def _launch_outside(self):
+        """Launches the start of vertices near colliders at the contact distance, where φ is lower there than at d = 0."""
+        model, x, direction = self.model, self.search.trial, self.search.direction
         wp.copy(x, self.base)
         for elements in self._solid:
             given = [elements.stencil, elements.rest, model.inverse_mass]
             model.launch(model.kernel(move_clear, elements.term, model.dtype), elements.count, given, [x])
-        model.launch(model.kernel(mismatch, model.dtype), model.count, [x, self.base], [d])
-        model.lock(d)
+        model.launch(model.kernel(mismatch, model.dtype), model.count, [x, self.base], [direction])
+        model.lock(direction)
+        self._launch_guess(self._wanted)
 
     def _launch_iterations(self):
         """Launches iterations until no copy is active, but at most ``AT_ONCE``."""

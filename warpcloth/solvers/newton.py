@@ -23,8 +23,8 @@ class Newton(ImplicitStep):
     It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Each step
     multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved to rounding, whatever the tolerance;
     angular momentum is not. Without contact and rigid clusters a step starts from the x − x̃ of the last one where this lowers
-    the function, else from x̃. With self-contact or meshes, cloth in contact starts from x̃, outside colliders, or from x(t),
-    wherever the function is lower.
+    the function, else from x̃; near colliders outside of these, if the function is lower there. With self-contact or meshes,
+    cloth in contact starts from x̃, outside colliders, or from x(t), wherever the function is lower.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
