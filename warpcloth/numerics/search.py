@@ -49,7 +49,6 @@ class Search:
         self.state = state = kernels.LineSearch()
         for name in ("energy", "before", "slope", "step", "trial_energy", "trial_slope", "square", "acceleration", "other"):
             setattr(state, name, model.scalars())
-        state.low, state.high = (model.scalars(wp.vec3d) for _ in range(2))
         state.searching, state.moved = (model.scalars(wp.int32) for _ in range(2))
         state.trials, state.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
         self.energy, self.slope, self.step, self.acceleration = state.energy, state.slope, state.step, state.acceleration
@@ -80,7 +79,7 @@ class Search:
         self._launch_sums(kernels.measure_start)
 
     def launch(self, active):
-        """Launches d += step·p, with a step of at most 1 that lowers φ, for the copies that are ``active`` (B,).
+        """Launches d += step·p, with the longest step of 1, ½, ¼ … that lowers φ enough, for ``active`` copies (B,).
 
         The first trial has launches of its own, because further ones, which a conditional loop repeats, are rare.
         """
@@ -131,7 +130,7 @@ class Search:
         self._launch(kernel, self.lanes.of_block, [self._parts, self.energy_of.parts], [self.state])
 
     def _check_trial(self):
-        given = [self._parts, self.energy_of.parts, self._slopes, self.noise, HALVINGS, 0.5**HALVINGS]
+        given = [self._parts, self.energy_of.parts, self._slopes, self.noise, HALVINGS]
         self._launch(kernels.check_trial, self.lanes.of_block, given, [self.state])
 
     def _take_trial(self):
