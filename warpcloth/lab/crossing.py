@@ -124,9 +124,9 @@ def meetings(solver, kept, h, speeds, device):
 def without_filter(stepper):
     """Removes the filter of self-contact from a stepper, at the end of steps and in the iterates of its method."""
     kept = stepper.pairs.filter
-    kept.launch_end = kept.launch_limit = lambda *given: None
-    kept.launch_start = kept.launch_first = lambda base, d: d.zero_()
-    kept.launch_guess = lambda base, d, guess: guess.zero_()
+    kept.launch_end = kept.launch_limit = lambda *given, **options: None
+    kept.launch_start = lambda base, d: d.zero_()
+    kept.launch_back = lambda d, direction: direction.zero_()
     stepper.pairs.contact.least = 0.0
     stepper.record_again()
 
