@@ -483,7 +483,11 @@ def test_pads_hold_what_they_pinch(soft, gap, held, device):
 
 
 def test_a_pressed_sheet_stays_at_rest(device):
-    """A pressure p at r − p/k, of which the prediction of a step lies 3.8 m inside the plane; float32 rounds that by 0.5 µm."""
+    """A pressure p at r − p/k, of which the prediction of a step lies 3.8 m inside the plane; to the tolerance of the steps.
+
+    A vertex without another force would move by the tolerance times p h²/ρ.
+    """
     case = random_case(416)
     moved = np.asarray(run_case(case, device)[0].points) - case.scene.positions
-    assert case.dtype == "float32" and np.abs(moved).max() < 2e-5
+    reach = np.abs(case.scene.loads[0].force).max(axis=0).max() / case.scene.vertex_masses.max() / case.scene.fps**2
+    assert case.dtype == "float32" and reach > 3.0 and np.abs(moved).max() < case.solver.tolerance * reach
