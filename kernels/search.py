@@ -12,8 +12,8 @@ from .reduce import block_largest, block_sums, larger
 from .vectors import types
 
 MODULE = "warpcloth.search"
-# The part of the slope by which φ must fall. At the minimum of a quadratic it falls by half of it; with 1e-4, steps jump to and
-# fro over a kink of friction, for ever: there they fall by 3 %.
+# The part of the slope by which φ must fall, below ½, by which a quadratic falls at its minimum (Goldstein 1965).
+# A jump over a kink of friction, which 1e-4 accepts for ever, lowers φ by 3 % of the slope.
 ENOUGH = wp.constant(wp.float64(0.25))
 # Rows of the sums over vertices that a trial needs, and their number.
 WORK, SLOPE, SQUARE, LARGEST, ROWS = 0, 1, 2, 3, 4

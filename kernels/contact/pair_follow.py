@@ -19,6 +19,7 @@ slope = contact.slope
 
 @wp.func
 def equal(s: wp.vec4i, q: wp.vec4i):
+    """Whether two contacts have the same vertices in the same order."""
     return s[0] == q[0] and s[1] == q[1] and s[2] == q[2] and s[3] == q[3]
 
 

@@ -371,7 +371,7 @@ class SelfSteps:
     # Obstacles.
 
     def _prepare_obstacles(self):
-        """Allocates positions of obstacles, and places those that stand."""
+        """Allocates positions of obstacles, and sets those that stand."""
         surface, model = self.surface, self.model
         self.placed = [wp.zeros(surface.count - model.count, dtype=model.vec3, device=model.device) for _ in range(3)]
         self._kept_poses = [wp.zeros_like(self._colliders.poses.before) for _ in range(3)]

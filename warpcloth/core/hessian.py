@@ -212,7 +212,7 @@ class Hessian(BlockMatrix):
         self.assemble_after_gradient(x, scale, correction, further)
 
     def assemble_after_gradient(self, x, scale, correction=None, further=None):
-        """As :meth:`assemble`, where a gradient at the same place has found the forces of dynamic elements."""
+        """As :meth:`assemble`, where a gradient at the same positions has found the forces of dynamic elements."""
         if self._constant is None:
             self.values.zero_()
         else:

@@ -252,8 +252,7 @@ class Minimiser:
     def _launch_stay(self):
         """Launches the start from the start of the step where φ is lower there.
 
-        So φ does not exceed its value there, and the energy of the cloth does not grow in the step. Cloth at rest is almost in
-        balance there, while x̃ is h²g below, from where contact would push it back.
+        Cloth at rest is almost in balance there, while x̃ is h²g below, from where contact would push it back.
         """
         self.pairs.filter.launch_back(self.correction, self.search.direction)
         self._launch_guess(self._wanted)
