@@ -268,7 +268,7 @@ def check_trial(block: int):
     """Kernel over (copies, lanes of one block): accepts a trial step or halves it; after ``most`` trials the step is 0, and one
     last trial measures that.
 
-    A step is accepted if φ(α) ≤ φ(0) + α φ'(0)/4 (Armijo). It is also accepted if φ(α) ≤ φ(0) + noise and
+    A step is accepted if φ(α) ≤ φ(0) + α φ'(0)/4 (Armijo), and φ(α) < φ(0) if φ'(0) ≥ 0, as with a raw Hessian. It is also accepted if φ(α) ≤ φ(0) + noise and
     φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe, Hager and Zhang 2005). NaN is never
     accepted.
     """
@@ -294,7 +294,7 @@ def check_trial(block: int):
             if search.searching[copy] == 1:
                 start = search.energy[copy]
                 trial = search.trial_energy[copy]
-                decrease = trial <= start + ENOUGH * search.step[copy] * slope
+                decrease = trial <= start + ENOUGH * search.step[copy] * slope and (slope < wp.float64(0.0) or trial < start)
                 level = trial <= start + noise * wp.abs(start)
                 flat = search.trial_slope[copy] <= -wp.float64(1.0 - 2.0e-4) * slope
                 if decrease or (level and flat):

@@ -351,11 +351,14 @@ def test_the_cost_of_a_cell_is_bounded(dt, steps, run, reference, device, monkey
 
 @pytest.mark.slow
 def test_02_a_raw_hessian_stalls_in_compression(device):
-    """Newton with the raw Hessian, factorised, stalls beyond h² = m/(k(L/l − 1)) and nowhere before; clamped it never does."""
+    """Newton with the raw Hessian, factorised, stalls in its first step beyond h² = m/(k(L/l − 1)) and nowhere before.
+
+    Later steps compress springs further than the start. Clamped it never stalls.
+    """
     soft = SceneRef("hanging", {"n": 5, "stiffness": 10.0})
     setups = [Setup("newton", {"hessian": kind, "linear": "factorised"}) for kind in ("raw", "clamp")]
     cells = mapped(
-        soft, setups, "compression", [0.0, 0.2, 0.4, 0.8], "dt", [1e-3, 1e-2, 1e-1], 20, device=device, reference=False
+        soft, setups, "compression", [0.0, 0.2, 0.4, 0.8], "dt", [1e-3, 1e-2, 1e-1], 1, device=device, reference=False
     )
     raw, clamped = (flat([rows]) for rows in cells)
     stalled = [cell for cell in raw if cell["verdict"] == "stalled"]

@@ -200,10 +200,12 @@ def test_float32_comes_near_float64(stretching, device):
 
 
 def test_what_rounding_hides_is_no_rest_shape(device):
-    """With kL²/D = 1e12 float32 leaves forces of 4e5 times the weight, and the strip 0.7 m away."""
-    rest = wc.equilibrium(scene("cantilever", stretching=1e12), dtype="float32", device=device)
-    assert rest.status.result not in SETTLED
-    assert "; rounding hides the equilibrium in float32" in rest.status.message
+    """With kL²/D = 1e12 float32 leaves forces of 2 to 1e7 times the weight, and the strip 0.7 m away.
+
+    Rounding decides too whether the descent ends there or uses up its iterations.
+    """
+    status = wc.equilibrium(scene("cantilever", stretching=1e12), dtype="float32", device=device).status
+    assert status.result not in SETTLED and not status and status.residual > 0.5
 
 
 def test_a_sheet_too_stiff_to_move_is_no_rest_shape(device):
@@ -213,6 +215,7 @@ def test_a_sheet_too_stiff_to_move_is_no_rest_shape(device):
         sheet = wc.Scene(mesh, density=density, terms=[wc.Spring(stiffness=1e18)], pins=[0, 4])
         rest = wc.equilibrium(sheet, device=device)
         assert rest.status.result not in SETTLED and not rest.stable, rest.status
+        assert "; rounding hides the equilibrium in float64" in rest.status.message
         assert rest.status.residual > 1.0 - 1e-6  # and what lengths are rounded by times the stiffness, which is 0 on the CPU
 
 
