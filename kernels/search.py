@@ -268,9 +268,9 @@ def check_trial(block: int):
     """Kernel over (copies, lanes of one block): accepts a trial step or halves it; after ``most`` trials the step is 0, and one
     last trial measures that.
 
-    A step is accepted if φ(α) ≤ φ(0) + α φ'(0)/4 (Armijo), and φ(α) < φ(0) if φ'(0) ≥ 0, as with a raw Hessian. It is also accepted if φ(α) ≤ φ(0) + noise and
-    φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe, Hager and Zhang 2005). NaN is never
-    accepted.
+    A step is accepted if φ(α) ≤ φ(0) + α φ'(0)/4 (Armijo), and φ(α) < φ(0) if φ'(0) ≥ 0, as with a raw Hessian. It is also
+    accepted if φ(α) ≤ φ(0) + noise and φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe,
+    Hager and Zhang 2005). NaN is never accepted.
     """
     (_store, add_up), add = block_sums(block), add_trial(block)
 

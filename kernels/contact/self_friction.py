@@ -5,10 +5,10 @@ n, kA and N = −kAφ′ times their share are those at the start of the step, a
 there. A step updates it, ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of
 a sliding pair slides along.
 
-At the end of a step ξ turns about n with the edges of the pair, so that it rotates with the cloth about n. Where the cloth
-turns n itself by an angle, a contact that sticks slips by that angle times its gap. A pair takes the ξ of the contact between
-the same vertices, those of nonzero w, in the last step. Without one it takes the mean of those that the vertex had with a part
-of the same face, or else the mean of the contacts with a common vertex on each side.
+At the end of a step ξ rotates with the cloth, or with the mesh, and u is without what turns the gap: R of :func:`turn_of`
+moves one side by d(Rn − n) relative to the other, d the gap. That of meshes is known, so u is without it in the whole step. A
+pair takes the ξ of the contact between the same vertices, those of nonzero w, in the last step. Without one it takes the mean
+of those that the vertex had with a part of the same face, or else the mean of the contacts with a common vertex on each side.
 """
 
 from functools import cache, partial
@@ -16,6 +16,7 @@ from functools import cache, partial
 import warp as wp
 
 from ..coulomb import Law
+from ..rotation import nearest_rotation
 from ..terms import contact
 from ..vectors import types
 from .obstacles import Layout, copy_of, in_copy
@@ -84,60 +85,80 @@ def same_vertices(s: wp.vec4i, q: wp.vec4i, sides: int):
     return found
 
 
+@wp.struct
+class Rings:
+    """The ``vertices`` first[i] to first[i + 1] share a triangle with vertex i, all numbered as in a copy."""
+
+    first: wp.array(dtype=wp.int32)
+    vertices: wp.array(dtype=wp.int32)
+
+
 @wp.func
-def joins(s: wp.vec4i, sides: int, i: int, j: int):
-    """Whether corners i < j of a pair are on one side, which has an edge between them."""
-    return (i < sides) == (j < sides)
+def with_mesh(layout: Layout, s: wp.vec4i):
+    """Whether one of the vertices that touch, others being −1, belongs to a mesh."""
+    return wp.max(wp.max(s[0], s[1]), wp.max(s[2], s[3])) >= layout.cloth
 
 
 @cache
-def turned(dtype):
-    """Device function (layout, s, t, sides, n, u, start, moves, x) → u of a pair turned about n by the edges of its sides.
+def turn_of(dtype):
+    """Device function (layout, rings, s, w, sides, start, moves, x) → the rotation R of a contact from ``start`` to x.
 
-    The turn from ``start`` to x is that which fits the edges best. ``moves`` are those of obstacles. s has −1 for vertices that
-    do not touch. A contact of two vertices turns with the edges of all vertices t of its pair.
+    It is the one that fits the edges at the vertices s that touch (−1: not) best (Kabsch 1976), each with |w|. With a mesh, it
+    is that of the mesh by the ``moves`` of its vertices, or of none. Vertices without a triangle have the edges of the contact.
     """
     vec3, _ = types(dtype)
     _at, exact = vertex_of(dtype)
 
     @wp.func
-    def turn(
+    def edge(
         layout: Layout,
-        s: wp.vec4i,
-        t: wp.vec4i,
-        sides: int,
-        n: wp.vec3d,
-        u: wp.vec3d,
+        i: int,
+        j: int,
         start: wp.array(dtype=vec3),
         moves: wp.array(dtype=wp.vec3d),
         x: wp.array(dtype=vec3),
     ):
-        q = s
-        some = wp.bool(False)
+        before = exact(start[j]) - exact(start[i])
+        after = before
+        if i < layout.cloth:
+            after = exact(x[j]) - exact(x[i])
+        else:
+            after += moves[j - layout.cloth] - moves[i - layout.cloth]
+        return wp.outer(after, before), wp.dot(before, before)
+
+    @wp.func
+    def turn(
+        layout: Layout,
+        rings: Rings,
+        s: wp.vec4i,
+        w: wp.vec4d,
+        sides: int,
+        start: wp.array(dtype=vec3),
+        moves: wp.array(dtype=wp.vec3d),
+        x: wp.array(dtype=vec3),
+    ):
+        of_mesh = with_mesh(layout, s)
+        A = wp.mat33d()
+        if of_mesh and not moves:
+            return wp.identity(n=3, dtype=wp.float64)
         for i in range(4):
-            for j in range(i + 1, 4):
-                some = some or (joins(s, sides, i, j) and wp.min(s[i], s[j]) >= 0)
-        if not some:
-            q = t
-        cosine = ZERO
-        sine = ZERO
-        for i in range(4):
-            for j in range(i + 1, 4):
-                if joins(q, sides, i, j) and wp.min(q[i], q[j]) >= 0:
-                    before = exact(start[q[j]]) - exact(start[q[i]])
-                    after = before
-                    if q[i] < layout.cloth and q[j] < layout.cloth:
-                        after = exact(x[q[j]]) - exact(x[q[i]])
-                    elif q[i] >= layout.cloth and q[j] >= layout.cloth:
-                        after += moves[q[j] - layout.cloth] - moves[q[i] - layout.cloth]
-                    before -= wp.dot(n, before) * n
-                    cosine += wp.dot(before, after)
-                    sine += wp.dot(n, wp.cross(before, after))
-        size = wp.sqrt(cosine * cosine + sine * sine)
-        found = u
-        if size > ZERO:
-            found = (cosine * u + sine * wp.cross(n, u)) / size
-        return found
+            if s[i] < 0 or (of_mesh and s[i] < layout.cloth):
+                continue
+            own = wp.mat33d()
+            size = ZERO
+            v = in_copy(layout, s[i])
+            for k in range(rings.first[v], rings.first[v + 1]):
+                one, square = edge(layout, s[i], s[i] + rings.vertices[k] - v, start, moves, x)
+                own += one
+                size += square
+            for j in range(4):
+                if rings.first[v] == rings.first[v + 1] and s[j] >= 0 and (i < sides) == (j < sides):
+                    one, square = edge(layout, s[i], s[j], start, moves, x)
+                    own += one
+                    size += square
+            if size > ZERO:
+                A += wp.where(of_mesh, ONE, wp.abs(w[i])) / size * own
+        return nearest_rotation(A)
 
     return turn
 
@@ -192,6 +213,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
 
     μ is the first one of ``friction`` for cloth with cloth, and then that of each obstacle of a copy.
     """
+    (vec3, _), rotation_of = types(dtype), turn_of(dtype)
     slope, limit_of = contact.bounded_slope if bounded else contact.slope, law.limit
 
     @wp.kernel(module=f"{friction_module(dtype, law)}.{bounded}", enable_backward=False)
@@ -200,7 +222,10 @@ def begin_friction(dtype, law: Law, bounded: bool):
         touching: near_pairs(dtype),
         # state in
         contacts: Contacts,
+        x: wp.array(dtype=vec3),
+        moves: wp.array(dtype=wp.vec3d),
         # parameters
+        rings: Rings,
         friction: wp.array(dtype=wp.float64),
         # out
         pairs: near_pairs(dtype),
@@ -226,12 +251,18 @@ def begin_friction(dtype, law: Law, bounded: bool):
             rubbed.parts[e] = parts
             pairs.stencils[e] = s
             rubbed.limit[e] = limit
+            n = contacts.normal[e]
+            w = contacts.weights[e]
+            sides = wp.where(contacts.code[e] == TWO_EDGES, 2, 1)
             if touching.layout.obstacles > 0:
                 rubbed.travel[e] = contacts.travel[e]
-            rubbed.normal[e] = contacts.normal[e]
-            rubbed.weights[e] = contacts.weights[e]
+                if own > 0 and moves:
+                    R = rotation_of(touching.layout, rings, parts, w, sides, x, moves, x)
+                    rubbed.travel[e] -= contacts.gap[e] * (R * n - n)
+            rubbed.normal[e] = n
+            rubbed.weights[e] = w
             rubbed.stiffness[e] = k
-            rubbed.sides[e] = wp.where(contacts.code[e] == TWO_EDGES, 2, 1)
+            rubbed.sides[e] = sides
             pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
             for i in range(4):
                 wp.atomic_add(pairs.corner_counts, s[i], 1)
@@ -359,7 +390,7 @@ def end_friction(dtype):
     The pairs ``kept`` are those of the step, with the vertices of the surface, but for ``first``.
     """
     vec3, _ = types(dtype)
-    y_of, turn_of = difference_of(dtype), turned(dtype)
+    y_of, rotation_of = difference_of(dtype), turn_of(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def end_friction_of_pairs(
@@ -370,19 +401,27 @@ def end_friction(dtype):
         start: wp.array(dtype=vec3),
         moves: wp.array(dtype=wp.vec3d),
         x: wp.array(dtype=vec3),
+        # parameters
+        rings: Rings,
         # out
         kept: near_pairs(dtype),
         slips: wp.array(dtype=SLIP),
     ):
         for turn in range(wp.tid(), pairs.number[0], pairs.threads):
             e = pairs.acting[turn]
-            kept.stencils[e] = rubbed.parts[e]
+            parts = rubbed.parts[e]
+            kept.stencils[e] = parts
             for i in range(4 * turn, 4 * turn + 4):
                 kept.corners[i] = pairs.corners[i]
             s = pairs.stencils[e]
             sides = rubbed.sides[e]
-            u = slip_from(pairs.layout, rubbed, e, y_of(pairs.layout, s, rubbed.weights[e], x), ONE)
-            u = turn_of(pairs.layout, rubbed.parts[e], s, sides, rubbed.normal[e], u, start, moves, x)
+            w = rubbed.weights[e]
+            R = rotation_of(pairs.layout, rings, parts, w, sides, start, moves, x)
+            y = y_of(pairs.layout, s, w, x)
+            if not with_mesh(pairs.layout, parts):
+                before = y_of(pairs.layout, s, w, start)
+                y -= R * before - before
+            u = R * slip_from(pairs.layout, rubbed, e, y, ONE)
             slips[e] = SLIP(u[0], u[1], u[2], rubbed.stiffness[e], wp.float64(sides))
 
     return end_friction_of_pairs

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 import warpcloth as wc
 from support.laws import EXTRA, Sticky
-from support.layers import GRAVITY, after_frames, begin, energy, gradient, pairs_of, rubbing, slope
+from support.layers import DENSITY, GRAVITY, after_frames, begin, energy, gradient, pairs_of, rubbing, slope
 from support.rows import slow_but
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.block_rows import block_rows
@@ -205,21 +206,48 @@ def test_energy_becomes_heat(name, device):
         assert total[0] - total[-1] == pytest.approx(recorded[-1], rel=0.003)
 
 
-def test_turns_with_the_cloth(device):
+@pytest.mark.parametrize("axis", "xyz")
+def test_turns_with_the_cloth(axis, device):
     """A stretch that is kept turns with both sheets: after a step with a quarter turn, forces are those of before, turned."""
-    scene = rubbing(gap=4e-3)
+    scene, turn = rubbing(gap=4e-3), Rotation.from_euler(axis, 0.5 * np.pi)
     pairs, found = pairs_of(scene, device, h=0.01), []
-    turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     moved = scene.positions + np.where(np.arange(32)[:, None] < 16, 2e-4, 0.0) * [1.0, 0.0, 0.5]
     pairs.friction.launch_end(pairs.model.array(moved, pairs.model.vec3))
     pairs.steps.fill_(1)
-    for x in (moved, moved @ turn.T):
+    for x in (moved, turn.apply(moved)):
         if found:
             pairs.friction.launch_end(pairs.model.array(x, pairs.model.vec3))
         begin(pairs, x)
         found.append(gradient(pairs, x, pairs.friction))
     assert np.abs(found[0]).max() > 1e-3
-    assert found[1] == pytest.approx(found[0] @ turn.T, abs=1e-12)
+    assert found[1] == pytest.approx(turn.apply(found[0]), abs=1e-12)
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("name", slow_but(["newton"], ["newton", "xpbd"]))
+def test_a_plate_that_tilts_carries_what_sticks(name, device):
+    """A mesh, by its moves, as a box by its pose, to 1 % of what turns the gap of 4.2 mm by 0.3 rad, which is no slip."""
+    frames, sheet, plate = 12, wc.Mesh.grid(5, 5, size=0.25), wc.Mesh.grid(3, 3, size=0.6)
+    x = sheet.points - sheet.points.mean(axis=0) + [0.02, 4.2e-3, 0.03]
+    turn = Rotation.from_euler("z", np.linspace(0.0, 0.3, frames + 1)[:, None])
+    pose, slips = {"rotation": turn.as_quat(), "friction": 5.0}, []
+    for collider in (
+        wc.MeshCollider(plate.points - plate.points.mean(axis=0), plate.triangles, position=np.zeros(3), **pose),
+        wc.Box(size=(0.6, 0.1, 0.6), position=turn.apply([0.0, -0.05, 0.0]), **pose),
+    ):
+        scene = wc.Scene(
+            sheet,
+            positions=x,
+            density=DENSITY,
+            terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-3)],
+            colliders=[collider],
+            contact=wc.Contact(distance=5e-3, stiffness=1e4),
+            fps=24.0,
+        )
+        solver = wc.Newton(substeps=2) if name == "newton" else wc.XPBD(substeps=2, iterations=100)
+        stepper = after_frames(scene, solver, frames, dtype="float64", device=device)
+        slips.append((turn[-1].inv().apply(stepper.state.x.numpy()) - x)[:, [0, 2]].mean(axis=0))
+    assert slips[0] == pytest.approx(slips[1], abs=0.01 * 4.2e-3 * 0.3) and np.abs(slips[1]).max() < 6e-5
 
 
 @pytest.mark.parametrize(("name", "friction"), [("xpbd", 0.6), ("xpbd", 0.2), ("newton", 0.35)])

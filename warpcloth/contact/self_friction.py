@@ -112,6 +112,9 @@ class SelfFriction(DynamicElements):
         model = surface.model
         super().__init__(model, kernels.friction_of_pairs(law), wp.zeros(1, dtype=wp.int32, device=model.device))
         self._kept, self._steps, self._ahead = slips, steps, ahead
+        self._rings, self._moves = kernels.Rings(), surface.moves_of_step if surface.moves else None
+        self._of_rings = [wp.array(each, dtype=wp.int32, device=model.device) for each in surface.rings()]
+        self._rings.first, self._rings.vertices = self._of_rings  # the struct holds no references
         self._friction = wp.array(friction, dtype=wp.float64, device=model.device)
         self.start, self._step = surface.vectors(), Slips(model, slips.room)
         self._vertices = Scan(model, model.count)
@@ -147,7 +150,8 @@ class SelfFriction(DynamicElements):
         self.present.fill_(1)
         wp.copy(self.start, x)
         super().launch_none()
-        self._launch(kernels.begin_friction, self.pairs.threads, [touching, contacts, self._friction], [self.pairs, self.data])
+        given = [touching, contacts, x, self._moves, self._rings, self._friction]
+        self._launch(kernels.begin_friction, self.pairs.threads, given, [self.pairs, self.data])
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
         self._launch(fill_corners, self.pairs.threads, [], [self.pairs])
         self._launch(sort_corners, model.count, [], [self.pairs])
@@ -171,7 +175,7 @@ class SelfFriction(DynamicElements):
 
     def launch_end(self, x):
         """Stores the pairs of the step and the stretch of their springs at x, for the next step."""
-        kept, moves = self._kept, self.surface.moves_of_step if self.surface.obstacles else None
-        given = [self.pairs, self.data, self.start, moves, x]
+        kept = self._kept
+        given = [self.pairs, self.data, self.start, self._moves, x, self._rings]
         self._launch(kernels.end_friction, self.pairs.threads, given, [kept.pairs, kept.slips])
         wp.copy(kept.pairs.first, self.pairs.first)

@@ -139,6 +139,13 @@ class ContactSurface:
             edges.append(own / np.maximum(np.bincount(each.edges.ravel(), minlength=len(own)), 1))
         return np.concatenate(vertices), np.concatenate(edges)
 
+    def rings(self):
+        """Returns the vertices that share a triangle with each vertex of a copy, (n + m + 1,) offsets and (…,) vertices."""
+        own = self.items[: self.triangles // self.model.copies, :3].astype(np.int64)  # of the first copy
+        own[own >= self.model.count] -= self.model.count - self.model.per_copy
+        pairs = np.unique(np.concatenate([own[:, [i, j]] for i in range(3) for j in range(3) if i != j]), axis=0)
+        return np.searchsorted(pairs[:, 0], np.arange(len(self.rest) + 1)), pairs[:, 1]
+
     def pieces(self, piece):
         """The pieces of a copy with its obstacles, (n + m,): those of the cloth, −1 without an element, then each collider."""
         _, of_collider = np.unique(self.colliders, return_inverse=True)
