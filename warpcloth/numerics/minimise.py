@@ -11,7 +11,7 @@ from ..core.status import Result
 from ..core.sums import Sums
 from ..kernels import minimise as kernels
 from ..kernels.contact.clear_elements import move_clear
-from ..kernels.contact.self_filter import copies_near_colliders
+from ..kernels.contact.self_filter import aim_back, copies_near_colliders
 from ..kernels.elementwise import mismatch
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
@@ -66,12 +66,12 @@ class Minimiser:
         s: Weight of the inertia, 1/h² [1/s²].
         linear_iterations: Maximum number of iterations of a conjugate gradient solve.
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter bounds steps; or None.
-        near: 1 for copies that may come near colliders in a step, (B,) int32 on the device; None if all may.
         last: The array for d (N,) [m], which holds that of the last step. Without contact a descent starts there if φ is lower
             than at d = 0. None: every descent starts from d = 0. With pairs a descent starts where
             :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says, or at the start of the step if φ is lower there.
-        solid: Elements of contact with colliders. A descent without pairs starts at their contact distance if φ is lower there
-            than at d = 0, which may be so deep inside that rounding of the way out moves cloth along the collider.
+        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`, or None. Near them a descent without pairs
+            starts from d = 0, from their contact distance, or from the start of the step, wherever φ is lowest. d = 0 may be so
+            deep inside that rounding of the way out moves cloth along the collider.
 
     Attributes:
         correction: d (N,) [m].
@@ -81,8 +81,10 @@ class Minimiser:
         iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
 
-    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, near=None, last=None, solid=()):
-        self.model, self.base, self.pairs, self._near, self._solid = model, base, pairs, near, () if pairs else solid
+    def __init__(self, model, base, hessian, linear, s, linear_iterations=10_000, pairs=None, last=None, colliders=None):
+        self.model, self.base, self.pairs, self._colliders = model, base, pairs, colliders
+        self._near = near = None if colliders is None else colliders.near
+        self._solid = () if pairs is not None or colliders is None else colliders.solid
         self.warm = last is not None and _resembles_the_last_step(model)
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
@@ -244,7 +246,7 @@ class Minimiser:
             self._unsolved.zero_()
             given = [self._near, self.active, self._near is None]
             self._launch(copies_near_colliders, self.model.copies, given, [self._wanted, self._unsolved])
-            wp.capture_if(self._unsolved, self._launch_outside)
+            wp.capture_if(self._unsolved, self._launch_beside)
         elif self.pairs is not None:
             self.pairs.filter.launch_touching(self.active, self._wanted, self._unsolved)
             wp.capture_if(self._unsolved, self._launch_stay)
@@ -264,16 +266,18 @@ class Minimiser:
         given = [self.search.acceleration, self._limits]
         self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
 
-    def _launch_outside(self):
-        """Launches the start of vertices near colliders at the contact distance, where φ is lower there than at d = 0."""
+    def _launch_beside(self):
+        """Launches the start of vertices near colliders at the contact distance, then at the start of the step."""
         model, x, direction = self.model, self.search.trial, self.search.direction
         wp.copy(x, self.base)
         for elements in self._solid:
             given = [elements.stencil, elements.rest, model.inverse_mass]
             model.launch(model.kernel(move_clear, elements.term, model.dtype), elements.count, given, [x])
-        model.launch(model.kernel(mismatch, model.dtype), model.count, [x, self.base], [direction])
-        model.lock(direction)
-        self._launch_guess(self._wanted)
+        for goal in x, self._colliders.x_before:
+            model.launch(model.kernel(mismatch, model.dtype), model.count, [goal, self.base], [direction])
+            given = [model.inverse_mass, model.mobility, direction, self.correction]
+            model.launch(model.kernel(aim_back, model.dtype), model.count, given, [direction])
+            self._launch_guess(self._wanted)
 
     def _launch_iterations(self):
         """Launches iterations until no copy is active, but at most ``AT_ONCE``."""

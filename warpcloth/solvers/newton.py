@@ -23,8 +23,7 @@ class Newton(ImplicitStep):
     It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Each step
     multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved to rounding, whatever the tolerance;
     angular momentum is not. Without contact and rigid clusters a step starts from the x − x̃ of the last one where this lowers
-    the function, else from x̃; near colliders outside of these, if the function is lower there. With self-contact or meshes,
-    cloth in contact starts from x̃, outside colliders, or from x(t), wherever the function is lower.
+    the function, else from x̃. In contact it starts from x̃, outside colliders, or from x(t), wherever the function is lowest.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
@@ -107,8 +106,7 @@ class NewtonStepper(ImplicitStepper):
         super().__init__(options, model)
         model = self.model
         last = self.state.add("correction", model.vectors())
-        near, solid = (None, ()) if self.colliders is None else (self.colliders.near, self.colliders.solid)
-        given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "near": near, "last": last, "solid": solid}
+        given = {"s": 1.0 / self.he**2, "pairs": self.pairs, "last": last, "colliders": self.colliders}
         self.minimiser = Minimiser(model, self.state.x, options.hessian, options.linear, **given)
         for name, array in self.minimiser.kept.items():
             self.state.add(name, array)
