@@ -1,9 +1,9 @@
-"""Factories of the kernels that move meshes in a step and carry near cloth along, so that it does not get in their way.
+"""Factories of the kernels that move colliders in a step and carry near cloth along, so that it does not get in their way.
 
-A vertex of the cloth that is listed with a mesh makes the move of the point of the mesh that is nearest to it, and one that is
-listed with such cloth makes the move of that. Pairs that would still approach are pushed apart, by
-:func:`.self_filter.push_pairs`. Then continuous collision detection says how far all of a copy may move together. Where that is
-not the whole way, pairs are listed anew, and the rest follows.
+A vertex of the cloth that is listed with a mesh makes the move of the point of the mesh that is nearest to it. One that a
+shape would meet makes the move of the shape. One that is listed with such cloth makes the move of that. Pairs that would
+still approach are pushed apart, by :func:`.self_filter.push_pairs`. Then continuous collision detection says how far all of a
+copy may move together. Where that is not the whole way, pairs are listed anew, and the rest follows.
 """
 
 from functools import cache
@@ -11,6 +11,7 @@ from functools import cache
 import warp as wp
 
 from ..vectors import types
+from .colliders import gap_of, of_pose, shapes, step_poses
 from .gap_notes import FIRST
 from .obstacles import has_obstacle
 from .self_gaps import ONE, ZERO, vertex_of
@@ -114,6 +115,49 @@ def find_carriers(dtype, of_meshes: bool):
                     changed[0] = 1
 
     return find_each_carrier
+
+
+@cache
+def carry_with_shapes(dtype, solids):
+    """Kernel over vertices of the cloth: p, the move of a shape to ``at`` that is then nearer than ``distance``; its key is 1.
+
+    Pins have none. ``some`` is 1 if a vertex moves.
+    """
+    vec3, _ = types(dtype)
+    to_local, to_space = of_pose(dtype)
+    gap = gap_of(dtype, solids)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def carry_each_vertex(
+        # elements
+        inverse_mass: wp.array(dtype=dtype),
+        shape: shapes(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        poses: step_poses(dtype),
+        # parameters
+        per_copy: int,
+        distance: dtype,
+        # out
+        p: wp.array(dtype=vec3),
+        keys: wp.array(dtype=wp.int64),
+        some: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        if inverse_mass[i] == dtype(0.0):
+            return
+        copy = i // per_copy
+        nearest = distance
+        for c in range(shape.radius.shape[0]):
+            d, _n = gap(shape, c, to_local(poses.at[copy, c], x[i]))
+            if d < nearest:
+                nearest = d
+                p[i] = to_space(poses.at[copy, c], to_local(poses.before[copy, c], x[i])) - x[i]
+                keys[i] = wp.int64(1)
+        if wp.length_sq(p[i]) > dtype(0.0):
+            some[0] = 1
+
+    return carry_each_vertex
 
 
 @cache

@@ -64,7 +64,8 @@ class SelfFilter:
             made += self_filter.find_held, self_filter.push_pairs
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         if contact.surface.moves:
-            self._prepare_moves()
+            self._prepare_advance()
+            self._prepare_carrying()
         self._count = model.kernel(count_step)
 
     def _launch(self, factory, dim, inputs, outputs):
@@ -88,11 +89,11 @@ class SelfFilter:
             colliders = self._colliders
             given, x_before = [self._cut_before, colliders.notes.cut, self._surface.layout], self._contact.x_before
             self._launch(self_filter.walk_from_start, model.count, [colliders.x_before, *given, 0], [x_before])
-            if self._moves is not None:
+            if self._surface.moves:
                 given = [self._contact.placed[0], *given, model.count]
                 self._launch_move(self_filter.walk_from_start, given, [self._surface.behind(x_before)])
             self.launch_fresh(self._contact.x_before, self._contact.relist)
-            if self._moves is not None:
+            if self._surface.moves:
                 self._contact.launch_sides(self._contact.x_before)
         self._launch_meshes(self._contact.placed[2])
         wp.copy(self._other, x, count=model.count)
@@ -233,9 +234,8 @@ class SelfFilter:
 
     # Meshes that move, and cloth that they carry along, see :mod:`warpcloth.kernels.contact.mesh_moves`.
 
-    def _prepare_moves(self):
+    def _prepare_carrying(self):
         model, device = self.model, self.model.device
-        self._prepare_advance()
         self._moves = self._surface.vectors()
         self._carried, self._keys = (wp.zeros(model.count, dtype=wp.int64, device=device) for _ in range(2))
         made = mesh_moves.are_away, mesh_moves.aim_obstacles, mesh_moves.carry_vertices, mesh_moves.end_move
@@ -252,7 +252,7 @@ class SelfFilter:
 
     def _launch_meshes(self, goal):
         """Moves meshes to their ``goal`` (B·m,) [m], and cloth that would be in their way, in the positions of the step."""
-        if self._moves is None:
+        if not self._surface.moves:
             return
         x = self._contact.x_before
         for array in (self._rounds, self._proceed):
@@ -269,12 +269,7 @@ class SelfFilter:
             array.zero_()
         self._launch_move(mesh_moves.aim_obstacles, [goal], [self._surface.behind(x), self._surface.behind(p)])
         self._launch_carriers(self._carriers[0])
-        self._changed.fill_(1)
-        wp.capture_while(self._changed, self._launch_carriers, kernel=self._carriers[1])
-        self._launch_pushes(model.inverse_mass, p, opens=True)
-        model.lock(p)
-        self.launch_limit(p)
-        self._add(x, p, 1.0, x, self._walking)
+        self._launch_carry_on(x)
         model.launch(self._count, 1, [], [self._rounds])
         self._proceed.zero_()
         given = [self.fraction, self._rounds, contact.steps, ROUNDS, contact.per_frame]
@@ -286,6 +281,26 @@ class SelfFilter:
         wp.copy(self._surface.behind(x), goal)
         self.launch_fresh(x, self._contact.relist)
         self._contact.launch_sides(x)
+
+    def _launch_shapes(self):
+        """Carries cloth along with the shapes that move onto it, as far as pairs stay apart, in the positions of the step."""
+        model, x, colliders = self.model, self._contact.x_before, self._colliders
+        for array in (self._moves, self._carried, self._keys, self._changed):
+            array.zero_()
+        self._walking.fill_(1)
+        given = [model.inverse_mass, colliders.shapes, x, colliders.poses, model.per_copy, model.colliders.distance]
+        model.launch(self._carry_with_shapes, model.count, given, [self._moves, self._keys, self._changed])
+        wp.copy(self._carried, self._keys)
+        wp.capture_if(self._changed, self._launch_carry_on, x=x)
+
+    def _launch_carry_on(self, x):
+        """Moves x with what carries the cloth, and cloth that is listed with carried cloth with that."""
+        self._changed.fill_(1)
+        wp.capture_while(self._changed, self._launch_carriers, kernel=self._carriers[1])
+        self._launch_pushes(self.model.inverse_mass, self._moves, opens=True)
+        self.model.lock(self._moves)
+        self.launch_limit(self._moves)
+        self._add(x, self._moves, 1.0, x, self._walking)
 
     def _launch_carriers(self, kernel):
         model, contact = self.model, self._contact
@@ -308,6 +323,10 @@ class SelfFilter:
             turn = self_filter.turn_where_blocked
             self._kernels[turn] = model.kernel(turn, model.dtype)
         self._direction, self._back = model.vectors(), model.vectors()
+        if self._lets_out:
+            if self._moves is None:
+                self._prepare_carrying()
+            self._carry_with_shapes = model.kernel(mesh_moves.carry_with_shapes, model.dtype, model.colliders.solids)
         self._near_colliders = model.kernel(self_filter.copies_near_colliders)
         made = self_filter.copies_in_contact, self_filter.aim_back
         self._kernels |= {factory: model.kernel(factory, model.dtype) for factory in made}
@@ -324,13 +343,15 @@ class SelfFilter:
         """
         x, direction = self._contact.x_before, self._direction
         self.launch_meshes()
+        self._add(x, base, -1.0, self._back)
+        if self._lets_out:
+            self._launch_shapes()
         wp.copy(self._target, base)
         for elements in self._touching:
             kernel = self.model.kernel(move_clear, elements.term, self.model.dtype)
             given = [elements.stencil, elements.rest, self.model.inverse_mass]
             self.model.launch(kernel, elements.count, given, [self._target])
         self._add(self._target, x, -1.0, direction)
-        self._add(x, base, -1.0, self._back)
         self.launch_limit(direction, whole=True)
         if self.model.keyframes is not None:
             self._turn(direction, pins=True)
