@@ -50,10 +50,11 @@ class DescentState:
 
     ``residual`` is the largest unbalanced acceleration over the scale of :class:`Limits`, ``previous`` its value an iteration
     before, or 0; ``end`` is an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also iterates before the host
-    looks.
+    looks. ``stays`` is 1 where d is that of the start of the step.
     """
 
     active: wp.array(dtype=wp.int32)
+    stays: wp.array(dtype=wp.int32)
     end: wp.array(dtype=wp.int32)
     iterations: wp.array(dtype=wp.int32)
     residual: wp.array(dtype=wp.float64)
@@ -94,7 +95,11 @@ def look(progress: DescentState, limits: Limits, copy: int, acceleration: wp.flo
 
 @cache
 def begin_descent():
-    """Kernel over copies: the state of :class:`DescentState` at d = 0; ``proceed`` and ``more`` are 0 before."""
+    """Kernel over copies: the state of :class:`DescentState` where the descent begins; ``proceed`` and ``more`` are 0 before.
+
+    Cloth that stays where the step began takes an iteration even if its residual is below the tolerance: without, all motion
+    and loads below it would be lost in each step. The iteration is as accurate as the residual must be, ``previous`` is −1.
+    """
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def begin(
@@ -109,28 +114,36 @@ def begin_descent():
         progress.previous[copy] = wp.float64(0.0)
         progress.iterations[copy] = 0
         look(progress, limits, copy, acceleration[copy], USED_UP)
+        if progress.stays[copy] == 1 and progress.end[copy] == CONVERGED:
+            progress.previous[copy] = wp.float64(-1.0)
+            progress.active[copy] = 1
+            progress.proceed[0] = 1
+            progress.more[0] = 1
 
     return begin
 
 
 @cache
-def begin_at_guess():
-    """Kernel over copies: the state of :class:`DescentState` where the descent begins, for copies that are active at d = 0."""
+def note_stay():
+    """Kernel over copies: ``stays`` = ``value`` where the search moved d; or 1 where a ``fraction`` (B,) is below 1, else 0."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
-    def begin(
+    def note(
         # state in
-        acceleration: wp.array(dtype=wp.float64),
+        moved: wp.array(dtype=wp.int32),
+        fraction: wp.array(dtype=wp.float64),
         # parameters
-        limits: Limits,
+        value: int,
         # in and out
         progress: DescentState,
     ):
         copy = wp.tid()
-        if progress.active[copy] == 1:
-            look(progress, limits, copy, acceleration[copy], USED_UP)
+        if fraction:
+            progress.stays[copy] = wp.where(fraction[copy] < wp.float64(1.0), 1, 0)
+        elif moved[copy] == 1:
+            progress.stays[copy] = value
 
-    return begin
+    return note
 
 
 @cache
@@ -168,6 +181,8 @@ def begin_newton():
         if progress.active[copy] == 1:
             residual = progress.residual[copy]
             forcing = LOOSEST
+            if progress.previous[copy] < wp.float64(0.0):
+                forcing = limits.tolerance[0]
             if progress.previous[copy] > wp.float64(0.0):
                 ratio = residual / progress.previous[copy]
                 forcing = wp.max(wp.float64(0.9) * ratio * ratio, LEFT * limits.tolerance[0] / residual)

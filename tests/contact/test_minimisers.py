@@ -231,3 +231,24 @@ def test_a_sphere_that_moves_carries_two_sheets(substeps, device):
     other = wc.simulate(scene, wc.Explicit(substeps=400), device=device, dtype="float64")
     assert found.status.result is Result.CONVERGED and found.status.ok, found.status.message
     assert found.worst_strain == pytest.approx(other.worst_strain, rel=0.05)
+
+
+@pytest.mark.parametrize("of_mesh", [False, True])
+def test_a_slope_below_the_tolerance_moves_cloth(of_mesh, device):
+    """½g tan θ t² without friction, but for the first of 48 steps, 1 − (47/48)², where the tolerance is 2g tan θ."""
+    sheet, ground = wc.Mesh.grid(5, 5, size=0.25), wc.Mesh.grid(3, 3, size=4.0)
+    scene = wc.Scene(
+        sheet,
+        positions=sheet.points - sheet.points.mean(axis=0) + [0.0, 2.9e-3, 0.0],
+        density=0.15,
+        terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-4)],
+        gravity=(5e-4 * GRAVITY, -GRAVITY, 0.0),
+        colliders=[wc.MeshCollider(ground.points - ground.points.mean(axis=0), ground.triangles) if of_mesh else wc.Plane()],
+        contact=wc.Contact(distance=3e-3, stiffness=1.5e4),
+        fps=24.0,
+    )
+    stepper = wc.Newton(substeps=1, tolerance=1e-3).bind(scene.build(dtype="float64", device=device))
+    for _ in range(48):
+        stepper.frame()
+    way = stepper.state.x.numpy()[:, 0].mean() - scene.positions[:, 0].mean()
+    assert way == pytest.approx(0.5 * 5e-4 * GRAVITY * 2.0**2, rel=1.0 - (47.0 / 48.0) ** 2)

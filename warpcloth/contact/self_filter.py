@@ -27,6 +27,7 @@ class SelfFilter:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
+        back: d of the start of the step (N,) [m], after :meth:`launch_start`; only if iterates stay apart.
         fraction: The fraction of the last direction that pairs left each copy, (B,); only if iterates stay apart.
         moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
             an axis and there are no colliders.
@@ -322,7 +323,7 @@ class SelfFilter:
         if model.keyframes is not None:
             turn = self_filter.turn_where_blocked
             self._kernels[turn] = model.kernel(turn, model.dtype)
-        self._direction, self._back = model.vectors(), model.vectors()
+        self._direction, self.back = model.vectors(), model.vectors()
         if self._lets_out:
             if self._moves is None:
                 self._prepare_carrying()
@@ -343,7 +344,7 @@ class SelfFilter:
         """
         x, direction = self._contact.x_before, self._direction
         self.launch_meshes()
-        self._add(x, base, -1.0, self._back)
+        self._add(x, base, -1.0, self.back)
         if self._lets_out:
             self._launch_shapes()
         wp.copy(self._target, base)
@@ -381,12 +382,12 @@ class SelfFilter:
 
         wp.capture_if(self._contact.listed, in_contact)
 
-    def launch_back(self, d, direction):
-        """Sets the direction from d to the start of the step, of free vertices; or 0 if pairs do not stay apart on this way.
+    def launch_back(self, goal, d, direction):
+        """Sets the direction from d to ``goal`` (N,) [m], of free vertices; or 0 if pairs do not stay apart on this way.
 
         Call it after :meth:`launch_start`, with pairs listed at d.
         """
-        given = [self.model.inverse_mass, self.model.mobility, self._back, d]
+        given = [self.model.inverse_mass, self.model.mobility, goal, d]
         self._launch(self_filter.aim_back, self.model.count, given, [direction])
         self.launch_limit(direction, whole=True)
 

@@ -68,10 +68,10 @@ class Minimiser:
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter bounds steps; or None.
         last: The array for d (N,) [m], which holds that of the last step. Without contact a descent starts there if φ is lower
             than at d = 0. None: every descent starts from d = 0. With pairs a descent starts where
-            :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says, or at the start of the step if φ is lower there.
+            :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says, at the start of the step, or at the last d.
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`, or None. Near them a descent without pairs
-            starts from d = 0, from their contact distance, or from the start of the step, wherever φ is lowest. d = 0 may be so
-            deep inside that rounding of the way out moves cloth along the collider.
+            starts from d = 0, their contact distance, the start of the step or the last d, wherever φ is lowest. d = 0 may be
+            so deep inside that rounding of the way out moves cloth along the collider.
 
     Attributes:
         correction: d (N,) [m].
@@ -85,7 +85,8 @@ class Minimiser:
         self.model, self.base, self.pairs, self._colliders = model, base, pairs, colliders
         self._near = near = None if colliders is None else colliders.near
         self._solid = () if pairs is not None or colliders is None else colliders.solid
-        self.warm = last is not None and _resembles_the_last_step(model)
+        self._last = last is not None
+        self.warm = self._last and _resembles_the_last_step(model)
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
         self.search = Search(model, base, self.sums, s, pairs, last)
@@ -111,7 +112,7 @@ class Minimiser:
             self._inverse_total = wp.array(axes / total[:, None], dtype=wp.vec3d, device=model.device)
             self._moments = lanes.parts(3)
         of_means = (kernels.mean_parts, kernels.take_mean) if axes.any() else ()
-        of_copies = kernels.begin_descent, kernels.begin_at_guess, kernels.begin_newton, kernels.find_indefinite
+        of_copies = kernels.begin_descent, kernels.note_stay, kernels.begin_newton, kernels.find_indefinite
         self._launch = model.launcher(
             ((rounding, *of_means), model.dtype, lanes.block),
             ((*of_copies, copies_near_colliders),),
@@ -124,7 +125,7 @@ class Minimiser:
         """Allocates what the kernels know of the descent, and what the host reads of it."""
         model, flag = self.model, partial(wp.zeros, 1, dtype=wp.int32, device=self.model.device)
         self._progress, self._limits = kernels.DescentState(), kernels.Limits()
-        for name in ("active", "end", "iterations"):
+        for name in ("active", "stays", "end", "iterations"):
             setattr(self._progress, name, model.scalars(wp.int32))
         for name in ("residual", "previous"):
             setattr(self._progress, name, model.scalars())
@@ -230,54 +231,59 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        """Launches the start from d = 0, or where φ is lower from the last d, outside colliders, or the start of the step."""
-        if self.warm:
+        """Launches the start where φ is lowest: d = 0, the last d, outside colliders, or the start of the step."""
+        if self._last:
             wp.copy(self.right, self.correction)
         self.clear()
         self.linear.outdate()
-        self._progress.proceed.zero_()
-        given = [self.search.acceleration, self._limits]
-        self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
+        self.active.fill_(1)
         if self.warm:
             self._launch_mean(self.right)
             wp.copy(self.search.direction, self.right)
-            self._launch_guess(self.active)
+            self.search.launch_guess(self.active)
         elif self._solid:
             self._unsolved.zero_()
             given = [self._near, self.active, self._near is None]
             self._launch(copies_near_colliders, self.model.copies, given, [self._wanted, self._unsolved])
             wp.capture_if(self._unsolved, self._launch_beside)
-        elif self.pairs is not None:
+        elif self.pairs is not None and self._last:
+            self._note_stay(1, self.pairs.filter.fraction)
             self.pairs.filter.launch_touching(self.active, self._wanted, self._unsolved)
-            wp.capture_if(self._unsolved, self._launch_stay)
-
-    def _launch_stay(self):
-        """Launches the start from the start of the step where φ is lower there.
-
-        Cloth at rest is almost in balance there, while x̃ is h²g below, from where contact would push it back.
-        """
-        self.pairs.filter.launch_back(self.correction, self.search.direction)
-        self._launch_guess(self._wanted)
-
-    def _launch_guess(self, active):
-        """Launches the move along the direction where it lowers φ, for the copies that are ``active`` (B,)."""
-        self.search.launch_guess(active)
+            wp.capture_if(self._unsolved, self._launch_apart)
         self._progress.proceed.zero_()
         given = [self.search.acceleration, self._limits]
-        self._launch(kernels.begin_at_guess, self.model.copies, given, [self._progress])
+        self._launch(kernels.begin_descent, self.model.copies, given, [self._progress])
+
+    def _launch_apart(self):
+        """Launches the start from the start of the step or from the last d, as far as pairs stay apart.
+
+        Cloth at rest is almost in balance at the start of the step, while x̃ is h²g below, from where contact would push it
+        back. Cloth that slides is so at the last d, which does not stop what is slower than the tolerance.
+        """
+        for goal, stays in (self.pairs.filter.back, 1), (self.right, 0):
+            self.pairs.filter.launch_back(goal, self.correction, self.search.direction)
+            self.search.launch_guess(self._wanted)
+            self._note_stay(stays)
 
     def _launch_beside(self):
-        """Launches the start of vertices near colliders at the contact distance, then at the start of the step."""
+        """Launches the start of vertices near colliders at the contact distance, at the start of the step, or at the last d."""
         model, x, direction = self.model, self.search.trial, self.search.direction
         wp.copy(x, self.base)
         for elements in self._solid:
             given = [elements.stencil, elements.rest, model.inverse_mass]
             model.launch(model.kernel(move_clear, elements.term, model.dtype), elements.count, given, [x])
-        for goal in x, self._colliders.x_before:
-            model.launch(model.kernel(mismatch, model.dtype), model.count, [goal, self.base], [direction])
-            given = [model.inverse_mass, model.mobility, direction, self.correction]
+        self._progress.stays.zero_()
+        for goal, stays in (x, 0), (self._colliders.x_before, 1), (None, 0):
+            if goal is not None:
+                model.launch(model.kernel(mismatch, model.dtype), model.count, [goal, self.base], [direction])
+            given = [model.inverse_mass, model.mobility, self.right if goal is None else direction, self.correction]
             model.launch(model.kernel(aim_back, model.dtype), model.count, given, [direction])
-            self._launch_guess(self._wanted)
+            self.search.launch_guess(self._wanted)
+            self._note_stay(stays)
+
+    def _note_stay(self, value, fraction=None):
+        given = [self.search.state.moved, fraction, value]
+        self._launch(kernels.note_stay, self.model.copies, given, [self._progress])
 
     def _launch_iterations(self):
         """Launches iterations until no copy is active, but at most ``AT_ONCE``."""

@@ -23,7 +23,8 @@ class Newton(ImplicitStep):
     It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Each step
     multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved to rounding, whatever the tolerance;
     angular momentum is not. Without contact and rigid clusters a step starts from the x − x̃ of the last one where this lowers
-    the function, else from x̃. In contact it starts from x̃, outside colliders, or from x(t), wherever the function is lowest.
+    the function, else from x̃. In contact it starts from x̃, outside colliders, from x(t), or from the last x − x̃, wherever the
+    function is lowest. From x(t) it takes an iteration at least, so that slow motion goes on.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
