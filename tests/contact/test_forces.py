@@ -1,13 +1,15 @@
 """Forces on colliders, works and heat against known answers and balances."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 import trimesh
 
 import warpcloth as wc
-from support.rows import slow_but
+from support.layers import cloth
+from support.rows import table
 from support.scenes import incline
 from warpcloth.cli import main
 
@@ -42,7 +44,7 @@ def rates(scene, run):
     return np.diff(momentum, axis=0) * scene.fps - scene.vertex_masses.sum() * scene.gravity
 
 
-@pytest.mark.parametrize("name", slow_but([name for name in SOLVERS if name != "explicit"], SOLVERS))
+@table("name", [name for name in SOLVERS if name != "explicit"], SOLVERS)
 def test_a_plane_bears_the_weight(name, device):
     scene, _, _ = incline(0.0, 0.0)
     run = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64", record=BOTH)
@@ -55,7 +57,7 @@ def test_a_plane_bears_the_weight(name, device):
     assert run.friction_forces == {} and (run.cuts == 0.0).all()
 
 
-@pytest.mark.parametrize("name", slow_but(["explicit", "admm"], [name for name in SOLVERS if name != "constrained dynamics"]))
+@table("name", ["explicit", "admm"], [name for name in SOLVERS if name != "constrained dynamics"])
 def test_a_slope_bears_the_weight_and_slides_by_friction(name, device):
     """N = mg cos θ and μN up the slope; the heat is μN times the way, less what the anchors store."""
     scene, normal, down = incline(30.0, 0.3, terms=[wc.Spring(stiffness=1000.0)])
@@ -73,22 +75,12 @@ def test_a_slope_bears_the_weight_and_slides_by_friction(name, device):
 def pushed(friction):
     """A sheet that is held all round, and a ball that rises into it faster and faster, drifts and turns."""
     k = np.arange(12)
-    ball = wc.Sphere(
-        radius=0.1,
-        position=np.stack([0.25 + 0.002 * k, 0.0015 * k**1.5 - 0.106, 0.23 + 0.0 * k], axis=1),
-        rotation=np.stack([0.0 * k, np.sin(0.01 * k), 0.0 * k, np.cos(0.01 * k)], axis=1),
-        friction=friction,
-        name="ball",
-    )
-    return wc.Scene(
-        wc.Mesh.grid(6, 6, size=0.5),
-        density=1.0,
-        terms=[wc.Spring(stiffness=4.0), wc.QuadraticBending(stiffness=1e-5)],
-        pins="boundary",
-        gravity=(0.0, -1.0, 0.0),
-        colliders=[ball],
-        contact=wc.Contact(distance=6e-3, stiffness=2e4),
-    )
+    position = np.stack([0.25 + 0.002 * k, 0.0015 * k**1.5 - 0.106, 0.23 + 0.0 * k], axis=1)
+    rotation = np.stack([0.0 * k, np.sin(0.01 * k), 0.0 * k, np.cos(0.01 * k)], axis=1)
+    ball = wc.Sphere(radius=0.1, position=position, rotation=rotation, friction=friction, name="ball")
+    fields = {"density": 1.0, "pins": "boundary", "gravity": (0.0, -1.0, 0.0), "stiffness": 4.0}
+    contact = wc.Contact(distance=6e-3, stiffness=2e4)
+    return cloth(wc.Mesh.grid(6, 6, size=0.5), colliders=[ball], contact=contact, **fields)
 
 
 def swelling(friction):
@@ -112,17 +104,11 @@ ORDERS = {
 }
 
 
-# The work of a swelling mesh is found as that of a pushed one, but in explicit steps, where the filter of pairs moves the cloth
-# and records no work.
-@pytest.mark.parametrize(
-    ("scene", "name", "friction"),
-    slow_but(
-        [(pushed, "newton midpoint", 0.4), (swelling, "newton", 0.4)],
-        [
-            *((pushed, name, friction) for friction in (0.0, 0.4) for name in ORDERS),
-            *((swelling, name, 0.4) for name in ("newton", "xpbd")),
-        ],
-    ),
+# In explicit steps the filter of pairs moves cloth over a swelling mesh, and records no work.
+@table(
+    "scene, name, friction",
+    [(pushed, "newton midpoint", 0.4), (swelling, "newton", 0.4)],
+    [*product([pushed], ORDERS, (0.0, 0.4)), (swelling, "newton", 0.4), (swelling, "xpbd", 0.4)],
 )
 def test_work_of_colliders_is_the_change_of_energy_to_the_order_of_the_scheme(scene, name, friction, device):
     """With friction too, of which the heat is counted; below 1e-4 of the work midpoint has no order any more."""
@@ -155,12 +141,12 @@ def test_a_collider_that_jumps_does_the_work_that_the_cloth_gets(name, device):
     assert energies["kinetic"][2] == pytest.approx(1.5 * (0.1 * scene.fps) ** 2, rel=2.0 * R / 0.1)
 
 
+FILTERED = {"explicit": wc.Explicit(substeps=1), "midpoint": wc.Newton(substeps=1, integrator="midpoint")}
+FILTERED |= {"pbd": wc.PBD(substeps=1)}
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.5])
-@pytest.mark.parametrize(
-    "solver",
-    [wc.Explicit(substeps=1), wc.Newton(substeps=1, integrator="midpoint"), wc.PBD(substeps=1)],
-    ids=["explicit", "midpoint", "pbd"],
-)
+@pytest.mark.parametrize("solver", FILTERED.values(), ids=FILTERED)
 def test_the_filter_takes_the_energy_of_what_it_stops(solver, tilt, device):
     """Of beads at a floor ½mv², of those that it leaves r/10 above it all; of one that slides on, what is normal to a slope."""
     normal, masses = np.array([np.sin(tilt), np.cos(tilt), 0.0]), np.array([1.0, 2.0, 3.0])
@@ -179,14 +165,9 @@ def jumping(friction=0.0):
     jumps = np.random.default_rng(1).normal(scale=0.03, size=(12, 3))
     jumps[0] = 0.0
     position = np.array([0.25, -0.106, 0.23]) + np.cumsum(jumps, axis=0)
-    return wc.Scene(
-        wc.Mesh.grid(8, 8, size=0.5),
-        density=DENSITY,
-        terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)],
-        colliders=[wc.Sphere(radius=0.1, position=position, friction=friction)],
-        contact=wc.Contact(distance=R, stiffness=10.0 * DENSITY * G / R),
-        pins="corners",
-    )
+    ball = wc.Sphere(radius=0.1, position=position, friction=friction)
+    contact = wc.Contact(distance=R, stiffness=10.0 * DENSITY * G / R)
+    return cloth(wc.Mesh.grid(8, 8, size=0.5), colliders=[ball], contact=contact, pins="corners")
 
 
 @pytest.mark.parametrize(("friction", "dtype"), ((0.0, "float64"), (0.3, "float32")))
@@ -249,12 +230,11 @@ def test_copies_have_forces_of_their_own(device):
     for threads in (1, 2) if device == "cpu" else (1,):
         batch = wc.simulate(scene, solver, copies=2, **run, threads=threads)
         assert list(batch.collider_forces) == ["ball", "ball 2"] and list(batch.friction_forces) == ["ball"]
-        assert (batch.collider_forces["ball 2"] == 0.0).all()
-        for found, expected in ((batch.collider_forces, alone.collider_forces), (batch.energies, alone.energies)):
-            for name, values in expected.items():
-                both = np.stack([values, values], axis=1)
-                np.testing.assert_allclose(found[name], both, rtol=0.0, atol=1e-9, err_msg=name)
-        assert batch.cuts.shape == (5, 2)
+        assert (batch.collider_forces["ball 2"] == 0.0).all() and batch.cuts.shape == (5, 2)
+        found = batch.collider_forces | batch.energies
+        for name, values in (alone.collider_forces | alone.energies).items():
+            both = np.stack([values, values], axis=1)
+            np.testing.assert_allclose(found[name], both, rtol=0.0, atol=1e-9, err_msg=name)
     assert list(alone.energies) == [
         *("Spring", "QuadraticBending", "contact with ball", "friction on ball", "contact with ball 2"),
         *("kinetic", "gravity", "work of colliders", "work of the filter", "heat of friction"),
@@ -304,9 +284,9 @@ def test_heat_on_a_mesh_is_that_on_a_plane(integrator):
     corners = [[-2.0, 0.0, -2.0], [-2.0, 0.0, 2.0], [2.0, 0.0, 2.0], [2.0, 0.0, -2.0]]
     moving = {"position": [(0.03 * k, -0.0009, 0.0) for k in range(7)], "friction": 0.3}
     solver, heats = wc.Newton(substeps=8, tolerance=1e-7, integrator=integrator), []
+    fields = {"terms": [wc.Spring(stiffness=100.0)], "duration": 0.25, "fps": 24.0}
     for belt in (wc.MeshCollider(corners, [[0, 1, 2], [0, 2, 3]], **moving), wc.Plane(**moving)):
-        fields = {"terms": [wc.Spring(stiffness=100.0)], "density": DENSITY, "duration": 0.25, "fps": 24.0}
-        fields["contact"] = wc.Contact(distance=R, stiffness=1.5e4)
-        scene = wc.Scene(wc.Mesh.grid(4, 4, size=0.5), colliders=[belt], **fields)
+        contact = wc.Contact(distance=R, stiffness=1.5e4)
+        scene = cloth(wc.Mesh.grid(4, 4, size=0.5), colliders=[belt], contact=contact, **fields)
         heats.append(wc.simulate(scene, solver, dtype="float64", record="energies").energies["heat of friction"][-1])
     assert heats[0] == pytest.approx(heats[1], rel=0.03) and heats[1] > 1e-3

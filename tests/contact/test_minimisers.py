@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 import warpcloth as wc
-from support.layers import GRAVITY, layers, rubbing, stack
-from support.rows import slow_but
+from support.layers import GRAVITY, after_frames, cloth, layers, rubbing, stack
+from support.rows import slow_but, table
 from warpcloth.core.energy import Energy
 from warpcloth.core.status import Result
 
@@ -18,17 +18,13 @@ SLOW = pytest.mark.slow
 
 
 def stretched(gravity, friction):
-    """A sheet in tension over a ball and on a plane, which it enters in the step that follows.
-
-    Contact alone would move a vertex by 0.26 m in the step, beyond the middle of the ball, whose far side is then nearer.
-    """
+    """A sheet in tension over a ball and on a plane. Contact alone would move a vertex beyond the middle of the ball."""
     grid = wc.Mesh.grid(8, 8, size=0.5)
     x, _, z = grid.points.T
     height = np.sqrt(np.maximum(0.2004**2 - (x - 0.25) ** 2 - (z - 0.25) ** 2, 0.0)) - 0.2
-    return wc.Scene(
+    return cloth(
         wc.Mesh(0.8 * grid.points, grid.triangles),
-        density=0.15,
-        terms=[wc.Spring(stiffness=20.0), wc.QuadraticBending(stiffness=1e-5)],
+        stiffness=20.0,
         positions=np.stack([x, np.maximum(height, -0.1494), z], axis=1),
         velocities=np.tile([0.3, -0.2, 0.1], (64, 1)),
         gravity=(0.0, -gravity, 0.0),
@@ -41,11 +37,7 @@ def stretched(gravity, friction):
 
 
 def roofed(gravity, friction):
-    """A sheet in tension, bent along the two edges of a flat roof of triangles, on its top and slopes and on a plane.
-
-    Cloth that slides over many edges of a mesh, as over a ball, has several minima, 1e-4 m apart, and methods end at different
-    ones. Here it slides by up to 3 mm.
-    """
+    """A sheet in tension on a flat roof with two edges, where it slides by 3 mm; over many edges φ has several minima."""
     grid, slope = wc.Mesh.grid(8, 8, size=0.5), 0.1
     x, _, z = grid.points.T
     top, foot = 0.5 / 7.0 * 1.5, 1.0
@@ -129,9 +121,7 @@ def end(what, name, device):
     """Where the last step of a solver ends; no vertex is cut, and what is pressed, rubs or is locked does so."""
     make, steps = SCENES[what]
     scene, solver = make(), (OF_COLLIDERS if what in COLLIDERS else OF_CLOTH)[name]
-    stepper = solver.bind(scene.build(device=device, dtype="float64"))
-    for _ in range(steps):
-        stepper.step()
+    stepper = after_frames(scene, solver, steps=steps, device=device, dtype="float64")
     x = stepper.state.x.numpy().copy()
     assert stepper.cut == 0.0
     assert np.abs(x - scene.positions).max() > (1e-4 if what in LOCKED else 1e-5)
@@ -148,52 +138,46 @@ def end(what, name, device):
     return x
 
 
-@pytest.mark.parametrize(
-    ("what", "name"),
-    slow_but(
-        [
-            *(("slides", name) for name in ("newton_clamp", "xpbd")),
-            ("roof", "newton_clamp"),
-            *(("both stages", name) for name in ("newton_factorised", "admm", "projective_dynamics", "constrained")),
-            *(("locked axes", name) for name in ("newton_factorised", "constrained")),
-            *(("rubs at 2.2 mm", name) for name in ("newton_factorised", "admm")),
-            *(("rubs over a valley", name) for name in ("xpbd", "admm", "constrained")),
-        ],
-        [
-            *((what, name) for what in COLLIDERS for name in ALL_OF_COLLIDERS),
-            ("slides", "projective_dynamics_none"),
-            *((what, name) for what in (*PRESSED, *LOCKED) for name in ALL_OF_CLOTH),
-            *((what, name) for what in RUBBING for name in WITH_FRICTION),
-        ],
-    ),
+@table(
+    "what, name",
+    [
+        *(("slides", name) for name in ("newton_clamp", "xpbd")),
+        ("roof", "newton_clamp"),
+        *(("both stages", name) for name in ("newton_factorised", "admm", "projective_dynamics", "constrained")),
+        *(("locked axes", name) for name in ("newton_factorised", "constrained")),
+        *(("rubs at 2.2 mm", name) for name in ("newton_factorised", "admm")),
+        *(("rubs over a valley", name) for name in ("xpbd", "admm", "constrained")),
+    ],
+    [
+        *((what, name) for what in COLLIDERS for name in ALL_OF_COLLIDERS),
+        ("slides", "projective_dynamics_none"),
+        *((what, name) for what in (*PRESSED, *LOCKED) for name in ALL_OF_CLOTH),
+        *((what, name) for what in RUBBING for name in WITH_FRICTION),
+    ],
 )
 def test_minimiser_is_the_same(what, name, device):
     """As that of Newton's method to 1e-8 m, at gaps down to r/60, deep in the logarithm."""
     assert end(what, name, device) == pytest.approx(end(what, "newton", device), abs=1e-8)
 
 
-@pytest.mark.parametrize(
-    "name",
-    slow_but(["newton_clamp", "xpbd", "admm"], ["newton_clamp", "xpbd", "admm", "projective_dynamics", "constrained"]),
-)
+@table("name", ["newton_clamp", "xpbd", "admm"], ["newton_clamp", "xpbd", "admm", "projective_dynamics", "constrained"])
 def test_minimiser_is_the_same_as_far_as_float32_allows(name, device):
     """0.5 m are known to 3e-8 m, a gap of r/45 and its force to 1.4e-3: 4e-4 m of the 0.27 m that gravity moves in the step."""
     iterations = {"newton_clamp": 100, "projective_dynamics": 100, "xpbd": 1000, "admm": 300, "constrained": 40}[name]
     newton, rough, ends = OF_COLLIDERS["newton"], replace(OF_COLLIDERS[name], iterations=iterations), []
     for solver, dtype in ((newton, "float64"), (newton, "float32"), (rough, "float32")):
-        stepper = solver.bind(stretched(981.0, 0.0).build(device=device, dtype=dtype))
-        stepper.step()
+        stepper = after_frames(stretched(981.0, 0.0), solver, steps=1, device=device, dtype=dtype)
         ends.append(stepper.state.x.numpy())
         assert dtype == "float32" or (stepper.cut == 0.0 and stepper.results[0] in (Result.CONVERGED, Result.ROUNDED))
     exact, *rounded = ends
     assert np.abs(np.array(rounded) - exact).max() < 4e-4
 
 
-@pytest.mark.parametrize("acceleration", slow_but(["l-bfgs"], ["chebyshev", "anderson", "l-bfgs"]))
+@table("acceleration", ["l-bfgs"], ["chebyshev", "anderson", "l-bfgs"])
 def test_iterations_of_projective_dynamics_lower_the_objective(acceleration, device):
     """φ = ‖d‖²_M/2h² + U, deep in contact, where rough solutions alone raise it; to the rounding that a `Search` takes, √ε."""
     solver = wc.ProjectiveDynamics(substeps=1, iterations=40, tolerance=1e-12, acceleration=acceleration)
-    stepper = solver.bind(stretched(981.0, 0.3).build(device=device, dtype="float64"))
+    stepper = after_frames(stretched(981.0, 0.3), solver, device=device, dtype="float64")
     energy_of, energy = Energy(stepper.model, stepper.sums, corrected=True), stepper.model.scalars()
     measure, found = stepper.measure, []
 

@@ -6,7 +6,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.pairs import all_pairs, pieces
-from support.rows import slow_but
+from support.rows import table
 from warpcloth.contact.proximity import Proximity
 from warpcloth.contact.surface import ContactSurface
 from warpcloth.model.model import Model
@@ -103,7 +103,7 @@ SHEETS = wc.Mesh.join({"one": SMALL, "other": SMALL})
 UNEVEN = wc.Mesh(np.sign(GRID.points - 0.5) * np.abs(GRID.points - 0.5) ** 4 * 8 + 0.5, triangles=GRID.triangles)
 
 
-@pytest.mark.parametrize("dtype", slow_but(["float32"], ["float32", "float64"]))
+@table("dtype", ["float32"], ["float32", "float64"])
 @pytest.mark.parametrize(
     ("mesh", "gap", "options"),
     [

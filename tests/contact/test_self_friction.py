@@ -1,6 +1,7 @@
 """Friction of cloth with itself: sticking and sliding by Coulomb's law, heat, and what steps pass on."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import warpcloth as wc
 from support.laws import EXTRA, Sticky
-from support.layers import DENSITY, GRAVITY, after_frames, begin, energy, gradient, pairs_of, rubbing, slope
-from support.rows import slow_but
+from support.layers import GRAVITY, after_frames, begin, cloth, energy, gradient, pairs_of, rubbing, slope
+from support.rows import table
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.block_rows import block_rows
 from warpcloth.kernels.multigrid import subtract_product
@@ -44,12 +45,9 @@ def acceleration(scene, solver, device):
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("dtype", slow_but(["float32"], ["float64", "float32"]))
+@table("dtype", ["float32"], ["float64", "float32"])
 def test_contact_that_is_gathered_is_what_is_scattered(dtype, device):
-    """As on a GPU, which gathers: each of the four sums of contact and of friction, up to the rounding of some ten terms.
-
-    Products there are also part of those of rows, see :mod:`warpcloth.kernels.block_rows`.
-    """
+    """As on a GPU: the four sums, to the rounding of ten terms, and products as of :mod:`warpcloth.kernels.block_rows`."""
     pairs = pairs_of(rubbing(), device, h=0.01, dtype=dtype)
     pairs.contact.list_corners()
     model = pairs.model
@@ -115,25 +113,17 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
         assert found == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize(
-    ("name", "layers", "law", "error"),
-    [
-        *slow_but(
-            [("explicit", 1, float, 1e-3), ("newton", 1, Sticky, 1e-3), ("xpbd", 2, float, 5e-3)],
-            [
-                *((name, 1, law, 1e-3) for law in (float, Sticky) for name in SOLVERS),
-                *((name, 2, float, 5e-3) for name in ("newton", "xpbd")),
-            ],
-        ),
-        *((integrator, 1, float, 1e-2) for integrator in ("midpoint", "bdf2")),
-    ],
+SLIDING = [("explicit", 1, float, 1e-3), ("newton", 1, Sticky, 1e-3), ("xpbd", 2, float, 5e-3)]
+SLIDING += [("midpoint", 1, float, 1e-2), ("bdf2", 1, float, 1e-2)]
+
+
+@table(
+    "name, layers, law, error",
+    SLIDING,
+    [*dict.fromkeys([*SLIDING, *product(SOLVERS, [1], (float, Sticky), [1e-3]), ("newton", 2, float, 5e-3)])],
 )
 def test_slides(name, layers, law, error, device):
-    """On a slope of tan θ = 0.6, a = g sin θ − μ(g cos θ + a_y): all sheets, as each interface bears what is above it.
-
-    If the springs bear e more, a is less by ke/2ρ: half of the area is that of the vertices of the ground, and none of these is
-    below the sheet.
-    """
+    """All sheets have a = g sin θ − μ(g cos θ + a_y), less ke/2ρ if springs bear e more: half of the area is of the ground."""
     solver = SOLVERS[name] if name in SOLVERS else wc.Newton(substeps=10, integrator=name)
     a, angle = acceleration(slope(0.6, law(0.3), layers), solver, device), np.arctan(0.6)
     expected = GRAVITY * np.sin(angle) - 0.3 * (GRAVITY * np.cos(angle) + a[:, 1])
@@ -141,12 +131,10 @@ def test_slides(name, layers, law, error, device):
     assert a[:, 0] == pytest.approx(expected, rel=error)
 
 
-@pytest.mark.parametrize(
-    ("name", "dtype"),
-    slow_but(
-        [("newton", "float64"), ("projective_dynamics", "float64"), ("xpbd", "float32")],
-        [*((name, "float64") for name in SOLVERS), ("newton", "float32"), ("xpbd", "float32")],
-    ),
+@table(
+    "name, dtype",
+    [("newton", "float64"), ("projective_dynamics", "float64"), ("xpbd", "float32")],
+    [*product(SOLVERS, ["float64"]), ("newton", "float32"), ("xpbd", "float32")],
 )
 def test_sticks(name, dtype, device):
     """At tan θ = 0.9 μ implicit steps end at rest; in float32 some coordinates of 0.5 m move by a last place a frame.
@@ -154,7 +142,7 @@ def test_sticks(name, dtype, device):
     Explicit steps swing about there, as nothing damps them: by no more than ε = 0.1 r μ, at a speed of no more than √(k/ρ) ε.
     """
     solver = wc.Newton(substeps=10) if (name, dtype) == ("newton", "float32") else SOLVERS[name]
-    stepper, ends = solver.bind(slope(0.27).build(device=device, dtype=dtype)), []
+    stepper, ends = after_frames(slope(0.27), solver, device=device, dtype=dtype), []
     start = np.array(stepper.state.x.numpy())
     for _ in range(24):
         stepper.frame()
@@ -166,7 +154,7 @@ def test_sticks(name, dtype, device):
     assert creep < (least if dtype == "float64" else 24.0 * np.spacing(np.float32(0.5)) * 1.1)
 
 
-@pytest.mark.parametrize("name", slow_but(["xpbd"], SOLVERS))
+@table("name", ["xpbd"], SOLVERS)
 def test_momentum_and_energy(name, device):
     """Sheets that press and rub: Σp stays, as exactly as linear systems are solved, and motion along them loses energy."""
     scene, left = rubbing(gap=4.5e-3), []
@@ -174,9 +162,7 @@ def test_momentum_and_energy(name, device):
     mass = scene.vertex_masses[:, None]
     for friction in (0.0, 0.3):
         declared = replace(scene, self_contact=replace(scene.self_contact, friction=friction))
-        stepper = solver.bind(declared.build(device=device, dtype="float64"))
-        for _ in range(10):
-            stepper.step()
+        stepper = after_frames(declared, solver, steps=10, device=device, dtype="float64")
         v = stepper.state.v.numpy()
         assert stepper.cut == 0.0
         assert np.abs((mass * v).sum(axis=0)).max() < (1e-9 if name == "newton" else 1e-12) * np.abs(mass * v).sum()
@@ -184,12 +170,12 @@ def test_momentum_and_energy(name, device):
     assert left[1] < 0.99 * left[0]
 
 
-@pytest.mark.parametrize("name", slow_but(["xpbd"], ["explicit", "newton", "xpbd"]))
+@table("name", ["xpbd"], ["explicit", "newton", "xpbd"])
 def test_energy_becomes_heat(name, device):
     """What a sheet that slides down a slope loses is μ mg cos θ times its way, and it never gains: to 3 % of the heat.
 
-    Implicit steps damp 1.8 % at the end. The record has this heat too. Explicit steps damp nothing: the sheet bounces, so that
-    N is not its weight, by 2.6 %, but the heat is all that it loses, to 0.002 in these steps.
+    Implicit steps damp 1.8 % at the end. Explicit steps damp nothing: the sheet bounces, so that N is not its weight, by 2.6 %,
+    but the heat is all that it loses, to 0.002 in these steps.
     """
     scene = slope(0.6, duration=0.25)
     mass = scene.vertex_masses[4:, None]
@@ -224,27 +210,20 @@ def test_turns_with_the_cloth(axis, device):
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("name", slow_but(["newton"], ["newton", "xpbd"]))
+@table("name", ["newton"], ["newton", "xpbd"])
 def test_a_plate_that_tilts_carries_what_sticks(name, device):
     """A mesh, by its moves, as a box by its pose, to 1 % of what turns the gap of 4.2 mm by 0.3 rad, which is no slip."""
     frames, sheet, plate = 12, wc.Mesh.grid(5, 5, size=0.25), wc.Mesh.grid(3, 3, size=0.6)
     x = sheet.points - sheet.points.mean(axis=0) + [0.02, 4.2e-3, 0.03]
     turn = Rotation.from_euler("z", np.linspace(0.0, 0.3, frames + 1)[:, None])
     pose, slips = {"rotation": turn.as_quat(), "friction": 5.0}, []
+    fields = {"bending": 1e-3, "contact": wc.Contact(distance=5e-3, stiffness=1e4), "fps": 24.0}
+    solver = wc.Newton(substeps=2) if name == "newton" else wc.XPBD(substeps=2, iterations=100)
     for collider in (
         wc.MeshCollider(plate.points - plate.points.mean(axis=0), plate.triangles, position=np.zeros(3), **pose),
         wc.Box(size=(0.6, 0.1, 0.6), position=turn.apply([0.0, -0.05, 0.0]), **pose),
     ):
-        scene = wc.Scene(
-            sheet,
-            positions=x,
-            density=DENSITY,
-            terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-3)],
-            colliders=[collider],
-            contact=wc.Contact(distance=5e-3, stiffness=1e4),
-            fps=24.0,
-        )
-        solver = wc.Newton(substeps=2) if name == "newton" else wc.XPBD(substeps=2, iterations=100)
+        scene = cloth(sheet, positions=x, colliders=[collider], **fields)
         stepper = after_frames(scene, solver, frames, dtype="float64", device=device)
         slips.append((turn[-1].inv().apply(stepper.state.x.numpy()) - x)[:, [0, 2]].mean(axis=0))
     assert slips[0] == pytest.approx(slips[1], abs=0.01 * 4.2e-3 * 0.3) and np.abs(slips[1]).max() < 6e-5

@@ -329,9 +329,7 @@ def contact_energy(run, frame):
     total = 0.0
     for gaps in run.distances:
         r, k = run.scene.contact.distance, run.scene.contact.stiffness
-        d = np.maximum(gaps[frame], 1e-3 * r)
-        phi = np.where(d < 0.5 * r, 0.125 * r * r + 0.25 * r * r * np.log(0.5 * r / d), 0.5 * np.maximum(r - d, 0.0) ** 2)
-        total += k * (run.free * run.vertex_areas * phi).sum()
+        total += k * (run.free * run.vertex_areas * barrier(np.maximum(gaps[frame], 1e-3 * r), r)).sum()
     return total
 
 
@@ -474,8 +472,14 @@ def _right_cauchy_green(run):
     return np.swapaxes(F, -1, -2) @ F
 
 
+def barrier(d, r):
+    """Returns φ(d) [m²] at d > 0, ½(r − d)² for r/2 ≤ d < r, and ⅛r² + ¼r² ln(r/2d) below."""
+    far, near = 0.5 * np.maximum(r - d, 0.0) ** 2, 0.125 * r * r + 0.25 * r * r * np.log(0.5 * r / d)
+    return np.where(d < 0.5 * r, near, far)
+
+
 def barrier_slope(d, r):
-    """Returns −φ′(d) [m] of φ = ½(r − d)² for r/2 ≤ d < r, and ⅛r² + ¼r² ln(r/2d) below."""
+    """Returns −φ′(d) [m] of :func:`barrier`."""
     return np.where(d < 0.5 * r, 0.25 * r * r / np.maximum(d, 1e-3 * r), np.maximum(r - d, 0.0))
 
 

@@ -22,20 +22,41 @@ def stack(count, n, size, gap=0.0, turn=0.0, shrink=1.0, **grid):
     return wc.Mesh(np.concatenate(points), np.concatenate([sheet.triangles + k * n * n for k in range(count)]))
 
 
+def cloth(mesh, stiffness=100.0, bending=1e-5, **fields):
+    """A scene of a mesh with springs and bending."""
+    terms = [wc.Spring(stiffness=stiffness), wc.QuadraticBending(stiffness=bending)]
+    return wc.Scene(mesh, **{"density": DENSITY, "terms": terms} | fields)
+
+
 def layers(count=2, n=6, gap=0.02, speed=0.0, turn=0.0, distance=5e-3, stiffness=1e5, size=0.5, shrink=1.0, **fields):
     """A :func:`stack`, ``turn`` in degrees, without gravity: the first sheet moves up at ``speed`` [m/s], the others down."""
     velocities = np.zeros((count * n * n, 3))
     velocities[:, 1] = np.where(np.arange(count * n * n) < n * n, speed, -speed)
     given = {
-        "density": DENSITY,
-        "terms": [wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-5)],
         "velocities": velocities,
         "gravity": np.zeros(3),
         "fps": 24.0,
-        "duration": 1.0,
         "self_contact": wc.SelfContact(distance=distance, stiffness=stiffness),
     }
-    return wc.Scene(stack(count, n, size, gap, np.radians(turn), shrink), **given | fields)
+    return cloth(stack(count, n, size, gap, np.radians(turn), shrink), **given | fields)
+
+
+def folded(n=13, gap=0.02, closing=0.0, **fields):
+    """A sheet of 0.5 m folded in two about a half circle, whose halves come together at a speed [m/s]."""
+    grid, radius = wc.Mesh.grid(n, n, size=0.5), 0.5 * gap + 0.03
+    s, half = grid.points[:, 0] - 0.25, 0.5 * np.pi * radius
+    bent = np.abs(s) < half
+    x = np.where(bent, radius * np.cos(s / radius), half - np.abs(s))
+    y = np.where(bent, radius * np.sin(s / radius), np.sign(s) * radius)
+    return cloth(
+        grid,
+        terms=[wc.Spring(stiffness=100.0, pairs=("structural", "shear")), wc.QuadraticBending(stiffness=1e-5)],
+        positions=np.stack([x, y, grid.points[:, 2]], axis=1),
+        velocities=-closing * np.sign(y)[:, None] * [0.0, 1.0, 0.0],
+        fps=24.0,
+        self_contact=wc.SelfContact(distance=5e-3, stiffness=1e4),
+        **fields,
+    )
 
 
 def rubbing(gap=2.2e-3, speed=0.05, friction=0.3, **fields):
@@ -54,10 +75,9 @@ def slope(tangent, friction=0.3, layers=1, distance=2e-3, **fields):
         y += distance - (layers - layer) * weight / stiffness  # where it rests
         points.append(turned(grid.points, 0.3 * layer + 0.3) + ground.points.mean(axis=0) + [-0.2, y, 0.013])
         triangles.append(grid.triangles + 4 + 9 * layer)
-    return wc.Scene(
+    return cloth(
         wc.Mesh(np.concatenate(points), np.concatenate(triangles)),
-        density=DENSITY,
-        terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-4)],
+        bending=1e-4,
         pins=np.arange(4),
         gravity=GRAVITY * np.array([np.sin(angle), -np.cos(angle), 0.0]),
         fps=24.0,
@@ -100,9 +120,11 @@ def gradient(pairs, x, term=None):
     return out.numpy()
 
 
-def after_frames(scene, solver, frames=0, **build):
-    """A stepper after some frames."""
+def after_frames(scene, solver, frames=0, steps=0, **build):
+    """A stepper after some frames, and steps more."""
     stepper = solver.bind(scene.build(**build))
     for _ in range(frames):
         stepper.frame()
+    for _ in range(steps):
+        stepper.step()
     return stepper

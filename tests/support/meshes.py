@@ -11,3 +11,31 @@ def kite(apex):
     """Two triangles with that angle [°] opposite the edge (0, 1) that they share."""
     height = 0.5 / np.tan(np.radians(apex / 2))
     return wc.Mesh([[0.0, 0, 0], [1.0, 0, 0], [0.5, height, 0], [0.5, -height, 0]], [[0, 1, 2], [1, 0, 3]])
+
+
+def leaf(height, other_diagonals=False, n=6):
+    """A grid whose height is given by a function, with a back at the same points."""
+    front = wc.Mesh.grid(n, n, pattern="diagonal")
+    points = np.array(front.points) - [0.5, 0.0, 0.5]
+    points[:, 1] = height(points[:, 0], points[:, 2])
+    back = np.array(front.triangles)[:, ::-1]
+    if other_diagonals:
+        quads = back.reshape(-1, 2, 3)
+        a, c, d, b = quads[:, 0, 2], quads[:, 0, 1], quads[:, 0, 0], quads[:, 1, 0]
+        back = np.stack([a, b, c, b, d, c], axis=1).reshape(-1, 3)
+    return np.concatenate([points, points]), np.concatenate([front.triangles, back + len(points)])
+
+
+def disc(n, first):
+    """A disc of n corners whose front and back are fans, from the corners 0 and ``first``."""
+    angles, around = 2.0 * np.pi * np.arange(n) / n, np.roll(np.arange(n), -first)
+    points = 0.4 * np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1)
+    fan = np.array([(0, k + 1, k) for k in range(1, n - 1)])
+    return np.concatenate([points, points]), np.concatenate([fan, around[fan][:, ::-1] + n])
+
+
+def joined(*parts):
+    """Several meshes as one, each (points, triangles)."""
+    firsts = np.cumsum([0, *(len(points) for points, _ in parts)])
+    triangles = [triangles + first for (_, triangles), first in zip(parts, firsts, strict=False)]
+    return np.concatenate([points for points, _ in parts]), np.concatenate(triangles)

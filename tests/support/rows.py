@@ -11,3 +11,8 @@ def slow_but(kept, rows):
         row if row in kept else pytest.param(*(row if isinstance(row, tuple) else (row,)), marks=pytest.mark.slow)
         for row in rows
     ]
+
+
+def table(names, kept, rows):
+    """Runs a test with each of the rows, of which all but those in ``kept`` are slow."""
+    return pytest.mark.parametrize(names, slow_but(kept, rows))
