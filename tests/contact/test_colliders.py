@@ -82,13 +82,9 @@ def near(shape, count=50):
 
 def beads(points, stiffness, mass=1e-3, **fields):
     """Points that pairs of the softest springs join, so that contact alone moves them."""
-    return wc.Scene(
-        wc.Mesh(points, edges=np.arange(len(points)).reshape(-1, 2)),
-        masses=np.full(len(points), mass),
-        terms=[wc.Spring(stiffness=1e-9)],
-        contact=wc.Contact(distance=R, stiffness=stiffness),
-        **fields,
-    )
+    mesh, masses = wc.Mesh(points, edges=np.arange(len(points)).reshape(-1, 2)), np.full(len(points), mass)
+    contact = wc.Contact(distance=R, stiffness=stiffness)
+    return wc.Scene(mesh, masses=masses, terms=[wc.Spring(stiffness=1e-9)], contact=contact, **fields)
 
 
 def touching(shape):
@@ -155,18 +151,15 @@ def test_prox_and_constraint_belong_to_the_energy(shape, compliance):
     """The prox is where (p − v)/c + ∂u/∂y is 0, from far inside too; u = ½C²."""
     model = touching(shape)
     (elements,) = model.terms
-    y = model.positions.numpy().copy()
-    gradient = model.vectors()
+    y, constraints = model.positions.numpy().copy(), wp.zeros(model.count, dtype=wp.vec2d)
+    gradient, found, residual = (model.vectors() for _ in range(3))
     Gradient(model).add(model.positions, gradient)
     inwards = gradient.numpy() / np.maximum(np.linalg.norm(gradient.numpy(), axis=1), 1e-300)[:, None]
     y[::3] += 5e-3 * inwards[::3]
-    found, residual = model.vectors(), model.vectors()
-    constraints = wp.zeros(len(y), dtype=wp.vec2d)
     given = [model.array(y, model.vec3), elements.rest, compliance, found, residual, constraints]
     wp.launch(local_steps(elements.term), len(y), given, device="cpu")
     size = np.linalg.norm(found.numpy() - y, axis=1) / compliance
-    assert (size > 0.0).sum() > 20
-    assert np.linalg.norm(residual.numpy(), axis=1).max() < 1e-9 * max(size.max(), R)
+    assert (size > 0.0).sum() > 20 and np.linalg.norm(residual.numpy(), axis=1).max() < 1e-9 * max(size.max(), R)
     assert SHAPES[shape].distances(found.numpy()).min() > 0.0 or compliance < 1.0
     assert np.abs(constraints.numpy()).max() < 1e-12
 
@@ -623,10 +616,8 @@ def test_a_card_of_two_quads_is_no_room(lift):
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_front_and_back_that_coincide_hold_cloth_on_both_sides(name, side):
     points, triangles = DOUBLED[name]
-    collider, grid = (
-        wc.MeshCollider(points - [0.0, points[:, 1].max() * (side > 0), 0.0], triangles),
-        wc.Mesh.grid(7, 7, size=0.3),
-    )
+    collider = wc.MeshCollider(points - [0.0, points[:, 1].max() * (side > 0), 0.0], triangles)
+    grid = wc.Mesh.grid(7, 7, size=0.3)
     mesh = wc.Mesh(grid.points + np.array([-0.15, side * 0.45, -0.15]), grid.triangles)
     fields = {"density": 0.2, "terms": [wc.Spring(stiffness=500.0)], "gravity": (0.0, -9.81 * side, 0.0)}
     run = wc.simulate(wc.Scene(mesh, colliders=[collider], **fields), wc.Newton(substeps=4), frames=40)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.contacts import begin, energy, gradient, pairs_of
 from support.judges import barrier_slope
-from support.layers import begin, energy, gradient, pairs_of, stack
+from support.layers import stack
 from support.pairs import energies
 from support.rows import table
 

@@ -9,8 +9,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 import warpcloth as wc
+from support.contacts import begin, energy, gradient, pairs_of, slope_of
 from support.laws import EXTRA, Sticky
-from support.layers import GRAVITY, after_frames, begin, cloth, energy, gradient, pairs_of, rubbing, slope
+from support.layers import GRAVITY, after_frames, cloth, rubbing, slope
 from support.rows import table
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.block_rows import block_rows
@@ -101,15 +102,12 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
     assert H == pytest.approx((J.T @ D @ J).toarray(), abs=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(friction).min() > -1e-12 * np.abs(friction).max()
 
-    def slope(f, direction, **given):
-        return (f(pairs, x + eta * direction, **given) - f(pairs, x - eta * direction, **given)) / (2.0 * eta)
-
     for _ in range(3):
         direction = rng.normal(size=x.shape)
-        change = slope(energy, direction, term=pairs.friction, stored=True)
+        change = slope_of(energy, pairs, x, direction, eta, term=pairs.friction, stored=True)
         assert change == pytest.approx((force * direction).sum(), abs=1e-5 * total)
         expected = (friction @ direction.ravel()).reshape(-1, 3)
-        found = slope(gradient, direction, term=pairs.friction)
+        found = slope_of(gradient, pairs, x, direction, eta, term=pairs.friction)
         assert found == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
 
 

@@ -1,10 +1,8 @@
-"""Sheets above one another, and what the pairs of their self-contact give at any positions."""
+"""Sheets above one another, and scenes and steps of them."""
 
 import numpy as np
 
 import warpcloth as wc
-from warpcloth.contact.self_steps import SelfSteps
-from warpcloth.core.sums import Sums
 
 DENSITY, GRAVITY = 0.15, 9.81
 
@@ -84,40 +82,6 @@ def slope(tangent, friction=0.3, layers=1, distance=2e-3, **fields):
         self_contact=wc.SelfContact(distance=distance, stiffness=stiffness, friction=friction),
         **fields,
     )
-
-
-def pairs_of(scene, device, bounded=False, h=1.0 / 24.0, dtype="float64", **build):
-    """The :class:`SelfSteps` of a scene, in no solver; they begin at its positions."""
-    model = scene.build(device=device, dtype=dtype, **build)
-    state = wc.Explicit(substeps=1000, above_limit="allow").bind(model).state
-    pairs = SelfSteps(model, state, h, 1, bounded, None)
-    begin(pairs, scene.positions)
-    return pairs
-
-
-def begin(pairs, x):
-    """Begins a step at x (N, 3), with as much room as its pairs take."""
-    x = pairs.model.array(x, pairs.model.vec3)
-    pairs.launch_begin(x)
-    while pairs.overflowed:
-        pairs.grow()
-        pairs.launch_begin(x)
-
-
-def energy(pairs, x, term=None, stored=False):
-    """U [J] at x (N, 3) in the step that was begun last, with the contacts, or those of one term alone, found anew there."""
-    (term or pairs.forces).launch(pairs.model.array(x, pairs.model.vec3))
-    out = pairs.model.scalars()
-    pairs.forces.add_energy(Sums(pairs.model), out, stored=stored)
-    return out.numpy()[0]
-
-
-def gradient(pairs, x, term=None):
-    """∂U/∂x (N, 3) [N] at x (N, 3) in the step that was begun last, of all terms or of one."""
-    (term or pairs.forces).launch(pairs.model.array(x, pairs.model.vec3))
-    out = pairs.model.vectors()
-    (term or pairs.forces).add_gradient(out)
-    return out.numpy()
 
 
 def after_frames(scene, solver, frames=0, steps=0, **build):
