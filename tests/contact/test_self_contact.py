@@ -641,8 +641,7 @@ def test_directions_of_one_vertex(way, device):
 
 def test_sweeps_over_coarse_levels_find_no_contacts_anew(device):
     """Only those over all terms count, where the halves of a fold are near enough to be listed."""
-    stepper = wc.HierarchicalPBD(substeps=1, iterations=3).bind(folded(gap=-0.05).build(device=device))
-    stepper.step()
+    stepper = after_frames(folded(gap=-0.05), wc.HierarchicalPBD(substeps=1, iterations=3), steps=1, device=device)
     assert len(stepper.levels) > 1 and stepper.pairs.contact.turn.numpy() == [3]
 
 
@@ -751,10 +750,8 @@ PANEL = wc.Mesh.grid(4, 4, size=0.5, pattern="alternating")
 def start_of(*panels, **fields):
     """A scene of panels, each (points, triangles) or points of :data:`PANEL`, with a contact distance of 2 mm."""
     parts = [wc.Mesh(*panel) if isinstance(panel, tuple) else wc.Mesh(panel, PANEL.triangles) for panel in panels]
-    mesh, contact = (
-        wc.Mesh.join({f"panel{k}": part for k, part in enumerate(parts)}),
-        wc.SelfContact(distance=2e-3, stiffness=1e4),
-    )
+    mesh = wc.Mesh.join({f"panel{k}": part for k, part in enumerate(parts)})
+    contact = wc.SelfContact(distance=2e-3, stiffness=1e4)
     return cloth(mesh, terms=[wc.Spring(stiffness=100.0)], self_contact=contact, fps=24.0, **fields)
 
 
