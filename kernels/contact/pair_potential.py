@@ -399,13 +399,7 @@ def lowest_gap(dtype, of_vertex: bool):
 
     @wp.func
     def find(
-        s: wp.vec4i,
-        n: wp.vec3d,
-        b: wp.vec3d,
-        c: wp.vec3d,
-        d: wp.vec3d,
-        goal: wp.array(dtype=vec3),
-        move: wp.array(dtype=vec3),
+        s: wp.vec4i, n: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, goal: wp.array(dtype=vec3), move: wp.array(dtype=vec3)
     ):
         found = gap_along(VERTEX, n, wp.vec3d(), b, c, d)
         if goal:

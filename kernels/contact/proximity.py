@@ -112,15 +112,7 @@ def take_near(dtype, of_edges: bool):
     KIND = wp.constant(int(of_edges))
 
     @wp.func
-    def take(
-        surface: surfaces(dtype),
-        x: wp.array(dtype=vec3),
-        s: wp.vec4i,
-        i: int,
-        k: int,
-        triangles: int,
-        pairs: pair_list,
-    ):
+    def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, pairs: pair_list):
         _w, y = closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
         d = wp.length(y)
         if d < surface.max_distance + surface.skin:

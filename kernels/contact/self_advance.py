@@ -91,15 +91,7 @@ def take_advance(dtype, of_edges: bool):
     advance, allowed = advances(dtype), allowed_fraction(dtype, of_edges)
 
     @wp.func
-    def take(
-        surface: surfaces(dtype),
-        x: wp.array(dtype=vec3),
-        s: wp.vec4i,
-        i: int,
-        k: int,
-        triangles: int,
-        out: advance,
-    ):
+    def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, out: advance):
         copy = copy_of(surface.layout, s[0])
         if out.far[copy] == 0:
             return

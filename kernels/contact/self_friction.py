@@ -111,12 +111,7 @@ def turn_of(dtype):
 
     @wp.func
     def edge(
-        layout: Layout,
-        i: int,
-        j: int,
-        start: wp.array(dtype=vec3),
-        moves: wp.array(dtype=wp.vec3d),
-        x: wp.array(dtype=vec3),
+        layout: Layout, i: int, j: int, start: wp.array(dtype=vec3), moves: wp.array(dtype=wp.vec3d), x: wp.array(dtype=vec3)
     ):
         before = exact(start[j]) - exact(start[i])
         after = before

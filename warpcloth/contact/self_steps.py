@@ -128,11 +128,7 @@ class SelfSteps:
         self.held.first = state.add("first pin held back", model.scalars(wp.int64), Count(rest=model.per_copy))
         self.first_forced = state.add("first mesh that went through cloth", model.scalars(wp.int64))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
-        made = (
-            pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs,
-            gap_notes.note_gaps,
-            take_moved,
-        )
+        made = (pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs, gap_notes.note_gaps, take_moved)
         self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
         self._counted = None
         size = pair_blocks.NUMBERS * pair_blocks.BLOCK
