@@ -8,7 +8,7 @@ from ..vectors import types
 from .obstacles import cloth_vertex, copy_of, has_obstacle
 from .pair_potential import CLOSE, Laws
 from .self_contact import least_gap
-from .self_gaps import ONE, ZERO, vertex_of
+from .self_gaps import ONE, ZERO
 from .self_pairs import StepPairs, module_of, near_pairs
 
 FOUR = wp.constant(wp.float64(4.0))
@@ -40,13 +40,12 @@ class GapNotes:
 def resolved_gap(dtype):
     """Device function (s, x) → four units in the last place of float32 of the largest coordinate of a pair [m]."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.func
     def resolved(s: wp.vec4i, x: wp.array(dtype=vec3)):
         far = ZERO
         for i in range(4):
-            far = wp.max(far, wp.max(wp.abs(exact(x[s[i]]))))
+            far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
         # 0.75 to 1.5 units more, which is rounded to the next number.
         next = wp.float32(far) + MORE * wp.float32(far)
         return FOUR * wp.float64(next - wp.float32(far))

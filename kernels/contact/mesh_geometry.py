@@ -1,6 +1,4 @@
 """Factories of the struct of mesh colliders, and of device functions on their points and on triangles.
-
-Points of a mesh move linearly between its keyframes, in the frame of the collider. ``halves`` are numbers of half steps.
 """
 
 from functools import cache
@@ -12,18 +10,15 @@ from ..vectors import types
 
 @cache
 def meshes(dtype):
-    """Struct of the meshes of C colliders. ``points`` has the keyframes of all meshes, ``triangles`` their triangles.
+    """Struct of the meshes of C colliders: the ``points`` of all keyframes of all meshes.
 
-    For each collider: the index of the first triangle, the index of the first point, the points per keyframe, and the number of
-    keyframes, 0 if it is not a mesh.
+    For each collider: the index of its first point, the points per keyframe, and the number of keyframes, 0 if it is not a mesh.
     """
     vec3, _ = types(dtype)
 
     @wp.struct
     class Meshes:
         points: wp.array(dtype=vec3)
-        triangles: wp.array(dtype=wp.vec3i)
-        first_triangle: wp.array(dtype=wp.int32)
         first_point: wp.array(dtype=wp.int32)
         size: wp.array(dtype=wp.int32)
         frames: wp.array(dtype=wp.int32)
@@ -33,9 +28,9 @@ def meshes(dtype):
 
 @cache
 def point_at(dtype):
-    """Device function (mesh, c, i, halves, per_frame) → point i of mesh c after ``halves`` half steps.
+    """Device function (mesh, c, i, halves, per_frame) → point i of mesh c after ``halves`` half steps, in the frame of the collider.
 
-    A frame has ``per_frame`` half steps. After the last keyframe points stand still.
+    A frame has ``per_frame`` half steps. Points move linearly between keyframes, and stand still after the last.
     """
 
     @wp.func

@@ -14,7 +14,7 @@ from ..vectors import types
 from .colliders import gap_of, of_pose, shapes, step_poses
 from .gap_notes import FIRST
 from .obstacles import has_obstacle
-from .self_gaps import ONE, ZERO, vertex_of
+from .self_gaps import ONE, ZERO
 from .self_pairs import StepPairs, near_pairs
 
 # Gaps are compared in this many parts of the contact distance and the skin.
@@ -167,7 +167,6 @@ def carry_vertices(dtype):
     Pins have none.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
     def carry_each_vertex(
@@ -208,9 +207,9 @@ def carry_vertices(dtype):
                     if one < 0:
                         one = s[k]
                     near = wp.max(wp.abs(w[k]), SMALL)
-                    move += near * (exact(p[s[k]]) - exact(p[one]))
+                    move += near * (wp.vec3d(p[s[k]]) - wp.vec3d(p[one]))
                     weight += near
-        move = exact(p[one]) + move / weight
+        move = wp.vec3d(p[one]) + move / weight
         if mobility:
             for axis in range(3):
                 if mobility[i][axis] == dtype(0.0):

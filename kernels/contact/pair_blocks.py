@@ -7,7 +7,6 @@ import warp as wp
 from ..memory import load, store
 from ..vectors import types
 from . import self_gaps
-from .self_gaps import vertex_of
 from .self_pairs import StepPairs, module_of, near_pairs
 
 # Pairs of a block, and the numbers of each: three vectors between its vertices, then w, y and d.
@@ -57,7 +56,6 @@ def begin_blocks(dtype):
     ``block`` (NUMBERS·BLOCK,) is scratch.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
     stencil, vector = load(wp.vec4i), load(vec3)
     put_normal, put_weights = store(wp.vec3d), store(wp.vec4d)
     of_vertices, of_edges = nearest_in_block(False), nearest_in_block(True)
@@ -81,10 +79,10 @@ def begin_blocks(dtype):
             e = first
             while e < end:
                 s = stencil(pairs.stencils, e)
-                a = exact(vector(x, s[0]))
-                put_vector(block, 0, e - first, exact(vector(x, s[1])) - a)
-                put_vector(block, 3, e - first, exact(vector(x, s[2])) - a)
-                put_vector(block, 6, e - first, exact(vector(x, s[3])) - a)
+                a = wp.vec3d(vector(x, s[0]))
+                put_vector(block, 0, e - first, wp.vec3d(vector(x, s[1])) - a)
+                put_vector(block, 3, e - first, wp.vec3d(vector(x, s[2])) - a)
+                put_vector(block, 6, e - first, wp.vec3d(vector(x, s[3])) - a)
                 e += 1
             if first < vertex_pairs:
                 of_vertices(block, end - first)

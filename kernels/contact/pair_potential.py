@@ -309,7 +309,6 @@ def counts_of(dtype):
 def put_contact(dtype):
     """Device function that stores a contact in a slot, and lists it."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.func
     def put(
@@ -337,7 +336,7 @@ def put_contact(dtype):
             for i in range(4):
                 j = s[i] - pairs.layout.cloth
                 if j >= 0:
-                    o += w[i] * exact(x[s[i]])
+                    o += w[i] * wp.vec3d(x[s[i]])
                     travel += w[i] * contacts.moves[j]
                     s[i] = own
                     w[i] = ZERO
@@ -394,7 +393,7 @@ def lowest_gap(dtype, of_vertex: bool):
     It is the less of the gaps along n there and, if given, at goal + move, where the pair may have passed through.
     """
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
+    at = vertex_of(dtype)
     VERTEX = wp.constant(of_vertex)
 
     @wp.func
@@ -420,7 +419,7 @@ def find_near_faces(dtype):
     A face is near if it has a force there, or may have one at goal + move if that is given. Only the first ``vertices`` count.
     """
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
+    at = vertex_of(dtype)
     lowest, stencil = lowest_gap(dtype, True), load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -468,7 +467,7 @@ def find_vertex_contacts(dtype):
     ``distant`` contacts may have no force.
     """
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
+    at = vertex_of(dtype)
     (at_edge, at_vertex), put = counts_of(dtype), put_contact(dtype)
     stencil, number = load(wp.vec4i), load(wp.int32)
 
@@ -623,7 +622,7 @@ def width_of(areas: Areas, layout: Layout, laws: Laws, i: int, j: int):
 def find_edge_contacts(dtype):
     """Kernel over pairs of edges: their contacts, as :func:`find_vertex_contacts`."""
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
+    at = vertex_of(dtype)
 
     put, lowest = put_contact(dtype), lowest_gap(dtype, False)
     stencil = load(wp.vec4i)

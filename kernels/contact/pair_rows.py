@@ -14,7 +14,7 @@ from ..constraint_rows import ROUNDINGS, RowLayout, lowest_compliance, row_value
 from ..rotation import epsilon
 from ..vectors import types
 from .pair_sums import PairTerm
-from .self_gaps import ONE, ZERO, vertex_of
+from .self_gaps import ONE, ZERO
 from .self_pairs import near_pairs
 
 # The compliance of a row whose force is given.
@@ -39,7 +39,7 @@ def row_of_pair(copy: int, e: int, layout: RowLayout, rows: int):
 def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
     """Kernel over copies and pairs at x̃ + d: rows as in :func:`..constraint_rows.linearise`."""
     vec3, _ = types(dtype)
-    (_at, exact), row_of = vertex_of(dtype), term.row(dtype)
+    row_of = term.row(dtype)
     Q = wp.constant(2 if curved else term.rows)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -85,7 +85,7 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
             free = wp.float64(inverse_mass[s[i]])
             moved += free * w * w
             most = wp.max(most, free * wp.abs(w))
-            size += wp.abs(w) * wp.length(exact(d[s[i]]))
+            size += wp.abs(w) * wp.length(wp.vec3d(d[s[i]]))
         if moved == ZERO or wp.length_sq(found.first) == ZERO:
             return
         slopes.weights[e] = found.weights
@@ -128,7 +128,6 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
 def apply_pair_rows(dtype, two: bool):
     """Kernel over pairs: rows += J v."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
     Q = wp.constant(2 if two else 1)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -151,7 +150,7 @@ def apply_pair_rows(dtype, two: bool):
         row = row_of_pair(s[0] // per_copy, e, layout, Q)
         moved = wp.vec3d()
         for i in range(4):
-            moved += slopes.weights[e][i] * exact(v[s[i]])
+            moved += slopes.weights[e][i] * wp.vec3d(v[s[i]])
         rows[row] = rows[row] + dtype(wp.dot(slopes.first[e], moved))
         if wp.static(two):
             rows[row + 1] = rows[row + 1] + dtype(wp.dot(slopes.second[e], moved))

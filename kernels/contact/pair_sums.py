@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from ..vectors import types
-from .self_gaps import ZERO, vertex_of
+from .self_gaps import ZERO
 from .self_pairs import near_pairs
 
 
@@ -287,7 +287,6 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
 def pair_products(term: PairTerm, dtype, scatters: bool):
     """Kernel over threads: q += wᵢ ∂²U/∂y² Σⱼ wⱼpⱼ over the other vertices j of each pair, in active copies."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
     range_of, corners_at = taken_by(dtype, scatters)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
@@ -325,9 +324,9 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
                     u = forces.across[e]
                 for i in range(4):
                     if inverse_mass[s[i]] > dtype(0.0):
-                        along[i] = w[i] * wp.dot(t, exact(p[s[i]]))
+                        along[i] = w[i] * wp.dot(t, wp.vec3d(p[s[i]]))
                         if bend[1] > ZERO:
-                            across[i] = w[i] * wp.dot(u, exact(p[s[i]]))
+                            across[i] = w[i] * wp.dot(u, wp.vec3d(p[s[i]]))
                 whole = along[0] + along[1] + along[2] + along[3]
                 whole_across = across[0] + across[1] + across[2] + across[3]
                 for i in range(corner, end_corner):

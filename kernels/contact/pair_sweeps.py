@@ -15,7 +15,7 @@ import warp as wp
 from ..memory import load
 from ..vectors import types
 from .pair_sums import PairForces, PairTerm, is_single
-from .self_gaps import ONE, ZERO, vertex_of
+from .self_gaps import ONE, ZERO
 from .self_pairs import near_pairs
 
 # Smallest D of a hard pair, over its D with all axes free. If n is at an angle ε to the free axes, the vertices of the pair
@@ -47,7 +47,6 @@ def mobility(dtype, axes: bool, isotropic: bool):
     With ``axes``, inverse masses are vectors. R is that largest 1/m if ``isotropic``, else W.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.func
     def alike(inverse_mass: wp.array(dtype=dtype), i: int, v: wp.vec3d):
@@ -55,7 +54,7 @@ def mobility(dtype, axes: bool, isotropic: bool):
 
     @wp.func
     def by_axis(inverse_mass: wp.array(dtype=vec3), i: int, v: wp.vec3d):
-        return wp.cw_mul(exact(inverse_mass[i]), v)
+        return wp.cw_mul(wp.vec3d(inverse_mass[i]), v)
 
     moved = by_axis if axes else alike
 

@@ -8,7 +8,7 @@ from ..memory import load
 from ..vectors import types
 from .obstacles import copy_of, vector_within
 from .proximity_grid import surfaces
-from .self_gaps import ONE, ZERO, nearest, vertex_of
+from .self_gaps import ONE, ZERO, nearest
 from .self_pairs import module_of, near_pairs
 from .self_planes import KEPT, margin_of, needs_no_cut, part_apart, ulp_of, ways_of_sides
 
@@ -41,7 +41,6 @@ def allowed_fraction(dtype, of_edges: bool):
     allows less than the direction, as for cloth that slides over an edge, :func:`.self_planes.part_apart` may allow more.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
     ulp, vector_or_zero, advance, sides = (
         ulp_of(dtype),
         vector_within(dtype),
@@ -52,18 +51,18 @@ def allowed_fraction(dtype, of_edges: bool):
 
     @wp.func
     def allowed(s: wp.vec4i, x: wp.array(dtype=vec3), out: advance):
-        a = exact(x[s[0]])
-        b = exact(x[s[1]])
-        c = exact(x[s[2]])
-        d = exact(x[s[3]])
-        pa = exact(vector_or_zero(out.direction, s[0]))
-        pb = exact(vector_or_zero(out.direction, s[1]))
-        pc = exact(vector_or_zero(out.direction, s[2]))
-        pd = exact(vector_or_zero(out.direction, s[3]))
+        a = wp.vec3d(x[s[0]])
+        b = wp.vec3d(x[s[1]])
+        c = wp.vec3d(x[s[2]])
+        d = wp.vec3d(x[s[3]])
+        pa = wp.vec3d(vector_or_zero(out.direction, s[0]))
+        pb = wp.vec3d(vector_or_zero(out.direction, s[1]))
+        pc = wp.vec3d(vector_or_zero(out.direction, s[2]))
+        pd = wp.vec3d(vector_or_zero(out.direction, s[3]))
         far = ZERO
         for i in range(4):
             if s[i] < out.direction.shape[0]:  # obstacles that stand are not rounded
-                far = wp.max(far, wp.max(wp.abs(exact(x[s[i]]))))
+                far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
         far += wp.max(wp.max(wp.length(pa), wp.length(pb)), wp.max(wp.length(pc), wp.length(pd)))
         margin = wp.float64(2.0) * margin_of(out.least, ulp * far)
         _w, y, _inside = nearest(of_vertex, a, b, c, d)
@@ -73,9 +72,9 @@ def allowed_fraction(dtype, of_edges: bool):
         t = ONE
         for p in range(sides):
             for q in range(sides, 4):
-                approach = wp.dot(n, exact(vector_or_zero(out.direction, s[q])) - exact(vector_or_zero(out.direction, s[p])))
+                approach = wp.dot(n, wp.vec3d(vector_or_zero(out.direction, s[q])) - wp.vec3d(vector_or_zero(out.direction, s[p])))
                 if approach > ZERO:
-                    apart = wp.dot(n, exact(x[s[p]]) - exact(x[s[q]])) - floor
+                    apart = wp.dot(n, wp.vec3d(x[s[p]]) - wp.vec3d(x[s[q]])) - floor
                     t = wp.min(t, wp.max(apart, ZERO) / approach)
         if t < ONE:
             t = wp.max(t, part_apart(of_vertex, a, b, c, d, pa, pb, pc, pd, floor))

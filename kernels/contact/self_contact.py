@@ -31,14 +31,13 @@ ALL = wp.constant(wp.vec4d(1.0, 1.0, 1.0, 1.0))
 def least_gap(dtype):
     """Device function (stencil, x, least) → the least gap f [m] that the filter leaves a pair at x: twice its margin."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
     ulp = ulp_of(dtype)
 
     @wp.func
     def least_gap_of(s: wp.vec4i, x: wp.array(dtype=vec3), least: wp.float64):
         far = ZERO
         for i in range(4):
-            far = wp.max(far, wp.max(wp.abs(exact(x[s[i]]))))
+            far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
         return wp.float64(2.0) * margin_of(least, ulp * far)
 
     return least_gap_of
@@ -110,7 +109,7 @@ def find_forces(dtype, bounded: bool):
 def gap_at(dtype):
     """Device function (pairs, contacts, e, x, correction) → n·Σ wᵢ(xᵢ + dᵢ), the gap along n of a contact found elsewhere."""
     vec3, _ = types(dtype)
-    at, _exact = vertex_of(dtype)
+    at = vertex_of(dtype)
     stencil, normal, weights = (load(each) for each in (wp.vec4i, wp.vec3d, wp.vec4d))
 
     @wp.func

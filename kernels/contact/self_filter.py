@@ -10,7 +10,7 @@ import warp as wp
 from ..vectors import types
 from .gap_notes import FIRST
 from .obstacles import Layout, copy_of, has_obstacle, vector_within
-from .self_gaps import ONE, PLANAR, ZERO, vertex_of
+from .self_gaps import ONE, PLANAR, ZERO
 from .self_pairs import StepPairs, module_of, near_pairs
 from .self_planes import bounded_share
 
@@ -27,7 +27,6 @@ def keep_apart(dtype):
     bound alone shortened. Copies whose ``walk`` is 0 do not move.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def keep_each_apart(
@@ -50,13 +49,13 @@ def keep_apart(dtype):
         if walk[copy] == 0:
             return
         u = common[copy]
-        move = exact(target[i]) - exact(x_ref[i]) - u
+        move = wp.vec3d(target[i]) - wp.vec3d(x_ref[i]) - u
         far = bounded_share(move, most)
         t = wp.min(far, share[i])
         if t < ONE:
             if t < least_share[i]:
                 t = ZERO
-            end = exact(x_ref[i]) + u + t * move
+            end = wp.vec3d(x_ref[i]) + u + t * move
             x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
             if share[i] >= far:
                 wp.atomic_add(cuts, copy, 1)
@@ -159,7 +158,6 @@ def share_of_pins(dtype):
     sine.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_each_share_of_pins(
@@ -188,7 +186,7 @@ def share_of_pins(dtype):
         sides = wp.where(e < pairs.counts[0], 1, 2)
         gap = step.gap[e]
         floor = wp.min(gap, wp.float64(pairs.distances[e]))
-        end, turned = turned_gap(e < pairs.counts[0], n, exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        end, turned = turned_gap(e < pairs.counts[0], n, wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
         most = TOGETHER
         for i in range(4):
             if inverse_mass[s[i]] > dtype(0.0):
@@ -209,7 +207,6 @@ def share_of_pins(dtype):
 def hold_pins(dtype):
     """Kernel over vertices: pins make the ``share`` of their moves from x_before in x, and v changes with them."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def hold_each_pin(
@@ -228,8 +225,8 @@ def hold_pins(dtype):
     ):
         i = wp.tid()
         if inverse_mass[i] == dtype(0.0) and share[i] < ONE:
-            move = exact(x[i]) - exact(x_before[i])
-            end = exact(x_before[i]) + share[i] * move
+            move = wp.vec3d(x[i]) - wp.vec3d(x_before[i])
+            end = wp.vec3d(x_before[i]) + share[i] * move
             note_held(held, steps, per_copy, i, (ONE - share[i]) * wp.length(move))
             x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
             v[i] = dtype(share[i]) * v[i]
@@ -245,7 +242,6 @@ def end_filter(dtype):
     move, which took ``pin_h``.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def end_each_filter(
@@ -270,7 +266,7 @@ def end_filter(dtype):
         change = x[i] - target[i]
         if wp.length_sq(change) > dtype(0.0):
             copy = i // per_copy
-            pinned = exact(change)
+            pinned = wp.vec3d(change)
             if inverse_mass[i] > dtype(0.0):
                 wp.atomic_add(cut, copy, wp.int64(1))
                 for axis in range(3):
@@ -357,7 +353,6 @@ def push_pairs(dtype):
     Obstacles move if p has their moves, and cannot be pushed.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
     vector_or_zero = vector_within(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -379,12 +374,12 @@ def push_pairs(dtype):
             n = step.normal[e]
             w = step.weights[e]
             gap = step.gap[e]
-            one = exact(vector_or_zero(p, s[0]))  # relative to this, so that equal moves change no gap
+            one = wp.vec3d(vector_or_zero(p, s[0]))  # relative to this, so that equal moves change no gap
             W = ZERO
             for i in range(4):
                 if s[i] < mobile.shape[0]:
                     W += w[i] * w[i] * wp.float64(mobile[s[i]])
-                gap += w[i] * wp.dot(n, exact(vector_or_zero(p, s[i])) - one)
+                gap += w[i] * wp.dot(n, wp.vec3d(vector_or_zero(p, s[i])) - one)
             short = wp.min(wp.where(opens, step.gap[e] + step.gap[e], step.gap[e]), left) - gap
             if short > ZERO and W > ZERO:
                 for i in range(4):

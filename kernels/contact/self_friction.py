@@ -22,7 +22,7 @@ from ..vectors import types
 from .obstacles import Layout, copy_of, in_copy
 from .pair_potential import TWO_EDGES, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
-from .self_gaps import ONE, ZERO, perpendicular, vertex_of
+from .self_gaps import ONE, ZERO, perpendicular
 from .self_pairs import near_pairs
 
 
@@ -107,16 +107,15 @@ def turn_of(dtype):
     is that of the mesh by the ``moves`` of its vertices, or of none. Vertices without a triangle have the edges of the contact.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.func
     def edge(
         layout: Layout, i: int, j: int, start: wp.array(dtype=vec3), moves: wp.array(dtype=wp.vec3d), x: wp.array(dtype=vec3)
     ):
-        before = exact(start[j]) - exact(start[i])
+        before = wp.vec3d(start[j]) - wp.vec3d(start[i])
         after = before
         if i < layout.cloth:
-            after = exact(x[j]) - exact(x[i])
+            after = wp.vec3d(x[j]) - wp.vec3d(x[i])
         else:
             after += moves[j - layout.cloth] - moves[i - layout.cloth]
         return wp.outer(after, before), wp.dot(before, before)
@@ -162,15 +161,14 @@ def turn_of(dtype):
 def difference_of(dtype):
     """Device function (layout, stencil, w, x) → Σ wᵢxᵢ over the cloth, without obstacles relative to the first vertex."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.func
     def difference(layout: Layout, s: wp.vec4i, w: wp.vec4d, x: wp.array(dtype=vec3)):
         y = wp.vec3d()
         for i in range(1, 4):
-            y += w[i] * (exact(x[s[i]]) - exact(x[s[0]]))
+            y += w[i] * (wp.vec3d(x[s[i]]) - wp.vec3d(x[s[0]]))
         if layout.obstacles > 0:
-            y += (w[0] + w[1] + w[2] + w[3]) * exact(x[s[0]])
+            y += (w[0] + w[1] + w[2] + w[3]) * wp.vec3d(x[s[0]])
         return y
 
     return difference

@@ -165,20 +165,16 @@ def perpendicular(n: wp.vec3d):
 
 @cache
 def vertex_of(dtype):
-    """Device functions (x, correction, i) → xᵢ or xᵢ + dᵢ in float64, and (v) → v in float64."""
+    """Device function (x, correction, i) → xᵢ or xᵢ + dᵢ in float64."""
     vec3, _ = types(dtype)
     vector = load(vec3)
 
     @wp.func
-    def exact(v: vec3):
-        return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-
-    @wp.func
     def at(x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3), i: int):
-        found = exact(vector(x, i))
+        found = wp.vec3d(vector(x, i))
         if correction:
             if i < correction.shape[0]:  # obstacles have none
-                found += exact(vector(correction, i))
+                found += wp.vec3d(vector(correction, i))
         return found
 
-    return at, exact
+    return at

@@ -7,7 +7,7 @@ import warp as wp
 from ..vectors import types
 from .obstacles import Layout
 from .proximity import sort
-from .self_gaps import nearest, vertex_of
+from .self_gaps import nearest
 
 
 @cache
@@ -66,7 +66,6 @@ def module_of(dtype):
 def begin_pairs(dtype):
     """Kernel over pairs: n, d and w at the positions x at the start of a step."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def begin_each_pair(
@@ -81,7 +80,7 @@ def begin_pairs(dtype):
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
         s = pairs.stencils[e]
-        w, y, _inside = nearest(e < pairs.counts[0], exact(x[s[0]]), exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        w, y, _inside = nearest(e < pairs.counts[0], wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
         d = wp.length(y)
         step.gap[e] = d
         step.weights[e] = w

@@ -8,7 +8,7 @@ import warp as wp
 from ..memory import load
 from ..vectors import types
 from .obstacles import copy_of
-from .self_gaps import ONE, SIDE, ZERO, nearest, vertex_of
+from .self_gaps import ONE, SIDE, ZERO, nearest
 from .self_pairs import module_of, near_pairs
 
 # Fraction of its distance to a plane that a vertex may move in one round of the filter.
@@ -43,13 +43,12 @@ def bounded_share(move: wp.vec3d, most: wp.float64):
 def wanted_move(dtype):
     """Device function (x, target, i) → wanted move of vertex i, target − x; 0 for obstacles, which have no target."""
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
 
     @wp.func
     def wanted(x: wp.array(dtype=vec3), target: wp.array(dtype=vec3), i: int):
         found = wp.vec3d()
         if i < target.shape[0]:
-            found = exact(target[i]) - exact(x[i])
+            found = wp.vec3d(target[i]) - wp.vec3d(x[i])
         return found
 
     return wanted
@@ -90,7 +89,6 @@ def find_ways(dtype):
     is ``relative`` to the first vertex of the copy where cloth meets nothing but itself; obstacles have not moved since.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
     wanted = wanted_move(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -110,14 +108,14 @@ def find_ways(dtype):
         least_share: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
-        start = exact(x[i])
+        start = wp.vec3d(x[i])
         move = wanted(x, target, i)
         own = move - common[i // per_copy]
         far = wp.max(wp.max(wp.abs(start)), wp.max(wp.abs(start + move)))
-        since = start - exact(begun[i])
+        since = start - wp.vec3d(begun[i])
         if relative:
             one = i - i % per_copy
-            since -= exact(x[one]) - exact(begun[one])
+            since -= wp.vec3d(x[one]) - wp.vec3d(begun[one])
         share[i] = bounded_share(own, most)
         ways[i] = wp.vec3d(wp.length(own) + WIDE * wp.length(since), far, share[i])
         least_share[i] = ZERO
@@ -276,7 +274,6 @@ def cut_by_planes(dtype):
     all. Roundings of shorter moves, which can be equal in many steps, would take it nearer.
     """
     vec3, _ = types(dtype)
-    _at, exact = vertex_of(dtype)
     wanted, ulp = wanted_move(dtype), ulp_of(dtype)
     stencil = load(wp.vec4i)
 
@@ -307,8 +304,8 @@ def cut_by_planes(dtype):
         margin = margin_of(least, ulp * far)
         if needs_no_cut(e, way, margin, gap):
             return
-        origin = exact(x[s[0]])
-        _w, y, _inside = nearest(of_vertex, origin, exact(x[s[1]]), exact(x[s[2]]), exact(x[s[3]]))
+        origin = wp.vec3d(x[s[0]])
+        _w, y, _inside = nearest(of_vertex, origin, wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
         n = y / wp.max(wp.length(y), wp.float64(1e-300))
         lowest = wp.float64(wp.inf)
         highest = -wp.float64(wp.inf)
@@ -321,7 +318,7 @@ def cut_by_planes(dtype):
         for i in range(4):
             move = wanted(x, target, s[i])
             approach = wp.dot(n, move - own)
-            along = wp.dot(n, exact(x[s[i]]) - origin)
+            along = wp.dot(n, wp.vec3d(x[s[i]]) - origin)
             position[i] = along
             if i < sides:
                 approaches[i] = -approach
@@ -347,9 +344,9 @@ def cut_by_planes(dtype):
         whole = part_apart(
             of_vertex,
             origin,
-            exact(x[s[1]]),
-            exact(x[s[2]]),
-            exact(x[s[3]]),
+            wp.vec3d(x[s[1]]),
+            wp.vec3d(x[s[2]]),
+            wp.vec3d(x[s[3]]),
             ways[s[0]][2] * (wanted(x, target, s[0]) - own),
             ways[s[1]][2] * (wanted(x, target, s[1]) - own),
             ways[s[2]][2] * (wanted(x, target, s[2]) - own),

@@ -19,7 +19,7 @@ class DeviceMeshes(NamedTuple):
 
     @property
     def arrays(self):
-        return [self.geometry.points, self.geometry.triangles]
+        return [self.geometry.points]
 
 
 def meshes_on(model, colliders):
@@ -28,14 +28,11 @@ def meshes_on(model, colliders):
         return None
     found = kernels.meshes(model.dtype)()
     frames = [collider.frames if collider.is_mesh else np.empty((0, 0, 3)) for collider in colliders]
-    triangles = [collider.triangles if collider.is_mesh else np.empty((0, 3), np.int32) for collider in colliders]
 
     def numbers(values):
         return wp.array(np.array(values), dtype=wp.int32, device=model.device)
 
     found.points = model.array(np.concatenate([each.reshape(-1, 3) for each in frames]), model.vec3)
-    found.triangles = wp.array(np.concatenate(triangles), dtype=wp.vec3i, device=model.device)
-    found.first_triangle = numbers(np.cumsum([0, *map(len, triangles)])[:-1])
     found.first_point = numbers(np.cumsum([0, *(each.shape[0] * each.shape[1] for each in frames)])[:-1])
     found.size, found.frames = numbers([each.shape[1] for each in frames]), numbers([len(each) for each in frames])
     return DeviceMeshes(found)
