@@ -10,8 +10,6 @@ from ..terms.contact import turned
 from ..vectors import types
 from .colliders import gap_of, of_pose, pose_types, shapes, step_poses
 
-turned_by = turned
-
 
 @cache
 def slip_of(dtype, law: Law):
@@ -22,12 +20,11 @@ def slip_of(dtype, law: Law):
 
     @wp.func
     def slip(held: anchor_type, X: vec3, n: vec3):
-        found = vec3()
         if held[3] > dtype(0.0):
             u = X - vec3(held[0], held[1], held[2])
             u = u - wp.dot(n, u) * n
-            found = kept(wp.length(u), held[3]) * u
-        return found
+            return kept(wp.length(u), held[3]) * u
+        return vec3()
 
     return slip
 
@@ -36,9 +33,9 @@ def slip_of(dtype, law: Law):
 def anchor_vertices(dtype, solids, law: Law, bounded: bool):
     """Kernel over friction elements of one collider at the start of a step: anchors, and the rest states of the step.
 
-    N = −kAφ′(d) at the state, or kA(r − d) if ``bounded``; ε = μN/(kA) by Coulomb's law. The anchor of a vertex that comes into
-    contact is its position. If a vertex slid, that is, ‖u‖ is above the ε of the last step, its anchor follows to a distance of
-    that ε. Anchors are stored in the frame of the collider, with ε, which is 0 without contact.
+    N = −kAφ′(d), or kA(r − d) if ``bounded``; ε = μN/(kA) by Coulomb's law. A vertex that comes into contact has its anchor
+    there. If ‖u‖ is above the ε of the last step, the vertex slid, and its anchor follows to a distance of that ε. Anchors are
+    in the frame of the collider, with ε, which is 0 without contact.
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
@@ -74,7 +71,7 @@ def anchor_vertices(dtype, solids, law: Law, bounded: bool):
             a = X - slip(anchors[i], X, n)
             now = poses.at[copy, collider]
             target = to_space(now, a)
-            normal = turned_by(vec3(now[3], now[4], now[5]), now[6], n)
+            normal = turned(vec3(now[3], now[4], now[5]), now[6], n)
             r = rest_type()
             for k in range(3):
                 r[k] = target[k]

@@ -1,7 +1,7 @@
-"""Factories of kernels over contact with colliders. On the CPU they skip elements of one vertex that have no force.
+"""Factories of kernels over contact with colliders, which on the CPU skip elements that have no force.
 
-``clear`` is the distance that the vertex of an element can move from x̃ without a force [m]. It is 0 or less where a force is
-possible at x̃. Elements with a shorter correction d are skipped before their rest state is read.
+``clear`` is the distance that the vertex of an element can move from x̃ without a force [m]. Elements with a shorter correction
+d are skipped before their rest state is read.
 """
 
 from functools import cache
@@ -66,25 +66,25 @@ def move_clear(term: Term, dtype):
     return move
 
 
-# A secant of add_secants ends at LEAP d, or at LIFT r if that is more, at most.
+# A secant ends at LEAP d, or at LIFT r if that is more, at most.
 LEAP, LIFT = wp.constant(10.0), wp.constant(0.04)
 
 
 @cache
-def add_secants(term: Term, dtype):
-    """Kernel over contact elements: values[diagonal[vertex]] += kA c nnᵀ [N/m], c = φ″ or the slope of a secant of φ′.
+def add_hessian(term: Term, dtype):
+    """Kernel over elements: values[diagonal[vertex]] += kₑ Aₑ ∂²u/∂y² [N/m], semi-definite; of contact kA c nnᵀ.
 
-    The secant goes from d outwards. For small d, φ″ is so large that Newton's method at most doubles d. The secant ends at the
-    distance that the vertex would have with its own ``inertia`` m/h² [N/m] and the present force of everything else, or before.
-    At the minimum that distance is d, and c is φ″. A secant is no upper bound, so ``careful`` copies have φ″. ``gradient`` is
-    ∇φ of the whole objective [N]. ``diagonal`` is negative for pins. It works on any device, for no two elements share a
-    vertex. ``clear`` may be None.
+    c is φ″ or the slope of a secant of φ′, from d outwards. For small d, φ″ is so large that Newton's method at most doubles d.
+    The secant ends at the distance that the vertex would have with its own ``inertia`` m/h² [N/m] and the present force of
+    everything else, or before. At the minimum that distance is d, and c is φ″. A secant is no upper bound, so ``careful``
+    copies have φ″. ``gradient`` is ∇φ of the whole objective [N]. ``diagonal`` is negative for pins. No two elements share a
+    vertex.
     """
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
-    measure, gap, slope = term.measure, term.gap, contact.slope
-    bend, mean_bend, gap_after = contact.bend, contact.mean_bend, contact.gap_after
+    (_energy, _gradient, hessian_of), measure, gap = of_element(term, dtype, True), term.measure, term.gap
+    slope, bend, mean_bend, gap_after = contact.slope, contact.bend, contact.mean_bend, contact.gap_after
 
     @wp.kernel(module="unique", enable_backward=False)
     def add(
@@ -114,54 +114,20 @@ def add_secants(term: Term, dtype):
             if is_clear(clear[e], d[i]):
                 return
         r = rest_of(rest, e)
-        distance = r[11]
-        now, n = gap(y_of(stencil, e, r, x, d), r)
-        if now <= distance:
-            k = number(stiffness, e) * measure(r)
-            curvature = bend(now, distance)
-            if careful[i // per_copy] == 0 and inertia[i] > dtype(0.0):
-                others = wp.dot(gradient[i], n) - k * slope(now, distance)
-                after = gap_after(now - others / inertia[i], distance, k / inertia[i])
-                after = wp.min(after, wp.max(dtype(LEAP) * now, dtype(LIFT) * distance))
-                if after > dtype(1.001) * now:
-                    curvature = mean_bend(now, after, distance)
-            values[slot] = values[slot] + (k * curvature) * wp.outer(n, n)
-
-    return add
-
-
-@cache
-def add_hessian(term: Term, dtype):
-    """Kernel over elements: values[diagonal[vertex]] += kₑ Aₑ ∂²u/∂y² [N/m], projected to semi-definite.
-
-    ``diagonal`` is negative for pins. It works on any device, for no two elements share a vertex. ``clear`` may be None.
-    """
-    vec3, mat33 = types(dtype)
-    rest_type = wp.types.vector(term.parameters, dtype)
-    (_energy, _gradient, hessian_of), rest_of = of_element(term, dtype, True), load(rest_type)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add(
-        # elements
-        stencil: wp.array2d(dtype=wp.int32),
-        stiffness: wp.array(dtype=dtype),
-        rest: wp.array(dtype=rest_type),
-        clear: wp.array(dtype=dtype),
-        diagonal: wp.array(dtype=wp.int32),
-        # state in
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        # in and out
-        values: wp.array(dtype=mat33),
-    ):
-        e = wp.tid()
-        i = stencil[e, 0]
-        slot = diagonal[i]
-        if slot < 0:
-            return
-        if clear.shape[0] > 0:
-            if is_clear(clear[e], d[i]):
-                return
-        values[slot] = values[slot] + hessian_of(stencil, stiffness, e, rest_of(rest, e), x, d, dtype(0.0))
+        if wp.static(term.gap is None):
+            values[slot] = values[slot] + hessian_of(stencil, stiffness, e, r, x, d, dtype(0.0))
+        else:
+            distance = r[11]
+            now, n = gap(y_of(stencil, e, r, x, d), r)
+            if now <= distance:
+                k = number(stiffness, e) * measure(r)
+                curvature = bend(now, distance)
+                if careful[i // per_copy] == 0 and inertia[i] > dtype(0.0):
+                    others = wp.dot(gradient[i], n) - k * slope(now, distance)
+                    after = gap_after(now - others / inertia[i], distance, k / inertia[i])
+                    after = wp.min(after, wp.max(dtype(LEAP) * now, dtype(LIFT) * distance))
+                    if after > dtype(1.001) * now:
+                        curvature = mean_bend(now, after, distance)
+                values[slot] = values[slot] + (k * curvature) * wp.outer(n, n)
 
     return add

@@ -14,10 +14,10 @@ from .colliders import gap_of, of_pose, shapes, step_poses
 def clearances(dtype):
     """Struct of what is known of the distances of vertices to colliders that stand.
 
-    ``balls`` has the centre and the radius of a ball about each vertex [m]; no collider is within the contact ``distance`` of
-    it. A ball that contains the motion of its vertex makes the distance to the colliders unnecessary. ``near`` is 1 for copies
-    with a vertex that may come near in this step, ``before`` for those of the last step (B,). ``some`` is 1 if there is one in
-    this step. If steps are ``followed``, all refresh contact.
+    ``balls`` has the centre and the radius of a ball about each vertex [m], with no collider within the contact ``distance`` of
+    it. Where a ball contains the motion of its vertex, distances are not computed. ``near`` is 1 for copies with a vertex that
+    may come near in this step, ``before`` for those of the last step (B,); ``some`` is 1 if there is one. If steps are
+    ``followed``, all refresh contact.
     """
 
     @wp.struct
@@ -37,8 +37,8 @@ def near_colliders(dtype, ended: bool):
     """Kernel over vertices: due = 1 if a vertex may come near a collider in a step.
 
     At the start of a step the motion is the prediction h v + h² g, and the contact distance further, because what refreshes
-    contact looks so far. due is also 1 if a copy was near before, so that a refresh leaves anchors and half-spaces behind. When
-    one vertex of a copy is near, the others are skipped. After a step (``ended``), a vertex moved from x to ``end``.
+    contact looks so far. due is also 1 if a copy was near before, so that a refresh leaves anchors and half-spaces behind.
+    After a step (``ended``), a vertex moved from x to ``end``.
     """
     vec3, _ = types(dtype)
     to_local, _to_space = of_pose(dtype)

@@ -10,7 +10,6 @@ from ..terms.contact import turned
 from ..vectors import types
 from .colliders import gap_of, kept_part, of_pose, shapes, step_poses
 
-turned_by = turned
 ROUNDS = wp.constant(6)  # maximum number of tests of a vertex that colliders stop
 SLIDING = wp.constant(2)  # in so many of these it slides; then its move is only shortened, which terminates
 FIRST = wp.constant(wp.int64(2**62))
@@ -21,10 +20,8 @@ class FilterNotes:
     """Notes of the filter after ``steps`` steps: the number of cuts (copies,), and the first vertex inside (copies, colliders).
 
     ``inside`` is 0 if no vertex is inside. Else it is FIRST − ((step·n + vertex)(C + 1) + other) with n vertices and C
-    colliders. other is the last collider that held the vertex back, or C for a vertex that is not free.
-
-    ``pushed`` and ``kicked``, (N,) or None, are the changes of the positions and velocities of vertices by cuts; entries of
-    other vertices are not written.
+    colliders. other is the last collider that held the vertex back, or C for a vertex that is not free. ``pushed`` and
+    ``kicked``, (N,) or None, are the changes of the positions and velocities of vertices by cuts.
     """
 
     steps: wp.array(dtype=wp.int32)
@@ -39,8 +36,8 @@ def note_cut(notes: FilterNotes, copy: int, i: int, pushed: Any, kicked: Any):
     """Notes that the move of vertex i of a copy was cut, with the changes of its position and velocity."""
     wp.atomic_add(notes.cut, copy, wp.int64(1))
     if notes.pushed.shape[0] > 0:
-        notes.pushed[i] = wp.vec3d(wp.float64(pushed[0]), wp.float64(pushed[1]), wp.float64(pushed[2]))
-        notes.kicked[i] = wp.vec3d(wp.float64(kicked[0]), wp.float64(kicked[1]), wp.float64(kicked[2]))
+        notes.pushed[i] = wp.vec3d(pushed)
+        notes.kicked[i] = wp.vec3d(kicked)
 
 
 @wp.func
@@ -72,10 +69,10 @@ def sliding(dtype):
 
     @wp.func
     def velocity(v: vec3, move: vec3, change: vec3, push: vec3, h: dtype):
-        """The velocity after a step whose ``move`` was changed by a push and friction.
+        """The velocity after a step whose ``move`` was changed: v + change/h, but along the push that of the move.
 
-        Along the push it is that of the move. For Euler it is v + change/h. For midpoint, v is twice the mean velocity of the
-        step minus that at its start, so v + change/h would throw the vertex back.
+        For midpoint, v is twice the mean velocity of the step minus that at its start, so that v + change/h would throw the
+        vertex back.
         """
         size = wp.dot(push, push)
         found = v + (change - push) / h
@@ -91,8 +88,7 @@ def stopped_by_shape(dtype, solids):
     """Device function (shapes, c, X, move, …) → the end of a move from X in its frame, its change, push, and stop.
 
     A move that would come nearer than ``least`` stops before, at a distance of at most ``landing`` more. With ``slides``, it
-    continues along the plane through that point, which has a convex collider behind it, raised to twice ``least`` so that
-    rounding does not stop it. The fourth value is whether the move was stopped.
+    continues along the tangent plane there, raised to twice ``least`` so that rounding does not stop it.
     """
     vec3, _ = types(dtype)
     gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
@@ -124,7 +120,7 @@ def outside(dtype, solids):
     """Device function (x, end, v, …) → final position and velocity of a free vertex that moves from x to ``end``.
 
     In the frame of a collider it moves along a segment, or, if that comes too near, as in :func:`stopped_by_shape`. The third
-    value is whether a collider stopped it. ``notes`` counts stops, and notes the vertex if colliders leave no way out.
+    value is whether a collider stopped it. ``notes`` has the stops, and the vertex if colliders leave no way out.
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
@@ -162,8 +158,8 @@ def outside(dtype, solids):
                 X, less, by, hit = stopped(shape, c, X, to_local(pose, end) - X, rounded, landing, rounds <= SLIDING)
                 if hit:
                     end = to_space(pose, X)
-                    change += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], less)
-                    push += turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], by)
+                    change += turned(vec3(pose[3], pose[4], pose[5]), pose[6], less)
+                    push += turned(vec3(pose[3], pose[4], pose[5]), pose[6], by)
                     cuts = rounds
                     last = c
         if cuts > 0:

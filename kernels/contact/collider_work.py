@@ -75,15 +75,15 @@ def rigid_moves(dtype):
 def add_collider_work(dtype):
     """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
 
-    ∇U is that of contact and friction, ∇H that of friction alone. δ is the displacement of the collider's material at the
-    vertex. Both gradients are evaluated where the step takes its forces, ``now``. With ``before``, the trapezoidal rule takes
-    the mean of the products there and at the start of the step; ∇U and ∇H are then stored for the next step.
+    ∇U is that of contact and friction, ∇H that of friction alone, δ the displacement of the collider's material at the vertex.
+    Both gradients are those where the step takes its forces, ``now``. With ``before``, the trapezoidal rule takes the mean of
+    the products there and at the start of the step; ∇U and ∇H are then stored for the next step.
 
-    Contact acts within ``distance``. If the gap changes by more in a step, the two are in contact for only a part of it, in
-    which they move together. The work of contact is then that of the part of Δx that δ shares.
+    If the gap changes by more than the contact ``distance`` in a step, the two are in contact for only a part of it, in which
+    they move together. The work of contact is then that of the part of Δx that δ shares.
 
     If the filter shortened the move, Δx is the unshortened move, to ``uncut``, and only the forces of ``now`` count, in this
-    step and in the next. Δx then does not change the energy of contact by ∇U·(Δx − δ); the filter did, so of_filter −= that.
+    step and in the next. The filter then changed the energy of contact, not Δx: of_filter −= ∇U·(Δx − δ).
     """
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
@@ -170,14 +170,13 @@ def add_filter_work(dtype):
         uncut[i] = x[i]
         cuts[i] = cuts[i] // 2
         if wp.dot(push, push) + wp.dot(kick, kick) > wp.float64(0.0):
-            uncut[i] = x[i] - vec3(dtype(push[0]), dtype(push[1]), dtype(push[2]))
+            uncut[i] = x[i] - vec3(push)
             cuts[i] = NOW
             m = wp.float64(mass[i])
-            g = gravity[i // per_copy]
-            pull = m * wp.vec3d(wp.float64(g[0]), wp.float64(g[1]), wp.float64(g[2]))
+            pull = m * wp.vec3d(gravity[i // per_copy])
             if force.shape[0] > 0:
-                pull += wp.vec3d(wp.float64(force[i][0]), wp.float64(force[i][1]), wp.float64(force[i][2]))
-            mean = wp.vec3d(wp.float64(v[i][0]), wp.float64(v[i][1]), wp.float64(v[i][2])) - wp.float64(0.5) * kick
+                pull += wp.vec3d(force[i])
+            mean = wp.vec3d(v[i]) - wp.float64(0.5) * kick
             of_filter[i] = of_filter[i] + m * wp.dot(mean, kick) - wp.dot(pull, push)
             pushed[i] = wp.vec3d()
             kicked[i] = wp.vec3d()
@@ -211,7 +210,7 @@ def add_stored(
 def limit_pulls(dtype):
     """Kernel over vertices: scales ∇U of a collider by ‖f‖/‖∇U‖ if that is below ½, with the ∇U of all colliders.
 
-    f is the contact force that the step gave the vertex. If the step converged, f = −∇U. Else the vertex may be deep in a
+    f is the contact force that the step gave the vertex. Unless the step converged to f = −∇U, the vertex may be deep in a
     collider, with a ∇U that is millions of times larger.
     """
     vec3, _ = types(dtype)

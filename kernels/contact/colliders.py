@@ -1,8 +1,6 @@
 """Factories of what contact and the filter know of colliders: shapes, poses, motion, and rest states where a step begins.
 
-A pose is a position and a quaternion (x, y, z, w), seven numbers. A step needs the poses at its start, at its end, and at the
-time of its forces, see :func:`move_colliders`. Anchors of friction are in :mod:`.anchors`, the filter is in
-:mod:`.collider_filter`.
+A pose is a position and a quaternion (x, y, z, w), seven numbers.
 """
 
 from functools import cache
@@ -13,7 +11,6 @@ from ..terms import contact
 from ..terms.contact import gap_to, turned
 from ..vectors import types
 
-turned_by = turned
 MARCHES = wp.constant(32)  # maximum number of separating planes of a move past a convex collider
 TRACES = wp.constant(512)  # maximum number of empty balls of a move past another collider
 
@@ -26,7 +23,7 @@ def pose_types(dtype):
 
 @cache
 def shapes(dtype):
-    """Struct of C colliders: ``kind``, see :func:`gap_of`, half sizes of the core, radius, and friction μ."""
+    """Struct of C colliders: ``kind``, see :func:`gap_of`, half sizes and radius of the shape, and friction μ."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -61,11 +58,11 @@ def of_pose(dtype):
 
     @wp.func
     def to_local(pose: pose_type, x: vec3):
-        return turned_by(-vec3(pose[3], pose[4], pose[5]), pose[6], x - vec3(pose[0], pose[1], pose[2]))
+        return turned(-vec3(pose[3], pose[4], pose[5]), pose[6], x - vec3(pose[0], pose[1], pose[2]))
 
     @wp.func
     def to_space(pose: pose_type, X: vec3):
-        return turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], X) + vec3(pose[0], pose[1], pose[2])
+        return turned(vec3(pose[3], pose[4], pose[5]), pose[6], X) + vec3(pose[0], pose[1], pose[2])
 
     return to_local, to_space
 
@@ -169,7 +166,7 @@ def gap_of(dtype, solids):
 
 @cache
 def find_distances(solid):
-    """Kernel over points in the frame of a shape: their signed distances [m], in double precision."""
+    """Kernel over points in the frame of a shape: their signed distances [m]."""
     gap = gap_to(solid)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -193,11 +190,10 @@ def find_distances(solid):
 def kept_part(dtype, solids):
     """Device function (shapes, collider, X, move, least) → the fraction of a move from X that is kept, in the collider's frame.
 
-    The plane through the nearest point of a convex collider, normal to the distance, has the whole collider behind it. The move
-    is kept until it is nearer to that plane than ``least``, or than its start if that is nearer. From there the next plane
-    decides. Of a collider that is not convex, nothing is within the ball of radius d about a point at the distance d; the move
-    is kept as far as it leads in this ball, less ``least``, or less half of its start if that is nearer (Hart 1996, *Sphere
-    tracing*).
+    A convex collider is behind the plane through its nearest point, normal to the distance. The move is kept until it is nearer
+    to that plane than ``least``, or than its start if that is nearer. From there the next plane decides. Any other collider is
+    outside the ball of radius d about a point at the distance d; the move is kept as far as it leads in this ball, less
+    ``least``, or less half of its start if that is nearer (Hart 1996, *Sphere tracing*).
     """
     vec3, _ = types(dtype)
     gap, concave = gap_of(dtype, solids), sum(not each.convex for each in solids)
@@ -239,8 +235,7 @@ def pose_collider(dtype, solids):
     """Kernel over contact elements of one collider at the start of a step: rest states with its pose, or with a half-space.
 
     If the prediction x + h v + h² g of a vertex crosses the collider, it has contact with the half-space behind the tangent
-    plane where it meets the collider, for beyond a thin collider no force would lead it back. With h = 0, as in explicit steps,
-    there is no prediction. Other rest states are written only if they change.
+    plane where it meets the collider, for beyond a thin collider no force would lead it back. Explicit steps have h = 0.
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
@@ -283,14 +278,13 @@ def pose_collider(dtype, solids):
                 X = X + t * way
                 d, n = gap(shape, collider, X)
                 position = to_space(pose, X - d * n)
-                pose = behind(position, turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], n))
+                pose = behind(position, turned(vec3(pose[3], pose[4], pose[5]), pose[6], n))
                 core = vec3(dtype(wp.inf), dtype(wp.inf), dtype(wp.inf))
                 radius = dtype(0.0)
         r = rest[e]
-        changed = wp.isfinite(r[7]) != wp.isfinite(core[0])
+        changed = wp.isfinite(r[7]) != wp.isfinite(core[0])  # few are
         for k in range(7):
-            if r[k] != pose[k]:
-                changed = True
+            changed = changed or r[k] != pose[k]
         if changed:
             for k in range(7):
                 r[k] = pose[k]

@@ -8,11 +8,9 @@ from ..vectors import types
 from .obstacles import cloth_vertex, copy_of, has_obstacle
 from .pair_potential import CLOSE, Laws
 from .self_contact import least_gap
-from .self_gaps import ONE, ZERO
+from .self_gaps import ONE, SIDE, ZERO, farthest_of
 from .self_pairs import StepPairs, module_of, near_pairs
 
-FOUR = wp.constant(wp.float64(4.0))
-HALF = wp.constant(wp.float64(0.5))
 # The least gap that coarse positions leave is 6 units in the last place. Rounding changes gaps by two of them.
 ROUNDED = wp.constant(wp.float64(4.0 / 3.0))
 MORE = wp.constant(wp.float32(0.75 * 2.0**-23))
@@ -23,34 +21,16 @@ FIRST = wp.constant(wp.int64(2**62))
 class GapNotes:
     """The smallest gaps in the frames so far, (copies,).
 
-    ``nearest`` is 1/d for the smallest gap d [1/m]. ``too_near`` is 0 if float32 resolves all gaps. Else it is
-    FIRST − (frame·n + vertex) with n vertices: the first frame with an unresolved pair, and the first vertex of such a pair.
-    ``pressed`` (copies, 2) is the same for pairs with contact that are nearer than half the distance where that begins, of
-    cloth with cloth and with meshes. ``unresolved`` is the same for pairs that the filter stops where their contact begins,
-    within rounding, as positions far from the origin are coarse.
+    ``nearest`` is 1/d for the smallest gap d [1/m]. The others are FIRST − (frame·n + vertex), with n vertices, for the first
+    frame with such a pair and its first vertex, or 0: ``too_near`` for gaps that float32 does not resolve, ``pressed``
+    (copies, 2) for pairs nearer than half the distance where their contact begins, of cloth with cloth and with meshes, and
+    ``unresolved`` for pairs that the filter stops where their contact begins, within rounding, far from the origin.
     """
 
     nearest: wp.array(dtype=wp.float64)
     too_near: wp.array(dtype=wp.int64)
     pressed: wp.array2d(dtype=wp.int64)
     unresolved: wp.array(dtype=wp.int64)
-
-
-@cache
-def resolved_gap(dtype):
-    """Device function (s, x) → four units in the last place of float32 of the largest coordinate of a pair [m]."""
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def resolved(s: wp.vec4i, x: wp.array(dtype=vec3)):
-        far = ZERO
-        for i in range(4):
-            far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
-        # 0.75 to 1.5 units more, which is rounded to the next number.
-        next = wp.float32(far) + MORE * wp.float32(far)
-        return FOUR * wp.float64(next - wp.float32(far))
-
-    return resolved
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
@@ -75,11 +55,10 @@ def cutoff_of(dtype):
     def contact_distance(pairs: near_pairs(dtype), laws: Laws, e: int):
         s = pairs.stencils[e]
         r = dtype(laws.distance[wp.where(has_obstacle(pairs.layout, s), 1, 0)])
-        found = ZERO
-        if pairs.distances[e] == r:
-            close = e >= pairs.counts[0] or s[0] >= pairs.layout.cloth
-            found = wp.where(close, CLOSE, ONE) * wp.float64(r)
-        return found
+        if pairs.distances[e] != r:
+            return ZERO
+        close = e >= pairs.counts[0] or s[0] >= pairs.layout.cloth
+        return wp.where(close, CLOSE, ONE) * wp.float64(r)
 
     return contact_distance
 
@@ -91,7 +70,7 @@ def note_gaps(dtype):
     ``least`` [m] is the least gap of the filter without rounding if it keeps iterates apart, else 0.
     """
     vec3, _ = types(dtype)
-    resolved, contact_distance, least_gap_of = resolved_gap(dtype), cutoff_of(dtype), least_gap(dtype)
+    farthest, contact_distance, least_gap_of = farthest_of(dtype), cutoff_of(dtype), least_gap(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def note_each_gap(
@@ -122,11 +101,13 @@ def note_gaps(dtype):
         frame = wp.int64(steps[copy] // per_frame)
         first = cloth_vertex(pairs.layout, s) - copy * pairs.layout.per_copy
         key = FIRST - frame * wp.int64(pairs.layout.per_copy) - wp.int64(first)
-        if not d >= resolved(s, x):
+        far = wp.float32(farthest(s, x))
+        next = far + MORE * far  # 0.75 to 1.5 units more, which is rounded to the next number
+        if not d >= wp.float64(4.0) * wp.float64(next - far):
             wp.atomic_max(notes.too_near, copy, key)
         begins = contact_distance(pairs, laws, e)
         law = wp.where(has_obstacle(pairs.layout, s), 1, 0)
-        if d < HALF * begins and (law == 0 or least > ZERO):  # edges have no contact with meshes in explicit steps
+        if d < SIDE * begins and (law == 0 or least > ZERO):  # edges have no contact with meshes in explicit steps
             wp.atomic_max(notes.pressed, copy, law, key)
         f = least_gap_of(s, x, least)
         if least > ZERO and begins > ZERO and wp.max(begins, d) <= ROUNDED * f:

@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .obstacles import copy_of, in_copy
+from .obstacles import copy_of, obstacle_of
 from .pair_sums import PairForces
 from .self_gaps import ZERO
 from .self_pairs import near_pairs
@@ -32,10 +32,9 @@ def keep_forces(dtype):
         if t >= pairs.number[0]:
             return
         e = pairs.acting[t]
-        own = wp.int32(-1)
-        for i in range(4):
-            if parts[e][i] >= pairs.layout.cloth:
-                own = colliders[in_copy(pairs.layout, parts[e][i]) - pairs.layout.per_copy]
+        own = obstacle_of(pairs.layout, parts[e])
+        if own >= 0:
+            own = colliders[own]
         if own != kept:
             forces.energy[e] = ZERO
             forces.force[e] = wp.vec3d()
@@ -61,13 +60,10 @@ def work_of_meshes(dtype):
     ):
         for t in range(pairs.number[0]):
             e = pairs.acting[t]
-            other = wp.int32(-1)
-            for i in range(4):
-                if parts[e][i] >= pairs.layout.cloth:
-                    other = parts[e][i]
+            other = obstacle_of(pairs.layout, parts[e])
             if other >= 0 and wp.max(forces.bend[e]) > ZERO:
-                c = colliders[in_copy(pairs.layout, other) - pairs.layout.per_copy]
-                copy = copy_of(pairs.layout, other)
+                c = colliders[other]
+                copy = copy_of(pairs.layout, parts[e][0])
                 out[copy, c] = out[copy, c] + wp.dot(forces.force[e], travel[e])
 
     return add_work_of_meshes

@@ -1,9 +1,9 @@
 """Factories of the kernels that move colliders in a step and carry near cloth along, so that it does not get in their way.
 
-A vertex of the cloth that is listed with a mesh makes the move of the point of the mesh that is nearest to it. One that a
-shape would meet makes the move of the shape. One that is listed with such cloth makes the move of that. Pairs that would
-still approach are pushed apart, by :func:`.self_filter.push_pairs`. Then continuous collision detection says how far all of a
-copy may move together. Where that is not the whole way, pairs are listed anew, and the rest follows.
+A vertex listed with a mesh makes the move of the nearest point there, one that a shape would meet that of the shape, and one
+listed with such cloth the move of that. Pairs that would still approach are pushed apart, by :func:`.self_filter.push_pairs`.
+Then continuous collision detection says how far all of a copy may move together. If that is not the whole way, pairs are listed
+anew, and the rest follows.
 """
 
 from functools import cache
@@ -68,10 +68,10 @@ def aim_obstacles(dtype):
 
 @cache
 def find_carriers(dtype, of_meshes: bool):
-    """Kernel over pairs: the pair that carries each vertex of the cloth, from the key of the nearest, for ``of_meshes`` a mesh.
+    """Kernel over pairs: the key of the pair that carries each vertex of the cloth, with a mesh or with cloth that is carried.
 
-    Else it is one with cloth that is carried already. First are pairs of the vertex itself with a triangle, whose nearest point
-    moves as the vertex should where the mesh turns, then those with the smallest gap.
+    Pairs of the vertex itself with a triangle come first, as their nearest point moves as it should where the mesh turns, then
+    those with the smallest gap.
     """
 
     # Separate modules: graphs on the CPU find kernels of a module by name.
@@ -92,10 +92,7 @@ def find_carriers(dtype, of_meshes: bool):
         if e >= wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0]):
             return
         s = pairs.stencils[e]
-        if wp.static(of_meshes):
-            if not has_obstacle(pairs.layout, s):
-                return
-        elif has_obstacle(pairs.layout, s):
+        if has_obstacle(pairs.layout, s) != wp.static(of_meshes):
             return
         near = wp.clamp(ONE - step.gap[e] / max_distance, ZERO, ONE)
         sides = wp.where(e < pairs.counts[0], 1, 2)
@@ -162,10 +159,7 @@ def carry_with_shapes(dtype, solids):
 
 @cache
 def carry_vertices(dtype):
-    """Kernel over vertices of the cloth: p, the move of what carries them on the other side of the pair of their new key.
-
-    Pins have none.
-    """
+    """Kernel over free vertices of the cloth with a new key: p, the move of what carries them on the other side of its pair."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
@@ -183,23 +177,20 @@ def carry_vertices(dtype):
     ):
         i = wp.tid()
         key = keys[i]
-        if key == carried[i]:
-            return
-        if inverse_mass[i] == dtype(0.0):
+        if key == carried[i] or inverse_mass[i] == dtype(0.0):
             return
         e = wp.int32((key - wp.int64(1)) % wp.int64(2147483648))
         s = pairs.stencils[e]
         w = step.weights[e]
         sides = wp.where(e < pairs.counts[0], 1, 2)
-        own = wp.int32(1)
+        own = wp.bool(False)  # whether the vertex is on the first side
         for k in range(sides):
-            if s[k] == i:
-                own = 0
+            own = own or s[k] == i
         move = wp.vec3d()  # relative to that of one vertex, so that a translation is exact
         one = wp.int32(-1)
         weight = ZERO
         for k in range(4):
-            if (k < sides) != (own == 0):
+            if (k < sides) != own:
                 carries = s[k] >= pairs.layout.cloth
                 if not carries:
                     carries = carried[s[k]] > wp.int64(0)
@@ -214,7 +205,7 @@ def carry_vertices(dtype):
             for axis in range(3):
                 if mobility[i][axis] == dtype(0.0):
                     move[axis] = ZERO
-        p[i] = vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+        p[i] = vec3(move)
 
     return carry_each_vertex
 
@@ -223,8 +214,7 @@ def carry_vertices(dtype):
 def end_move(dtype):
     """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
 
-    After ``most`` rounds meshes go through what is in their way, and ``first`` is FIRST − frame for the first frame with such a
-    step.
+    After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame.
     """
 
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)

@@ -28,23 +28,17 @@ class Layout:
 @wp.func
 def copy_of(layout: Layout, i: int):
     """The copy of a vertex."""
-    found = wp.int32(0)
     if i < layout.cloth:
-        found = i // layout.per_copy
-    else:
-        found = (i - layout.cloth) // layout.obstacles
-    return found
+        return i // layout.per_copy
+    return (i - layout.cloth) // layout.obstacles
 
 
 @wp.func
 def in_copy(layout: Layout, i: int):
     """The index of a vertex in its copy, where obstacles follow the cloth."""
-    found = wp.int32(0)
     if i < layout.cloth:
-        found = i % layout.per_copy
-    else:
-        found = layout.per_copy + (i - layout.cloth) % layout.obstacles
-    return found
+        return i % layout.per_copy
+    return layout.per_copy + (i - layout.cloth) % layout.obstacles
 
 
 @wp.func
@@ -63,6 +57,16 @@ def has_obstacle(layout: Layout, s: wp.vec4i):
     return s[0] >= layout.cloth or s[3] >= layout.cloth
 
 
+@wp.func
+def obstacle_of(layout: Layout, s: wp.vec4i):
+    """The last of the obstacles of a copy that is a vertex of a pair, or −1 without one."""
+    found = wp.int32(-1)
+    for i in range(4):
+        if s[i] >= layout.cloth:
+            found = in_copy(layout, s[i]) - layout.per_copy
+    return found
+
+
 @cache
 def vector_within(dtype):
     """Device function (p, i) → the move of vertex i, which is 0 beyond the array, where p is for the cloth alone."""
@@ -71,20 +75,16 @@ def vector_within(dtype):
 
     @wp.func
     def vector_or_zero(p: wp.array(dtype=vec3), i: int):
-        found = vec3()
         if i < p.shape[0]:
-            found = vector(p, i)
-        return found
+            return vector(p, i)
+        return vec3()
 
     return vector_or_zero
 
 
 @wp.struct
 class Obstacles:
-    """The obstacles of a copy: the collider of each and its vertex there, (m,), and which frames of colliders are present.
-
-    ``first_frame`` of each collider is an index into ``present``.
-    """
+    """The collider and its vertex of each obstacle of a copy, (m,), and where the frames of colliders begin in ``present``."""
 
     collider: wp.array(dtype=wp.int32)
     vertex: wp.array(dtype=wp.int32)
@@ -94,9 +94,9 @@ class Obstacles:
 
 @cache
 def find_obstacles(dtype):
-    """Kernel over obstacles of all copies: their positions in a step at the ``poses`` after ``halves`` half steps.
+    """Kernel over obstacles of all copies: their positions after ``halves`` half steps, with the ``poses`` there.
 
-    A frame has ``per_frame`` half steps. Positions are NaN while a collider is absent, that is at one point for a whole step.
+    Positions are NaN while a collider is absent, that is at one point for a whole step.
     """
     vec3, _ = types(dtype)
     _local, to_space = of_pose(dtype)

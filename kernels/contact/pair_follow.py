@@ -17,12 +17,6 @@ from .self_pairs import module_of, near_pairs
 slope = contact.slope
 
 
-@wp.func
-def equal(s: wp.vec4i, q: wp.vec4i):
-    """Whether two contacts have the same vertices in the same order."""
-    return s[0] == q[0] and s[1] == q[1] and s[2] == q[2] and s[3] == q[3]
-
-
 @cache
 def carry_forces(dtype):
     """Kernel over contacts: carries over λ along n, before the contacts are found elsewhere."""
@@ -85,7 +79,7 @@ def start_forces(dtype):
                 first = half + 3 * first
                 end = wp.min(half + 3 * end, 2 * half)
             for k in range(first, end):
-                if contacts.followed.carried[k] > ZERO and equal(contacts.parts[e], contacts.followed.stencils[k]):
+                if contacts.followed.carried[k] > ZERO and contacts.parts[e] == contacts.followed.stencils[k]:
                     found = contacts.followed.carried[k]
             contacts.followed.start[e] = wp.where(contacts.stiffness[e] > ZERO, found, ZERO)
 
@@ -111,8 +105,8 @@ def count_sweep(
 def fix_forces(dtype):
     """Kernel over vertices: the part of the forces of contacts over a valley that sweeps do not compute anew, as λ [kg·m].
 
-    That is −h²(1 − share)kAφ′ along n, and all of negative contacts, where the contacts were found; but in proportion to the λ
-    of the positive ones, because the positions there may be far from the solution.
+    That is −h²(1 − share)kAφ′ along n, and all of negative contacts, but in proportion to the λ of the positive ones, because
+    the positions where the contacts were found may be far from the solution.
     """
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)

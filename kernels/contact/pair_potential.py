@@ -86,8 +86,16 @@ def nearest_of_face(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 
 @wp.func
+def from_middles(s: wp.float64, t: wp.float64):
+    """1 + ⅛((2s − 1)² + (2t − 1)²)."""
+    x = TWO * s - ONE
+    z = TWO * t - ONE
+    return ONE + MIDDLE * (x * x + z * z)
+
+
+@wp.func
 def on_two_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """s and t of the least ‖y‖² (1 + ⅛((2s − 1)² + (2t − 1)²)) of the edges ab and cd, by Newton's method within the square."""
+    """s and t of D of the edges ab and cd, by Newton's method within the square, and D/‖y‖."""
     u = b - a
     v = d - c
     w = a - c
@@ -101,13 +109,11 @@ def on_two_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
         turn += 1
         y = w + s * u - t * v
         q = wp.dot(y, y)
-        x = TWO * s - ONE
-        z = TWO * t - ONE
-        g = ONE + MIDDLE * (x * x + z * z)
+        g = from_middles(s, t)
         qs = TWO * wp.dot(y, u)
         qt = -TWO * wp.dot(y, v)
-        gs = wp.float64(4.0) * MIDDLE * x
-        gt = wp.float64(4.0) * MIDDLE * z
+        gs = wp.float64(4.0) * MIDDLE * (TWO * s - ONE)
+        gt = wp.float64(4.0) * MIDDLE * (TWO * t - ONE)
         fs = g * qs + q * gs
         ft = g * qt + q * gt
         ss = TWO * g * uu + TWO * gs * qs + wp.float64(8.0) * MIDDLE * q
@@ -136,9 +142,7 @@ def on_two_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
             s1 = wp.clamp(s + step * ds, ZERO, ONE)
             t1 = wp.clamp(t + step * dt, ZERO, ONE)
             y = w + s1 * u - t1 * v
-            x = TWO * s1 - ONE
-            z = TWO * t1 - ONE
-            if wp.dot(y, y) * (ONE + MIDDLE * (x * x + z * z)) <= before * (ONE + wp.float64(1e-13)):
+            if wp.dot(y, y) * from_middles(s1, t1) <= before * (ONE + wp.float64(1e-13)):
                 tries = 20
             step *= SIDE
             tries += 1
@@ -146,9 +150,7 @@ def on_two_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
             turn = 40
         s = s1
         t = t1
-    x = TWO * s - ONE
-    z = TWO * t - ONE
-    return s, t, wp.sqrt(ONE + MIDDLE * (x * x + z * z))
+    return s, t, wp.sqrt(from_middles(s, t))
 
 
 @wp.struct
@@ -181,15 +183,14 @@ class Laws:
 class Contacts:
     """The contacts at some positions, by slots: w, n, d, r [m], kA with the sign of m [N/m], ``share``, and ``fixed`` λ [kg·m].
 
-    There are 2C slots. Slot e < C is that of the pair e: of the nearest point of a face, or of two edges. Those from
-    C + 3·rows[i] on are for terms of vertex i whose faces have their nearest points elsewhere. That is enough, because F
-    faces share at most 1.5 F edges, and as many vertices. kA is 0 in slots without a contact. ``code`` says where the nearest
-    point of a face is. ``near`` (C,) lists the pairs of the near faces of vertex i from rows[i] on.
+    Slot e < C of 2C is that of the pair e: of the nearest point of a face, or of two edges. Those from C + 3·rows[i] on are for
+    terms of vertex i whose faces have their nearest points elsewhere; F faces share at most 1.5 F edges, and as many vertices.
+    kA is 0 in slots without a contact. ``code`` says where the nearest point of a face is. ``near`` (C,) lists the pairs of the
+    near faces of vertex i from rows[i] on.
 
-    ``parts`` has the vertices of the surface between which a contact is. The stencil of its slot has those of the cloth, and
-    the first of them with w = 0 in place of each obstacle. With obstacles there is the ``offset`` o = Σ wⱼXⱼ [m] of their
-    positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,). Bit i of ``touching`` is 1 if wᵢ of
-    the parts is not 0.
+    ``parts`` has the vertices of the surface between which a contact is; bit i of ``touching`` is 1 if wᵢ is not 0. The stencil
+    has the first vertex of the cloth with w = 0 in place of each obstacle. With obstacles there is the ``offset`` o = Σ wⱼXⱼ
+    [m] of their positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,).
 
     The ``share`` of a contact is the sum of m over its side of the vertex, divided by that of positive m. Sweeps compute this
     share of its force anew, and leave the rest ``fixed``, see :mod:`.pair_follow`.
@@ -235,74 +236,40 @@ def corner_of(s: wp.vec4i, u: int):
 
 
 @wp.func
-def edge_between(i: int, j: int):
-    """The code of the edge between two corners, 1 to 3."""
-    return wp.where(i + j == 3, EDGE, EDGE + 6 - i - j)
+def place_between(i: int, j: int):
+    """The code of the edge between two corners, 1 to 3, or of the corner i = j."""
+    return wp.where(i == j, CORNER + i - 1, wp.where(i + j == 3, EDGE, EDGE + 6 - i - j))
 
 
-@cache
-def counts_of(dtype):
-    """Device functions (stencils, codes, near, first, end, …) that count near faces of a vertex at an edge pq, or a vertex p.
+Stencils, Numbers = wp.array(dtype=wp.vec4i), wp.array(dtype=wp.int32)
+_stencil, _number = load(wp.vec4i), load(wp.int32)
 
-    The pairs of the near faces are in ``near`` from ``first`` to ``end``, in order. Both return the face that owns the term,
-    which is the first whose nearest point is there or else the first; the number of faces; and of those whose nearest point is
-    there. That of edges also returns the first face. On the CPU a function that takes a struct copies it.
+
+@wp.func  # on the CPU a function that takes a struct copies it
+def count_faces(stencils: Stencils, codes: Numbers, near: Numbers, first: int, end: int, p: int, q: int):
+    """Counts the near faces of a vertex at an edge pq, or a vertex p = q; their pairs are ``near`` from ``first`` to ``end``.
+
+    Returns the face that owns the term, which is the first whose nearest point is there or else the first; the number of faces;
+    of those whose nearest point is there; and the first face.
     """
-    stencil, number = load(wp.vec4i), load(wp.int32)
-
-    @wp.func
-    def at_edge(
-        stencils: wp.array(dtype=wp.vec4i),
-        codes: wp.array(dtype=wp.int32),
-        near: wp.array(dtype=wp.int32),
-        first: int,
-        end: int,
-        p: int,
-        q: int,
-    ):
-        lowest = wp.int32(-1)
-        owner = wp.int32(-1)
-        faces = wp.int32(0)
-        on = wp.int32(0)
-        for k in range(first, end):
-            f = number(near, k)
-            s = stencil(stencils, f)
-            i = corner_of(s, p)
-            j = corner_of(s, q)
-            if i > 0 and j > 0:
-                here = number(codes, f) == edge_between(i, j)
-                if faces == 0:
-                    lowest = f
-                if faces == 0 or (here and on == 0):
-                    owner = f
-                faces += 1
-                on += wp.where(here, 1, 0)
-        return owner, faces, on, lowest
-
-    @wp.func
-    def at_vertex(
-        stencils: wp.array(dtype=wp.vec4i),
-        codes: wp.array(dtype=wp.int32),
-        near: wp.array(dtype=wp.int32),
-        first: int,
-        end: int,
-        p: int,
-    ):
-        owner = wp.int32(-1)
-        faces = wp.int32(0)
-        on = wp.int32(0)
-        for k in range(first, end):
-            f = number(near, k)
-            i = corner_of(stencil(stencils, f), p)
-            if i > 0:
-                here = number(codes, f) == CORNER + i - 1
-                if faces == 0 or (here and on == 0):
-                    owner = f
-                faces += 1
-                on += wp.where(here, 1, 0)
-        return owner, faces, on
-
-    return at_edge, at_vertex
+    lowest = wp.int32(-1)
+    owner = wp.int32(-1)
+    faces = wp.int32(0)
+    on = wp.int32(0)
+    for k in range(first, end):
+        f = _number(near, k)
+        s = _stencil(stencils, f)
+        i = corner_of(s, p)
+        j = corner_of(s, q)
+        if i > 0 and j > 0:
+            here = _number(codes, f) == place_between(i, j)
+            if faces == 0:
+                lowest = f
+            if faces == 0 or (here and on == 0):
+                owner = f
+            faces += 1
+            on += wp.where(here, 1, 0)
+    return owner, faces, on, lowest
 
 
 @cache
@@ -390,7 +357,7 @@ def set_shares(contacts: Contacts, first: int, count: int, extra: int, extras: i
 def lowest_gap(dtype, of_vertex: bool):
     """Device function (stencil, n, b, c, d, goal, move) → a lower bound of the gap; b, c and d are relative to vertex 0.
 
-    It is the less of the gaps along n there and, if given, at goal + move, where the pair may have passed through.
+    It is the gap along n there or, if less and given, at goal + move, where the pair may have passed through.
     """
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
@@ -420,7 +387,7 @@ def find_near_faces(dtype):
     """
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
-    lowest, stencil = lowest_gap(dtype, True), load(wp.vec4i)
+    lowest = lowest_gap(dtype, True)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_each_near_face(
@@ -439,7 +406,7 @@ def find_near_faces(dtype):
         contacts: Contacts,
     ):
         for e in range(wp.tid(), wp.min(lists.counts[0], lists.stencils.shape[0]), lists.threads):
-            s = stencil(lists.stencils, e)
+            s = _stencil(lists.stencils, e)
             v = s[0]
             found = NONE
             r = laws.distance[wp.where(has_obstacle(lists.layout, s), 1, 0)]
@@ -468,59 +435,25 @@ def find_vertex_contacts(dtype):
     """
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
-    (at_edge, at_vertex), put = counts_of(dtype), put_contact(dtype)
-    stencil, number = load(wp.vec4i), load(wp.int32)
+    points, put = wp.array(dtype=vec3), put_contact(dtype)
 
     @wp.func
-    def multiplicity_of_edge(
-        stencils: wp.array(dtype=wp.vec4i),
-        codes: wp.array(dtype=wp.int32),
-        near: wp.array(dtype=wp.int32),
-        first: int,
-        end: int,
-        p: int,
-        q: int,
-        P: wp.vec3d,
-        Q: wp.vec3d,
+    def edges_at(
+        stencils: Stencils, codes: Numbers, near: Numbers, first: int, end: int, p: int, a: wp.vec3d, x: points, d: points
     ):
-        """m of the edge pq, and the owner of its term."""
-        owner, faces, m, _lowest = at_edge(stencils, codes, near, first, end, p, q)
-        if along(P, Q) > ZERO and along(Q, P) > ZERO:
-            m -= faces - 1
-        return m, owner
-
-    @wp.func
-    def multiplicity_of_vertex(
-        stencils: wp.array(dtype=wp.vec4i),
-        codes: wp.array(dtype=wp.int32),
-        near: wp.array(dtype=wp.int32),
-        first: int,
-        end: int,
-        p: int,
-        a: wp.vec3d,
-        x: wp.array(dtype=vec3),
-        correction: wp.array(dtype=vec3),
-        e: int,
-    ):
-        """m of the vertex p, and the owner of its term; only if that is e."""
-        owner, faces, m = at_vertex(stencils, codes, near, first, end, p)
+        """The number of edges of near faces at the vertex p; those with p nearest to a count once for each of their faces."""
         edges = wp.int32(0)
-        if owner == e:
-            P = at(x, correction, p) - a
-            for k in range(first, end):
-                f = number(near, k)
-                s = stencil(stencils, f)
-                i = corner_of(s, p)
-                if i > 0:
-                    for j in range(1, 4):
-                        if j != i:
-                            _owner, count, _on, lowest = at_edge(stencils, codes, near, first, end, p, s[j])
-                            if lowest == f:
-                                edges += 1
-                                if along(P, at(x, correction, s[j]) - a) <= ZERO:
-                                    m -= count - 1
-            m += 1 + faces - edges
-        return m, owner
+        P = at(x, d, p) - a
+        for k in range(first, end):
+            f = _number(near, k)
+            s = _stencil(stencils, f)
+            i = corner_of(s, p)
+            for j in range(1, 4):
+                if i > 0 and j != i:
+                    _owner, count, _on, lowest = count_faces(stencils, codes, near, first, end, p, s[j])
+                    if lowest == f:
+                        edges += wp.where(along(P, at(x, d, s[j]) - a) <= ZERO, count, 1)
+        return edges
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_contacts_of_vertex(
@@ -547,7 +480,7 @@ def find_vertex_contacts(dtype):
                 continue
             near = wp.int32(0)
             for e in range(first, end):
-                if number(contacts.code, e) != NONE:
+                if _number(contacts.code, e) != NONE:
                     contacts.near[first + near] = e
                     near += 1
             if near == 0:
@@ -557,9 +490,9 @@ def find_vertex_contacts(dtype):
             end = first + near
             extras = wp.int32(0)
             for k in range(first, end):
-                e = number(contacts.near, k)
-                code = number(contacts.code, e)
-                s = stencil(lists.stencils, e)
+                e = _number(contacts.near, k)
+                code = _number(contacts.code, e)
+                s = _stencil(lists.stencils, e)
                 r = laws.distance[0]
                 kA = SIDE * laws.stiffness[0] * areas.of_vertices[v]
                 if has_obstacle(lists.layout, s):
@@ -582,7 +515,9 @@ def find_vertex_contacts(dtype):
                     j = wp.where(i == 3, 1, i + 1)
                     P = corners[i - 1]
                     Q = corners[j - 1]
-                    m, owner = multiplicity_of_edge(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[j], P, Q)
+                    owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[j])
+                    if along(P, Q) > ZERO and along(Q, P) > ZERO:
+                        m -= faces - 1
                     if owner == e and m != 0:
                         t = along(P, Q) / (along(P, Q) + along(Q, P))
                         y = (t - ONE) * P - t * Q
@@ -590,16 +525,17 @@ def find_vertex_contacts(dtype):
                             w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                             w4[i] = t - ONE
                             w4[j] = -t
-                            slot = wp.where(code == edge_between(i, j), e, extra + extras)
+                            slot = wp.where(code == place_between(i, j), e, extra + extras)
                             extras += wp.where(slot == e, 0, 1)
                             put(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
-                    m, owner = multiplicity_of_vertex(
-                        lists.stencils, contacts.code, contacts.near, first, end, s[i], a, x, correction, e
-                    )
+                    owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[i])
+                    if owner == e:
+                        m += 1 + faces
+                        m -= edges_at(lists.stencils, contacts.code, contacts.near, first, end, s[i], a, x, correction)
                     if owner == e and m != 0 and (distant or wp.length(P) < r):
                         w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                         w4[i] = -ONE
-                        slot = wp.where(code == CORNER + i - 1, e, extra + extras)
+                        slot = wp.where(code == place_between(i, i), e, extra + extras)
                         extras += wp.where(slot == e, 0, 1)
                         put(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
             if extras > 0:
@@ -623,9 +559,7 @@ def find_edge_contacts(dtype):
     """Kernel over pairs of edges: their contacts, as :func:`find_vertex_contacts`."""
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
-
     put, lowest = put_contact(dtype), lowest_gap(dtype, False)
-    stencil = load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_contact_of_edges(
@@ -647,24 +581,22 @@ def find_edge_contacts(dtype):
         end = wp.min(lists.counts[0] + lists.counts[1], lists.stencils.shape[0])
         for e in range(lists.counts[0] + wp.tid(), end, lists.threads):
             contacts.code[e] = TWO_EDGES
-            s = stencil(lists.stencils, e)
+            s = _stencil(lists.stencils, e)
             law = wp.where(has_obstacle(lists.layout, s), 1, 0)
             if lists.distances[e] != dtype(laws.distance[law]):
                 continue
             r = CLOSE * laws.distance[law]
             a = at(x, correction, s[0])
-            zero = wp.vec3d()
             b = at(x, correction, s[1]) - a
             c = at(x, correction, s[2]) - a
             d = at(x, correction, s[3]) - a
             if lowest(s, normals[e], b, c, d, goal, move) >= r:
                 continue
-            u, t, factor = on_two_edges(zero, b, c, d)
+            u, t, ratio = on_two_edges(wp.vec3d(), b, c, d)
             y = u * b - (c + t * (d - c))
-            if not goal and factor * wp.length(y) >= r:
+            if not goal and ratio * wp.length(y) >= r:
                 continue
-            ratio = factor
-            factor /= CLOSE
+            factor = ratio / CLOSE
             A = HALF_PI * width_of(areas, lists.layout, laws, s[0], s[1]) * width_of(areas, lists.layout, laws, s[2], s[3])
             w = wp.vec4d(ONE - u, u, t - ONE, -t)
             put(e, s, w, y, laws.distance[law] / factor, factor * factor * laws.stiffness[law] * A, x, pairs, contacts)

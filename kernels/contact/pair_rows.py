@@ -1,9 +1,8 @@
 """Factories of the constraint rows of pairs, for each :class:`.pair_sums.PairTerm`.
 
-Each copy has rows for all pairs of the list. Rows of pairs of other copies, or of pairs without a force, are inactive, see
-:mod:`..constraint_rows`. Pairs of a term with one row have a second one with ``curved``, which adds the stiffness −λC″.
-
-λ is found anew from the positions, as −C/α and the ``fixed`` force, for pairs may have other slots than in the last rows.
+Each copy has rows for all pairs of the list. Those of pairs of other copies, or without a force, are inactive, see
+:mod:`..constraint_rows`. With ``curved``, pairs of a term with one row have a second one, which adds the stiffness −λC″. λ is
+found anew, as −C/α and the ``fixed`` force, for pairs may have other slots than in the last rows.
 """
 
 from functools import cache
@@ -17,8 +16,7 @@ from .pair_sums import PairTerm
 from .self_gaps import ONE, ZERO
 from .self_pairs import near_pairs
 
-# The compliance of a row whose force is given.
-FIXED = wp.constant(wp.float64(1e20))
+FIXED = wp.constant(wp.float64(1e20))  # compliance of a row whose force is given
 
 
 @wp.struct
@@ -61,7 +59,7 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
         rows: row_values(dtype),
     ):
         copy, e = wp.tid()
-        own = pairs.stencils[e][0] // per_copy == copy
+        s = pairs.stencils[e]
         start = row_of_pair(copy, e, layout, Q)
         for j in range(Q):
             rows.multipliers[start + j] = dtype(0.0)
@@ -71,12 +69,11 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
             rows.residual[start + j] = ZERO
             rows.rounding[start + j] = ZERO
             rows.carried[start + j] = ZERO
-        if not own:
+        if s[0] // per_copy != copy:
             return
         slopes.first[e] = wp.vec3d()
         slopes.second[e] = wp.vec3d()
         found = row_of(pairs, data, e, x, d)
-        s = pairs.stencils[e]
         moved = ZERO
         most = ZERO
         size = found.size
@@ -95,9 +92,7 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
         slopes.second[e] = found.second
         for j in range(Q):
             row = start + j
-            square = wp.length_sq(found.first)
-            if j == 1:
-                square = wp.length_sq(found.second)
+            square = wp.length_sq(wp.where(j == 1, found.second, found.first))
             total = square * moved
             if wp.static(curved) and j == 1:
                 rows.inverse[row] = dtype(ONE / (total + ONE))
@@ -187,6 +182,6 @@ def gather_pair_rows(dtype, two: bool):
                 if wp.static(two):
                     pull += wp.float64(rows[row + 1]) * slopes.second[e]
                 total += slopes.weights[e][pairs.corners[k] - 4 * e] * pull
-        out[i] = out[i] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+        out[i] = out[i] + vec3(total)
 
     return gather_of_pairs

@@ -2,9 +2,8 @@
 
 The energy of a pair is a function of y = Σ wᵢxᵢ, so vertex i gets wᵢ ∂U/∂y, and wᵢwⱼ ∂²U/∂y² joins vertices i and j. A
 :class:`PairTerm` finds these in :class:`PairForces`. Kernels gather, with a thread for each vertex, which adds up its pairs in
-order, in float64. For the CPU they scatter: one thread takes the pairs with a force in order and adds to the vertices of each.
-So they need no list of the pairs of a vertex, and products with the Hessian find Σ wⱼpⱼ of each pair once. Both agree up to
-rounding.
+order, in float64. For the CPU they scatter: one thread takes the pairs with a force in order, so that no list of the pairs of a
+vertex is needed, and products with the Hessian find Σ wⱼpⱼ of each pair once. Both agree up to rounding.
 """
 
 from collections.abc import Callable
@@ -54,6 +53,15 @@ def note_pressing(forces: PairForces, e: int, s: wp.vec4i):
             forces.joining[wp.atomic_add(forces.count, 1, 1)] = e
 
 
+@wp.func
+def block_of(forces: PairForces, e: int):
+    """∂²U/∂y² of a pair with a force."""
+    block = forces.bend[e][0] * wp.outer(forces.along[e], forces.along[e])
+    if forces.bend[e][1] > ZERO:
+        block += forces.bend[e][1] * wp.outer(forces.across[e], forces.across[e])
+    return block
+
+
 @cache
 def pair_blocks(dtype):
     """Struct of what products of each pair read, in the precision of the matrix: w, 0 at pins, and ∂²U/∂y² [N/m]."""
@@ -74,7 +82,7 @@ class PairTerm:
     Attributes:
         name: Its name in reports.
         module: Name of the Warp module of its kernels, without the precision.
-        rows: The number of its constraint rows, 1 or 2.
+        rows: The number of its constraint rows.
         data: Warp struct of what the step holds of each pair, among it its normal n.
         near: Function of a precision, which makes the device function (pairs, data, e, x, d, always) → whether pair e may
             have a force at x + d, v, n and w, for a sweep; n is a unit vector. v is the y of friction, and the gap along n of
@@ -125,27 +133,19 @@ def taken_by(dtype, scatters: bool):
 
     @wp.func
     def range_of(pairs: near_pairs(dtype), forces: PairForces, thread: int):
-        first = wp.int32(0)
-        end = wp.int32(0)
         if wp.static(scatters):
-            end = forces.count[0]
+            return wp.int32(0), forces.count[0]
         else:
-            first = pairs.first[thread]
-            end = pairs.first[thread + 1]
-        return first, end
+            return pairs.first[thread], pairs.first[thread + 1]
 
     @wp.func
     def corners_at(pairs: near_pairs(dtype), forces: PairForces, k: int):
-        e = wp.int32(0)
-        i = wp.int32(0)
-        end = wp.int32(4)
         if wp.static(scatters):
-            e = forces.pressing[k]
+            return forces.pressing[k], wp.int32(0), wp.int32(4)
         else:
             e = pairs.corners[k] // 4
             i = pairs.corners[k] - 4 * e
-            end = i + wp.where(wp.max(forces.bend[e]) > ZERO, 1, 0)
-        return e, i, end
+            return e, i, i + wp.where(wp.max(forces.bend[e]) > ZERO, 1, 0)
 
     return range_of, corners_at
 
@@ -176,10 +176,10 @@ def pair_forces(term: PairTerm, dtype, scatters: bool):
             for i in range(corner, end_corner):
                 force = w[i] * whole
                 if wp.static(scatters):
-                    out[s[i]] = out[s[i]] + vec3(dtype(force[0]), dtype(force[1]), dtype(force[2]))
+                    out[s[i]] = out[s[i]] + vec3(force)
                 total += force
         if wp.static(not scatters):
-            out[v] = out[v] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+            out[v] = out[v] + vec3(total)
 
     return add_forces_of_pairs
 
@@ -229,11 +229,8 @@ def set_pair_blocks(term: PairTerm, dtype):
             return
         e = pairs.acting[t]
         block = wp.mat33d()
-        bend = forces.bend[e]
-        if wp.max(bend) > ZERO:
-            block = bend[0] * wp.outer(forces.along[e], forces.along[e])
-            if bend[1] > ZERO:
-                block += bend[1] * wp.outer(forces.across[e], forces.across[e])
+        if wp.max(forces.bend[e]) > ZERO:
+            block = block_of(forces, e)
             s = pairs.stencils[e]
             w = forces.weights[e]
             for i in range(4):
@@ -269,9 +266,7 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
             e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
             w = forces.weights[e]
-            block = forces.bend[e][0] * wp.outer(forces.along[e], forces.along[e])
-            if forces.bend[e][1] > ZERO:
-                block += forces.bend[e][1] * wp.outer(forces.across[e], forces.across[e])
+            block = block_of(forces, e)
             for i in range(corner, end_corner):
                 if inverse_mass[s[i]] > dtype(0.0):
                     if wp.static(scatters):
@@ -335,9 +330,9 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
                         if bend[1] > ZERO:
                             pull += w[i] * bend[1] * (whole_across - across[i]) * u
                         if wp.static(scatters):
-                            q[s[i]] = q[s[i]] + vec3(dtype(pull[0]), dtype(pull[1]), dtype(pull[2]))
+                            q[s[i]] = q[s[i]] + vec3(pull)
                         total += pull
         if wp.static(not scatters):
-            q[v] = q[v] + vec3(dtype(total[0]), dtype(total[1]), dtype(total[2]))
+            q[v] = q[v] + vec3(total)
 
     return add_products_of_pairs

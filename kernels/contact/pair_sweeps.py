@@ -123,7 +123,7 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
                     if held:
                         move -= forces.weights[e][i] * before
                     move = moved(inverse_mass, s[i], move)
-                    correction[s[i]] = correction[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+                    correction[s[i]] = correction[s[i]] + vec3(move)
                 if multipliers:
                     multipliers[e] = after
                     forces.weights[e] = w
@@ -133,7 +133,7 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
 
 @cache
 def number_corners(dtype):
-    """Kernel over entries of ``corners``: stores the index of each corner in ``slots``."""
+    """Kernel over entries of ``corners``: the index of each corner."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def number_each_corner(
@@ -185,8 +185,7 @@ def touch_pairs(term: PairTerm, dtype):
             for i in range(4):
                 again = wp.bool(False)  # as for obstacles, which the stencil has not
                 for j in range(i):
-                    if s[j] == s[i]:
-                        again = True
+                    again = again or s[j] == s[i]
                 if not again:
                     wp.atomic_add(swept.touching, s[i], 1)
 
@@ -276,7 +275,6 @@ def move_by_pairs(dtype, axes: bool):
         total = wp.vec3d()
         for k in range(pairs.first[i], pairs.first[i + 1]):
             total += swept.moves[k]
-        move = moved(inverse_mass, i, total)
-        correction[i] = correction[i] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+        correction[i] = correction[i] + vec3(moved(inverse_mass, i, total))
 
     return move_each_by_pairs

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
-from .obstacles import Layout, copy_of
+from .obstacles import Layout, copy_of, vector_within
 from .proximity_grid import MODULE
 
 SAMPLES = wp.constant(9)  # vertices whose median motion is that of a piece
@@ -16,10 +16,10 @@ SAMPLES = wp.constant(9)  # vertices whose median motion is that of a piece
 def pieces(dtype):
     """Struct of the connected pieces of all copies: the piece of each vertex, or −1, and the drift of each piece [m].
 
-    The drift is its motion: along each axis the median of that of SAMPLES of its vertices, ``samples`` (pieces·SAMPLES,). A
-    part that moves alone, such as a fold that rolls, hardly changes it. If a copy has more than one piece (``per_copy``), each
-    also has a box, and the largest motion of its vertices relative to the drift [m]. Its first ones are those of the ``cloth``,
-    which meet one another if that meets ``itself``, and the others are meshes.
+    The drift is its motion: along each axis the median of that of its ``samples`` (pieces·SAMPLES,). A part that moves alone,
+    such as a fold that rolls, hardly changes it. If a copy has more than one piece (``per_copy``), each also has a box, and the
+    largest motion of its vertices relative to the drift [m]. The first are those of the ``cloth``, which meet one another if it
+    meets ``itself``, and the others are meshes.
     """
     vec3, _ = types(dtype)
 
@@ -69,35 +69,42 @@ def note_moved(
     some: wp.array(dtype=wp.int32),
     due: wp.array(dtype=wp.int32),
 ):
-    found = wp.bool(True)
     if active:
-        found = active[copy] != 0
-    if found:
-        moved[copy] = 1
-        some[0] = 1
-        due[0] = 1
+        if active[copy] == 0:
+            return
+    moved[copy] = 1
+    some[0] = 1
+    due[0] = 1
 
 
 @cache
-def take_moved(dtype):
-    """Kernel over vertices: out = x in copies that have ``moved``."""
+def add_positions(dtype):
+    """Kernel over vertices: out = a + sign·b in the copies that are ``active``, or in all; b may be None, or end before a."""
     vec3, _ = types(dtype)
+    vector_or_zero = vector_within(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
-    def take_each_moved(
+    def add_each_position(
         # state in
-        x: wp.array(dtype=vec3),
-        moved: wp.array(dtype=wp.int32),
+        a: wp.array(dtype=vec3),
+        b: wp.array(dtype=vec3),
         # parameters
+        sign: dtype,
+        active: wp.array(dtype=wp.int32),
         layout: Layout,
         # out
         out: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        if moved[copy_of(layout, i)] != 0:
-            out[i] = x[i]
+        if active:
+            if active[copy_of(layout, i)] == 0:
+                return
+        found = a[i]
+        if b:
+            found = found + sign * vector_or_zero(b, i)
+        out[i] = found
 
-    return take_each_moved
+    return add_each_position
 
 
 @cache
@@ -140,8 +147,8 @@ def find_drift(dtype):
 def find_motion(dtype):
     """Kernel over vertices: finds copies in which a vertex has moved by more than ``most`` since ``found``.
 
-    The motion is relative to the drift of the piece. moved = 1 for such copies, among the ``active`` ones if given;
-    some = 1 if there is one; due = 1 then, and if the pairs were not listed at ``found``.
+    The motion is relative to the drift of the piece. moved = 1 for such copies among the ``active`` ones, and some = 1 if there
+    is one; due = 1 then, and if the pairs were not listed at ``found``.
     """
     vec3, _ = types(dtype)
 

@@ -17,8 +17,7 @@ MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 def pair_lists(dtype):
     """Struct of the pairs: ``counts`` (2,) of those found, and unordered (row, item) of those within the capacity.
 
-    Rows are vertices, then edges. Row i has the items from ``first`` [i] on, sorted. ``row_counts`` is scratch, and 0 between
-    launches.
+    Rows are vertices, then edges. Row i has the items from ``first`` [i] on, sorted. ``row_counts`` is 0 between launches.
     """
 
     @wp.struct
@@ -36,18 +35,14 @@ def pair_lists(dtype):
 
 @cache
 def closest_points(dtype, of_edges: bool):
-    """Device function (x₀, x₁, x₂, x₃) → (w, y): y = Σ wᵢ xᵢ is the shortest vector between two primitives.
-
-    It goes from triangle x₁ x₂ x₃ to vertex x₀, or from edge x₂ x₃ to edge x₀ x₁.
-    """
+    """Device function (x₀, x₁, x₂, x₃) → the shortest vector from triangle x₁ x₂ x₃ to vertex x₀, or edge x₂ x₃ to x₀ x₁."""
     vec3, mat33 = types(dtype)
-    vec4 = wp.types.vector(4, dtype)
     from_triangle = nearest_on_triangle(dtype)
     zero, one = dtype(0.0), dtype(1.0)
 
     @wp.func
     def on_segment(along: dtype, squared: dtype):
-        """The parameter of the nearest point of a segment; 0 for a segment without length."""
+        """The parameter of the nearest point of a segment, 0 without length."""
         return wp.where(squared > zero, wp.clamp(along / squared, zero, one), zero)
 
     @wp.func
@@ -67,22 +62,19 @@ def closest_points(dtype, of_edges: bool):
             s = wp.clamp((ef * fr - er * ff) / det, zero, one)
         t = on_segment(ef * s + fr, ff)
         s = on_segment(ef * t - er, ee)
-        return vec4(one - s, s, t - one, -t), r + s * e - t * f
+        return r + s * e - t * f
 
     @wp.func
     def of_vertex(p: vec3, a: vec3, b: vec3, c: vec3):
-        d, away, w = from_triangle(p, mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]))
-        return vec4(one, -w[0], -w[1], -w[2]), d * away
+        d, away = from_triangle(p, mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]))
+        return d * away
 
     return of_two_edges if of_edges else of_vertex
 
 
 @cache
 def cutoffs(dtype, of_edges: bool):
-    """Device function (surface, stencil) → contact distance of a pair [m].
-
-    For two elements of one piece, it is at most half the rest distance.
-    """
+    """Device function (surface, stencil) → contact distance of a pair [m], in one piece at most half the rest distance."""
     closest = closest_points(dtype, of_edges)
 
     @wp.func
@@ -96,7 +88,7 @@ def cutoffs(dtype, of_edges: bool):
             if not (wp.length(surface.rest[a] - surface.rest[d]) > surface.far):
                 b = in_copy(surface.layout, s[1])
                 c = in_copy(surface.layout, s[2])
-                _w, y = closest(surface.rest[a], surface.rest[b], surface.rest[c], surface.rest[d])
+                y = closest(surface.rest[a], surface.rest[b], surface.rest[c], surface.rest[d])
                 found = wp.min(found, dtype(0.5) * wp.length(y))
         return found
 
@@ -113,8 +105,7 @@ def take_near(dtype, of_edges: bool):
 
     @wp.func
     def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, pairs: pair_list):
-        _w, y = closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
-        d = wp.length(y)
+        d = wp.length(closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3])))
         if d < surface.max_distance + surface.skin:
             if d < surface.skin or d < surface.skin + cutoff(surface, s):
                 if pairs.counts[KIND] < MOST:
@@ -138,13 +129,12 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
 
     ``take`` (dtype, of_edges) returns a device function (surface, x, s, i, k, triangles, out) and the struct of ``out``. s is
     the stencil of a pair, i its vertex or edge, and k its triangle or other edge. The boxes are at x, or along moves ``p`` from
-    there, of the cloth or of all vertices. A box meets those of its own level and those above, but
-    that of a vertex that moves meets those of all levels, for it may be larger than theirs. The rows of cells near each
-    vertex or edge are divided among ``shares`` threads, the second dimension of the launch. Where there are more rows than
-    buckets, as for a move that is much longer than the boxes of a level, it goes through the buckets instead.
+    there, of the cloth or of all vertices. A box meets those of its own level and those above, but that of a vertex that moves
+    meets those of all levels, for it may be larger. The rows of cells near each vertex or edge are divided among ``shares``
+    threads. Where there are more rows than buckets, as for long moves, it goes through the buckets instead.
 
-    Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices. The distance
-    of two edges is always computed in the order of their indices.
+    Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices, which is also
+    the order in the stencil.
     """
     vec3, _ = types(dtype)
     box_along, level_of, cell_at, cells_about = boxes(dtype)

@@ -26,9 +26,9 @@ def surfaces(dtype):
 
     ``rest`` is the rest position of each vertex of a copy [m], and ``piece`` its connected piece, −1 without an element.
     ``groups`` of items and ``vertex_groups`` say which elements meet, and ``itself`` whether cloth meets cloth. ``distance`` is
-    the contact distance of cloth with cloth, ``of_meshes`` that with meshes, ``max_distance`` the larger one, and ``skin`` the
-    skin [m]. Elements whose first vertices are more than ``far`` apart at rest are surely at least twice the contact distance
-    apart [m]. ``lowest`` and ``highest`` are the corners of a box of the cloth of each copy; without obstacles they are empty.
+    the contact distance of cloth with cloth, ``of_meshes`` that with meshes, and ``max_distance`` the larger one [m]. Elements
+    whose first vertices are more than ``far`` apart at rest are surely at least twice the contact distance apart [m].
+    ``lowest`` and ``highest`` are corners of a box of the cloth of each copy; without obstacles they are empty.
     """
     vec3, _ = types(dtype)
 
@@ -57,8 +57,8 @@ def grids(dtype):
     """Struct of the grid: ``size``, the half size of the largest boxes of level 0 [m], and 2ᵏ buckets of entries.
 
     Bucket b has the entries first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell, see
-    :func:`code_of`. ``counts`` and ``keys`` are scratch. ``levels`` (4,) has a bit for each level with triangles of the cloth,
-    with edges of it, with triangles of obstacles, and with edges of them.
+    :func:`code_of`. ``counts`` and ``keys`` are scratch. ``levels`` (4,) has a bit for each level with items of each
+    :func:`kind_in_grid`.
     """
     vec3, _ = types(dtype)
 
@@ -97,9 +97,7 @@ def boxes(dtype):
     @wp.func
     def box_along(surface: surfaces(dtype), x: wp.array(dtype=vec3), p: wp.array(dtype=vec3), i: int, j: int, k: int):
         """The box of three vertices that move from x to x + p, or that stay, if p is None."""
-        a = corner(x, i)
-        b = corner(x, j)
-        c = corner(x, k)
+        a, b, c = corner(x, i), corner(x, j), corner(x, k)
         low, high = box_of(surface, a, b, c)
         if p:
             l, h = box_of(surface, a + vector_or_zero(p, i), b + vector_or_zero(p, j), c + vector_or_zero(p, k))
@@ -130,22 +128,18 @@ def boxes(dtype):
     @wp.func
     def cell_at(size: dtype, low: vec3, high: vec3, level: int):
         """The cell of the centre of a box."""
-        found = wp.vec3i()
         if level < LEVELS:
-            found = cell_of(size * dtype(1 << level), half * (low + high))
-        return found
+            return cell_of(size * dtype(1 << level), half * (low + high))
+        return wp.vec3i()
 
     @wp.func
     def cells_about(size: dtype, low: vec3, high: vec3, level: int):
         """The first and last cells of a level that can contain the centres of boxes that meet a box."""
-        first = wp.vec3i()
-        last = wp.vec3i()
         if level < LEVELS:
             most = size * dtype(1 << level)
             edge = vec3(most, most, most)
-            first = cell_of(most, low - edge)
-            last = cell_of(most, high + edge)
-        return first, last
+            return cell_of(most, low - edge), cell_of(most, high + edge)
+        return wp.vec3i(), wp.vec3i()
 
     return box_along, level_of, cell_at, cells_about
 

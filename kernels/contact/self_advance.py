@@ -36,25 +36,17 @@ def advances(dtype):
 def allowed_fraction(dtype, of_edges: bool):
     """Device function (stencil, x, advance) → the fraction of its moves that a pair may make.
 
-    A pair keeps a tenth of its gap. Where all vertices move by the same fraction, a plane between the two sides may move with
-    them: the two sides stay apart along y while no vertex of one side comes near the height of one of the other. Where this
-    allows less than the direction, as for cloth that slides over an edge, :func:`.self_planes.part_apart` may allow more.
+    A pair keeps a tenth of its gap. Where all vertices move by the same fraction, a plane between the sides may move with them:
+    they stay apart along y while no vertex of one side comes near the height of one of the other. Where this allows less than
+    the direction, as for cloth that slides over an edge, :func:`.self_planes.part_apart` may allow more.
     """
     vec3, _ = types(dtype)
-    ulp, vector_or_zero, advance, sides = (
-        ulp_of(dtype),
-        vector_within(dtype),
-        advances(dtype),
-        wp.constant(2 if of_edges else 1),
-    )
-    of_vertex = wp.constant(not of_edges)
+    ulp, vector_or_zero, advance = ulp_of(dtype), vector_within(dtype), advances(dtype)
+    of_vertex, sides = wp.constant(not of_edges), wp.constant(2 if of_edges else 1)
 
     @wp.func
     def allowed(s: wp.vec4i, x: wp.array(dtype=vec3), out: advance):
-        a = wp.vec3d(x[s[0]])
-        b = wp.vec3d(x[s[1]])
-        c = wp.vec3d(x[s[2]])
-        d = wp.vec3d(x[s[3]])
+        a, b, c, d = wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]])
         pa = wp.vec3d(vector_or_zero(out.direction, s[0]))
         pb = wp.vec3d(vector_or_zero(out.direction, s[1]))
         pc = wp.vec3d(vector_or_zero(out.direction, s[2]))
@@ -72,7 +64,9 @@ def allowed_fraction(dtype, of_edges: bool):
         t = ONE
         for p in range(sides):
             for q in range(sides, 4):
-                approach = wp.dot(n, wp.vec3d(vector_or_zero(out.direction, s[q])) - wp.vec3d(vector_or_zero(out.direction, s[p])))
+                approach = wp.dot(
+                    n, wp.vec3d(vector_or_zero(out.direction, s[q])) - wp.vec3d(vector_or_zero(out.direction, s[p]))
+                )
                 if approach > ZERO:
                     apart = wp.dot(n, wp.vec3d(x[s[p]]) - wp.vec3d(x[s[q]])) - floor
                     t = wp.min(t, wp.max(apart, ZERO) / approach)

@@ -16,7 +16,7 @@ from ..terms import contact
 from ..vectors import types
 from .pair_potential import ENDING, STARTING, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
-from .self_gaps import ONE, SIDE, ZERO, perpendicular, vertex_of
+from .self_gaps import ONE, SIDE, ZERO, farthest_of, perpendicular, vertex_of
 from .self_pairs import MODULE, module_of, near_pairs
 from .self_planes import margin_of, ulp_of
 
@@ -31,14 +31,11 @@ ALL = wp.constant(wp.vec4d(1.0, 1.0, 1.0, 1.0))
 def least_gap(dtype):
     """Device function (stencil, x, least) → the least gap f [m] that the filter leaves a pair at x: twice its margin."""
     vec3, _ = types(dtype)
-    ulp = ulp_of(dtype)
+    ulp, farthest = ulp_of(dtype), farthest_of(dtype)
 
     @wp.func
     def least_gap_of(s: wp.vec4i, x: wp.array(dtype=vec3), least: wp.float64):
-        far = ZERO
-        for i in range(4):
-            far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
-        return wp.float64(2.0) * margin_of(least, ulp * far)
+        return wp.float64(2.0) * margin_of(least, ulp * farthest(s, x))
 
     return least_gap_of
 
@@ -47,9 +44,9 @@ def least_gap(dtype):
 def find_forces(dtype, bounded: bool):
     """Kernel over contacts: their forces; φ = ½(r − d)² if ``bounded``.
 
-    If ``least`` [m], the least gap of the filter, is above 0, ψ is added to φ. It begins at d = 2f, where it is C², or at r if
-    that is less, as far from the origin. Without ψ, cloth would be pressed to f, where one pair stops the whole copy. The
-    Hessian of a negative contact is negative along n, which is left out. Half of that across n, U′/d, stays.
+    If ``least`` [m], the least gap f of the filter, is above 0, ψ is added to φ, from d = 2f on, where it is C², or from r if
+    that is less. Without ψ, cloth would be pressed to f, where one pair stops the whole copy. The Hessian of a negative contact
+    is negative along n, which is left out. Half of that across n, U′/d, stays.
     """
     vec3, _ = types(dtype)
     least_gap_of = least_gap(dtype)
@@ -144,9 +141,7 @@ def near_contact(dtype):
     ):
         gap = gap_along_normal(pairs, contacts, e, x, correction)
         n = contacts.normal[e]
-        touches = always or gap < contacts.distance[e]
-        if contacts.followed.mode[0] == STARTING:
-            touches = True
+        touches = always or gap < contacts.distance[e] or contacts.followed.mode[0] == STARTING
         return touches, gap * n, n, contacts.weights[e]
 
     return near_of
@@ -156,8 +151,7 @@ def near_contact(dtype):
 def push_contact(dtype):
     """The ``push`` of contact: λ = (d* − d)/D of the gap d = v·n, with D at least ``least`` if the contact is ``hard``.
 
-    The prox is that of the share of the contact; the rest of the force, and that of a negative contact, is as where the contact
-    was found.
+    The prox is that of the share of the contact; the rest of its force, and that of a negative contact, is ``fixed``.
     """
 
     @wp.func
@@ -199,7 +193,7 @@ def push_contact(dtype):
 def row_of_contact(dtype):
     """The ``row`` of contact: C = −√(2φ(d)), as for contact with colliders. The second has the stiffness −λC″ along n.
 
-    C is that of the share of the contact; the rest of its force is ``fixed``.
+    C is that of the share of the contact; the rest is ``fixed``.
     """
     vec3, _ = types(dtype)
 

@@ -56,7 +56,7 @@ def keep_apart(dtype):
             if t < least_share[i]:
                 t = ZERO
             end = wp.vec3d(x_ref[i]) + u + t * move
-            x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
+            x[i] = vec3(end)
             if share[i] >= far:
                 wp.atomic_add(cuts, copy, 1)
         else:
@@ -76,9 +76,9 @@ def another_round(
     walk: wp.array(dtype=wp.int32),
     proceed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: ``walk`` is 1 if a copy makes another round, of at most ``most``.
+    """Kernel over copies: ``walk`` is 1 if a copy makes another round, of at most ``most``, and ``proceed`` if any does.
 
-    It does so while the bound of the list cuts the move of a vertex. ``proceed`` is 1 if any copy makes another round.
+    It does so while the bound of the list cuts the move of a vertex.
     """
     c = wp.tid()
     rounds[c] = rounds[c] + 1
@@ -108,9 +108,8 @@ def walk_where_blocked(
 class HeldPins:
     """The prescribed moves that the filter has shortened, (copies,).
 
-    ``first`` is FIRST − (step·n + vertex), with n vertices a copy, for the first step in which a pinned coordinate was held
-    back, and the first such vertex. It is 0 if there was none. ``farthest`` is the largest distance by which one was held back
-    [m].
+    ``first`` is FIRST − (step·n + vertex), with n vertices a copy, for the first step and vertex with a pinned coordinate that
+    was held back, or 0. ``farthest`` is the largest distance by which one was held back [m].
     """
 
     first: wp.array(dtype=wp.int64)
@@ -119,7 +118,7 @@ class HeldPins:
 
 @wp.func
 def note_held(held: HeldPins, steps: wp.array(dtype=wp.int32), per_copy: int, i: int, back: wp.float64):
-    """Notes that the pin i was held back by the distance ``back`` [m]; nothing if that is 0, as of a pin that stands."""
+    """Notes that the pin i was held back by the distance ``back`` [m], if that is not 0."""
     if back == ZERO:
         return
     copy = i // per_copy
@@ -153,9 +152,8 @@ def share_of_pins(dtype):
     It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If they would pass
     through one another, pins stop at the contact distance or, if that is smaller, at the gap at the start of the step. If pairs
     are ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER, or LAGGING if a vertex is
-    free, or, if it is larger, the sine of the turn of their normal. Gaps are those of :func:`turned_gap`, which do not change
-    if a pair turns as one body. On the chords of a turn by θ between two keyframes they shrink, by up to tan θ/2 times this
-    sine.
+    free, or, if larger, the sine of the turn of their normal. Gaps are those of :func:`turned_gap`, which a turn as one body
+    does not change. On the chords of a turn by θ between keyframes they shrink, by up to tan θ/2 times this sine.
     """
     vec3, _ = types(dtype)
 
@@ -186,7 +184,9 @@ def share_of_pins(dtype):
         sides = wp.where(e < pairs.counts[0], 1, 2)
         gap = step.gap[e]
         floor = wp.min(gap, wp.float64(pairs.distances[e]))
-        end, turned = turned_gap(e < pairs.counts[0], n, wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
+        end, turned = turned_gap(
+            e < pairs.counts[0], n, wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]])
+        )
         most = TOGETHER
         for i in range(4):
             if inverse_mass[s[i]] > dtype(0.0):
@@ -228,7 +228,7 @@ def hold_pins(dtype):
             move = wp.vec3d(x[i]) - wp.vec3d(x_before[i])
             end = wp.vec3d(x_before[i]) + share[i] * move
             note_held(held, steps, per_copy, i, (ONE - share[i]) * wp.length(move))
-            x[i] = vec3(dtype(end[0]), dtype(end[1]), dtype(end[2]))
+            x[i] = vec3(end)
             v[i] = dtype(share[i]) * v[i]
 
     return hold_each_pin
@@ -238,8 +238,7 @@ def hold_pins(dtype):
 def end_filter(dtype):
     """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and the change over h to v.
 
-    ``cut`` counts the free vertices that the filter moved. ``held`` notes the pins that it held back. Pins have v of their last
-    move, which took ``pin_h``.
+    ``cut`` counts the free vertices among them, and ``held`` notes pins. These have v of their last move, which took ``pin_h``.
     """
     vec3, _ = types(dtype)
 
@@ -286,10 +285,7 @@ def end_filter(dtype):
 
 @cache
 def walk_from_start(dtype):
-    """Kernel over vertices from ``first`` on: x = x_before, the start of the step, in copies with cuts since ``before``.
-
-    Those are cuts of moves by colliders.
-    """
+    """Kernel over vertices from ``first`` on: x = x_before, the start of the step, in copies that colliders cut since."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -314,9 +310,9 @@ def walk_from_start(dtype):
 
 @cache
 def find_held(dtype):
-    """Kernel over vertices: ``mobile`` is 0 for vertices that are not at their position ``outside`` of colliders, else 1/m.
+    """Kernel over vertices: ``mobile`` is 1/m, or 0 for those not at their position ``outside`` of colliders.
 
-    It sets ``within`` to 1 if there is such a vertex and fewer than ``most`` turns were made.
+    ``within`` becomes 1 if there is such a vertex and fewer than ``most`` turns were made.
     """
     vec3, _ = types(dtype)
 
@@ -335,12 +331,11 @@ def find_held(dtype):
         within: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        w = inverse_mass[i]
+        mobile[i] = inverse_mass[i]
         if wp.length_sq(outside[i] - x[i]) > dtype(0.0):
-            w = dtype(0.0)
+            mobile[i] = dtype(0.0)
             if turns[0] < most:
                 within[0] = 1
-        mobile[i] = w
 
     return find_each_held
 
@@ -385,7 +380,7 @@ def push_pairs(dtype):
                 for i in range(4):
                     if s[i] < mobile.shape[0]:
                         move = w[i] * wp.float64(mobile[s[i]]) * short / W * n
-                        p[s[i]] = p[s[i]] + vec3(dtype(move[0]), dtype(move[1]), dtype(move[2]))
+                        p[s[i]] = p[s[i]] + vec3(move)
 
     return push_each_pair
 
@@ -410,40 +405,6 @@ def scale_directions(dtype):
         p[i] = dtype(wp.where(whole and part < ONE, ZERO, part)) * p[i]
 
     return scale_each_direction
-
-
-@cache
-def turn_where_blocked(dtype):
-    """Kernel over vertices: p = target − x in copies whose ``fraction`` of p is below 1, with ``pins`` of pinned axes only."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def turn_each(
-        # state in
-        fraction: wp.array(dtype=wp.float64),
-        inverse_mass: wp.array(dtype=dtype),
-        mobility: wp.array(dtype=vec3),
-        x: wp.array(dtype=vec3),
-        target: wp.array(dtype=vec3),
-        # parameters
-        pins: bool,
-        per_copy: int,
-        # in and out
-        p: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        if fraction[i // per_copy] < ONE:
-            move = target[i] - x[i]
-            if pins:
-                free = vec3(inverse_mass[i])
-                if mobility:
-                    free = mobility[i]
-                for axis in range(3):
-                    if free[axis] > dtype(0.0):
-                        move[axis] = dtype(0.0)
-            p[i] = move
-
-    return turn_each
 
 
 @cache
@@ -503,8 +464,11 @@ def copies_in_contact(dtype):
 
 
 @cache
-def aim_back(dtype):
-    """Kernel over vertices: p = goal − d, 0 along pinned axes, which are already where they must be."""
+def aim(dtype):
+    """Kernel over vertices: p = goal − x along ``free`` axes, pinned ones, or both, else 0; where ``fraction`` (B,) is below 1.
+
+    ``fraction`` may be None.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -513,45 +477,26 @@ def aim_back(dtype):
         inverse_mass: wp.array(dtype=dtype),
         mobility: wp.array(dtype=vec3),
         goal: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        # out
+        x: wp.array(dtype=vec3),
+        # parameters
+        free: bool,
+        pinned: bool,
+        fraction: wp.array(dtype=wp.float64),
+        per_copy: int,
+        # in and out
         p: wp.array(dtype=vec3),
     ):
         i = wp.tid()
-        free = vec3(inverse_mass[i])
+        if fraction:
+            if fraction[i // per_copy] >= ONE:
+                return
+        mobile = vec3(inverse_mass[i])
         if mobility:
-            free = mobility[i]
-        move = goal[i] - d[i]
+            mobile = mobility[i]
+        move = goal[i] - x[i]
         for axis in range(3):
-            if free[axis] == dtype(0.0):
+            if not wp.where(mobile[axis] > dtype(0.0), free, pinned):
                 move[axis] = dtype(0.0)
         p[i] = move
 
     return aim_each
-
-
-@cache
-def add_positions(dtype):
-    """Kernel over vertices: out = a + sign·b in the copies that are ``active``, or in all; b is 0 beyond its end."""
-    vec3, _ = types(dtype)
-    vector_or_zero = vector_within(dtype)
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def add_each_position(
-        # state in
-        a: wp.array(dtype=vec3),
-        b: wp.array(dtype=vec3),
-        # parameters
-        sign: dtype,
-        active: wp.array(dtype=wp.int32),
-        layout: Layout,
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        if active:
-            if active[copy_of(layout, i)] == 0:
-                return
-        out[i] = a[i] + sign * vector_or_zero(b, i)
-
-    return add_each_position

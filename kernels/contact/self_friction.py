@@ -7,8 +7,8 @@ a sliding pair slides along.
 
 At the end of a step ξ rotates with the cloth, or with the mesh, and u is without what turns the gap: R of :func:`turn_of`
 moves one side by d(Rn − n) relative to the other, d the gap. That of meshes is known, so u is without it in the whole step. A
-pair takes the ξ of the contact between the same vertices, those of nonzero w, in the last step. Without one it takes the mean
-of those that the vertex had with a part of the same face, or else the mean of the contacts with a common vertex on each side.
+pair takes the ξ of the contact between the same vertices, those of nonzero w, in the last step; without one, the mean of those
+that the vertex had with a part of the same face, or else of those with a common vertex on each side.
 """
 
 from functools import cache, partial
@@ -19,7 +19,7 @@ from ..coulomb import Law
 from ..rotation import nearest_rotation
 from ..terms import contact
 from ..vectors import types
-from .obstacles import Layout, copy_of, in_copy
+from .obstacles import Layout, copy_of, in_copy, obstacle_of
 from .pair_potential import TWO_EDGES, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
 from .self_gaps import ONE, ZERO, perpendicular
@@ -59,8 +59,7 @@ def friction_module(dtype, law=None):
 def has(s: wp.vec4i, vertex: int, first: int, last: int):
     found = wp.bool(False)
     for i in range(first, last):
-        if s[i] == vertex:
-            found = True
+        found = found or s[i] == vertex
     return found
 
 
@@ -69,8 +68,7 @@ def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_la
     """Whether two sides, given by their ranges of corners, have a common vertex."""
     found = wp.bool(False)
     for i in range(s_first, s_last):
-        if s[i] >= 0 and has(q, s[i], q_first, q_last):
-            found = True
+        found = found or (s[i] >= 0 and has(q, s[i], q_first, q_last))
     return found
 
 
@@ -229,15 +227,12 @@ def begin_friction(dtype, law: Law, bounded: bool):
             k = contacts.share[e] * contacts.stiffness[e]
             if not (k > ZERO and contacts.gap[e] < contacts.distance[e]):
                 continue
-            own = wp.int32(0)
-            for i in range(4):
-                if contacts.parts[e][i] >= touching.layout.cloth:
-                    own = 1 + in_copy(touching.layout, contacts.parts[e][i]) - touching.layout.per_copy
+            parts = contacts.parts[e]
+            own = 1 + obstacle_of(touching.layout, parts)
             limit = limit_of(-slope(contacts.gap[e], contacts.distance[e]), friction[own])
             if limit == ZERO:
                 continue
             s = touching.stencils[e]
-            parts = contacts.parts[e]
             for i in range(4):
                 if (contacts.touching[e] & (1 << i)) == 0:
                     parts[i] = -1
@@ -461,11 +456,10 @@ def push_friction(dtype, law: Law):
         h: wp.float64,
         hard: bool,
     ):
-        found = wp.vec3d()
         l = wp.length(u)
         if D > ZERO and l > ZERO:
-            found = -prox(l, rubbed.limit[e], D * rubbed.stiffness[e] * h * h) / D * u
-        return found
+            return -prox(l, rubbed.limit[e], D * rubbed.stiffness[e] * h * h) / D * u
+        return wp.vec3d()
 
     return push_of
 

@@ -132,14 +132,9 @@ def edge_edge(b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 @wp.func
 def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """w, y and whether the nearest points are interior; computed relative to the first vertex, which keeps digits."""
-    w = wp.vec4d()
-    y = wp.vec3d()
-    inside = wp.int32(0)
     if of_vertex:
-        w, y, inside = vertex_triangle(b - a, c - a, d - a)
-    else:
-        w, y, inside = edge_edge(b - a, c - a, d - a)
-    return w, y, inside
+        return vertex_triangle(b - a, c - a, d - a)
+    return edge_edge(b - a, c - a, d - a)
 
 
 @wp.func
@@ -148,10 +143,9 @@ def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3
     y = wp.dot(n, c - a)
     z = wp.dot(n, d - a)
     x = wp.dot(n, b - a)
-    found = -wp.max(wp.max(y, z), x)
-    if not of_vertex:
-        found = wp.min(x, ZERO) - wp.max(y, z)
-    return found
+    if of_vertex:
+        return -wp.max(wp.max(y, z), x)
+    return wp.min(x, ZERO) - wp.max(y, z)
 
 
 @wp.func
@@ -161,6 +155,21 @@ def perpendicular(n: wp.vec3d):
     axis[wp.int32(wp.argmin(wp.abs(n)))] = ONE
     t = wp.cross(n, axis)
     return t / wp.max(wp.length(t), wp.float64(1e-300))
+
+
+@cache
+def farthest_of(dtype):
+    """Device function (stencil, x) → the largest coordinate of a pair [m]."""
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def farthest(s: wp.vec4i, x: wp.array(dtype=vec3)):
+        far = ZERO
+        for i in range(4):
+            far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
+        return far
+
+    return farthest
 
 
 @cache

@@ -12,16 +12,15 @@ from .self_gaps import nearest
 
 @cache
 def near_pairs(dtype):
-    """Returns the struct of pairs: the near ones of :class:`warpcloth.contact.proximity.Proximity`, or the slots of an energy.
+    """Struct of pairs: the near ones of :class:`warpcloth.contact.proximity.Proximity`, or the slots of an energy.
 
     Near pairs have the fields up to ``distances``. ``counts`` has the numbers of vertex–triangle pairs, which come first, and
     of edge–edge pairs. The triangles near vertex i are in rows ``rows`` [i] to rows[i+1]. ``distances`` [m] is r, or half the
-    rest distance if that is less. Their vertices are those of the surface with this ``layout``; an energy has vertices of the
-    cloth alone. Kernels over pairs have so many ``threads``: on the CPU one, because each thread there copies all structs.
+    rest distance if that is less. Kernels over pairs have so many ``threads``: on the CPU one, for each there copies structs.
 
-    An energy has ``stencils`` and the others. ``acting`` lists the slots that act; ``number`` has their number. ``corners``
-    lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is scratch, 0
-    between launches. The last three are empty if no kernel sums over vertices.
+    An energy has ``stencils``, of cloth alone, and the others. ``acting`` lists the ``number`` (1,) of slots that act.
+    ``corners`` lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is
+    scratch, 0 between launches. The last three are empty if no kernel sums over vertices.
     """
 
     @wp.struct
@@ -56,8 +55,7 @@ MODULE = "warpcloth.self_contact"
 def module_of(dtype):
     """Returns the name of the module of the kernels that every scene with self-contact launches.
 
-    Warp compiles a module as a whole, and again if other kernels are in it. So kernels that only some scenes launch are in
-    modules of their own.
+    Warp compiles a module as a whole, and again if other kernels are in it. So other kernels are in modules of their own.
     """
     return f"{MODULE}.{dtype.__name__}"
 

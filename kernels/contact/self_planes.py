@@ -33,10 +33,7 @@ def ulp_of(dtype):
 def bounded_share(move: wp.vec3d, most: wp.float64):
     """Returns min(1, most/‖move‖), the fraction of a move that is at most ``most`` long."""
     size = wp.length(move)
-    far = ONE
-    if size > most:
-        far = most / size
-    return far
+    return wp.where(size > most, most / size, ONE)
 
 
 @cache
@@ -46,10 +43,9 @@ def wanted_move(dtype):
 
     @wp.func
     def wanted(x: wp.array(dtype=vec3), target: wp.array(dtype=vec3), i: int):
-        found = wp.vec3d()
         if i < target.shape[0]:
-            found = wp.vec3d(target[i]) - wp.vec3d(x[i])
-        return found
+            return wp.vec3d(target[i]) - wp.vec3d(x[i])
+        return wp.vec3d()
 
     return wanted
 
@@ -81,12 +77,11 @@ def common_move(dtype):
 
 @cache
 def find_ways(dtype):
-    """Kernel over vertices: the ``share`` of its wanted move, and ``ways`` with numbers of it.
+    """Kernel over vertices: ``share`` with which the wanted move minus the ``common`` move is at most ``most``, and ``ways``.
 
-    The share is the largest one with which the wanted move minus the ``common`` move is at most ``most``. Its ways are a bound
-    of its part in the approach of a pair [m], its largest coordinate [m], and its share. The bound is the length of the wanted
-    move minus the ``common`` move, plus WIDE times the length of the motion since ``begun``, where the gaps were computed. That
-    is ``relative`` to the first vertex of the copy where cloth meets nothing but itself; obstacles have not moved since.
+    The ways are a bound of its part in the approach of a pair [m], its largest coordinate [m], and its share. The bound is the
+    length of that move plus WIDE times that of the motion since ``begun``, where the gaps were computed. The latter is
+    ``relative`` to the first vertex of the copy where cloth meets nothing but itself; obstacles have not moved since.
     """
     vec3, _ = types(dtype)
     wanted = wanted_move(dtype)
@@ -149,10 +144,7 @@ def ways_of_sides(ways: wp.array(dtype=wp.vec3d), s: wp.vec4i, sides: int):
 
 @wp.func
 def needs_no_cut(e: int, way: wp.vec2d, margin: wp.float64, gap: wp.array(dtype=wp.float64)):
-    """Whether the ``gap`` of pair e is too wide for moves of the length ``way`` of its sides to be shortened.
-
-    For any division of the gap, approaches with at most this sum are not shortened.
-    """
+    """Whether the ``gap`` of pair e is too wide, however it is divided, for moves of the length ``way`` to be shortened."""
     return way[0] + way[1] <= WIDE * _value(gap, e) - KEPT / CLAMPED * margin
 
 
@@ -169,8 +161,8 @@ def moved_apart(
 ):
     """A fraction up to ``most`` of their moves for which |w·(u × v)| surely exceeds ``floor`` times |u × v|.
 
-    That quotient is the distance of two lines along u and v that are w apart, and of a point from a plane. The volume is a
-    cubic polynomial, of which KEPT of the excess may be used up.
+    That quotient is the distance of two lines along u and v that are w apart, or of a point from a plane. KEPT of the excess of
+    the volume, a cubic polynomial, may be used up.
     """
     n = wp.cross(u, v)
     turn = wp.cross(move_u, v) + wp.cross(u, move_v)
@@ -213,8 +205,8 @@ def part_apart(
     """The fraction of their moves for which a pair at a, b, c and d surely stays farther apart than ``floor``.
 
     The pair advances until its gap could be closed at the relative speed of its sides, finds its gap there, and goes on (Li,
-    Kaufman and Jiang 2021, additive continuous collision detection). Or it advances as far as :func:`moved_apart` allows, which
-    is farther for cloth that slides.
+    Kaufman and Jiang 2021, additive continuous collision detection); or, if farther, as for cloth that slides, as
+    :func:`moved_apart` allows.
     """
     mean = SIDE * SIDE * (move_a + move_b + move_c + move_d)
     first = wp.length(move_a - mean)
@@ -245,11 +237,9 @@ def part_apart(
                 if of_vertex:
                     u = C - B
                     w = B - A
-                left = ONE - advanced
-                further = moved_apart(u, D - C, w, move_u, move_v, move_w, floor, left)
-                advanced = wp.min(
-                    advanced + wp.max(KEPT * wp.max(room, ZERO) / wp.max(first + second, wp.float64(1e-300)), further), ONE
-                )
+                further = moved_apart(u, D - C, w, move_u, move_v, move_w, floor, ONE - advanced)
+                further = wp.max(KEPT * wp.max(room, ZERO) / wp.max(first + second, wp.float64(1e-300)), further)
+                advanced = wp.min(advanced + further, ONE)
                 A = a + advanced * (move_a - mean)
                 B = b + advanced * (move_b - mean)
                 C = c + advanced * (move_c - mean)
@@ -265,10 +255,9 @@ def cut_by_planes(dtype):
 
     A pair cuts nothing while its sides stay apart, by a tenth of their gap or more, with the shares that its vertices had
     before: along y, where a plane may move with them, or by :func:`part_apart`. So cloth that falls or turns together moves
-    freely. Otherwise each side gets a half-space for itself, so that the shares may fall further. A plane normal to y is
-    placed between the two sides. It divides their gap, minus the smallest distance, in the ratio of their approaches; each
-    side gets at least CLAMPED of it. The ``common`` move of a copy does not count as an approach. There is no plane for a
-    pair whose ``gap`` is too wide for the moves that :func:`find_ways` bounds.
+    freely. Otherwise each side gets a half-space for itself, so that the shares may fall further: a plane normal to y divides
+    their gap, minus the smallest distance, in the ratio of their approaches, not counting the ``common`` move of a copy; each
+    side gets at least CLAMPED of it. Pairs whose ``gap`` is too wide for the moves that :func:`find_ways` bounds have no plane.
 
     A vertex at the smallest distance from a plane that does not approach it moves by at least ``least_share``, or not at
     all. Roundings of shorter moves, which can be equal in many steps, would take it nearer.

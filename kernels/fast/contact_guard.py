@@ -10,12 +10,12 @@ import warp as wp
 
 from ..contact.anchors import slip_of
 from ..contact.collider_filter import FilterNotes, outside
-from ..contact.colliders import gap_of, of_pose, pose_types, shapes, step_poses, turned_by
+from ..contact.colliders import gap_of, of_pose, pose_types, shapes, step_poses
 from ..coulomb import COULOMB, huber_secant
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..rotation import epsilon
-from ..terms.contact import ROUNDED_BOX
+from ..terms.contact import ROUNDED_BOX, turned
 from ..vectors import types
 
 
@@ -112,7 +112,7 @@ def touching_step(dtype, symplectic: bool):
                     held = 1
                     slip = slip_along(guard.anchors[c, i], X, n)
                     pull -= huber_secant(wp.length(slip), most) * slip
-                force += guard.stiffness[c, i] * turned_by(vec3(pose[3], pose[4], pose[5]), pose[6], pull)
+                force += guard.stiffness[c, i] * turned(vec3(pose[3], pose[4], pose[5]), pose[6], pull)
             if guard.shape.friction[c] > dtype(0.0):
                 found = anchor_type()  # without contact 0, whatever the ball was
                 if most > dtype(0.0):

@@ -320,14 +320,6 @@ def contact(solid: Solid):
         return H
 
     @wp.func
-    def prox(v: Any, rest: Any, compliance: Any):
-        """The prox, along n."""
-        d, n = gap(v, rest)
-        p = v
-        p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
-        return p
-
-    @wp.func
     def prox_from(y: Any, v: Any, rest: Any, compliance: Any):
         """The prox of the half-space tangent to the collider nearest to y, for v may be nearer to another side."""
         d, n = gap(y, rest)
@@ -335,6 +327,11 @@ def contact(solid: Solid):
         p = v
         p[0] = v[0] + (gap_after(d, rest[11], compliance) - d) * n
         return p
+
+    @wp.func
+    def prox(v: Any, rest: Any, compliance: Any):
+        """The prox, along n."""
+        return prox_from(v, v, rest, compliance)
 
     @wp.func
     def constraint(y: Any, rest: Any):

@@ -10,7 +10,7 @@ from ..kernels.contact.colliders import shapes
 class Clearance:
     """Tells the steps in which vertices may come near a collider. In all others contact has no force, and the filter no effect.
 
-    A step after one that came near also refreshes contact, which then leaves the anchors of friction and half-spaces behind.
+    A step after one that came near also refreshes contact, which leaves anchors and half-spaces behind.
 
     Args:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`.

@@ -20,42 +20,57 @@ from .clearance import Clearance
 # The filter puts a vertex that would end in a collider at this gap, relative to the contact distance. At a much smaller gap the
 # logarithm would push hard, and in float32 noisily.
 LANDING = 0.1
-# The name of what held a vertex back in a collider, where other cloth did.
-CLOTH = "other cloth"
+CLOTH = "other cloth"  # that held a vertex back in a collider
+
+
+def cut_share(model, cut, steps):
+    """Returns the fraction of the moves of free vertices that were ``cut``, (B,), in all ``steps``, (B,)."""
+    free = (model.inverse_mass.numpy().reshape(model.copies, -1) > 0.0).sum(axis=1)
+    return cut.numpy() / np.maximum(steps.numpy().astype(np.float64) * free, 1.0)
+
+
+def launch_pose(kernel, shapes, poses, least, h, x, v, model, elements):
+    """Launches the rest states of contact ``elements`` by :func:`warpcloth.kernels.contact.colliders.pose_collider`."""
+    given = [elements.stencil, shapes, *model.free_gravity, x, v, poses, elements.collider, elements.per_copy, least, h]
+    model.launch(kernel, elements.count, given, [elements.rest])
+
+
+def launch_anchors(kernel, shapes, poses, anchors, x, model, elements):
+    """Launches the rest states of friction, and its anchors, by :func:`warpcloth.kernels.contact.anchors.anchor_vertices`."""
+    declared, c = model.colliders, elements.collider
+    given = [elements.stencil, shapes, x, poses, c, elements.per_copy, declared.distance, float(declared.friction[c])]
+    model.launch(kernel, elements.count, given, [anchors, elements.rest])
 
 
 class ColliderSteps:
     """The motion of colliders, and the anchors of friction and the filter of those that are no meshes, in one solver's steps.
 
     At the start of a step, a ``Refresh`` of the terms moves the colliders, stores the positions of the vertices, and sets the
-    anchors of friction. At the end of the step, :meth:`launch_end` moves vertices out of colliders. Meshes have no terms, see
+    anchors of friction. At its end, :meth:`launch_end` moves vertices out of colliders. Meshes have no terms, see
     :mod:`.self_steps`. If no collider has any, the solver calls :meth:`launch_start` itself.
 
     Args:
         model: The :class:`warpcloth.model.model.Model` of a scene with colliders.
-        state: The :class:`warpcloth.core.state.State` of the solver. This object adds its own arrays to it.
+        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds arrays.
         h: Time step [s].
         steps_per_frame: Steps per frame.
         part: The time within a step at which forces are evaluated, from 0 (its start) to 1 (its end). It is 0 for explicit
-            steps, whose contact is ``bounded``.
+            steps, whose contact is ``bounded``: it has no logarithm.
 
     Attributes:
         terms: The elements of the model. Those of contact have rest states of their own.
-        bounded: Whether contact has no logarithm, as in explicit steps.
-        part: As given.
         x_before: Positions at the start of the step, (N,) [m].
-        poses: Poses of the colliders in the step, a :func:`warpcloth.kernels.contact.colliders.step_poses`.
+        poses: A :func:`warpcloth.kernels.contact.colliders.step_poses`.
         shapes: A :func:`warpcloth.kernels.contact.colliders.shapes`.
         anchors: The anchors of friction, by the index of each collider with friction. They are rows of ``anchor_rows`` (C, N).
         least: The smallest distance from a collider at which a vertex may end a step [m].
         moved_by_terms: Whether the refresh of a term moves the colliders at the start of a step.
         near: See :class:`warpcloth.contact.clearance.Clearance`; None if all steps refresh contact.
-        steps_per_frame: As given.
         notes: :class:`warpcloth.kernels.contact.collider_filter.FilterNotes`.
         steps: The number of steps so far, (B,) int32.
         correction: x − x̃ of steps with contact (N,) [m], or None for explicit steps. ``he`` is their effective step [s].
-        pushed, kicked: Sums of what the filter changed in positions [m] and velocities [m/s] since they were last set to 0,
-            (N,) double precision. They exist after :meth:`note_pushes`.
+        pushed, kicked: What the filter changed in positions [m] and velocities [m/s] since both were last set to 0, (N,)
+            float64, after :meth:`note_pushes`.
     """
 
     def __init__(self, model, state, h, steps_per_frame, part):
@@ -71,12 +86,10 @@ class ColliderSteps:
         for name in ("before", "at", "after"):
             setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
         self.x_before = model.vectors()
-        self.steps = state.add("steps of colliders", wp.zeros(model.copies, dtype=wp.int32, device=device), Count())
+        self.steps = state.add("steps of colliders", model.scalars(wp.int32), Count())
         self.notes = FilterNotes()
         self.notes.steps = self.steps
-        self.notes.cut = state.add(
-            "vertices cut short", wp.zeros(model.copies, dtype=wp.int64, device=device), Count(sums=True)
-        )
+        self.notes.cut = state.add("vertices cut short", model.scalars(wp.int64), Count(sums=True))
         of_note = Count(rest=model.per_copy * (self._dim[1] + 1))
         self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device), of_note)
         self.correction, self.he = None, h
@@ -113,16 +126,14 @@ class ColliderSteps:
         model, declared = self.model, self.model.colliders
         first = all(each.refresh is None or each.collider is None for each in self.terms)
         term = elements.term.bounded if self.bounded else elements.term
-        anchors = None
+        launch, h = None, 0.0 if self.bounded else self.h
         if elements.term.law:
-            anchors = self.anchors[c] = state.add(f"anchors on collider {c}", self.anchor_rows[c])
-        if elements.term.law:
+            self.anchors[c] = state.add(f"anchors on collider {c}", self.anchor_rows[c])
             kernel = model.kernel(anchor_vertices, model.dtype, declared.solids, elements.term.law, self.bounded)
-            launch = partial(self._anchor, kernel, c, anchors, float(declared.friction[c]))
+            launch = partial(self._anchor, kernel, self.anchors[c])
         elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
-            launch = partial(self._pose_elements, model.kernel(kernels.pose_collider, model.dtype, declared.solids), c, state.v)
-        else:
-            launch = None
+            kernel = model.kernel(kernels.pose_collider, model.dtype, declared.solids)
+            launch = partial(launch_pose, kernel, self.shapes, self.poses, self.least, h, self.x_before, state.v)
         refresh = Refresh(STEP, partial(self._refresh, first, launch, state.v))
         clear = None
         if self._finds_clear:
@@ -135,26 +146,15 @@ class ColliderSteps:
             self.launch_start(moment.x)
             if self._clearance is not None:
                 self._clearance.launch_begin(self.x_before, v)
-        if launch is not None:
-            self._launch_if_near(partial(launch, model, elements))
+        if launch is not None and self._clearance is None:
+            launch(model, elements)
+        elif launch is not None:
+            self._clearance.launch_refresh(partial(launch, model, elements))
 
-    def _launch_if_near(self, launch):
-        if self._clearance is None:
-            launch()
-        else:
-            self._clearance.launch_refresh(launch)
-
-    def _pose_elements(self, kernel, c, v, model, elements):
-        given = [elements.stencil, self.shapes, *model.free_gravity, self.x_before, v, self.poses]
-        given += [c, elements.per_copy, self.least, 0.0 if self.bounded else self.h]
-        model.launch(kernel, elements.count, given, [elements.rest])
-
-    def _anchor(self, kernel, c, anchors, friction, model, elements):
-        given = [elements.stencil, self.shapes, self.x_before, self.poses]
-        given += [c, elements.per_copy, model.colliders.distance, friction]
+    def _anchor(self, kernel, anchors, model, elements):
         if self._reads:
             wp.copy(self._spare, anchors)
-        model.launch(kernel, elements.count, given, [anchors, elements.rest])
+        launch_anchors(kernel, self.shapes, self.poses, anchors, self.x_before, model, elements)
         if self._reads:
             wp.copy(anchors, self._spare)
 
@@ -175,16 +175,16 @@ class ColliderSteps:
             self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
 
     def launch_start(self, x):
-        """Launches the start of a step from positions x (N,): :meth:`launch_move`, and a copy of x to ``x_before``."""
+        """Launches :meth:`launch_move` at the start of a step, and a copy of x (N,) to ``x_before``."""
         self.launch_move()
         wp.copy(self.x_before, x)
 
     def launch_move(self):
-        """Launches the computation of the poses of colliders at the start of a step."""
+        """Launches the poses of colliders in a step, at its start."""
         self.model.launch(self._move, self._dim, self._given, [self.poses])
 
     def launch_clear(self, terms, x):
-        """Launches the computation of the distances by which vertices of ``terms`` can move from x̃ before they touch."""
+        """Launches the distances by which vertices of ``terms`` can move from x̃ before they touch."""
         for elements in terms:
             if elements.clear is not None:
                 kernel = self.model.kernel(find_clear, elements.term, self.model.dtype)
@@ -238,7 +238,7 @@ class ColliderSteps:
         device, model = self.model.device, self.model
         self._again, self._unread = True, FilterNotes()
         self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
-        self._unread.steps, self._unread.cut = self.steps, wp.zeros(model.copies, dtype=wp.int64, device=device)
+        self._unread.steps, self._unread.cut = self.steps, model.scalars(wp.int64)
         self._unread.inside = wp.zeros(self._dim, dtype=wp.int64, device=device)
 
     def launch_out(self, x, v):
@@ -253,8 +253,7 @@ class ColliderSteps:
     @property
     def share(self):
         """The fraction of the moves of free vertices, in all steps, that the filter cut short, (B,)."""
-        free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
-        return self.notes.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
+        return cut_share(self.model, self.notes.cut, self.steps)
 
     def inside(self):
         """The first vertex that ended a step inside each collider: (copy, collider, step, vertex, what held it back).

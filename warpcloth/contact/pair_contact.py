@@ -10,8 +10,8 @@ from ..kernels.contact import self_contact as kernels
 from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
 from .self_friction import acting_sizes
 
-# Sweeps find contacts anew after so many, once in a step of 20 sweeps, the default. Of a hierarchy, only those of the finest
-# level count. To find contacts costs as much as 2 or 3 sweeps. Sooner, XPBD gains no less energy.
+# Sweeps, of a hierarchy those of the finest level, find contacts anew after so many, which costs as much as 2 or 3 sweeps.
+# Sooner, XPBD gains no less energy.
 EVERY = 10
 
 
@@ -25,10 +25,10 @@ class PairContact(DynamicElements):
         listed: Whether there are listed pairs, (1,) int32.
 
     Attributes:
-        obstacles: Where forces are evaluated, positions of the obstacles are behind those of the cloth, (V,) [m].
+        obstacles: Positions (V,) [m] with the obstacles where forces are evaluated.
         least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
         lists: The listed pairs, a :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
-        turn: The number of sweeps of the step that count among those after which contacts are found anew, (1,) int32.
+        turn: The number of sweeps of the step that count towards EVERY, (1,) int32.
     """
 
     def __init__(self, surface, bounded, laws, listed):
@@ -63,10 +63,10 @@ class PairContact(DynamicElements):
         for name, size in acting_sizes(self.model, slots, self._corners).items():
             setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
         contacts = potential.Contacts()
-        for name, kind in (("weights", wp.vec4d), ("normal", wp.vec3d), ("code", wp.int32), ("touching", wp.int32)):
+        kinds = {"weights": wp.vec4d, "normal": wp.vec3d, "code": wp.int32, "touching": wp.int32}
+        kinds |= dict.fromkeys(("gap", "distance", "stiffness", "share", "ratio", "fixed"), wp.float64)
+        for name, kind in kinds.items():
             setattr(contacts, name, wp.zeros(slots, dtype=kind, device=device))
-        for name in ("gap", "distance", "stiffness", "share", "ratio", "fixed"):
-            setattr(contacts, name, wp.zeros(slots, dtype=wp.float64, device=device))
         contacts.near = wp.zeros(len(lists.stencils), dtype=wp.int32, device=device)
         contacts.followed.mode = wp.zeros(1, dtype=wp.int32, device=device)
         contacts.parts = pairs.stencils
@@ -112,11 +112,8 @@ class PairContact(DynamicElements):
             self._launch(fill_corners, self.pairs.threads, [], [self.pairs])
             self._launch(sort_corners, self.model.count, [], [self.pairs])
 
-    def launch_begin(self, x):
-        """Finds the contacts at the start of a step."""
-        self._launch_found(x)
-
-    def launch_rows(self, x, d):
+    def launch_rows(self, x, d=None):
+        """Finds the contacts at x, or x + d."""
         self._launch_found(x, d)
 
     def launch_forces(self, x, correction):
@@ -126,12 +123,10 @@ class PairContact(DynamicElements):
     # Sweeps, see :mod:`warpcloth.kernels.contact.pair_follow`.
 
     def follow(self, start, launch, positions):
-        """Prepares sweeps, which take contacts at ``positions`` (V,) that follow their iterates.
+        """Prepares sweeps, which take contacts at ``positions`` (V,) [m] that follow their iterates.
 
-        Args:
-            start: ``start()`` moves meshes to where forces are evaluated, and cloth out of their way, in the positions.
-            launch: ``launch(x, correction)`` moves the positions towards x + correction, as far as pairs stay apart.
-            positions: (V,) [m].
+        ``start()`` moves meshes there to where forces are evaluated, and cloth out of their way; ``launch(x, correction)``
+        moves them towards x + correction, as far as pairs stay apart.
         """
         self._start, self._follow, self._positions = start, launch, positions
 

@@ -10,12 +10,13 @@ from ..core.gradient import Gradient
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.collider_work import collider_pulls
+from .collider_steps import launch_anchors, launch_pose
 
 
 class PresentContact:
     """The elements of a model for the current poses of colliders, and the anchors that the next step would use.
 
-    Elements of a step cannot be used, for they may be those of the middle or the start of the step.
+    Those of a step may be at its middle or its start.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -45,15 +46,13 @@ class PresentContact:
     def _own(self, elements, steps):
         model, c = self.model, elements.collider
         term = elements.term.bounded if steps.bounded else elements.term
-        own = replace(elements, term=term, rest=wp.clone(elements.rest))
+        own, solids = replace(elements, term=term, rest=wp.clone(elements.rest)), model.colliders.solids
         if elements.term.law:
             anchors = wp.zeros(model.count, dtype=self._anchor_type, device=model.device)
-            kernel = model.kernel(anchor_vertices, model.dtype, model.colliders.solids, elements.term.law, steps.bounded)
+            kernel = model.kernel(anchor_vertices, model.dtype, solids, elements.term.law, steps.bounded)
             self._launches.append(partial(self._anchor, kernel, own, anchors))
         elif model.colliders.moves[c]:
-            self._launches.append(
-                partial(self._pose, model.kernel(kernels.pose_collider, model.dtype, model.colliders.solids), own)
-            )
+            self._launches.append(partial(self._pose, model.kernel(kernels.pose_collider, model.dtype, solids), own))
         return own
 
     def launch(self, x, v):
@@ -67,21 +66,13 @@ class PresentContact:
             launch(x, v)
 
     def _pose(self, kernel, own, x, v):
-        given = [own.stencil, self._shapes, *self.model.free_gravity, x, v, self._poses]
-        given += [own.collider, own.per_copy, self._least, 0.0]
-        self.model.launch(kernel, own.count, given, [own.rest])
+        launch_pose(kernel, self._shapes, self._poses, self._least, 0.0, x, v, self.model, own)
 
-    def _copy_anchors(self, c, anchors):
+    def _anchor(self, kernel, own, anchors, x, _v):
         n = self.model.per_copy
         for steps, first, end in self._parts:
-            wp.copy(anchors, steps.anchors[c], first * n, 0, (end - first) * n)
-
-    def _anchor(self, kernel, own, anchors, x, v):
-        model, c = self.model, own.collider
-        self._copy_anchors(c, anchors)
-        given = [own.stencil, self._shapes, x, self._poses]
-        given += [c, own.per_copy, model.colliders.distance, float(model.colliders.friction[c])]
-        model.launch(kernel, own.count, given, [anchors, own.rest])
+            wp.copy(anchors, steps.anchors[own.collider], first * n, 0, (end - first) * n)
+        launch_anchors(kernel, self._shapes, self._poses, anchors, x, self.model, own)
 
 
 class ColliderPulls:

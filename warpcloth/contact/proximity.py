@@ -80,7 +80,7 @@ class Proximity:
             ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
             ((kernels.fill_rows, kernels.write_pairs), model.dtype),
             ((piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
-            ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.take_moved), model.dtype),
+            ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.add_positions), model.dtype),
             ((piece_motion.find_motion_of_pieces,), model.dtype),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
@@ -175,7 +175,8 @@ class Proximity:
 
         So the pairs of a copy do not depend on other copies. Follows :meth:`moved`.
         """
-        self._launch(piece_motion.take_moved, self._vertices, [x, self.copies, self.surface.layout], [self.found])
+        given = [x, None, 1.0, self.copies, self.surface.layout]
+        self._launch(piece_motion.add_positions, self._vertices, given, [self.found])
         self.launch(self.found)
 
     def launch(self, x):

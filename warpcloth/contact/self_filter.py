@@ -4,7 +4,7 @@ from functools import partial
 
 import warp as wp
 
-from ..kernels.contact import mesh_moves, self_filter, self_planes
+from ..kernels.contact import mesh_moves, piece_motion, self_filter, self_planes
 from ..kernels.contact.clear_elements import move_clear
 from ..kernels.contact.self_advance import advance_listed, advances, take_advance
 from ..kernels.step import count_step
@@ -36,7 +36,7 @@ class SelfFilter:
     def __init__(self, contact, colliders):
         self.model = model = contact.model
         self._surface, self._moves = contact.surface, None
-        self._contact, self._colliders, self._cut_before, self._iterates = contact, colliders, None, False
+        self._contact, self._colliders, self._cut_before = contact, colliders, None
         device = model.device
         self._target, self._from, self._outside, self._other = *(model.vectors() for _ in range(3)), contact.surface.vectors()
         # Obstacles have the share 1 of no way.
@@ -50,7 +50,7 @@ class SelfFilter:
         self._changed = wp.zeros(1, dtype=wp.int32, device=device)
         self.moves_together = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
         made = self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move
-        made += self_filter.keep_apart, self_filter.end_filter, self_filter.add_positions
+        made += self_filter.keep_apart, self_filter.end_filter, piece_motion.add_positions
         if model.keyframes is not None:
             made += self_filter.share_of_pins, self_filter.hold_pins
         declared = model.colliders
@@ -317,19 +317,16 @@ class SelfFilter:
     def iterates(self):
         """Prepares the methods below for a solver whose iterates stay apart."""
         self._touching = () if self._colliders is None else self._colliders.solid
-        self._iterates, model = True, self.model
+        model = self.model
         self._contact.contact.least = self._contact.least
         self._prepare_advance()
-        if model.keyframes is not None:
-            turn = self_filter.turn_where_blocked
-            self._kernels[turn] = model.kernel(turn, model.dtype)
         self._direction, self.back = model.vectors(), model.vectors()
         if self._lets_out:
             if self._moves is None:
                 self._prepare_carrying()
             self._carry_with_shapes = model.kernel(mesh_moves.carry_with_shapes, model.dtype, model.colliders.solids)
         self._near_colliders = model.kernel(self_filter.copies_near_colliders)
-        made = self_filter.copies_in_contact, self_filter.aim_back
+        made = self_filter.copies_in_contact, self_filter.aim
         self._kernels |= {factory: model.kernel(factory, model.dtype) for factory in made}
         if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
@@ -355,7 +352,7 @@ class SelfFilter:
         self._add(self._target, x, -1.0, direction)
         self.launch_limit(direction, whole=True)
         if self.model.keyframes is not None:
-            self._turn(direction, pins=True)
+            self._aim(self._target, x, False, True, self.fraction, direction)
             self.launch_limit(direction, whole=True)
             self._proceed.zero_()
             self.model.launch(
@@ -387,19 +384,18 @@ class SelfFilter:
 
         Call it after :meth:`launch_start`, with pairs listed at d.
         """
-        given = [self.model.inverse_mass, self.model.mobility, goal, d]
-        self._launch(self_filter.aim_back, self.model.count, given, [direction])
+        self._aim(goal, d, True, False, None, direction)
         self.launch_limit(direction, whole=True)
 
-    def _turn(self, direction, pins):
-        model, filtered = self.model, [self._contact.x_before, self._target]
-        given = [self.fraction, model.inverse_mass, model.mobility, *filtered, pins, model.per_copy]
-        self._launch(self_filter.turn_where_blocked, model.count, given, [direction])
+    def _aim(self, goal, x, free, pinned, fraction, p):
+        model = self.model
+        given = [model.inverse_mass, model.mobility, goal, x, free, pinned, fraction, model.per_copy]
+        self._launch(self_filter.aim, model.count, given, [p])
 
     def _launch_walk_of_pins(self, x):
         """Moves the cloth with its pins in copies that are ``_walking``, and sets their directions from there."""
         self._launch_rounds(x)
-        self._turn(self._direction, pins=False)
+        self._aim(self._target, x, True, True, self.fraction, self._direction)
         self.launch_limit(self._direction, whole=True)
 
     def launch_between(self, base, before, d):
@@ -456,4 +452,4 @@ class SelfFilter:
 
     def _add(self, a, b, sign, out, active=None):
         count = min(len(a), len(out))
-        self._launch(self_filter.add_positions, count, [a, b, sign, active, self._surface.layout], [out])
+        self._launch(piece_motion.add_positions, count, [a, b, sign, active, self._surface.layout], [out])

@@ -22,15 +22,11 @@ def acting_sizes(model, room, corners=True):
 class Slips:
     """Contacts of a step, and the stretch of the friction spring of each at its end, which the next step takes over.
 
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        room: The number of contacts for which it allocates memory.
-
     Attributes:
-        room: As given.
+        room: The number of contacts that fit.
         pairs: A :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, without distances.
         slips: (room,), see :func:`warpcloth.kernels.contact.self_friction.end_friction`.
-        grow: A function that takes a number of contacts and allocates memory for them, by default for this object alone.
+        grow: A function that allocates memory for a number of contacts, by default for this object alone.
     """
 
     def __init__(self, model, room):

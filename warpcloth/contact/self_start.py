@@ -14,12 +14,8 @@ from .start_layers import apart
 def check_start(contact, state):
     """Checks that cloth does not start with intersections, or with gaps below the smallest gap of the filter.
 
-    Pieces of cloth that only touch or coincide are moved apart, in the state and in the model, see
-    :func:`warpcloth.contact.start_layers.apart`.
-
-    Args:
-        contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
-        state: The :class:`warpcloth.core.state.State` of the solver, with the positions.
+    Pieces of cloth that only touch or coincide are moved apart, in the :class:`warpcloth.core.state.State` and in the model of
+    the :class:`warpcloth.contact.self_steps.SelfSteps`, see :func:`warpcloth.contact.start_layers.apart`.
 
     Raises:
         ValueError: Cloth intersects cloth, or touches it and cannot be moved apart; the message names the first pair.
@@ -36,12 +32,7 @@ def check_start(contact, state):
 
 
 def check_reset(contact, mask, x):
-    """Checks the positions of a reset of copies, as :func:`check_start`, but moves nothing.
-
-    Args:
-        contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
-        mask: Copies that are reset, (B,).
-        x: Positions (B·n, 3) [m].
+    """Checks the positions x (B·n, 3) [m] of copies in ``mask`` (B,), as :func:`check_start`, but moves nothing.
 
     Raises:
         ValueError: Cloth intersects or nearly touches cloth; the message names the first pair.
@@ -175,16 +166,7 @@ def _triangles_of(model, edges):
 
 
 def crossings(points, edges, triangles):
-    """Finds the edges that intersect triangles.
-
-    Args:
-        points: (N, 3) [m].
-        edges: (E, 2).
-        triangles: (E, m, 3), the triangles to test with each edge.
-
-    Returns:
-        List of (edge (2,), triangle (3,)).
-    """
+    """Returns the edges (E, 2) that intersect one of the ``triangles`` (E, m, 3) of each, with that: [(edge, triangle), …]."""
     edges = np.repeat(edges, triangles.shape[1], axis=0)
     triangles = triangles.reshape(-1, 3)
     apart = ~(edges[:, :, None] == triangles[:, None, :]).any(axis=(1, 2))

@@ -15,9 +15,10 @@ from ..kernels.contact import gap_notes, pair_blocks, self_pairs
 from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes
 from ..kernels.contact.obstacles import find_moves
 from ..kernels.contact.pair_potential import Laws
-from ..kernels.contact.piece_motion import take_moved
+from ..kernels.contact.piece_motion import add_positions
 from ..kernels.contact.self_filter import HeldPins
 from ..kernels.terms.contact import FLOOR
+from .collider_steps import cut_share
 from .pair_contact import PairContact
 from .proximity import Proximity
 from .self_filter import WAY, SelfFilter
@@ -25,22 +26,15 @@ from .self_friction import SelfFriction, Slips
 from .self_start import check_reset, check_start
 from .surface import ContactSurface
 
-# The skin, over the longest edge of the rest shape. All pairs nearer than the contact distance plus the skin are listed. The
-# skin must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one of them. It
-# must be below 0.5, so that a flat grid has no pairs: a right-angled triangle with a longest side of 1 has that height.
+# The skin, over the longest edge of the rest shape. All pairs nearer than the contact distance plus the skin are listed. It
+# must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one of them. It must
+# be below 0.5, the height of a right-angled triangle with a longest side of 1, so that a flat grid has no pairs.
 SKIN = 0.35
-# The smallest skin, over the contact distance. While a list is kept, two parts approach by up to half of the skin.
-THICK = 0.5
+THICK = 0.5  # the smallest skin, over the contact distance; while a list is kept, two parts approach by up to half of it
 
 
 class FirstGap(NamedTuple):
-    """The first frame with a small gap between cloth and cloth.
-
-    Attributes:
-        copy: Index of the copy.
-        frame: Index of the frame.
-        vertex: Index of a vertex of the pair, in the order of the model, within the copy.
-    """
+    """The first frame with a small gap in a copy, and a vertex of the pair, in the order of the model within the copy."""
 
     copy: int
     frame: int
@@ -48,13 +42,9 @@ class FirstGap(NamedTuple):
 
 
 class PinHeld(NamedTuple):
-    """The first pin that the filter of self-contact stopped on its way.
+    """The first frame and vertex, in the order of the model within the copy, of a pin that the filter stopped on its way.
 
-    Attributes:
-        copy: Index of the copy.
-        frame: The frame whose steps held it back first.
-        vertex: Its index in the order of the model, within the copy.
-        farthest: The largest distance of a pin from its prescribed position at the end of a step so far [m].
+    ``farthest`` is the largest distance of a pin from its prescribed position at the end of a step so far [m].
     """
 
     copy: int
@@ -66,19 +56,19 @@ class PinHeld(NamedTuple):
 class SelfSteps:
     """Pairs of near parts of cloth in the steps of one solver, with their forces and the filter.
 
-    At the start of a step, :meth:`launch_begin` lists the near pairs and finds the contacts there. Wherever forces are computed
-    later in the step, contacts are those there. At its end, the filter keeps the pairs apart.
+    At the start of a step, :meth:`launch_begin` lists the near pairs. Contacts are found wherever forces are computed. At the
+    end, the filter keeps the pairs apart.
 
     Args:
         model: The :class:`warpcloth.model.model.Model` of a scene with self-contact.
-        state: The :class:`warpcloth.core.state.State` of the solver. This object adds its own arrays to it.
+        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds arrays.
         h: Time step [s].
         steps_per_frame: Steps per frame.
         bounded: Whether contact has no logarithm, as in explicit steps.
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
 
     Attributes:
-        surface: The :class:`warpcloth.contact.surface.ContactSurface`: the cloth, and meshes among the colliders.
+        surface: The :class:`warpcloth.contact.surface.ContactSurface`.
         distance, max_distance: The smaller and the larger of the contact distances of cloth with itself and with meshes [m].
         least: The least gap of the filter [m].
         placed: Positions of the meshes at the start of the step, where it evaluates forces, and at its end, (B·m,) [m].
@@ -114,7 +104,7 @@ class SelfSteps:
         self.skin = max(SKIN * float(scene.mesh.edge_lengths.max()), THICK * self.max_distance)
         self.proximity = Proximity(surface, distances[0], self.skin, distances[1])
         self.x_before, self.begun_at = surface.vectors(), surface.vectors()
-        self.cut = state.add("vertices kept apart", wp.zeros(model.copies, dtype=wp.int64, device=device), Count(sums=True))
+        self.cut = state.add("vertices kept apart", model.scalars(wp.int64), Count(sums=True))
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32), Count())
         self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
@@ -128,11 +118,11 @@ class SelfSteps:
         self.held.first = state.add("first pin held back", model.scalars(wp.int64), Count(rest=model.per_copy))
         self.first_forced = state.add("first mesh that went through cloth", model.scalars(wp.int64))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
-        made = (pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs, gap_notes.note_gaps, take_moved)
-        self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
+        made = (pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs, gap_notes.note_gaps, add_positions)
+        self._launch = model.launcher((made, model.dtype))
         self._counted = None
-        size = pair_blocks.NUMBERS * pair_blocks.BLOCK
-        self._block = wp.zeros(size, dtype=wp.float64, device=device) if device.is_cpu else None
+        size = pair_blocks.NUMBERS * pair_blocks.BLOCK * device.is_cpu
+        self._block = wp.zeros(size, dtype=wp.float64, device=device) if size else None
         self.placed, self._ahead = [None, None, None], 0 if colliders is None else int(np.ceil(2.0 * colliders.part))
         self.contact = PairContact(surface, bounded, self._laws, self.listed)
         if surface.obstacles:
@@ -162,13 +152,10 @@ class SelfSteps:
         self.start_again()
 
     def refuse_reset(self, mask, x):
-        """Refuses a reset of copies in ``mask`` (B,) to positions x (B·n, 3) at which cloth crosses or nearly touches cloth.
-
-        Returns:
-            Whether the capacity of lists has grown, so that graphs must be recorded again.
+        """Makes :func:`.self_start.check_reset`; returns whether lists have grown, so that graphs must be recorded again.
 
         Raises:
-            ValueError: Naming the first pair.
+            ValueError: Cloth crosses or nearly touches cloth at the positions x (B·n, 3) of copies in ``mask`` (B,).
         """
         before = len(self.pairs.stencils)
         check_reset(self, mask, x)
@@ -191,7 +178,7 @@ class SelfSteps:
 
     @contextmanager
     def looking(self):
-        """Restores the state at the end of this context, whatever was listed within it."""
+        """Restores the state at the end of this context."""
         kept = [wp.clone(array) for array in self._carried]
         try:
             yield
@@ -200,7 +187,7 @@ class SelfSteps:
                 wp.copy(array, before)
 
     def _hold(self):
-        """Allocates arrays for as many pairs as the list can hold."""
+        """Allocates arrays for the pairs that the list can hold."""
         found, device = self.proximity, self.model.device
         capacity = len(found.stencils)
 
@@ -250,8 +237,7 @@ class SelfSteps:
     @property
     def share(self):
         """The fraction of the moves of free vertices, in all steps, that the filter cut short, (B,)."""
-        free = (self.model.inverse_mass.numpy().reshape(self.model.copies, -1) > 0.0).sum(axis=1)
-        return self.cut.numpy() / np.maximum(self.steps.numpy().astype(np.float64) * free, 1.0)
+        return cut_share(self.model, self.cut, self.steps)
 
     @property
     def most(self):
@@ -270,9 +256,9 @@ class SelfSteps:
 
     @property
     def pressed(self):
-        """A :class:`FirstGap` for each copy in which cloth is nearer to cloth than half the distance where contact begins.
+        """A :class:`FirstGap` for each copy with cloth nearer to cloth than half the distance where contact begins; to meshes.
 
-        And the same of cloth and meshes; explicit steps note none of these.
+        Explicit steps note none of meshes.
         """
         notes = self._notes.pressed.numpy()
         return self._first(notes[:, 0]), self._first(notes[:, 1])
@@ -311,9 +297,6 @@ class SelfSteps:
         for array in (self.cut, self.steps, self.held.first, self.held.farthest, self.first_forced, *self._carried):
             array.zero_()
 
-    def _launch(self, factory, dim, inputs, outputs):
-        self.model.launch(self._kernels[factory], dim, inputs, outputs)
-
     def launch_begin(self, x):
         """Lists the pairs near x, (N,), at the start of a step.
 
@@ -346,7 +329,7 @@ class SelfSteps:
         else:
             self._launch_notes(x)
         if self.friction is not None:
-            self.contact.launch_begin(x)
+            self.contact.launch_rows(x)
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
     def launch_look(self, x):
@@ -385,11 +368,7 @@ class SelfSteps:
         self.contact.launch_obstacles(self.placed[1])
 
     def keep(self, collider):
-        """Leaves only the forces and energies of contact with a mesh after ``forces.launch``, for records.
-
-        Args:
-            collider: The index of the mesh in the scene, or −1 for contact of cloth with cloth.
-        """
+        """Leaves only forces and energies of contact with the mesh of this index, or −1 for cloth, after ``forces.launch``."""
         surface = self.surface
         if not surface.obstacles:
             return
@@ -398,10 +377,7 @@ class SelfSteps:
             self.model.launch(self.model.kernel(keep_forces, self.model.dtype), each.capacity, given, [each.forces])
 
     def launch_present(self, x):
-        """Lists the pairs near x (N,), with meshes where they are after the last step, for records between steps.
-
-        The poses of colliders stay those of the last step, which sums of work need.
-        """
+        """Lists the pairs near x (N,), with meshes where they are after the last step; poses stay those that sums need."""
         if not self.surface.moves:
             self.launch_begin(x)
             return
@@ -427,7 +403,7 @@ class SelfSteps:
     def forced(self):
         """The copies in which a mesh went through cloth that could not get out of its way: (copy, first frame, mesh).
 
-        The mesh is the index of its collider, or None if several move.
+        The mesh is None if several move.
         """
         moving = [c for c, each in enumerate(self.model.scene.colliders) if each.is_mesh and each.moves]
         mesh = moving[0] if len(moving) == 1 else None
@@ -462,7 +438,8 @@ class SelfSteps:
         if copies is None:
             wp.copy(self.begun_at, x)
         else:
-            self._launch(take_moved, self.surface.count, [x, copies, self.surface.layout], [self.begun_at])
+            given = [x, None, 1.0, copies, self.surface.layout]
+            self._launch(add_positions, self.surface.count, given, [self.begun_at])
         given = [self.pairs, self.begun_at]
         if self._block is None:
             self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), given, [self.begun])

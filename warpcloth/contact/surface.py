@@ -21,7 +21,6 @@ class ContactSurface:
         meets_itself: Whether cloth meets cloth.
 
     Attributes:
-        meets_itself: As given.
         obstacles: The number m of vertices of meshes in a copy.
         count: The number of vertices of all copies, N + B·m.
         layout: :class:`warpcloth.kernels.contact.obstacles.Layout`.
@@ -165,14 +164,7 @@ class ContactSurface:
         return whole[self.model.count :]
 
     def launch_positions(self, colliders, poses, halves, out):
-        """Places obstacles, out (B·m,) [m].
-
-        Args:
-            colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`.
-            poses: Those of its poses (B, C) that belong to this moment of the step.
-            halves: The number of half steps since the start of the step.
-            out: Positions (B·m,) [m].
-        """
+        """Places obstacles, out (B·m,) [m], ``halves`` half steps after the start of a step, with the ``poses`` (B, C) then."""
         model = self.model
         given = [self.layout, self.of_obstacles, model.colliders.meshes.geometry, poses, colliders.steps]
         model.launch(self._find, len(out), [*given, 2 * colliders.steps_per_frame, halves], [out])

@@ -171,7 +171,7 @@ def _self_contact(stepper):
 
     def find(x):
         pairs.launch_sides(x)
-        pairs.contact.launch_begin(x)
+        pairs.contact.launch_rows(x)
 
     timed = pairs.proximity.launch, find
     times = [1e9 * _seconds(Segment(x.device, partial(each, x))) / vertices for each in timed]

@@ -6,7 +6,7 @@ import warp as wp
 from ..core.capture import Mirror, Segment
 from ..core.dynamic import dynamic_of
 from ..core.hessian import Hessian
-from ..kernels.contact.clear_elements import add_hessian, add_secants
+from ..kernels.contact.clear_elements import add_hessian
 from ..kernels.term import HessianPolicy
 from ..model.host_values import host_values
 from .search import HALVINGS, Search
@@ -109,7 +109,7 @@ class ContactSystem(CorrectedSystem):
     The curvature of contact has no bound, so no constant matrix is an upper bound of the Hessian. A copy where φ rose is
     ``careful`` in the next 4 iterations, after a second rise in 16, and so on: w is then also shortened until φ falls. With
     self-contact all solves are accurate, because a rough w runs into pairs, which then stop the whole copy. In other copies the
-    blocks of vertices near colliders are those of :func:`warpcloth.kernels.contact.clear_elements.add_secants`.
+    blocks of vertices near colliders are those of :func:`warpcloth.kernels.contact.clear_elements.add_hessian`.
     Without :meth:`start`, all copies always are careful.
 
     Args:
@@ -127,7 +127,7 @@ class ContactSystem(CorrectedSystem):
     def __init__(self, model, x, gradient, linear, sums, s, pairs):
         super().__init__(model, x, linear)
         touching = [elements for elements in model.terms if elements.collider is not None]
-        self._touching = [(elements, self._kernel_of(elements.term)) for elements in touching]
+        self._touching = [(elements, model.kernel(add_hessian, elements.term, model.dtype)) for elements in touching]
         held = model.inverse_mass.numpy() == 0.0
         self._diagonal = wp.array(np.where(held, -1, self.matrix.diagonal.numpy()), dtype=wp.int32, device=model.device)
         self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
@@ -153,10 +153,6 @@ class ContactSystem(CorrectedSystem):
             self._pairs.filter.launch_limit(self._search.direction)
         self._search.launch(self._active.array)
 
-    def _kernel_of(self, term):
-        """Returns the kernel that adds the blocks of a term."""
-        return self.model.kernel(add_secants if term.gap else add_hessian, term, self.model.dtype)
-
     def _launch_assemble(self):
         self.matrix.assemble(self.x, 0.0, self._search.correction, self._launch_touching)
 
@@ -164,8 +160,7 @@ class ContactSystem(CorrectedSystem):
         """Adds the blocks of vertices near colliders."""
         for elements, kernel in self._touching:
             given = [*elements.arguments, elements.clear, self._diagonal, self.x, self._search.correction]
-            if elements.term.gap:
-                given += [self._gradient, self._inertia, self._marks.array, self.model.per_copy]
+            given += [self._gradient, self._inertia, self._marks.array, self.model.per_copy]
             self.model.launch(kernel, elements.count, given, [values])
 
     def start(self):

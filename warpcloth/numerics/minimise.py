@@ -11,7 +11,7 @@ from ..core.status import Result
 from ..core.sums import Sums
 from ..kernels import minimise as kernels
 from ..kernels.contact.clear_elements import move_clear
-from ..kernels.contact.self_filter import aim_back, copies_near_colliders
+from ..kernels.contact.self_filter import aim, copies_near_colliders
 from ..kernels.elementwise import mismatch
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
@@ -277,7 +277,7 @@ class Minimiser:
             if goal is not None:
                 model.launch(model.kernel(mismatch, model.dtype), model.count, [goal, self.base], [direction])
             given = [model.inverse_mass, model.mobility, self.right if goal is None else direction, self.correction]
-            model.launch(model.kernel(aim_back, model.dtype), model.count, given, [direction])
+            model.launch(model.kernel(aim, model.dtype), model.count, [*given, True, False, None, model.per_copy], [direction])
             self.search.launch_guess(self._wanted)
             self._note_stay(stays)
 
