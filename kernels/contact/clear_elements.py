@@ -84,7 +84,7 @@ def add_hessian(term: Term, dtype):
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, rest_of, number = local_coordinate(term, dtype, True), load(rest_type), load_shared(dtype)
     (_energy, _gradient, hessian_of), measure, gap = of_element(term, dtype, True), term.measure, term.gap
-    slope, bend, mean_bend, gap_after = contact.slope, contact.bend, contact.mean_bend, contact.gap_after
+    slope, bend, gap_after = contact.slope, contact.bend, contact.gap_after
 
     @wp.kernel(module="unique", enable_backward=False)
     def add(
@@ -127,7 +127,7 @@ def add_hessian(term: Term, dtype):
                     after = gap_after(now - others / inertia[i], distance, k / inertia[i])
                     after = wp.min(after, wp.max(dtype(LEAP) * now, dtype(LIFT) * distance))
                     if after > dtype(1.001) * now:
-                        curvature = mean_bend(now, after, distance)
+                        curvature = (slope(after, distance) - slope(now, distance)) / (after - now)
                 values[slot] = values[slot] + (k * curvature) * wp.outer(n, n)
 
     return add

@@ -49,10 +49,15 @@ def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex:
 
 
 @cache
-def sliding(dtype):
-    """Device functions for a vertex that a surface stops: ``along`` and ``velocity``."""
+def outside(dtype, solids):
+    """Device function (x, end, v, …) → final position and velocity of a free vertex that moves from x to ``end``.
+
+    In the frame of a collider it moves along a segment, unless that comes too near. The third value is whether a collider
+    stopped it. ``notes`` has the stops, and the vertex if colliders leave no way out.
+    """
     vec3, _ = types(dtype)
-    zero = dtype(0.0)
+    to_local, to_space = of_pose(dtype)
+    gap, kept, zero = gap_of(dtype, solids), kept_part(dtype, solids), dtype(0.0)
 
     @wp.func
     def along(move: vec3, n: vec3, friction: dtype):
@@ -80,22 +85,13 @@ def sliding(dtype):
             found += wp.dot((move + change) / h - v, push) / size * push
         return found
 
-    return along, velocity
-
-
-@cache
-def stopped_by_shape(dtype, solids):
-    """Device function (shapes, c, X, move, …) → the end of a move from X in its frame, its change, push, and stop.
-
-    A move that would come nearer than ``least`` stops before, at a distance of at most ``landing`` more. With ``slides``, it
-    continues along the tangent plane there, raised to twice ``least`` so that rounding does not stop it.
-    """
-    vec3, _ = types(dtype)
-    gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
-    along, _velocity = sliding(dtype)
-
     @wp.func
     def stopped(shape: shapes(dtype), c: int, X: vec3, move: vec3, least: dtype, landing: dtype, slides: bool):
+        """The end of a move from X, its change and push, and whether it would come nearer than ``least``.
+
+        Then it stops before, at a distance of at most ``landing`` more. With ``slides``, it continues along the tangent plane
+        there, raised to twice ``least`` so that rounding does not stop it.
+        """
         end = X + move
         change = vec3()
         push = vec3()
@@ -108,24 +104,9 @@ def stopped_by_shape(dtype, solids):
             if slides:
                 d, n = gap(shape, c, end)
                 left, push = along(-change, n, shape.friction[c])
-                end += left + wp.max(dtype(2.0) * least - d, dtype(0.0)) * n
+                end += left + wp.max(dtype(2.0) * least - d, zero) * n
                 change += left
         return end, change, push, hit
-
-    return stopped
-
-
-@cache
-def outside(dtype, solids):
-    """Device function (x, end, v, …) → final position and velocity of a free vertex that moves from x to ``end``.
-
-    In the frame of a collider it moves along a segment, or, if that comes too near, as in :func:`stopped_by_shape`. The third
-    value is whether a collider stopped it. ``notes`` has the stops, and the vertex if colliders leave no way out.
-    """
-    vec3, _ = types(dtype)
-    to_local, to_space = of_pose(dtype)
-    gap, stopped = gap_of(dtype, solids), stopped_by_shape(dtype, solids)
-    _along, velocity = sliding(dtype)
 
     @wp.func
     def end_outside(

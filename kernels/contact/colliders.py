@@ -68,27 +68,6 @@ def of_pose(dtype):
 
 
 @cache
-def half_space(dtype):
-    """Device function (point, normal) → the pose of the half-space behind the plane with this point and normal."""
-    vec3, _ = types(dtype)
-    pose_type, _anchor = pose_types(dtype)
-
-    @wp.func
-    def pose_of(point: vec3, normal: vec3):
-        turn = vec3(normal[2], dtype(0.0), -normal[0])
-        w = dtype(1.0) + normal[1]
-        size = wp.sqrt(wp.dot(turn, turn) + w * w)
-        if w <= dtype(0.0) or size == dtype(0.0):
-            turn = vec3(dtype(1.0), dtype(0.0), dtype(0.0))
-            w = dtype(0.0)
-            size = dtype(1.0)
-        turn /= size
-        return pose_type(point[0], point[1], point[2], turn[0], turn[1], turn[2], w / size)
-
-    return pose_of
-
-
-@cache
 def move_colliders(dtype):
     """Kernel over (copies, colliders): the :func:`step_poses` of a step, with ``at`` after ``halves`` half steps.
 
@@ -239,8 +218,19 @@ def pose_collider(dtype, solids):
     """
     vec3, _ = types(dtype)
     to_local, to_space = of_pose(dtype)
-    gap, kept, behind = gap_of(dtype, solids), kept_part(dtype, solids), half_space(dtype)
-    rest_type = wp.types.vector(contact.PARAMETERS, dtype)
+    gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
+    rest_type, (pose_type, _anchor) = wp.types.vector(contact.PARAMETERS, dtype), pose_types(dtype)
+
+    @wp.func
+    def behind(point: vec3, normal: vec3):
+        """The pose of the half-space behind the plane with this point and normal."""
+        turn = vec3(normal[2], dtype(0.0), -normal[0])
+        w = dtype(1.0) + normal[1]
+        size = wp.sqrt(wp.dot(turn, turn) + w * w)
+        if w <= dtype(0.0) or size == dtype(0.0):
+            return pose_type(point[0], point[1], point[2], dtype(1.0), dtype(0.0), dtype(0.0), dtype(0.0))
+        turn /= size
+        return pose_type(point[0], point[1], point[2], turn[0], turn[1], turn[2], w / size)
 
     @wp.kernel(module="unique", enable_backward=False)
     def set_pose(

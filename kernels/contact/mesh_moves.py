@@ -17,8 +17,7 @@ from .obstacles import has_obstacle
 from .self_gaps import ONE, ZERO
 from .self_pairs import StepPairs, near_pairs
 
-# Gaps are compared in this many parts of the contact distance and the skin.
-PARTS = wp.constant(wp.float64(2.0**20))
+PARTS = wp.constant(wp.float64(2.0**20))  # of the contact distance and the skin, in which gaps are compared
 SMALL = wp.constant(wp.float64(1e-9))  # a weight, so that their sum is not 0
 
 

@@ -59,7 +59,7 @@ def has_obstacle(layout: Layout, s: wp.vec4i):
 
 @wp.func
 def obstacle_of(layout: Layout, s: wp.vec4i):
-    """The last of the obstacles of a copy that is a vertex of a pair, or −1 without one."""
+    """The last of the obstacles of a copy that is a vertex of a pair (−1: no vertex), or −1."""
     found = wp.int32(-1)
     for i in range(4):
         if s[i] >= layout.cloth:

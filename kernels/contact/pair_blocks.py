@@ -51,10 +51,7 @@ def nearest_in_block(of_edges: bool):
 
 @cache
 def begin_blocks(dtype):
-    """Kernel of one thread: n, d and w of all pairs, as :func:`.self_pairs.begin_pairs`.
-
-    ``block`` (NUMBERS·BLOCK,) is scratch.
-    """
+    """Kernel of one thread: n, d and w of all pairs, as :func:`.self_pairs.begin_pairs`, with ``block`` (NUMBERS·BLOCK,)."""
     vec3, _ = types(dtype)
     stencil, vector = load(wp.vec4i), load(vec3)
     put_normal, put_weights = store(wp.vec3d), store(wp.vec4d)

@@ -28,10 +28,8 @@ from .obstacles import Layout, cloth_vertex, has_obstacle, in_copy
 from .self_gaps import ONE, SIDE, ZERO, gap_along, in_plane, vertex_of
 from .self_pairs import module_of, near_pairs
 
-# Barycentric coordinates below this are 0: rounding must not decide between a face and its edge.
-ON_EDGE = wp.constant(wp.float64(1e-10))
-# The weight of the distance from the middles of edges. Below 1/6 the function is strictly convex.
-MIDDLE = wp.constant(wp.float64(0.125))
+ON_EDGE = wp.constant(wp.float64(1e-10))  # coordinates below are 0: rounding must not decide between a face and its edge
+MIDDLE = wp.constant(wp.float64(0.125))  # weight of the distance from the middles of edges; below 1/6 D is strictly convex
 CLOSE = wp.constant(wp.float64(0.25))  # contact distance of edges over that of vertices
 TWO, HALF_PI = wp.constant(wp.float64(2.0)), wp.constant(wp.float64(1.5707963267948966))
 # Where the nearest point of a face is: inside, on the edges ab, bc, ca from EDGE on, or at the vertices a, b, c from CORNER on.
@@ -241,12 +239,12 @@ def place_between(i: int, j: int):
     return wp.where(i == j, CORNER + i - 1, wp.where(i + j == 3, EDGE, EDGE + 6 - i - j))
 
 
-Stencils, Numbers = wp.array(dtype=wp.vec4i), wp.array(dtype=wp.int32)
+STENCILS, NUMBERS = wp.array(dtype=wp.vec4i), wp.array(dtype=wp.int32)
 _stencil, _number = load(wp.vec4i), load(wp.int32)
 
 
 @wp.func  # on the CPU a function that takes a struct copies it
-def count_faces(stencils: Stencils, codes: Numbers, near: Numbers, first: int, end: int, p: int, q: int):
+def count_faces(stencils: STENCILS, codes: NUMBERS, near: NUMBERS, first: int, end: int, p: int, q: int):
     """Counts the near faces of a vertex at an edge pq, or a vertex p = q; their pairs are ``near`` from ``first`` to ``end``.
 
     Returns the face that owns the term, which is the first whose nearest point is there or else the first; the number of faces;
@@ -439,7 +437,7 @@ def find_vertex_contacts(dtype):
 
     @wp.func
     def edges_at(
-        stencils: Stencils, codes: Numbers, near: Numbers, first: int, end: int, p: int, a: wp.vec3d, x: points, d: points
+        stencils: STENCILS, codes: NUMBERS, near: NUMBERS, first: int, end: int, p: int, a: wp.vec3d, x: points, d: points
     ):
         """The number of edges of near faces at the vertex p; those with p nearest to a count once for each of their faces."""
         edges = wp.int32(0)

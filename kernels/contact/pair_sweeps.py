@@ -4,8 +4,8 @@ A sweep removes the λ of a pair and adds that of its prox at what remains: with
 along n, λ = −hₑ²∂U/∂y(v̂ + Dλ) in closed form, and Δxᵢ = wᵢλ/mᵢ. Then M(x − x̃) = Σ wᵢλ with w at x, and a fixed point minimises
 the objective of the step. Without multipliers nothing is removed (PBD).
 
-Where axes of a vertex are locked, a soft pair takes its D with all axes free. A larger D does not move the fixed point. With
-the smaller one, a pair that cannot open along its free axes would throw the cloth far along them.
+Where axes of a vertex are locked, a soft pair takes its D with all axes free, which does not move the fixed point. With the
+smaller one, a pair that cannot open along its free axes would throw the cloth far along them.
 """
 
 from functools import cache
@@ -18,8 +18,8 @@ from .pair_sums import PairForces, PairTerm, is_single
 from .self_gaps import ONE, ZERO
 from .self_pairs import near_pairs
 
-# Smallest D of a hard pair, over its D with all axes free. If n is at an angle ε to the free axes, the vertices of the pair
-# would move by (r − d)/sin ε. This bounds their moves by (r − d)/√LOCKED, and takes them to 0 where sin ε does.
+# Smallest D of a hard pair, over its D with all axes free. If n is at an angle ε to the free axes, its vertices would move by
+# (r − d)/sin ε. This bounds their moves by (r − d)/√LOCKED, and takes them to 0 where sin ε does.
 LOCKED = wp.constant(wp.float64(0.01))
 
 

@@ -9,6 +9,7 @@ from ..vectors import types
 from .obstacles import Layout, copy_of, vector_within
 from .proximity_grid import MODULE
 
+NUMBERS = wp.array(dtype=wp.int32)
 SAMPLES = wp.constant(9)  # vertices whose median motion is that of a piece
 
 
@@ -62,13 +63,7 @@ def extend_boxes(dtype):
 
 
 @wp.func
-def note_moved(
-    active: wp.array(dtype=wp.int32),
-    copy: int,
-    moved: wp.array(dtype=wp.int32),
-    some: wp.array(dtype=wp.int32),
-    due: wp.array(dtype=wp.int32),
-):
+def note_moved(active: NUMBERS, copy: int, moved: NUMBERS, some: NUMBERS, due: NUMBERS):
     if active:
         if active[copy] == 0:
             return

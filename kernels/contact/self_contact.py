@@ -103,46 +103,24 @@ def find_forces(dtype, bounded: bool):
 
 
 @cache
-def gap_at(dtype):
-    """Device function (pairs, contacts, e, x, correction) → n·Σ wᵢ(xᵢ + dᵢ), the gap along n of a contact found elsewhere."""
+def near_contact(dtype):
+    """The ``near`` of contact, with n and w as last found: v = n n·Σ wᵢ(xᵢ + dᵢ)."""
     vec3, _ = types(dtype)
-    at = vertex_of(dtype)
-    stencil, normal, weights = (load(each) for each in (wp.vec4i, wp.vec3d, wp.vec4d))
+    at, points = vertex_of(dtype), wp.array(dtype=vec3)
+    stencil, normal, weights = load(wp.vec4i), load(wp.vec3d), load(wp.vec4d)
 
     @wp.func
-    def gap_along_normal(
-        pairs: near_pairs(dtype), contacts: Contacts, e: int, x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3)
-    ):
+    def near_of(pairs: near_pairs(dtype), contacts: Contacts, e: int, x: points, correction: points, always: bool):
         s = stencil(pairs.stencils, e)
         w = weights(contacts.weights, e)
         a = at(x, correction, s[0])
         y = w[1] * (at(x, correction, s[1]) - a) + w[2] * (at(x, correction, s[2]) - a) + w[3] * (at(x, correction, s[3]) - a)
         if pairs.layout.obstacles > 0:  # Σ wᵢ of the cloth is not 0
             y += wp.dot(w, ALL) * a + contacts.offset[e]
-        return wp.dot(normal(contacts.normal, e), y)
-
-    return gap_along_normal
-
-
-@cache
-def near_contact(dtype):
-    """The ``near`` of contact, with n and w as last found."""
-    vec3, _ = types(dtype)
-    gap_along_normal = gap_at(dtype)
-
-    @wp.func
-    def near_of(
-        pairs: near_pairs(dtype),
-        contacts: Contacts,
-        e: int,
-        x: wp.array(dtype=vec3),
-        correction: wp.array(dtype=vec3),
-        always: bool,
-    ):
-        gap = gap_along_normal(pairs, contacts, e, x, correction)
-        n = contacts.normal[e]
+        n = normal(contacts.normal, e)
+        gap = wp.dot(n, y)
         touches = always or gap < contacts.distance[e] or contacts.followed.mode[0] == STARTING
-        return touches, gap * n, n, contacts.weights[e]
+        return touches, gap * n, n, w
 
     return near_of
 

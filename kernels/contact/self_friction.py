@@ -91,12 +91,6 @@ class Rings:
     vertices: wp.array(dtype=wp.int32)
 
 
-@wp.func
-def with_mesh(layout: Layout, s: wp.vec4i):
-    """Whether one of the vertices that touch, others being −1, belongs to a mesh."""
-    return wp.max(wp.max(s[0], s[1]), wp.max(s[2], s[3])) >= layout.cloth
-
-
 @cache
 def turn_of(dtype):
     """Device function (layout, rings, s, w, sides, start, moves, x) → the rotation R of a contact from ``start`` to x.
@@ -105,11 +99,10 @@ def turn_of(dtype):
     is that of the mesh by the ``moves`` of its vertices, or of none. Vertices without a triangle have the edges of the contact.
     """
     vec3, _ = types(dtype)
+    points, vectors = wp.array(dtype=vec3), wp.array(dtype=wp.vec3d)
 
     @wp.func
-    def edge(
-        layout: Layout, i: int, j: int, start: wp.array(dtype=vec3), moves: wp.array(dtype=wp.vec3d), x: wp.array(dtype=vec3)
-    ):
+    def edge(layout: Layout, i: int, j: int, start: points, moves: vectors, x: points):
         before = wp.vec3d(start[j]) - wp.vec3d(start[i])
         after = before
         if i < layout.cloth:
@@ -119,17 +112,8 @@ def turn_of(dtype):
         return wp.outer(after, before), wp.dot(before, before)
 
     @wp.func
-    def turn(
-        layout: Layout,
-        rings: Rings,
-        s: wp.vec4i,
-        w: wp.vec4d,
-        sides: int,
-        start: wp.array(dtype=vec3),
-        moves: wp.array(dtype=wp.vec3d),
-        x: wp.array(dtype=vec3),
-    ):
-        of_mesh = with_mesh(layout, s)
+    def turn(layout: Layout, rings: Rings, s: wp.vec4i, w: wp.vec4d, sides: int, start: points, moves: vectors, x: points):
+        of_mesh = obstacle_of(layout, s) >= 0
         A = wp.mat33d()
         if of_mesh and not moves:
             return wp.identity(n=3, dtype=wp.float64)
@@ -406,7 +390,7 @@ def end_friction(dtype):
             w = rubbed.weights[e]
             R = rotation_of(pairs.layout, rings, parts, w, sides, start, moves, x)
             y = y_of(pairs.layout, s, w, x)
-            if not with_mesh(pairs.layout, parts):
+            if obstacle_of(pairs.layout, parts) < 0:
                 before = y_of(pairs.layout, s, w, start)
                 y -= R * before - before
             u = R * slip_from(pairs.layout, rubbed, e, y, ONE)
@@ -418,23 +402,15 @@ def end_friction(dtype):
 @cache
 def near_friction(dtype):
     """The ``near`` of friction, with v = u."""
-    vec3, _ = types(dtype)
-    slip_of = slip_at(dtype)
+    (vec3, _), slip_of = types(dtype), slip_at(dtype)
+    points = wp.array(dtype=vec3)
 
     @wp.func
-    def near_of(
-        pairs: near_pairs(dtype),
-        rubbed: RubbedPairs,
-        e: int,
-        x: wp.array(dtype=vec3),
-        correction: wp.array(dtype=vec3),
-        always: bool,
-    ):
+    def near_of(pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: points, correction: points, always: bool):
         u = wp.vec3d()
-        rubs = rubbed.limit[e] > ZERO
-        if rubs:
+        if rubbed.limit[e] > ZERO:
             u = slip_of(pairs, rubbed, e, x, correction)
-        return rubs, u, rubbed.normal[e], rubbed.weights[e]
+        return rubbed.limit[e] > ZERO, u, rubbed.normal[e], rubbed.weights[e]
 
     return near_of
 

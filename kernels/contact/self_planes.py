@@ -11,8 +11,7 @@ from .obstacles import copy_of
 from .self_gaps import ONE, SIDE, ZERO, nearest
 from .self_pairs import module_of, near_pairs
 
-# Fraction of its distance to a plane that a vertex may move in one round of the filter.
-KEPT = wp.constant(wp.float64(0.9))
+KEPT = wp.constant(wp.float64(0.9))  # fraction of its distance to a plane that a vertex may move in one round of the filter
 CLAMPED = wp.constant(wp.float64(0.05))  # smallest distance of each side from the plane, as a fraction of the gap
 # A pair needs no plane if its sides approach by less than this fraction of the gap. It is below 0.9²: along y the sides are at
 # least 0.9 of the gap apart, and the fraction KEPT of this may be closed.
@@ -150,31 +149,24 @@ def needs_no_cut(e: int, way: wp.vec2d, margin: wp.float64, gap: wp.array(dtype=
 
 @wp.func
 def moved_apart(
-    u: wp.vec3d,
-    v: wp.vec3d,
-    w: wp.vec3d,
-    move_u: wp.vec3d,
-    move_v: wp.vec3d,
-    move_w: wp.vec3d,
-    floor: wp.float64,
-    most: wp.float64,
+    u: wp.vec3d, v: wp.vec3d, w: wp.vec3d, du: wp.vec3d, dv: wp.vec3d, dw: wp.vec3d, floor: wp.float64, most: wp.float64
 ):
-    """A fraction up to ``most`` of their moves for which |w·(u × v)| surely exceeds ``floor`` times |u × v|.
+    """A fraction up to ``most`` of the moves du, dv and dw for which |w·(u × v)| surely exceeds ``floor`` times |u × v|.
 
     That quotient is the distance of two lines along u and v that are w apart, or of a point from a plane. KEPT of the excess of
     the volume, a cubic polynomial, may be used up.
     """
     n = wp.cross(u, v)
-    turn = wp.cross(move_u, v) + wp.cross(u, move_v)
-    bend = wp.cross(move_u, move_v)
+    turn = wp.cross(du, v) + wp.cross(u, dv)
+    bend = wp.cross(du, dv)
     volume = wp.dot(w, n)
     side = wp.where(volume < ZERO, -ONE, ONE)
     room = KEPT * (side * volume - floor * wp.length(n))
     if room > -ROUNDED * floor * wp.length(n):
         room = wp.max(room, ZERO)
-    a = side * (wp.dot(move_w, n) + wp.dot(w, turn)) - floor * wp.length(turn)
-    b = wp.max(-side * (wp.dot(move_w, turn) + wp.dot(w, bend)), ZERO) + floor * wp.length(bend)
-    b += most * wp.max(-side * wp.dot(move_w, bend), ZERO)
+    a = side * (wp.dot(dw, n) + wp.dot(w, turn)) - floor * wp.length(turn)
+    b = wp.max(-side * (wp.dot(dw, turn) + wp.dot(w, bend)), ZERO) + floor * wp.length(bend)
+    b += most * wp.max(-side * wp.dot(dw, bend), ZERO)
     found = ZERO
     if room >= ZERO:
         found = most

@@ -170,35 +170,22 @@ def bend(d: Any, r: Any):
 
 
 @wp.func
-def mean_bend(d: Any, after: Any, r: Any):
-    """The slope of the secant of φ′ from d to a larger distance; at most φ″(d), for φ″ falls with d."""
-    return (slope(after, r) - slope(d, r)) / (after - d)
-
-
-@wp.func
-def beyond(x: Any, position: Any, u: Any, w: Any, half: Any, radius: Any, margin: Any):
-    """Whether x is farther than ``margin`` from a half-space, or from a bounding ball; faster than the gap."""
-    away = x - position
-    found = wp.bool(False)
-    if wp.isfinite(half[0]):
-        size = half[0] + half[1] + half[2] + radius + margin
-        found = wp.dot(away, away) > type(w)(1.0001) * size * wp.abs(size)
-    else:
-        two = type(w)(2.0)
-        n = wp.vector(
-            two * (u[0] * u[1] - w * u[2]), type(w)(1.0) - two * (u[0] * u[0] + u[2] * u[2]), two * (u[1] * u[2] + w * u[0])
-        )
-        found = wp.dot(n, away) > type(w)(1.01) * margin
-    return found
-
-
-@wp.func
 def idle(y: Any, rest: Any, margin: Any):
     """Whether a vertex is farther than r + margin from the half-space, or from a bounding ball of the collider."""
-    position = wp.vector(rest[0], rest[1], rest[2])
-    u = wp.vector(rest[3], rest[4], rest[5])
-    half = wp.vector(rest[7], rest[8], rest[9])
-    return wp.where(beyond(y[0], position, u, rest[6], half, rest[10], rest[11] + margin), wp.int32(1), wp.int32(0))
+    away = y[0] - wp.vector(rest[0], rest[1], rest[2])
+    found = wp.bool(False)
+    if wp.isfinite(rest[7]):
+        size = rest[7] + rest[8] + rest[9] + rest[10] + (rest[11] + margin)
+        found = wp.dot(away, away) > y.dtype(1.0001) * size * wp.abs(size)
+    else:  # faster than the gap
+        u = wp.vector(rest[3], rest[4], rest[5])
+        w = rest[6]
+        two = y.dtype(2.0)
+        n = wp.vector(
+            two * (u[0] * u[1] - w * u[2]), y.dtype(1.0) - two * (u[0] * u[0] + u[2] * u[2]), two * (u[1] * u[2] + w * u[0])
+        )
+        found = wp.dot(n, away) > y.dtype(1.01) * (rest[11] + margin)
+    return wp.where(found, wp.int32(1), wp.int32(0))
 
 
 @wp.func

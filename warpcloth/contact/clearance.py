@@ -12,10 +12,6 @@ class Clearance:
 
     A step after one that came near also refreshes contact, which leaves anchors and half-spaces behind.
 
-    Args:
-        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`.
-        state: The :class:`warpcloth.core.state.State` of the solver.
-
     Attributes:
         near: 1 for copies in which a vertex may come near a collider in this step, else 0, (B,) int32.
     """

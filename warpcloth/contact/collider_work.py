@@ -24,8 +24,7 @@ class ColliderWork:
 
     def __init__(self, colliders, terms, cuts, of_colliders, against_friction, of_filter, hard=None):
         self.colliders, self.model, self._x, model = colliders, colliders.model, cuts.uncut, colliders.model
-        self._sums, self._at_end = [of_colliders, against_friction, of_filter], colliders.part == 1.0
-        self._cuts = cuts.cuts
+        self._sums, self._at_end, self._cuts = [of_colliders, against_friction, of_filter], colliders.part == 1.0, cuts.cuts
         self.pulls = ColliderPulls(model, terms, hard)
         self._solid = [(c, self.pulls.found[c]) for c in self.pulls.solid]
         self._before, self._x_step = [], self._x if self._at_end else colliders.x_before
@@ -94,7 +93,7 @@ class PairWork:
     Work is ∂U/∂y times the travel of the meshes in a step, with y = Σ wᵢxᵢ of each pair where the step evaluates its forces.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`, with pairs.
+        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
         against_friction: Sums per vertex of the cloth, (N,) float64 [J]. The part of meshes is in ``against_meshes``.
 
     Attributes:
@@ -135,8 +134,9 @@ class PairWork:
 
     def sums(self):
         """Returns the work of meshes, and the part of meshes in the work against friction, (B,) [J], and resets both to 0."""
-        found = [array.numpy().sum(axis=1) for array in (self.of_meshes, self.against_meshes)]
-        for array in (self.of_meshes, self.against_meshes):
+        sums = self.of_meshes, self.against_meshes
+        found = [array.numpy().sum(axis=1) for array in sums]
+        for array in sums:
             array.zero_()
         return found
 
@@ -150,8 +150,7 @@ class FilterWork:
 
     Attributes:
         uncut: Positions (N,) [m] after the last step without the filter.
-        cuts: Whether the filter shortened the move of each vertex, (N,) int32, see
-            :mod:`warpcloth.kernels.contact.collider_work`.
+        cuts: UNCUT or NOW of :mod:`warpcloth.kernels.contact.collider_work`, or 1, for each vertex, (N,) int32.
     """
 
     def __init__(self, stepper, of_filter):
@@ -181,8 +180,8 @@ class FilterWork:
     def launch(self):
         """Launches the sums after a step: ½Σ m v² − Σ (m g + f)·x + U without contact, minus that of the unfiltered step.
 
-        The change of the contact energy in a filtered step, minus the work of contact along the unfiltered step, is also work
-        of the filter. :class:`ColliderWork` adds the latter.
+        So is the change of the energy of contact in a filtered step, minus the work along the unfiltered one, which
+        :class:`ColliderWork` adds.
         """
         model, colliders, (x, v) = self.model, self._stepper.colliders, self._stepper.state
         force = None if model.loads is None else model.loads.force

@@ -36,11 +36,9 @@ class PairContact(DynamicElements):
         model = surface.model
         super().__init__(model, kernels.CONTACT_OF_PAIRS, listed)
         self.least, self._laws, device = 0.0, laws, model.device
-        areas = surface.areas(surface.of_cloth)
+        areas = [wp.array(surface.of_model(each), dtype=wp.float64, device=device) for each in surface.areas()]
         self._areas = potential.Areas()
-        self._areas.of_vertices, self._areas.of_edges = (
-            wp.array(surface.of_model(each), dtype=wp.float64, device=device) for each in areas
-        )
+        self._areas.of_vertices, self._areas.of_edges = areas
         self._areas.rest = wp.array(surface.rest, dtype=wp.vec3d, device=device)
         self.obstacles, self._goal = (surface.vectors() for _ in range(2)) if surface.obstacles else (None, None)
         self._of_edges = not bounded  # the filter alone keeps edges, and vertices of meshes, apart in explicit steps

@@ -79,7 +79,6 @@ class ColliderPulls:
     """∂U/∂x of contact and friction with each collider, which is the force of the cloth on it.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
         terms: Elements; those of soft contact and of friction are used.
         hard: Function (index) → launcher that adds ∂U/∂x of hard contact with that collider to an array (N,), from its
             multipliers; or None.

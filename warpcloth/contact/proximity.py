@@ -18,13 +18,13 @@ class Proximity:
     """The vertex–triangle pairs and edge–edge pairs that are near one another in each copy of a surface.
 
     A pair is listed if its distance is below r_c + skin. r_c is the contact distance, but at most half the rest distance of two
-    elements of one connected piece. Pairs with a common vertex or with coordinates that are not finite are not listed. Edge
-    meshes have only edge–edge pairs among themselves. Positions (V,) are those of all vertices of the surface.
+    elements of one connected piece. Pairs with a common vertex or with coordinates that are not finite are not listed.
+    Positions (V,) are those of all vertices of the surface.
 
     Args:
         surface: The :class:`warpcloth.contact.surface.ContactSurface`.
         distance: The contact distance r [m].
-        skin: Skin of the list [m]. The list is complete until two vertices have approached one another by the skin.
+        skin: The list is complete until two vertices have approached one another by it [m].
         of_meshes: The contact distance of cloth with meshes [m].
 
     Attributes:
@@ -38,7 +38,7 @@ class Proximity:
         flag, copies: (1,) and (B,) int32, see :meth:`moved`.
         listed: Positions (V,) [m] of the list that is in the arrays.
         pieces: The connected piece of each vertex of the cloth of a copy, −1 without an element, (n,).
-        drift: Motion of each connected piece of all copies since ``found`` [m], see :meth:`launch_drift`.
+        drift: Motion of each connected piece of all copies since ``found`` [m].
     """
 
     @in_turn
@@ -141,8 +141,7 @@ class Proximity:
         self._buckets = Scan(model, buckets)
 
     def _allocate(self, capacity):
-        model = self.model
-        rows = self._vertices + self._edges
+        model, rows = self.model, self._vertices + self._edges
         refuse_memory(f"the cloth has {capacity} pairs that are near one another", BYTES_OF_A_PAIR * capacity)
 
         def zeros(count, dtype=wp.int32):
@@ -171,10 +170,7 @@ class Proximity:
         self.listed.fill_(np.nan)
 
     def launch_moved(self, x):
-        """Launches the detection at x (V,) in ``copies``, and at the previous positions in the others.
-
-        So the pairs of a copy do not depend on other copies. Follows :meth:`moved`.
-        """
+        """Launches the detection at x (V,) in ``copies``, after :meth:`moved`, and at the previous positions in the others."""
         given = [x, None, 1.0, self.copies, self.surface.layout]
         self._launch(piece_motion.add_positions, self._vertices, given, [self.found])
         self.launch(self.found)
@@ -198,10 +194,7 @@ class Proximity:
         return [self.model.kernel(kernels.search_pairs, self.model.dtype, each, take, name) for each in (False, True)]
 
     def launch_along(self, x, p, searches, out):
-        """Launches ``searches`` over all pairs whose boxes meet while vertices move from x (V,) to x + p [m].
-
-        p is (V,), or (N,) if obstacles stand.
-        """
+        """Launches ``searches`` of pairs whose boxes meet while vertices move from x (V,) by p [m], (V,) or (N,)."""
         self._launch_grid(self._along, x, p, searches, out)
 
     def _launch_grid(self, surface, x, p, searches, out):
@@ -225,10 +218,7 @@ class Proximity:
         self._launch(piece_motion.extend_boxes, self._vertices, [x], [self._pieces])
 
     def launch_kept(self, x, part, launch):
-        """Calls ``launch`` with x if :meth:`moved` sets the flag, or if the list is not that of ``found``.
-
-        So the list depends only on x and ``found``, not on lists made since ``found`` was set.
-        """
+        """Calls ``launch`` with x if :meth:`moved` sets the flag, or if the list is not that of ``found``."""
         self.moved(x, part)
         wp.capture_if(self._due, launch, x=x)
 
@@ -237,9 +227,7 @@ class Proximity:
         self._launch(piece_motion.find_drift, len(self.drift), [x, self.found], [self._pieces])
 
     def moved(self, x, part=0.5, active=None):
-        """Launches flag = 1 if pairs may be missing at x (V,), else 0, and returns it, for :func:`warp.capture_if`.
-
-        ``copies`` is 1 for copies in which pairs may be missing.
+        """Launches flag = 1 if pairs may be missing at x (V,), else 0, and returns it; ``copies`` is 1 for copies with such.
 
         The flag is 0 while each vertex has moved by at most the fraction ``part`` of the skin since the last detection,
         relative to the drift of its connected piece, the median motion of some of its vertices. Two pieces may also have
@@ -251,9 +239,6 @@ class Proximity:
             part: At most ½. If the flag is 0, no pair within its r_c is missing, also after each vertex moves by another
                 fraction ½ − ``part`` of the skin.
             active: Copies that count (B,) int32; None for all.
-
-        Returns:
-            wp.array: The flag, (1,) int32.
         """
         self.flag.zero_()
         self.launch_moved_since(x, part, active, self.flag)
@@ -285,9 +270,7 @@ class Proximity:
 
     @in_turn
     def grow(self, count=None):
-        """Allocates room for 1.5 times ``count`` pairs, by default the number that the last detection found.
-
-        Graphs recorded with the old arrays must be recorded again.
+        """Allocates room for 1.5 times ``count`` pairs, by default as last found. Graphs must be recorded again.
 
         Raises:
             ValueError: There is not enough memory.

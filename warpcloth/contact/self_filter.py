@@ -11,8 +11,8 @@ from ..kernels.step import count_step
 
 # A move that is longer than one list of pairs allows is made in at most ROUNDS rounds.
 ROUNDS = 32
-# The longest move of a vertex in a round, relative to the common motion, over the skin. The vertex may have moved as far since
-# the list was made, and so may the other side of a pair: together they approach by at most the skin.
+# The longest move of a vertex in a round, relative to the common motion, over the skin. It may have moved as far since the list
+# was made, and so may the other side of a pair: together they approach by at most the skin.
 WAY = 0.25
 # Vertices that cloth holds back in a collider are moved out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
 # keeps a gap of LEFT times the contact distance to other cloth, or its present gap if that is smaller.
@@ -22,15 +22,11 @@ OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
 class SelfFilter:
     """Moves cloth only as far as the pairs of a :class:`warpcloth.contact.self_steps.SelfSteps` stay apart.
 
-    Args:
-        contact: The :class:`warpcloth.contact.self_steps.SelfSteps`.
-        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
-
     Attributes:
         back: d of the start of the step (N,) [m], after :meth:`launch_start`; only if iterates stay apart.
         fraction: The fraction of the last direction that pairs left each copy, (B,); only if iterates stay apart.
-        moves_together: Whether the filter measures moves relative to their mean. It does if no vertex is pinned or locked along
-            an axis and there are no colliders.
+        moves_together: Whether the filter measures moves relative to their mean, as no vertex is pinned or locked along an axis
+            and there are no colliders.
     """
 
     def __init__(self, contact, colliders):
@@ -44,30 +40,28 @@ class SelfFilter:
         self._ways.fill_(wp.vec3d(0.0, 0.0, 1.0))
         self._share, self._least_share = (wp.ones(contact.surface.count, dtype=wp.float64, device=device) for _ in range(2))
         self._common = wp.zeros(model.copies, dtype=wp.vec3d, device=device)
-        self._cuts = model.scalars(wp.int32)
-        self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(2))
-        self._proceed = wp.zeros(1, dtype=wp.int32, device=device)
-        self._changed = wp.zeros(1, dtype=wp.int32, device=device)
+        self._cuts, self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(3))
+        self._proceed, self._changed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.moves_together = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
-        made = self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move
-        made += self_filter.keep_apart, self_filter.end_filter, piece_motion.add_positions
+        self._kernels = {}
+        self._make(self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move)
+        self._make(self_filter.keep_apart, self_filter.end_filter, piece_motion.add_positions)
         if model.keyframes is not None:
-            made += self_filter.share_of_pins, self_filter.hold_pins
-        declared = model.colliders
-        self._lets_out = colliders is not None and any(
-            moves and not is_mesh for moves, is_mesh in zip(declared.moves, declared.is_mesh, strict=True)
-        )
+            self._make(self_filter.share_of_pins, self_filter.hold_pins)
+        self._lets_out = colliders is not None and any(each.moves and not each.is_mesh for each in model.scene.colliders)
         if self._lets_out:
             colliders.end_again()
             self._mobile = wp.zeros(model.count, dtype=model.dtype, device=device)
             self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
             self._pushed = model.vectors()
-            made += self_filter.find_held, self_filter.push_pairs
-        self._kernels = {factory: model.kernel(factory, model.dtype) for factory in made}
+            self._make(self_filter.find_held, self_filter.push_pairs)
         if contact.surface.moves:
             self._prepare_advance()
             self._prepare_carrying()
         self._count = model.kernel(count_step)
+
+    def _make(self, *made):
+        self._kernels |= {factory: self.model.kernel(factory, self.model.dtype) for factory in made}
 
     def _launch(self, factory, dim, inputs, outputs):
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
@@ -80,10 +74,8 @@ class SelfFilter:
     def launch_end(self, x, v, move=None, parts=1):
         """Moves the cloth from its start of the step towards x, as far as pairs stay apart; corrects x, v and ``move``, (N,).
 
-        If the iterates of the solver stay apart, the move starts at the last iterate. But that may be inside a collider, out of
-        which the filter of colliders has moved x. Then the move starts at the start of the step, which is outside.
-
-        Pins have moved in ``parts`` equal parts of the step.
+        If iterates stay apart, the move starts at the last one; or at the start of the step, if that is inside a collider, out
+        of which the filter of colliders has moved x. Pins have moved in ``parts`` equal parts of the step.
         """
         model = self.model
         if self._cut_before is not None:
@@ -112,7 +104,8 @@ class SelfFilter:
     def _launch_end(self, x, v, move, parts):
         model, start = self.model, self._contact.x_before
         wp.copy(self._target, x)
-        self._walk(start)
+        self._walking.fill_(1)
+        self._launch_rounds(start)
         if self._lets_out:
             self._turns.zero_()
             self._walking.fill_(1)
@@ -124,10 +117,7 @@ class SelfFilter:
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
 
     def launch_hold(self, x, v, hard):
-        """Shortens moves of pins to x that other pins are in the way of, before a solver draws cloth after them; corrects v.
-
-        ``hard`` pairs keep the contact distance as a constraint.
-        """
+        """Shortens moves of pins to x that other pins are in the way of; corrects v. ``hard`` pairs are constraints."""
         wp.capture_if(self._contact.listed, self._launch_hold, x=x, v=v, hard=hard)
 
     def _launch_hold(self, x, v, hard):
@@ -139,19 +129,11 @@ class SelfFilter:
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
 
     def launch_fresh(self, x, launch, active=None):
-        """Calls ``launch`` with x if the next round might miss a pair, as a vertex has moved far since the last list.
-
-        Copies that are not ``active`` (B,) do not count; None means that all do.
-        """
+        """Calls ``launch`` with x if the next round might miss a pair of ``active`` copies (B,), or of any if None."""
         wp.capture_if(self._contact.proximity.moved(x, WAY, active), launch, x=x)
 
-    def _walk(self, x):
-        """Moves x towards the target as far as pairs stay apart. On a long move pairs are listed again."""
-        self._walking.fill_(1)
-        self._launch_rounds(x)
-
     def _launch_rounds(self, x):
-        """Moves x towards the target in copies that are ``_walking``."""
+        """Moves x towards the target, as far as pairs stay apart, in copies that are ``_walking``."""
         self._rounds.zero_()
         self._cuts.zero_()
         self._proceed.fill_(1)
@@ -203,10 +185,10 @@ class SelfFilter:
 
     def _launch_ways(self, x, target):
         """Finds how far vertices move from x to ``target`` at most, relative to their common move."""
-        model, wanted = self.model, [x, target]
+        model = self.model
         if self.moves_together:
-            self._launch(self_planes.common_move, model.copies, [*wanted, model.per_copy], [self._common])
-        given = [*wanted, self._common, self._contact.begun_at, model.per_copy, WAY * self._contact.skin]
+            self._launch(self_planes.common_move, model.copies, [x, target, model.per_copy], [self._common])
+        given = [x, target, self._common, self._contact.begun_at, model.per_copy, WAY * self._contact.skin]
         given += [self._surface.obstacles == 0]
         self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
 
@@ -219,8 +201,7 @@ class SelfFilter:
 
     def _launch_cuts(self, given):
         """Cuts the moves of pairs that would come too near, which may leave other pairs that do."""
-        model = self.model
-        given = [*given, self._contact.least]
+        model, given = self.model, [*given, self._contact.least]
         self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
         self._changed.zero_()
         model.launch(self_planes.note_cuts, model.count, [self._share], [self._ways, self._changed])
@@ -228,7 +209,7 @@ class SelfFilter:
     def _prepare_advance(self):
         """Prepares :meth:`launch_limit`."""
         model = self.model
-        self._kernels |= {each: model.kernel(each, model.dtype) for each in (self_filter.scale_directions, advance_listed)}
+        self._make(self_filter.scale_directions, advance_listed)
         self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
         self.fraction = self._advance.fraction = model.scalars()
         self._advance.far, self._advance.least = self._contact.proximity.copies, self._contact.least
@@ -239,16 +220,15 @@ class SelfFilter:
         model, device = self.model, self.model.device
         self._moves = self._surface.vectors()
         self._carried, self._keys = (wp.zeros(model.count, dtype=wp.int64, device=device) for _ in range(2))
-        made = mesh_moves.are_away, mesh_moves.aim_obstacles, mesh_moves.carry_vertices, mesh_moves.end_move
-        made += (self_filter.push_pairs,)
-        self._kernels |= {factory: model.kernel(factory, model.dtype) for factory in made}
+        self._make(mesh_moves.are_away, mesh_moves.aim_obstacles, mesh_moves.carry_vertices, mesh_moves.end_move)
+        self._make(self_filter.push_pairs)
         self._carriers = [model.kernel(mesh_moves.find_carriers, model.dtype, each) for each in (True, False)]
 
     def _launch_move(self, factory, inputs, outputs):
         self._launch(factory, self._surface.count - self.model.count, inputs, outputs)
 
     def launch_meshes(self):
-        """Moves meshes to where the step evaluates forces, and cloth out of their way, in the positions of the step."""
+        """As :meth:`_launch_meshes`, to where the step evaluates forces."""
         self._launch_meshes(self._contact.placed[1])
 
     def _launch_meshes(self, goal):
@@ -315,7 +295,7 @@ class SelfFilter:
     # For methods whose iterates base + d stay apart too.
 
     def iterates(self):
-        """Prepares the methods below for a solver whose iterates stay apart."""
+        """Prepares the methods below."""
         self._touching = () if self._colliders is None else self._colliders.solid
         model = self.model
         self._contact.contact.least = self._contact.least
@@ -326,18 +306,17 @@ class SelfFilter:
                 self._prepare_carrying()
             self._carry_with_shapes = model.kernel(mesh_moves.carry_with_shapes, model.dtype, model.colliders.solids)
         self._near_colliders = model.kernel(self_filter.copies_near_colliders)
-        made = self_filter.copies_in_contact, self_filter.aim
-        self._kernels |= {factory: model.kernel(factory, model.dtype) for factory in made}
+        self._make(self_filter.copies_in_contact, self_filter.aim)
         if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
-            self._kernels[self_filter.walk_from_start] = model.kernel(self_filter.walk_from_start, model.dtype)
+            self._make(self_filter.walk_from_start)
 
     def launch_start(self, base, d):
         """Sets d so that base + d is base if pairs stay apart on the way there, else the start of the step.
 
         Pins with keyframes are at base in any case. If pairs do not stay apart on the way of the pins alone, other vertices
-        move towards base too, as far as pairs stay apart. Vertices stop at the contact distance of colliders: inside a collider
-        contact is so stiff that a descent would take many iterations to get out.
+        move towards base too. Vertices stop at the contact distance of colliders: a descent from inside would take many
+        iterations to get out.
         """
         x, direction = self._contact.x_before, self._direction
         self.launch_meshes()
@@ -355,18 +334,14 @@ class SelfFilter:
             self._aim(self._target, x, False, True, self.fraction, direction)
             self.launch_limit(direction, whole=True)
             self._proceed.zero_()
-            self.model.launch(
-                self_filter.walk_where_blocked, self.model.copies, [self.fraction], [self._walking, self._proceed]
-            )
+            given = [self._walking, self._proceed]
+            self.model.launch(self_filter.walk_where_blocked, self.model.copies, [self.fraction], given)
             wp.capture_if(self._proceed, self._launch_walk_of_pins, x=x)
         self._add(x, base, -1.0, d)
         self._add(d, direction, 1.0, d)
 
     def launch_touching(self, active, touching, some):
-        """Sets ``touching`` (B,) to 1 for ``active`` copies (B,) near colliders, or with contacts where forces were last found.
-
-        It is 0 for others, and ``some`` (1,) is 1 if there are any such copies.
-        """
+        """Sets ``touching`` (B,): whether copies are ``active`` (B,), and near colliders or in contact; ``some``: any is."""
         model, contact, colliders = self.model, self._contact.contact, self._colliders
         near = None if colliders is None else colliders.near
         always = colliders is not None and near is None
@@ -380,10 +355,7 @@ class SelfFilter:
         wp.capture_if(self._contact.listed, in_contact)
 
     def launch_back(self, goal, d, direction):
-        """Sets the direction from d to ``goal`` (N,) [m], of free vertices; or 0 if pairs do not stay apart on this way.
-
-        Call it after :meth:`launch_start`, with pairs listed at d.
-        """
+        """Sets the direction of free vertices from d, where pairs are listed, to ``goal`` (N,) [m]; or 0 if pairs do not stay apart."""
         self._aim(goal, d, True, False, None, direction)
         self.launch_limit(direction, whole=True)
 
@@ -398,8 +370,8 @@ class SelfFilter:
         self._aim(self._target, x, True, True, self.fraction, self._direction)
         self.launch_limit(self._direction, whole=True)
 
-    def launch_between(self, base, before, d):
-        """Moves d towards ``before`` (N,), whose pairs are listed, so that pairs stay apart on the way to base + d."""
+    def launch_between(self, before, d):
+        """Moves d towards ``before`` (N,), whose pairs are listed, so that pairs stay apart on the way to d."""
         self._add(d, before, -1.0, self._direction)
         self.launch_limit(self._direction)
         self._add(before, self._direction, 1.0, d)
@@ -412,8 +384,7 @@ class SelfFilter:
     def launch_limit(self, direction, whole=False):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
 
-        All vertices of a copy move by the same fraction: shortened at each vertex, a direction would stretch stiff cloth. With
-        ``whole``, a direction that pairs do not leave whole becomes 0.
+        All of a copy move by the same fraction, for other moves would stretch stiff cloth; by none with ``whole``, if not by 1.
         """
         contact, proximity, target = self._contact, self._contact.proximity, self._other
 

@@ -86,8 +86,6 @@ class Slips:
 class SelfFriction(DynamicElements):
     """Friction between parts of cloth in contact, and the stretch of its springs, in the steps of one solver.
 
-    Its ``pairs`` are those of the step, without distances.
-
     Args:
         surface: The :class:`warpcloth.contact.surface.ContactSurface`.
         slips: :class:`Slips`, a part of the state of the solver.
@@ -125,10 +123,9 @@ class SelfFriction(DynamicElements):
         """Allocates arrays for ``room`` pairs. The slips of the last step are kept."""
         self._kept.hold(room)
         self._step.hold(room)
-        pairs = self._step.pairs
+        pairs, sizes = self._step.pairs, acting_sizes(self.model, room)
         for name in ("acting", "number", "corner_counts"):
-            size = acting_sizes(self.model, room)[name]
-            setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=self.model.device))
+            setattr(pairs, name, wp.zeros(sizes[name], dtype=wp.int32, device=self.model.device))
         pairs.layout, slots = self.surface.layout, len(pairs.stencils)
         data = kernels.RubbedPairs()
         data.limit = wp.zeros(slots, dtype=wp.float64, device=self.model.device)

@@ -93,19 +93,20 @@ def _refuse_pairs(model, start):
 
 
 def _refuse_pair(model, parts, why):
-    named = []
-    for part in parts:
-        vertices = [int(v % model.per_copy if model.order is None else model.order[v % model.per_copy]) for v in part]
-        named.append(f"{('vertex', 'edge', 'triangle')[len(part) - 1]} {'–'.join(map(str, vertices))}")
-    copy = f" of copy {parts[0][0] // model.per_copy}" if model.copies > 1 else ""
-    raise ValueError(f"{named[0]} and {named[1]}{copy} {why}")
+    raise ValueError(f"{_named(model, parts[0])} and {_named(model, parts[1])}{_of_copy(model, parts[0][0])} {why}")
+
+
+def _named(model, part):
+    vertices = [str(int(v % model.per_copy if model.order is None else model.order[v % model.per_copy])) for v in part]
+    return f"{('vertex', 'edge', 'triangle')[len(part) - 1]} {'–'.join(vertices)}"
+
+
+def _of_copy(model, vertex):
+    return f" of copy {vertex // model.per_copy}" if model.copies > 1 else ""
 
 
 def _too_near(contact, x):
-    """Lists the pairs at x (N,), and returns the :class:`_Start` there.
-
-    An edge that intersects a triangle is near one of its edges, so that this pair is listed.
-    """
+    """Returns the :class:`_Start` at x (N,). An edge that intersects a triangle is near one of its edges, so it is listed."""
     points = x.numpy().astype(np.float64)
     contact.launch_begin_at_start(x, _longest_edge(contact.model, points))
     of_vertices, of_edges = contact.proximity.counts.numpy()
@@ -134,12 +135,10 @@ def _refuse_meshes(contact, stencils, gaps, least):
         behind = s[s >= model.count]
         if len(behind) and gap < least:
             mesh = model.scene.colliders[surface.colliders[(behind[0] - model.count) % surface.obstacles]].label
-            own = int(s[s < model.count][0])
-            vertex = own % model.per_copy if model.order is None else int(model.order[own % model.per_copy])
-            copy = f" of copy {own // model.per_copy}" if model.copies > 1 else ""
+            own = s[s < model.count][:1]
             raise ValueError(
-                f"vertex {vertex}{copy}, or an element at it, starts {gap:.3g} m from {mesh}; it must start more than "
-                f"{least:.3g} m away, a thousandth of the contact distance and rounding"
+                f"{_named(model, own)}{_of_copy(model, own[0])}, or an element at it, starts {gap:.3g} m from {mesh}; it must "
+                f"start more than {least:.3g} m away, a thousandth of the contact distance and rounding"
             )
 
 

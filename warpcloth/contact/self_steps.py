@@ -132,12 +132,8 @@ class SelfSteps:
         self._hold()
         state.add("positions of the list", self.proximity.found)
         self.near = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
-        self._carried = (
-            self.proximity.found,
-            self._most.array,
-            self.lists,
-            *(getattr(self._notes, name) for name in ("nearest", "too_near", "pressed", "unresolved")),
-        )
+        notes = (getattr(self._notes, name) for name in ("nearest", "too_near", "pressed", "unresolved"))
+        self._carried = self.proximity.found, self._most.array, self.lists, *notes
         friction = surface.friction()
         if friction is not None:
             slips = state.add_part("friction", Slips(model, self.contact.capacity))
@@ -210,7 +206,7 @@ class SelfSteps:
             Stopped: There is no memory for them.
         """
         try:
-            self.grow_to(self._wanted)
+            self.grow_to(self.most)
         except ValueError as error:
             raise Stopped(str(error)) from None
 
@@ -228,11 +224,7 @@ class SelfSteps:
     @property
     def overflowed(self):
         """Whether the lists so far had more pairs than their capacity. The host reads the device."""
-        most = int(self._most.read().max())
-        if most > len(self.pairs.stencils):
-            self._wanted = most
-            return True
-        return False
+        return self.most > len(self.pairs.stencils)
 
     @property
     def share(self):
@@ -298,10 +290,7 @@ class SelfSteps:
             array.zero_()
 
     def launch_begin(self, x):
-        """Lists the pairs near x, (N,), at the start of a step.
-
-        It keeps an earlier list as long as the filter at the end of this step cannot miss a pair with it.
-        """
+        """Lists the pairs near x, (N,), at the start of a step, unless its filter can miss none with the last list."""
         wp.copy(self.x_before, x, count=self.model.count)
         if self.surface.moves:
             if not self._colliders.moved_by_terms:
@@ -333,10 +322,7 @@ class SelfSteps:
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
     def launch_look(self, x):
-        """Launches ``near`` = 0 if no pair is listed and none can be missing on a straight way to x (V,), else 1.
-
-        The way starts where the list has all pairs, as at the start of a step and at an iterate.
-        """
+        """Launches ``near`` = 0 if no pair is listed and none can be missing on a straight way to x (V,), else 1."""
         wp.copy(self.near.array, self.listed)
         self.proximity.launch_moved_since(x, 0.5, None, self.near.array)
 
@@ -394,7 +380,7 @@ class SelfSteps:
             wp.copy(array, spare)
 
     def launch_work(self, out, terms):
-        """Launches out (B, C) += the work of meshes on the cloth in the last step [J], by the forces of ``terms`` at last."""
+        """Launches out (B, C) += the work of meshes on the cloth in the last step [J], by the last forces of ``terms``."""
         for each in terms if self.surface.obstacles else ():
             given = [each.pairs, each.data.parts, self.surface.of_obstacles.collider, each.data.travel, each.forces]
             self.model.launch(self.model.kernel(work_of_meshes, self.model.dtype), 1, given, [out])
@@ -425,10 +411,7 @@ class SelfSteps:
         self.proximity.set_skin(self.skin)
 
     def launch_list(self, x):
-        """Lists the pairs again at x, in copies that have moved, and notes their number. It counts no list if none has moved.
-
-        Call it after :meth:`warpcloth.contact.proximity.Proximity.moved`.
-        """
+        """Lists the pairs again at x, in copies that have moved by :meth:`.Proximity.moved`; counts a list if one has."""
         self.proximity.launch_moved(x)
         given = [self.proximity.counts, self.proximity.flag]
         self.model.launch(self_pairs.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])

@@ -10,8 +10,8 @@ def apart(points, triangles, sides, gaps, piece, fixed, r):
 
     Touching pieces become layers, r apart or, if there are more than three, as far as moves of at most r allow. A piece lies
     above another one where its touching vertices are, or the vertices beside them, if these are farther than r from the other.
-    Pieces that coincide and have opposite normals move to the sides that they face. Of those with equal normals the later one
-    lies above. Vertices of touching elements move along their normals; those of pieces with a fixed one stay.
+    Pieces that coincide with opposite normals move to the sides that they face; of those with equal normals the later one lies
+    above. Vertices of touching elements move along their normals; those of pieces with a fixed one stay.
 
     Args:
         points: (N, 3) [m].

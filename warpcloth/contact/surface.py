@@ -16,11 +16,8 @@ class ContactSurface:
     Vertices of a mesh that coincide at all frames are one. Elements of the cloth with a vertex that cannot move do not meet
     meshes: pins may be inside a body.
 
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        meets_itself: Whether cloth meets cloth.
-
     Attributes:
+        meets_itself: Whether cloth meets cloth.
         obstacles: The number m of vertices of meshes in a copy.
         count: The number of vertices of all copies, N + B·m.
         layout: :class:`warpcloth.kernels.contact.obstacles.Layout`.
@@ -57,17 +54,16 @@ class ContactSurface:
         if self.obstacles:
             self._prepare_positions(found)
             self.moves_of_step = wp.zeros(self.count - model.count, dtype=wp.vec3d, device=model.device)
-            of_edges, (a, b) = self.areas(self.of_cloth)[1], model.in_model(mesh.edges).T
+            of_edges, (a, b) = self.areas()[1], model.in_model(mesh.edges).T
             self.width = float(((of_edges[a] + of_edges[b]) / mesh.edge_lengths).max())
 
     def _find_elements(self):
         """Finds the elements of a copy, and of all copies."""
         model, mesh, n = self.model, self.model.scene.mesh, self.model.per_copy
         held = (model.coordinate_mobility().reshape(-1, 3)[:n] == 0.0).all(axis=1)
-        self.vertex_groups = np.concatenate(
-            [np.where(held, int(kernels.HELD), int(kernels.CLOTH)), np.full(self.obstacles, int(kernels.OBSTACLE))]
-        )
-        kinds, counts = [], []
+        of_cloth = np.where(held, int(kernels.HELD), int(kernels.CLOTH))
+        self.vertex_groups = np.concatenate([of_cloth, np.full(self.obstacles, int(kernels.OBSTACLE))])
+        kinds, counts, groups = [], [], self.vertex_groups
         for kind, name in enumerate(("triangles", "edges")):
             local = [model.in_model(getattr(mesh, name)), *(getattr(each, name) + n + first for each, first in self._of_meshes)]
             local = np.concatenate([each.reshape(-1, 3 - kind) for each in local]).astype(np.int64)
@@ -77,9 +73,7 @@ class ContactSurface:
             vertices = np.tile(local, (model.copies, 1))
             behind = model.count + copy * self.obstacles + vertices - n
             vertices = np.where(vertices < n, vertices + copy * n, behind)
-            kinds.append(
-                np.column_stack([vertices, 2 * copy + kind, np.tile(self.vertex_groups[local].max(axis=1), model.copies)])
-            )
+            kinds.append(np.column_stack([vertices, 2 * copy + kind, np.tile(groups[local].max(axis=1), model.copies)]))
             counts.append(len(vertices))
         items = np.concatenate(kinds).astype(np.int32)
         (self.triangles, self.edges), self.items, self.groups = counts, items[:, :4], items[:, 4]
@@ -101,13 +95,6 @@ class ContactSurface:
             setattr(self.of_obstacles, name, self._arrays[name])
         self._find = model.kernel(kernels.find_obstacles, model.dtype)
 
-    @property
-    def of_cloth(self):
-        """Areas of the vertices of the cloth, in the order of the model, (n,) [m²]."""
-        found = np.empty(self.model.per_copy)
-        found[self.model.in_model(np.arange(len(found)))] = self.model.scene.touching_areas
-        return found
-
     def friction(self):
         """The law of friction, and μ of cloth with cloth, then that of each obstacle of a copy, (1 + m,). None: no friction.
 
@@ -123,13 +110,15 @@ class ContactSurface:
             raise ValueError(f"cloth and mesh colliders have the laws of friction {names}; they must have the same")
         return (*laws, np.array(given, dtype=np.float64)) if laws else None
 
-    def areas(self, of_cloth):
-        """Rest areas of vertices, and of each edge at them, (n + m,) [m²], given those of the vertices of the cloth (n,).
+    def areas(self):
+        """Rest areas of vertices, and of each edge at them, (n + m,) [m²], those of the cloth in the order of the model.
 
         The energy of a vertex of a mesh is to keep it out of large triangles of the cloth, not to press: it has the area that a
         vertex of the cloth has on average, if that is less.
         """
         mesh, n = self.model.scene.mesh, self.model.per_copy
+        of_cloth = np.empty(n)
+        of_cloth[self.model.in_model(np.arange(n))] = self.model.scene.touching_areas
         degrees = np.bincount(self.model.in_model(mesh.edges).ravel(), minlength=n)
         vertices, edges = [of_cloth], [of_cloth / np.maximum(degrees, 1)]
         for each, _ in self._of_meshes:

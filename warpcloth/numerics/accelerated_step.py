@@ -104,7 +104,7 @@ class AcceleratedStep:
             # A line search for w has listed the pairs of its trial.
             stepper.pairs.filter.launch_trial(stepper.state.x, d)
             for each in (self.plain, self.accelerated):
-                stepper.pairs.filter.launch_between(stepper.state.x, d, each)
+                stepper.pairs.filter.launch_between(d, each)
         self._launch_energy(self.plain, self._plain_energy)
         self._launch_energy(self.accelerated, self._energy)
         self._launch(kernels.next_slot, 1, [self.method.window], [self.slot])
