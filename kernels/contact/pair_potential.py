@@ -234,7 +234,7 @@ def corner_of(s: wp.vec4i, u: int):
 
 
 @wp.func
-def place_between(i: int, j: int):
+def code_between(i: int, j: int):
     """The code of the edge between two corners, 1 to 3, or of the corner i = j."""
     return wp.where(i == j, CORNER + i - 1, wp.where(i + j == 3, EDGE, EDGE + 6 - i - j))
 
@@ -260,7 +260,7 @@ def count_faces(stencils: STENCILS, codes: NUMBERS, near: NUMBERS, first: int, e
         i = corner_of(s, p)
         j = corner_of(s, q)
         if i > 0 and j > 0:
-            here = _number(codes, f) == place_between(i, j)
+            here = _number(codes, f) == code_between(i, j)
             if faces == 0:
                 lowest = f
             if faces == 0 or (here and on == 0):
@@ -523,7 +523,7 @@ def find_vertex_contacts(dtype):
                             w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                             w4[i] = t - ONE
                             w4[j] = -t
-                            slot = wp.where(code == place_between(i, j), e, extra + extras)
+                            slot = wp.where(code == code_between(i, j), e, extra + extras)
                             extras += wp.where(slot == e, 0, 1)
                             put(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
                     owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[i])
@@ -533,7 +533,7 @@ def find_vertex_contacts(dtype):
                     if owner == e and m != 0 and (distant or wp.length(P) < r):
                         w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                         w4[i] = -ONE
-                        slot = wp.where(code == place_between(i, i), e, extra + extras)
+                        slot = wp.where(code == code_between(i, i), e, extra + extras)
                         extras += wp.where(slot == e, 0, 1)
                         put(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
             if extras > 0:

@@ -54,7 +54,7 @@ def note_pressing(forces: PairForces, e: int, s: wp.vec4i):
 
 
 @wp.func
-def block_of(forces: PairForces, e: int):
+def bend_block(forces: PairForces, e: int):
     """∂²U/∂y² of a pair with a force."""
     block = forces.bend[e][0] * wp.outer(forces.along[e], forces.along[e])
     if forces.bend[e][1] > ZERO:
@@ -230,7 +230,7 @@ def set_pair_blocks(term: PairTerm, dtype):
         e = pairs.acting[t]
         block = wp.mat33d()
         if wp.max(forces.bend[e]) > ZERO:
-            block = block_of(forces, e)
+            block = bend_block(forces, e)
             s = pairs.stencils[e]
             w = forces.weights[e]
             for i in range(4):
@@ -266,7 +266,7 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
             e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
             w = forces.weights[e]
-            block = block_of(forces, e)
+            block = bend_block(forces, e)
             for i in range(corner, end_corner):
                 if inverse_mass[s[i]] > dtype(0.0):
                     if wp.static(scatters):
