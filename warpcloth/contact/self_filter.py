@@ -355,7 +355,7 @@ class SelfFilter:
         wp.capture_if(self._contact.listed, in_contact)
 
     def launch_back(self, goal, d, direction):
-        """Sets the direction of free vertices from d, where pairs are listed, to ``goal`` (N,) [m]; 0 if pairs meet on the way."""
+        """Sets the direction of free vertices from d, where pairs are listed, to ``goal`` (N,) [m]; 0 if pairs would meet."""
         self._aim(goal, d, True, False, None, direction)
         self.launch_limit(direction, whole=True)
 
