@@ -206,7 +206,7 @@ class SelfSteps:
             Stopped: There is no memory for them.
         """
         try:
-            self.grow_to(self.most)
+            self.grow_to(self._wanted)
         except ValueError as error:
             raise Stopped(str(error)) from None
 
@@ -224,7 +224,11 @@ class SelfSteps:
     @property
     def overflowed(self):
         """Whether the lists so far had more pairs than their capacity. The host reads the device."""
-        return self.most > len(self.pairs.stencils)
+        most = self.most
+        if most > len(self.pairs.stencils):
+            self._wanted = most  # the state, with this number, may be put back before the lists grow
+            return True
+        return False
 
     @property
     def share(self):
