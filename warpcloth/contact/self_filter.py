@@ -228,7 +228,7 @@ class SelfFilter:
         self._launch(factory, self._surface.count - self.model.count, inputs, outputs)
 
     def launch_meshes(self):
-        """As :meth:`_launch_meshes`, to where the step evaluates forces."""
+        """Moves meshes, and cloth out of their way, to where the step evaluates forces."""
         self._launch_meshes(self._contact.placed[1])
 
     def _launch_meshes(self, goal):
@@ -384,7 +384,7 @@ class SelfFilter:
     def launch_limit(self, direction, whole=False):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
 
-        All of a copy move by the same fraction, for other moves would stretch stiff cloth; by none with ``whole``, if not by 1.
+        All of a copy move by the same fraction, as others would stretch stiff cloth; with ``whole`` it is 0 if not 1.
         """
         contact, proximity, target = self._contact, self._contact.proximity, self._other
 

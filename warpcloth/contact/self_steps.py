@@ -252,7 +252,7 @@ class SelfSteps:
 
     @property
     def pressed(self):
-        """A :class:`FirstGap` for each copy with cloth nearer to cloth than half the distance where contact begins; to meshes.
+        """Lists of :class:`FirstGap` of cloth nearer to cloth, and to meshes, than half the distance where contact begins.
 
         Explicit steps note none of meshes.
         """
