@@ -250,7 +250,9 @@ class SelfFilter:
             array.zero_()
         self._launch_move(mesh_moves.aim_obstacles, [goal], [self._surface.behind(x), self._surface.behind(p)])
         self._launch_carriers(self._carriers[0])
-        self._launch_carry_on(x)
+        self._launch_carry_on()
+        self.launch_limit(p)
+        self._add(x, p, 1.0, x, self._walking)
         model.launch(self._count, 1, [], [self._rounds])
         self._proceed.zero_()
         given = [self.fraction, self._rounds, contact.steps, ROUNDS, contact.per_frame]
@@ -272,16 +274,19 @@ class SelfFilter:
         given = [model.inverse_mass, colliders.shapes, x, colliders.poses, model.per_copy, model.colliders.distance]
         model.launch(self._carry_with_shapes, model.count, given, [self._moves, self._keys, self._changed])
         wp.copy(self._carried, self._keys)
-        wp.capture_if(self._changed, self._launch_carry_on, x=x)
+        wp.capture_if(self._changed, self._launch_walk_with_shapes, x=x)
 
-    def _launch_carry_on(self, x):
-        """Moves x with what carries the cloth, and cloth that is listed with carried cloth with that."""
+    def _launch_walk_with_shapes(self, x):
+        self._launch_carry_on()
+        self._add(x, self._moves, 1.0, self._target)
+        self._launch_rounds(x)
+
+    def _launch_carry_on(self):
+        """Finds the moves of cloth that is listed with carried cloth, and pushes what would come too near apart."""
         self._changed.fill_(1)
         wp.capture_while(self._changed, self._launch_carriers, kernel=self._carriers[1])
         self._launch_pushes(self.model.inverse_mass, self._moves, opens=True)
         self.model.lock(self._moves)
-        self.launch_limit(self._moves)
-        self._add(x, self._moves, 1.0, x, self._walking)
 
     def _launch_carriers(self, kernel):
         model, contact = self.model, self._contact
