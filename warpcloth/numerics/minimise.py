@@ -237,6 +237,7 @@ class Minimiser:
         self.clear()
         self.linear.outdate()
         self.active.fill_(1)
+        self._progress.stays.zero_()
         if self.warm:
             self._launch_mean(self.right)
             wp.copy(self.search.direction, self.right)
@@ -272,7 +273,6 @@ class Minimiser:
         for elements in self._solid:
             given = [elements.stencil, elements.rest, model.inverse_mass]
             model.launch(model.kernel(move_clear, elements.term, model.dtype), elements.count, given, [x])
-        self._progress.stays.zero_()
         for goal, stays in (x, 0), (self._colliders.x_before, 1), (None, 0):
             if goal is not None:
                 model.launch(model.kernel(mismatch, model.dtype), model.count, [goal, self.base], [direction])
