@@ -8,7 +8,7 @@ from functools import cache
 import warp as wp
 
 from .contact.pair_sums import pair_blocks
-from .contact.self_pairs import near_pairs
+from .contact.self_pairs import Pairs
 from .memory import add_to, load
 from .vectors import types
 
@@ -35,9 +35,9 @@ def block_rows(dtype):
         diagonal: wp.array(dtype=wp.int32)
         values: wp.array(dtype=mat33)
         mobility: wp.array(dtype=vec3)
-        pairs: near_pairs(dtype)
+        pairs: Pairs
         blocks: pair_blocks(dtype)
-        other_pairs: near_pairs(dtype)
+        other_pairs: Pairs
         other_blocks: pair_blocks(dtype)
 
     return BlockRows
@@ -70,7 +70,7 @@ def product_of_pairs(dtype, lanes: int, turned: bool):
 
     @wp.func
     def product(
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         blocks: pair_blocks(dtype),
         i: int,
         lane: int,

@@ -9,7 +9,7 @@ from .obstacles import cloth_vertex, copy_of, has_obstacle
 from .pair_potential import CLOSE, Laws
 from .self_contact import least_gap
 from .self_gaps import ONE, SIDE, ZERO, farthest_of
-from .self_pairs import StepPairs, module_of, near_pairs
+from .self_pairs import Pairs, StepPairs, module_of
 
 # The least gap that coarse positions leave is 6 units in the last place. Rounding changes gaps by two of them.
 ROUNDED = wp.constant(wp.float64(4.0 / 3.0))
@@ -52,13 +52,13 @@ def cutoff_of(dtype):
     """Device function (pairs, laws, e) → the gap at which contact of a pair begins [m]; 0 if it has none."""
 
     @wp.func
-    def contact_distance(pairs: near_pairs(dtype), laws: Laws, e: int):
+    def contact_distance(pairs: Pairs, laws: Laws, e: int):
         s = pairs.stencils[e]
-        r = dtype(laws.distance[wp.where(has_obstacle(pairs.layout, s), 1, 0)])
+        r = wp.float64(dtype(laws.distance[wp.where(has_obstacle(pairs.layout, s), 1, 0)]))
         if pairs.distances[e] != r:
             return ZERO
         close = e >= pairs.counts[0] or s[0] >= pairs.layout.cloth
-        return wp.where(close, CLOSE, ONE) * wp.float64(r)
+        return wp.where(close, CLOSE, ONE) * r
 
     return contact_distance
 
@@ -75,7 +75,7 @@ def note_gaps(dtype):
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def note_each_gap(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         step: StepPairs,
         x: wp.array(dtype=vec3),
@@ -124,7 +124,7 @@ def count_pairs(dtype):
     @wp.kernel(module="unique", enable_backward=False)
     def count_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         step: StepPairs,
         # parameters

@@ -1,69 +1,57 @@
 """Factories of the kernels that sum forces between cloth and mesh colliders, for records."""
 
-from functools import cache
-
 import warp as wp
 
 from .obstacles import copy_of, obstacle_of
 from .pair_sums import PairForces
 from .self_gaps import ZERO
-from .self_pairs import near_pairs
+from .self_pairs import Pairs
 
 
-@cache
-def keep_forces(dtype):
+@wp.kernel(module="warpcloth.mesh_forces", enable_backward=False)
+def keep_forces(
+    # elements
+    pairs: Pairs,
+    parts: wp.array(dtype=wp.vec4i),
+    colliders: wp.array(dtype=wp.int32),
+    # parameters
+    kept: int,
+    # in and out
+    forces: PairForces,
+):
     """Kernel over contacts: forces and energies of contacts with other colliders than ``kept`` become 0.
 
     ``colliders`` is the collider of each obstacle of a copy; −1 keeps contact of cloth with cloth.
     """
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def keep_each_force(
-        # elements
-        pairs: near_pairs(dtype),
-        parts: wp.array(dtype=wp.vec4i),
-        colliders: wp.array(dtype=wp.int32),
-        # parameters
-        kept: int,
-        # in and out
-        forces: PairForces,
-    ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
-            return
-        e = pairs.acting[t]
-        own = obstacle_of(pairs.layout, parts[e])
-        if own >= 0:
-            own = colliders[own]
-        if own != kept:
-            forces.energy[e] = ZERO
-            forces.force[e] = wp.vec3d()
-
-    return keep_each_force
+    t = wp.tid()
+    if t >= pairs.number[0]:
+        return
+    e = pairs.acting[t]
+    own = obstacle_of(pairs.layout, parts[e])
+    if own >= 0:
+        own = colliders[own]
+    if own != kept:
+        forces.energy[e] = ZERO
+        forces.force[e] = wp.vec3d()
 
 
-@cache
-def work_of_meshes(dtype):
+@wp.kernel(module="warpcloth.mesh_forces", enable_backward=False)
+def work_of_meshes(
+    # elements
+    pairs: Pairs,
+    parts: wp.array(dtype=wp.vec4i),
+    colliders: wp.array(dtype=wp.int32),
+    # state in
+    travel: wp.array(dtype=wp.vec3d),
+    forces: PairForces,
+    # in and out
+    out: wp.array2d(dtype=wp.float64),
+):
     """Kernel of one thread: out (B, C) += Σ ∂U/∂y·travel, the work of mesh colliders on the cloth in a step [J]."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_work_of_meshes(
-        # elements
-        pairs: near_pairs(dtype),
-        parts: wp.array(dtype=wp.vec4i),
-        colliders: wp.array(dtype=wp.int32),
-        # state in
-        travel: wp.array(dtype=wp.vec3d),
-        forces: PairForces,
-        # in and out
-        out: wp.array2d(dtype=wp.float64),
-    ):
-        for t in range(pairs.number[0]):
-            e = pairs.acting[t]
-            other = obstacle_of(pairs.layout, parts[e])
-            if other >= 0 and wp.max(forces.bend[e]) > ZERO:
-                c = colliders[other]
-                copy = copy_of(pairs.layout, parts[e][0])
-                out[copy, c] = out[copy, c] + wp.dot(forces.force[e], travel[e])
-
-    return add_work_of_meshes
+    for t in range(pairs.number[0]):
+        e = pairs.acting[t]
+        other = obstacle_of(pairs.layout, parts[e])
+        if other >= 0 and wp.max(forces.bend[e]) > ZERO:
+            c = colliders[other]
+            copy = copy_of(pairs.layout, parts[e][0])
+            out[copy, c] = out[copy, c] + wp.dot(forces.force[e], travel[e])

@@ -15,7 +15,7 @@ from .colliders import gap_of, of_pose, shapes, step_poses
 from .gap_notes import FIRST
 from .obstacles import has_obstacle
 from .self_gaps import ONE, ZERO
-from .self_pairs import StepPairs, near_pairs
+from .self_pairs import Pairs, StepPairs
 
 PARTS = wp.constant(wp.float64(2.0**20))  # of the contact distance and the skin, in which gaps are compared
 SMALL = wp.constant(wp.float64(1e-9))  # a weight, so that their sum is not 0
@@ -77,7 +77,7 @@ def find_carriers(dtype, of_meshes: bool):
     @wp.kernel(module=f"warpcloth.carriers.{dtype.__name__}.{of_meshes}", enable_backward=False)
     def find_each_carrier(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         step: StepPairs,
         carried: wp.array(dtype=wp.int64),
@@ -164,7 +164,7 @@ def carry_vertices(dtype):
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
     def carry_each_vertex(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=dtype),
         mobility: wp.array(dtype=vec3),
         # state in
@@ -209,35 +209,30 @@ def carry_vertices(dtype):
     return carry_each_vertex
 
 
-@cache
-def end_move(dtype):
+@wp.kernel(module="warpcloth.mesh_moves", enable_backward=False)
+def end_move(
+    # state in
+    fraction: wp.array(dtype=wp.float64),
+    rounds: wp.array(dtype=wp.int32),
+    steps: wp.array(dtype=wp.int32),
+    # parameters
+    most: int,
+    per_frame: int,
+    # in and out
+    active: wp.array(dtype=wp.int32),
+    # out
+    proceed: wp.array(dtype=wp.int32),
+    first: wp.array(dtype=wp.int64),
+):
     """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
 
     After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame.
     """
-
-    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
-    def end_each_move(
-        # state in
-        fraction: wp.array(dtype=wp.float64),
-        rounds: wp.array(dtype=wp.int32),
-        steps: wp.array(dtype=wp.int32),
-        # parameters
-        most: int,
-        per_frame: int,
-        # in and out
-        active: wp.array(dtype=wp.int32),
-        # out
-        proceed: wp.array(dtype=wp.int32),
-        first: wp.array(dtype=wp.int64),
-    ):
-        c = wp.tid()
-        if fraction[c] == ONE:
-            active[c] = 0
-        elif active[c] != 0:
-            if rounds[0] < most:
-                proceed[0] = 1
-            else:
-                wp.atomic_max(first, c, FIRST - wp.int64(steps[c] // per_frame + 1))
-
-    return end_each_move
+    c = wp.tid()
+    if fraction[c] == ONE:
+        active[c] = 0
+    elif active[c] != 0:
+        if rounds[0] < most:
+            proceed[0] = 1
+        else:
+            wp.atomic_max(first, c, FIRST - wp.int64(steps[c] // per_frame + 1))

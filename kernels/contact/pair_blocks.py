@@ -7,7 +7,7 @@ import warp as wp
 from ..memory import load, store
 from ..vectors import types
 from . import self_gaps
-from .self_pairs import StepPairs, module_of, near_pairs
+from .self_pairs import Pairs, StepPairs, module_of
 
 # Pairs of a block, and the numbers of each: three vectors between its vertices, then w, y and d.
 BLOCK, NUMBERS = 128, 17
@@ -60,7 +60,7 @@ def begin_blocks(dtype):
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def begin_each_block(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         x: wp.array(dtype=vec3),
         # in and out

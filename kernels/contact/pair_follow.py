@@ -4,86 +4,73 @@ Sweeps leave w and n as they were found. Then contacts are found anew where the 
 new contacts start with the λ of the old ones.
 """
 
-from functools import cache
-
 import warp as wp
 
 from ..memory import load
 from ..terms import contact
 from .pair_potential import Contacts
 from .self_gaps import ONE, SIDE, ZERO
-from .self_pairs import module_of, near_pairs
+from .self_pairs import Pairs
 
-slope = contact.slope
+slope, _number = contact.slope, load(wp.int32)
 
 
-@cache
-def carry_forces(dtype):
+@wp.kernel(module="warpcloth.pair_follow", enable_backward=False)
+def carry_forces(
+    # elements
+    pairs: Pairs,
+    # state in
+    multipliers: wp.array(dtype=wp.vec3d),
+    # in and out
+    contacts: Contacts,
+):
     """Kernel over contacts: carries over λ along n, before the contacts are found elsewhere."""
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def carry_each_force(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        multipliers: wp.array(dtype=wp.vec3d),
-        # in and out
-        contacts: Contacts,
-    ):
-        for t in range(wp.tid(), pairs.number[0], pairs.threads):
-            e = pairs.acting[t]
-            contacts.followed.carried[e] = wp.dot(multipliers[e], contacts.normal[e])
-            contacts.followed.stencils[e] = contacts.parts[e]
-
-    return carry_each_force
+    for t in range(wp.tid(), pairs.number[0], pairs.threads):
+        e = pairs.acting[t]
+        contacts.followed.carried[e] = wp.dot(multipliers[e], contacts.normal[e])
+        contacts.followed.stencils[e] = contacts.parts[e]
 
 
-@cache
-def start_forces(dtype):
+@wp.kernel(module="warpcloth.pair_follow", enable_backward=False)
+def start_forces(
+    # elements
+    lists: Pairs,
+    pairs: Pairs,
+    # parameters
+    h: wp.float64,
+    vertices: int,
+    # in and out
+    contacts: Contacts,
+):
     """Kernel over contacts: the start of λ is that of the same contact before, else −h²kAφ′, but 0 below r/2."""
-    number = load(wp.int32)
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def start_each_force(
-        # elements
-        lists: near_pairs(dtype),
-        pairs: near_pairs(dtype),
-        # parameters
-        h: wp.float64,
-        vertices: int,
-        # in and out
-        contacts: Contacts,
-    ):
-        for t in range(wp.tid(), pairs.number[0], pairs.threads):
-            e = pairs.acting[t]
-            gap = contacts.gap[e]
-            r = contacts.distance[e]
-            found = ZERO
-            if gap >= SIDE * r:
-                found = -contacts.stiffness[e] * slope(gap, r) * h * h
-            # The list may have been made anew, so that the contact is now in another slot of its row.
-            half = contacts.code.shape[0] // 2
-            row = contacts.parts[e][0]
-            if e >= lists.counts[0] and e < half:
-                row = vertices
-                above = lists.rows.shape[0] - 1
-                while above - row > 1:
-                    middle = (row + above) // 2
-                    if number(lists.rows, middle) <= e:
-                        row = middle
-                    else:
-                        above = middle
-            first = contacts.followed.rows[row]
-            end = wp.min(contacts.followed.rows[row + 1], half)
-            if e >= half:
-                first = half + 3 * first
-                end = wp.min(half + 3 * end, 2 * half)
-            for k in range(first, end):
-                if contacts.followed.carried[k] > ZERO and contacts.parts[e] == contacts.followed.stencils[k]:
-                    found = contacts.followed.carried[k]
-            contacts.followed.start[e] = wp.where(contacts.stiffness[e] > ZERO, found, ZERO)
-
-    return start_each_force
+    for t in range(wp.tid(), pairs.number[0], pairs.threads):
+        e = pairs.acting[t]
+        gap = contacts.gap[e]
+        r = contacts.distance[e]
+        found = ZERO
+        if gap >= SIDE * r:
+            found = -contacts.stiffness[e] * slope(gap, r) * h * h
+        # The list may have been made anew, so that the contact is now in another slot of its row.
+        half = contacts.code.shape[0] // 2
+        row = contacts.parts[e][0]
+        if e >= lists.counts[0] and e < half:
+            row = vertices
+            above = lists.rows.shape[0] - 1
+            while above - row > 1:
+                middle = (row + above) // 2
+                if _number(lists.rows, middle) <= e:
+                    row = middle
+                else:
+                    above = middle
+        first = contacts.followed.rows[row]
+        end = wp.min(contacts.followed.rows[row + 1], half)
+        if e >= half:
+            first = half + 3 * first
+            end = wp.min(half + 3 * end, 2 * half)
+        for k in range(first, end):
+            if contacts.followed.carried[k] > ZERO and contacts.parts[e] == contacts.followed.stencils[k]:
+                found = contacts.followed.carried[k]
+        contacts.followed.start[e] = wp.where(contacts.stiffness[e] > ZERO, found, ZERO)
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
@@ -101,44 +88,39 @@ def count_sweep(
     turn[0] = turn[0] + 1
 
 
-@cache
-def fix_forces(dtype):
+@wp.kernel(module="warpcloth.pair_follow", enable_backward=False)
+def fix_forces(
+    # elements
+    lists: Pairs,
+    # parameters
+    h: wp.float64,
+    # in and out
+    contacts: Contacts,
+):
     """Kernel over vertices: the part of the forces of contacts over a valley that sweeps do not compute anew, as λ [kg·m].
 
     That is −h²(1 − share)kAφ′ along n, and all of negative contacts, but in proportion to the λ of the positive ones, because
     the positions where the contacts were found may be far from the solution.
     """
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def fix_forces_of_vertex(
-        # elements
-        lists: near_pairs(dtype),
-        # parameters
-        h: wp.float64,
-        # in and out
-        contacts: Contacts,
-    ):
-        v = wp.tid()
-        first = lists.rows[v]
-        count = lists.rows[v + 1] - first
-        extra = contacts.code.shape[0] // 2 + 3 * first
-        if count < 2 or extra + 3 * count > contacts.code.shape[0]:
-            return
-        for i in range(4 * count):
-            one = wp.where(i < count, first + i, extra + i - count)
-            k = contacts.stiffness[one]
-            share = wp.where(k > ZERO, contacts.share[one], ZERO)
-            if k != ZERO and share < ONE:
-                held = ZERO
-                whole = ZERO
-                for j in range(4 * count):
-                    other = wp.where(j < count, first + j, extra + j - count)
-                    A = contacts.stiffness[other]
-                    if A > ZERO and wp.dot(contacts.normal[one], contacts.normal[other]) > ZERO:
-                        held += contacts.followed.start[other]
-                        whole -= h * h * A * slope(contacts.gap[other], contacts.distance[other])
-                if held > ZERO and whole > ZERO:
-                    part = wp.min(held / whole, ONE) * (ONE - share)
-                    contacts.fixed[one] = -part * h * h * k * slope(contacts.gap[one], contacts.distance[one])
-
-    return fix_forces_of_vertex
+    v = wp.tid()
+    first = lists.rows[v]
+    count = lists.rows[v + 1] - first
+    extra = contacts.code.shape[0] // 2 + 3 * first
+    if count < 2 or extra + 3 * count > contacts.code.shape[0]:
+        return
+    for i in range(4 * count):
+        one = wp.where(i < count, first + i, extra + i - count)
+        k = contacts.stiffness[one]
+        share = wp.where(k > ZERO, contacts.share[one], ZERO)
+        if k != ZERO and share < ONE:
+            held = ZERO
+            whole = ZERO
+            for j in range(4 * count):
+                other = wp.where(j < count, first + j, extra + j - count)
+                A = contacts.stiffness[other]
+                if A > ZERO and wp.dot(contacts.normal[one], contacts.normal[other]) > ZERO:
+                    held += contacts.followed.start[other]
+                    whole -= h * h * A * slope(contacts.gap[other], contacts.distance[other])
+            if held > ZERO and whole > ZERO:
+                part = wp.min(held / whole, ONE) * (ONE - share)
+                contacts.fixed[one] = -part * h * h * k * slope(contacts.gap[one], contacts.distance[one])

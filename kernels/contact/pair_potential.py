@@ -26,7 +26,7 @@ from ..memory import load
 from ..vectors import types
 from .obstacles import Layout, cloth_vertex, has_obstacle, in_copy
 from .self_gaps import ONE, SIDE, ZERO, gap_along, in_plane, vertex_of
-from .self_pairs import module_of, near_pairs
+from .self_pairs import Pairs, module_of
 
 ON_EDGE = wp.constant(wp.float64(1e-10))  # coordinates below are 0: rounding must not decide between a face and its edge
 MIDDLE = wp.constant(wp.float64(0.125))  # weight of the distance from the middles of edges; below 1/6 D is strictly convex
@@ -284,7 +284,7 @@ def put_contact(dtype):
         r: wp.float64,
         kA: wp.float64,
         x: wp.array(dtype=vec3),
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         contacts: Contacts,
     ):
         gap = wp.length(y)
@@ -390,7 +390,7 @@ def find_near_faces(dtype):
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_each_near_face(
         # elements
-        lists: near_pairs(dtype),
+        lists: Pairs,
         # state in
         normals: wp.array(dtype=wp.vec3d),
         x: wp.array(dtype=vec3),
@@ -408,7 +408,7 @@ def find_near_faces(dtype):
             v = s[0]
             found = NONE
             r = laws.distance[wp.where(has_obstacle(lists.layout, s), 1, 0)]
-            if v < vertices and lists.distances[e] == dtype(r):  # else the rest distance is below 2r
+            if v < vertices and lists.distances[e] == wp.float64(dtype(r)):  # else the rest distance is below 2r
                 r = wp.where(v < lists.layout.cloth, r, CLOSE * r)
                 a = at(x, correction, v)
                 b = at(x, correction, s[1]) - a
@@ -456,7 +456,7 @@ def find_vertex_contacts(dtype):
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_contacts_of_vertex(
         # elements
-        lists: near_pairs(dtype),
+        lists: Pairs,
         areas: Areas,
         # state in
         x: wp.array(dtype=vec3),
@@ -467,7 +467,7 @@ def find_vertex_contacts(dtype):
         vertices: int,
         threads: int,
         # out
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         contacts: Contacts,
     ):
         for v in range(wp.tid(), vertices, threads):
@@ -562,7 +562,7 @@ def find_edge_contacts(dtype):
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_contact_of_edges(
         # elements
-        lists: near_pairs(dtype),
+        lists: Pairs,
         areas: Areas,
         # state in
         normals: wp.array(dtype=wp.vec3d),
@@ -573,7 +573,7 @@ def find_edge_contacts(dtype):
         # parameters
         laws: Laws,
         # out
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         contacts: Contacts,
     ):
         end = wp.min(lists.counts[0] + lists.counts[1], lists.stencils.shape[0])
@@ -581,7 +581,7 @@ def find_edge_contacts(dtype):
             contacts.code[e] = TWO_EDGES
             s = _stencil(lists.stencils, e)
             law = wp.where(has_obstacle(lists.layout, s), 1, 0)
-            if lists.distances[e] != dtype(laws.distance[law]):
+            if lists.distances[e] != wp.float64(dtype(laws.distance[law])):
                 continue
             r = CLOSE * laws.distance[law]
             a = at(x, correction, s[0])

@@ -14,7 +14,7 @@ from ..rotation import epsilon
 from ..vectors import types
 from .pair_sums import PairTerm
 from .self_gaps import ONE, ZERO
-from .self_pairs import near_pairs
+from .self_pairs import Pairs
 
 FIXED = wp.constant(wp.float64(1e20))  # compliance of a row whose force is given
 
@@ -43,7 +43,7 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
     @wp.kernel(module="unique", enable_backward=False)
     def linearise_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=dtype),
         # state in
         data: term.data,
@@ -128,7 +128,7 @@ def apply_pair_rows(dtype, two: bool):
     @wp.kernel(module="unique", enable_backward=False)
     def apply_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         slopes: PairSlopes,
         v: wp.array(dtype=vec3),
@@ -162,7 +162,7 @@ def gather_pair_rows(dtype, two: bool):
     @wp.kernel(module="unique", enable_backward=False)
     def gather_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         slopes: PairSlopes,
         rows: wp.array(dtype=dtype),

@@ -15,7 +15,7 @@ import warp as wp
 
 from ..vectors import types
 from .self_gaps import ZERO
-from .self_pairs import near_pairs
+from .self_pairs import Pairs
 
 
 @wp.struct
@@ -87,7 +87,7 @@ class PairTerm:
         near: Function of a precision, which makes the device function (pairs, data, e, x, d, always) → whether pair e may
             have a force at x + d, v, n and w, for a sweep; n is a unit vector. v is the y of friction, and the gap along n of
             contact. With ``always``, w and v are found in any case.
-        push: Device function (pairs, data, e, v, n, D, least, h, hard) → λ = −h²∂U/∂y at v + Dλ [kg·m], v without the force of
+        push: Device function (data, e, v, n, D, least, h, hard) → λ = −h²∂U/∂y at v + Dλ [kg·m], v without the force of
             the pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.pair_sweeps`.
         row: Function of a precision, which makes the device function (pairs, data, e, x, d) → :class:`PairRow`.
         isotropic: Whether D is that of a vertex without locked axes, because ``push`` needs one D for all directions.
@@ -125,21 +125,21 @@ class PairRow:
 
 
 @cache
-def taken_by(dtype, scatters: bool):
+def taken_by(scatters: bool):
     """Device functions (pairs, forces, thread) → its range, and (pairs, forces, k) → pair e, and the range of its corners.
 
     Without a force, the range of corners is empty.
     """
 
     @wp.func
-    def range_of(pairs: near_pairs(dtype), forces: PairForces, thread: int):
+    def range_of(pairs: Pairs, forces: PairForces, thread: int):
         if wp.static(scatters):
             return wp.int32(0), forces.count[0]
         else:
             return pairs.first[thread], pairs.first[thread + 1]
 
     @wp.func
-    def corners_at(pairs: near_pairs(dtype), forces: PairForces, k: int):
+    def corners_at(pairs: Pairs, forces: PairForces, k: int):
         if wp.static(scatters):
             return forces.pressing[k], wp.int32(0), wp.int32(4)
         else:
@@ -154,12 +154,12 @@ def taken_by(dtype, scatters: bool):
 def pair_forces(term: PairTerm, dtype, scatters: bool):
     """Kernel over threads: out += ∂U/∂x."""
     vec3, _ = types(dtype)
-    range_of, corners_at = taken_by(dtype, scatters)
+    range_of, corners_at = taken_by(scatters)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
     def add_forces_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         forces: PairForces,
         # in and out
@@ -187,12 +187,12 @@ def pair_forces(term: PairTerm, dtype, scatters: bool):
 @cache
 def pair_energies(term: PairTerm, dtype, scatters: bool):
     """Kernel over threads: adds the energies [J] of the pairs to those of their first vertices."""
-    range_of, corners_at = taken_by(dtype, scatters)
+    range_of, corners_at = taken_by(scatters)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
     def add_energies_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         forces: PairForces,
         # in and out
@@ -217,7 +217,7 @@ def set_pair_blocks(term: PairTerm, dtype):
     @wp.kernel(module=term.of(dtype, False), enable_backward=False)
     def set_blocks_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=dtype),
         # state in
         forces: PairForces,
@@ -246,12 +246,12 @@ def set_pair_blocks(term: PairTerm, dtype):
 def pair_diagonal(term: PairTerm, dtype, scatters: bool):
     """Kernel over threads: adds Σ wᵢ² ∂²U/∂y² to the diagonal blocks of a Hessian, except those of pins."""
     _, mat33 = types(dtype)
-    range_of, corners_at = taken_by(dtype, scatters)
+    range_of, corners_at = taken_by(scatters)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
     def add_diagonal_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=dtype),
         diagonal: wp.array(dtype=wp.int32),
         # state in
@@ -282,12 +282,12 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
 def pair_products(term: PairTerm, dtype, scatters: bool):
     """Kernel over threads: q += wᵢ ∂²U/∂y² Σⱼ wⱼpⱼ over the other vertices j of each pair, in active copies."""
     vec3, _ = types(dtype)
-    range_of, corners_at = taken_by(dtype, scatters)
+    range_of, corners_at = taken_by(scatters)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
     def add_products_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=dtype),
         # state in
         forces: PairForces,

@@ -16,7 +16,7 @@ from ..memory import load
 from ..vectors import types
 from .pair_sums import PairForces, PairTerm, is_single
 from .self_gaps import ONE, ZERO
-from .self_pairs import near_pairs
+from .self_pairs import Pairs
 
 # Smallest D of a hard pair, over its D with all axes free. If n is at an angle ε to the free axes, its vertices would move by
 # (r − d)/sin ε. This bounds their moves by (r − d)/√LOCKED, and takes them to 0 where sin ε does.
@@ -74,12 +74,12 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
     """Kernel of one thread, which takes each acting pair in turn."""
     vec3, _ = types(dtype)
     moved, respond, greatest = mobility(dtype, axes, term.isotropic)
-    near, push, number, stencil = term.near(dtype), term.push(dtype), load(wp.int32), load(wp.vec4i)
+    near, push, number, stencil = term.near(dtype), term.push, load(wp.int32), load(wp.vec4i)
 
     @wp.kernel(module="unique", enable_backward=False)
     def sweep_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=vec3 if axes else dtype),
         # state in
         data: term.data,
@@ -117,7 +117,7 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
                 if not hard and D > ZERO:
                     v -= (whole - D) * before
                     D = whole
-                after = push(pairs, data, e, v, n, D, LOCKED * whole, h, hard)
+                after = push(data, e, v, n, D, LOCKED * whole, h, hard)
                 for i in range(corners):
                     move = w[i] * after
                     if held:
@@ -131,22 +131,17 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
     return sweep_each_pair
 
 
-@cache
-def number_corners(dtype):
+@wp.kernel(module="warpcloth.pair_sweeps", enable_backward=False)
+def number_corners(
+    # elements
+    pairs: Pairs,
+    # out
+    slots: wp.array(dtype=wp.int32),
+):
     """Kernel over entries of ``corners``: the index of each corner."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def number_each_corner(
-        # elements
-        pairs: near_pairs(dtype),
-        # out
-        slots: wp.array(dtype=wp.int32),
-    ):
-        k = wp.tid()
-        if k < pairs.first[pairs.first.shape[0] - 1]:
-            slots[pairs.corners[k]] = k
-
-    return number_each_corner
+    k = wp.tid()
+    if k < pairs.first[pairs.first.shape[0] - 1]:
+        slots[pairs.corners[k]] = k
 
 
 @cache
@@ -158,7 +153,7 @@ def touch_pairs(term: PairTerm, dtype):
     @wp.kernel(module="unique", enable_backward=False)
     def touch_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         data: term.data,
         multipliers: wp.array(dtype=wp.vec3d),
@@ -201,12 +196,12 @@ def press_pairs(term: PairTerm, dtype, axes: bool):
     """
     _moved, respond, greatest = mobility(dtype, axes, term.isotropic)
     vec3, _ = types(dtype)
-    push = term.push(dtype)
+    push = term.push
 
     @wp.kernel(module="unique", enable_backward=False)
     def press_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=vec3 if axes else dtype),
         # state in
         data: term.data,
@@ -240,7 +235,7 @@ def press_pairs(term: PairTerm, dtype, axes: bool):
         before = wp.vec3d()
         if multipliers:
             before = multipliers[e]
-        after = push(pairs, data, e, swept.v[e] - D * before, n, D, LOCKED * whole, h, hard)
+        after = push(data, e, swept.v[e] - D * before, n, D, LOCKED * whole, h, hard)
         for i in range(4):
             move = w[i] * after
             if not (before == wp.vec3d()):
@@ -262,7 +257,7 @@ def move_by_pairs(dtype, axes: bool):
     @wp.kernel(module="unique", enable_backward=False)
     def move_each_by_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=vec3 if axes else dtype),
         # in and out
         swept: SweptPairs,

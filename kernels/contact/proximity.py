@@ -13,24 +13,20 @@ from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, code_of, grids
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 
 
-@cache
-def pair_lists(dtype):
-    """Struct of the pairs: ``counts`` (2,) of those found, and unordered (row, item) of those within the capacity.
+@wp.struct
+class PairList:
+    """The pairs: ``counts`` (2,) of those found, and unordered (row, item) of those within the capacity.
 
     Rows are vertices, then edges. Row i has the items from ``first`` [i] on, sorted. ``row_counts`` is 0 between launches.
     """
 
-    @wp.struct
-    class PairList:
-        counts: wp.array(dtype=wp.int32)
-        found: wp.array(dtype=wp.vec2i)
-        row_counts: wp.array(dtype=wp.int32)
-        first: wp.array(dtype=wp.int32)
-        items: wp.array(dtype=wp.int32)
-        stencils: wp.array(dtype=wp.vec4i)
-        distances: wp.array(dtype=dtype)
-
-    return PairList
+    counts: wp.array(dtype=wp.int32)
+    found: wp.array(dtype=wp.vec2i)
+    row_counts: wp.array(dtype=wp.int32)
+    first: wp.array(dtype=wp.int32)
+    items: wp.array(dtype=wp.int32)
+    stencils: wp.array(dtype=wp.vec4i)
+    distances: wp.array(dtype=wp.float64)
 
 
 @cache
@@ -99,12 +95,12 @@ def cutoffs(dtype, of_edges: bool):
 def take_near(dtype, of_edges: bool):
     """The function of :func:`search_pairs` that lists pairs nearer than their contact distance and the skin, and its struct."""
     vec3, _ = types(dtype)
-    corner, pair_list = load(vec3), pair_lists(dtype)
+    corner = load(vec3)
     closest, cutoff = closest_points(dtype, of_edges), cutoffs(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
     @wp.func
-    def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, pairs: pair_list):
+    def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, pairs: PairList):
         d = wp.length(closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3])))
         if d < surface.max_distance + surface.skin:
             if d < surface.skin or d < surface.skin + cutoff(surface, s):
@@ -120,7 +116,7 @@ def take_near(dtype, of_edges: bool):
                         wp.atomic_add(pairs.row_counts, row, 1)
                         pairs.found[slot] = wp.vec2i(row, item + triangles)
 
-    return take, pair_list
+    return take, PairList
 
 
 @cache
@@ -279,23 +275,18 @@ def kept(counts: wp.array(dtype=wp.int32), capacity: int):
     return wp.min(wp.min(counts[0], capacity) + counts[1], capacity)
 
 
-@cache
-def fill_rows(dtype):
+@wp.kernel(module="warpcloth.proximity", enable_backward=False)
+def fill_rows(
+    # in and out
+    pairs: PairList,
+):
     """Kernel over the capacity: the items of each row; counts ``row_counts`` down to 0."""
-
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
-    def fill_each_row(
-        # in and out
-        pairs: pair_lists(dtype),
-    ):
-        capacity = pairs.found.shape[0]
-        k = capacity - 1 - wp.tid()
-        if k < kept(pairs.counts, capacity):
-            row = pairs.found[k][0]
-            slot = pairs.first[row] + wp.atomic_sub(pairs.row_counts, row, 1) - 1
-            pairs.items[slot] = pairs.found[k][1]
-
-    return fill_each_row
+    capacity = pairs.found.shape[0]
+    k = capacity - 1 - wp.tid()
+    if k < kept(pairs.counts, capacity):
+        row = pairs.found[k][0]
+        slot = pairs.first[row] + wp.atomic_sub(pairs.row_counts, row, 1) - 1
+        pairs.items[slot] = pairs.found[k][1]
 
 
 @cache
@@ -311,7 +302,7 @@ def write_pairs(dtype):
         vertices: int,
         triangles: int,
         # out
-        pairs: pair_lists(dtype),
+        pairs: PairList,
     ):
         row = wp.tid()
         first = pairs.first[row]
@@ -329,6 +320,6 @@ def write_pairs(dtype):
                 s = wp.vec4i(own[0], own[1], v[0], v[1])
                 d = edge_cutoff(surface, s)
             pairs.stencils[k] = s
-            pairs.distances[k] = d
+            pairs.distances[k] = wp.float64(d)
 
     return write_each_pair

@@ -9,7 +9,7 @@ from ..vectors import types
 from .obstacles import copy_of, vector_within
 from .proximity_grid import surfaces
 from .self_gaps import ONE, ZERO, nearest
-from .self_pairs import module_of, near_pairs
+from .self_pairs import Pairs, module_of
 from .self_planes import KEPT, margin_of, needs_no_cut, part_apart, ulp_of, ways_of_sides
 
 
@@ -109,7 +109,7 @@ def advance_listed(dtype):
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def advance_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         gap: wp.array(dtype=wp.float64),
         # state in
         x: wp.array(dtype=vec3),

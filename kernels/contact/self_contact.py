@@ -17,7 +17,7 @@ from ..vectors import types
 from .pair_potential import ENDING, STARTING, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
 from .self_gaps import ONE, SIDE, ZERO, farthest_of, perpendicular, vertex_of
-from .self_pairs import MODULE, module_of, near_pairs
+from .self_pairs import MODULE, Pairs, module_of
 from .self_planes import margin_of, ulp_of
 
 potential, slope, bend, gap_after = contact.potential, contact.slope, contact.bend, contact.gap_after
@@ -54,7 +54,7 @@ def find_forces(dtype, bounded: bool):
     @wp.kernel(module=f"{module_of(dtype)}.{bounded}", enable_backward=False)
     def find_forces_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         contacts: Contacts,
         x: wp.array(dtype=vec3),
@@ -110,7 +110,7 @@ def near_contact(dtype):
     stencil, normal, weights = load(wp.vec4i), load(wp.vec3d), load(wp.vec4d)
 
     @wp.func
-    def near_of(pairs: near_pairs(dtype), contacts: Contacts, e: int, x: points, correction: points, always: bool):
+    def near_of(pairs: Pairs, contacts: Contacts, e: int, x: points, correction: points, always: bool):
         s = stencil(pairs.stencils, e)
         w = weights(contacts.weights, e)
         a = at(x, correction, s[0])
@@ -125,46 +125,33 @@ def near_contact(dtype):
     return near_of
 
 
-@cache
-def push_contact(dtype):
+@wp.func
+def push_contact(
+    contacts: Contacts, e: int, v: wp.vec3d, n: wp.vec3d, D: wp.float64, least: wp.float64, h: wp.float64, hard: bool
+):
     """The ``push`` of contact: λ = (d* − d)/D of the gap d = v·n, with D at least ``least`` if the contact is ``hard``.
 
     The prox is that of the share of the contact; the rest of its force, and that of a negative contact, is ``fixed``.
     """
-
-    @wp.func
-    def push_of(
-        pairs: near_pairs(dtype),
-        contacts: Contacts,
-        e: int,
-        v: wp.vec3d,
-        n: wp.vec3d,
-        D: wp.float64,
-        least: wp.float64,
-        h: wp.float64,
-        hard: bool,
-    ):
-        k = contacts.stiffness[e]
-        mode = contacts.followed.mode[0]
-        if mode == ENDING or not D > ZERO:
-            return wp.vec3d()
-        if mode == STARTING:
-            return wp.where(k > ZERO, contacts.followed.start[e], contacts.fixed[e]) * n
-        r = contacts.distance[e]
-        gap = wp.dot(v, n)
-        if hard:
-            if gap < r and k > ZERO:
-                return (r - gap) / wp.max(D, least) * n
-            return wp.vec3d()
-        share = wp.where(k > ZERO, contacts.share[e], ZERO)
-        fixed = contacts.fixed[e]
-        gap += D * fixed
-        found = fixed
-        if gap < r and share > ZERO:
-            found += (gap_after(gap, r, D * share * k * h * h) - gap) / D
-        return found * n
-
-    return push_of
+    k = contacts.stiffness[e]
+    mode = contacts.followed.mode[0]
+    if mode == ENDING or not D > ZERO:
+        return wp.vec3d()
+    if mode == STARTING:
+        return wp.where(k > ZERO, contacts.followed.start[e], contacts.fixed[e]) * n
+    r = contacts.distance[e]
+    gap = wp.dot(v, n)
+    if hard:
+        if gap < r and k > ZERO:
+            return (r - gap) / wp.max(D, least) * n
+        return wp.vec3d()
+    share = wp.where(k > ZERO, contacts.share[e], ZERO)
+    fixed = contacts.fixed[e]
+    gap += D * fixed
+    found = fixed
+    if gap < r and share > ZERO:
+        found += (gap_after(gap, r, D * share * k * h * h) - gap) / D
+    return found * n
 
 
 @cache
@@ -176,7 +163,7 @@ def row_of_contact(dtype):
     vec3, _ = types(dtype)
 
     @wp.func
-    def row_of(pairs: near_pairs(dtype), contacts: Contacts, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
+    def row_of(pairs: Pairs, contacts: Contacts, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
         found = PairRow()
         k = contacts.stiffness[e]
         if k == ZERO:

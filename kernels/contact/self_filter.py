@@ -11,7 +11,7 @@ from ..vectors import types
 from .gap_notes import FIRST
 from .obstacles import Layout, copy_of, has_obstacle, vector_within
 from .self_gaps import ONE, PLANAR, ZERO
-from .self_pairs import StepPairs, module_of, near_pairs
+from .self_pairs import Pairs, StepPairs, module_of
 from .self_planes import bounded_share
 
 # Pins of hard pairs may approach by this fraction of their gap in a step. The second is for pairs with a free vertex, which
@@ -160,7 +160,7 @@ def share_of_pins(dtype):
     @wp.kernel(module="unique", enable_backward=False)
     def find_each_share_of_pins(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         inverse_mass: wp.array(dtype=dtype),
         # state in
         step: StepPairs,
@@ -183,7 +183,7 @@ def share_of_pins(dtype):
         n = step.normal[e]
         sides = wp.where(e < pairs.counts[0], 1, 2)
         gap = step.gap[e]
-        floor = wp.min(gap, wp.float64(pairs.distances[e]))
+        floor = wp.min(gap, pairs.distances[e])
         end, turned = turned_gap(
             e < pairs.counts[0], n, wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]])
         )
@@ -353,7 +353,7 @@ def push_pairs(dtype):
     @wp.kernel(module="unique", enable_backward=False)
     def push_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         mobile: wp.array(dtype=dtype),
         # state in
         step: StepPairs,
@@ -407,60 +407,50 @@ def scale_directions(dtype):
     return scale_each_direction
 
 
-@cache
-def copies_near_colliders():
+@wp.kernel(module="warpcloth.near_colliders", enable_backward=False)
+def copies_near_colliders(
+    # state in
+    near: wp.array(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),
+    # parameters
+    always: bool,
+    # out
+    touching: wp.array(dtype=wp.int32),
+    some: wp.array(dtype=wp.int32),
+):
     """Kernel over copies: ``touching`` is 1 for ``active`` copies that are ``near`` colliders, else 0; then ``some`` becomes 1.
 
     ``near`` (B,) is None if it holds ``always`` or never.
     """
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def find_copies(
-        # state in
-        near: wp.array(dtype=wp.int32),
-        active: wp.array(dtype=wp.int32),
-        # parameters
-        always: bool,
-        # out
-        touching: wp.array(dtype=wp.int32),
-        some: wp.array(dtype=wp.int32),
-    ):
-        copy = wp.tid()
-        is_near = always
-        if near:
-            is_near = near[copy] != 0
-        touching[copy] = wp.where(is_near, active[copy], 0)
-        if touching[copy] != 0:
-            some[0] = 1
-
-    return find_copies
+    copy = wp.tid()
+    is_near = always
+    if near:
+        is_near = near[copy] != 0
+    touching[copy] = wp.where(is_near, active[copy], 0)
+    if touching[copy] != 0:
+        some[0] = 1
 
 
-@cache
-def copies_in_contact(dtype):
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def copies_in_contact(
+    # elements
+    pairs: Pairs,
+    # state in
+    active: wp.array(dtype=wp.int32),
+    # parameters
+    per_copy: int,
+    # out
+    touching: wp.array(dtype=wp.int32),
+    some: wp.array(dtype=wp.int32),
+):
     """Kernel over contacts: ``touching`` becomes 1 for their copies if these are ``active``, and then ``some``."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def find_copy(
-        # elements
-        pairs: near_pairs(dtype),
-        # state in
-        active: wp.array(dtype=wp.int32),
-        # parameters
-        per_copy: int,
-        # out
-        touching: wp.array(dtype=wp.int32),
-        some: wp.array(dtype=wp.int32),
-    ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
-            return
-        copy = pairs.stencils[pairs.acting[t]][0] // per_copy
-        if active[copy] != 0:
-            touching[copy] = 1
-            some[0] = 1
-
-    return find_copy
+    t = wp.tid()
+    if t >= pairs.number[0]:
+        return
+    copy = pairs.stencils[pairs.acting[t]][0] // per_copy
+    if active[copy] != 0:
+        touching[copy] = 1
+        some[0] = 1
 
 
 @cache

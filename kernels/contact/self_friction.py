@@ -23,7 +23,7 @@ from .obstacles import Layout, copy_of, in_copy, obstacle_of
 from .pair_potential import TWO_EDGES, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
 from .self_gaps import ONE, ZERO, perpendicular
-from .self_pairs import near_pairs
+from .self_pairs import Pairs
 
 
 @wp.struct
@@ -172,7 +172,7 @@ def slip_at(dtype):
     y_of = difference_of(dtype)
 
     @wp.func
-    def slip_of(pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
+    def slip_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
         s = pairs.stencils[e]
         y = y_of(pairs.layout, s, rubbed.weights[e], x)
         if d:
@@ -194,7 +194,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
     @wp.kernel(module=f"{friction_module(dtype, law)}.{bounded}", enable_backward=False)
     def begin_friction_of_pairs(
         # elements
-        touching: near_pairs(dtype),
+        touching: Pairs,
         # state in
         contacts: Contacts,
         x: wp.array(dtype=vec3),
@@ -203,7 +203,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
         rings: Rings,
         friction: wp.array(dtype=wp.float64),
         # out
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         rubbed: RubbedPairs,
     ):
         for t in range(wp.tid(), touching.number[0], touching.threads):
@@ -251,10 +251,10 @@ def set_anchors(dtype, law: Law):
     @wp.kernel(module=friction_module(dtype, law), enable_backward=False)
     def set_anchor_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         x: wp.array(dtype=vec3),
-        kept: near_pairs(dtype),
+        kept: Pairs,
         slips: wp.array(dtype=SLIP),
         steps: wp.array(dtype=wp.int32),
         # in and out
@@ -321,7 +321,7 @@ def find_friction(dtype, law: Law):
     @wp.kernel(module=friction_module(dtype, law), enable_backward=False)
     def find_friction_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         rubbed: RubbedPairs,
         x: wp.array(dtype=vec3),
@@ -367,7 +367,7 @@ def end_friction(dtype):
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def end_friction_of_pairs(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         rubbed: RubbedPairs,
         start: wp.array(dtype=vec3),
@@ -376,7 +376,7 @@ def end_friction(dtype):
         # parameters
         rings: Rings,
         # out
-        kept: near_pairs(dtype),
+        kept: Pairs,
         slips: wp.array(dtype=SLIP),
     ):
         for turn in range(wp.tid(), pairs.number[0], pairs.threads):
@@ -406,7 +406,7 @@ def near_friction(dtype):
     points = wp.array(dtype=vec3)
 
     @wp.func
-    def near_of(pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: points, correction: points, always: bool):
+    def near_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: points, correction: points, always: bool):
         u = wp.vec3d()
         if rubbed.limit[e] > ZERO:
             u = slip_of(pairs, rubbed, e, x, correction)
@@ -416,21 +416,13 @@ def near_friction(dtype):
 
 
 @cache
-def push_friction(dtype, law: Law):
+def push_friction(law: Law):
     """The ``push`` of friction by the prox of the law."""
     prox = law.prox
 
     @wp.func
     def push_of(
-        pairs: near_pairs(dtype),
-        rubbed: RubbedPairs,
-        e: int,
-        u: wp.vec3d,
-        n: wp.vec3d,
-        D: wp.float64,
-        least: wp.float64,
-        h: wp.float64,
-        hard: bool,
+        rubbed: RubbedPairs, e: int, u: wp.vec3d, n: wp.vec3d, D: wp.float64, least: wp.float64, h: wp.float64, hard: bool
     ):
         l = wp.length(u)
         if D > ZERO and l > ZERO:
@@ -447,7 +439,7 @@ def row_of_friction(dtype, law: Law):
     slip_of, secant = slip_at(dtype), law.secant
 
     @wp.func
-    def row_of(pairs: near_pairs(dtype), rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
+    def row_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
         found = PairRow()
         if rubbed.limit[e] > ZERO:
             u = slip_of(pairs, rubbed, e, x, d)
@@ -465,5 +457,7 @@ def row_of_friction(dtype, law: Law):
 @cache
 def friction_of_pairs(law: Law):
     """Returns the :class:`.pair_sums.PairTerm` of friction by a law."""
-    push, row = (partial(make, law=law) for make in (push_friction, row_of_friction))
-    return PairTerm("self-friction", f"{MODULE}.{law.name}", 2, RubbedPairs, near_friction, push, row, isotropic=True)
+    row = partial(row_of_friction, law=law)
+    return PairTerm(
+        "self-friction", f"{MODULE}.{law.name}", 2, RubbedPairs, near_friction, push_friction(law), row, isotropic=True
+    )

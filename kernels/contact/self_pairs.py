@@ -10,34 +10,31 @@ from .proximity import sort
 from .self_gaps import nearest
 
 
-@cache
-def near_pairs(dtype):
-    """Struct of pairs: the near ones of :class:`warpcloth.contact.proximity.Proximity`, or the slots of an energy.
+@wp.struct
+class Pairs:
+    """The near pairs of :class:`warpcloth.contact.proximity.Proximity`, or the slots of an energy.
 
     Near pairs have the fields up to ``distances``. ``counts`` has the numbers of vertex–triangle pairs, which come first, and
     of edge–edge pairs. The triangles near vertex i are in rows ``rows`` [i] to rows[i+1]. ``distances`` [m] is r, or half the
-    rest distance if that is less. Kernels over pairs have so many ``threads``: on the CPU one, for each there copies structs.
+    rest distance if that is less, in the precision of the model. Kernels over pairs have so many ``threads``: on the CPU one,
+    for each there copies structs.
 
     An energy has ``stencils``, of cloth alone, and the others. ``acting`` lists the ``number`` (1,) of slots that act.
     ``corners`` lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is
     scratch, 0 between launches. The last three are empty if no kernel sums over vertices.
     """
 
-    @wp.struct
-    class Pairs:
-        layout: Layout
-        threads: wp.int32
-        stencils: wp.array(dtype=wp.vec4i)
-        counts: wp.array(dtype=wp.int32)
-        rows: wp.array(dtype=wp.int32)
-        distances: wp.array(dtype=dtype)
-        acting: wp.array(dtype=wp.int32)
-        number: wp.array(dtype=wp.int32)
-        corner_counts: wp.array(dtype=wp.int32)
-        first: wp.array(dtype=wp.int32)
-        corners: wp.array(dtype=wp.int32)
-
-    return Pairs
+    layout: Layout
+    threads: wp.int32
+    stencils: wp.array(dtype=wp.vec4i)
+    counts: wp.array(dtype=wp.int32)
+    rows: wp.array(dtype=wp.int32)
+    distances: wp.array(dtype=wp.float64)
+    acting: wp.array(dtype=wp.int32)
+    number: wp.array(dtype=wp.int32)
+    corner_counts: wp.array(dtype=wp.int32)
+    first: wp.array(dtype=wp.int32)
+    corners: wp.array(dtype=wp.int32)
 
 
 @wp.struct
@@ -68,7 +65,7 @@ def begin_pairs(dtype):
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def begin_each_pair(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         # state in
         x: wp.array(dtype=vec3),
         # out
@@ -87,58 +84,43 @@ def begin_pairs(dtype):
     return begin_each_pair
 
 
-@cache
-def forget_contacts(dtype):
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def forget_contacts(
+    # elements
+    pairs: Pairs,
+    # out
+    marks: wp.array(dtype=wp.float64),
+    multipliers: wp.array(dtype=wp.vec3d),
+):
     """Kernel over acting contacts: their ``marks``, 0 in slots without a contact, and λ become 0; either may be None."""
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def forget_each_contact(
-        # elements
-        pairs: near_pairs(dtype),
-        # out
-        marks: wp.array(dtype=wp.float64),
-        multipliers: wp.array(dtype=wp.vec3d),
-    ):
-        for t in range(wp.tid(), pairs.number[0], pairs.threads):
-            if marks:
-                marks[pairs.acting[t]] = wp.float64(0.0)
-            if multipliers:
-                multipliers[pairs.acting[t]] = wp.vec3d()
-
-    return forget_each_contact
+    for t in range(wp.tid(), pairs.number[0], pairs.threads):
+        if marks:
+            marks[pairs.acting[t]] = wp.float64(0.0)
+        if multipliers:
+            multipliers[pairs.acting[t]] = wp.vec3d()
 
 
-@cache
-def fill_corners(dtype):
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def fill_corners(
+    # in and out
+    pairs: Pairs,
+):
     """Kernel over pairs: lists the corners of acting pairs at each vertex, and counts ``corner_counts`` down to 0."""
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def fill_each_corner(
-        # in and out
-        pairs: near_pairs(dtype),
-    ):
-        for t in range(wp.tid(), pairs.number[0], pairs.threads):
-            e = pairs.acting[pairs.number[0] - 1 - t]
-            s = pairs.stencils[e]
-            for i in range(4):
-                pairs.corners[pairs.first[s[i]] + wp.atomic_sub(pairs.corner_counts, s[i], 1) - 1] = 4 * e + i
-
-    return fill_each_corner
+    for t in range(wp.tid(), pairs.number[0], pairs.threads):
+        e = pairs.acting[pairs.number[0] - 1 - t]
+        s = pairs.stencils[e]
+        for i in range(4):
+            pairs.corners[pairs.first[s[i]] + wp.atomic_sub(pairs.corner_counts, s[i], 1) - 1] = 4 * e + i
 
 
-@cache
-def sort_corners(dtype):
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def sort_corners(
+    # in and out
+    pairs: Pairs,
+):
     """Kernel over vertices: sorts the corners of each vertex."""
-
-    @wp.kernel(module=module_of(dtype), enable_backward=False)
-    def sort_each(
-        # in and out
-        pairs: near_pairs(dtype),
-    ):
-        i = wp.tid()
-        sort(pairs.corners, pairs.first[i], pairs.first[i + 1])
-
-    return sort_each
+    i = wp.tid()
+    sort(pairs.corners, pairs.first[i], pairs.first[i + 1])
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)

@@ -9,7 +9,7 @@ from ..memory import load
 from ..vectors import types
 from .obstacles import copy_of
 from .self_gaps import ONE, SIDE, ZERO, nearest
-from .self_pairs import module_of, near_pairs
+from .self_pairs import Pairs, module_of
 
 KEPT = wp.constant(wp.float64(0.9))  # fraction of its distance to a plane that a vertex may move in one round of the filter
 CLAMPED = wp.constant(wp.float64(0.05))  # smallest distance of each side from the plane, as a fraction of the gap
@@ -261,7 +261,7 @@ def cut_by_planes(dtype):
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def cut_by_each_plane(
         # elements
-        pairs: near_pairs(dtype),
+        pairs: Pairs,
         gap: wp.array(dtype=wp.float64),
         # state in
         x: wp.array(dtype=vec3),

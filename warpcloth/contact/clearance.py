@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ..core.structs import filled
 from ..kernels.contact.clearance import clearances, near_colliders
 from ..kernels.contact.colliders import shapes
 
@@ -19,20 +20,25 @@ class Clearance:
     def __init__(self, colliders, state):
         self._colliders, self.model = colliders, colliders.model
         model, device = self.model, self.model.device
-        self._clear = clear = clearances(model.dtype)()
-        clear.before, clear.near = state.add("near colliders", model.scalars(wp.int32)), model.scalars(wp.int32)
-        # Rest states may also be those near colliders because the state was set to another one.
-        clear.some = wp.full(1, 1, dtype=wp.int32, device=device)
-        clear.followed, self._due, self._ended = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
-        self.near, clear.distance = clear.near, model.colliders.distance
         balls = np.zeros((model.count, 4))
         balls[:, 3] = -1.0
         if model.pins is None:
             balls[model.inverse_mass.numpy() == 0.0, 3] = np.inf  # pins may stand near
-        clear.balls = model.array(balls, wp.types.vector(4, model.dtype))
+        followed, self._due, self._ended = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
+        self.near = model.scalars(wp.int32)
+        self._clear = filled(
+            clearances(model.dtype),
+            before=state.add("near colliders", model.scalars(wp.int32)),
+            near=self.near,
+            # Rest states may also be those near colliders because the state was set to another one.
+            some=wp.full(1, 1, dtype=wp.int32, device=device),
+            followed=followed,
+            balls=model.array(balls, wp.types.vector(4, model.dtype)),
+            distance=model.colliders.distance,
+        )
         halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
-        self._bounds = shapes(model.dtype)()
-        self._bounds.core, self._bounds.radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
+        core, radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
+        self._bounds = filled(shapes(model.dtype), core=core, radius=radius)
         self._finds = [model.kernel(near_colliders, model.dtype, ended) for ended in (False, True)]
 
     def follow(self):

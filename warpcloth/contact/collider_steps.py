@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..core.state import Count
+from ..core.structs import filled
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.clear_elements import find_clear
@@ -78,20 +79,17 @@ class ColliderSteps:
         self.steps_per_frame = steps_per_frame
         declared = model.colliders
         pose_type, self._anchor_type = kernels.pose_types(model.dtype)
-        self.shapes = kernels.shapes(model.dtype)()
-        self._friction = model.array(declared.friction, model.dtype)  # the struct does not keep it alive
-        self.shapes.kind, self.shapes.core, self.shapes.radius = declared.kind, declared.core, declared.radius
-        self.shapes.friction = self._friction
-        self._dim, self.poses = (model.copies, len(declared.radius)), kernels.step_poses(model.dtype)()
-        for name in ("before", "at", "after"):
-            setattr(self.poses, name, wp.zeros(self._dim, dtype=pose_type, device=device))
+        values = {name: getattr(declared, name) for name in ("kind", "core", "radius")}
+        self.shapes = filled(kernels.shapes(model.dtype), friction=model.array(declared.friction, model.dtype), **values)
+        self._dim = model.copies, len(declared.radius)
+        poses = {name: wp.zeros(self._dim, dtype=pose_type, device=device) for name in ("before", "at", "after")}
+        self.poses = filled(kernels.step_poses(model.dtype), **poses)
         self.x_before = model.vectors()
         self.steps = state.add("steps of colliders", model.scalars(wp.int32), Count())
-        self.notes = FilterNotes()
-        self.notes.steps = self.steps
-        self.notes.cut = state.add("vertices cut short", model.scalars(wp.int64), Count(sums=True))
-        of_note = Count(rest=model.per_copy * (self._dim[1] + 1))
-        self.notes.inside = state.add("first inside colliders", wp.zeros(self._dim, dtype=wp.int64, device=device), of_note)
+        cut = state.add("vertices cut short", model.scalars(wp.int64), Count(sums=True))
+        inside, of_note = wp.zeros(self._dim, dtype=wp.int64, device=device), Count(rest=model.per_copy * (self._dim[1] + 1))
+        inside = state.add("first inside colliders", inside, of_note)
+        self.notes = filled(FilterNotes, steps=self.steps, cut=cut, inside=inside)
         self.correction, self.he = None, h
         self.anchors, rows = {}, len(declared.radius) * bool(declared.friction.any())
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
@@ -235,11 +233,10 @@ class ColliderSteps:
 
     def end_again(self):
         """Prepares :meth:`launch_out` and :meth:`launch_inside`. From now on the latter counts the step."""
-        device, model = self.model.device, self.model
-        self._again, self._unread = True, FilterNotes()
+        device, model, self._again = self.model.device, self.model, True
         self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
-        self._unread.steps, self._unread.cut = self.steps, model.scalars(wp.int64)
-        self._unread.inside = wp.zeros(self._dim, dtype=wp.int64, device=device)
+        inside = wp.zeros(self._dim, dtype=wp.int64, device=device)
+        self._unread = filled(FilterNotes, steps=self.steps, cut=model.scalars(wp.int64), inside=inside)
 
     def launch_out(self, x, v):
         """Moves vertices in x and v as :meth:`launch_end` does, and notes nothing."""

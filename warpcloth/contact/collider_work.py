@@ -4,6 +4,7 @@ import warp as wp
 
 from ..core.energy import Energy
 from ..core.gradient import Gradient
+from ..core.structs import filled
 from ..core.sums import Sums
 from ..kernels.contact import collider_work as kernels
 from ..kernels.project import add_momentum
@@ -33,12 +34,9 @@ class ColliderWork:
             self._limit = [model.kernel(each, model.dtype) for each in (add_momentum, add_scaled, kernels.limit_pulls)]
             self._elastic, self._given, self._taken = Gradient(model, terms=others), model.vectors(), model.vectors()
         for _c, now in self._solid:
-            before = kernels.collider_pulls(model.dtype)()
             now.move = model.vectors()
-            if self._at_end:
-                before.all, before.friction = model.vectors(), model.vectors() if now.friction else None
-                before.move = model.vectors()
-            self._before.append(before)
+            kept = [name for name in ("all", "friction", "move") if self._at_end and getattr(now, name)]
+            self._before.append(filled(kernels.collider_pulls(model.dtype), **{name: model.vectors() for name in kept}))
         self._half_way = None
         if colliders.part == 0.5:
             self._half_way, self._x_step = model.kernel(kernels.half_way, model.dtype), model.vectors()

@@ -3,12 +3,10 @@
 import warp as wp
 
 from ..core.dynamic import DynamicElements
-from ..core.scan import Scan
+from ..core.structs import filled
 from ..kernels.contact import pair_follow
 from ..kernels.contact import pair_potential as potential
 from ..kernels.contact import self_contact as kernels
-from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
-from .self_friction import acting_sizes
 
 # Sweeps, of a hierarchy those of the finest level, find contacts anew after so many, which costs as much as 2 or 3 sweeps.
 # Sooner, XPBD gains no less energy.
@@ -27,7 +25,7 @@ class PairContact(DynamicElements):
     Attributes:
         obstacles: Positions (V,) [m] with the obstacles where forces are evaluated.
         least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
-        lists: The listed pairs, a :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
+        lists: The listed pairs, a :class:`warpcloth.kernels.contact.self_pairs.Pairs`.
         turn: The number of sweeps of the step that count towards EVERY, (1,) int32.
     """
 
@@ -37,16 +35,14 @@ class PairContact(DynamicElements):
         super().__init__(model, kernels.CONTACT_OF_PAIRS, listed)
         self.least, self._laws, device = 0.0, laws, model.device
         areas = [wp.array(surface.of_model(each), dtype=wp.float64, device=device) for each in surface.areas()]
-        self._areas = potential.Areas()
-        self._areas.of_vertices, self._areas.of_edges = areas
-        self._areas.rest = wp.array(surface.rest, dtype=wp.vec3d, device=device)
+        rest = wp.array(surface.rest, dtype=wp.vec3d, device=device)
+        self._areas = filled(potential.Areas, of_vertices=areas[0], of_edges=areas[1], rest=rest)
         self.obstacles, self._goal = (surface.vectors() for _ in range(2)) if surface.obstacles else (None, None)
         self._of_edges = not bounded  # the filter alone keeps edges, and vertices of meshes, apart in explicit steps
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
         made = potential.find_near_faces, potential.find_vertex_contacts, potential.find_edge_contacts
-        self._launch = model.launcher(((*made, fill_corners, sort_corners), model.dtype))
+        self._launch = model.launcher((made, model.dtype))
         self._corners = model.device.is_cuda
-        self._vertices = Scan(model, model.count)
 
     def list_corners(self):
         if not self._corners:
@@ -56,22 +52,16 @@ class PairContact(DynamicElements):
     def hold(self, lists, normals):
         """Takes the listed pairs and their normals (capacity,), and allocates contacts."""
         self.lists, self._normals = lists, normals
-        pairs, slots, device = near_pairs(self.model.dtype)(), 2 * len(lists.stencils), self.model.device
-        pairs.stencils, pairs.layout = wp.zeros(slots, dtype=wp.vec4i, device=device), self.surface.layout
-        for name, size in acting_sizes(self.model, slots, self._corners).items():
-            setattr(pairs, name, wp.zeros(size, dtype=wp.int32, device=device))
-        contacts = potential.Contacts()
+        slots, device = 2 * len(lists.stencils), self.model.device
+        pairs = self.new_pairs(slots, self.surface.layout, self._corners)
         kinds = {"weights": wp.vec4d, "normal": wp.vec3d, "code": wp.int32, "touching": wp.int32}
         kinds |= dict.fromkeys(("gap", "distance", "stiffness", "share", "ratio", "fixed"), wp.float64)
-        for name, kind in kinds.items():
-            setattr(contacts, name, wp.zeros(slots, dtype=kind, device=device))
+        if self.surface.obstacles:
+            kinds |= {"parts": wp.vec4i, "offset": wp.vec3d, "travel": wp.vec3d}
+        arrays = {name: wp.zeros(slots, dtype=kind, device=device) for name, kind in kinds.items()}
+        contacts = filled(potential.Contacts, **{"parts": pairs.stencils, "moves": self.surface.moves_of_step} | arrays)
         contacts.near = wp.zeros(len(lists.stencils), dtype=wp.int32, device=device)
         contacts.followed.mode = wp.zeros(1, dtype=wp.int32, device=device)
-        contacts.parts = pairs.stencils
-        if self.surface.obstacles:
-            contacts.parts = wp.zeros(slots, dtype=wp.vec4i, device=device)
-            contacts.offset, contacts.travel = (wp.zeros(slots, dtype=wp.vec3d, device=device) for _ in range(2))
-            contacts.moves = self.surface.moves_of_step
         self.hold_pairs(pairs, contacts, contacts.stiffness)
         if self._in_turn is not None:
             self._hold_followed()
@@ -106,9 +96,7 @@ class PairContact(DynamicElements):
             given = [self.lists, self._areas, *positions]
             self._launch(potential.find_edge_contacts, self.lists.threads, given, [self.pairs, self.data])
         if self._corners:
-            self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
-            self._launch(fill_corners, self.pairs.threads, [], [self.pairs])
-            self._launch(sort_corners, self.model.count, [], [self.pairs])
+            self.launch_corners()
 
     def launch_rows(self, x, d=None):
         """Finds the contacts at x, or x + d."""
@@ -130,8 +118,6 @@ class PairContact(DynamicElements):
 
     def sweeps(self, in_turn):
         super().sweeps(in_turn)
-        made = pair_follow.carry_forces, pair_follow.start_forces, pair_follow.fix_forces
-        self._take_over = self.model.launcher((made, self.model.dtype))
         self._hold_followed()
 
     def _hold_followed(self):
@@ -156,17 +142,18 @@ class PairContact(DynamicElements):
         """Finds the contacts where the iterate is now; those that add forces take over those of the last ones."""
         wp.copy(self.data.followed.rows, self.lists.rows)
         self._follow(x, correction)
+        launch = self.model.launch
         if adds:
             self.data.followed.carried.zero_()
-            self._take_over(pair_follow.carry_forces, self.pairs.threads, [self.pairs, self.multipliers], [self.data])
+            launch(pair_follow.carry_forces, self.pairs.threads, [self.pairs, self.multipliers], [self.data])
             self._launch_all(potential.ENDING, x, correction, h)
         self._launch_found(self._positions, None, x, correction)
         if not self._in_turn:
             self.launch_corner_slots()
         if adds:
             vertices = self.surface.count
-            self._take_over(pair_follow.start_forces, self.pairs.threads, [self.lists, self.pairs, h, vertices], [self.data])
-            self._take_over(pair_follow.fix_forces, vertices, [self.lists, h], [self.data])
+            launch(pair_follow.start_forces, self.pairs.threads, [self.lists, self.pairs, h, vertices], [self.data])
+            launch(pair_follow.fix_forces, vertices, [self.lists, h], [self.data])
             self._launch_all(potential.STARTING, x, correction, h)
 
     def _launch_all(self, mode, x, correction, h):

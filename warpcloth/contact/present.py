@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..core.gradient import Gradient
+from ..core.structs import filled
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.collider_work import collider_pulls
@@ -35,10 +36,9 @@ class PresentContact:
         declared, steps = model.colliders, parts[0][0]
         pose_type, self._anchor_type = kernels.pose_types(model.dtype)
         self._dim, self._steps = (model.copies, len(declared.radius)), model.scalars(wp.int32)
-        self._poses, self._moved = (kernels.step_poses(model.dtype)() for _ in range(2))
-        self._poses.at, after = (wp.zeros(self._dim, dtype=pose_type, device=model.device) for _ in range(2))
-        self._poses.before = self._poses.after = self._moved.before = self._moved.at = self._poses.at
-        self._moved.after = after  # poses after the next step, which are not read
+        at, after = (wp.zeros(self._dim, dtype=pose_type, device=model.device) for _ in range(2))
+        self._poses = filled(kernels.step_poses(model.dtype), before=at, at=at, after=at)
+        self._moved = filled(kernels.step_poses(model.dtype), before=at, at=at, after=after)  # the last are not read
         self._given = [declared.keyframes, declared.firsts, self._steps, steps.steps_per_frame, 0]
         self._move, self._shapes, self._least = model.kernel(kernels.move_colliders, model.dtype), steps.shapes, steps.least
         self.terms = tuple(elements if elements.collider is None else self._own(elements, steps) for elements in model.terms)
@@ -96,11 +96,8 @@ class ColliderPulls:
         self._pairs, scene = pairs, model.scene
         self.solid = [c for c in range(len(scene.colliders)) if c not in scene.meshes]
         for collider in scene.colliders:
-            found = collider_pulls(model.dtype)()
-            found.all = model.vectors()
-            if collider.friction:
-                found.friction = model.vectors()
-            self.found.append(found)
+            friction = model.vectors() if collider.friction else None
+            self.found.append(filled(collider_pulls(model.dtype), all=model.vectors(), friction=friction))
         for c in self.solid:
             mine = [elements for elements in terms if elements.collider == c]
             friction = tuple(elements for elements in mine if elements.term.law)

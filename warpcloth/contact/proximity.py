@@ -7,6 +7,7 @@ from ..base.limits import refuse_memory
 from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.scan import Scan
+from ..core.structs import filled
 from ..kernels.contact import piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 
@@ -51,7 +52,7 @@ class Proximity:
         piece = surface.pieces(self.pieces)
         rest = np.concatenate([points, surface.rest[len(points) :]])
         boxes = model.copies if surface.obstacles else 0
-        self._kept = {  # the struct holds no references
+        values = {
             "items": wp.array(surface.items, dtype=wp.vec4i, device=device),
             "groups": wp.array(surface.groups, dtype=wp.int32, device=device),
             "vertex_groups": wp.array(surface.vertex_groups, dtype=wp.int32, device=device),
@@ -60,13 +61,10 @@ class Proximity:
             "lowest": wp.zeros(boxes, dtype=model.vec3, device=device),
             "highest": wp.zeros(boxes, dtype=model.vec3, device=device),
         }
-        values = {"layout": surface.layout, "itself": surface.meets_itself, "distance": distance, "of_meshes": of_meshes}
+        values |= {"layout": surface.layout, "itself": surface.meets_itself, "distance": distance, "of_meshes": of_meshes}
         values |= {"max_distance": self._max_distance, "skin": skin, "far": 2.0 * (distance + surface.edge_lengths.max())}
-        self._surface, self._along = (proximity_grid.surfaces(model.dtype)() for _ in range(2))
-        for each in (self._surface, self._along):
-            for name, value in (values | self._kept).items():
-                setattr(each, name, value)
-        self._along.max_distance = self._along.skin = 0.0
+        self._surface = filled(proximity_grid.surfaces(model.dtype), **values)
+        self._along = filled(proximity_grid.surfaces(model.dtype), **values | {"max_distance": 0.0, "skin": 0.0})
         self._allocate_grid()
         self._set_pieces(piece)
         self._whole = model.device.is_cpu and self._pieces.per_copy == 1 and (piece >= 0).all()
@@ -78,7 +76,7 @@ class Proximity:
         self._near = self.searches(kernels.take_near, "near")
         self._launch = model.launcher(
             ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
-            ((kernels.fill_rows, kernels.write_pairs), model.dtype),
+            ((kernels.write_pairs,), model.dtype),
             ((piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.add_positions), model.dtype),
             ((piece_motion.find_motion_of_pieces,), model.dtype),
@@ -115,29 +113,26 @@ class Proximity:
             "piece": np.concatenate([of_copies[:, :n].ravel(), of_copies[:, n:].ravel()]),
             "samples": np.where(samples < n, samples + copy * n, model.count + copy * surface.obstacles + samples - n).ravel(),
         }
-        self._piece_arrays = {k: wp.array(v, dtype=wp.int32, device=model.device) for k, v in arrays.items()}
+        arrays = {name: wp.array(each, dtype=wp.int32, device=model.device) for name, each in arrays.items()}
         kinds = {"drift": model.vec3}
         if len(used) > 1:
             kinds |= {"lower": model.vec3, "upper": model.vec3, "motion": model.dtype}
-        for name, kind in kinds.items():
-            self._piece_arrays[name] = wp.zeros(model.copies * len(used), dtype=kind, device=model.device)
-        self.drift = self._piece_arrays["drift"]
-        self._pieces = piece_motion.pieces(model.dtype)()
+        size = model.copies * len(used)
+        arrays |= {name: wp.zeros(size, dtype=kind, device=model.device) for name, kind in kinds.items()}
         numbers = {"per_copy": len(used), "cloth": len(used) - len(np.unique(surface.colliders))}
-        for name, value in (numbers | {"layout": surface.layout, "itself": surface.meets_itself} | self._piece_arrays).items():
-            setattr(self._pieces, name, value)
+        meets = {"layout": surface.layout, "itself": surface.meets_itself}
+        self._pieces = filled(piece_motion.pieces(model.dtype), **numbers, **meets, **arrays)
+        self.drift = self._pieces.drift
 
     def _allocate_grid(self):
         model, items, lengths = self.model, self._triangles + self._edges, self.surface.edge_lengths
         size = 0.5 * (min(1.05 * lengths.max(), 2.0 * np.median(lengths)) + self._max_distance + self.skin)
         buckets = 1 << max(4, (items - 1).bit_length())
-        count = {"levels": 4, "counts": buckets, "keys": items, "first": buckets + 1}
-        self._grid_arrays = {k: wp.zeros(size, dtype=wp.int32, device=model.device) for k, size in count.items()}
+        counts = {"levels": 4, "counts": buckets, "keys": items, "first": buckets + 1}
+        arrays = {name: wp.zeros(count, dtype=wp.int32, device=model.device) for name, count in counts.items()}
         for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("entries", wp.vec4i)):
-            self._grid_arrays[name] = wp.zeros(items, dtype=kind, device=model.device)
-        self._grid = proximity_grid.grids(model.dtype)()
-        for name, value in ({"size": size} | self._grid_arrays).items():
-            setattr(self._grid, name, value)
+            arrays[name] = wp.zeros(items, dtype=kind, device=model.device)
+        self._grid = filled(proximity_grid.grids(model.dtype), size=size, **arrays)
         self._buckets = Scan(model, buckets)
 
     def _allocate(self, capacity):
@@ -149,20 +144,18 @@ class Proximity:
 
         self.capacity = capacity
         self.listed.fill_(np.nan)
-        self.stencils, self.distances = zeros(capacity, wp.vec4i), zeros(capacity, model.dtype)
+        self.stencils, self.distances = zeros(capacity, wp.vec4i), zeros(capacity, wp.float64)
         self.rows = zeros(rows + 1)
-        self._arrays = {
-            "counts": self.counts,
-            "found": zeros(capacity, wp.vec2i),
-            "row_counts": zeros(rows),
-            "first": self.rows,
-            "items": zeros(capacity),
-            "stencils": self.stencils,
-            "distances": self.distances,
-        }
-        self._pairs = kernels.pair_lists(model.dtype)()
-        for name, value in self._arrays.items():
-            setattr(self._pairs, name, value)
+        self._pairs = filled(
+            kernels.PairList,
+            counts=self.counts,
+            found=zeros(capacity, wp.vec2i),
+            row_counts=zeros(rows),
+            first=self.rows,
+            items=zeros(capacity),
+            stencils=self.stencils,
+            distances=self.distances,
+        )
 
     def set_skin(self, skin):
         """Sets another skin [m]; the next :meth:`launch_kept` makes a new list."""
@@ -177,7 +170,7 @@ class Proximity:
 
     def launch(self, x):
         """Launches the detection at positions x (V,)."""
-        pairs, N, own = self._pairs, self._vertices, self._arrays
+        pairs, N = self._pairs, self._vertices
         if x is not self.found:
             wp.copy(self.found, x)
         wp.copy(self.listed, x)
@@ -185,8 +178,8 @@ class Proximity:
             self._launch_boxes(x)
         self.counts.zero_()
         self._launch_grid(self._surface, x, None, self._near, pairs)
-        self._rows.launch(own["row_counts"], own["first"])
-        self._launch(kernels.fill_rows, self.capacity, [], [pairs])
+        self._rows.launch(pairs.row_counts, pairs.first)
+        self.model.launch(kernels.fill_rows, self.capacity, [], [pairs])
         self._launch(kernels.write_pairs, N + self._edges, [self._surface, N, self._triangles], [pairs])
 
     def searches(self, take, name):
@@ -199,13 +192,13 @@ class Proximity:
 
     def _launch_grid(self, surface, x, p, searches, out):
         grid, items, model = self._grid, self._triangles + self._edges, self.model
-        self._grid_arrays["levels"].zero_()
+        grid.levels.zero_()
         if self.surface.obstacles:
-            self._kept["lowest"].fill_(np.inf)
-            self._kept["highest"].fill_(-np.inf)
+            surface.lowest.fill_(np.inf)
+            surface.highest.fill_(-np.inf)
             self._launch(proximity_grid.bound_cloth, model.count, [surface, x, p], [])
         self._launch(proximity_grid.count_items, items, [surface, x, p], [grid])
-        self._buckets.launch(self._grid_arrays["counts"], self._grid_arrays["first"])
+        self._buckets.launch(grid.counts, grid.first)
         self._launch(proximity_grid.fill_buckets, items, [surface, x, p], [grid])
         for search, count in zip(searches, (self._vertices if self._triangles else 0, self._edges), strict=True):
             if count:
@@ -213,8 +206,8 @@ class Proximity:
                 self.model.launch(search, (count, self._shares), given, [out])
 
     def _launch_boxes(self, x):
-        self._piece_arrays["lower"].fill_(np.inf)
-        self._piece_arrays["upper"].fill_(-np.inf)
+        self._pieces.lower.fill_(np.inf)
+        self._pieces.upper.fill_(-np.inf)
         self._launch(piece_motion.extend_boxes, self._vertices, [x], [self._pieces])
 
     def launch_kept(self, x, part, launch):

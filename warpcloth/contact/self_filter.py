@@ -220,7 +220,7 @@ class SelfFilter:
         model, device = self.model, self.model.device
         self._moves = self._surface.vectors()
         self._carried, self._keys = (wp.zeros(model.count, dtype=wp.int64, device=device) for _ in range(2))
-        self._make(mesh_moves.are_away, mesh_moves.aim_obstacles, mesh_moves.carry_vertices, mesh_moves.end_move)
+        self._make(mesh_moves.are_away, mesh_moves.aim_obstacles, mesh_moves.carry_vertices)
         self._make(self_filter.push_pairs)
         self._carriers = [model.kernel(mesh_moves.find_carriers, model.dtype, each) for each in (True, False)]
 
@@ -256,7 +256,7 @@ class SelfFilter:
         model.launch(self._count, 1, [], [self._rounds])
         self._proceed.zero_()
         given = [self.fraction, self._rounds, contact.steps, ROUNDS, contact.per_frame]
-        self._launch(mesh_moves.end_move, model.copies, given, [self._walking, self._proceed, contact.first_forced])
+        model.launch(mesh_moves.end_move, model.copies, given, [self._walking, self._proceed, contact.first_forced])
         wp.capture_if(self._proceed, lambda: None, lambda: self._launch_arrived(x, goal))
 
     def _launch_arrived(self, x, goal):
@@ -310,8 +310,7 @@ class SelfFilter:
             if self._moves is None:
                 self._prepare_carrying()
             self._carry_with_shapes = model.kernel(mesh_moves.carry_with_shapes, model.dtype, model.colliders.solids)
-        self._near_colliders = model.kernel(self_filter.copies_near_colliders)
-        self._make(self_filter.copies_in_contact, self_filter.aim)
+        self._make(self_filter.aim)
         if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
             self._make(self_filter.walk_from_start)
@@ -351,11 +350,11 @@ class SelfFilter:
         near = None if colliders is None else colliders.near
         always = colliders is not None and near is None
         some.zero_()
-        model.launch(self._near_colliders, model.copies, [near, active, always], [touching, some])
+        model.launch(self_filter.copies_near_colliders, model.copies, [near, active, always], [touching, some])
         given = [active, model.per_copy]
 
         def in_contact():
-            self._launch(self_filter.copies_in_contact, contact.capacity, [contact.pairs, *given], [touching, some])
+            model.launch(self_filter.copies_in_contact, contact.capacity, [contact.pairs, *given], [touching, some])
 
         wp.capture_if(self._contact.listed, in_contact)
 

@@ -4,19 +4,9 @@ import numpy as np
 import warp as wp
 
 from ..core.dynamic import DynamicElements
-from ..core.scan import Scan
+from ..core.structs import filled
 from ..kernels.contact import self_friction as kernels
-from ..kernels.contact.self_pairs import fill_corners, near_pairs, sort_corners
-
-# Rows of each array of a list, per pair of its capacity.
-ROWS = {"stencils": 1, "corners": 4, "slips": 1}
-LISTS = "stencils", "first", "corners"
-
-
-def acting_sizes(model, room, corners=True):
-    """Returns the sizes of the arrays of acting pairs in a :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, by name."""
-    sizes = {"acting": room, "number": 1}
-    return sizes | {"corner_counts": model.count, "first": model.count + 1, "corners": 4 * room} if corners else sizes
+from ..kernels.contact.self_pairs import Pairs
 
 
 class Slips:
@@ -24,27 +14,23 @@ class Slips:
 
     Attributes:
         room: The number of contacts that fit.
-        pairs: A :func:`warpcloth.kernels.contact.self_pairs.near_pairs`, without distances.
+        pairs: :class:`warpcloth.kernels.contact.self_pairs.Pairs` with ``first``, ``stencils`` and ``corners``.
         slips: (room,), see :func:`warpcloth.kernels.contact.self_friction.end_friction`.
         grow: A function that allocates memory for a number of contacts, by default for this object alone.
     """
 
     def __init__(self, model, room):
         self.model, self.grow, self._arrays = model, self.hold, {}
-        self._arrays["first"] = wp.zeros(model.count + 1, dtype=wp.int32, device=model.device)
         self.hold(room)
 
     def hold(self, room):
         """Allocates memory for ``room`` contacts, and keeps those that it has."""
-        before, self.room = self.to_host() if "slips" in self._arrays else None, room
-        for (name, rows), dtype in zip(ROWS.items(), (wp.vec4i, wp.int32, kernels.SLIP), strict=True):
-            self._arrays[name] = wp.zeros(rows * room, dtype=dtype, device=self.model.device)
-        if before is not None:
-            self._write(before)
-        self.slips = self._arrays["slips"]
-        self.pairs = near_pairs(self.model.dtype)()
-        for name in LISTS:
-            setattr(self.pairs, name, self._arrays[name])
+        before, self.room = self.to_host() if self._arrays else {}, room
+        lists = {"first": (self.model.count + 1, wp.int32), "stencils": (room, wp.vec4i), "corners": (4 * room, wp.int32)}
+        lists = {name: wp.zeros(size, dtype=kind, device=self.model.device) for name, (size, kind) in lists.items()}
+        self.slips = wp.zeros(room, dtype=kernels.SLIP, device=self.model.device)
+        self.pairs, self._arrays = filled(Pairs, **lists), lists | {"slips": self.slips}
+        self._write(before)
 
     # As a part of a state.
 
@@ -77,10 +63,10 @@ class Slips:
         self._write(values)
 
     def _write(self, values):
-        for name, array in self._arrays.items():
-            whole = array.numpy()
-            whole[: len(values[name])] = values[name]
-            array.assign(whole)
+        for name, rows in values.items():
+            whole = self._arrays[name].numpy()
+            whole[: len(rows)] = rows
+            self._arrays[name].assign(whole)
 
 
 class SelfFriction(DynamicElements):
@@ -106,14 +92,14 @@ class SelfFriction(DynamicElements):
         model = surface.model
         super().__init__(model, kernels.friction_of_pairs(law), wp.zeros(1, dtype=wp.int32, device=model.device))
         self._kept, self._steps, self._ahead = slips, steps, ahead
-        self._rings, self._moves = kernels.Rings(), surface.moves_of_step if surface.moves else None
-        self._of_rings = [wp.array(each, dtype=wp.int32, device=model.device) for each in surface.rings()]
-        self._rings.first, self._rings.vertices = self._of_rings  # the struct holds no references
+        first, vertices = (wp.array(each, dtype=wp.int32, device=model.device) for each in surface.rings())
+        self._rings, self._moves = filled(kernels.Rings, first=first, vertices=vertices), None
+        if surface.moves:
+            self._moves = surface.moves_of_step
         self._friction = wp.array(friction, dtype=wp.float64, device=model.device)
-        self.start, self._step = surface.vectors(), Slips(model, slips.room)
-        self._vertices = Scan(model, model.count)
+        self.start = surface.vectors()
         self._launch = model.launcher(
-            ((kernels.end_friction, fill_corners, sort_corners), model.dtype),
+            ((kernels.end_friction,), model.dtype),
             ((kernels.set_anchors, kernels.find_friction), model.dtype, law),
             ((kernels.begin_friction,), model.dtype, law, bounded),
         )
@@ -122,32 +108,21 @@ class SelfFriction(DynamicElements):
     def hold(self, room):
         """Allocates arrays for ``room`` pairs. The slips of the last step are kept."""
         self._kept.hold(room)
-        self._step.hold(room)
-        pairs, sizes = self._step.pairs, acting_sizes(self.model, room)
-        for name in ("acting", "number", "corner_counts"):
-            setattr(pairs, name, wp.zeros(sizes[name], dtype=wp.int32, device=self.model.device))
-        pairs.layout, slots = self.surface.layout, len(pairs.stencils)
-        data = kernels.RubbedPairs()
-        data.limit = wp.zeros(slots, dtype=wp.float64, device=self.model.device)
-        self.hold_pairs(pairs, data, data.limit)
-        data.parts, data.ahead = self.room(wp.vec4i), self._ahead
-        if self.surface.obstacles:
-            data.travel = self.room(wp.vec3d)
-        for name in ("normal", "anchor"):
-            setattr(data, name, self.room(wp.vec3d))
-        data.stiffness, data.weights, data.sides = map(self.room, (wp.float64, wp.vec4d, wp.int32))
+        kinds = {"parts": wp.vec4i, "weights": wp.vec4d, "sides": wp.int32, "normal": wp.vec3d, "anchor": wp.vec3d}
+        kinds |= {"stiffness": wp.float64, "limit": wp.float64} | ({"travel": wp.vec3d} if self.surface.obstacles else {})
+        arrays = {name: wp.zeros(room, dtype=kind, device=self.model.device) for name, kind in kinds.items()}
+        data = filled(kernels.RubbedPairs, ahead=self._ahead, **arrays)
+        self.hold_pairs(self.new_pairs(room, self.surface.layout), data, data.limit)
 
     def launch_begin(self, touching, contacts, x):
         """At the start of a step, at x (V,): takes the contacts there, and the slips of the last step."""
-        model, kept = self.model, self._kept
+        kept = self._kept
         self.present.fill_(1)
         wp.copy(self.start, x)
         super().launch_none()
         given = [touching, contacts, x, self._moves, self._rings, self._friction]
         self._launch(kernels.begin_friction, self.pairs.threads, given, [self.pairs, self.data])
-        self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
-        self._launch(fill_corners, self.pairs.threads, [], [self.pairs])
-        self._launch(sort_corners, model.count, [], [self.pairs])
+        self.launch_corners()
         given = [self.pairs, x, kept.pairs, kept.slips, self._steps]
         self._launch(kernels.set_anchors, self.pairs.threads, given, [self.data])
 

@@ -10,6 +10,7 @@ from ..core.capture import Mirror
 from ..core.dynamic import Dynamic
 from ..core.state import Count
 from ..core.status import Stopped
+from ..core.structs import filled
 from ..core.sums import Sums
 from ..kernels.contact import gap_notes, pair_blocks, self_pairs
 from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes
@@ -76,7 +77,7 @@ class SelfSteps:
         forces: The :class:`warpcloth.core.dynamic.Dynamic` of contact and friction.
         contact: :class:`warpcloth.contact.pair_contact.PairContact`.
         filter: :class:`warpcloth.contact.self_filter.SelfFilter`.
-        pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
+        pairs: :class:`warpcloth.kernels.contact.self_pairs.Pairs`.
         begun: Normals, gaps and weights of the pairs, :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
         x_before: Positions at the start of the step, or of an iterate, and of obstacles behind them, (V,) [m].
         begun_at: Positions at which the gaps of ``begun`` were found, (V,) [m].
@@ -98,9 +99,7 @@ class SelfSteps:
         )
         self.distance, self.max_distance = min(filter(None, distances)), max(distances)
         self.least, self.per_frame = FLOOR * self.distance, steps_per_frame
-        self._laws = Laws()
-        self._laws.distance, self._laws.stiffness = wp.vec2d(*distances), wp.vec2d(*stiffnesses)
-        self._laws.width = surface.width
+        self._laws = filled(Laws, distance=wp.vec2d(*distances), stiffness=wp.vec2d(*stiffnesses), width=surface.width)
         self.skin = max(SKIN * float(scene.mesh.edge_lengths.max()), THICK * self.max_distance)
         self.proximity = Proximity(surface, distances[0], self.skin, distances[1])
         self.x_before, self.begun_at = surface.vectors(), surface.vectors()
@@ -109,12 +108,13 @@ class SelfSteps:
         self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
         self.listed, self._ends = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
-        self._notes = gap_notes.GapNotes()
-        self._notes.nearest = state.add("nearest", model.scalars(wp.float64))
-        self._notes.too_near = state.add("first too near", model.scalars(wp.int64))
-        self._notes.pressed = state.add("first pressed", wp.zeros((model.copies, 2), dtype=wp.int64, device=device))
-        self._notes.unresolved = state.add("first unresolved", model.scalars(wp.int64))
-        self.held = HeldPins()
+        notes = {
+            "nearest": state.add("nearest", model.scalars(wp.float64)),
+            "too_near": state.add("first too near", model.scalars(wp.int64)),
+            "pressed": state.add("first pressed", wp.zeros((model.copies, 2), dtype=wp.int64, device=device)),
+            "unresolved": state.add("first unresolved", model.scalars(wp.int64)),
+        }
+        self._notes, self.held = filled(gap_notes.GapNotes, **notes), HeldPins()
         self.held.first = state.add("first pin held back", model.scalars(wp.int64), Count(rest=model.per_copy))
         self.first_forced = state.add("first mesh that went through cloth", model.scalars(wp.int64))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
@@ -132,8 +132,7 @@ class SelfSteps:
         self._hold()
         state.add("positions of the list", self.proximity.found)
         self.near = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
-        notes = (getattr(self._notes, name) for name in ("nearest", "too_near", "pressed", "unresolved"))
-        self._carried = self.proximity.found, self._most.array, self.lists, *notes
+        self._carried = self.proximity.found, self._most.array, self.lists, *notes.values()
         friction = surface.friction()
         if friction is not None:
             slips = state.add_part("friction", Slips(model, self.contact.capacity))
@@ -190,13 +189,10 @@ class SelfSteps:
         def room(dtype):
             return wp.zeros(capacity, dtype=dtype, device=device)
 
-        self.pairs = self_pairs.near_pairs(self.model.dtype)()
-        for name in ("stencils", "counts", "rows", "distances"):
-            setattr(self.pairs, name, getattr(found, name))
-        self.begun = self_pairs.StepPairs()
-        self.begun.normal, self.begun.weights = room(wp.vec3d), room(wp.vec4d)
-        self.begun.gap = room(wp.float64)
-        self.pairs.layout, self.pairs.threads = self.surface.layout, 1 if device.is_cpu else capacity
+        lists = {name: getattr(found, name) for name in ("stencils", "counts", "rows", "distances")}
+        threads = 1 if device.is_cpu else capacity
+        self.pairs = filled(self_pairs.Pairs, layout=self.surface.layout, threads=threads, **lists)
+        self.begun = filled(self_pairs.StepPairs, normal=room(wp.vec3d), weights=room(wp.vec4d), gap=room(wp.float64))
         self.contact.hold(self.pairs, self.begun.normal)
 
     def grow(self):
@@ -364,7 +360,7 @@ class SelfSteps:
             return
         for each in self.forces.terms:
             given = [each.pairs, each.data.parts, surface.of_obstacles.collider, collider]
-            self.model.launch(self.model.kernel(keep_forces, self.model.dtype), each.capacity, given, [each.forces])
+            self.model.launch(keep_forces, each.capacity, given, [each.forces])
 
     def launch_present(self, x):
         """Lists the pairs near x (N,), with meshes where they are after the last step; poses stay those that sums need."""
@@ -387,7 +383,7 @@ class SelfSteps:
         """Launches out (B, C) += the work of meshes on the cloth in the last step [J], by the last forces of ``terms``."""
         for each in terms if self.surface.obstacles else ():
             given = [each.pairs, each.data.parts, self.surface.of_obstacles.collider, each.data.travel, each.forces]
-            self.model.launch(self.model.kernel(work_of_meshes, self.model.dtype), 1, given, [out])
+            self.model.launch(work_of_meshes, 1, given, [out])
 
     @property
     def forced(self):

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ..core.structs import filled
 from ..kernels.contact import obstacles as kernels
 from ..kernels.coulomb import law_of
 from ..mesh.mesh import Mesh
@@ -41,8 +42,7 @@ class ContactSurface:
         self._vertices = np.concatenate([vertices for _, vertices, _, _ in found] or [np.empty(0, np.int64)])
         self.obstacles, self.moves = len(self.colliders), any(scene.colliders[c].moves for c, _, _, _ in found)
         self.count = model.count + model.copies * self.obstacles
-        self.layout = kernels.Layout()
-        self.layout.cloth, self.layout.per_copy, self.layout.obstacles = model.count, n, self.obstacles
+        self.layout = filled(kernels.Layout, cloth=model.count, per_copy=n, obstacles=self.obstacles)
         firsts = np.cumsum([0, *(len(vertices) for _, vertices, _, _ in found)])
         self._of_meshes = [
             (Mesh(points, triangles), first) for (_, _, points, triangles), first in zip(found, firsts, strict=False)
@@ -50,7 +50,7 @@ class ContactSurface:
         self.rest = np.concatenate([model.rest_points, *(each.points for each, _ in self._of_meshes)])
         self.edge_lengths = mesh.edge_lengths
         self._find_elements()
-        self._find, self.width = None, 0.0
+        self._find, self.width, self.moves_of_step = None, 0.0, None
         if self.obstacles:
             self._prepare_positions(found)
             self.moves_of_step = wp.zeros(self.count - model.count, dtype=wp.vec3d, device=model.device)
@@ -83,16 +83,14 @@ class ContactSurface:
         frames = [model.scene.colliders[c].frames for c in range(len(model.scene.colliders)) if c in self.colliders]
         present = {c: np.ptp(each, axis=1).any(axis=1) for (c, *_), each in zip(found, frames, strict=True)}
         counts = [len(present.get(c, ())) for c in range(len(model.scene.colliders))]
-        self._arrays = {  # the struct holds no references
+        values = {
             "collider": self.colliders,
             "vertex": self._vertices,
             "first_frame": np.cumsum([0, *counts])[:-1],
             "present": np.concatenate([present[c] for c in sorted(present)]),
         }
-        self.of_obstacles = kernels.Obstacles()
-        for name, values in self._arrays.items():
-            self._arrays[name] = wp.array(values, dtype=wp.int32, device=device)
-            setattr(self.of_obstacles, name, self._arrays[name])
+        arrays = {name: wp.array(each, dtype=wp.int32, device=device) for name, each in values.items()}
+        self.of_obstacles = filled(kernels.Obstacles, **arrays)
         self._find = model.kernel(kernels.find_obstacles, model.dtype)
 
     def friction(self):

@@ -6,7 +6,9 @@ import numpy as np
 import warp as wp
 
 from ..kernels.contact import pair_sums, pair_sweeps
-from ..kernels.contact.self_pairs import forget_contacts
+from ..kernels.contact.self_pairs import Pairs, fill_corners, forget_contacts, sort_corners
+from .scan import Scan
+from .structs import filled
 
 SUMS = pair_sums.pair_forces, pair_sums.pair_energies, pair_sums.pair_diagonal, pair_sums.pair_products
 
@@ -24,7 +26,7 @@ class DynamicElements:
 
     Attributes:
         present: As given.
-        pairs: :func:`warpcloth.kernels.contact.self_pairs.near_pairs`.
+        pairs: :class:`warpcloth.kernels.contact.self_pairs.Pairs`.
         data: The ``data`` of the term.
         forces: :class:`warpcloth.kernels.contact.pair_sums.PairForces`.
         blocks: :func:`warpcloth.kernels.contact.pair_sums.pair_blocks`, empty if sums are scattered.
@@ -38,7 +40,7 @@ class DynamicElements:
     def __init__(self, model, term, present):
         self.model, self.term, self.present = model, term, present
         self._swept, self._in_turn, self.pairs, self.multipliers = None, None, None, None
-        self._forget = model.kernel(forget_contacts, model.dtype)
+        self._vertices = Scan(model, model.count)
         self.set_sums(model.device.is_cpu)
 
     def set_sums(self, scatters):
@@ -52,36 +54,37 @@ class DynamicElements:
         if self.pairs is not None:
             self._hold_blocks()
 
+    def new_pairs(self, slots, layout, corners=True):
+        """Returns pairs with a number of slots, and with lists of ``corners`` at each vertex if kernels sum over vertices."""
+        sizes, device = {"acting": slots, "number": 1}, self.model.device
+        if corners:
+            sizes |= {"corner_counts": self.model.count, "first": self.model.count + 1, "corners": 4 * slots}
+        lists = {name: wp.zeros(size, dtype=wp.int32, device=device) for name, size in sizes.items()}
+        return filled(Pairs, layout=layout, stencils=wp.zeros(slots, dtype=wp.vec4i, device=device), **lists)
+
     def hold_pairs(self, pairs, data, marks):
         """Takes the arrays of pairs, with ``marks``, 0 in slots without one, and allocates those of forces and sweeps."""
         self.pairs, self.data, self._marks = pairs, data, marks
         pairs.threads = 1 if self.model.device.is_cpu else self.capacity
         model, room = self.model, self.room
-        self.forces = pair_sums.PairForces()
-        kinds = {
-            "weights": wp.vec4d,
-            "energy": wp.float64,
-            "force": wp.vec3d,
-            "bend": wp.vec2d,
-            "along": wp.vec3d,
-            "across": wp.vec3d,
-        }
+        kinds = {"weights": wp.vec4d, "energy": wp.float64, "bend": wp.vec2d}
+        kinds |= dict.fromkeys(("force", "along", "across"), wp.vec3d)
+        kinds |= dict.fromkeys(("pressing", "joining"), wp.int32) if model.device.is_cpu else {}
+        self.forces = filled(pair_sums.PairForces, **{name: room(kind) for name, kind in kinds.items()})
         if model.device.is_cpu:
-            kinds["pressing"] = kinds["joining"] = wp.int32
             self.forces.count = wp.zeros(2, dtype=wp.int32, device=model.device)
-        for name, kind in kinds.items():
-            setattr(self.forces, name, room(kind))
         self._hold_blocks()
         if self._in_turn is not None:
             self.multipliers = room(wp.vec3d)
         if self._in_turn is False:
-            self._swept = pair_sweeps.SweptPairs()
-            self._swept.touches, self._swept.v, self._swept.normal = room(wp.int32), room(wp.vec3d), room(wp.vec3d)
-            self._swept.weights = room(wp.vec4d)
-            corners = len(pairs.corners)
-            self._swept.slots = wp.zeros(corners, dtype=wp.int32, device=model.device)
-            self._swept.moves = wp.zeros(corners, dtype=wp.vec3d, device=model.device)
-            self._swept.touching = wp.zeros(model.count, dtype=wp.int32, device=model.device)
+            corners, device = len(pairs.corners), model.device
+            self._swept = filled(
+                pair_sweeps.SweptPairs,
+                **{"touches": room(wp.int32), "v": room(wp.vec3d), "normal": room(wp.vec3d), "weights": room(wp.vec4d)},
+                slots=wp.zeros(corners, dtype=wp.int32, device=device),
+                moves=wp.zeros(corners, dtype=wp.vec3d, device=device),
+                touching=wp.zeros(model.count, dtype=wp.int32, device=device),
+            )
 
     def _hold_blocks(self):
         self.blocks, model = pair_sums.pair_blocks(self.model.dtype)(), self.model
@@ -102,10 +105,16 @@ class DynamicElements:
 
     def launch_none(self):
         """Empties the list of acting pairs. Only their slots are cleared, for there may be a thousand times as many."""
-        self.model.launch(self._forget, self.pairs.threads, [self.pairs], [self._marks, self.multipliers])
+        self.model.launch(forget_contacts, self.pairs.threads, [self.pairs], [self._marks, self.multipliers])
         self.pairs.number.zero_()
         if self.pairs.first:
             self.pairs.first.zero_()
+
+    def launch_corners(self):
+        """Lists the corners of acting pairs at each vertex."""
+        self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
+        self.model.launch(fill_corners, self.pairs.threads, [], [self.pairs])
+        self.model.launch(sort_corners, self.model.count, [], [self.pairs])
 
     def launch(self, x, correction=None):
         """Launches the forces of the pairs at x, or at x + correction. The methods below sum them."""
@@ -160,7 +169,6 @@ class DynamicElements:
         if self._in_turn:
             self._sweep = model.kernel(pair_sweeps.sweep_pairs, self.term, model.dtype, axes)
         else:
-            self._number_corners = model.kernel(pair_sweeps.number_corners, model.dtype)
             self._touch = model.kernel(pair_sweeps.touch_pairs, self.term, model.dtype)
             self._press = model.kernel(pair_sweeps.press_pairs, self.term, model.dtype, axes)
             self._move = model.kernel(pair_sweeps.move_by_pairs, model.dtype, axes)
@@ -168,13 +176,13 @@ class DynamicElements:
 
     def launch_sweep_start(self, x):
         """Launches λ = 0 for all pairs before the first sweep, at x̃ (N,)."""
-        self.model.launch(self._forget, self.pairs.threads, [self.pairs], [None, self.multipliers])
+        self.model.launch(forget_contacts, self.pairs.threads, [self.pairs], [None, self.multipliers])
         if not self._in_turn:
             self.launch_corner_slots()
 
     def launch_corner_slots(self):
         """Launches the search of the index of each corner in the lists of vertices, for Jacobi sweeps."""
-        self.model.launch(self._number_corners, len(self.pairs.corners), [self.pairs], [self._swept.slots])
+        self.model.launch(pair_sweeps.number_corners, len(self.pairs.corners), [self.pairs], [self._swept.slots])
 
     def launch_sweep(self, x, correction, h, adds, backward, follows):
         """See :meth:`Dynamic.launch_sweep`."""

@@ -2,11 +2,12 @@
 
 import warp as wp
 
+from ..core.structs import filled
 from ..kernels.fast import gather_corrections as kernels
 from ..kernels.fast.term_facts import elements_struct
 from ..terms.refresh import EVALUATION, Moment
 from .gather_layout import gathered_in_rows
-from .structs import chained, filled
+from .structs import chained
 
 RUN = 64  # sweeps per graph, an even number
 
@@ -72,7 +73,8 @@ def _chained(parts, found, before, after, dtype):
     """Struct of all terms, with λ before and after a sweep."""
     structs = []
     for of, (_part, arrays), *lambdas in zip(parts, found, before, after, strict=True):
-        elements = filled(elements_struct(of.part, dtype), {name: array for name, array in arrays.items() if name != "factor"})
+        values = {name: array for name, array in arrays.items() if name != "factor"}
+        elements = filled(elements_struct(of.part, dtype), **values)
         structs.append({"elements": elements, "factor": arrays["factor"]})
         if of.multipliers:
             structs[-1] |= dict(zip(("before", "after"), lambdas, strict=True))

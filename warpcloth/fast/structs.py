@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ..core.structs import filled
 from ..kernels.fast.term_facts import chain_of, elements_struct
 
 
@@ -17,16 +18,8 @@ def chained(parts, arrays, dtype, struct_of=elements_struct):
     """
     made = chain_of(tuple(parts), dtype, struct_of)()
     if parts:
-        made.first = filled(struct_of(parts[0], dtype), arrays[0])
+        made.first = filled(struct_of(parts[0], dtype), **arrays[0])
         made.others = chained(parts[1:], arrays[1:], dtype, struct_of)
-    return made
-
-
-def filled(struct, values):
-    """An instance of a struct with values by name."""
-    made = struct()
-    for name, value in values.items():
-        setattr(made, name, value)
     return made
 
 

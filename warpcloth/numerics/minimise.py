@@ -115,7 +115,7 @@ class Minimiser:
         of_copies = kernels.begin_descent, kernels.note_stay, kernels.begin_newton, kernels.find_indefinite
         self._launch = model.launcher(
             ((rounding, *of_means), model.dtype, lanes.block),
-            ((*of_copies, copies_near_colliders),),
+            (of_copies,),
             ((kernels.end_newton,), lanes.block),
         )
         self.record()
@@ -245,7 +245,7 @@ class Minimiser:
         elif self._solid:
             self._unsolved.zero_()
             given = [self._near, self.active, self._near is None]
-            self._launch(copies_near_colliders, self.model.copies, given, [self._wanted, self._unsolved])
+            self.model.launch(copies_near_colliders, self.model.copies, given, [self._wanted, self._unsolved])
             wp.capture_if(self._unsolved, self._launch_beside)
         elif self.pairs is not None and self._last:
             self._note_stay(1, self.pairs.filter.fraction)
