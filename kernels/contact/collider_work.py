@@ -75,15 +75,15 @@ def rigid_moves(dtype):
 def add_collider_work(dtype):
     """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
 
-    ∇U is that of contact and friction, ∇H that of friction alone, δ the displacement of the collider's material at the vertex.
-    Both gradients are those where the step takes its forces, ``now``. With ``before``, the trapezoidal rule takes the mean of
-    the products there and at the start of the step; ∇U and ∇H are then stored for the next step.
+    ∇U is that of contact and friction, ∇H that of friction alone, where the step takes its forces (``now``); δ is the
+    displacement of the collider's material at the vertex. With ``before``, the trapezoidal rule takes the mean of the products
+    there and at the start of the step; ∇U and ∇H are then stored for the next step.
 
-    If the gap changes by more than the contact ``distance`` in a step, the two are in contact for only a part of it, in which
-    they move together. The work of contact is then that of the part of Δx that δ shares.
+    If the gap changes by more than the contact ``distance`` in a step, the two are in contact, and move together, for a part of
+    it alone. The work of contact is then that of the part of Δx that δ shares.
 
     If the filter shortened the move, Δx is the unshortened move, to ``uncut``, and only the forces of ``now`` count, in this
-    step and in the next. The filter then changed the energy of contact, not Δx: of_filter −= ∇U·(Δx − δ).
+    and in the next step. The filter then changed the energy of contact: of_filter −= ∇U·(Δx − δ).
     """
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
@@ -143,7 +143,7 @@ def add_collider_work(dtype):
 def add_filter_work(dtype):
     """Kernel over vertices, after a step: work of the filter += ½m(v² − v₋²) − (m g + f)·(x − x₋), x₋ and v₋ without it.
 
-    Sets ``uncut`` to x₋, updates ``cuts``, and resets the notes of the filter to 0.
+    It sets ``uncut`` to x₋, updates ``cuts``, and resets the notes of the filter to 0.
     """
     vec3, _ = types(dtype)
 
@@ -210,8 +210,7 @@ def add_stored(
 def limit_pulls(dtype):
     """Kernel over vertices: scales ∇U of a collider by ‖f‖/‖∇U‖ if that is below ½, with the ∇U of all colliders.
 
-    f is the contact force that the step gave the vertex. Unless the step converged to f = −∇U, the vertex may be deep in a
-    collider, with a ∇U that is millions of times larger.
+    f is the contact force of the step. Where the step has not converged to f = −∇U, a vertex deep inside has a far larger ∇U.
     """
     vec3, _ = types(dtype)
 

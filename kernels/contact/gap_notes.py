@@ -21,10 +21,10 @@ FIRST = wp.constant(wp.int64(2**62))
 class GapNotes:
     """The smallest gaps in the frames so far, (copies,).
 
-    ``nearest`` is 1/d for the smallest gap d [1/m]. The others are FIRST − (frame·n + vertex), with n vertices, for the first
-    frame with such a pair and its first vertex, or 0: ``too_near`` for gaps that float32 does not resolve, ``pressed``
-    (copies, 2) for pairs nearer than half the distance where their contact begins, of cloth with cloth and with meshes, and
-    ``unresolved`` for pairs that the filter stops where their contact begins, within rounding, far from the origin.
+    ``nearest`` is 1/d for the smallest gap d [1/m]. The others are FIRST − (frame·n + vertex), with n vertices, of the first
+    frame and vertex, or 0: of gaps that float32 does not resolve, of pairs nearer than half the distance where contact begins,
+    of cloth with cloth and with meshes (copies, 2), and of pairs that rounding, far from the origin, stops where contact
+    begins.
     """
 
     nearest: wp.array(dtype=wp.float64)
@@ -67,7 +67,7 @@ def cutoff_of(dtype):
 def note_gaps(dtype):
     """Kernel over pairs at the start of a step: records their gaps if a frame ends there.
 
-    ``least`` [m] is the least gap of the filter without rounding if it keeps iterates apart, else 0.
+    ``least`` is the least gap [m] of a filter that keeps iterates apart, without rounding, else 0.
     """
     vec3, _ = types(dtype)
     farthest, contact_distance, least_gap_of = farthest_of(dtype), cutoff_of(dtype), least_gap(dtype)

@@ -1,7 +1,7 @@
 """Factories of the kernels by which the contacts of sweeps follow the iterate.
 
-Sweeps leave w and n as they were found. Then contacts are found anew where the iterate is now: all forces are removed, and the
-new contacts start with the λ of the old ones.
+Sweeps leave w and n as they were found. Then all forces are removed, contacts are found anew where the iterate is now, and the
+new ones start with the λ of the old ones.
 """
 
 import warp as wp
@@ -99,8 +99,8 @@ def fix_forces(
 ):
     """Kernel over vertices: the part of the forces of contacts over a valley that sweeps do not compute anew, as λ [kg·m].
 
-    That is −h²(1 − share)kAφ′ along n, and all of negative contacts, but in proportion to the λ of the positive ones, because
-    the positions where the contacts were found may be far from the solution.
+    That is −h²(1 − share)kAφ′ along n, and all of negative contacts, in proportion to the λ of the positive ones, because the
+    positions where the contacts were found may be far from the solution.
     """
     v = wp.tid()
     first = lists.rows[v]

@@ -1,16 +1,14 @@
 """Factories of the kernels that find the contacts of a surface at given positions, with a potential of these alone.
 
 U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)). The first sum is over the vertices v, with rest area aᵥ, half
-for each side, and the faces, edges and vertices F of the surface near v. The multiplicities m are those of inclusion and
-exclusion: 1 for a face, 1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces that have E edges there.
-Inside a surface these are 1, −1 and 1. As the nearest point of a face may be on its edge, most of them cancel: over a plane or
-a convex edge one term is left, with m = 1, and over a valley there are two faces and minus one edge. So a flat sheet has the
-pressure −kφ′, and the gradient is continuous.
+for each side, and the faces, edges and vertices F near v. The multiplicities m are those of inclusion and exclusion: 1 for a
+face, 1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces that have E edges there. As the nearest
+point of a face may be on its edge, most terms cancel: over a plane or a convex edge one is left, with m = 1, and over a valley
+there are two faces and minus one edge. So a flat sheet has the pressure −kφ′, and the gradient is continuous.
 
-The second sum is over pairs of edges, for vertices do not find the place where two edges cross. b is the rest area of an edge
-over its length, and D² = min over s and t of ‖y(s, t)‖² (1 + ⅛((2s − 1)² + (2t − 1)²)), a strictly convex function, so that D
-has a gradient for parallel edges too. Edges act below a quarter of the contact distance of vertices, because flat sheets do not
-need them.
+The second sum is over pairs of edges, for vertices do not find where two edges cross. b is the rest area of an edge over its
+length, and D² = min over s and t of ‖y(s, t)‖² (1 + ⅛((2s − 1)² + (2t − 1)²)), strictly convex, so that D has a gradient for
+parallel edges too. Flat sheets do not need it, so edges act below a quarter of the contact distance.
 
 Elements with a common vertex have no contact, nor have those of one piece whose rest distance is below 2r.
 
@@ -181,14 +179,13 @@ class Laws:
 class Contacts:
     """The contacts at some positions, by slots: w, n, d, r [m], kA with the sign of m [N/m], ``share``, and ``fixed`` λ [kg·m].
 
-    Slot e < C of 2C is that of the pair e: of the nearest point of a face, or of two edges. Those from C + 3·rows[i] on are for
-    terms of vertex i whose faces have their nearest points elsewhere; F faces share at most 1.5 F edges, and as many vertices.
-    kA is 0 in slots without a contact. ``code`` says where the nearest point of a face is. ``near`` (C,) lists the pairs of the
-    near faces of vertex i from rows[i] on.
+    Slot e < C of 2C is that of the pair e. Those from C + 3·rows[i] on are for terms of vertex i whose faces have their nearest
+    points elsewhere; F faces share at most 1.5 F edges, and as many vertices. kA is 0 in slots without a contact. ``code`` says
+    where the nearest point of a face is. ``near`` (C,) lists the pairs of the near faces of vertex i from rows[i] on.
 
-    ``parts`` has the vertices of the surface between which a contact is; bit i of ``touching`` is 1 if wᵢ is not 0. The stencil
-    has the first vertex of the cloth with w = 0 in place of each obstacle. With obstacles there is the ``offset`` o = Σ wⱼXⱼ
-    [m] of their positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,).
+    ``parts`` has the vertices of the surface of a contact, and bit i of ``touching`` is 1 if wᵢ is not 0. The stencil has the
+    first vertex of the cloth with w = 0 in place of each obstacle. Obstacles give the ``offset`` o = Σ wⱼXⱼ [m] of their
+    positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,).
 
     The ``share`` of a contact is the sum of m over its side of the vertex, divided by that of positive m. Sweeps compute this
     share of its force anew, and leave the rest ``fixed``, see :mod:`.pair_follow`.
@@ -247,8 +244,8 @@ _stencil, _number = load(wp.vec4i), load(wp.int32)
 def count_faces(stencils: STENCILS, codes: NUMBERS, near: NUMBERS, first: int, end: int, p: int, q: int):
     """Counts the near faces of a vertex at an edge pq, or a vertex p = q; their pairs are ``near`` from ``first`` to ``end``.
 
-    Returns the face that owns the term, which is the first whose nearest point is there or else the first; the number of faces;
-    of those whose nearest point is there; and the first face.
+    Returns the face that owns the term, the first whose nearest point is there or else the first; the number of faces; of those
+    whose nearest point is there; and the first face.
     """
     lowest = wp.int32(-1)
     owner = wp.int32(-1)

@@ -1,8 +1,8 @@
 """Factories of the constraint rows of pairs, for each :class:`.pair_sums.PairTerm`.
 
-Each copy has rows for all pairs of the list. Those of pairs of other copies, or without a force, are inactive, see
-:mod:`..constraint_rows`. With ``curved``, pairs of a term with one row have a second one, which adds the stiffness −λC″. λ is
-found anew, as −C/α and the ``fixed`` force, for pairs may have other slots than in the last rows.
+Each copy has rows for all pairs; those of other copies, or without a force, are inactive, see :mod:`..constraint_rows`. With
+``curved``, pairs of a term with one row have a second one, which adds the stiffness −λC″. λ is found anew, as −C/α and the
+``fixed`` force, for pairs may have other slots than in the last rows.
 """
 
 from functools import cache

@@ -1,9 +1,9 @@
 """Factories of the kernels that sum energies, forces and Hessians of pairs: those of contact, and those of friction.
 
-The energy of a pair is a function of y = Σ wᵢxᵢ, so vertex i gets wᵢ ∂U/∂y, and wᵢwⱼ ∂²U/∂y² joins vertices i and j. A
-:class:`PairTerm` finds these in :class:`PairForces`. Kernels gather, with a thread for each vertex, which adds up its pairs in
-order, in float64. For the CPU they scatter: one thread takes the pairs with a force in order, so that no list of the pairs of a
-vertex is needed, and products with the Hessian find Σ wⱼpⱼ of each pair once. Both agree up to rounding.
+The energy of a pair is a function of y = Σ wᵢxᵢ: vertex i gets wᵢ ∂U/∂y, and wᵢwⱼ ∂²U/∂y² joins vertices i and j. Kernels
+gather, with a thread for each vertex, in order and in float64. For the CPU they scatter: one thread takes the pairs with a
+force in order, so that no list of the pairs of a vertex is needed, and products find Σ wⱼpⱼ of each pair once. Both agree up to
+rounding.
 """
 
 from collections.abc import Callable
@@ -22,9 +22,9 @@ from .self_pairs import Pairs
 class PairForces:
     """Values of each pair at some positions, in float64: w, U [J] and ∂U/∂y [N].
 
-    ∂²U/∂y² = bend[0]·along alongᵀ + bend[1]·across acrossᵀ [N/m], where ``across`` is for friction and negative contacts. Both
-    ``bend`` are 0 for pairs without a force. ``pressing`` lists the ``count`` [0] pairs with a force, in order, for kernels
-    that scatter, and ``joining`` the ``count`` [1] ones among them that join vertices: those with a mesh may have only one.
+    ∂²U/∂y² = bend[0]·along alongᵀ + bend[1]·across acrossᵀ [N/m], where ``across`` is for friction and negative contacts; both
+    ``bend`` are 0 for pairs without a force. For kernels that scatter, ``pressing`` lists the ``count`` [0] pairs with a force,
+    in order, and ``joining`` the ``count`` [1] ones that join vertices: those with a mesh may have only one.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -83,12 +83,12 @@ class PairTerm:
         name: Its name in reports.
         module: Name of the Warp module of its kernels, without the precision.
         rows: The number of its constraint rows.
-        data: Warp struct of what the step holds of each pair, among it its normal n.
-        near: Function of a precision, which makes the device function (pairs, data, e, x, d, always) → whether pair e may
-            have a force at x + d, v, n and w, for a sweep; n is a unit vector. v is the y of friction, and the gap along n of
-            contact. With ``always``, w and v are found in any case.
-        push: Device function (data, e, v, n, D, least, h, hard) → λ = −h²∂U/∂y at v + Dλ [kg·m], v without the force of
-            the pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.pair_sweeps`.
+        data: Warp struct of the values of each pair in the step, among them its normal n.
+        near: Function of a precision, which makes the device function (pairs, data, e, x, d, always) → whether pair e may have
+            a force at x + d, v, n and w, for a sweep. v is the y of friction, and the gap along n of contact. With ``always``,
+            w and v are found in any case.
+        push: Device function (data, e, v, n, D, least, h, hard) → λ = −h²∂U/∂y at v + Dλ [kg·m], v without the force of the
+            pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.pair_sweeps`.
         row: Function of a precision, which makes the device function (pairs, data, e, x, d) → :class:`PairRow`.
         isotropic: Whether D is that of a vertex without locked axes, because ``push`` needs one D for all directions.
     """
@@ -109,7 +109,7 @@ class PairTerm:
 
 @wp.struct
 class PairRow:
-    """The constraint rows C of a pair at some positions: w, ∂C/∂y of both rows, 0 if inactive, C, and the stiffness k [N/m].
+    """The constraint rows C of a pair: w, ∂C/∂y of both rows, 0 if inactive, C, and the stiffness k [N/m].
 
     ``size`` is the length of what cancels in y, without the correction [m]. ``fixed`` is the part of the force of the first row
     that does not follow from C [N]. A row without stiffness has that alone.
@@ -126,9 +126,9 @@ class PairRow:
 
 @cache
 def taken_by(scatters: bool):
-    """Device functions (pairs, forces, thread) → its range, and (pairs, forces, k) → pair e, and the range of its corners.
+    """Device functions (pairs, forces, thread) → its range, and (pairs, forces, k) → pair e and the range of its corners.
 
-    Without a force, the range of corners is empty.
+    The range of corners is empty without a force.
     """
 
     @wp.func

@@ -1,11 +1,11 @@
 """Factories of the kernels of Gauss–Seidel and Jacobi sweeps over pairs, for each :class:`.pair_sums.PairTerm`.
 
-A sweep removes the λ of a pair and adds that of its prox at what remains: with v̂ without the force of the pair and D = Σ wᵢ²/mᵢ
-along n, λ = −hₑ²∂U/∂y(v̂ + Dλ) in closed form, and Δxᵢ = wᵢλ/mᵢ. Then M(x − x̃) = Σ wᵢλ with w at x, and a fixed point minimises
-the objective of the step. Without multipliers nothing is removed (PBD).
+A sweep removes the λ of a pair and adds that of its prox at what remains: with v̂ without the force of the pair and D = Σ
+wᵢ²/mᵢ along n, λ = −hₑ²∂U/∂y(v̂ + Dλ) in closed form, and Δxᵢ = wᵢλ/mᵢ. Then M(x − x̃) = Σ wᵢλ with w at x, and a fixed point
+minimises the objective of the step. Without multipliers nothing is removed (PBD).
 
-Where axes of a vertex are locked, a soft pair takes its D with all axes free, which does not move the fixed point. With the
-smaller one, a pair that cannot open along its free axes would throw the cloth far along them.
+Where axes of a vertex are locked, a soft pair takes D with all axes free, which does not move the fixed point: by the smaller
+D, a pair that cannot open along its free axes would throw the cloth far along them.
 """
 
 from functools import cache
@@ -191,8 +191,8 @@ def touch_pairs(term: PairTerm, dtype):
 def press_pairs(term: PairTerm, dtype, axes: bool):
     """Kernel over acting pairs of a Jacobi sweep: λ of the prox, with D = Σ nᵢwᵢ²/mᵢ, nᵢ the touching pairs of vertex i.
 
-    D ⪰ J W Jᵀ, so the sum of the moves does not overshoot. The fixed point is that of :func:`sweep_pairs`. It stores
-    wᵢλ − w′ᵢλ′ for each corner, w′ and λ′ of the last sweep, and then λ and w for the next one.
+    D ⪰ J W Jᵀ, so the sum of the moves does not overshoot; the fixed point is that of :func:`sweep_pairs`. It stores wᵢλ −
+    w′ᵢλ′ for each corner, w′ and λ′ of the last sweep, and then λ and w for the next one.
     """
     _moved, respond, greatest = mobility(dtype, axes, term.isotropic)
     vec3, _ = types(dtype)

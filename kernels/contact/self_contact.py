@@ -2,9 +2,7 @@
 
 U = Σ kA φ(d) over the contacts, with φ as for colliders (:mod:`..terms.contact`). The nearest points minimise ‖y‖, so their
 motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian is approximated by its
-semi-definite part kA φ″ wᵢwⱼnnᵀ, of contacts over a valley by their share of it.
-
-Everything is computed in float64 for every precision of the model, so that positions are exact.
+semi-definite part kA φ″ wᵢwⱼnnᵀ, of contacts over a valley by their share of it. All is in float64 for every precision.
 """
 
 from functools import cache
@@ -44,9 +42,9 @@ def least_gap(dtype):
 def find_forces(dtype, bounded: bool):
     """Kernel over contacts: their forces; φ = ½(r − d)² if ``bounded``.
 
-    If ``least`` [m], the least gap f of the filter, is above 0, ψ is added to φ, from d = 2f on, where it is C², or from r if
-    that is less. Without ψ, cloth would be pressed to f, where one pair stops the whole copy. The Hessian of a negative contact
-    is negative along n, which is left out. Half of that across n, U′/d, stays.
+    If the least gap f of the filter, ``least`` [m], is above 0, ψ is added to φ, from d = 2f on, where it is C², or from r if
+    that is less: else cloth would be pressed to f, where one pair stops the whole copy. Of the Hessian of a negative contact
+    the part along n, which is negative, is left out, and half of that across n, U′/d, stays.
     """
     vec3, _ = types(dtype)
     least_gap_of = least_gap(dtype)

@@ -1,14 +1,13 @@
 """Factories of the kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(Σ wᵢxᵢ − a), a = Σ wᵢxᵢⁿ − ξ.
 
-H is that of :mod:`..coulomb`, with ε = μN/(kA): a spring with the stiffness of contact and a force of at most μN. Contacts, w,
-n, kA and N = −kAφ′ times their share are those at the start of the step, at the positions xⁿ. ξ is the elongation of the spring
-there. A step updates it, ξ ← u, and the next one shortens it to at most ε. So a sticking pair does not creep, and the spring of
-a sliding pair slides along.
+H is that of :mod:`..coulomb`, with ε = μN/(kA). Contacts, w, n, kA and N = −kAφ′ times their share are those at the start xⁿ of
+the step. A step updates the elongation ξ of the spring, ξ ← u, and the next one shortens it to at most ε: a sticking pair does
+not creep, and the spring of a sliding pair slides along. A pair takes the ξ of the contact between the same vertices, those of
+nonzero w, in the last step; without one, the mean of those that the vertex had with a part of the same face, or else of those
+with a common vertex on each side.
 
-At the end of a step ξ rotates with the cloth, or with the mesh, and u is without what turns the gap: R of :func:`turn_of`
-moves one side by d(Rn − n) relative to the other, d the gap. That of meshes is known, so u is without it in the whole step. A
-pair takes the ξ of the contact between the same vertices, those of nonzero w, in the last step; without one, the mean of those
-that the vertex had with a part of the same face, or else of those with a common vertex on each side.
+At the end of a step ξ rotates with the cloth or the mesh, and u is without what turns the gap d: R of :func:`turn_of` moves one
+side by d(Rn − n) relative to the other. That of meshes is known, so u is without it in the whole step.
 """
 
 from functools import cache, partial
@@ -30,8 +29,8 @@ from .self_pairs import Pairs
 class RubbedPairs:
     """Values of contacts at the start of the step: n, w, kA [N/m], ε [m], the anchor a [m], and the vertices on the first side.
 
-    ``parts`` are the vertices of the surface, −1 where w is 0. ``travel`` is the part of y that obstacles add by the end of the
-    step, of which forces see the fraction ``ahead``.
+    ``parts`` are vertices of the surface, −1 where w is 0. ``travel`` is what obstacles add to y in the step; forces see the
+    fraction ``ahead`` of it.
     """
 
     normal: wp.array(dtype=wp.vec3d)
@@ -95,8 +94,8 @@ class Rings:
 def turn_of(dtype):
     """Device function (layout, rings, s, w, sides, start, moves, x) → the rotation R of a contact from ``start`` to x.
 
-    It is the one that fits the edges at the vertices s that touch (−1: not) best (Kabsch 1976), each with |w|. With a mesh, it
-    is that of the mesh by the ``moves`` of its vertices, or of none. Vertices without a triangle have the edges of the contact.
+    It fits the edges at its vertices s (−1: none) best, each with |w| (Kabsch 1976): of a mesh by the ``moves`` of its
+    vertices, else of the cloth. Vertices without a triangle have the edges of the contact.
     """
     vec3, _ = types(dtype)
     points, vectors = wp.array(dtype=vec3), wp.array(dtype=wp.vec3d)
@@ -186,7 +185,7 @@ def slip_at(dtype):
 def begin_friction(dtype, law: Law, bounded: bool):
     """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force and friction, which act.
 
-    μ is the first one of ``friction`` for cloth with cloth, and then that of each obstacle of a copy.
+    ``friction`` has μ of cloth with cloth, then that of each obstacle of a copy.
     """
     (vec3, _), rotation_of = types(dtype), turn_of(dtype)
     slope, limit_of = contact.bounded_slope if bounded else contact.slope, law.limit
@@ -357,10 +356,7 @@ def find_friction(dtype, law: Law):
 
 @cache
 def end_friction(dtype):
-    """Kernel over acting pairs at the end x of a step: what the next step takes over.
-
-    The pairs ``kept`` are those of the step, with the vertices of the surface, but for ``first``.
-    """
+    """Kernel over acting pairs at the end x of a step: pairs ``kept`` for the next step, all but ``first``, and their ξ."""
     vec3, _ = types(dtype)
     y_of, rotation_of = difference_of(dtype), turn_of(dtype)
 

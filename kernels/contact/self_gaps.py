@@ -1,7 +1,7 @@
 """Nearest points of a vertex and a triangle, or of two edges, and the gap between them, in float64.
 
-A pair has four vertices. y = Σ wᵢxᵢ is the vector between its nearest points, with w = (1, −β₁, −β₂, −β₃) for a vertex and a
-triangle, and (1 − s, s, −(1 − t), −t) for two edges. The gap is d = ‖y‖.
+y = Σ wᵢxᵢ is the vector between the nearest points of the four vertices of a pair, with w = (1, −β₁, −β₂, −β₃) for a vertex and
+a triangle, and (1 − s, s, −(1 − t), −t) for two edges. The gap is d = ‖y‖.
 """
 
 from functools import cache

@@ -14,10 +14,9 @@ from .self_gaps import nearest
 class Pairs:
     """The near pairs of :class:`warpcloth.contact.proximity.Proximity`, or the slots of an energy.
 
-    Near pairs have the fields up to ``distances``. ``counts`` has the numbers of vertex–triangle pairs, which come first, and
-    of edge–edge pairs. The triangles near vertex i are in rows ``rows`` [i] to rows[i+1]. ``distances`` [m] is r, or half the
-    rest distance if that is less, in the precision of the model. Kernels over pairs have so many ``threads``: on the CPU one,
-    for each there copies structs.
+    Near pairs have the fields up to ``distances``: ``counts`` of vertex–triangle pairs, which come first, and of edge–edge
+    pairs; those of vertex i in rows ``rows`` [i] to rows[i+1]; and r or, if less, half the rest distance [m], in the precision
+    of the model. Kernels over pairs have so many ``threads``: on the CPU one, for each there copies structs.
 
     An energy has ``stencils``, of cloth alone, and the others. ``acting`` lists the ``number`` (1,) of slots that act.
     ``corners`` lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is
@@ -52,7 +51,7 @@ MODULE = "warpcloth.self_contact"
 def module_of(dtype):
     """Returns the name of the module of the kernels that every scene with self-contact launches.
 
-    Warp compiles a module as a whole, and again if other kernels are in it. So other kernels are in modules of their own.
+    Warp compiles a module as a whole, and again if it has other kernels; so these are in modules of their own.
     """
     return f"{MODULE}.{dtype.__name__}"
 

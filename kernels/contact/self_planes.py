@@ -78,9 +78,9 @@ def common_move(dtype):
 def find_ways(dtype):
     """Kernel over vertices: ``share`` with which the wanted move minus the ``common`` move is at most ``most``, and ``ways``.
 
-    The ways are a bound of its part in the approach of a pair [m], its largest coordinate [m], and its share. The bound is the
-    length of that move plus WIDE times that of the motion since ``begun``, where the gaps were computed. The latter is
-    ``relative`` to the first vertex of the copy where cloth meets nothing but itself; obstacles have not moved since.
+    The ways are a bound of what it adds to the approach of a pair [m], its largest coordinate [m], and its share. The bound is
+    the length of that move plus WIDE times that of the motion since ``begun``, where gaps were computed, ``relative`` to the
+    first vertex of the copy where cloth meets nothing but itself. Obstacles have not moved since.
     """
     vec3, _ = types(dtype)
     wanted = wanted_move(dtype)
@@ -153,7 +153,7 @@ def moved_apart(
 ):
     """A fraction up to ``most`` of the moves du, dv and dw for which |w·(u × v)| surely exceeds ``floor`` times |u × v|.
 
-    That quotient is the distance of two lines along u and v that are w apart, or of a point from a plane. KEPT of the excess of
+    The quotient is the distance of two lines along u and v that are w apart, or of a point from a plane. KEPT of the excess of
     the volume, a cubic polynomial, may be used up.
     """
     n = wp.cross(u, v)
@@ -197,8 +197,8 @@ def part_apart(
     """The fraction of their moves for which a pair at a, b, c and d surely stays farther apart than ``floor``.
 
     The pair advances until its gap could be closed at the relative speed of its sides, finds its gap there, and goes on (Li,
-    Kaufman and Jiang 2021, additive continuous collision detection); or, if farther, as for cloth that slides, as
-    :func:`moved_apart` allows.
+    Kaufman and Jiang 2021, additive continuous collision detection); or farther, as :func:`moved_apart` allows cloth that
+    slides.
     """
     mean = SIDE * SIDE * (move_a + move_b + move_c + move_d)
     first = wp.length(move_a - mean)
@@ -247,12 +247,12 @@ def cut_by_planes(dtype):
 
     A pair cuts nothing while its sides stay apart, by a tenth of their gap or more, with the shares that its vertices had
     before: along y, where a plane may move with them, or by :func:`part_apart`. So cloth that falls or turns together moves
-    freely. Otherwise each side gets a half-space for itself, so that the shares may fall further: a plane normal to y divides
-    their gap, minus the smallest distance, in the ratio of their approaches, not counting the ``common`` move of a copy; each
-    side gets at least CLAMPED of it. Pairs whose ``gap`` is too wide for the moves that :func:`find_ways` bounds have no plane.
+    freely. Else a plane normal to y divides their gap, minus the smallest distance, in the ratio of their approaches, not
+    counting the ``common`` move of a copy; each side gets at least CLAMPED of it, and shares may fall further. Pairs whose
+    ``gap`` is too wide for the moves that :func:`find_ways` bounds have no plane.
 
-    A vertex at the smallest distance from a plane that does not approach it moves by at least ``least_share``, or not at
-    all. Roundings of shorter moves, which can be equal in many steps, would take it nearer.
+    A vertex at the smallest distance from a plane that it does not approach moves by at least ``least_share``, or not at all:
+    roundings of shorter moves, which can be equal in many steps, would take it nearer.
     """
     vec3, _ = types(dtype)
     wanted, ulp = wanted_move(dtype), ulp_of(dtype)
