@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..core.structs import filled
+from ..core.filled import filled
 from ..kernels.contact.clearance import clearances, near_colliders
 from ..kernels.contact.colliders import shapes
 

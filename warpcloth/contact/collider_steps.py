@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from ..core.filled import filled
 from ..core.state import Count
-from ..core.structs import filled
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.clear_elements import find_clear

@@ -3,8 +3,8 @@
 import warp as wp
 
 from ..core.energy import Energy
+from ..core.filled import filled
 from ..core.gradient import Gradient
-from ..core.structs import filled
 from ..core.sums import Sums
 from ..kernels.contact import collider_work as kernels
 from ..kernels.project import add_momentum

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..core.dynamic import DynamicElements
-from ..core.structs import filled
+from ..core.filled import filled
 from ..kernels.contact import pair_follow
 from ..kernels.contact import pair_potential as potential
 from ..kernels.contact import self_contact as kernels

@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from ..core.filled import filled
 from ..core.gradient import Gradient
-from ..core.structs import filled
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.collider_work import collider_pulls

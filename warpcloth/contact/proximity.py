@@ -6,8 +6,8 @@ import warp as wp
 from ..base.limits import refuse_memory
 from ..base.turns import in_turn
 from ..core.capture import Mirror
+from ..core.filled import filled
 from ..core.scan import Scan
-from ..core.structs import filled
 from ..kernels.contact import piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 

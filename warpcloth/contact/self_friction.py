@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..core.dynamic import DynamicElements
-from ..core.structs import filled
+from ..core.filled import filled
 from ..kernels.contact import self_friction as kernels
 from ..kernels.contact.self_pairs import Pairs
 

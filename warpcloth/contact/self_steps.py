@@ -8,9 +8,9 @@ import warp as wp
 
 from ..core.capture import Mirror
 from ..core.dynamic import Dynamic
+from ..core.filled import filled
 from ..core.state import Count
 from ..core.status import Stopped
-from ..core.structs import filled
 from ..core.sums import Sums
 from ..kernels.contact import gap_notes, pair_blocks, self_pairs
 from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes

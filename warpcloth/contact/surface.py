@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..core.structs import filled
+from ..core.filled import filled
 from ..kernels.contact import obstacles as kernels
 from ..kernels.coulomb import law_of
 from ..mesh.mesh import Mesh

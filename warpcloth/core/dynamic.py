@@ -7,8 +7,8 @@ import warp as wp
 
 from ..kernels.contact import pair_sums, pair_sweeps
 from ..kernels.contact.self_pairs import Pairs, fill_corners, forget_contacts, sort_corners
+from .filled import filled
 from .scan import Scan
-from .structs import filled
 
 SUMS = pair_sums.pair_forces, pair_sums.pair_energies, pair_sums.pair_diagonal, pair_sums.pair_products
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..core.structs import filled
+from ..core.filled import filled
 from ..kernels.fast import gather_corrections as kernels
 from ..kernels.fast.term_facts import elements_struct
 from ..terms.refresh import EVALUATION, Moment

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..core.structs import filled
+from ..core.filled import filled
 from ..kernels.fast.term_facts import chain_of, elements_struct
 
 
