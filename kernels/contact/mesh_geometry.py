@@ -1,4 +1,4 @@
-"""Factories of the struct of mesh colliders, and of device functions on their points and on triangles."""
+"""Factories of the struct of mesh colliders, and of a device function on their points."""
 
 from functools import cache
 
@@ -44,48 +44,3 @@ def point_at(dtype):
         return found
 
     return point
-
-
-@cache
-def nearest_on_triangle(dtype):
-    """Device function (p, corners) → distance of p to a triangle, and the direction away from it."""
-    vec3, mat33 = types(dtype)
-    zero, one = dtype(0.0), dtype(1.0)
-
-    @wp.func
-    def from_side(p: vec3, a: vec3, b: vec3):
-        """The vector from the segment ab to p. A short one must not be tilted along ab by rounding, for the ends may be far."""
-        e = b - a
-        l = wp.dot(e, e)
-        t = zero
-        if l > zero:
-            t = wp.clamp(wp.dot(p - a, e) / l, zero, one)
-        y = p - a - t * e
-        if t > zero and t < one:
-            y -= wp.dot(y, e) / l * e
-        return y
-
-    @wp.func
-    def from_triangle(p: vec3, t: mat33):
-        a, b, c = t[0], t[1], t[2]
-        n = wp.cross(b - a, c - a)
-        w = vec3(wp.dot(wp.cross(c - b, p - b), n), wp.dot(wp.cross(a - c, p - c), n), wp.dot(wp.cross(b - a, p - a), n))
-        size = w[0] + w[1] + w[2]
-        if size > zero and w[0] >= zero and w[1] >= zero and w[2] >= zero:
-            n = wp.normalize(n)
-            d = wp.dot(n, p - a)
-            return wp.abs(d), wp.where(d < zero, -n, n)
-        best = dtype(wp.inf)
-        away = vec3()
-        for k in range(3):  # the sides opposite c, a and b
-            if w[(k + 2) % 3] < zero or size <= zero:
-                y = from_side(p, t[k], t[(k + 1) % 3])
-                if wp.dot(y, y) < best:
-                    best = wp.dot(y, y)
-                    away = y
-        d = wp.length(away)
-        if d > zero:
-            away = away / d
-        return d, away
-
-    return from_triangle

@@ -6,9 +6,9 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
-from .mesh_geometry import nearest_on_triangle
 from .obstacles import CLOTH, OBSTACLE, copy_of, has_obstacle, in_copy
 from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, code_of, grids, surfaces
+from .self_gaps import nearest_of_face
 
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 
@@ -30,10 +30,9 @@ class PairList:
 
 
 @cache
-def closest_points(dtype, of_edges: bool):
-    """Device function (x₀, x₁, x₂, x₃) → the shortest vector from triangle x₁ x₂ x₃ to vertex x₀, or edge x₂ x₃ to x₀ x₁."""
-    vec3, mat33 = types(dtype)
-    from_triangle = nearest_on_triangle(dtype)
+def distance_of(dtype, of_edges: bool):
+    """Device function (x₀, x₁, x₂, x₃) → the distance of vertex x₀ and triangle x₁x₂x₃, or of edges x₀x₁ and x₂x₃ [m]."""
+    vec3, _ = types(dtype)
     zero, one = dtype(0.0), dtype(1.0)
 
     @wp.func
@@ -58,12 +57,15 @@ def closest_points(dtype, of_edges: bool):
             s = wp.clamp((ef * fr - er * ff) / det, zero, one)
         t = on_segment(ef * s + fr, ff)
         s = on_segment(ef * t - er, ee)
-        return r + s * e - t * f
+        return wp.length(r + s * e - t * f)
 
     @wp.func
     def of_vertex(p: vec3, a: vec3, b: vec3, c: vec3):
-        d, away = from_triangle(p, mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]))
-        return d * away
+        one = wp.vec3d(a) - wp.vec3d(p)
+        two = wp.vec3d(b) - wp.vec3d(p)
+        three = wp.vec3d(c) - wp.vec3d(p)
+        _code, w = nearest_of_face(one, two, three)
+        return dtype(wp.length(w[0] * one + w[1] * two + w[2] * three))
 
     return of_two_edges if of_edges else of_vertex
 
@@ -71,7 +73,7 @@ def closest_points(dtype, of_edges: bool):
 @cache
 def cutoffs(dtype, of_edges: bool):
     """Device function (surface, stencil) → contact distance of a pair [m], in one piece at most half the rest distance."""
-    closest = closest_points(dtype, of_edges)
+    distance = distance_of(dtype, of_edges)
 
     @wp.func
     def cutoff(surface: surfaces(dtype), s: wp.vec4i):
@@ -84,8 +86,8 @@ def cutoffs(dtype, of_edges: bool):
             if not (wp.length(surface.rest[a] - surface.rest[d]) > surface.far):
                 b = in_copy(surface.layout, s[1])
                 c = in_copy(surface.layout, s[2])
-                y = closest(surface.rest[a], surface.rest[b], surface.rest[c], surface.rest[d])
-                found = wp.min(found, dtype(0.5) * wp.length(y))
+                apart = distance(surface.rest[a], surface.rest[b], surface.rest[c], surface.rest[d])
+                found = wp.min(found, dtype(0.5) * apart)
         return found
 
     return cutoff
@@ -96,12 +98,12 @@ def take_near(dtype, of_edges: bool):
     """The function of :func:`search_pairs` that lists pairs nearer than their contact distance and the skin, and its struct."""
     vec3, _ = types(dtype)
     corner = load(vec3)
-    closest, cutoff = closest_points(dtype, of_edges), cutoffs(dtype, of_edges)
+    distance, cutoff = distance_of(dtype, of_edges), cutoffs(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
     @wp.func
     def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, pairs: PairList):
-        d = wp.length(closest(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3])))
+        d = distance(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
         if d < surface.max_distance + surface.skin:
             if d < surface.skin or d < surface.skin + cutoff(surface, s):
                 if pairs.counts[KIND] < MOST:

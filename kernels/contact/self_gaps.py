@@ -15,6 +15,9 @@ from ..vectors import types
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 SIDE = wp.constant(wp.float64(0.5))
 PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges below which they have no normal
+ON_EDGE = wp.constant(wp.float64(1e-10))  # coordinates below are 0: rounding must not decide between a face and its edge
+# Where the nearest point of a face is: inside, on the edges ab, bc, ca from EDGE on, or at the vertices a, b, c from CORNER on.
+INSIDE, EDGE, CORNER = (wp.constant(code) for code in (0, 1, 4))
 
 
 @wp.func
@@ -146,6 +149,52 @@ def gap_along(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3
     if of_vertex:
         return -wp.max(wp.max(y, z), x)
     return wp.min(x, ZERO) - wp.max(y, z)
+
+
+@wp.func
+def along(p: wp.vec3d, q: wp.vec3d):
+    """(q − p)·(−p), above 0 if the origin is beyond p towards q. It has the same bits for all faces with the edge."""
+    return -wp.dot(q - p, p)
+
+
+@wp.func
+def nearest_of_face(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """The code of the point of a face nearest to the origin, and its barycentric coordinates."""
+    ab = along(a, b)
+    ba = along(b, a)
+    bc = along(b, c)
+    cb = along(c, b)
+    ca = along(c, a)
+    ac = along(a, c)
+    n = wp.cross(b - a, c - a)
+    wa = wp.dot(n, wp.cross(b, c))
+    wb = wp.dot(n, wp.cross(c, a))
+    wc = wp.dot(n, wp.cross(a, b))
+    least = ON_EDGE * wp.dot(n, n)
+    code = INSIDE
+    w = wp.vec3d(wa, wb, wc) / (wa + wb + wc)
+    if ab <= ZERO and ac <= ZERO:
+        code = CORNER
+        w = wp.vec3d(ONE, ZERO, ZERO)
+    elif ba <= ZERO and bc <= ZERO:
+        code = CORNER + 1
+        w = wp.vec3d(ZERO, ONE, ZERO)
+    elif ca <= ZERO and cb <= ZERO:
+        code = CORNER + 2
+        w = wp.vec3d(ZERO, ZERO, ONE)
+    elif wc <= least and ab > ZERO and ba > ZERO:
+        code = EDGE
+        t = ab / (ab + ba)
+        w = wp.vec3d(ONE - t, t, ZERO)
+    elif wa <= least and bc > ZERO and cb > ZERO:
+        code = EDGE + 1
+        t = bc / (bc + cb)
+        w = wp.vec3d(ZERO, ONE - t, t)
+    elif wb <= least and ca > ZERO and ac > ZERO:
+        code = EDGE + 2
+        t = ca / (ca + ac)
+        w = wp.vec3d(t, ZERO, ONE - t)
+    return code, w
 
 
 @wp.func
