@@ -8,7 +8,7 @@ from ..memory import load
 from ..vectors import types
 from .obstacles import copy_of, vector_within
 from .proximity_grid import surfaces
-from .self_gaps import ONE, ZERO, nearest
+from .self_gaps import CORNERS, ONE, ZERO, corners_of, nearest
 from .self_pairs import Pairs, module_of
 from .self_planes import KEPT, margin_of, needs_no_cut, part_apart, ulp_of, ways_of_sides
 
@@ -41,37 +41,35 @@ def allowed_fraction(dtype, of_edges: bool):
     the direction, as for cloth that slides over an edge, :func:`.self_planes.part_apart` may allow more.
     """
     vec3, _ = types(dtype)
-    ulp, vector_or_zero, advance = ulp_of(dtype), vector_within(dtype), advances(dtype)
+    ulp, vector_or_zero, advance, corners = ulp_of(dtype), vector_within(dtype), advances(dtype), corners_of(dtype)
     of_vertex, sides = wp.constant(not of_edges), wp.constant(2 if of_edges else 1)
 
     @wp.func
     def allowed(s: wp.vec4i, x: wp.array(dtype=vec3), out: advance):
-        a, b, c, d = wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]])
-        pa = wp.vec3d(vector_or_zero(out.direction, s[0]))
-        pb = wp.vec3d(vector_or_zero(out.direction, s[1]))
-        pc = wp.vec3d(vector_or_zero(out.direction, s[2]))
-        pd = wp.vec3d(vector_or_zero(out.direction, s[3]))
+        at = corners(x, s)
+        moves = CORNERS()
         far = ZERO
+        way = ZERO
         for i in range(4):
+            moves[i] = wp.vec3d(vector_or_zero(out.direction, s[i]))
+            way = wp.max(way, wp.length(moves[i]))
             if s[i] < out.direction.shape[0]:  # obstacles that stand are not rounded
-                far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
-        far += wp.max(wp.max(wp.length(pa), wp.length(pb)), wp.max(wp.length(pc), wp.length(pd)))
+                far = wp.max(far, wp.max(wp.abs(at[i])))
+        far += way
         margin = wp.float64(2.0) * margin_of(out.least, ulp * far)
-        _w, y, _inside = nearest(of_vertex, a, b, c, d)
+        _w, y, _inside = nearest(of_vertex, at)
         distance = wp.length(y)
         n = y / wp.max(distance, wp.float64(1e-300))
         floor = (ONE - KEPT) * wp.max(distance - margin, ZERO) + wp.min(distance, margin)
         t = ONE
         for p in range(sides):
             for q in range(sides, 4):
-                approach = wp.dot(
-                    n, wp.vec3d(vector_or_zero(out.direction, s[q])) - wp.vec3d(vector_or_zero(out.direction, s[p]))
-                )
+                approach = wp.dot(n, moves[q] - moves[p])
                 if approach > ZERO:
-                    apart = wp.dot(n, wp.vec3d(x[s[p]]) - wp.vec3d(x[s[q]])) - floor
+                    apart = wp.dot(n, at[p] - at[q]) - floor
                     t = wp.min(t, wp.max(apart, ZERO) / approach)
         if t < ONE:
-            t = wp.max(t, part_apart(of_vertex, a, b, c, d, pa, pb, pc, pd, floor))
+            t = wp.max(t, part_apart(of_vertex, at, moves, floor))
         return t
 
     return allowed

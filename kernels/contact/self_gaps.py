@@ -14,6 +14,7 @@ from ..vectors import types
 # Constants for all kernels of pairs.
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 SIDE = wp.constant(wp.float64(0.5))
+CORNERS = wp.types.matrix((4, 3), wp.float64)  # of a pair: the positions of its vertices, or their moves [m]
 PLANAR = wp.constant(wp.float64(1e-26))  # sin² of the angle between edges below which they have no normal
 ON_EDGE = wp.constant(wp.float64(1e-10))  # coordinates below are 0: rounding must not decide between a face and its edge
 # Where the nearest point of a face is: inside, on the edges ab, bc, ca from EDGE on, or at the vertices a, b, c from CORNER on.
@@ -133,11 +134,11 @@ def edge_edge(b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 
 @wp.func
-def nearest(of_vertex: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+def nearest(of_vertex: bool, x: CORNERS):
     """w, y and whether the nearest points are interior; computed relative to the first vertex, which keeps digits."""
     if of_vertex:
-        return vertex_triangle(b - a, c - a, d - a)
-    return edge_edge(b - a, c - a, d - a)
+        return vertex_triangle(x[1] - x[0], x[2] - x[0], x[3] - x[0])
+    return edge_edge(x[1] - x[0], x[2] - x[0], x[3] - x[0])
 
 
 @wp.func
@@ -204,6 +205,18 @@ def perpendicular(n: wp.vec3d):
     axis[wp.int32(wp.argmin(wp.abs(n)))] = ONE
     t = wp.cross(n, axis)
     return t / wp.max(wp.length(t), wp.float64(1e-300))
+
+
+@cache
+def corners_of(dtype):
+    """Device function (x, stencil) → the corners of a pair."""
+    vec3, _ = types(dtype)
+
+    @wp.func
+    def corners(x: wp.array(dtype=vec3), s: wp.vec4i):
+        return wp.matrix_from_rows(wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
+
+    return corners
 
 
 @cache

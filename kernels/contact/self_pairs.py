@@ -7,7 +7,7 @@ import warp as wp
 from ..vectors import types
 from .obstacles import Layout
 from .proximity import sort
-from .self_gaps import nearest
+from .self_gaps import corners_of, nearest
 
 
 @wp.struct
@@ -59,7 +59,7 @@ def module_of(dtype):
 @cache
 def begin_pairs(dtype):
     """Kernel over pairs: n, d and w at the positions x at the start of a step."""
-    vec3, _ = types(dtype)
+    (vec3, _), corners = types(dtype), corners_of(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def begin_each_pair(
@@ -74,7 +74,7 @@ def begin_pairs(dtype):
         if e >= pairs.counts[0] + pairs.counts[1]:
             return
         s = pairs.stencils[e]
-        w, y, _inside = nearest(e < pairs.counts[0], wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
+        w, y, _inside = nearest(e < pairs.counts[0], corners(x, s))
         d = wp.length(y)
         step.gap[e] = d
         step.weights[e] = w

@@ -8,7 +8,7 @@ import warp as wp
 from ..memory import load
 from ..vectors import types
 from .obstacles import copy_of
-from .self_gaps import ONE, SIDE, ZERO, nearest
+from .self_gaps import CORNERS, ONE, SIDE, ZERO, corners_of, nearest
 from .self_pairs import Pairs, module_of
 
 KEPT = wp.constant(wp.float64(0.9))  # fraction of its distance to a plane that a vertex may move in one round of the filter
@@ -182,61 +182,43 @@ def moved_apart(
 
 
 @wp.func
-def part_apart(
-    of_vertex: bool,
-    a: wp.vec3d,
-    b: wp.vec3d,
-    c: wp.vec3d,
-    d: wp.vec3d,
-    move_a: wp.vec3d,
-    move_b: wp.vec3d,
-    move_c: wp.vec3d,
-    move_d: wp.vec3d,
-    floor: wp.float64,
-):
-    """The fraction of their moves for which a pair at a, b, c and d surely stays farther apart than ``floor``.
+def across(of_vertex: bool, x: CORNERS):
+    """Vectors along two edges of a pair, and from a vertex of the first to one of the second, as of :func:`moved_apart`."""
+    if of_vertex:
+        return x[2] - x[1], x[3] - x[2], x[1] - x[0]
+    return x[1] - x[0], x[3] - x[2], x[2] - x[0]
+
+
+@wp.func
+def part_apart(of_vertex: bool, x: CORNERS, moves: CORNERS, floor: wp.float64):
+    """The fraction of its ``moves`` for which a pair at x surely stays farther apart than ``floor``.
 
     The pair advances until its gap could be closed at the relative speed of its sides, finds its gap there, and goes on (Li,
-    Kaufman and Jiang 2021, additive continuous collision detection); or farther, as :func:`moved_apart` allows cloth that
-    slides.
+    Kaufman and Jiang 2021, additive continuous collision detection); or farther, by :func:`moved_apart`, where cloth slides.
     """
-    mean = SIDE * SIDE * (move_a + move_b + move_c + move_d)
-    first = wp.length(move_a - mean)
-    second = wp.max(wp.length(move_c - mean), wp.length(move_d - mean))
+    mean = SIDE * SIDE * (moves[0] + moves[1] + moves[2] + moves[3])
+    relative = wp.matrix_from_rows(moves[0] - mean, moves[1] - mean, moves[2] - mean, moves[3] - mean)
+    first = wp.length(relative[0])
+    second = wp.max(wp.length(relative[2]), wp.length(relative[3]))
     if of_vertex:
-        second = wp.max(second, wp.length(move_b - mean))
+        second = wp.max(second, wp.length(relative[1]))
     else:
-        first = wp.max(first, wp.length(move_b - mean))
+        first = wp.max(first, wp.length(relative[1]))
     advanced = ZERO
-    _w, y, _inside = nearest(of_vertex, a, b, c, d)
+    _w, y, _inside = nearest(of_vertex, x)
     room = wp.length(y) - floor
     enough = NEAR * room
     if room > -ROUNDED * floor:
-        move_v = move_d - move_c
-        move_u = move_b - move_a
-        move_w = move_c - move_a
-        if of_vertex:
-            move_u = move_c - move_b
-            move_w = move_b - move_a
-        A = a
-        B = b
-        C = c
-        D = d
+        du, dv, dw = across(of_vertex, moves)
+        now = x
         for turn in range(ADVANCES):
             if room > enough or turn == 0:
-                u = B - A
-                w = C - A
-                if of_vertex:
-                    u = C - B
-                    w = B - A
-                further = moved_apart(u, D - C, w, move_u, move_v, move_w, floor, ONE - advanced)
+                u, v, w = across(of_vertex, now)
+                further = moved_apart(u, v, w, du, dv, dw, floor, ONE - advanced)
                 further = wp.max(KEPT * wp.max(room, ZERO) / wp.max(first + second, wp.float64(1e-300)), further)
                 advanced = wp.min(advanced + further, ONE)
-                A = a + advanced * (move_a - mean)
-                B = b + advanced * (move_b - mean)
-                C = c + advanced * (move_c - mean)
-                D = d + advanced * (move_d - mean)
-                _w, y, _inside = nearest(of_vertex, A, B, C, D)
+                now = x + advanced * relative
+                _w, y, _inside = nearest(of_vertex, now)
                 room = wp.where(advanced < ONE, wp.length(y) - floor, ZERO)
     return advanced
 
@@ -255,8 +237,7 @@ def cut_by_planes(dtype):
     roundings of shorter moves, which can be equal in many steps, would take it nearer.
     """
     vec3, _ = types(dtype)
-    wanted, ulp = wanted_move(dtype), ulp_of(dtype)
-    stencil = load(wp.vec4i)
+    wanted, corners, ulp, stencil = wanted_move(dtype), corners_of(dtype), ulp_of(dtype), load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def cut_by_each_plane(
@@ -285,8 +266,8 @@ def cut_by_planes(dtype):
         margin = margin_of(least, ulp * far)
         if needs_no_cut(e, way, margin, gap):
             return
-        origin = wp.vec3d(x[s[0]])
-        _w, y, _inside = nearest(of_vertex, origin, wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
+        at = corners(x, s)
+        _w, y, _inside = nearest(of_vertex, at)
         n = y / wp.max(wp.length(y), wp.float64(1e-300))
         lowest = wp.float64(wp.inf)
         highest = -wp.float64(wp.inf)
@@ -299,7 +280,7 @@ def cut_by_planes(dtype):
         for i in range(4):
             move = wanted(x, target, s[i])
             approach = wp.dot(n, move - own)
-            along = wp.dot(n, wp.vec3d(x[s[i]]) - origin)
+            along = wp.dot(n, at[i] - at[0])
             position[i] = along
             if i < sides:
                 approaches[i] = -approach
@@ -322,19 +303,10 @@ def cut_by_planes(dtype):
         floor = (ONE - KEPT) * between + wp.float64(2.0) * margin
         if lowest_end - highest_end >= floor:
             return
-        whole = part_apart(
-            of_vertex,
-            origin,
-            wp.vec3d(x[s[1]]),
-            wp.vec3d(x[s[2]]),
-            wp.vec3d(x[s[3]]),
-            ways[s[0]][2] * (wanted(x, target, s[0]) - own),
-            ways[s[1]][2] * (wanted(x, target, s[1]) - own),
-            ways[s[2]][2] * (wanted(x, target, s[2]) - own),
-            ways[s[3]][2] * (wanted(x, target, s[3]) - own),
-            floor,
-        )
-        if whole == ONE:
+        moves = CORNERS()
+        for i in range(4):
+            moves[i] = ways[s[i]][2] * (wanted(x, target, s[i]) - own)
+        if part_apart(of_vertex, at, moves, floor) == ONE:
             return
         for i in range(4):
             room = highest - position[i] + part * between

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpcloth.kernels.contact.self_gaps import nearest
+from warpcloth.kernels.contact.self_gaps import CORNERS, nearest
 from warpcloth.kernels.contact.self_planes import part_apart
 
 SAMPLES = 400
@@ -13,30 +13,28 @@ SAMPLES = 400
 @wp.kernel(module="unique", enable_backward=False)
 def advance_pairs(
     of_vertex: bool,
-    x: wp.array2d(dtype=wp.vec3d),
-    p: wp.array2d(dtype=wp.vec3d),
+    x: wp.array(dtype=CORNERS),
+    p: wp.array(dtype=CORNERS),
     keep: wp.float64,
     part: wp.array(dtype=wp.float64),
     gaps: wp.array2d(dtype=wp.float64),
 ):
     """The part of each pair, and its gaps over ``keep`` times that at the start, on the way."""
     e = wp.tid()
-    _w, y, _inside = nearest(of_vertex, x[e, 0], x[e, 1], x[e, 2], x[e, 3])
+    _w, y, _inside = nearest(of_vertex, x[e])
     floor = keep * wp.length(y)
-    t = part_apart(of_vertex, x[e, 0], x[e, 1], x[e, 2], x[e, 3], p[e, 0], p[e, 1], p[e, 2], p[e, 3], floor)
+    t = part_apart(of_vertex, x[e], p[e], floor)
     part[e] = t
     for k in range(SAMPLES):
         s = t * wp.float64(k + 1) / wp.float64(SAMPLES)
-        _w, y, _inside = nearest(
-            of_vertex, x[e, 0] + s * p[e, 0], x[e, 1] + s * p[e, 1], x[e, 2] + s * p[e, 2], x[e, 3] + s * p[e, 3]
-        )
+        _w, y, _inside = nearest(of_vertex, x[e] + s * p[e])
         gaps[e, k] = wp.length(y) / floor
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def nearest_of_pairs(of_vertex: bool, x: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.vec3d)):
+def nearest_of_pairs(of_vertex: bool, x: wp.array(dtype=CORNERS), out: wp.array(dtype=wp.vec3d)):
     e = wp.tid()
-    _w, y, _inside = nearest(of_vertex, x[e, 0], x[e, 1], x[e, 2], x[e, 3])
+    _w, y, _inside = nearest(of_vertex, x[e])
     out[e] = y
 
 
@@ -54,7 +52,7 @@ def test_pairs_stay_apart_along_their_part(of_vertex, keep, device):
     p = rng.uniform(-0.5, 0.5, (count, 4, 3)) * [1, 1, 0.1]
     p[:, sides, 2] += np.linspace(-0.05, 0.15, count)[:, None]
     part, gaps = wp.zeros(count, dtype=wp.float64, device=device), wp.zeros((count, SAMPLES), dtype=wp.float64, device=device)
-    given = [of_vertex, *(wp.array(each, dtype=wp.vec3d, device=device) for each in (x, p)), keep]
+    given = [of_vertex, *(wp.array(each, dtype=CORNERS, device=device) for each in (x, p)), keep]
     wp.launch(advance_pairs, count, given, [part, gaps], device=device)
     t, least = part.numpy(), gaps.numpy().min(axis=1)
     assert (least >= 1.0 - 1e-8).all() and t.max() == 1.0
@@ -96,7 +94,7 @@ def thin_triangles(angle):
 def test_planes_of_pairs_that_are_almost_degenerate(of_vertex, pairs, device):
     """At a gap of 5 µm y separates all vertices by nine tenths of it."""
     out = wp.zeros(COUNT, dtype=wp.vec3d, device=device)
-    wp.launch(nearest_of_pairs, COUNT, [of_vertex, wp.array(pairs, dtype=wp.vec3d, device=device)], [out], device=device)
+    wp.launch(nearest_of_pairs, COUNT, [of_vertex, wp.array(pairs, dtype=CORNERS, device=device)], [out], device=device)
     y = out.numpy()
     heights = np.einsum("ij,ikj->ki", y / np.linalg.norm(y, axis=1)[:, None], pairs)
     above, below = np.split(heights, [1 if of_vertex else 2])
