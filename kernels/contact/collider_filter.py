@@ -31,6 +31,24 @@ class FilterNotes:
     kicked: wp.array(dtype=wp.vec3d)
 
 
+@cache
+def filters(dtype):
+    """Struct of colliders, their ``poses`` in a step, and the numbers of the filter.
+
+    A vertex may end at the distance ``least`` [m]. One that is stopped ends at most ``landing`` farther away [m].
+    """
+
+    @wp.struct
+    class Filter:
+        shape: shapes(dtype)
+        poses: step_poses(dtype)
+        per_copy: wp.int32
+        least: dtype
+        landing: dtype
+
+    return Filter
+
+
 @wp.func
 def note_cut(notes: FilterNotes, copy: int, i: int, pushed: Any, kicked: Any):
     """Notes that the move of vertex i of a copy was cut, with the changes of its position and velocity."""
@@ -109,23 +127,10 @@ def outside(dtype, solids):
         return end, change, push, hit
 
     @wp.func
-    def end_outside(
-        x: vec3,
-        end: vec3,
-        v: vec3,
-        h: dtype,
-        i: int,
-        step: int,
-        shape: shapes(dtype),
-        poses: step_poses(dtype),
-        per_copy: int,
-        least: dtype,
-        landing: dtype,
-        notes: FilterNotes,
-    ):
-        copy = i // per_copy
+    def end_outside(x: vec3, end: vec3, v: vec3, h: dtype, i: int, step: int, by: filters(dtype), notes: FilterNotes):
+        copy = i // by.per_copy
         move = end - x
-        rounded = least + dtype(8.0) * epsilon(least) * wp.max(wp.abs(end))
+        rounded = by.least + dtype(8.0) * epsilon(by.least) * wp.max(wp.abs(end))
         change = vec3()
         push = vec3()
         cuts = wp.int32(0)
@@ -133,14 +138,14 @@ def outside(dtype, solids):
         rounds = wp.int32(0)
         while rounds <= cuts and rounds < ROUNDS:  # another round after each cut
             rounds += 1
-            for c in range(shape.radius.shape[0]):
-                pose = poses.after[copy, c]
-                X = to_local(poses.before[copy, c], x)
-                X, less, by, hit = stopped(shape, c, X, to_local(pose, end) - X, rounded, landing, rounds <= SLIDING)
+            for c in range(by.shape.radius.shape[0]):
+                pose = by.poses.after[copy, c]
+                X = to_local(by.poses.before[copy, c], x)
+                X, less, pushed, hit = stopped(by.shape, c, X, to_local(pose, end) - X, rounded, by.landing, rounds <= SLIDING)
                 if hit:
                     end = to_space(pose, X)
                     change += turned(vec3(pose[3], pose[4], pose[5]), pose[6], less)
-                    push += turned(vec3(pose[3], pose[4], pose[5]), pose[6], by)
+                    push += turned(vec3(pose[3], pose[4], pose[5]), pose[6], pushed)
                     cuts = rounds
                     last = c
         if cuts > 0:
@@ -148,10 +153,10 @@ def outside(dtype, solids):
             note_cut(notes, copy, i, end - x - move, after - v)
             v = after
         if cuts == ROUNDS:
-            for c in range(shape.radius.shape[0]):
-                d, _n = gap(shape, c, to_local(poses.after[copy, c], end))
+            for c in range(by.shape.radius.shape[0]):
+                d, _n = gap(by.shape, c, to_local(by.poses.after[copy, c], end))
                 if d <= dtype(0.0):
-                    note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, last)
+                    note_inside(notes, copy, c, step, i - copy * by.per_copy, by.per_copy, last)
         return end, v, cuts > 0
 
     return end_outside
@@ -165,26 +170,16 @@ def entry(dtype, solids):
     gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
 
     @wp.func
-    def note_entry(
-        x: vec3,
-        end: vec3,
-        i: int,
-        step: int,
-        shape: shapes(dtype),
-        poses: step_poses(dtype),
-        per_copy: int,
-        least: dtype,
-        notes: FilterNotes,
-    ):
-        copy = i // per_copy
-        rounding = dtype(8.0) * epsilon(least)
-        for c in range(shape.radius.shape[0]):
-            X = to_local(poses.before[copy, c], x)
-            way = to_local(poses.after[copy, c], end) - X
-            d, _n = gap(shape, c, X)
+    def note_entry(x: vec3, end: vec3, i: int, step: int, by: filters(dtype), notes: FilterNotes):
+        copy = i // by.per_copy
+        rounding = dtype(8.0) * epsilon(by.least)
+        for c in range(by.shape.radius.shape[0]):
+            X = to_local(by.poses.before[copy, c], x)
+            way = to_local(by.poses.after[copy, c], end) - X
+            d, _n = gap(by.shape, c, X)
             deep = -rounding * wp.max(wp.max(wp.abs(end)), wp.max(wp.abs(X)))  # a vertex that moves along may touch
-            if d > deep and kept(shape, c, X, way, deep) < dtype(1.0):
-                note_inside(notes, copy, c, step, i - copy * per_copy, per_copy, shape.radius.shape[0])
+            if d > deep and kept(by.shape, c, X, way, deep) < dtype(1.0):
+                note_inside(notes, copy, c, step, i - copy * by.per_copy, by.per_copy, by.shape.radius.shape[0])
 
     return note_entry
 
@@ -202,14 +197,10 @@ def filter_step(dtype, solids):
     def filter_vertices(
         # elements
         inverse_mass: wp.array(dtype=dtype),
-        shape: shapes(dtype),
+        by: filters(dtype),
         # state in
         x_before: wp.array(dtype=vec3),
-        poses: step_poses(dtype),
         # parameters
-        per_copy: int,
-        least: dtype,
-        landing: dtype,
         h: dtype,
         # in and out
         x: wp.array(dtype=vec3),
@@ -218,16 +209,16 @@ def filter_step(dtype, solids):
         notes: FilterNotes,
     ):
         i = wp.tid()
-        now = notes.steps[i // per_copy]
+        now = notes.steps[i // by.per_copy]
         if inverse_mass[i] > dtype(0.0):
-            end, after, short = end_outside(x_before[i], x[i], v[i], h, i, now, shape, poses, per_copy, least, landing, notes)
+            end, after, short = end_outside(x_before[i], x[i], v[i], h, i, now, by, notes)
             if short:
                 if move:
                     move[i] = move[i] + (end - x[i])
                 x[i] = end
                 v[i] = after
         else:
-            note_entry(x_before[i], x[i], i, now, shape, poses, per_copy, least, notes)
+            note_entry(x_before[i], x[i], i, now, by, notes)
 
     return filter_vertices
 
@@ -274,19 +265,15 @@ def note_fixed(dtype, solids):
     def note(
         # elements
         fixed: wp.array(dtype=wp.int32),
-        shape: shapes(dtype),
+        by: filters(dtype),
         # state in
         x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
-        poses: step_poses(dtype),
-        # parameters
-        per_copy: int,
-        least: dtype,
         # in and out
         notes: FilterNotes,
     ):
         p = wp.tid()
         i = fixed[p]
-        note_entry(x_before[p], x[i], i, notes.steps[i // per_copy], shape, poses, per_copy, least, notes)
+        note_entry(x_before[p], x[i], i, notes.steps[i // by.per_copy], by, notes)
 
     return note

@@ -9,8 +9,8 @@ from functools import cache
 import warp as wp
 
 from ..contact.anchors import slip_of
-from ..contact.collider_filter import FilterNotes, outside
-from ..contact.colliders import gap_of, of_pose, pose_types, shapes, step_poses
+from ..contact.collider_filter import FilterNotes, filters, outside
+from ..contact.colliders import gap_of, of_pose, pose_types
 from ..coulomb import COULOMB, huber_secant
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
@@ -30,8 +30,7 @@ def guard_struct(dtype):
 
     @wp.struct
     class Guard:
-        shape: shapes(dtype)
-        poses: step_poses(dtype)
+        filter: filters(dtype)
         stiffness: wp.array2d(dtype=dtype)
         anchors: wp.array2d(dtype=anchor_type)
         balls: wp.array(dtype=wp.types.vector(4, dtype))
@@ -40,8 +39,6 @@ def guard_struct(dtype):
         notes: FilterNotes
         per_copy: int
         distance: dtype
-        least: dtype
-        landing: dtype
         drift: dtype
 
     return Guard
@@ -99,12 +96,12 @@ def touching_step(dtype, symplectic: bool):
         copy = i // guard.per_copy
         force = vec3()
         held = wp.int32(0)
-        for c in range(guard.shape.radius.shape[0]):
-            pose = guard.poses.before[copy, c]
+        for c in range(guard.filter.shape.radius.shape[0]):
+            pose = guard.filter.poses.before[copy, c]
             X = to_local(pose, x)
-            d, n = gap(guard.shape, c, X)
+            d, n = gap(guard.filter.shape, c, X)
             depth = wp.max(guard.distance - d, dtype(0.0))
-            most = guard.shape.friction[c] * depth
+            most = guard.filter.shape.friction[c] * depth
             slip = vec3()
             if depth > dtype(0.0):
                 pull = depth * n
@@ -113,7 +110,7 @@ def touching_step(dtype, symplectic: bool):
                     slip = slip_along(guard.anchors[c, i], X, n)
                     pull -= huber_secant(wp.length(slip), most) * slip
                 force += guard.stiffness[c, i] * turned(vec3(pose[3], pose[4], pose[5]), pose[6], pull)
-            if guard.shape.friction[c] > dtype(0.0):
+            if guard.filter.shape.friction[c] > dtype(0.0):
                 found = anchor_type()  # without contact 0, whatever the ball was
                 if most > dtype(0.0):
                     X = X - slip
@@ -121,14 +118,12 @@ def touching_step(dtype, symplectic: bool):
                 guard.anchors[c, i] = found
         after, _rest, velocity = step(x, vec3(), v, a + w * force, h)
         now = guard.steps[copy]
-        end, velocity, _short = end_outside(
-            x, after, velocity, h, i, now, guard.shape, guard.poses, guard.per_copy, guard.least, guard.landing, guard.notes
-        )
+        end, velocity, _short = end_outside(x, after, velocity, h, i, now, guard.filter, guard.notes)
         radius = dtype(-1.0)  # no ball while there is an anchor: a later step must release it
         if held == 0:
             radius = dtype(wp.inf)
-            for c in range(guard.shape.radius.shape[0]):
-                d, _n = gap(guard.shape, c, to_local(guard.poses.after[copy, c], end))
+            for c in range(guard.filter.shape.radius.shape[0]):
+                d, _n = gap(guard.filter.shape, c, to_local(guard.filter.poses.after[copy, c], end))
                 radius = wp.min(radius, d)
             radius -= guard.distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(end))
         put(guard.balls, i, ball_type(end[0], end[1], end[2], radius))

@@ -12,7 +12,7 @@ from ..core.state import Count
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.clear_elements import find_clear
-from ..kernels.contact.collider_filter import FIRST, FilterNotes, filter_step, hold_locked
+from ..kernels.contact.collider_filter import FIRST, FilterNotes, filter_step, filters, hold_locked
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..terms.refresh import STEP, Refresh
@@ -67,6 +67,7 @@ class ColliderSteps:
         least: The smallest distance from a collider at which a vertex may end a step [m].
         moved_by_terms: Whether the refresh of a term moves the colliders at the start of a step.
         near: See :class:`warpcloth.contact.clearance.Clearance`; None if all steps refresh contact.
+        filter: A :func:`warpcloth.kernels.contact.collider_filter.filters`.
         notes: :class:`warpcloth.kernels.contact.collider_filter.FilterNotes`.
         steps: The number of steps so far, (B,) int32.
         correction: x − x̃ of steps with contact (N,) [m], or None for explicit steps. ``he`` is their effective step [s].
@@ -95,6 +96,8 @@ class ColliderSteps:
         self.anchor_rows = wp.zeros((rows, model.count), dtype=self._anchor_type, device=device)
         self._spare, self._reads, self._again = None, False, False
         self.least = FLOOR * declared.distance
+        numbers = {"per_copy": model.per_copy, "least": self.least, "landing": LANDING * declared.distance}
+        self.filter = filled(filters(model.dtype), shape=self.shapes, poses=self.poses, **numbers)
         # Midpoint evaluates forces at the middle of a step, other integrators at its end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
         self.bounded = part == 0.0
@@ -224,10 +227,8 @@ class ColliderSteps:
     def _launch_filter(self, inverse_mass, x, v, move, notes):
         if self._filter is None:
             return
-        model = self.model
-        given = [inverse_mass, self.shapes, self.x_before, self.poses]
-        given += [model.per_copy, self.least, LANDING * model.colliders.distance, self.h]
-        model.launch(self._filter, model.count, given, [x, v, move, notes])
+        given = [inverse_mass, self.filter, self.x_before, self.h]
+        self.model.launch(self._filter, self.model.count, given, [x, v, move, notes])
 
     # For self-contact, which can hold vertices back inside a collider that moves onto them.
 

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..contact.collider_steps import LANDING
+from ..core.filled import filled
 from ..kernels.contact.collider_filter import note_fixed
 from ..kernels.copy import copy_chosen
 from ..kernels.fast import contact_guard as kernels
@@ -41,19 +41,19 @@ class ContactGuard:
             stiffness[elements.collider, host_values(elements.stencil)[:, 0]] = host_values(elements.stiffness) * areas
         balls = np.zeros((model.count, 4))
         balls[:, 3] = np.where(model.inverse_mass.numpy() > 0.0, -1.0, np.inf)
-        data = self.data = kernels.guard_struct(model.dtype)()
-        self._kept = {  # the struct holds no references
-            "stiffness": model.array(stiffness, model.dtype),
-            "anchors": colliders.anchor_rows,
-            "balls": model.array(balls, wp.types.vector(4, model.dtype)),
-            "found": wp.zeros(model.count, dtype=wp.int32, device=model.device),
-            "steps": colliders.steps,
-        }
-        for name, array in self._kept.items():
-            setattr(data, name, array)
-        data.shape, data.poses, data.notes, data.per_copy = colliders.shapes, colliders.poses, colliders.notes, model.per_copy
-        data.distance, data.least, data.drift = declared.distance, colliders.least, colliders.drift
-        data.landing = LANDING * declared.distance
+        self.data = filled(
+            kernels.guard_struct(model.dtype),
+            filter=colliders.filter,
+            stiffness=model.array(stiffness, model.dtype),
+            anchors=colliders.anchor_rows,
+            balls=model.array(balls, wp.types.vector(4, model.dtype)),
+            found=wp.zeros(model.count, dtype=wp.int32, device=model.device),
+            steps=colliders.steps,
+            notes=colliders.notes,
+            per_copy=model.per_copy,
+            distance=declared.distance,
+            drift=colliders.drift,
+        )
         colliders.launch_move()
 
     def follow(self):
@@ -76,7 +76,7 @@ class ContactGuard:
         """Launches, after pins have moved, the notes of pins inside colliders, and the step count if kernels do not count."""
         colliders, model = self.colliders, self.model
         if len(self._fixed):
-            given = [self._fixed, colliders.shapes, self._fixed_before, x, colliders.poses]
-            model.launch(self._note, len(self._fixed), [*given, model.per_copy, colliders.least], [colliders.notes])
+            given = [self._fixed, colliders.filter, self._fixed_before, x]
+            model.launch(self._note, len(self._fixed), given, [colliders.notes])
         if self.moving:
             colliders.launch_count()
