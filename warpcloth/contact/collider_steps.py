@@ -44,33 +44,30 @@ def launch_anchors(kernel, shapes, poses, anchors, x, model, elements):
 
 
 class ColliderSteps:
-    """The motion of colliders, and the anchors of friction and the filter of those that are no meshes, in one solver's steps.
+    """The motion of colliders, and the anchors of friction and the filter of those that are not meshes, in one solver's steps.
 
-    At the start of a step, a ``Refresh`` of the terms moves the colliders, stores the positions of the vertices, and sets the
-    anchors of friction. At its end, :meth:`launch_end` moves vertices out of colliders. Meshes have no terms, see
-    :mod:`.self_steps`. If no collider has any, the solver calls :meth:`launch_start` itself.
+    At the start of a step, a ``Refresh`` of the terms moves the colliders, stores positions, and sets the anchors of friction.
+    At its end, :meth:`launch_end` moves vertices out of colliders. Meshes have no terms, see :mod:`.self_steps`; without any,
+    the solver calls :meth:`launch_start` itself.
 
     Args:
         model: The :class:`warpcloth.model.model.Model` of a scene with colliders.
         state: The :class:`warpcloth.core.state.State` of the solver, to which it adds arrays.
         h: Time step [s].
         steps_per_frame: Steps per frame.
-        part: The time within a step at which forces are evaluated, from 0 (its start) to 1 (its end). It is 0 for explicit
-            steps, whose contact is ``bounded``: it has no logarithm.
+        part: The time within a step at which forces are evaluated, from 0 to 1. It is 0 for explicit steps, whose contact is
+            ``bounded``: it has no logarithm.
 
     Attributes:
         terms: The elements of the model. Those of contact have rest states of their own.
         x_before: Positions at the start of the step, (N,) [m].
-        poses: A :func:`warpcloth.kernels.contact.colliders.step_poses`.
-        shapes: A :func:`warpcloth.kernels.contact.colliders.shapes`.
-        anchors: The anchors of friction, by the index of each collider with friction. They are rows of ``anchor_rows`` (C, N).
+        poses, shapes, filter, notes: Structs of :mod:`warpcloth.kernels.contact.colliders` and ``collider_filter``.
+        anchors: The anchors of friction, by the index of each collider with friction; rows of ``anchor_rows`` (C, N).
         least: The smallest distance from a collider at which a vertex may end a step [m].
         moved_by_terms: Whether the refresh of a term moves the colliders at the start of a step.
         near: See :class:`warpcloth.contact.clearance.Clearance`; None if all steps refresh contact.
-        filter: A :func:`warpcloth.kernels.contact.collider_filter.filters`.
-        notes: :class:`warpcloth.kernels.contact.collider_filter.FilterNotes`.
         steps: The number of steps so far, (B,) int32.
-        correction: x − x̃ of steps with contact (N,) [m], or None for explicit steps. ``he`` is their effective step [s].
+        correction: x − x̃ of steps with contact (N,) [m], None if explicit. ``he`` is their effective step [s].
         pushed, kicked: What the filter changed in positions [m] and velocities [m/s] since both were last set to 0, (N,)
             float64, after :meth:`note_pushes`.
     """
@@ -256,7 +253,7 @@ class ColliderSteps:
     def inside(self):
         """The first vertex that ended a step inside each collider: (copy, collider, step, vertex, what held it back).
 
-        What held it back is the index of another collider, CLOTH for other cloth, or None for a vertex that is not free.
+        The last is the index of another collider, CLOTH, or None for a vertex that is not free.
         """
         colliders, found, n = self._dim[1], [], self.model.per_copy
         free = self.model.inverse_mass.numpy() > 0.0 if self._again else np.zeros(self.model.count, dtype=bool)

@@ -25,7 +25,7 @@ class PairContact(DynamicElements):
     Attributes:
         obstacles: Positions (V,) [m] with the obstacles where forces are evaluated.
         least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
-        lists: The listed pairs, a :class:`warpcloth.kernels.contact.self_pairs.Pairs`.
+        lists: The listed pairs.
         turn: The number of sweeps of the step that count towards EVERY, (1,) int32.
     """
 

@@ -30,8 +30,8 @@ class Proximity:
 
     Attributes:
         capacity: Number of pairs that the arrays can hold.
-        stencils: (capacity,) vertices of the model: (v, a, b, c) of vertex–triangle pairs, sorted, then (a, b, c, d) of
-            pairs of edges ab and cd.
+        stencils: (capacity,) vertices (v, a, b, c) of vertex–triangle pairs, sorted, then (a, b, c, d) of pairs of edges ab and
+            cd.
         distances: (capacity,) r_c of each pair [m].
         counts: (2,) int32, numbers of pairs found of each kind, which may exceed the capacity.
         rows: Pairs rows[i] to rows[i+1] are the vertex–triangle pairs of vertex i. Those of edges follow, by their first edge.
@@ -225,7 +225,7 @@ class Proximity:
         The flag is 0 while each vertex has moved by at most the fraction ``part`` of the skin since the last detection,
         relative to the drift of its connected piece, the median motion of some of its vertices. Two pieces may also have
         approached one another by twice that, plus the excess of the distance of their boxes over the contact distance and the
-        skin. So sheets that fall together, or far apart, need no detection.
+        skin.
 
         Args:
             x: Positions (V,) [m].

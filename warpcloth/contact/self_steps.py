@@ -45,7 +45,7 @@ class FirstGap(NamedTuple):
 class PinHeld(NamedTuple):
     """The first frame and vertex, in the order of the model within the copy, of a pin that the filter stopped on its way.
 
-    ``farthest`` is the largest distance of a pin from its prescribed position at the end of a step so far [m].
+    ``farthest`` is the largest distance of a pin from its prescribed position at the end of a step [m].
     """
 
     copy: int
@@ -73,19 +73,13 @@ class SelfSteps:
         distance, max_distance: The smaller and the larger of the contact distances of cloth with itself and with meshes [m].
         least: The least gap of the filter [m].
         placed: Positions of the meshes at the start of the step, where it evaluates forces, and at its end, (B·m,) [m].
-        proximity: :class:`warpcloth.contact.proximity.Proximity`.
-        forces: The :class:`warpcloth.core.dynamic.Dynamic` of contact and friction.
-        contact: :class:`warpcloth.contact.pair_contact.PairContact`.
-        filter: :class:`warpcloth.contact.self_filter.SelfFilter`.
-        pairs: :class:`warpcloth.kernels.contact.self_pairs.Pairs`.
-        begun: Normals, gaps and weights of the pairs, :class:`warpcloth.kernels.contact.self_pairs.StepPairs`.
+        forces: The :class:`warpcloth.core.dynamic.Dynamic` of ``contact`` and ``friction``, which is None without.
+        pairs, begun: The listed pairs, and their gaps at ``begun_at`` (V,), of :mod:`warpcloth.kernels.contact.self_pairs`.
         x_before: Positions at the start of the step, or of an iterate, and of obstacles behind them, (V,) [m].
-        begun_at: Positions at which the gaps of ``begun`` were found, (V,) [m].
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
         near: The :class:`warpcloth.core.capture.Mirror` of what :meth:`launch_look` found, (1,) int32.
         lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
         listed: 1 if the last list has pairs, else 0, (1,) int32.
-        friction: :class:`warpcloth.contact.self_friction.SelfFriction`, or None without friction.
         stale: Whether the capacity of lists has grown outside of steps, so that graphs must be recorded again.
     """
 
@@ -387,10 +381,7 @@ class SelfSteps:
 
     @property
     def forced(self):
-        """The copies in which a mesh went through cloth that could not get out of its way: (copy, first frame, mesh).
-
-        The mesh is None if several move.
-        """
+        """The copies in which a mesh went through cloth without a way out: (copy, first frame, mesh, None if several move)."""
         moving = [c for c, each in enumerate(self.model.scene.colliders) if each.is_mesh and each.moves]
         mesh = moving[0] if len(moving) == 1 else None
         return [(c, int(gap_notes.FIRST) - int(note), mesh) for c, note in enumerate(self.first_forced.numpy()) if note]

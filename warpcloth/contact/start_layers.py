@@ -24,8 +24,8 @@ def apart(points, triangles, sides, gaps, piece, fixed, r):
         r: The contact distance [m].
 
     Returns:
-        (N, 3) [m], or None if a piece touches itself, if touching pieces cannot be put in layers, if two that must stay touch,
-        or if a normal is not defined.
+        (N, 3) [m], or None if a piece touches itself, if touching pieces cannot be layers, if two that must stay touch, or if a
+        normal is not defined.
     """
     pairs = piece[sides[:, :, 0]]
     if (pairs[:, 0] == pairs[:, 1]).any():

@@ -21,7 +21,7 @@ class ContactSurface:
         meets_itself: Whether cloth meets cloth.
         obstacles: The number m of vertices of meshes in a copy.
         count: The number of vertices of all copies, N + B·m.
-        layout: :class:`warpcloth.kernels.contact.obstacles.Layout`.
+        layout, of_obstacles: Structs of :mod:`warpcloth.kernels.contact.obstacles`.
         items: Vertices of the triangles, then of the edges, of all copies, each with 2·copy + kind, (items, 4) int32.
         triangles, edges: The numbers of both, over all copies.
         groups: The group of each item, (items,), and ``vertex_groups`` that of each vertex of a copy, (n + m,).
@@ -30,7 +30,6 @@ class ContactSurface:
         colliders: The index of the collider of each obstacle of a copy, (m,).
         moves: Whether a mesh moves or deforms.
         width: The largest area of an edge of the cloth over its length [m].
-        of_obstacles: :class:`warpcloth.kernels.contact.obstacles.Obstacles`, if there are some.
         moves_of_step: Moves of obstacles in the step, (B·m,) vectors [m].
     """
 
@@ -111,8 +110,8 @@ class ContactSurface:
     def areas(self):
         """Rest areas of vertices, and of each edge at them, (n + m,) [m²], those of the cloth in the order of the model.
 
-        The energy of a vertex of a mesh is to keep it out of large triangles of the cloth, not to press: it has the area that a
-        vertex of the cloth has on average, if that is less.
+        The energy of a vertex of a mesh keeps it out of large triangles of the cloth, and does not press: its area is at most
+        the mean of those of the cloth.
         """
         mesh, n = self.model.scene.mesh, self.model.per_copy
         of_cloth = np.empty(n)
