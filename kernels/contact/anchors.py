@@ -6,9 +6,8 @@ import warp as wp
 
 from ..coulomb import Law
 from ..terms import contact
-from ..terms.contact import turned
 from ..vectors import types
-from .colliders import gap_of, of_pose, pose_types, shapes, step_poses
+from .colliders import gap_of, pose_types, rotated, shapes, step_poses, to_local, to_space
 
 
 @cache
@@ -39,7 +38,6 @@ def anchor_vertices(dtype, solids, law: Law, bounded: bool):
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
-    to_local, to_space = of_pose(dtype)
     rest_type, gap, slip = wp.types.vector(8, dtype), gap_of(dtype, solids), slip_of(dtype, law)
     slope, limit = contact.bounded_slope if bounded else contact.slope, law.limit
 
@@ -71,7 +69,7 @@ def anchor_vertices(dtype, solids, law: Law, bounded: bool):
             a = X - slip(anchors[i], X, n)
             now = poses.at[copy, collider]
             target = to_space(now, a)
-            normal = turned(vec3(now[3], now[4], now[5]), now[6], n)
+            normal = rotated(now, n)
             r = rest_type()
             for k in range(3):
                 r[k] = target[k]

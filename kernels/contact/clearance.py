@@ -7,7 +7,7 @@ import warp as wp
 from ..rotation import epsilon
 from ..terms.contact import ROUNDED_BOX
 from ..vectors import types
-from .colliders import gap_of, of_pose, shapes, step_poses
+from .colliders import gap_of, shapes, step_poses, to_local
 
 
 @cache
@@ -41,7 +41,6 @@ def near_colliders(dtype, ended: bool):
     After a step (``ended``), a vertex moved from x to ``end``.
     """
     vec3, _ = types(dtype)
-    to_local, _to_space = of_pose(dtype)
     gap, ball_type = gap_of(dtype, (ROUNDED_BOX,)), wp.types.vector(4, dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -6,9 +6,8 @@ from typing import Any
 import warp as wp
 
 from ..rotation import epsilon
-from ..terms.contact import turned
 from ..vectors import types
-from .colliders import gap_of, kept_part, of_pose, shapes, step_poses
+from .colliders import gap_of, kept_part, rotated, shapes, step_poses, to_local, to_space
 
 ROUNDS = wp.constant(6)  # maximum number of tests of a vertex that colliders stop
 SLIDING = wp.constant(2)  # in so many of these it slides; then its move is only shortened, which terminates
@@ -74,7 +73,6 @@ def outside(dtype, solids):
     stopped it. ``notes`` has the stops, and the vertex if colliders leave no way out.
     """
     vec3, _ = types(dtype)
-    to_local, to_space = of_pose(dtype)
     gap, kept, zero = gap_of(dtype, solids), kept_part(dtype, solids), dtype(0.0)
 
     @wp.func
@@ -144,8 +142,8 @@ def outside(dtype, solids):
                 X, less, pushed, hit = stopped(by.shape, c, X, to_local(pose, end) - X, rounded, by.landing, rounds <= SLIDING)
                 if hit:
                     end = to_space(pose, X)
-                    change += turned(vec3(pose[3], pose[4], pose[5]), pose[6], less)
-                    push += turned(vec3(pose[3], pose[4], pose[5]), pose[6], pushed)
+                    change += rotated(pose, less)
+                    push += rotated(pose, pushed)
                     cuts = rounds
                     last = c
         if cuts > 0:
@@ -166,7 +164,6 @@ def outside(dtype, solids):
 def entry(dtype, solids):
     """Device function (x, end, …) that notes a vertex that is not free if it enters a collider between x and ``end``."""
     vec3, _ = types(dtype)
-    to_local, _to_space = of_pose(dtype)
     gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
 
     @wp.func

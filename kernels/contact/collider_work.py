@@ -6,7 +6,7 @@ import warp as wp
 
 from ..vectors import types
 from ..work import wide_dot
-from .colliders import of_pose, pose_types, step_poses
+from .colliders import pose_types, step_poses, to_local, to_space
 
 UNCUT, NOW = wp.constant(0), wp.constant(2)  # the filter shortened no move of a vertex, or one in this step (1: in the last)
 
@@ -49,7 +49,6 @@ def rigid_moves(dtype):
     """Kernel over vertices: displacement in a step of the material point of a collider at x, from its ``poses``."""
     vec3, _ = types(dtype)
     pose_type, _anchor = pose_types(dtype)
-    to_local, to_space = of_pose(dtype)
 
     @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
     def moves(

@@ -4,6 +4,7 @@ A pose is a position and a quaternion (x, y, z, w), seven numbers.
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -50,21 +51,22 @@ def step_poses(dtype):
     return StepPoses
 
 
-@cache
-def of_pose(dtype):
-    """Device functions (pose, x) → x in the frame of a pose, and (pose, X) → X in space."""
-    vec3, _ = types(dtype)
-    pose_type, _anchor = pose_types(dtype)
+@wp.func
+def rotated(pose: Any, v: Any):
+    """A vector v in the frame of a pose, in space."""
+    return turned(type(v)(pose[3], pose[4], pose[5]), pose[6], v)
 
-    @wp.func
-    def to_local(pose: pose_type, x: vec3):
-        return turned(-vec3(pose[3], pose[4], pose[5]), pose[6], x - vec3(pose[0], pose[1], pose[2]))
 
-    @wp.func
-    def to_space(pose: pose_type, X: vec3):
-        return turned(vec3(pose[3], pose[4], pose[5]), pose[6], X) + vec3(pose[0], pose[1], pose[2])
+@wp.func
+def to_local(pose: Any, x: Any):
+    """The point x in the frame of a pose."""
+    return turned(-type(x)(pose[3], pose[4], pose[5]), pose[6], x - type(x)(pose[0], pose[1], pose[2]))
 
-    return to_local, to_space
+
+@wp.func
+def to_space(pose: Any, X: Any):
+    """The point X in the frame of a pose, in space."""
+    return rotated(pose, X) + type(X)(pose[0], pose[1], pose[2])
 
 
 @cache
@@ -217,7 +219,6 @@ def pose_collider(dtype, solids):
     plane where it meets the collider, for beyond a thin collider no force would lead it back. Explicit steps have h = 0.
     """
     vec3, _ = types(dtype)
-    to_local, to_space = of_pose(dtype)
     gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
     rest_type, (pose_type, _anchor) = wp.types.vector(contact.PARAMETERS, dtype), pose_types(dtype)
 
@@ -268,7 +269,7 @@ def pose_collider(dtype, solids):
                 X = X + t * way
                 d, n = gap(shape, collider, X)
                 position = to_space(pose, X - d * n)
-                pose = behind(position, turned(vec3(pose[3], pose[4], pose[5]), pose[6], n))
+                pose = behind(position, rotated(pose, n))
                 core = vec3(dtype(wp.inf), dtype(wp.inf), dtype(wp.inf))
                 radius = dtype(0.0)
         r = rest[e]

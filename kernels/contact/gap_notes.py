@@ -8,7 +8,7 @@ from ..vectors import types
 from .obstacles import cloth_vertex, copy_of, has_obstacle
 from .pair_potential import CLOSE, Laws
 from .self_contact import least_gap
-from .self_gaps import ONE, SIDE, ZERO, farthest_of
+from .self_gaps import ONE, SIDE, ZERO, farthest
 from .self_pairs import Pairs, StepPairs, module_of
 
 # The least gap that coarse positions leave is 6 units in the last place. Rounding changes gaps by two of them.
@@ -70,7 +70,7 @@ def note_gaps(dtype):
     ``least`` is the least gap [m] of a filter that keeps iterates apart, without rounding, else 0.
     """
     vec3, _ = types(dtype)
-    farthest, contact_distance, least_gap_of = farthest_of(dtype), cutoff_of(dtype), least_gap(dtype)
+    contact_distance, least_gap_of = cutoff_of(dtype), least_gap(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def note_each_gap(
@@ -101,7 +101,7 @@ def note_gaps(dtype):
         frame = wp.int64(steps[copy] // per_frame)
         first = cloth_vertex(pairs.layout, s) - copy * pairs.layout.per_copy
         key = FIRST - frame * wp.int64(pairs.layout.per_copy) - wp.int64(first)
-        far = wp.float32(farthest(s, x))
+        far = wp.float32(farthest(x, s))
         next = far + MORE * far  # 0.75 to 1.5 units more, which is rounded to the next number
         if not d >= wp.float64(4.0) * wp.float64(next - far):
             wp.atomic_max(notes.too_near, copy, key)

@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from ..vectors import types
-from .colliders import gap_of, of_pose, shapes, step_poses
+from .colliders import gap_of, shapes, step_poses, to_local, to_space
 from .gap_notes import FIRST
 from .obstacles import has_obstacle
 from .self_gaps import ONE, ZERO
@@ -120,7 +120,6 @@ def carry_with_shapes(dtype, solids):
     Pins have none. ``some`` is 1 if a vertex moves.
     """
     vec3, _ = types(dtype)
-    to_local, to_space = of_pose(dtype)
     gap = gap_of(dtype, solids)
 
     @wp.kernel(module="unique", enable_backward=False)

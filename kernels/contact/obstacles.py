@@ -9,7 +9,7 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
-from .colliders import of_pose, pose_types
+from .colliders import pose_types, to_space
 from .mesh_geometry import meshes, point_at
 
 # Groups of elements: cloth, cloth with a vertex that cannot move, and obstacles.
@@ -99,7 +99,6 @@ def find_obstacles(dtype):
     Positions are NaN while a collider is absent, that is at one point for a whole step.
     """
     vec3, _ = types(dtype)
-    _local, to_space = of_pose(dtype)
     pose_type, _anchor = pose_types(dtype)
     at = point_at(dtype)
 

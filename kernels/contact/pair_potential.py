@@ -17,6 +17,7 @@ cloth like edges, by k aᵥ φ(4d). Positions of meshes are not unknowns, so y =
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -218,58 +219,52 @@ def count_faces(stencils: STENCILS, codes: NUMBERS, near: NUMBERS, first: int, e
     return owner, faces, on, lowest
 
 
-@cache
-def put_contact(dtype):
-    """Device function that stores a contact in a slot, and lists it."""
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def put(
-        slot: int,
-        s: wp.vec4i,
-        w: wp.vec4d,
-        y: wp.vec3d,
-        r: wp.float64,
-        kA: wp.float64,
-        x: wp.array(dtype=vec3),
-        pairs: Pairs,
-        contacts: Contacts,
-    ):
-        gap = wp.length(y)
-        contacts.parts[slot] = s
-        touching = wp.int32(0)
+@wp.func
+def put_contact(
+    slot: int,
+    s: wp.vec4i,
+    w: wp.vec4d,
+    y: wp.vec3d,
+    r: wp.float64,
+    kA: wp.float64,
+    x: wp.array(dtype=Any),
+    pairs: Pairs,
+    contacts: Contacts,
+):
+    """Stores a contact in a slot, and lists it."""
+    gap = wp.length(y)
+    contacts.parts[slot] = s
+    touching = wp.int32(0)
+    for i in range(4):
+        if w[i] != ZERO:
+            touching += 1 << i
+    contacts.touching[slot] = touching
+    if pairs.layout.obstacles > 0:
+        own = cloth_vertex(pairs.layout, s)
+        o = wp.vec3d()
+        travel = wp.vec3d()
         for i in range(4):
-            if w[i] != ZERO:
-                touching += 1 << i
-        contacts.touching[slot] = touching
-        if pairs.layout.obstacles > 0:
-            own = cloth_vertex(pairs.layout, s)
-            o = wp.vec3d()
-            travel = wp.vec3d()
-            for i in range(4):
-                j = s[i] - pairs.layout.cloth
-                if j >= 0:
-                    o += w[i] * wp.vec3d(x[s[i]])
-                    travel += w[i] * contacts.moves[j]
-                    s[i] = own
-                    w[i] = ZERO
-            contacts.offset[slot] = o
-            contacts.travel[slot] = travel
-        pairs.stencils[slot] = s
-        contacts.weights[slot] = w
-        contacts.normal[slot] = y / wp.max(gap, wp.float64(1e-300))
-        contacts.gap[slot] = gap
-        contacts.distance[slot] = r
-        contacts.stiffness[slot] = kA
-        contacts.share[slot] = ONE
-        contacts.ratio[slot] = ONE
-        contacts.fixed[slot] = ZERO
-        pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = slot
-        if pairs.corner_counts:
-            for i in range(4):
-                wp.atomic_add(pairs.corner_counts, s[i], 1)
-
-    return put
+            j = s[i] - pairs.layout.cloth
+            if j >= 0:
+                o += w[i] * wp.vec3d(x[s[i]])
+                travel += w[i] * contacts.moves[j]
+                s[i] = own
+                w[i] = ZERO
+        contacts.offset[slot] = o
+        contacts.travel[slot] = travel
+    pairs.stencils[slot] = s
+    contacts.weights[slot] = w
+    contacts.normal[slot] = y / wp.max(gap, wp.float64(1e-300))
+    contacts.gap[slot] = gap
+    contacts.distance[slot] = r
+    contacts.stiffness[slot] = kA
+    contacts.share[slot] = ONE
+    contacts.ratio[slot] = ONE
+    contacts.fixed[slot] = ZERO
+    pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = slot
+    if pairs.corner_counts:
+        for i in range(4):
+            wp.atomic_add(pairs.corner_counts, s[i], 1)
 
 
 @wp.func
@@ -381,7 +376,7 @@ def find_vertex_contacts(dtype):
     """
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
-    points, put = wp.array(dtype=vec3), put_contact(dtype)
+    points = wp.array(dtype=vec3)
 
     @wp.func
     def edges_at(
@@ -454,7 +449,7 @@ def find_vertex_contacts(dtype):
                 w4 = contacts.weights[e]
                 if code == INSIDE or near == 1:
                     y = in_plane(code == INSIDE, w4[1] * b + w4[2] * c + w4[3] * d, wp.cross(c - b, d - b), b)
-                    put(e, s, w4, y, r, kA, x, pairs, contacts)
+                    put_contact(e, s, w4, y, r, kA, x, pairs, contacts)
                 if near == 1:
                     continue
                 for i in range(1, 4):
@@ -473,7 +468,7 @@ def find_vertex_contacts(dtype):
                             w4[j] = -t
                             slot = wp.where(code == code_between(i, j), e, extra + extras)
                             extras += wp.where(slot == e, 0, 1)
-                            put(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
+                            put_contact(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
                     owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[i])
                     if owner == e:
                         m += 1 + faces
@@ -483,7 +478,7 @@ def find_vertex_contacts(dtype):
                         w4[i] = -ONE
                         slot = wp.where(code == code_between(i, i), e, extra + extras)
                         extras += wp.where(slot == e, 0, 1)
-                        put(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
+                        put_contact(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
             if extras > 0:
                 set_shares(contacts, first, near, extra, extras)
 
@@ -505,7 +500,7 @@ def find_edge_contacts(dtype):
     """Kernel over pairs of edges: their contacts, as :func:`find_vertex_contacts`."""
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
-    put, lowest = put_contact(dtype), lowest_gap(dtype, False)
+    lowest = lowest_gap(dtype, False)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_contact_of_edges(
@@ -545,7 +540,7 @@ def find_edge_contacts(dtype):
             factor = ratio / CLOSE
             A = HALF_PI * width_of(areas, lists.layout, laws, s[0], s[1]) * width_of(areas, lists.layout, laws, s[2], s[3])
             w = wp.vec4d(ONE - u, u, t - ONE, -t)
-            put(e, s, w, y, laws.distance[law] / factor, factor * factor * laws.stiffness[law] * A, x, pairs, contacts)
+            put_contact(e, s, w, y, laws.distance[law] / factor, factor * factor * laws.stiffness[law] * A, x, pairs, contacts)
             contacts.ratio[e] = ratio
 
     return find_contact_of_edges

@@ -37,7 +37,7 @@ def row_of_pair(copy: int, e: int, layout: RowLayout, rows: int):
 def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
     """Kernel over copies and pairs at x̃ + d: rows as in :func:`..constraint_rows.linearise`."""
     vec3, _ = types(dtype)
-    row_of = term.row(dtype)
+    row_of = term.row
     Q = wp.constant(2 if curved else term.rows)
 
     @wp.kernel(module="unique", enable_backward=False)

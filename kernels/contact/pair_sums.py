@@ -89,7 +89,7 @@ class PairTerm:
             w and v are found in any case.
         push: Device function (data, e, v, n, D, least, h, hard) → λ = −h²∂U/∂y at v + Dλ [kg·m], v without the force of the
             pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.pair_sweeps`.
-        row: Function of a precision, which makes the device function (pairs, data, e, x, d) → :class:`PairRow`.
+        row: Device function (pairs, data, e, x, d) → :class:`PairRow`.
         isotropic: Whether D is that of a vertex without locked axes, because ``push`` needs one D for all directions.
     """
 

@@ -137,7 +137,6 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     vec3, _ = types(dtype)
     box_along, level_of, cell_at, cells_about = boxes(dtype)
     number, corner, four = load(wp.int32), load(vec3), load(wp.vec4i)
-    meet = boxes_meet(dtype)
     visit, out_type = take(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
 
@@ -173,7 +172,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
         if level < 0:
             return
         if group == OBSTACLE:
-            if not meet(low, high, surface.lowest[copy], surface.highest[copy]):
+            if not boxes_meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 return
         lowest = level
         layer = cell_at(grid.size, low, high, level)[2]
@@ -216,7 +215,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                         # A sequence beyond the last bucket continues at the first.
                         for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
                             slot = wp.where(at < end, at, at - end)
-                            if not meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
+                            if not boxes_meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
                                 continue
                             entry = four(grid.entries, slot)
                             if everywhere:

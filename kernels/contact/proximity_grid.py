@@ -7,6 +7,7 @@ sequence of buckets. So cells are a quarter as long as wide (measured on waves: 
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -144,16 +145,9 @@ def boxes(dtype):
     return box_along, level_of, cell_at, cells_about
 
 
-@cache
-def boxes_meet(dtype):
-    """Device function (low, high, l, u) → whether two boxes meet."""
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def meet(low: vec3, high: vec3, l: vec3, u: vec3):
-        return not (l[0] > high[0] or u[0] < low[0] or l[1] > high[1] or u[1] < low[1] or l[2] > high[2] or u[2] < low[2])
-
-    return meet
+@wp.func
+def boxes_meet(low: Any, high: Any, l: Any, u: Any):
+    return not (l[0] > high[0] or u[0] < low[0] or l[1] > high[1] or u[1] < low[1] or l[2] > high[2] or u[2] < low[2])
 
 
 @wp.func
@@ -205,7 +199,6 @@ def count_items(dtype):
     """
     vec3, _ = types(dtype)
     box_along, level_of, cell_at, _about = boxes(dtype)
-    meet = boxes_meet(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def count_each_item(
@@ -223,7 +216,7 @@ def count_items(dtype):
         level = level_of(grid.size, low, high)
         if surface.groups[item] == OBSTACLE:
             copy = v[3] >> 1
-            if not meet(low, high, surface.lowest[copy], surface.highest[copy]):
+            if not boxes_meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 level = -1
         key = wp.int32(-1)
         if level >= 0:

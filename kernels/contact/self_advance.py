@@ -8,7 +8,7 @@ from ..memory import load
 from ..vectors import types
 from .obstacles import copy_of, vector_within
 from .proximity_grid import surfaces
-from .self_gaps import CORNERS, ONE, ZERO, corners_of, nearest
+from .self_gaps import CORNERS, ONE, ZERO, corners, nearest
 from .self_pairs import Pairs, module_of
 from .self_planes import KEPT, margin_of, needs_no_cut, part_apart, ulp_of, ways_of_sides
 
@@ -41,7 +41,7 @@ def allowed_fraction(dtype, of_edges: bool):
     the direction, as for cloth that slides over an edge, :func:`.self_planes.part_apart` may allow more.
     """
     vec3, _ = types(dtype)
-    ulp, vector_or_zero, advance, corners = ulp_of(dtype), vector_within(dtype), advances(dtype), corners_of(dtype)
+    ulp, vector_or_zero, advance = ulp_of(dtype), vector_within(dtype), advances(dtype)
     of_vertex, sides = wp.constant(not of_edges), wp.constant(2 if of_edges else 1)
 
     @wp.func

@@ -6,6 +6,7 @@ semi-definite part kA φ″ wᵢwⱼnnᵀ, of contacts over a valley by their sh
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -14,7 +15,7 @@ from ..terms import contact
 from ..vectors import types
 from .pair_potential import ENDING, STARTING, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
-from .self_gaps import ONE, SIDE, ZERO, farthest_of, perpendicular, vertex_of
+from .self_gaps import ONE, SIDE, ZERO, farthest, perpendicular, vertex_of
 from .self_pairs import MODULE, Pairs, module_of
 from .self_planes import margin_of, ulp_of
 
@@ -29,11 +30,11 @@ ALL = wp.constant(wp.vec4d(1.0, 1.0, 1.0, 1.0))
 def least_gap(dtype):
     """Device function (stencil, x, least) → the least gap f [m] that the filter leaves a pair at x: twice its margin."""
     vec3, _ = types(dtype)
-    ulp, farthest = ulp_of(dtype), farthest_of(dtype)
+    ulp = ulp_of(dtype)
 
     @wp.func
     def least_gap_of(s: wp.vec4i, x: wp.array(dtype=vec3), least: wp.float64):
-        return wp.float64(2.0) * margin_of(least, ulp * farthest(s, x))
+        return wp.float64(2.0) * margin_of(least, ulp * farthest(x, s))
 
     return least_gap_of
 
@@ -152,40 +153,34 @@ def push_contact(
     return found * n
 
 
-@cache
-def row_of_contact(dtype):
+@wp.func
+def row_of_contact(pairs: Pairs, contacts: Contacts, e: int, x: wp.array(dtype=Any), d: wp.array(dtype=Any)):
     """The ``row`` of contact: C = −√(2φ(d)), as for contact with colliders. The second has the stiffness −λC″ along n.
 
     C is that of the share of the contact; the rest is ``fixed``.
     """
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def row_of(pairs: Pairs, contacts: Contacts, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        found = PairRow()
-        k = contacts.stiffness[e]
-        if k == ZERO:
-            return found
-        r = contacts.distance[e]
-        gap = contacts.gap[e]
-        n = contacts.normal[e]
-        share = wp.where(k > ZERO, contacts.share[e], ZERO)
-        found.weights = contacts.weights[e]
-        found.size = gap
-        found.fixed = -(ONE - share) * k * slope(gap, r)
-        found.stiffness = share * k
-        found.first = n
-        if share > ZERO:
-            steep = constraint_slope(gap, r)
-            if steep > ZERO:
-                found.fixed /= steep
-            C = -wp.sqrt(wp.float64(2.0) * potential(gap, r))
-            found.C[0] = C
-            found.first = constraint_slope(gap, r) * n
-            found.second = wp.sqrt(wp.max((found.stiffness * C - found.fixed) * constraint_bend(gap, r), ZERO)) * n
+    found = PairRow()
+    k = contacts.stiffness[e]
+    if k == ZERO:
         return found
-
-    return row_of
+    r = contacts.distance[e]
+    gap = contacts.gap[e]
+    n = contacts.normal[e]
+    share = wp.where(k > ZERO, contacts.share[e], ZERO)
+    found.weights = contacts.weights[e]
+    found.size = gap
+    found.fixed = -(ONE - share) * k * slope(gap, r)
+    found.stiffness = share * k
+    found.first = n
+    if share > ZERO:
+        steep = constraint_slope(gap, r)
+        if steep > ZERO:
+            found.fixed /= steep
+        C = -wp.sqrt(wp.float64(2.0) * potential(gap, r))
+        found.C[0] = C
+        found.first = constraint_slope(gap, r) * n
+        found.second = wp.sqrt(wp.max((found.stiffness * C - found.fixed) * constraint_bend(gap, r), ZERO)) * n
+    return found
 
 
 CONTACT_OF_PAIRS = PairTerm("self-contact", MODULE, 1, Contacts, near_contact, push_contact, row_of_contact, isotropic=False)

@@ -10,7 +10,8 @@ At the end of a step ξ rotates with the cloth or the mesh, and u is without wha
 side by d(Rn − n) relative to the other. That of meshes is known, so u is without it in the whole step.
 """
 
-from functools import cache, partial
+from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -90,69 +91,60 @@ class Rings:
     vertices: wp.array(dtype=wp.int32)
 
 
-@cache
-def turn_of(dtype):
-    """Device function (layout, rings, s, w, sides, start, moves, x) → the rotation R of a contact from ``start`` to x.
+POINTS, VECTORS = wp.array(dtype=Any), wp.array(dtype=wp.vec3d)
+
+
+@wp.func
+def turn_of_edge(layout: Layout, i: int, j: int, start: POINTS, moves: VECTORS, x: POINTS):
+    before = wp.vec3d(start[j]) - wp.vec3d(start[i])
+    after = before
+    if i < layout.cloth:
+        after = wp.vec3d(x[j]) - wp.vec3d(x[i])
+    else:
+        after += moves[j - layout.cloth] - moves[i - layout.cloth]
+    return wp.outer(after, before), wp.dot(before, before)
+
+
+@wp.func
+def turn_of(layout: Layout, rings: Rings, s: wp.vec4i, w: wp.vec4d, sides: int, start: POINTS, moves: VECTORS, x: POINTS):
+    """The rotation R of a contact from ``start`` to x.
 
     It fits the edges at its vertices s (−1: none) best, each with |w| (Kabsch 1976): of a mesh by the ``moves`` of its
     vertices, else of the cloth. Vertices without a triangle have the edges of the contact.
     """
-    vec3, _ = types(dtype)
-    points, vectors = wp.array(dtype=vec3), wp.array(dtype=wp.vec3d)
-
-    @wp.func
-    def edge(layout: Layout, i: int, j: int, start: points, moves: vectors, x: points):
-        before = wp.vec3d(start[j]) - wp.vec3d(start[i])
-        after = before
-        if i < layout.cloth:
-            after = wp.vec3d(x[j]) - wp.vec3d(x[i])
-        else:
-            after += moves[j - layout.cloth] - moves[i - layout.cloth]
-        return wp.outer(after, before), wp.dot(before, before)
-
-    @wp.func
-    def turn(layout: Layout, rings: Rings, s: wp.vec4i, w: wp.vec4d, sides: int, start: points, moves: vectors, x: points):
-        of_mesh = obstacle_of(layout, s) >= 0
-        A = wp.mat33d()
-        if of_mesh and not moves:
-            return wp.identity(n=3, dtype=wp.float64)
-        for i in range(4):
-            if s[i] < 0 or (of_mesh and s[i] < layout.cloth):
-                continue
-            own = wp.mat33d()
-            size = ZERO
-            v = in_copy(layout, s[i])
-            for k in range(rings.first[v], rings.first[v + 1]):
-                one, square = edge(layout, s[i], s[i] + rings.vertices[k] - v, start, moves, x)
+    of_mesh = obstacle_of(layout, s) >= 0
+    A = wp.mat33d()
+    if of_mesh and not moves:
+        return wp.identity(n=3, dtype=wp.float64)
+    for i in range(4):
+        if s[i] < 0 or (of_mesh and s[i] < layout.cloth):
+            continue
+        own = wp.mat33d()
+        size = ZERO
+        v = in_copy(layout, s[i])
+        for k in range(rings.first[v], rings.first[v + 1]):
+            one, square = turn_of_edge(layout, s[i], s[i] + rings.vertices[k] - v, start, moves, x)
+            own += one
+            size += square
+        for j in range(4):
+            if rings.first[v] == rings.first[v + 1] and s[j] >= 0 and (i < sides) == (j < sides):
+                one, square = turn_of_edge(layout, s[i], s[j], start, moves, x)
                 own += one
                 size += square
-            for j in range(4):
-                if rings.first[v] == rings.first[v + 1] and s[j] >= 0 and (i < sides) == (j < sides):
-                    one, square = edge(layout, s[i], s[j], start, moves, x)
-                    own += one
-                    size += square
-            if size > ZERO:
-                A += wp.where(of_mesh, ONE, wp.abs(w[i])) / size * own
-        return nearest_rotation(A)
-
-    return turn
+        if size > ZERO:
+            A += wp.where(of_mesh, ONE, wp.abs(w[i])) / size * own
+    return nearest_rotation(A)
 
 
-@cache
-def difference_of(dtype):
-    """Device function (layout, stencil, w, x) → Σ wᵢxᵢ over the cloth, without obstacles relative to the first vertex."""
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def difference(layout: Layout, s: wp.vec4i, w: wp.vec4d, x: wp.array(dtype=vec3)):
-        y = wp.vec3d()
-        for i in range(1, 4):
-            y += w[i] * (wp.vec3d(x[s[i]]) - wp.vec3d(x[s[0]]))
-        if layout.obstacles > 0:
-            y += (w[0] + w[1] + w[2] + w[3]) * wp.vec3d(x[s[0]])
-        return y
-
-    return difference
+@wp.func
+def difference(layout: Layout, s: wp.vec4i, w: wp.vec4d, x: wp.array(dtype=Any)):
+    """Σ wᵢxᵢ over the cloth, without obstacles relative to the first vertex."""
+    y = wp.vec3d()
+    for i in range(1, 4):
+        y += w[i] * (wp.vec3d(x[s[i]]) - wp.vec3d(x[s[0]]))
+    if layout.obstacles > 0:
+        y += (w[0] + w[1] + w[2] + w[3]) * wp.vec3d(x[s[0]])
+    return y
 
 
 @wp.func
@@ -164,21 +156,14 @@ def slip_from(layout: Layout, rubbed: RubbedPairs, e: int, y: wp.vec3d, ahead: w
     return u - wp.dot(rubbed.normal[e], u) * rubbed.normal[e]
 
 
-@cache
-def slip_at(dtype):
-    """Device function (pairs, rubbed, e, x, d) → u at x, or at x + d."""
-    vec3, _ = types(dtype)
-    y_of = difference_of(dtype)
-
-    @wp.func
-    def slip_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        s = pairs.stencils[e]
-        y = y_of(pairs.layout, s, rubbed.weights[e], x)
-        if d:
-            y += y_of(pairs.layout, s, rubbed.weights[e], d)
-        return slip_from(pairs.layout, rubbed, e, y, rubbed.ahead)
-
-    return slip_of
+@wp.func
+def slip_at(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=Any), d: wp.array(dtype=Any)):
+    """u at x, or at x + d."""
+    s = pairs.stencils[e]
+    y = difference(pairs.layout, s, rubbed.weights[e], x)
+    if d:
+        y += difference(pairs.layout, s, rubbed.weights[e], d)
+    return slip_from(pairs.layout, rubbed, e, y, rubbed.ahead)
 
 
 @cache
@@ -187,7 +172,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
 
     ``friction`` has μ of cloth with cloth, then that of each obstacle of a copy.
     """
-    (vec3, _), rotation_of = types(dtype), turn_of(dtype)
+    vec3, _ = types(dtype)
     slope, limit_of = contact.bounded_slope if bounded else contact.slope, law.limit
 
     @wp.kernel(module=f"{friction_module(dtype, law)}.{bounded}", enable_backward=False)
@@ -228,7 +213,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
             if touching.layout.obstacles > 0:
                 rubbed.travel[e] = contacts.travel[e]
                 if own > 0 and moves:
-                    R = rotation_of(touching.layout, rings, parts, w, sides, x, moves, x)
+                    R = turn_of(touching.layout, rings, parts, w, sides, x, moves, x)
                     rubbed.travel[e] -= contacts.gap[e] * (R * n - n)
             rubbed.normal[e] = n
             rubbed.weights[e] = w
@@ -245,7 +230,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
 def set_anchors(dtype, law: Law):
     """Kernel over acting pairs at the start of a step: a; ξ is from ``kept`` of the last step, if there are ``steps``."""
     vec3, _ = types(dtype)
-    y_of, kept_of = difference_of(dtype), law.kept
+    kept_of = law.kept
 
     @wp.kernel(module=friction_module(dtype, law), enable_backward=False)
     def set_anchor_of_pairs(
@@ -306,7 +291,7 @@ def set_anchors(dtype, law: Law):
                 total = total / weight
             total -= wp.dot(n, total) * n
             total = kept_of(wp.length(total), rubbed.limit[e]) * total
-            rubbed.anchor[e] = y_of(pairs.layout, pairs.stencils[e], rubbed.weights[e], x) - total
+            rubbed.anchor[e] = difference(pairs.layout, pairs.stencils[e], rubbed.weights[e], x) - total
 
     return set_anchor_of_pairs
 
@@ -315,7 +300,7 @@ def set_anchors(dtype, law: Law):
 def find_friction(dtype, law: Law):
     """Kernel over acting pairs: the forces at x, or x + correction."""
     vec3, _ = types(dtype)
-    slip_of, energy, secant, bend = slip_at(dtype), law.energy, law.secant, law.bend
+    energy, secant, bend = law.energy, law.secant, law.bend
 
     @wp.kernel(module=friction_module(dtype, law), enable_backward=False)
     def find_friction_of_pairs(
@@ -337,7 +322,7 @@ def find_friction(dtype, law: Law):
             n = rubbed.normal[e]
             w = rubbed.weights[e]
             k = rubbed.stiffness[e]
-            u = slip_of(pairs, rubbed, e, x, correction)
+            u = slip_at(pairs, rubbed, e, x, correction)
             l = wp.length(u)
             across = k * secant(l, limit)
             along = perpendicular(n)
@@ -358,7 +343,6 @@ def find_friction(dtype, law: Law):
 def end_friction(dtype):
     """Kernel over acting pairs at the end x of a step: pairs ``kept`` for the next step, all but ``first``, and their ξ."""
     vec3, _ = types(dtype)
-    y_of, rotation_of = difference_of(dtype), turn_of(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
     def end_friction_of_pairs(
@@ -384,10 +368,10 @@ def end_friction(dtype):
             s = pairs.stencils[e]
             sides = rubbed.sides[e]
             w = rubbed.weights[e]
-            R = rotation_of(pairs.layout, rings, parts, w, sides, start, moves, x)
-            y = y_of(pairs.layout, s, w, x)
+            R = turn_of(pairs.layout, rings, parts, w, sides, start, moves, x)
+            y = difference(pairs.layout, s, w, x)
             if obstacle_of(pairs.layout, parts) < 0:
-                before = y_of(pairs.layout, s, w, start)
+                before = difference(pairs.layout, s, w, start)
                 y -= R * before - before
             u = R * slip_from(pairs.layout, rubbed, e, y, ONE)
             slips[e] = SLIP(u[0], u[1], u[2], rubbed.stiffness[e], wp.float64(sides))
@@ -398,14 +382,14 @@ def end_friction(dtype):
 @cache
 def near_friction(dtype):
     """The ``near`` of friction, with v = u."""
-    (vec3, _), slip_of = types(dtype), slip_at(dtype)
+    vec3, _ = types(dtype)
     points = wp.array(dtype=vec3)
 
     @wp.func
     def near_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: points, correction: points, always: bool):
         u = wp.vec3d()
         if rubbed.limit[e] > ZERO:
-            u = slip_of(pairs, rubbed, e, x, correction)
+            u = slip_at(pairs, rubbed, e, x, correction)
         return rubbed.limit[e] > ZERO, u, rubbed.normal[e], rubbed.weights[e]
 
     return near_of
@@ -429,16 +413,15 @@ def push_friction(law: Law):
 
 
 @cache
-def row_of_friction(dtype, law: Law):
+def row_of_friction(law: Law):
     """The ``row`` of friction: C = (u·t, u·(n × t)), t normal to n. A sliding pair has a softer spring with the same force."""
-    vec3, _ = types(dtype)
-    slip_of, secant = slip_at(dtype), law.secant
+    secant = law.secant
 
     @wp.func
-    def row_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
+    def row_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=Any), d: wp.array(dtype=Any)):
         found = PairRow()
         if rubbed.limit[e] > ZERO:
-            u = slip_of(pairs, rubbed, e, x, d)
+            u = slip_at(pairs, rubbed, e, x, d)
             found.weights = rubbed.weights[e]
             found.first = perpendicular(rubbed.normal[e])
             found.second = wp.cross(rubbed.normal[e], found.first)
@@ -453,7 +436,5 @@ def row_of_friction(dtype, law: Law):
 @cache
 def friction_of_pairs(law: Law):
     """Returns the :class:`.pair_sums.PairTerm` of friction by a law."""
-    row = partial(row_of_friction, law=law)
-    return PairTerm(
-        "self-friction", f"{MODULE}.{law.name}", 2, RubbedPairs, near_friction, push_friction(law), row, isotropic=True
-    )
+    push, row = push_friction(law), row_of_friction(law)
+    return PairTerm("self-friction", f"{MODULE}.{law.name}", 2, RubbedPairs, near_friction, push, row, isotropic=True)

@@ -5,6 +5,7 @@ a triangle, and (1 − s, s, −(1 − t), −t) for two edges. The gap is d = �
 """
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
@@ -207,31 +208,19 @@ def perpendicular(n: wp.vec3d):
     return t / wp.max(wp.length(t), wp.float64(1e-300))
 
 
-@cache
-def corners_of(dtype):
-    """Device function (x, stencil) → the corners of a pair."""
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def corners(x: wp.array(dtype=vec3), s: wp.vec4i):
-        return wp.matrix_from_rows(wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
-
-    return corners
+@wp.func
+def corners(x: wp.array(dtype=Any), s: wp.vec4i):
+    """The corners of a pair."""
+    return wp.matrix_from_rows(wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
 
 
-@cache
-def farthest_of(dtype):
-    """Device function (stencil, x) → the largest coordinate of a pair [m]."""
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def farthest(s: wp.vec4i, x: wp.array(dtype=vec3)):
-        far = ZERO
-        for i in range(4):
-            far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
-        return far
-
-    return farthest
+@wp.func
+def farthest(x: wp.array(dtype=Any), s: wp.vec4i):
+    """The largest coordinate of a pair [m]."""
+    far = ZERO
+    for i in range(4):
+        far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))
+    return far
 
 
 @cache

@@ -7,7 +7,7 @@ import warp as wp
 from ..vectors import types
 from .obstacles import Layout
 from .proximity import sort
-from .self_gaps import corners_of, nearest
+from .self_gaps import corners, nearest
 
 
 @wp.struct
@@ -59,7 +59,7 @@ def module_of(dtype):
 @cache
 def begin_pairs(dtype):
     """Kernel over pairs: n, d and w at the positions x at the start of a step."""
-    (vec3, _), corners = types(dtype), corners_of(dtype)
+    vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def begin_each_pair(

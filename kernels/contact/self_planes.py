@@ -1,6 +1,7 @@
 """Factories of the kernels that limit the moves of vertices, by a plane between the two sides of each pair."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -8,7 +9,7 @@ import warp as wp
 from ..memory import load
 from ..vectors import types
 from .obstacles import copy_of
-from .self_gaps import CORNERS, ONE, SIDE, ZERO, corners_of, nearest
+from .self_gaps import CORNERS, ONE, SIDE, ZERO, corners, nearest
 from .self_pairs import Pairs, module_of
 
 KEPT = wp.constant(wp.float64(0.9))  # fraction of its distance to a plane that a vertex may move in one round of the filter
@@ -35,25 +36,18 @@ def bounded_share(move: wp.vec3d, most: wp.float64):
     return wp.where(size > most, most / size, ONE)
 
 
-@cache
-def wanted_move(dtype):
-    """Device function (x, target, i) → wanted move of vertex i, target − x; 0 for obstacles, which have no target."""
-    vec3, _ = types(dtype)
-
-    @wp.func
-    def wanted(x: wp.array(dtype=vec3), target: wp.array(dtype=vec3), i: int):
-        if i < target.shape[0]:
-            return wp.vec3d(target[i]) - wp.vec3d(x[i])
-        return wp.vec3d()
-
-    return wanted
+@wp.func
+def wanted(x: wp.array(dtype=Any), target: wp.array(dtype=Any), i: int):
+    """The wanted move of vertex i, target − x; 0 for obstacles, which have no target."""
+    if i < target.shape[0]:
+        return wp.vec3d(target[i]) - wp.vec3d(x[i])
+    return wp.vec3d()
 
 
 @cache
 def common_move(dtype):
     """Kernel over copies: the mean of the wanted moves of all vertices [m]."""
     vec3, _ = types(dtype)
-    wanted = wanted_move(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_common_move(
@@ -83,7 +77,6 @@ def find_ways(dtype):
     first vertex of the copy where cloth meets nothing but itself. Obstacles have not moved since.
     """
     vec3, _ = types(dtype)
-    wanted = wanted_move(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_each_way(
@@ -237,7 +230,7 @@ def cut_by_planes(dtype):
     roundings of shorter moves, which can be equal in many steps, would take it nearer.
     """
     vec3, _ = types(dtype)
-    wanted, corners, ulp, stencil = wanted_move(dtype), corners_of(dtype), ulp_of(dtype), load(wp.vec4i)
+    ulp, stencil = ulp_of(dtype), load(wp.vec4i)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def cut_by_each_plane(

@@ -10,12 +10,12 @@ import warp as wp
 
 from ..contact.anchors import slip_of
 from ..contact.collider_filter import FilterNotes, filters, outside
-from ..contact.colliders import gap_of, of_pose, pose_types
+from ..contact.colliders import gap_of, pose_types, rotated, to_local
 from ..coulomb import COULOMB, huber_secant
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..rotation import epsilon
-from ..terms.contact import ROUNDED_BOX, turned
+from ..terms.contact import ROUNDED_BOX
 from ..vectors import types
 
 
@@ -86,7 +86,6 @@ def touching_step(dtype, symplectic: bool):
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
-    to_local, _to_space = of_pose(dtype)
     gap, end_outside = gap_of(dtype, (ROUNDED_BOX,)), outside(dtype, (ROUNDED_BOX,))
     step, ball_type = kick_and_drift(dtype, symplectic), wp.types.vector(4, dtype)
     put, slip_along = store(ball_type), slip_of(dtype, COULOMB)
@@ -109,7 +108,7 @@ def touching_step(dtype, symplectic: bool):
                     held = 1
                     slip = slip_along(guard.anchors[c, i], X, n)
                     pull -= huber_secant(wp.length(slip), most) * slip
-                force += guard.stiffness[c, i] * turned(vec3(pose[3], pose[4], pose[5]), pose[6], pull)
+                force += guard.stiffness[c, i] * rotated(pose, pull)
             if guard.filter.shape.friction[c] > dtype(0.0):
                 found = anchor_type()  # without contact 0, whatever the ball was
                 if most > dtype(0.0):
