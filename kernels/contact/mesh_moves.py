@@ -12,7 +12,6 @@ import warp as wp
 
 from ..vectors import types
 from .colliders import gap_of, shapes, step_poses, to_local, to_space
-from .gap_notes import FIRST
 from .obstacles import has_obstacle
 from .self_gaps import ONE, ZERO
 from .self_pairs import Pairs, StepPairs
@@ -206,32 +205,3 @@ def carry_vertices(dtype):
         p[i] = vec3(move)
 
     return carry_each_vertex
-
-
-@wp.kernel(module="warpcloth.mesh_moves", enable_backward=False)
-def end_move(
-    # state in
-    fraction: wp.array(dtype=wp.float64),
-    rounds: wp.array(dtype=wp.int32),
-    steps: wp.array(dtype=wp.int32),
-    # parameters
-    most: int,
-    per_frame: int,
-    # in and out
-    active: wp.array(dtype=wp.int32),
-    # out
-    proceed: wp.array(dtype=wp.int32),
-    first: wp.array(dtype=wp.int64),
-):
-    """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
-
-    After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame.
-    """
-    c = wp.tid()
-    if fraction[c] == ONE:
-        active[c] = 0
-    elif active[c] != 0:
-        if rounds[0] < most:
-            proceed[0] = 1
-        else:
-            wp.atomic_max(first, c, FIRST - wp.int64(steps[c] // per_frame + 1))

@@ -90,18 +90,32 @@ def another_round(
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def walk_where_blocked(
+def end_move(
     # state in
     fraction: wp.array(dtype=wp.float64),
+    rounds: wp.array(dtype=wp.int32),
+    steps: wp.array(dtype=wp.int32),
+    # parameters
+    most: int,
+    per_frame: int,
+    # in and out
+    active: wp.array(dtype=wp.int32),
     # out
-    walk: wp.array(dtype=wp.int32),
     proceed: wp.array(dtype=wp.int32),
+    first: wp.array(dtype=wp.int64),
 ):
-    """Kernel over copies: ``walk`` is 1 for copies whose ``fraction`` of a direction is below 1; then ``proceed`` is 1."""
+    """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
+
+    After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame.
+    """
     c = wp.tid()
-    walk[c] = wp.where(fraction[c] < ONE, 1, 0)
-    if fraction[c] < ONE:
-        proceed[0] = 1
+    if fraction[c] == ONE:
+        active[c] = 0
+    elif active[c] != 0:
+        if rounds[0] < most:
+            proceed[0] = 1
+        else:
+            wp.atomic_max(first, c, FIRST - wp.int64(steps[c] // per_frame + 1))
 
 
 @wp.struct

@@ -243,7 +243,7 @@ class SelfFilter:
         wp.capture_while(self._proceed, self._launch_meshes_on, x=x, goal=goal)
 
     def _launch_meshes_on(self, x, goal):
-        model, p, contact = self.model, self._moves, self._contact
+        p, contact = self._moves, self._contact
         self.launch_fresh(x, contact.relist)
         contact.launch_sides(x)
         for array in (p, self._carried, self._keys):
@@ -253,11 +253,15 @@ class SelfFilter:
         self._launch_carry_on()
         self.launch_limit(p)
         self._add(x, p, 1.0, x, self._walking)
-        model.launch(self._count, 1, [], [self._rounds])
+        self.model.launch(self._count, 1, [], [self._rounds])
         self._proceed.zero_()
-        given = [self.fraction, self._rounds, contact.steps, ROUNDS, contact.per_frame]
-        model.launch(mesh_moves.end_move, model.copies, given, [self._walking, self._proceed, contact.first_forced])
+        self._launch_end_move()
         wp.capture_if(self._proceed, lambda: None, lambda: self._launch_arrived(x, goal))
+
+    def _launch_end_move(self):
+        given = [self.fraction, self._rounds, self._contact.steps, ROUNDS, self._contact.per_frame]
+        out = [self._walking, self._proceed, self._contact.first_forced]
+        self.model.launch(self_filter.end_move, self.model.copies, given, out)
 
     def _launch_arrived(self, x, goal):
         """Puts meshes at their goal, also those that are still on their way, and lists the pairs there."""
@@ -337,9 +341,10 @@ class SelfFilter:
         if self.model.keyframes is not None:
             self._aim(self._target, x, False, True, self.fraction, direction)
             self.launch_limit(direction, whole=True)
-            self._proceed.zero_()
-            given = [self._walking, self._proceed]
-            self.model.launch(self_filter.walk_where_blocked, self.model.copies, [self.fraction], given)
+            for array in (self._proceed, self._rounds):
+                array.zero_()
+            self._walking.fill_(1)
+            self._launch_end_move()
             wp.capture_if(self._proceed, self._launch_walk_of_pins, x=x)
         self._add(x, base, -1.0, d)
         self._add(d, direction, 1.0, d)

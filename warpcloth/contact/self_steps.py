@@ -114,7 +114,6 @@ class SelfSteps:
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
         made = (pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs, gap_notes.note_gaps, add_positions)
         self._launch = model.launcher((made, model.dtype))
-        self._counted = None
         size = pair_blocks.NUMBERS * pair_blocks.BLOCK * device.is_cpu
         self._block = wp.zeros(size, dtype=wp.float64, device=device) if size else None
         self.placed, self._ahead = [None, None, None], 0 if colliders is None else int(np.ceil(2.0 * colliders.part))
@@ -270,13 +269,10 @@ class SelfSteps:
 
     def in_frame(self):
         """Returns the pairs listed, the pairs in contact and the least gap [m] at the last :meth:`launch_begin`, each (B,)."""
-        model = self.model
-        if self._counted is None:
-            self._counted = model.kernel(gap_notes.count_pairs, model.dtype)
-        counts, nearest = wp.zeros((model.copies, 2), dtype=wp.int32, device=model.device), model.scalars(wp.float64)
-        given = [self.pairs, self.begun, self._laws]
-        model.launch(self._counted, len(self.pairs.stencils), given, [counts, nearest])
-        return *counts.numpy().T, _gaps(nearest)
+        counts = wp.zeros((self.model.copies, 2), dtype=wp.int32, device=self.model.device)
+        notes = filled(gap_notes.GapNotes, nearest=self.model.scalars(), counts=counts)
+        self._launch_notes(self.begun_at, 1, notes)
+        return *counts.numpy().T, _gaps(notes.nearest)
 
     def start_again(self):
         """Clears counts and the list, after a reset and after the steps in which an integrator finds its past state."""
@@ -308,9 +304,9 @@ class SelfSteps:
         if self.per_frame > 1:
             self._ends.zero_()
             self.model.launch(gap_notes.find_frames, self.model.copies, [self.steps, self.per_frame], [self._ends])
-            wp.capture_if(self._ends, self._launch_notes, x=x)
+            wp.capture_if(self._ends, self._launch_notes, x=x, per_frame=self.per_frame, notes=self._notes)
         else:
-            self._launch_notes(x)
+            self._launch_notes(x, 1, self._notes)
         if self.friction is not None:
             self.contact.launch_rows(x)
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
@@ -386,9 +382,9 @@ class SelfSteps:
         mesh = moving[0] if len(moving) == 1 else None
         return [(c, int(gap_notes.FIRST) - int(note), mesh) for c, note in enumerate(self.first_forced.numpy()) if note]
 
-    def _launch_notes(self, x):
-        given = [self.pairs, self.begun, x, self.steps, self._laws, self.per_frame, self.contact.least]
-        self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [self._notes])
+    def _launch_notes(self, x, per_frame, notes):
+        given = [self.pairs, self.begun, x, self.steps, self._laws, per_frame, self.contact.least]
+        self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [notes])
 
     def launch_begin_at_start(self, x, longest):
         """Lists all pairs near x (N,) at the start of a run, and grows the lists. The longest edge is ``longest`` [m]."""
