@@ -5,14 +5,14 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..kernels.contact import mesh_geometry as kernels
+from ..kernels.contact import obstacles as kernels
 
 
 class DeviceMeshes(NamedTuple):
     """The meshes of the colliders of a scene, which all copies share.
 
     Attributes:
-        geometry: The struct :func:`warpcloth.kernels.contact.mesh_geometry.meshes`.
+        geometry: The struct :func:`warpcloth.kernels.contact.obstacles.meshes`.
     """
 
     geometry: object
