@@ -11,11 +11,10 @@ import trimesh
 import warp as wp
 
 import warpcloth as wc
-from support.layers import DENSITY, GRAVITY, after_frames, cloth
-from support.meshes import disc, joined, leaf
+from support.layers import DENSITY, GRAVITY, R, after_frames, falling
 from support.rows import table
 from support.scenes import scene
-from support.shapes import Torus
+from support.shapes import TILTED, Torus
 from support.steps import stopped_and_resumed
 from warpcloth.cli import main
 from warpcloth.contact.clearance import Clearance
@@ -28,8 +27,6 @@ from warpcloth.kernels.term import HessianPolicy
 from warpcloth.lab.counts import launches_of
 from warpcloth.usd import write_scene
 
-R = 1e-3
-TILTED = (0.18257419, 0.36514837, 0.54772256, 0.73029674)
 SHAPES = {
     "plane": wc.Plane(normal=(0.2, 1.0, 0.1), position=(0.0, -0.11, 0.0)),
     "sphere": wc.Sphere(radius=0.1, position=(0.25, -0.12, 0.25)),
@@ -51,18 +48,6 @@ SOLVERS = {
     "constrained dynamics": wc.ConstrainedDynamics(substeps=1, iterations=20),
 }
 each_solver = table("name", ("explicit", "newton", "xpbd", "pbd"), SOLVERS)
-
-
-def falling(colliders, speed=1.0, fps=24.0, n=6, stiffness=100.0, height=0.05, **fields):
-    """A sheet of 0.5 m that falls, and drifts sideways."""
-    grid = wc.Mesh.grid(n, n, size=0.5)
-    given = {
-        "positions": grid.points + np.array([0.0, height, 0.0]),
-        "velocities": np.tile([0.3 * speed, -speed, 0.0], (n * n, 1)),
-        "duration": 8.0 / fps,
-        "contact": wc.Contact(distance=R, stiffness=10.0 * DENSITY * GRAVITY / R),  # explicit steps of 1/960 s are stable
-    }
-    return cloth(grid, stiffness, colliders=colliders, fps=fps, **given | fields)
 
 
 @cache
@@ -544,174 +529,6 @@ def test_refused_in_a_sentence(declare, message):
     with pytest.raises(ValueError) as error:
         declare()
     assert message in str(error.value) and "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("weld", (True, False))
-def test_distances_to_a_mesh_are_those_to_its_box(weld):
-    """Signed, about faces, edges and corners; seams do not open it. An open one has no inside."""
-    box = SHAPES["box"]
-    cube = CUBE if weld else CUBE.copy()
-    if not weld:
-        cube.unmerge_vertices()
-    mesh = wc.MeshCollider(cube.vertices, cube.faces, position=box.position, rotation=box.rotation)
-    points = box.position + np.random.default_rng(0).uniform(-0.3, 0.3, size=(500, 3))
-    assert mesh.closed
-    np.testing.assert_allclose(mesh.distances(points), box.distances(points), atol=1e-12)
-    sheet = replace(mesh, triangles=cube.faces[1:])
-    assert not sheet.closed and sheet.distances(points).min() > 0.0
-
-
-DOUBLED = {
-    "square, other diagonal": disc(4, 1),
-    "pentagon": disc(5, 0),
-    "disc": disc(12, 5),
-    "card": leaf(lambda x, z: 0.0 * x),
-    "card, other diagonals": leaf(lambda x, z: 0.0 * x, True),
-    "dome": leaf(lambda x, z: 0.4 - x**2 - z**2),
-    "dome, other diagonals": leaf(lambda x, z: 0.4 - x**2 - 2.0 * z**2 + x * z**2, True),
-    "leaf": leaf(lambda x, z: 0.5 * x * z),
-    "leaf, other diagonals": leaf(lambda x, z: 0.5 * x * z, True),
-    "leaf, other diagonals, turned": leaf(lambda x, z: -0.5 * x * z, True),
-}
-# A cube with a sheet beside it, and one that is there three times with other first corners.
-CUBES = {
-    "with a leaf": (0.1, joined((0.1 * CUBE.vertices, CUBE.faces), leaf(lambda x, z: 0.0 * x + 0.2))),
-    "three times": (1.0, joined(*((CUBE.vertices, np.roll(CUBE.faces, k, axis=1)) for k in range(3)))),
-}
-PROBES = np.random.default_rng(0).uniform(-0.7, 0.7, size=(2000, 3))
-
-
-@pytest.mark.parametrize("name", DOUBLED)
-def test_front_and_back_that_coincide_are_a_sheet(name):
-    """Nothing is inside, a few points between diagonals of a twisted leaf aside."""
-    collider = wc.MeshCollider(*DOUBLED[name])
-    distances = collider.distances(PROBES)
-    assert not collider.faces_inwards and distances.min() > -0.01 and (distances < 0.0).mean() < 0.01
-    assert "diagonal" in name or not collider.closed
-
-
-@pytest.mark.parametrize("name", CUBES)
-def test_the_inside_of_cubes(name):
-    scale, mesh = CUBES[name]
-    probes = np.concatenate([PROBES, PROBES * scale / 2.0])
-    inside = (np.abs(probes) < scale * CUBE.vertices.max(axis=0)).all(axis=1)
-    assert inside.sum() > 20
-    np.testing.assert_array_equal(wc.MeshCollider(*mesh).distances(probes) < 0.0, inside)
-
-
-@pytest.mark.parametrize("size", [(10, 0.1, 10), (10, 3, 10), (20, 0.02, 20)])
-def test_slabs_and_rooms_whose_fronts_face_inwards(size):
-    cube = CUBE.vertices * np.array(size)
-    assert wc.MeshCollider(cube, CUBE.faces[:, ::-1]).faces_inwards and not wc.MeshCollider(cube, CUBE.faces).faces_inwards
-
-
-@pytest.mark.parametrize("lift", [0.1, -0.1])
-def test_a_card_of_two_quads_is_no_room(lift):
-    """A front and a back whose fans have other diagonals, with a corner that is lifted."""
-    points = [[0, 0, 0], [1, 0, 0], [1, lift, 1], [0, 0, 1]]
-    assert not wc.MeshCollider(points, [[0, 1, 2], [0, 2, 3], [3, 2, 1], [3, 1, 0]]).faces_inwards
-
-
-@table("name", ["square, other diagonal", "card"], DOUBLED)
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_front_and_back_that_coincide_hold_cloth_on_both_sides(name, side):
-    points, triangles = DOUBLED[name]
-    collider = wc.MeshCollider(points - [0.0, points[:, 1].max() * (side > 0), 0.0], triangles)
-    grid = wc.Mesh.grid(7, 7, size=0.3)
-    mesh = wc.Mesh(grid.points + np.array([-0.15, side * 0.45, -0.15]), grid.triangles)
-    fields = {"density": 0.2, "terms": [wc.Spring(stiffness=500.0)], "gravity": (0.0, -9.81 * side, 0.0)}
-    run = wc.simulate(wc.Scene(mesh, colliders=[collider], **fields), wc.Newton(substeps=4), frames=40)
-    assert run.status.ok and -0.45 < (side * run.points[-1][:, 1]).min() < 0.2  # 1.7 m lower without a collider
-
-
-def test_the_default_stiffness_is_said():
-    """(2/r)(wL/r + Y/L) on any mesh, Y of the stiffest term; ``print`` and ``info`` say it."""
-    for n, given in (
-        (6, {"terms": [wc.CorotatedMembrane(stiffness=300.0), wc.Spring(stiffness=100.0)]}),
-        (9, {"stiffness": 150.0 * np.sqrt(3.0)}),
-    ):
-        scene = falling([wc.Plane()], n=n, contact=None, **given)
-        assert scene.contact.stiffness == pytest.approx(2.0 / R * (0.15 * 9.81 * 0.5 / R + 300.0 / 0.5))
-        assert "contact: distance 0.001 m, stiffness 2.67" in str(scene)
-    hard = falling([wc.Plane()], terms=[wc.Spring(stiffness=np.inf)], contact=None)
-    assert hard.contact.stiffness == pytest.approx(2.0 / R * 0.15 * 9.81 * 0.5 / R)
-    mesh, fields = wc.Mesh.chain(11, length=2.0), {"density": 0.1, "terms": [wc.Spring(stiffness=1e3)]}
-    chain = wc.Scene(mesh, colliders=[wc.Plane(position=(0, -3, 0))], **fields)
-    assert chain.contact.stiffness == pytest.approx(2.0 / R * 0.1 * 9.81 / (2.0 * R) * 2.0 / R)  # as a strip of width 2 R
-
-
-ROUND = {
-    "sphere": wc.Sphere(radius=0.05),
-    "capsule": wc.Capsule(radius=0.03, length=0.1),
-    "box": wc.Box(size=(0.3, 0.04, 0.1), rotation=TILTED),
-}
-
-
-@pytest.mark.parametrize("shape", ROUND.values(), ids=ROUND)
-def test_gaps_that_keep_triangles_out(shape, edge=0.2):
-    """No triangle with vertices at this gap or farther is cut, of any shape."""
-    random, gap = np.random.default_rng(0), shape.clearing_gap(edge)
-    triangles = random.normal(scale=0.2, size=(200000, 1, 3)) + random.uniform(-0.15, 0.15, size=(200000, 3, 3))
-    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-    triangles = triangles[(longest <= edge) & (shape.distances(triangles).min(axis=1) >= gap)]
-    nearest = np.full((len(triangles), 1), np.inf)
-    for _ in range(100):
-        nearest = np.minimum(nearest, shape.distances(random.dirichlet(np.ones(3), len(triangles))[:, None] @ triangles))
-    assert len(triangles) > 1000 and nearest.min() > 0.0
-
-
-def test_gaps_of_triangles_that_touch(edge=0.2):
-    """A triangle whose vertices are just as near touches a ball, or a point. ``print`` says the gaps of a scene."""
-    angles = 2.0 * np.pi / 3.0 * np.arange(3)
-    corners = edge / np.sqrt(3.0) * np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1)
-    for touched in (wc.Sphere(radius=0.05, position=(0.0, -0.05, 0.0)), wc.Box(size=(1e-9, 1e-9, 1e-9))):
-        assert touched.distances(corners) == pytest.approx(touched.clearing_gap(edge))
-    assert wc.Plane().clearing_gap(edge) == 0.0
-    large = wc.Sphere(radius=9.0, position=(0, -9.3, 0))
-    text = str(falling([wc.Plane(position=(0, -1, 0)), wc.Box(name="chest", position=(0.0, -1.0, 0.0)), large]))
-    assert "as edges are up to 0.141 m; gaps that prevent it: 0.0816 m of chest" in text
-
-
-def test_an_animation_has_colliders_as_primitives(tmp_path):
-    """With their sizes, and where they are at each frame."""
-    from pxr import Usd, UsdGeom
-
-    colliders = [
-        wc.Sphere(radius=0.1, position=[(0.25, -0.3, 0.1 * k) for k in range(3)], name="ball"),
-        wc.Capsule(radius=0.05, length=0.2, axis=(1.0, 0.0, 0.0), position=(0.0, -1.0, 0.0)),
-        wc.Box(size=(0.1, 0.2, 0.3), position=(0.0, -2.0, 0.0), rotation=TILTED),
-        wc.Plane(position=(0.0, -3.0, 0.0), name="ball"),
-        wc.MeshCollider(BREATHING, BALL.faces, position=(0.0, -4.0, 0.0), name="breathing"),
-    ]
-    path = str(tmp_path / "a.usda")
-    wc.simulate(falling(colliders, n=3, fps=60.0, duration=0.1), wc.Newton(substeps=4), output=path, frames=2)
-    stage = Usd.Stage.Open(path)
-    prims = {prim.GetName(): prim for prim in stage.GetPrimAtPath("/World/Colliders").GetChildren()}
-    kinds = {name: prim.GetTypeName() for name, prim in prims.items()}
-    assert kinds == {"ball": "Sphere", "Capsule": "Capsule", "Box": "Cube", "ball_2": "Plane", "breathing": "Mesh"}
-    points = UsdGeom.Mesh(prims["breathing"]).GetPointsAttr()
-    np.testing.assert_allclose([points.Get(frame) for frame in range(9)], BREATHING, atol=1e-7)
-    for (name, prim), collider in zip(list(prims.items())[:4], colliders[:4], strict=True):
-        half, radius = collider.core
-        high = 0.5 if name == "Box" else half[1] + radius if np.isfinite(half[1]) else 0.0
-        for frame in (0, 1, 2):
-            to_world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(frame))
-            surface = [0.0, high, 0.0, 1.0] @ to_world
-            assert collider.distances(surface[:3], frame) == pytest.approx(0.0, abs=1e-6)
-
-
-@pytest.mark.parametrize("n", (3, 4, 7))
-def test_the_scene_drape_starts_without_contact(n):
-    declared = scene("drape", n=n)
-    assert all(collider.distances(declared.positions).min() > declared.contact.distance for collider in declared.colliders)
-
-
-def test_the_scene_drape_stays_outside():
-    declared = scene("drape", n=12, duration=1.0)
-    animation = wc.simulate(declared, wc.Newton(substeps=2))
-    points = animation.points.astype(np.float64)
-    assert animation.status.ok and min(collider.distances(points).min() for collider in declared.colliders) > 0.0
-    assert declared.colliders[0].distances(points[-1]).min() < declared.contact.distance < points[-1][:, 1].max()
 
 
 @table("name", ["newton"], ["explicit", "newton"])

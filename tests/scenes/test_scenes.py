@@ -410,3 +410,19 @@ def test_a_diverging_run_stops_with_its_last_good_frame(device, tmp_path):
     assert animation.status.message.startswith(f"diverged in frame {animation.status.frame + 1}")
     assert len(animation.points) == len(animation.times) == animation.status.frame + 1
     assert np.isfinite(np.asarray(animation.points)).all()
+
+
+@pytest.mark.parametrize("n", (3, 4, 7))
+def test_the_scene_drape_starts_without_contact(n):
+    declared = scene("drape", n=n)
+    assert all(collider.distances(declared.positions).min() > declared.contact.distance for collider in declared.colliders)
+
+
+@pytest.mark.parametrize("n", [2, 8, 9, 64])
+def test_the_scene_of_a_folded_sheet_starts_at_rest(n):
+    """Only the edges that bend around the fold are shorter than at rest, by less than the fold is long, π/2 of the gap."""
+    declared = scene("folded_sheet", n=n)
+    now, rest = (
+        np.linalg.norm(np.diff(x[declared.mesh.edges], axis=1), axis=2) for x in (declared.positions, declared.mesh.points)
+    )
+    assert np.all(now <= rest + 1e-12) and np.all(now >= rest - 0.5 * np.pi * 1e-3)

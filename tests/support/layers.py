@@ -5,6 +5,7 @@ import numpy as np
 import warpcloth as wc
 
 DENSITY, GRAVITY = 0.15, 9.81
+R = 1e-3  # the contact distance of what is falling
 
 
 def turned(points, angle):
@@ -24,6 +25,18 @@ def cloth(mesh, stiffness=100.0, bending=1e-5, **fields):
     """A scene of a mesh with springs and bending."""
     terms = [wc.Spring(stiffness=stiffness), wc.QuadraticBending(stiffness=bending)]
     return wc.Scene(mesh, **{"density": DENSITY, "terms": terms} | fields)
+
+
+def falling(colliders, speed=1.0, fps=24.0, n=6, stiffness=100.0, height=0.05, **fields):
+    """A sheet of 0.5 m that falls, and drifts sideways."""
+    grid = wc.Mesh.grid(n, n, size=0.5)
+    given = {
+        "positions": grid.points + np.array([0.0, height, 0.0]),
+        "velocities": np.tile([0.3 * speed, -speed, 0.0], (n * n, 1)),
+        "duration": 8.0 / fps,
+        "contact": wc.Contact(distance=R, stiffness=10.0 * DENSITY * GRAVITY / R),  # explicit steps of 1/960 s are stable
+    }
+    return cloth(grid, stiffness, colliders=colliders, fps=fps, **given | fields)
 
 
 def layers(count=2, n=6, gap=0.02, speed=0.0, turn=0.0, distance=5e-3, stiffness=1e5, size=0.5, shrink=1.0, **fields):

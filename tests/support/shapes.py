@@ -9,6 +9,8 @@ import warp as wp
 from warpcloth.kernels.terms.contact import Solid
 from warpcloth.scene.colliders import Collider
 
+TILTED = (0.18257419, 0.36514837, 0.54772256, 0.73029674)  # a unit quaternion
+
 
 @wp.func
 def torus(X: Any, half: Any, radius: Any):

@@ -4,9 +4,12 @@ import warnings
 
 import numpy as np
 import pytest
-from pxr import Usd
+import trimesh
+from pxr import Usd, UsdGeom
 
 import warpcloth as wc
+from support.layers import falling
+from support.shapes import TILTED
 from support.usd_validation import validate
 from warpcloth.usd import read_scene, read_stage_mesh, write_scene
 from warpcloth.usd.drawn import read_drawn
@@ -536,3 +539,31 @@ def test_a_cloth_of_a_skinned_character_has_pins_that_follow_it(path):
     stage = Usd.Stage.Open(str(result))
     for name in ("primvars:skel:jointIndices", "primvars:skel:jointWeights", "skel:blendShapes"):
         assert not stage.GetPrimAtPath("/Rig/Body").GetAttribute(name).HasValue()
+
+
+def test_an_animation_has_colliders_as_primitives(tmp_path):
+    """With their sizes, and where they are at each frame."""
+    ball = trimesh.creation.icosphere(2, radius=0.1)
+    breathing = [ball.vertices * (1.0 + 0.3 * np.sin(180.0 * ball.vertices[:, :1] + k)) for k in range(9)]
+    colliders = [
+        wc.Sphere(radius=0.1, position=[(0.25, -0.3, 0.1 * k) for k in range(3)], name="ball"),
+        wc.Capsule(radius=0.05, length=0.2, axis=(1.0, 0.0, 0.0), position=(0.0, -1.0, 0.0)),
+        wc.Box(size=(0.1, 0.2, 0.3), position=(0.0, -2.0, 0.0), rotation=TILTED),
+        wc.Plane(position=(0.0, -3.0, 0.0), name="ball"),
+        wc.MeshCollider(breathing, ball.faces, position=(0.0, -4.0, 0.0), name="breathing"),
+    ]
+    path = str(tmp_path / "a.usda")
+    wc.simulate(falling(colliders, n=3, fps=60.0, duration=0.1), wc.Newton(substeps=4), output=path, frames=2)
+    stage = Usd.Stage.Open(path)
+    prims = {prim.GetName(): prim for prim in stage.GetPrimAtPath("/World/Colliders").GetChildren()}
+    kinds = {name: prim.GetTypeName() for name, prim in prims.items()}
+    assert kinds == {"ball": "Sphere", "Capsule": "Capsule", "Box": "Cube", "ball_2": "Plane", "breathing": "Mesh"}
+    points = UsdGeom.Mesh(prims["breathing"]).GetPointsAttr()
+    np.testing.assert_allclose([points.Get(frame) for frame in range(9)], breathing, atol=1e-7)
+    for (name, prim), collider in zip(list(prims.items())[:4], colliders[:4], strict=True):
+        half, radius = collider.core
+        high = 0.5 if name == "Box" else half[1] + radius if np.isfinite(half[1]) else 0.0
+        for frame in (0, 1, 2):
+            to_world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(frame))
+            surface = [0.0, high, 0.0, 1.0] @ to_world
+            assert collider.distances(surface[:3], frame) == pytest.approx(0.0, abs=1e-6)
