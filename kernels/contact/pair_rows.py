@@ -52,7 +52,6 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
         # parameters
         h: wp.float64,
         least: wp.float64,
-        per_copy: int,
         layout: RowLayout,
         # out, and the multipliers in and out
         slopes: PairSlopes,
@@ -69,7 +68,7 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
             rows.residual[start + j] = ZERO
             rows.rounding[start + j] = ZERO
             rows.carried[start + j] = ZERO
-        if s[0] // per_copy != copy:
+        if s[0] // pairs.layout.per_copy != copy:
             return
         slopes.first[e] = wp.vec3d()
         slopes.second[e] = wp.vec3d()
@@ -133,7 +132,6 @@ def apply_pair_rows(dtype, two: bool):
         slopes: PairSlopes,
         v: wp.array(dtype=vec3),
         # parameters
-        per_copy: int,
         layout: RowLayout,
         # in and out
         rows: wp.array(dtype=dtype),
@@ -142,7 +140,7 @@ def apply_pair_rows(dtype, two: bool):
         if wp.length_sq(slopes.first[e]) == ZERO:
             return
         s = pairs.stencils[e]
-        row = row_of_pair(s[0] // per_copy, e, layout, Q)
+        row = row_of_pair(s[0] // pairs.layout.per_copy, e, layout, Q)
         moved = wp.vec3d()
         for i in range(4):
             moved += slopes.weights[e][i] * wp.vec3d(v[s[i]])
@@ -167,7 +165,6 @@ def gather_pair_rows(dtype, two: bool):
         slopes: PairSlopes,
         rows: wp.array(dtype=dtype),
         # parameters
-        per_copy: int,
         layout: RowLayout,
         # in and out
         out: wp.array(dtype=vec3),
@@ -177,7 +174,7 @@ def gather_pair_rows(dtype, two: bool):
         for k in range(pairs.first[i], pairs.first[i + 1]):
             e = pairs.corners[k] // 4
             if wp.length_sq(slopes.first[e]) > ZERO:
-                row = row_of_pair(i // per_copy, e, layout, Q)
+                row = row_of_pair(i // pairs.layout.per_copy, e, layout, Q)
                 pull = wp.float64(rows[row]) * slopes.first[e]
                 if wp.static(two):
                     pull += wp.float64(rows[row + 1]) * slopes.second[e]

@@ -294,7 +294,6 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
         p: wp.array(dtype=vec3),
         # parameters
         active: wp.array(dtype=wp.int32),
-        per_copy: int,
         # in and out
         q: wp.array(dtype=vec3),
     ):
@@ -308,7 +307,7 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
             if wp.static(scatters):
                 e = forces.joining[k]
             s = pairs.stencils[e]
-            if end_corner > 0 and active[s[0] // per_copy] != 0:
+            if end_corner > 0 and active[s[0] // pairs.layout.per_copy] != 0:
                 w = forces.weights[e]
                 bend = forces.bend[e]
                 t = forces.along[e]

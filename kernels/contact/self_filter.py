@@ -120,23 +120,25 @@ def end_move(
 
 @wp.struct
 class HeldPins:
-    """The prescribed moves that the filter has shortened, (copies,).
+    """The prescribed moves that the filter has shortened after ``steps``, (copies,).
 
     ``first`` is FIRST − (step·n + vertex), with n vertices a copy, for the first step and vertex with a pinned coordinate that
     was held back, or 0. ``farthest`` is the largest distance by which one was held back [m].
     """
 
+    steps: wp.array(dtype=wp.int32)
+    per_copy: wp.int32
     first: wp.array(dtype=wp.int64)
     farthest: wp.array(dtype=wp.float64)
 
 
 @wp.func
-def note_held(held: HeldPins, steps: wp.array(dtype=wp.int32), per_copy: int, i: int, back: wp.float64):
+def note_held(held: HeldPins, i: int, back: wp.float64):
     """Notes that the pin i was held back by the distance ``back`` [m], if that is not 0."""
     if back == ZERO:
         return
-    copy = i // per_copy
-    key = wp.int64(steps[copy]) * wp.int64(per_copy) + wp.int64(i - copy * per_copy)
+    copy = i // held.per_copy
+    key = wp.int64(held.steps[copy]) * wp.int64(held.per_copy) + wp.int64(i - copy * held.per_copy)
     wp.atomic_max(held.first, copy, FIRST - key)
     wp.atomic_max(held.farthest, copy, back)
 
@@ -229,9 +231,6 @@ def hold_pins(dtype):
         # state in
         share: wp.array(dtype=wp.float64),
         x_before: wp.array(dtype=vec3),
-        steps: wp.array(dtype=wp.int32),
-        # parameters
-        per_copy: int,
         # in and out
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -241,7 +240,7 @@ def hold_pins(dtype):
         if inverse_mass[i] == dtype(0.0) and share[i] < ONE:
             move = wp.vec3d(x[i]) - wp.vec3d(x_before[i])
             end = wp.vec3d(x_before[i]) + share[i] * move
-            note_held(held, steps, per_copy, i, (ONE - share[i]) * wp.length(move))
+            note_held(held, i, (ONE - share[i]) * wp.length(move))
             x[i] = vec3(end)
             v[i] = dtype(share[i]) * v[i]
 
@@ -264,9 +263,7 @@ def end_filter(dtype):
         # state in
         target: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
-        steps: wp.array(dtype=wp.int32),
         # parameters
-        per_copy: int,
         h: dtype,
         pin_h: dtype,
         # in and out
@@ -278,10 +275,9 @@ def end_filter(dtype):
         i = wp.tid()
         change = x[i] - target[i]
         if wp.length_sq(change) > dtype(0.0):
-            copy = i // per_copy
             pinned = wp.vec3d(change)
             if inverse_mass[i] > dtype(0.0):
-                wp.atomic_add(cut, copy, wp.int64(1))
+                wp.atomic_add(cut, i // held.per_copy, wp.int64(1))
                 for axis in range(3):
                     free = True
                     if mobility:
@@ -289,7 +285,7 @@ def end_filter(dtype):
                     if free:
                         pinned[axis] = ZERO
             if wp.length_sq(pinned) > ZERO:
-                note_held(held, steps, per_copy, i, wp.length(pinned))
+                note_held(held, i, wp.length(pinned))
             v[i] = v[i] + change / wp.where(inverse_mass[i] > dtype(0.0), h, pin_h)
             if move:
                 move[i] = move[i] + change
@@ -451,8 +447,6 @@ def copies_in_contact(
     pairs: Pairs,
     # state in
     active: wp.array(dtype=wp.int32),
-    # parameters
-    per_copy: int,
     # out
     touching: wp.array(dtype=wp.int32),
     some: wp.array(dtype=wp.int32),
@@ -461,7 +455,7 @@ def copies_in_contact(
     t = wp.tid()
     if t >= pairs.number[0]:
         return
-    copy = pairs.stencils[pairs.acting[t]][0] // per_copy
+    copy = pairs.stencils[pairs.acting[t]][0] // pairs.layout.per_copy
     if active[copy] != 0:
         touching[copy] = 1
         some[0] = 1

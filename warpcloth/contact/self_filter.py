@@ -112,8 +112,7 @@ class SelfFilter:
             self._launch_held(start)
             wp.capture_while(self._within, self._launch_let_out, x=start)
         wp.copy(x, start, count=model.count)
-        given = [model.inverse_mass, model.mobility, self._target, x, self._contact.steps, model.per_copy]
-        given += [self._contact.h, self._contact.h / parts]
+        given = [model.inverse_mass, model.mobility, self._target, x, self._contact.h, self._contact.h / parts]
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
 
     def launch_hold(self, x, v, hard):
@@ -125,7 +124,7 @@ class SelfFilter:
         self._share.fill_(1.0)
         given = [contact.pairs, model.inverse_mass, contact.begun, x, hard]
         self._launch(self_filter.share_of_pins, len(contact.pairs.stencils), given, [self._share])
-        given = [model.inverse_mass, self._share, contact.x_before, contact.steps, model.per_copy]
+        given = [model.inverse_mass, self._share, contact.x_before]
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
 
     def launch_fresh(self, x, launch, active=None):
@@ -356,10 +355,9 @@ class SelfFilter:
         always = colliders is not None and near is None
         some.zero_()
         model.launch(self_filter.copies_near_colliders, model.copies, [near, active, always], [touching, some])
-        given = [active, model.per_copy]
 
         def in_contact():
-            model.launch(self_filter.copies_in_contact, contact.capacity, [contact.pairs, *given], [touching, some])
+            model.launch(self_filter.copies_in_contact, contact.capacity, [contact.pairs, active], [touching, some])
 
         wp.capture_if(self._contact.listed, in_contact)
 

@@ -108,7 +108,8 @@ class SelfSteps:
             "pressed": state.add("first pressed", wp.zeros((model.copies, 2), dtype=wp.int64, device=device)),
             "unresolved": state.add("first unresolved", model.scalars(wp.int64)),
         }
-        self._notes, self.held = filled(gap_notes.GapNotes, **notes), HeldPins()
+        self._notes = filled(gap_notes.GapNotes, **notes)
+        self.held = filled(HeldPins, steps=self.steps, per_copy=model.per_copy)
         self.held.first = state.add("first pin held back", model.scalars(wp.int64), Count(rest=model.per_copy))
         self.first_forced = state.add("first mesh that went through cloth", model.scalars(wp.int64))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))

@@ -139,7 +139,7 @@ class DynamicElements:
 
     def add_products(self, p, q, active):
         """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
-        given = [self.pairs, self.model.inverse_mass, self.forces, p, active, self.model.per_copy]
+        given = [self.pairs, self.model.inverse_mass, self.forces, p, active]
         self.model.launch(self._products, self._sums_over, given, [q])
 
     def on_host(self):

@@ -43,17 +43,17 @@ class PairRows:
         """As of the rows of a term."""
         model, of = self.model, self._of
         of.launch_rows(x, d)
-        given = [of.pairs, model.inverse_mass, of.data, x, d, h, least, model.per_copy, self._layout]
+        given = [of.pairs, model.inverse_mass, of.data, x, d, h, least, self._layout]
         model.launch(self._linearise, (model.copies, self.per_copy), given, [self._slopes, values])
 
     def launch_apply(self, v, out, active=None):
         """Launches out += J v, of all copies."""
-        given = [self._of.pairs, self._slopes, v, self.model.per_copy, self._layout]
+        given = [self._of.pairs, self._slopes, v, self._layout]
         self.model.launch(self._apply, self.per_copy, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
         """Launches out += Jᵀ rows, of all copies."""
-        given = [self._of.pairs, self._slopes, rows, self.model.per_copy, self._layout]
+        given = [self._of.pairs, self._slopes, rows, self._layout]
         self.model.launch(self._gather, self.model.count, given, [out])
 
     def entries(self):
