@@ -125,10 +125,10 @@ def outside(dtype, solids):
         return end, change, push, hit
 
     @wp.func
-    def end_outside(x: vec3, end: vec3, v: vec3, h: dtype, i: int, step: int, by: filters(dtype), notes: FilterNotes):
-        copy = i // by.per_copy
+    def end_outside(x: vec3, end: vec3, v: vec3, h: dtype, i: int, step: int, colliders: filters(dtype), notes: FilterNotes):
+        copy = i // colliders.per_copy
         move = end - x
-        rounded = by.least + dtype(8.0) * epsilon(by.least) * wp.max(wp.abs(end))
+        rounded = colliders.least + dtype(8.0) * epsilon(colliders.least) * wp.max(wp.abs(end))
         change = vec3()
         push = vec3()
         cuts = wp.int32(0)
@@ -136,10 +136,12 @@ def outside(dtype, solids):
         rounds = wp.int32(0)
         while rounds <= cuts and rounds < ROUNDS:  # another round after each cut
             rounds += 1
-            for c in range(by.shape.radius.shape[0]):
-                pose = by.poses.after[copy, c]
-                X = to_local(by.poses.before[copy, c], x)
-                X, less, pushed, hit = stopped(by.shape, c, X, to_local(pose, end) - X, rounded, by.landing, rounds <= SLIDING)
+            for c in range(colliders.shape.radius.shape[0]):
+                pose = colliders.poses.after[copy, c]
+                X = to_local(colliders.poses.before[copy, c], x)
+                X, less, pushed, hit = stopped(
+                    colliders.shape, c, X, to_local(pose, end) - X, rounded, colliders.landing, rounds <= SLIDING
+                )
                 if hit:
                     end = to_space(pose, X)
                     change += rotated(pose, less)
@@ -151,10 +153,10 @@ def outside(dtype, solids):
             note_cut(notes, copy, i, end - x - move, after - v)
             v = after
         if cuts == ROUNDS:
-            for c in range(by.shape.radius.shape[0]):
-                d, _n = gap(by.shape, c, to_local(by.poses.after[copy, c], end))
+            for c in range(colliders.shape.radius.shape[0]):
+                d, _n = gap(colliders.shape, c, to_local(colliders.poses.after[copy, c], end))
                 if d <= dtype(0.0):
-                    note_inside(notes, copy, c, step, i - copy * by.per_copy, by.per_copy, last)
+                    note_inside(notes, copy, c, step, i - copy * colliders.per_copy, colliders.per_copy, last)
         return end, v, cuts > 0
 
     return end_outside
@@ -167,16 +169,18 @@ def entry(dtype, solids):
     gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
 
     @wp.func
-    def note_entry(x: vec3, end: vec3, i: int, step: int, by: filters(dtype), notes: FilterNotes):
-        copy = i // by.per_copy
-        rounding = dtype(8.0) * epsilon(by.least)
-        for c in range(by.shape.radius.shape[0]):
-            X = to_local(by.poses.before[copy, c], x)
-            way = to_local(by.poses.after[copy, c], end) - X
-            d, _n = gap(by.shape, c, X)
+    def note_entry(x: vec3, end: vec3, i: int, step: int, colliders: filters(dtype), notes: FilterNotes):
+        copy = i // colliders.per_copy
+        rounding = dtype(8.0) * epsilon(colliders.least)
+        for c in range(colliders.shape.radius.shape[0]):
+            X = to_local(colliders.poses.before[copy, c], x)
+            way = to_local(colliders.poses.after[copy, c], end) - X
+            d, _n = gap(colliders.shape, c, X)
             deep = -rounding * wp.max(wp.max(wp.abs(end)), wp.max(wp.abs(X)))  # a vertex that moves along may touch
-            if d > deep and kept(by.shape, c, X, way, deep) < dtype(1.0):
-                note_inside(notes, copy, c, step, i - copy * by.per_copy, by.per_copy, by.shape.radius.shape[0])
+            if d > deep and kept(colliders.shape, c, X, way, deep) < dtype(1.0):
+                note_inside(
+                    notes, copy, c, step, i - copy * colliders.per_copy, colliders.per_copy, colliders.shape.radius.shape[0]
+                )
 
     return note_entry
 
@@ -194,7 +198,7 @@ def filter_step(dtype, solids):
     def filter_vertices(
         # elements
         inverse_mass: wp.array(dtype=dtype),
-        by: filters(dtype),
+        colliders: filters(dtype),
         # state in
         x_before: wp.array(dtype=vec3),
         # parameters
@@ -206,16 +210,16 @@ def filter_step(dtype, solids):
         notes: FilterNotes,
     ):
         i = wp.tid()
-        now = notes.steps[i // by.per_copy]
+        now = notes.steps[i // colliders.per_copy]
         if inverse_mass[i] > dtype(0.0):
-            end, after, short = end_outside(x_before[i], x[i], v[i], h, i, now, by, notes)
+            end, after, short = end_outside(x_before[i], x[i], v[i], h, i, now, colliders, notes)
             if short:
                 if move:
                     move[i] = move[i] + (end - x[i])
                 x[i] = end
                 v[i] = after
         else:
-            note_entry(x_before[i], x[i], i, now, by, notes)
+            note_entry(x_before[i], x[i], i, now, colliders, notes)
 
     return filter_vertices
 
@@ -262,7 +266,7 @@ def note_fixed(dtype, solids):
     def note(
         # elements
         fixed: wp.array(dtype=wp.int32),
-        by: filters(dtype),
+        colliders: filters(dtype),
         # state in
         x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
@@ -271,6 +275,6 @@ def note_fixed(dtype, solids):
     ):
         p = wp.tid()
         i = fixed[p]
-        note_entry(x_before[p], x[i], i, notes.steps[i // by.per_copy], by, notes)
+        note_entry(x_before[p], x[i], i, notes.steps[i // colliders.per_copy], colliders, notes)
 
     return note

@@ -61,11 +61,11 @@ def distance_of(dtype, of_edges: bool):
 
     @wp.func
     def of_vertex(p: vec3, a: vec3, b: vec3, c: vec3):
-        one = wp.vec3d(a) - wp.vec3d(p)
-        two = wp.vec3d(b) - wp.vec3d(p)
-        three = wp.vec3d(c) - wp.vec3d(p)
-        _code, w = nearest_of_face(one, two, three)
-        return dtype(wp.length(w[0] * one + w[1] * two + w[2] * three))
+        A = wp.vec3d(a) - wp.vec3d(p)
+        B = wp.vec3d(b) - wp.vec3d(p)
+        C = wp.vec3d(c) - wp.vec3d(p)
+        _code, w = nearest_of_face(A, B, C)
+        return dtype(wp.length(w[0] * A + w[1] * B + w[2] * C))
 
     return of_two_edges if of_edges else of_vertex
 

@@ -46,7 +46,7 @@ def allowed_fraction(dtype, of_edges: bool):
 
     @wp.func
     def allowed(s: wp.vec4i, x: wp.array(dtype=vec3), out: advance):
-        at = corners(x, s)
+        points = corners(x, s)
         moves = CORNERS()
         far = ZERO
         way = ZERO
@@ -54,10 +54,10 @@ def allowed_fraction(dtype, of_edges: bool):
             moves[i] = wp.vec3d(vector_or_zero(out.direction, s[i]))
             way = wp.max(way, wp.length(moves[i]))
             if s[i] < out.direction.shape[0]:  # obstacles that stand are not rounded
-                far = wp.max(far, wp.max(wp.abs(at[i])))
+                far = wp.max(far, wp.max(wp.abs(points[i])))
         far += way
         margin = wp.float64(2.0) * margin_of(out.least, ulp * far)
-        _w, y, _inside = nearest(of_vertex, at)
+        _w, y, _inside = nearest(of_vertex, points)
         distance = wp.length(y)
         n = y / wp.max(distance, wp.float64(1e-300))
         floor = (ONE - KEPT) * wp.max(distance - margin, ZERO) + wp.min(distance, margin)
@@ -66,10 +66,10 @@ def allowed_fraction(dtype, of_edges: bool):
             for q in range(sides, 4):
                 approach = wp.dot(n, moves[q] - moves[p])
                 if approach > ZERO:
-                    apart = wp.dot(n, at[p] - at[q]) - floor
+                    apart = wp.dot(n, points[p] - points[q]) - floor
                     t = wp.min(t, wp.max(apart, ZERO) / approach)
         if t < ONE:
-            t = wp.max(t, part_apart(of_vertex, at, moves, floor))
+            t = wp.max(t, part_apart(of_vertex, points, moves, floor))
         return t
 
     return allowed

@@ -259,8 +259,8 @@ def cut_by_planes(dtype):
         margin = margin_of(least, ulp * far)
         if needs_no_cut(e, way, margin, gap):
             return
-        at = corners(x, s)
-        _w, y, _inside = nearest(of_vertex, at)
+        points = corners(x, s)
+        _w, y, _inside = nearest(of_vertex, points)
         n = y / wp.max(wp.length(y), wp.float64(1e-300))
         lowest = wp.float64(wp.inf)
         highest = -wp.float64(wp.inf)
@@ -273,7 +273,7 @@ def cut_by_planes(dtype):
         for i in range(4):
             move = wanted(x, target, s[i])
             approach = wp.dot(n, move - own)
-            along = wp.dot(n, at[i] - at[0])
+            along = wp.dot(n, points[i] - points[0])
             position[i] = along
             if i < sides:
                 approaches[i] = -approach
@@ -299,7 +299,7 @@ def cut_by_planes(dtype):
         moves = CORNERS()
         for i in range(4):
             moves[i] = ways[s[i]][2] * (wanted(x, target, s[i]) - own)
-        if part_apart(of_vertex, at, moves, floor) == ONE:
+        if part_apart(of_vertex, points, moves, floor) == ONE:
             return
         for i in range(4):
             room = highest - position[i] + part * between
