@@ -21,6 +21,7 @@ from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.stability import measure
 from warpcloth.run import balance
 from warpcloth.run.frames_ahead import Frame
+from warpcloth.run.pulling import held_coordinates, pulled
 from warpcloth.run.sources import Source, source_of
 from warpcloth.run.watch import Watch
 from warpcloth.scenes import flag, hanging, net
@@ -177,6 +178,14 @@ def test_pins_may_put_energy_in(name, solver, device):
     assert status.ok, status.message
 
 
+def moved_apart(times):
+    """A chain of 1 m between two pins that part by ``times`` m."""
+    mesh, ends = wc.Mesh.chain(9, length=1.0, direction=(1.0, 0.0, 0.0)), np.zeros((61, 2, 3))
+    ends[:, 1, 0] = 1.0 + times * np.arange(61) / 60.0
+    given = {"terms": [wc.Spring(stiffness=2e3)], "gravity": (0.0, 0.0, 0.0), "duration": 1.0}
+    return wc.Scene(mesh, masses=np.full(9, 0.01), pins=wc.Pins([0, 8], ends), **given)
+
+
 def test_what_pins_stretch_may_turn_into_motion(device):
     """A chain between pins that stretch it by half and let it snap back has nothing but what they stored in it."""
     mesh = wc.Mesh.chain(9, length=1.0, direction=(1.0, 0.0, 0.0))
@@ -189,6 +198,72 @@ def test_what_pins_stretch_may_turn_into_motion(device):
     assert animation.status.ok, animation.status.message
     speed = np.linalg.norm(animation.velocities[22:], axis=-1).max()
     assert speed > 10.0  # kept in float64, the waves that the jump of the pin leaves
+
+
+def held_sheet(way, moves="ball"):
+    """A sheet with four pins above a ball, which moves up by a way (21,) [m], or the pins down by it."""
+    grid = wc.Mesh.grid(8, 8, size=0.5, pattern="alternating")
+    points, way = grid.points - [0.25, 0.0, 0.25], way[:, None] * [0.0, 1.0, 0.0]
+    ball = wc.Sphere(radius=0.11, position=[0.0, -0.12, 0.0] + (way if moves == "ball" else 0.0 * way[0]), friction=0.3)
+    corners = [0, 7, 56, 63]
+    pins = corners if moves == "ball" else wc.Pins(corners, points[corners] - way[:, None])
+    given = {"density": 0.15, "terms": [wc.Spring(stiffness=200.0)], "pins": pins, "fps": 24.0, "duration": 20 / 24}
+    return wc.Scene(wc.Mesh(points, grid.triangles), colliders=[ball], contact=wc.Contact(distance=2e-3), **given)
+
+
+def band():
+    """A band about two rods, of which one moves away by 0.6 m."""
+    n, angles = 24, np.arange(24) * np.pi / 12
+    points = [[0.105 * np.cos(t), 0.105 * np.sin(t), 0.03 * j] for j in range(4) for t in angles]
+    around = [(j * n + i, j * n + (i + 1) % n) for j in range(3) for i in range(n)]
+    triangles = [triangle for i, k in around for triangle in ([i, k, i + n], [i + n, k, k + n])]
+    rods = [np.array([[0.0, -0.06, 0.045]]), np.array([[0.0, 0.06 + min(y / 12, 0.6), 0.045] for y in range(25)])]
+    colliders = [wc.Capsule(radius=0.03, length=0.3, axis=(0.0, 0.0, 1.0), position=each) for each in rods]
+    given = {"density": 0.15, "terms": [wc.Spring(pairs="edges", stiffness=1e4)], "fps": 24.0, "duration": 1.0}
+    return wc.Scene(wc.Mesh(points, triangles), colliders=colliders, contact=wc.Contact(distance=2e-3), **given)
+
+
+def loaded(**given):
+    """A chain without gravity that a force of 2 N pulls down."""
+    mesh = wc.Mesh.chain(6, length=1.0, direction=(0.0, -1.0, 0.0))
+    load = wc.Force(vertices=[5], force=(0.0, -2.0, 0.0))
+    given = {"masses": np.full(6, 0.01), "gravity": (0.0, 0.0, 0.0), "duration": 0.5, **given}
+    return wc.Scene(mesh, terms=[wc.Spring(stiffness=1e5), *given.pop("terms", ())], loads=[load], **given)
+
+
+TIMES = np.arange(31) / 60.0
+UP = [0.0, 1.0, 0.0]
+BY_1_MM = {"contact": wc.Contact(distance=1e-3, stiffness=1e6), "terms": [wc.Attachment(vertices=[0], stiffness=1e-3)]}
+PULLED = {
+    "a ball lifts a sheet": lambda: held_sheet(np.arange(21) / 24.0),
+    "pins draw a sheet over a ball": lambda: held_sheet(np.arange(21) / 4.0, "pins"),
+    "a rod stretches a band": band,
+    "pins part by 20 times the chain": lambda: moved_apart(20.0),
+    "a pin lifts a load": lambda: loaded(pins=wc.Pins([0], np.multiply(0.15 * TIMES[:, None, None] ** 2, UP))),
+    "a box lifts a load": lambda: loaded(
+        colliders=[wc.Box(size=(1.0, 0.1, 1.0), position=np.multiply(0.03 * TIMES[:, None], UP) - [0.0, 1.051, 0.0])], **BY_1_MM
+    ),
+}
+
+
+@pytest.mark.host
+@pytest.mark.parametrize("name", PULLED)
+def test_what_moves_may_pull_cloth_from_what_holds_it(name, device):
+    """Each was called not usable or diverged: pulling stores more in cloth than its motion has, and loads more than gravity."""
+    status = wc.simulate(PULLED[name](), wc.Newton(substeps=16), device=device, dtype="float64").status
+    assert status.ok, status.message
+
+
+@pytest.mark.parametrize("way", [1e-3, 0.3, 1.0, 3.0, 1e3])
+def test_the_energy_of_a_pull_is_that_of_its_springs(way, device):
+    """Σ½k way² of the springs that join what is held to the rest, in all directions: 0.9 to 3 times as much."""
+    directions = np.random.default_rng(0).normal(size=(200, 3))
+    points = np.vstack([np.zeros(3), directions / np.linalg.norm(directions, axis=1)[:, None]])
+    mesh = wc.Mesh(points, edges=np.column_stack([np.zeros(200, int), np.arange(1, 201)]))
+    scene = wc.Scene(mesh, masses=np.ones(201), terms=[wc.Spring(stiffness=3.0)], pins=[0])
+    model = scene.build(device=device, dtype="float64")
+    energy = pulled(Watch(model, wc.Newton(substeps=1).bind(model)).balance, way, held_coordinates(scene))
+    assert 0.9 <= energy[0] / (200 * 1.5 * way**2) <= 3.0
 
 
 def test_each_copy_has_a_balance_of_its_own(device):

@@ -43,6 +43,14 @@ def test_an_impact_does_not_stall(device):
 
 
 @pytest.mark.host
+@pytest.mark.parametrize("seed", [399, 480])
+def test_what_colliders_stretch_has_not_diverged(seed, device):
+    """Shapes draw pinned cloth out to 24 and 90 times its length, in the first case as exact steps do."""
+    animation, condemned = run_case(random_case(seed), device)
+    assert condemned == [] and animation.status.complete and animation.worst_strain > 20.0
+
+
+@pytest.mark.host
 def test_no_crossing_after_a_line_search_for_the_direction(device):
     """Projective dynamics shortens directions where φ rose, by trials elsewhere, from where iterates must not be bounded."""
     _, condemned = run_case(random_case(43), device)

@@ -4,6 +4,7 @@ A state is compared with all states that are physically possible, so a condemnat
 scene has such frames. Errors below the tolerances pass, and each judge says what they are.
 """
 
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -295,8 +296,8 @@ def energy_available(run):
     w²/4; cloth that only wind touches is judged in the frame of the wind, where air only brakes.
 
     Else colliders that move estimate it: one of relative velocity V turns a speed of v into v + 2V at most, and is taken to
-    do so :data:`HITS` times. Displacements D of what holds or touches pinned cloth may stretch it, by the energy 2kD².
-    None if loads have keyframes.
+    do so :data:`HITS` times. What they store in cloth that something else holds is :func:`pulled_energies`. None if loads have
+    keyframes.
     """
     V = rest_frame(run)
     exact = V is not None
@@ -311,9 +312,49 @@ def energy_available(run):
         return A + start, True
     M, relative = run.masses.sum(), _obstacle_speed(run, V)
     A = A + 0.5 * M * (np.sqrt(2.0 * start / M) + 2.0 * HITS * relative) ** 2
+    return A + pulled_energies(run, relative), False
+
+
+def pulled_energies(run, speed):
+    """Returns the elastic energy that colliders may store in cloth that something else holds, (F+1,) [J].
+
+    In the frame of reference of a collider, only pins and other colliders do work. If they move vertices at w, their power on
+    elastic cloth is Σ ∇U·w over the elements that join such a vertex to another, for springs at most √(2U Σk) w. So √U grows
+    by at most √(½Σk) times the way, wherever the cloth is. ½Σk way² is the energy of the start with those vertices moved that
+    far along these springs; it is summed over the axes, each the mean of both senses, as springs have all directions: 0.9 to 3
+    times as much.
+    Pins move the same vertices all the time, colliders those that they may touch in a step.
+
+    Args:
+        run: The :class:`Run`.
+        speed: The largest speed of a collider or pin relative to another [m/s].
+    """
+    found, alone = np.zeros(len(run.x)), copy(run)
+    alone.pins = None
     if run.pins is not None:
-        A = A + 2.0 * max(term.stiffness for term in run.scene.terms) * (relative * run.times) ** 2
-    return A, False
+        found += _of_moves(run, np.broadcast_to(~run.free, found.shape + run.free.shape), speed * run.times)
+    if len(run.colliders) > 1 and rest_frame(alone) is None:
+        touched, one_step = _touched(run, speed), np.full(len(found), speed * run.h)
+        of_others = [np.delete(touched, c, axis=0).any(axis=0) & run.free for c in range(len(touched))]
+        found += np.min([np.cumsum(np.sqrt(_of_moves(run, moved, one_step))) ** 2 for moved in of_others], axis=0)
+    return found
+
+
+def _touched(run, speed):
+    """Returns which vertices each collider may touch in the step before each frame, (C, F+1, n)."""
+    ways = np.zeros(run.x.shape[:2])
+    ways[1:] = np.linalg.norm(np.diff(run.x, axis=0), axis=2) + speed * run.h
+    found = [gaps < run.scene.contact.distance + ways for gaps in run.distances]
+    return np.array(found) & (run.times > 0.0)[:, None]
+
+
+def _of_moves(run, moved, ways):
+    """Returns the energy that moving vertices (F+1, n) of the start by ways (F+1,) adds, see :func:`pulled_energies`."""
+    after, energy = copy(run), np.zeros(len(ways))
+    for direction in np.concatenate([np.eye(3), -np.eye(3)]):
+        after.x = run.x[0] + (ways[:, None] * moved)[..., None] * direction
+        energy += 0.5 * elastic_energies(after)
+    return np.maximum(energy - 3.0 * elastic_energies(run)[0], 0.0)
 
 
 def _forces(run):

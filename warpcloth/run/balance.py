@@ -30,6 +30,7 @@ from ..base.turns import TURN
 from ..core.energy import Energy
 from ..core.sums import Sums
 from ..fast.plan import plan
+from ..kernels.terms.air import AIR
 from ..scene.colliders import Collider
 from ..scene.scene import Pins
 from .sources import common_velocity, source_of
@@ -121,7 +122,10 @@ class Balance:
     Attributes:
         mass, total: Masses of the free vertices (B, n) and their sum (B,) [kg].
         free: Whether no pin, attachment or rail holds it.
+        gravity: Of each copy, (B, 3) [m/s²].
+        loads: Constant loads on cloth that is held, (B, n, 3) [N], or None.
         elastic: :class:`Elastic` of the model.
+        attached: Whether attachments hold it.
         sources: The sources of the scene.
         points: Positions of the frame that is checked, (B·n, 3) [m].
         has, given: Energy of each copy, and the energy that its sources can have added, in the last checked frame, (B,) [J].
@@ -144,12 +148,12 @@ class Balance:
         held = any(elements.term.vertices == 1 and not elements.cells for elements in model.terms)
         held = held or any(each.is_mesh for each in model.scene.colliders)
         self.free = not (held or len(model.scene.fixed) or model.mobility is not None)
-        self._gravity = model.gravity.numpy().astype(np.float64)
+        self.gravity = model.gravity.numpy().astype(np.float64)
         constant = None if model.loads is None or self.free else model.loads.constant
-        self._pull = None if constant is None else model.in_scene_order(constant.reshape(-1, 3)).reshape(constant.shape)
+        self.loads = None if constant is None else model.in_scene_order(constant.reshape(-1, 3)).reshape(constant.shape)
         self._start = points.reshape(model.copies, -1, 3)
-        attached = any(each.term.vertices == 1 and each.collider is None and not each.cells for each in model.terms)
-        self._velocity, self._time = np.zeros(3) if attached else common_velocity(model.scene), 0.0
+        self.attached = any(each.term.vertices == 1 and each.collider is None and not each.cells for each in model.terms)
+        self._velocity, self._frame = np.zeros(3) if self.attached else common_velocity(model.scene), 0
         self._moment, self._fastest = self._moments(points), np.zeros(model.copies)
         self._rounding = np.zeros(model.copies)
         self.elastic = Elastic(model)
@@ -186,7 +190,7 @@ class Balance:
         """
         with np.errstate(all="ignore"):
             points, velocities = points.astype(np.float64, copy=False), velocities.astype(np.float64, copy=False)
-            self._time = frame / self.model.scene.fps
+            self._frame = frame
             kinetic, height = self.kinetic(velocities), self._height(points)
             self._h = min(self._h, self._stepper.h)
             if self.free:
@@ -194,7 +198,7 @@ class Balance:
             self.points = points
             self._lowest = np.fmin(self._lowest, height)
             per_frame = 1.0 / self.model.scene.fps
-            speed = self._fastest + np.linalg.norm(self._gravity, axis=1) * per_frame
+            speed = self._fastest + np.linalg.norm(self.gravity, axis=1) * per_frame
             given = sum(source.energy(frame, speed) for source in self.sources) - self._lowest
             given = given + self._rounding * frame * per_frame / self._h + self._rounded_height
             carried = max(source.speed(frame) for source in self.sources)
@@ -260,6 +264,12 @@ class Balance:
         return np.where(converged, added, 0.0)
 
     @cached_property
+    def cloth(self):
+        """:class:`Elastic` of the model without contact and air."""
+        terms = [each for each in self.model.terms if each.collider is None and each.term is not AIR]
+        return type(self.elastic)(self.model.with_terms(terms))
+
+    @cached_property
     def _strained(self):
         """The elastic energy of a uniform strain of :data:`STRAIN`, (B,) [J]."""
         model, elastic = self.model, self.elastic
@@ -285,7 +295,7 @@ class Balance:
     @property
     def weighs(self):
         """Whether gravity acts on each copy, (B,)."""
-        return self._gravity.any(axis=1)
+        return self.gravity.any(axis=1)
 
     def sentence(self, copy):
         """Returns the part of a message that says how much energy a copy has gained by the last frame."""
@@ -305,7 +315,8 @@ class Balance:
         with TURN:
             x = self.elastic.put(points)
             energy, gaps = self.elastic.energy(x)[copy], self.elastic.gaps(x, self.elastic.hard)[copy]
-        return energy <= GAIN * self.given[copy] and gaps < 0.5 * stretch**2
+            given = self.given + sum(source.stored(self._frame) for source in self.sources)
+        return energy <= GAIN * given[copy] and gaps < 0.5 * stretch**2
 
     def _gain(self, kinetic, height, carried, given):
         self.has, self.given = self._relative(kinetic, carried) + height - self._lowest, given
@@ -321,7 +332,7 @@ class Balance:
         rounded = 4.0 * np.finfo(self.model.numpy_dtype).eps * farthest
         stored = self._strained * (rounded / (STRAIN * self._edge)) ** 2
         self._rounding = np.fmax(0.5 * self.total * (rounded / self._h) ** 2 + stored, self._rounding)
-        self._rounded_height = self.total * np.linalg.norm(self._gravity, axis=1) * rounded
+        self._rounded_height = self.total * np.linalg.norm(self.gravity, axis=1) * rounded
 
     def _moments(self, points):
         return np.einsum("bi,bij->bj", self.mass, points.reshape(*self.mass.shape, 3))
@@ -330,16 +341,16 @@ class Balance:
         """Returns the potential energy of gravity and constant loads since the start, (B,) [J]; 0 for a free cloth."""
         if self.free:
             return np.zeros(self.model.copies)
-        moved = self._time * self._velocity
-        height = -((self._moments(points) - self._moment - self.total[:, None] * moved) * self._gravity).sum(axis=1)
-        if self._pull is not None:
-            height = height - (self._pull * (points.reshape(self._pull.shape) - self._start - moved)).sum(axis=(1, 2))
+        moved = self._frame / self.model.scene.fps * self._velocity
+        height = -((self._moments(points) - self._moment - self.total[:, None] * moved) * self.gravity).sum(axis=1)
+        if self.loads is not None:
+            height = height - (self.loads * (points.reshape(self.loads.shape) - self._start - moved)).sum(axis=(1, 2))
         return height
 
     def _at_positions(self, points, velocities):
         """Returns the velocities at the time of the positions, half a step later."""
         mass, shape = self.mass[..., None], (*self.mass.shape, 3)
-        forces = mass * self._gravity[:, None] - self.elastic.gradient(self.elastic.put(points)).reshape(shape)
+        forces = mass * self.gravity[:, None] - self.elastic.gradient(self.elastic.put(points)).reshape(shape)
         if self.model.loads is not None:
             forces = forces + self.model.in_scene_order(self.model.loads.force.numpy()).reshape(shape)
         kicks = np.divide(forces, mass, out=np.zeros(shape), where=mass > 0.0)

@@ -14,6 +14,7 @@ from ..scene.colliders import Collider
 from ..scene.scene import Pins
 from ..solvers.solver import Stepper
 from ..terms.loads import Loads
+from .pulling import Pull, held_coordinates, pulled
 
 # If there are more patches of pins than this, all pins are treated as one patch.
 _PATCHES = 32
@@ -104,9 +105,9 @@ class MovingPins(Source):
 
     Pins joined by edges form a patch. If a patch moves as a rigid body, the cloth can move with it and keep its energy relative
     to that motion. A change δ of the speed of a patch, over the whole cloth, adds at most ½δ² + δ·speed per unit mass. Apart
-    from that, only lifting adds energy. Patches that move relative to one another store at most the energy of the start
-    deformed by them, each vertex by the mean of their motions with weights 1/distance². Where there are meshes, which may hold
-    the cloth back, also a single patch stores energy: at most that of the start with all other vertices as they were.
+    from that, only motion against gravity and constant loads adds energy. Patches that move relative to one another store at
+    most the energy of the start deformed by them, each vertex by the mean of their motions with weights 1/distance². From
+    colliders, which may hold the cloth back, also a single patch pulls it, see :mod:`warpcloth.run.pulling`.
     """
 
     name = "moving pins"
@@ -130,11 +131,13 @@ class MovingPins(Source):
             for found, of_maps, of_pins in ((speeds, moves, own), (kicks, turns, own_turns)):
                 mean = np.sqrt(np.maximum(np.einsum("fij,jk,fik->f", of_maps, spread, of_maps), 0.0))
                 found.append(scene.fps * (mean + np.linalg.norm(of_pins, axis=-1).max(axis=1)))
-            rises.append((maps - maps[0]) @ middle)
+            rises.append(maps - maps[0])
         self._speeds, self._kicks = np.max(speeds, axis=0), np.max(kicks, axis=0)
-        gravity = balance.model.gravity.numpy().astype(np.float64)
-        heights = np.max(-np.einsum("pfi,bi->pfb", np.array(rises), gravity), axis=0)
-        self._lifted = balance.total * np.maximum.accumulate(np.maximum(heights, 0.0))
+        pull = np.einsum("b,bi,j->bij", balance.total, balance.gravity, middle)
+        if balance.loads is not None:
+            pull = pull + np.einsum("bni,nj->bij", balance.loads, points)
+        heights = np.max(-np.einsum("pfij,bij->pfb", np.array(rises), pull), axis=0)
+        self._lifted = np.maximum.accumulate(np.maximum(heights, 0.0))
 
     def _found(self):
         """Returns the indices of the pins of each patch."""
@@ -181,18 +184,20 @@ class MovingPins(Source):
         return self._speeds[frame] if frame < len(self._speeds) else 0.0
 
     def stored(self, frame):
-        elastic, pins = self._balance.elastic, self._balance.model.scene.pins.vertices
+        cloth, scene, pins = self._balance.cloth, self._balance.model.scene, self._balance.model.scene.pins.vertices
         while self._seen < min(frame, len(self._frames) - 1):
             self._seen += 1
             moved = np.zeros_like(self._points)
             for weight, maps in zip(self._weights.T, self._maps, strict=True):
                 matrix = maps[self._seen]
                 moved += weight[:, None] * (self._points @ matrix[:, :3].T + matrix[:, 3])
-            for points in (moved, self._points.copy()) if self._balance.model.scene.meshes else (moved,):
-                points[pins] = self._frames[self._seen]
-                x = elastic.put(np.tile(points, (self._balance.model.copies, 1)))
-                self._stored = np.maximum(self._stored, elastic.energy(x))
-        return self._stored
+            moved[pins] = self._frames[self._seen]
+            x = cloth.put(np.tile(moved, (self._balance.model.copies, 1)))
+            self._stored = np.maximum(self._stored, cloth.energy(x))
+        if not scene.colliders:
+            return self._stored
+        way = np.linalg.norm(np.diff(self._frames[: frame + 1], axis=0), axis=-1).max(axis=1).sum()
+        return np.maximum(self._stored, pulled(self._balance, way, held_coordinates(scene)))
 
 
 class DrivenLoads(Source):
@@ -283,7 +288,8 @@ class MovingCollider(Source):
     """A collider that keyframes move.
 
     In a frame in which its surface moves at V, it may give each vertex a velocity of up to 2V, as a bat does to a ball, and
-    lift it by V over the frame rate. A half-space that turns counts as large as the cloth.
+    move it against gravity and constant loads by V over the frame rate. A half-space that turns counts as large as the cloth.
+    It also pulls cloth that something else holds, see :class:`warpcloth.run.pulling.Pull`.
     """
 
     name = "moving colliders"
@@ -295,18 +301,23 @@ class MovingCollider(Source):
             extent = np.linalg.norm(scene.positions - poses[0, :3], axis=1).max() + np.ptp(scene.positions, axis=0).max()
         turns = 2.0 * np.arccos(np.clip(np.abs((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1)), 0.0, 1.0))
         moves = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + extent * turns
-        deforms = collider.deforms
-        frames = max(len(moves), len(deforms))
-        moves, deforms = (np.append(each, np.zeros(frames - len(each))) for each in (moves, deforms))
+        frames = max(scene.frames, len(moves), len(collider.deforms))
+        moves, turns, deforms = (np.append(each, np.zeros(frames - len(each))) for each in (moves, turns, collider.deforms))
         moves += deforms
+        self._pull = Pull(collider, turns, deforms, balance)
         self._speeds = np.append(0.0, scene.fps * moves)
         self._lifts = np.cumsum(np.append(0.0, moves))
-        self._gravity = np.linalg.norm(balance.model.gravity.numpy().astype(np.float64), axis=1)
+        self._weight = balance.total * np.linalg.norm(balance.gravity, axis=1)
+        if balance.loads is not None:
+            self._weight = self._weight + np.linalg.norm(balance.loads, axis=2).sum(axis=1)
 
     def energy(self, frame, speed):
         speeds = 2.0 * self._speeds[: frame + 1]
-        lifted = self._gravity * self._lifts[min(frame, len(self._lifts) - 1)]
-        return self._balance.total * (0.5 * (speeds**2).sum() + speeds.sum() * speed + lifted)
+        lifted = self._weight * self._lifts[min(frame, len(self._lifts) - 1)]
+        return self._balance.total * (0.5 * (speeds**2).sum() + speeds.sum() * speed) + lifted
+
+    def stored(self, frame):
+        return self._pull.energy(frame)
 
 
 @source_of.register
