@@ -20,7 +20,7 @@ from warpcloth.contact.self_start import crossings
 from warpcloth.core.status import Result
 from warpcloth.kernels.contact.pair_blocks import BLOCK
 from warpcloth.kernels.contact.self_pairs import begin_pairs
-from warpcloth.scenes import loop
+from warpcloth.scenes import knot, loop
 
 SLOW = pytest.mark.slow
 SOLVERS = {
@@ -716,6 +716,21 @@ def test_crossings():
     edges, triangles = np.array([[3, 4], [5, 6], [0, 4]]), np.tile([[[0, 1, 2]]], (3, 1, 1))
     ((edge, triangle),) = crossings(points, edges, triangles)
     assert edge.tolist() == [3, 4] and triangle.tolist() == [0, 1, 2]
+
+
+def test_an_edge_in_line_with_a_triangle_does_not_cross_it():
+    """Of a straight row of triangles, in which rounding decides on which side of another an edge begins and ends."""
+    random = np.random.default_rng(0)
+    row = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [3, 0, 0]])
+    turns = np.linalg.qr(random.normal(size=(1000, 3, 3)))[0]
+    points = (row @ turns + random.normal(size=(1000, 1, 3))).reshape(-1, 3)
+    first = 5 * np.arange(1000)[:, None]
+    assert crossings(points, first + [3, 4], (first + [0, 1, 2])[:, None]) == []
+
+
+@pytest.mark.parametrize(("along", "across"), [(120, 10), (240, 5), (240, 10)])
+def test_a_knot_of_finer_strips_starts(along, across, device):
+    pairs_of(knot.scene(along=along, across=across), device)
 
 
 @pytest.mark.parametrize(("stretch", "away"), [(1.0, 0.05), (3.0, 0.28)])

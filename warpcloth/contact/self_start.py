@@ -165,17 +165,21 @@ def _triangles_of(model, edges):
 
 
 def crossings(points, edges, triangles):
-    """Returns the edges (E, 2) that intersect one of the ``triangles`` (E, m, 3) of each, with that: [(edge, triangle), …]."""
+    """Returns the edges (E, 2) that intersect one of the ``triangles`` (E, m, 3) of each, with that: [(edge, triangle), …].
+
+    An edge that crosses the plane of a triangle does so at a point of its own, which must be inside the triangle. In a straight
+    row of triangles, where it is rounding that decides whether the edge crosses the plane, that point is therefore outside of
+    others in the row. If an edge that lies in the plane touches the triangle, the gap to one of its sides or corners is 0.
+    """
     edges = np.repeat(edges, triangles.shape[1], axis=0)
     triangles = triangles.reshape(-1, 3)
     apart = ~(edges[:, :, None] == triangles[:, None, :]).any(axis=(1, 2))
     edges, triangles = edges[apart], triangles[apart]
-    (p, q), (a, b, c) = points[edges].swapaxes(0, 1), points[triangles].swapaxes(0, 1)
-
-    def volume(a, b, c, d):
-        return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)
-
-    through = volume(a, b, c, p) * volume(a, b, c, q) < 0.0
-    sides = np.sign([volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)])
-    through &= (sides >= 0.0).all(axis=0) | (sides <= 0.0).all(axis=0)
+    (p, q), corners = points[edges].swapaxes(0, 1), points[triangles].swapaxes(0, 1)
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    above, below = (np.einsum("ij,ij->i", normal, end - corners[0]) for end in (p, q))
+    through = above * below < 0.0
+    at = p + np.divide(above, above - below, out=np.zeros_like(above), where=through)[:, None] * (q - p)
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        through &= np.einsum("ij,ij->i", normal, np.cross(end - start, at - start)) >= 0.0
     return list(zip(edges[through], triangles[through], strict=True))
