@@ -104,14 +104,16 @@ def add_positions(dtype):
 
 @cache
 def find_drift(dtype):
-    """Kernel over pieces: their drift from ``found`` to x; 0 if it is not finite."""
+    """Kernel over pieces: their drift from ``found`` to x + d, d (N,) or None; 0 if it is not finite."""
     vec3, _ = types(dtype)
+    vector_or_zero = vector_within(dtype)
     numbers = wp.types.vector(SAMPLES, dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def find_each_drift(
         # state in
         x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
         found: wp.array(dtype=vec3),
         # in and out
         pieces: pieces(dtype),
@@ -122,7 +124,10 @@ def find_drift(dtype):
             sorted = numbers()
             for k in range(SAMPLES):
                 i = pieces.samples[p * SAMPLES + k]
-                own = x[i][axis] - found[i][axis]
+                own = x[i][axis]
+                if d:
+                    own += vector_or_zero(d, i)[axis]
+                own -= found[i][axis]
                 at = k
                 while at > 0:
                     if sorted[at - 1] <= own:
@@ -140,19 +145,20 @@ def find_drift(dtype):
 
 @cache
 def find_motion(dtype):
-    """Kernel over vertices: finds copies in which a vertex has moved by more than ``most`` since ``found``.
+    """Kernel over vertices: finds copies in which a vertex at x + d has moved by more than ``most`` since ``found``.
 
     The motion is relative to the drift of the piece. moved = 1 for such copies among the ``active`` ones, and some = 1 if there
-    is one; due = 1 then, and if the pairs were not listed at ``found``.
+    is one; due = 1 then. d is (N,) or None.
     """
     vec3, _ = types(dtype)
+    vector_or_zero = vector_within(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def find_each_motion(
         # state in
         x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
         found: wp.array(dtype=vec3),
-        listed: wp.array(dtype=vec3),
         # parameters
         active: wp.array(dtype=wp.int32),
         most: dtype,
@@ -164,11 +170,12 @@ def find_motion(dtype):
         due: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        if not (wp.length_sq(found[i] - listed[i]) <= dtype(0.0)):
-            due[0] = 1
         p = pieces.piece[i]
         if p >= 0:
-            own = wp.length((x[i] - found[i]) - pieces.drift[p])
+            at = x[i]
+            if d:
+                at = at + vector_or_zero(d, i)
+            own = wp.length((at - found[i]) - pieces.drift[p])
             if not (own <= most):
                 note_moved(active, p // pieces.per_copy, moved, some, due)
             if pieces.per_copy > 1:
@@ -188,8 +195,8 @@ def find_motion_of_pieces(dtype):
     def find_motion_of_each_piece(
         # state in
         x: wp.array(dtype=vec3),
+        d: wp.array(dtype=vec3),
         found: wp.array(dtype=vec3),
-        listed: wp.array(dtype=vec3),
         # parameters
         active: wp.array(dtype=wp.int32),
         most: dtype,
@@ -204,22 +211,41 @@ def find_motion_of_pieces(dtype):
         copy = wp.tid()
         drift = pieces.drift[copy]
         moving = per_copy
-        other = per_copy
         i = copy * per_copy
         end = i + per_copy
+        if d:
+            while i < end:
+                own = vector(x, i) + vector(d, i) - vector(found, i) - drift
+                moving -= wp.where(wp.dot(own, own) <= most * most, 1, 0)
+                i += 1
         while i < end:
-            at_list = vector(found, i)
-            own = vector(x, i) - at_list - drift
-            apart = at_list - vector(listed, i)
+            own = vector(x, i) - vector(found, i) - drift
             moving -= wp.where(wp.dot(own, own) <= most * most, 1, 0)
-            other -= wp.where(wp.dot(apart, apart) <= dtype(0.0), 1, 0)
             i += 1
-        if other != 0:
-            due[0] = 1
         if moving != 0:
             note_moved(active, copy, moved, some, due)
 
     return find_motion_of_each_piece
+
+
+@cache
+def compare_lists(dtype):
+    """Kernel over vertices: due = 1 if the pairs were not listed at ``found``."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def compare_each_listed(
+        # state in
+        found: wp.array(dtype=vec3),
+        listed: wp.array(dtype=vec3),
+        # out
+        due: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        if not (wp.length_sq(found[i] - listed[i]) <= dtype(0.0)):
+            due[0] = 1
+
+    return compare_each_listed
 
 
 @cache

@@ -523,7 +523,7 @@ def test_steps_with_nothing_near_are_those_with_contact(name, speed, device, mon
         stepper = SOLVERS[name].bind(bent.build(device=device, copies=2))
         near = stepper.pairs.near
         if not tested:
-            monkeypatch.setattr(wp, "capture_if", partial(launch_always, (stepper.pairs.listed, near.array)))
+            monkeypatch.setattr(wp, "capture_if", partial(launch_always, (stepper.pairs.listed, stepper.pairs.far, near.array)))
             monkeypatch.setattr(near, "read", lambda: np.ones(1, dtype=np.int32))
             stepper.record_again()
         for _ in range(3):

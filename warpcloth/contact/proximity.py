@@ -77,7 +77,7 @@ class Proximity:
         self._launch = model.launcher(
             ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
             ((kernels.write_pairs,), model.dtype),
-            ((piece_motion.extend_boxes, piece_motion.find_drift), model.dtype),
+            ((piece_motion.extend_boxes, piece_motion.find_drift, piece_motion.compare_lists), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.add_positions), model.dtype),
             ((piece_motion.find_motion_of_pieces,), model.dtype),
         )
@@ -212,12 +212,11 @@ class Proximity:
 
     def launch_kept(self, x, part, launch):
         """Calls ``launch`` with x if :meth:`moved` sets the flag, or if the list is not that of ``found``."""
-        self.moved(x, part)
+        for array in (self.flag, self.copies, self._due):
+            array.zero_()
+        self._launch(piece_motion.compare_lists, self._vertices, [self.found, self.listed], [self._due])
+        self._launch_moved_since(x, part, None, self.flag)
         wp.capture_if(self._due, launch, x=x)
-
-    def launch_drift(self, x):
-        """Finds the drift of each piece from ``found`` to x (V,)."""
-        self._launch(piece_motion.find_drift, len(self.drift), [x, self.found], [self._pieces])
 
     def moved(self, x, part=0.5, active=None):
         """Launches flag = 1 if pairs may be missing at x (V,), else 0, and returns it; ``copies`` is 1 for copies with such.
@@ -237,15 +236,19 @@ class Proximity:
         self.launch_moved_since(x, part, active, self.flag)
         return self.flag
 
-    def launch_moved_since(self, x, part, active, flag):
-        """Launches ``flag`` (1,) = 1 where :meth:`moved` sets it, which does not change it otherwise."""
+    def launch_moved_since(self, x, part, active, flag, correction=None):
+        """Launches ``flag`` (1,) = 1 where :meth:`moved` sets it, at x (V,) + ``correction`` (N,); else it stays."""
         for array in (self.copies, self._due):
             array.zero_()
+        self._launch_moved_since(x, part, active, flag, correction)
+
+    def _launch_moved_since(self, x, part, active, flag, correction=None):
         several = self._pieces.per_copy > 1
         if several:
             self._pieces.motion.zero_()
-        self.launch_drift(x)
-        given, out = [x, self.found, self.listed, active, part * self.skin], [self._pieces, self.copies, flag, self._due]
+        at = [x, correction, self.found]
+        self._launch(piece_motion.find_drift, len(self.drift), at, [self._pieces])
+        given, out = [*at, active, part * self.skin], [self._pieces, self.copies, flag, self._due]
         if self._whole:
             given.append(self.model.per_copy)
             self._launch(piece_motion.find_motion_of_pieces, self.model.copies, given, out)

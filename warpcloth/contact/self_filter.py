@@ -89,9 +89,7 @@ class SelfFilter:
             if self._surface.moves:
                 self._contact.launch_sides(self._contact.x_before)
         self._launch_meshes(self._contact.placed[2])
-        wp.copy(self._other, x, count=model.count)
-        if self._surface.obstacles:
-            wp.copy(self._surface.behind(self._other), self._surface.behind(self._contact.x_before))
+        self._put(self._other, x)
         walk = partial(self._launch_end, x, v, move, parts)
         self._contact.launch_near(self._other, walk, walk)
         if self._lets_out:
@@ -127,9 +125,12 @@ class SelfFilter:
         given = [model.inverse_mass, self._share, contact.x_before]
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
 
-    def launch_fresh(self, x, launch, active=None):
-        """Calls ``launch`` with x if the next round might miss a pair of ``active`` copies (B,), or of any if None."""
-        wp.capture_if(self._contact.proximity.moved(x, WAY, active), launch, x=x)
+    def launch_fresh(self, x, launch, active=None, part=WAY):
+        """Calls ``launch`` with x if ``active`` copies (B,), or any if None, have moved by ``part`` of the skin.
+
+        With WAY the next round can miss no pair, with ½ none is missing at x.
+        """
+        wp.capture_if(self._contact.proximity.moved(x, part, active), launch, x=x)
 
     def _launch_rounds(self, x):
         """Moves x towards the target, as far as pairs stay apart, in copies that are ``_walking``."""
@@ -383,10 +384,10 @@ class SelfFilter:
         self.launch_limit(self._direction)
         self._add(before, self._direction, 1.0, d)
 
-    def launch_trial(self, base, d, active=None):
-        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if vertices have moved far enough."""
+    def launch_trial(self, base, d, active=None, part=WAY):
+        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if they have moved by ``part`` of the skin."""
         self._add(base, d, 1.0, self._contact.x_before, active)
-        self.launch_fresh(self._contact.x_before, self._contact.relist, active)
+        self.launch_fresh(self._contact.x_before, self._contact.relist, active, part)
 
     def launch_limit(self, direction, whole=False):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
@@ -413,11 +414,20 @@ class SelfFilter:
         self._add(contact.x_before, direction, 1.0, target)
         contact.launch_near(target, listed, far)
 
-    def launch_look(self, base, d, w):
-        """Lists the pairs at base + d, and tests whether the way from there by −w (N,) may be near other cloth."""
-        self.launch_trial(base, d)
-        self._add(self._contact.x_before, w, -1.0, self._other)
-        self._contact.launch_look(self._other)
+    def launch_look(self, base, ends):
+        """Sets ``near`` to 0 if no pair is listed, and none can be missing at base + d for d of ``ends``, else to 1.
+
+        If d of the last :meth:`launch_look` or :meth:`launch_trial` was not near, pairs stay apart on the ways from there too.
+        """
+        near, x = self._contact.near.array, self._other
+        wp.copy(near, self._contact.listed)
+        self._put(x, base)
+        for d in ends:
+            self._contact.proximity.launch_moved_since(x, 0.5, None, near, d)
+
+    def launch_near_trial(self, base, d):
+        """Launches :meth:`launch_trial` if :meth:`launch_look` found that pairs may be near."""
+        wp.capture_if(self._contact.near.array, self.launch_trial, base=base, d=d, part=0.5)
 
     def launch_follow(self, base, d):
         """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs."""
@@ -427,6 +437,12 @@ class SelfFilter:
         self.launch_limit(direction)
         self._add(x, direction, 1.0, x)
         self.launch_fresh(x, self._contact.relist)
+
+    def _put(self, out, x):
+        """Sets positions (V,) to x (N,), with the obstacles where they are now."""
+        wp.copy(out, x, count=self.model.count)
+        if self._surface.obstacles:
+            wp.copy(self._surface.behind(out), self._surface.behind(self._contact.x_before))
 
     def _add(self, a, b, sign, out, active=None):
         count = min(len(a), len(out))

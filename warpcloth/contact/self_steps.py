@@ -77,9 +77,10 @@ class SelfSteps:
         pairs, begun: The listed pairs, and their gaps at ``begun_at`` (V,), of :mod:`warpcloth.kernels.contact.self_pairs`.
         x_before: Positions at the start of the step, or of an iterate, and of obstacles behind them, (V,) [m].
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
-        near: The :class:`warpcloth.core.capture.Mirror` of what :meth:`launch_look` found, (1,) int32.
+        near: The :class:`warpcloth.core.capture.Mirror` of what :meth:`.SelfFilter.launch_look` found, (1,) int32.
         lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
         listed: 1 if the last list has pairs, else 0, (1,) int32.
+        far: 1 if pairs that are not listed may meet on the way of the last :meth:`launch_near`, else 0, (1,) int32.
         stale: Whether the capacity of lists has grown outside of steps, so that graphs must be recorded again.
     """
 
@@ -101,7 +102,7 @@ class SelfSteps:
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32), Count())
         self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
-        self.listed, self._ends = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self.listed, self.far, self._ends = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
         notes = {
             "nearest": state.add("nearest", model.scalars(wp.float64)),
             "too_near": state.add("first too near", model.scalars(wp.int64)),
@@ -312,17 +313,11 @@ class SelfSteps:
             self.contact.launch_rows(x)
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
-    def launch_look(self, x):
-        """Launches ``near`` = 0 if no pair is listed and none can be missing on a straight way to x (V,), else 1."""
-        wp.copy(self.near.array, self.listed)
-        self.proximity.launch_moved_since(x, 0.5, None, self.near.array)
-
     def launch_near(self, x, listed, others):
         """Calls ``others`` if pairs that are not listed may meet on the way to x (V,), else ``listed`` if any is listed."""
-        near = self.near.array
-        near.zero_()
-        self.proximity.launch_moved_since(x, 0.5, None, near)
-        wp.capture_if(near, others, lambda: wp.capture_if(self.listed, listed))
+        self.far.zero_()
+        self.proximity.launch_moved_since(x, 0.5, None, self.far)
+        wp.capture_if(self.far, others, lambda: wp.capture_if(self.listed, listed))
 
     # Obstacles.
 

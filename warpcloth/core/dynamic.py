@@ -232,11 +232,20 @@ class Dynamic:
     def add_energy(self, sums, out, stored=False):
         """out (B,) += U, or the part of it that is ``stored`` in the state."""
         terms = [each for each in self.terms if each.stored or not stored]
-        if terms:
+
+        def add():
             self._energies.zero_()
             for each in terms:
                 wp.capture_if(each.present, partial(each.add_energies, self._energies))
             sums.sum(self._energies, self.model.per_copy, out, accumulate=1)
+
+        self.when_present(add, terms)
+
+    def when_present(self, launch, terms=None):
+        """Calls ``launch`` if there may be elements of any of ``terms``, or of all."""
+        terms = self.terms if terms is None else terms
+        if terms:
+            wp.capture_if(terms[0].present, launch, partial(self.when_present, launch, terms[1:]))
 
     def add_diagonal(self, diagonal, values):
         """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""

@@ -6,6 +6,7 @@ import warp as wp
 from ..core.capture import Mirror, Segment
 from ..core.dynamic import dynamic_of
 from ..core.hessian import Hessian
+from ..kernels.accelerate import plain_step
 from ..kernels.contact.clear_elements import add_hessian
 from ..kernels.term import HessianPolicy
 from ..model.host_values import host_values
@@ -209,11 +210,12 @@ class PairSystem(CorrectedSystem):
     Args:
         model, x, linear: See :class:`CorrectedSystem`.
         sums: :class:`warpcloth.core.sums.Sums`.
+        d, w: d and A⁻¹∇ψ there (N,) [m], the caller's arrays.
     """
 
-    def __init__(self, model, x, linear, sums, pairs):
+    def __init__(self, model, x, linear, sums, pairs, d, w):
         super().__init__(model, x, linear)
-        self._pairs = pairs
+        self._pairs, self._d, self._w, self._plain_step = pairs, d, w, model.kernel(plain_step, model.dtype)
         self._sums, self._dynamic = sums, dynamic_of(model)
         trial, pull = model.vectors(), model.vectors()
         self._trial, self._pull, self._energy = Mirror(trial), Mirror(pull), Mirror(model.scalars())
@@ -224,12 +226,12 @@ class PairSystem(CorrectedSystem):
         device, trial = self.model.device, self._trial.array
         self._press = Segment(device, self._launch_press)
         self._bound = Segment(device, lambda: self._pairs.filter.launch_limit(self._pull.array))
-        self._look = Segment(device, lambda: self._pairs.filter.launch_look(self.x, trial, self._pull.array))
+        self._look = Segment(device, self._launch_look)
         self._assemble = Segment(device, lambda: self.matrix.assemble_after_gradient(self.x, 0.0, trial))
 
     def _launch_press(self):
         """Launches U and ∂U/∂x at the trial."""
-        self._pairs.filter.launch_trial(self.x, self._trial.array)
+        self._pairs.filter.launch_trial(self.x, self._trial.array, part=0.5)
         self._dynamic.launch(self.x, self._trial.array)
         self._energy.array.zero_()
         self._dynamic.add_energy(self._sums, self._energy.array)
@@ -237,12 +239,11 @@ class PairSystem(CorrectedSystem):
         self._dynamic.add_gradient(self._pull.array)
         self.model.lock(self._pull.array)
 
-    def _meets(self, d, w):
-        """Returns whether cloth may be near other cloth on the way from d to d − w."""
-        wp.copy(self._trial.array, d)
-        wp.copy(self._pull.array, w)
-        self._look()
-        return bool(self._pairs.near.read()[0])
+    def _launch_look(self):
+        """Tests whether cloth may be near other cloth on the way from d to d − w."""
+        given = [self._d, self._w, self._all, self.model.per_copy]
+        self.model.launch(self._plain_step, self.model.count, given, [self._trial.array])
+        self._pairs.filter.launch_look(self.x, (self._trial.array,))
 
     def _pressed(self, d):
         self._trial.write(d)
@@ -255,11 +256,12 @@ class PairSystem(CorrectedSystem):
         self._bound()
         return (self._scaled(self._pairs.filter.fraction.numpy(), each) for each in vectors)
 
-    def correct(self, d, gradient, w, active):
+    def correct(self, gradient, active):
         """Replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1. Away from other cloth w minimises ψ as it is."""
-        if not self._meets(d, w):
+        self._look()
+        if not self._pairs.near.read()[0]:
             return
-        d, b, found = (array.numpy().astype(np.float64) for array in (d, gradient, w))
+        d, b, found = (array.numpy().astype(np.float64) for array in (self._d, gradient, self._w))
         energy, pull = self._pressed(d)
         self._assemble()
         Aw, pressed = b, self._product(found)
@@ -280,4 +282,4 @@ class PairSystem(CorrectedSystem):
                 break
             step = np.where(wanted, 0.5 * step, step)
         self._found.write(self._scaled(step, found))
-        wp.copy(w, self._result)
+        wp.copy(self._w, self._result)

@@ -1,6 +1,7 @@
 """ADMM: implicit Euler split into element problems and a vertex problem, coupled by multipliers."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -182,7 +183,10 @@ class ADMMStepper(ImplicitStepper):
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._scale = ResidualScale(model).acceleration
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
-        self._pressed = PairSystem(model, self.state.x, self._factors, self._sums, self.pairs) if model.dynamic else None
+        self._pressed = None
+        if model.dynamic:
+            given = model, self.state.x, self._factors, self._sums, self.pairs, self.correction, self._w
+            self._pressed = PairSystem(*given)
         self._record()
         self.ready()
 
@@ -215,7 +219,7 @@ class ADMMStepper(ImplicitStepper):
         self._active.update(active)
         self._factors.solve(self._force, self._w)
         if self._pressed is not None:
-            self._pressed.correct(self.correction, self._force, self._w, active)
+            self._pressed.correct(self._force, active)
         self._move()
 
     def _ratios_of(self, elements, scale):
@@ -259,17 +263,26 @@ class ADMMStepper(ImplicitStepper):
             self._gradient.add(self.state.x, self._force, self.correction)
         self._inertia.add(self.correction, self._force)
         if self._gradient is not None:
-            self._sums.largest(model.inverse_mass, self._force, self._unbalanced.array)
+            self._launch_unbalanced()
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
             model.lock(forces)
             self._sums.largest(model.inverse_mass, forces, largest.array)
+
+    def _launch_unbalanced(self):
+        """Launches the largest unbalanced acceleration where the forces are not those of split terms alone, else 0."""
+        launch = partial(self._sums.largest, self.model.inverse_mass, self._force, self._unbalanced.array)
+        if self._whole:
+            launch()
+            return
+        self._unbalanced.array.zero_()
+        self._gradient.dynamic.when_present(launch)
 
     def _launch_move(self):
         model = self.model
         given = [self.correction, self._w, self._active.array, model.per_copy]
         model.launch(self._plain_step, model.count, given, [self.correction])
         if self.pairs is not None:
-            self.pairs.filter.launch_trial(self.state.x, self.correction)
+            self.pairs.filter.launch_near_trial(self.state.x, self.correction)
 
     def _each(self):
         return zip(self._terms, self._split, self._kernels, strict=True)
