@@ -193,7 +193,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
             while present != 0:
                 if (present & 1) != 0:
                     code = code_of(copy, kind, level)
-                    one, two = cells_about(grid.size, low, high, level)
+                    one, two = cells_about(grid.size, low, high, level, grid.extents[kind, level])
                     if wp.static(of_edges):
                         within = ordered and level == lowest
                         if within:

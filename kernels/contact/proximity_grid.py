@@ -59,7 +59,7 @@ def grids(dtype):
 
     Bucket b has the entries first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell, see
     :func:`code_of`. ``counts`` and ``keys`` are scratch. ``levels`` (4,) has a bit for each level with items of each
-    :func:`kind_in_grid`.
+    :func:`kind_in_grid`, and ``extents`` the largest half sizes of these along each axis [m].
     """
     vec3, _ = types(dtype)
 
@@ -67,6 +67,7 @@ def grids(dtype):
     class Grid:
         size: dtype
         levels: wp.array(dtype=wp.int32)
+        extents: wp.array2d(dtype=vec3)
         counts: wp.array(dtype=wp.int32)
         keys: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
@@ -134,12 +135,11 @@ def boxes(dtype):
         return wp.vec3i()
 
     @wp.func
-    def cells_about(size: dtype, low: vec3, high: vec3, level: int):
-        """The first and last cells of a level that can contain the centres of boxes that meet a box."""
+    def cells_about(size: dtype, low: vec3, high: vec3, level: int, extent: vec3):
+        """The first and last cells of a level with the centres of boxes that meet a box; half of theirs is in ``extent``."""
         if level < LEVELS:
             most = size * dtype(1 << level)
-            edge = vec3(most, most, most)
-            return cell_of(most, low - edge), cell_of(most, high + edge)
+            return cell_of(most, low - extent), cell_of(most, high + extent)
         return wp.vec3i(), wp.vec3i()
 
     return box_along, level_of, cell_at, cells_about
@@ -223,6 +223,9 @@ def count_items(dtype):
             kind = kind_in_grid(v, surface.groups[item])
             if (grid.levels[kind] & (1 << level)) == 0:
                 wp.atomic_or(grid.levels, kind, 1 << level)
+            own = dtype(0.5) * (high - low)
+            if wp.max(own - grid.extents[kind, level]) > dtype(0.0):  # few are
+                wp.atomic_max(grid.extents, kind, level, own)
             cell = cell_at(grid.size, low, high, level)
             key = bucket_of(cell[0], cell[1], cell[2], code_of(v[3] >> 1, kind, level), grid.counts.shape[0])
             wp.atomic_add(grid.counts, key, 1)

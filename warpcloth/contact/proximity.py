@@ -132,6 +132,7 @@ class Proximity:
         arrays = {name: wp.zeros(count, dtype=wp.int32, device=model.device) for name, count in counts.items()}
         for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("entries", wp.vec4i)):
             arrays[name] = wp.zeros(items, dtype=kind, device=model.device)
+        arrays["extents"] = wp.zeros((4, proximity_grid.LEVELS + 1), dtype=model.vec3, device=model.device)
         self._grid = filled(proximity_grid.grids(model.dtype), size=size, **arrays)
         self._buckets = Scan(model, buckets)
 
@@ -193,6 +194,7 @@ class Proximity:
     def _launch_grid(self, surface, x, p, searches, out):
         grid, items, model = self._grid, self._triangles + self._edges, self.model
         grid.levels.zero_()
+        grid.extents.zero_()
         if self.surface.obstacles:
             surface.lowest.fill_(np.inf)
             surface.highest.fill_(-np.inf)
