@@ -22,6 +22,7 @@ from typing import Any
 import warp as wp
 
 from ..memory import load
+from ..terms.contact import bend
 from ..vectors import types
 from .obstacles import Layout, cloth_vertex, has_obstacle, in_copy
 from .self_gaps import CORNER, EDGE, INSIDE, ONE, SIDE, ZERO, along, gap_along, in_plane, nearest_of_face, vertex_of
@@ -139,8 +140,9 @@ class Contacts:
     first vertex of the cloth with w = 0 in place of each obstacle. Obstacles give the ``offset`` o = Σ wⱼXⱼ [m] of their
     positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,).
 
-    The ``share`` of a contact is the sum of m over its side of the vertex, divided by that of positive m. Sweeps compute this
-    share of its force anew, and leave the rest ``fixed``, see :mod:`.pair_follow`.
+    The ``share`` of a contact is the curvature Σ kA φ″ along n of the contacts on its side of the vertex, divided by that of the
+    positive ones. The Hessian has this share of its φ″. Sweeps compute this share of its force anew, and leave the rest
+    ``fixed``, see :mod:`.pair_follow`.
 
     Two edges with 4D = cd have r/c and c²kA, for φ(cd) with r is c²φ(d) with r/c. Their ``ratio`` is D/d, else 1.
     """
@@ -285,12 +287,15 @@ def set_shares(contacts: Contacts, first: int, count: int, extra: int, extras: i
             positive = ZERO
             for j in range(count + extras):
                 other = slot_of(contacts, first, count, extra, j)
-                k = contacts.stiffness[other]
+                r = contacts.distance[other]
+                gap = contacts.gap[other]
                 # Contacts beyond r have no force, so that others have the same share with a goal as without.
-                beyond = contacts.gap[other] >= contacts.distance[other] and contacts.gap[one] < contacts.distance[one]
-                if k != ZERO and not beyond and wp.dot(contacts.normal[one], contacts.normal[other]) > ZERO:
-                    total += k
-                    positive += wp.max(k, ZERO)
+                beyond = gap >= r and contacts.gap[one] < contacts.distance[one]
+                turn = wp.dot(contacts.normal[one], contacts.normal[other])
+                if contacts.stiffness[other] != ZERO and not beyond and turn > ZERO:
+                    curvature = contacts.stiffness[other] * bend(wp.min(gap, r), r) * turn * turn
+                    total += curvature
+                    positive += wp.max(curvature, ZERO)
             contacts.share[one] = wp.clamp(total / positive, ZERO, ONE)
 
 

@@ -11,6 +11,7 @@ from support.judges import barrier_slope
 from support.layers import stack
 from support.pairs import energies
 from support.rows import table
+from warpcloth.core.hessian import Hessian
 
 STIFFNESS = 1e4
 
@@ -59,6 +60,23 @@ def pair_of(ratio, gap):
     mesh, x = crumpled(R / ratio, n=6, seed=int(10 * gap))
     x[len(x) // 2 :, 1] += gap * R * (1.0 if ratio < 1.0 else 2.0)
     return mesh, x
+
+
+def test_the_hessian_knows_the_nearest_face_of_a_sharp_valley(device):
+    """A vertex lies r/10 from one face of a valley of 60°, and 0.6 r from the other: the edge has m = −1 on the side of both."""
+    faces = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.5, 0.75**0.5, 0.0], [-0.5, 0.75**0.5, 0.0]])
+    angle = np.arctan2(0.1 * 0.75**0.5, 0.6 + 0.05)  # sin(60° − angle) = 6 sin(angle)
+    vertex = 0.1 * R / np.sin(angle) * np.array([np.sin(np.pi / 6 - angle), np.cos(np.pi / 6 - angle), 0.0])
+    x = np.concatenate([faces, vertex + [[0.0, 0.0, 0.0], [0.1, 1.0, 0.3], [0.1, 1.0, -0.3]]])
+    mesh = wc.Mesh(x + np.repeat([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], [4, 3], axis=0), [[0, 1, 2], [1, 0, 3], [4, 5, 6]])
+    potential, n, eta = Potential(mesh, R, device), np.array([-(0.75**0.5), 0.5, 0.0]), 1e-6 * R
+    ends = [potential.gradient(x + sign * eta * np.eye(7)[4][:, None] * n)[4] @ n for sign in (1.0, -1.0)]
+    potential.gradient(x)
+    steps = potential.steps
+    hessian = Hessian(steps.model, terms=[], dynamic=steps.forces.terms)
+    hessian.assemble(steps.model.array(x, steps.model.vec3), 0.0)
+    block = hessian.values.numpy()[hessian.diagonal.numpy()[4]]
+    assert n @ block @ n == pytest.approx((ends[0] - ends[1]) / (2.0 * eta), rel=0.1)  # less what curves across n
 
 
 @pytest.mark.parametrize(("ratio", "gap"), CRUMPLED)
