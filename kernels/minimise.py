@@ -225,7 +225,8 @@ def end_newton(block: int):
 
     Rounding allows no further progress if the gradient is within its rounding, and no step was found or φ fell by no more than
     its rounding. A copy is stuck if no step was found or the direction does not descend. Pairs leave a ``fraction`` (B,) of the
-    direction, which may be None. ``roundings`` has the parts of :func:`.linear.rounding`.
+    direction, which may be None. A list with the ``most`` pairs (B,) has lost some if it has less ``room``: the step will be
+    repeated, so its descent ends. ``roundings`` has the parts of :func:`.linear.rounding`.
     """
     (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
 
@@ -235,7 +236,9 @@ def end_newton(block: int):
         search: LineSearch,
         roundings: wp.array3d(dtype=wp.float64),
         fraction: wp.array(dtype=wp.float64),
+        most: wp.array(dtype=wp.int32),
         # parameters
+        room: int,
         resolution: wp.float64,
         limits: Limits,
         # in and out
@@ -262,6 +265,9 @@ def end_newton(block: int):
             ended = ROUNDED
         elif stuck and not noisy:
             ended = STALLED
+        if most:
+            if most[copy] > room:
+                ended = STALLED
         look(progress, limits, copy, search.acceleration[copy], ended)
 
     return end

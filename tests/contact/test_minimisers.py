@@ -257,3 +257,16 @@ def test_a_step_far_from_colliders_is_as_at_first(device):
             stepper.frame()
         stepper.reset()
     assert found[0][0] == found[1][0] == 0 and np.array_equal(found[0][1], found[1][1])
+
+
+@pytest.mark.parametrize("linear", ["cg", "factorised"])
+def test_a_descent_ends_where_lists_have_lost_pairs(linear, device):
+    """The step will be repeated; without, a descent went on to its last iteration."""
+    solver = wc.Newton(substeps=10, tolerance=1e-13, linear=linear)
+    stepper = after_frames(PAIR(gap=2.2e-3), solver, steps=1, device=device, dtype="float64")
+    minimiser, listed = stepper.minimiser, stepper.pairs.most_listed
+    minimiser.minimise(1e-13, 10, minimiser.scale)
+    assert minimiser.iterations > 1
+    listed.fill_(len(stepper.pairs.pairs.stencils) + 1)
+    minimiser.minimise(1e-13, 10, minimiser.scale)
+    assert minimiser.iterations == 1

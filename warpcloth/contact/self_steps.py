@@ -79,6 +79,7 @@ class SelfSteps:
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
         near: The :class:`warpcloth.core.capture.Mirror` of what :meth:`.SelfFilter.launch_look` found, (1,) int32.
         lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
+        most_listed: The largest number of pairs in a list so far, (B,) int32.
         listed: 1 if the last list has pairs, else 0, (1,) int32.
         far: 1 if pairs that are not listed may meet on the way of the last :meth:`launch_near`, else 0, (1,) int32.
         stale: Whether the capacity of lists has grown outside of steps, so that graphs must be recorded again.
@@ -100,7 +101,8 @@ class SelfSteps:
         self.x_before, self.begun_at = surface.vectors(), surface.vectors()
         self.cut = state.add("vertices kept apart", model.scalars(wp.int64), Count(sums=True))
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32), Count())
-        self._most = Mirror(state.add("most pairs", model.scalars(wp.int32)))
+        self.most_listed = state.add("most pairs", model.scalars(wp.int32))
+        self._most = Mirror(self.most_listed)
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
         self.listed, self.far, self._ends = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
         notes = {
@@ -127,7 +129,7 @@ class SelfSteps:
         self._hold()
         state.add("positions of the list", self.proximity.found)
         self.near = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
-        self._carried = self.proximity.found, self._most.array, self.lists, *notes.values()
+        self._carried = self.proximity.found, self.most_listed, self.lists, *notes.values()
         friction = surface.friction()
         if friction is not None:
             slips = state.add_part("friction", Slips(model, self.contact.capacity))
@@ -397,7 +399,7 @@ class SelfSteps:
         """Lists the pairs again at x, in copies that have moved by :meth:`.Proximity.moved`; counts a list if one has."""
         self.proximity.launch_moved(x)
         given = [self.proximity.counts, self.proximity.flag]
-        self.model.launch(self_pairs.note_list, self.model.copies, given, [self._most.array, self.lists, self.listed])
+        self.model.launch(self_pairs.note_list, self.model.copies, given, [self.most_listed, self.lists, self.listed])
 
     def launch_sides(self, x, copies=None):
         """Computes the side and the gap of each listed pair: in ``copies`` at x, in others where the last call did."""

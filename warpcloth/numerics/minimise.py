@@ -318,9 +318,13 @@ class Minimiser:
     def _launch_end(self):
         """Launches the line search, and finds the copies that have ended."""
         self._launch_search()
-        fraction = None if self.pairs is None else self.pairs.filter.fraction
-        given = [self.search.state, self._roundings, fraction, self.resolution, self._limits]
+        given = [self.search.state, self._roundings, *self._of_pairs(), self.resolution, self._limits]
         self._launch(kernels.end_newton, self.search.lanes.of_block, given, [self._progress])
+
+    def _of_pairs(self):
+        """Returns the fraction that pairs leave, the most pairs of a list so far, and the room of lists."""
+        pairs = self.pairs
+        return (None, None, 0) if pairs is None else (pairs.filter.fraction, pairs.most_listed, len(pairs.pairs.stencils))
 
     def _launch_assemble(self):
         self.hessian.assemble_after_gradient(self.base, self.search.inertia.s, self.correction)
