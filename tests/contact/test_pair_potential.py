@@ -63,11 +63,11 @@ def pair_of(ratio, gap):
 
 
 def test_the_hessian_knows_the_nearest_face_of_a_sharp_valley(device):
-    """A vertex lies r/10 from one face of a valley of 60°, and 0.6 r from the other: the edge has m = −1 on the side of both."""
+    """A vertex lies r/10 from one face of a valley of 60°, and 0.6 r from the other: the edge has m = −1 on both sides."""
     faces = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.5, 0.75**0.5, 0.0], [-0.5, 0.75**0.5, 0.0]])
     angle = np.arctan2(0.1 * 0.75**0.5, 0.6 + 0.05)  # sin(60° − angle) = 6 sin(angle)
     vertex = 0.1 * R / np.sin(angle) * np.array([np.sin(np.pi / 6 - angle), np.cos(np.pi / 6 - angle), 0.0])
-    x = np.concatenate([faces, vertex + [[0.0, 0.0, 0.0], [0.1, 1.0, 0.3], [0.1, 1.0, -0.3]]])
+    x = np.concatenate([faces, vertex + np.array([[0.0, 0.0, 0.0], [0.1, 1.0, 0.3], [0.1, 1.0, -0.3]])])
     mesh = wc.Mesh(x + np.repeat([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], [4, 3], axis=0), [[0, 1, 2], [1, 0, 3], [4, 5, 6]])
     potential, n, eta = Potential(mesh, R, device), np.array([-(0.75**0.5), 0.5, 0.0]), 1e-6 * R
     ends = [potential.gradient(x + sign * eta * np.eye(7)[4][:, None] * n)[4] @ n for sign in (1.0, -1.0)]

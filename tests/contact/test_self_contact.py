@@ -725,7 +725,7 @@ def test_an_edge_in_line_with_a_triangle_does_not_cross_it():
     turns = np.linalg.qr(random.normal(size=(1000, 3, 3)))[0]
     points = (row @ turns + random.normal(size=(1000, 1, 3))).reshape(-1, 3)
     first = 5 * np.arange(1000)[:, None]
-    assert crossings(points, first + [3, 4], (first + [0, 1, 2])[:, None]) == []
+    assert crossings(points, first + np.array([3, 4]), (first + np.arange(3))[:, None]) == []
 
 
 @pytest.mark.parametrize(("along", "across"), [(120, 10), (240, 5), (240, 10)])
