@@ -13,7 +13,7 @@ import numpy as np
 def pulled(balance, way, held):
     """Returns the elastic energy that a body may add on its way, (B,) [J].
 
-    ½Σk way² is the energy of the start with all that is not held moved by the way along these springs. As they have all
+    ½Σk way² is the energy that the start gains if all that is not held moves by the way along these springs. As they have all
     directions, it is summed over the three axes, each the mean of both senses, which is 0.9 to 3 times as much.
 
     Args:
@@ -22,10 +22,10 @@ def pulled(balance, way, held):
         held: The coordinates that are held, (n, 3) booleans.
     """
     model, cloth, energy = balance.model, balance.cloth, np.zeros(balance.model.copies)
-    for move in way * np.concatenate([np.eye(3), -np.eye(3)]):
+    for move in way * np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))]):
         points = model.scene.positions + np.where(held, 0.0, move)
-        energy += 0.5 * cloth.energy(cloth.put(np.tile(points, (model.copies, 1))))
-    return energy
+        energy += (0.5 if move.any() else -3.0) * cloth.energy(cloth.put(np.tile(points, (model.copies, 1))))
+    return np.maximum(energy, 0.0)
 
 
 def held_coordinates(scene):

@@ -1,7 +1,6 @@
 """ADMM: implicit Euler split into element problems and a vertex problem, coupled by multipliers."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -263,19 +262,10 @@ class ADMMStepper(ImplicitStepper):
             self._gradient.add(self.state.x, self._force, self.correction)
         self._inertia.add(self.correction, self._force)
         if self._gradient is not None:
-            self._launch_unbalanced()
+            self._sums.largest(model.inverse_mass, self._force, self._unbalanced.array)
         for forces, largest in ((self._gaps, self._primal), (self._changes, self._dual)):
             model.lock(forces)
             self._sums.largest(model.inverse_mass, forces, largest.array)
-
-    def _launch_unbalanced(self):
-        """Launches the largest unbalanced acceleration where the forces are not those of split terms alone, else 0."""
-        launch = partial(self._sums.largest, self.model.inverse_mass, self._force, self._unbalanced.array)
-        if self._whole:
-            launch()
-            return
-        self._unbalanced.array.zero_()
-        self._gradient.dynamic.when_present(launch)
 
     def _launch_move(self):
         model = self.model
