@@ -537,6 +537,7 @@ def test_steps_with_nothing_near_are_those_with_contact(name, speed, device, mon
 
 
 FOLLOWS = {"xpbd_that_follows": wc.XPBD(substeps=4, iterations=50)}
+ENDS = {"admm_that_ends": wc.ADMM(substeps=1, iterations=200, tolerance=0.1)}  # by what each copy measures
 # Where bits must repeat: sheets that meet at 3 m/s with few or many pairs, sheets that rub, and pairs that come later.
 MEETING = partial(layers, n=5, turn=17.0, speed=3.0)
 REPEATED = {
@@ -562,12 +563,12 @@ REPEATED = {
         *product(FEW, ["many pairs"]),
         *product(["constrained_dynamics"], ("3 meet", "4 meet")),
         *product((*FEW, "xpbd_jacobi"), ["rub"]),
-        *product(("newton", "newton_factorised", "xpbd", "pbd"), ["come"]),
+        *product(("newton", "newton_factorised", "xpbd", "pbd", "admm_that_ends", "projective_dynamics"), ["come"]),
     ],
 )
 def test_bits_repeat(name, what, device):
     """Of another run, whatever room its lists have, of copies at speeds of their own, and of states that are put back."""
-    scene, solver, frames = REPEATED[what](), (SOLVERS | FOLLOWS)[name], 4 if what == "come" else 2
+    scene, solver, frames = REPEATED[what](), (SOLVERS | FOLLOWS | ENDS)[name], 4 if what == "come" else 2
     speeds = np.stack([scene.velocities, scene.velocities / 30.0])
     *singles, both = (solver.bind(scene.build(device=device, copies=copies)) for copies in (1, 1, 1, 1, 1, 1, 2))
     one, slow, again, small, large, other = singles
