@@ -51,7 +51,7 @@ def work_of_meshes(
     for t in range(pairs.number[0]):
         e = pairs.acting[t]
         other = obstacle_of(pairs.layout, parts[e])
-        if other >= 0 and wp.max(forces.bend[e]) > ZERO:
+        if other >= 0:
             c = colliders[other]
             copy = copy_of(pairs.layout, parts[e][0])
             out[copy, c] = out[copy, c] + wp.dot(forces.force[e], travel[e])

@@ -20,19 +20,20 @@ from .self_pairs import Pairs
 
 @wp.struct
 class PairForces:
-    """Values of each pair at some positions, in float64: w, U [J] and ∂U/∂y [N].
+    """Values of each pair at some positions, in float64: w, U [J], ∂U/∂y [N] and ∂²U/∂y² [N/m]; 0 for pairs without a force.
 
-    ∂²U/∂y² = bend[0]·along alongᵀ + bend[1]·across acrossᵀ [N/m], where ``across`` is for friction and negative contacts; both
-    ``bend`` are 0 for pairs without a force. For kernels that scatter, ``pressing`` lists the ``count`` [0] pairs with a force,
-    in order, and ``joining`` the ``count`` [1] ones that join vertices: those with a mesh may have only one.
+    ∂²U/∂y² is the ``definite`` part, positive semi-definite, and the ``rest``, of which the matrix takes the factor that a
+    :class:`..term.HessianPolicy` gives the negative part; ``block`` is their sum. For kernels that scatter, ``pressing`` lists
+    the ``count`` [0] pairs with a force, in order, and ``joining`` the ``count`` [1] ones that join vertices: those with a mesh
+    may have only one.
     """
 
     weights: wp.array(dtype=wp.vec4d)
     energy: wp.array(dtype=wp.float64)
     force: wp.array(dtype=wp.vec3d)
-    bend: wp.array(dtype=wp.vec2d)
-    along: wp.array(dtype=wp.vec3d)
-    across: wp.array(dtype=wp.vec3d)
+    definite: wp.array(dtype=wp.mat33d)
+    rest: wp.array(dtype=wp.mat33d)
+    block: wp.array(dtype=wp.mat33d)
     pressing: wp.array(dtype=wp.int32)
     joining: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
@@ -51,15 +52,6 @@ def note_pressing(forces: PairForces, e: int, s: wp.vec4i):
         forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
         if not is_single(s):
             forces.joining[wp.atomic_add(forces.count, 1, 1)] = e
-
-
-@wp.func
-def bend_block(forces: PairForces, e: int):
-    """∂²U/∂y² of a pair with a force."""
-    block = forces.bend[e][0] * wp.outer(forces.along[e], forces.along[e])
-    if forces.bend[e][1] > ZERO:
-        block += forces.bend[e][1] * wp.outer(forces.across[e], forces.across[e])
-    return block
 
 
 @cache
@@ -126,10 +118,7 @@ class PairRow:
 
 @cache
 def taken_by(scatters: bool):
-    """Device functions (pairs, forces, thread) → its range, and (pairs, forces, k) → pair e and the range of its corners.
-
-    The range of corners is empty without a force.
-    """
+    """Device functions (pairs, forces, thread) → its range, and (pairs, forces, k) → pair e and the range of its corners."""
 
     @wp.func
     def range_of(pairs: Pairs, forces: PairForces, thread: int):
@@ -145,7 +134,7 @@ def taken_by(scatters: bool):
         else:
             e = pairs.corners[k] // 4
             i = pairs.corners[k] - 4 * e
-            return e, i, i + wp.where(wp.max(forces.bend[e]) > ZERO, 1, 0)
+            return e, i, i + 1
 
     return range_of, corners_at
 
@@ -200,8 +189,8 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
     ):
         first, end = range_of(pairs, forces, wp.tid())
         for k in range(first, end):
-            e, corner, end_corner = corners_at(pairs, forces, k)
-            if corner == 0 and end_corner > 0:
+            e, corner, _end = corners_at(pairs, forces, k)
+            if corner == 0:
                 v = pairs.stencils[e][0]
                 energies[v] = energies[v] + forces.energy[e]
 
@@ -209,35 +198,35 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
 
 
 @cache
-def set_pair_blocks(term: PairTerm, dtype):
-    """Kernel over acting pairs: the :func:`pair_blocks` for kernels that gather products."""
+def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
+    """Kernel over acting pairs: ``block`` with the ``policy`` (B,), and the :func:`pair_blocks` if products are gathered."""
     _, mat33 = types(dtype)
     vec4 = wp.types.vector(4, dtype)
 
-    @wp.kernel(module=term.of(dtype, False), enable_backward=False)
+    @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
     def set_blocks_of_pairs(
         # elements
         pairs: Pairs,
         inverse_mass: wp.array(dtype=dtype),
-        # state in
+        # parameters
+        policy: wp.array(dtype=wp.float64),
+        # in and out
         forces: PairForces,
         # out
         out: pair_blocks(dtype),
     ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
-            return
-        e = pairs.acting[t]
-        block = wp.mat33d()
-        if wp.max(forces.bend[e]) > ZERO:
-            block = bend_block(forces, e)
+        for t in range(wp.tid(), pairs.number[0], pairs.threads):
+            e = pairs.acting[t]
             s = pairs.stencils[e]
-            w = forces.weights[e]
-            for i in range(4):
-                if inverse_mass[s[i]] == dtype(0.0):
-                    w[i] = ZERO
-            out.weights[e] = vec4(dtype(w[0]), dtype(w[1]), dtype(w[2]), dtype(w[3]))
-        out.blocks[e] = mat33(block)
+            block = forces.definite[e] + wp.max(policy[s[0] // pairs.layout.per_copy], ZERO) * forces.rest[e]
+            forces.block[e] = block
+            if wp.static(not scatters):
+                w = forces.weights[e]
+                for i in range(4):
+                    if inverse_mass[s[i]] == dtype(0.0):
+                        w[i] = ZERO
+                out.weights[e] = vec4(dtype(w[0]), dtype(w[1]), dtype(w[2]), dtype(w[3]))
+                out.blocks[e] = mat33(block)
 
     return set_blocks_of_pairs
 
@@ -266,7 +255,7 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
             e, corner, end_corner = corners_at(pairs, forces, k)
             s = pairs.stencils[e]
             w = forces.weights[e]
-            block = bend_block(forces, e)
+            block = forces.block[e]
             for i in range(corner, end_corner):
                 if inverse_mass[s[i]] > dtype(0.0):
                     if wp.static(scatters):
@@ -307,27 +296,16 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
             if wp.static(scatters):
                 e = forces.joining[k]
             s = pairs.stencils[e]
-            if end_corner > 0 and active[s[0] // pairs.layout.per_copy] != 0:
+            if active[s[0] // pairs.layout.per_copy] != 0:
                 w = forces.weights[e]
-                bend = forces.bend[e]
-                t = forces.along[e]
-                along = wp.vec4d()
-                u = wp.vec3d()
-                across = wp.vec4d()
-                if bend[1] > ZERO:
-                    u = forces.across[e]
+                block = forces.block[e]
+                y = wp.vec3d()
                 for i in range(4):
                     if inverse_mass[s[i]] > dtype(0.0):
-                        along[i] = w[i] * wp.dot(t, wp.vec3d(p[s[i]]))
-                        if bend[1] > ZERO:
-                            across[i] = w[i] * wp.dot(u, wp.vec3d(p[s[i]]))
-                whole = along[0] + along[1] + along[2] + along[3]
-                whole_across = across[0] + across[1] + across[2] + across[3]
+                        y += w[i] * wp.vec3d(p[s[i]])
                 for i in range(corner, end_corner):
                     if inverse_mass[s[i]] > dtype(0.0):
-                        pull = w[i] * bend[0] * (whole - along[i]) * t
-                        if bend[1] > ZERO:
-                            pull += w[i] * bend[1] * (whole_across - across[i]) * u
+                        pull = w[i] * (block * (y - w[i] * wp.vec3d(p[s[i]])))
                         if wp.static(scatters):
                             q[s[i]] = q[s[i]] + vec3(pull)
                         total += pull

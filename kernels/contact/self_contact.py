@@ -1,8 +1,9 @@
 """Factories of the kernels of the energy of self-contact and its derivatives, from the contacts of :mod:`.pair_potential`.
 
 U = Σ kA φ(d) over the contacts, with φ as for colliders (:mod:`..terms.contact`). The nearest points minimise ‖y‖, so their
-motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian is approximated by its
-semi-definite part kA φ″ wᵢwⱼnnᵀ, of contacts over a valley by their share of it. All is in float64 for every precision.
+motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian of a contact is
+wᵢwⱼ kA (φ″ nnᵀ + φ′/d P), see :func:`free_to_turn`. Its second part is negative, and as large as the first at small gaps. The
+definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All is in float64 for every precision.
 """
 
 from functools import cache
@@ -13,9 +14,9 @@ import warp as wp
 from ..memory import load
 from ..terms import contact
 from ..vectors import types
-from .pair_potential import ENDING, STARTING, Contacts
+from .pair_potential import ENDING, STARTING, TWO_EDGES, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
-from .self_gaps import ONE, SIDE, ZERO, farthest, perpendicular, vertex_of
+from .self_gaps import ON_EDGE, ONE, SIDE, ZERO, farthest, vertex_of
 from .self_pairs import MODULE, Pairs, module_of
 from .self_planes import margin_of, ulp_of
 
@@ -24,6 +25,7 @@ constraint_slope, constraint_bend = contact.constraint_slope, contact.constraint
 # The force of ψ at the least gap, divided by that of φ there.
 STEEP = wp.constant(wp.float64(100.0))
 ALL = wp.constant(wp.vec4d(1.0, 1.0, 1.0, 1.0))
+UNITY = wp.constant(wp.mat33d(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
 
 @cache
@@ -40,6 +42,52 @@ def least_gap(dtype):
 
 
 @cache
+def free_to_turn(dtype):
+    """Device function (contacts, e, n, x, d) → P, the projection on directions across n that the nearest points do not follow.
+
+    ∂²d/∂y² is P/d, up to terms smaller by d over the length of an edge: P is 1 − nnᵀ between two vertices, (n × t)(n × t)ᵀ on
+    an edge along t, and 0 where two edges cross and on a face.
+    """
+    vec3, _ = types(dtype)
+    at = vertex_of(dtype)
+
+    @wp.func
+    def free(contacts: Contacts, e: int, n: wp.vec3d, x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3)):
+        s = contacts.parts[e]
+        bits = contacts.touching[e]
+        # The corners of the side that may be an edge: of a face, or of the two edges.
+        first = wp.int32(1)
+        end = wp.int32(4)
+        if contacts.code[e] == TWO_EDGES:
+            first = wp.where((bits & 3) == 3, 0, 2)
+            end = first + 2
+        touching = wp.int32(0)
+        t = wp.vec3d()
+        a = wp.vec3d()
+        for i in range(4):
+            if (bits >> i) & 1 == 1:
+                touching += 1
+                if i >= first and i < end:
+                    a = at(x, correction, s[i])
+                    t = a - t
+        found = wp.mat33d()
+        if end == 4 and first == 1:
+            for i in range(1, 4):
+                if (bits >> i) & 1 == 0:
+                    o = at(x, correction, s[i]) - a
+                    if wp.abs(wp.dot(n, o)) <= ON_EDGE * wp.length(o):  # beyond the edge only by rounding, as on a flat mesh
+                        return found
+        if touching == 2:
+            found = UNITY - wp.outer(n, n)
+        if touching == 3:
+            u = wp.cross(n, t)
+            found = wp.outer(u, u) / wp.max(wp.dot(u, u), wp.float64(1e-300))
+        return found
+
+    return free
+
+
+@cache
 def find_forces(dtype, bounded: bool):
     """Kernel over contacts: their forces; φ = ½(r − d)² if ``bounded``.
 
@@ -48,7 +96,7 @@ def find_forces(dtype, bounded: bool):
     the part along n, which is negative, is left out, and half of that across n, U′/d, stays.
     """
     vec3, _ = types(dtype)
-    least_gap_of = least_gap(dtype)
+    least_gap_of, turning = least_gap(dtype), free_to_turn(dtype)
 
     @wp.kernel(module=f"{module_of(dtype)}.{bounded}", enable_backward=False)
     def find_forces_of_pairs(
@@ -57,6 +105,7 @@ def find_forces(dtype, bounded: bool):
         # state in
         contacts: Contacts,
         x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
         # parameters
         least: wp.float64,
         # out
@@ -87,15 +136,13 @@ def find_forces(dtype, bounded: bool):
             forces.weights[e] = contacts.weights[e]
             forces.energy[e] = energy
             forces.force[e] = pull * n
-            if k > ZERO:
-                forces.bend[e] = wp.vec2d(curvature * contacts.share[e], ZERO)
-                forces.along[e] = n
-            else:
-                q = SIDE * pull / wp.max(gap, wp.float64(1e-300))
-                u = perpendicular(n)
-                forces.bend[e] = wp.vec2d(q, q)
-                forces.along[e] = u
-                forces.across[e] = wp.cross(n, u)
+            bend_across = pull / wp.max(gap, wp.float64(1e-300))
+            along_n = wp.outer(n, n)
+            definite = contacts.share[e] * curvature * along_n
+            if k < ZERO:
+                definite = SIDE * bend_across * (UNITY - along_n)
+            forces.definite[e] = definite
+            forces.rest[e] = curvature * along_n + bend_across * turning(contacts, e, n, x, correction) - definite
             note_pressing(forces, e, pairs.stencils[e])
 
     return find_forces_of_pairs

@@ -316,7 +316,9 @@ def find_friction(dtype, law: Law):
         for turn in range(wp.tid(), pairs.number[0], pairs.threads):
             e = pairs.acting[turn]
             limit = rubbed.limit[e]
-            forces.bend[e] = wp.vec2d()
+            forces.energy[e] = ZERO
+            forces.force[e] = wp.vec3d()
+            forces.definite[e] = wp.mat33d()
             if limit == ZERO:
                 continue
             n = rubbed.normal[e]
@@ -324,16 +326,15 @@ def find_friction(dtype, law: Law):
             k = rubbed.stiffness[e]
             u = slip_at(pairs, rubbed, e, x, correction)
             l = wp.length(u)
-            across = k * secant(l, limit)
+            pull = k * secant(l, limit)
             along = perpendicular(n)
             if l > ZERO:
                 along = u / l
+            across = wp.cross(n, along)
             forces.weights[e] = w
             forces.energy[e] = k * energy(l, limit)
-            forces.force[e] = across * u
-            forces.bend[e] = wp.vec2d(k * bend(l, limit), across)
-            forces.along[e] = along
-            forces.across[e] = wp.cross(n, along)
+            forces.force[e] = pull * u
+            forces.definite[e] = k * bend(l, limit) * wp.outer(along, along) + pull * wp.outer(across, across)
             note_pressing(forces, e, pairs.stencils[e])
 
     return find_friction_of_pairs

@@ -76,7 +76,7 @@ COLLIDERS = {
     "slides": (partial(stretched, 981.0, 0.3), 1),
     "sticks": (partial(stretched, 981.0, 30.0), 1),
     "without friction": (partial(stretched, 300.0, 0.0), 1),
-    "roof": (partial(roofed, 250.0, 0.3), 1),
+    "roof": (partial(roofed, 280.0, 0.3), 1),
 }
 PRESSED = {
     "both stages": (partial(PAIR, gap=2.2e-3), 1),

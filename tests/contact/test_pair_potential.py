@@ -12,6 +12,7 @@ from support.layers import stack
 from support.pairs import energies
 from support.rows import table
 from warpcloth.core.hessian import Hessian
+from warpcloth.kernels.term import HessianPolicy
 
 STIFFNESS = 1e4
 
@@ -62,21 +63,44 @@ def pair_of(ratio, gap):
     return mesh, x
 
 
-def test_the_hessian_knows_the_nearest_face_of_a_sharp_valley(device):
-    """A vertex lies r/10 from one face of a valley of 60°, and 0.6 r from the other: the edge has m = −1 on both sides."""
-    faces = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.5, 0.75**0.5, 0.0], [-0.5, 0.75**0.5, 0.0]])
+def places_at_a_fold():
+    """Vertices near two faces at 60° that meet in the edge (0, 0, ±1): in the valley, by the edge, by its end, by a face.
+
+    In the valley the vertex lies r/10 from one face and 0.6 r from the other: the edge has m = −1 on both sides.
+    """
     angle = np.arctan2(0.1 * 0.75**0.5, 0.6 + 0.05)  # sin(60° − angle) = 6 sin(angle)
-    vertex = 0.1 * R / np.sin(angle) * np.array([np.sin(np.pi / 6 - angle), np.cos(np.pi / 6 - angle), 0.0])
-    x = np.concatenate([faces, vertex + np.array([[0.0, 0.0, 0.0], [0.1, 1.0, 0.3], [0.1, 1.0, -0.3]])])
+    valley = 0.1 * R / np.sin(angle) * np.array([np.sin(np.pi / 6 - angle), np.cos(np.pi / 6 - angle), 0.0])
+    face = np.array([0.25, 0.4330127018922193, 0.1]) + 0.3 * R * np.array([0.75**0.5, -0.5, 0.0])
+    return {"valley": valley, "edge": R * np.array([0.1, -0.4, 3.0]), "end": [0.1 * R, -0.2 * R, 1.0 + 0.3 * R], "face": face}
+
+
+@pytest.mark.parametrize("policy", [HessianPolicy.RAW, HessianPolicy.CLAMP])
+@pytest.mark.parametrize("place", places_at_a_fold())
+def test_the_hessian_is_the_derivative_of_the_force(place, policy, device):
+    """By central differences with respect to the vertex; clamped, along the normal of the nearest face in the valley.
+
+    Without the edge of m = −1 the clamped Hessian is 160 times smaller there. It lacks what curves across the normal.
+    """
+    faces = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.5, 0.75**0.5, 0.0], [-0.5, 0.75**0.5, 0.0]])
+    away = 1.0 if place == "valley" else -1.0
+    vertex = places_at_a_fold()[place] + np.array([[0.0, 0.0, 0.0], [0.1, away, 0.3], [0.1, away, -0.3]])
+    x = np.concatenate([faces, vertex])
     mesh = wc.Mesh(x + np.repeat([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], [4, 3], axis=0), [[0, 1, 2], [1, 0, 3], [4, 5, 6]])
-    potential, n, eta = Potential(mesh, R, device), np.array([-(0.75**0.5), 0.5, 0.0]), 1e-6 * R
-    ends = [potential.gradient(x + sign * eta * np.eye(7)[4][:, None] * n)[4] @ n for sign in (1.0, -1.0)]
+    potential, eta = Potential(mesh, R, device), 1e-6 * R
+    moves = eta * np.eye(7)[4][:, None] * np.eye(3)[:, None]
+    slopes = [(potential.gradient(x + move)[4] - potential.gradient(x - move)[4]) / (2.0 * eta) for move in moves]
     potential.gradient(x)
     steps = potential.steps
-    hessian = Hessian(steps.model, terms=[], dynamic=steps.forces.terms)
+    hessian = Hessian(steps.model, policy, terms=[], dynamic=steps.forces.terms)
     hessian.assemble(steps.model.array(x, steps.model.vec3), 0.0)
-    block = hessian.values.numpy()[hessian.diagonal.numpy()[4]]
-    assert n @ block @ n == pytest.approx((ends[0] - ends[1]) / (2.0 * eta), rel=0.1)  # less what curves across n
+    block, size = hessian.values.numpy()[hessian.diagonal.numpy()[4]], np.abs(slopes).max()
+    if policy == HessianPolicy.RAW:
+        assert block == pytest.approx(np.array(slopes), abs=1e-6 * size)
+        return
+    assert np.linalg.eigvalsh(block).min() > -1e-12 * size
+    if place == "valley":
+        n = np.array([-(0.75**0.5), 0.5, 0.0])
+        assert n @ block @ n == pytest.approx(n @ slopes @ n, rel=0.1)
 
 
 @pytest.mark.parametrize(("ratio", "gap"), CRUMPLED)

@@ -51,7 +51,8 @@ def contacts_at(pairs, x):
     acting[found.pairs.acting.numpy()[: found.pairs.number.numpy()[0]]] = True
     pull = np.where(acting, (forces.force.numpy() * n).sum(axis=1), 0.0)
     share = np.maximum(found.data.share.numpy(), 1e-300)
-    bend = np.where(acting & (found.data.stiffness.numpy() > 0.0), forces.bend.numpy()[:, 0] / share, 0.0)
+    along = np.einsum("ei,eij,ej->e", n, forces.definite.numpy(), n)
+    bend = np.where(acting & (found.data.stiffness.numpy() > 0.0), along / share, 0.0)
     return pull, bend, n, found.data.weights.numpy().copy(), found.pairs.stencils.numpy().copy()
 
 

@@ -104,7 +104,8 @@ class PairContact(DynamicElements):
 
     def launch_forces(self, x, correction):
         self._launch_found(x, correction)
-        self.model.launch(self._find, self.pairs.threads, [self.pairs, self.data, x, self.least], [self.forces])
+        given = [self.pairs, self.data, self._whole(x, self.obstacles), correction, self.least]
+        self.model.launch(self._find, self.pairs.threads, given, [self.forces])
 
     # Sweeps, see :mod:`warpcloth.kernels.contact.pair_follow`.
 

@@ -50,7 +50,7 @@ class DynamicElements:
         self._forces, self._energies, self._diagonal, self._products = (
             model.kernel(factory, self.term, model.dtype, scatters) for factory in SUMS
         )
-        self._set_blocks = None if scatters else model.kernel(pair_sums.set_pair_blocks, self.term, model.dtype)
+        self._set_blocks = model.kernel(pair_sums.set_pair_blocks, self.term, model.dtype, scatters)
         if self.pairs is not None:
             self._hold_blocks()
 
@@ -67,8 +67,8 @@ class DynamicElements:
         self.pairs, self.data, self._marks = pairs, data, marks
         pairs.threads = 1 if self.model.device.is_cpu else self.capacity
         model, room = self.model, self.room
-        kinds = {"weights": wp.vec4d, "energy": wp.float64, "bend": wp.vec2d}
-        kinds |= dict.fromkeys(("force", "along", "across"), wp.vec3d)
+        kinds = {"weights": wp.vec4d, "energy": wp.float64, "force": wp.vec3d}
+        kinds |= dict.fromkeys(("definite", "rest", "block"), wp.mat33d)
         kinds |= dict.fromkeys(("pressing", "joining"), wp.int32) if model.device.is_cpu else {}
         self.forces = filled(pair_sums.PairForces, **{name: room(kind) for name, kind in kinds.items()})
         if model.device.is_cpu:
@@ -130,11 +130,10 @@ class DynamicElements:
         """Adds the energies of the pairs to those of their first vertices, (N,) [J]."""
         self.model.launch(self._energies, self._sums_over, [self.pairs, self.forces], [out])
 
-    def add_diagonal(self, diagonal, values):
-        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`, and sets ``blocks`` for its products."""
+    def add_diagonal(self, diagonal, values, policy):
+        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`, and sets those for its products."""
         model, pairs, forces = self.model, self.pairs, self.forces
-        if self._set_blocks is not None:
-            model.launch(self._set_blocks, self.capacity, [pairs, model.inverse_mass, forces], [self.blocks])
+        model.launch(self._set_blocks, pairs.threads, [pairs, model.inverse_mass, policy], [forces, self.blocks])
         model.launch(self._diagonal, self._sums_over, [pairs, model.inverse_mass, diagonal, forces], [values])
 
     def add_products(self, p, q, active):
@@ -142,18 +141,19 @@ class DynamicElements:
         given = [self.pairs, self.model.inverse_mass, self.forces, p, active]
         self.model.launch(self._products, self._sums_over, given, [q])
 
-    def on_host(self):
-        """Returns stencils (m, 4), w (m, 4), directions (m, 3) and bends (m,) [N/m] of all pairs with a force.
+    def matrix(self):
+        """Returns ∂²U/∂x² as last added to a Hessian, scipy CSR (3N, 3N), 0 along pinned coordinates; waits for the device."""
+        from scipy.sparse import csr_matrix
 
-        There are two rows of each, first all of ``along``, then all of ``across``.
-        """
         acting = np.sort(self.pairs.acting.numpy()[: self.pairs.number.numpy()[0]])
-        bend = self.forces.bend.numpy()
-        acting = acting[bend[acting].any(axis=1)]
-        directions = [self.forces.along, self.forces.across]
-        stencils, w = (array.numpy()[acting] for array in (self.pairs.stencils, self.forces.weights))
-        rows = [(stencils, w, array.numpy()[acting], bend[acting, k]) for k, array in enumerate(directions)]
-        return [np.concatenate(each) for each in zip(*rows, strict=True)]
+        arrays = self.pairs.stencils, self.forces.weights, self.forces.block
+        stencils, w, block = (array.numpy()[acting] for array in arrays)
+        columns = 3 * stencils.astype(np.int64)[:, :, None] + np.arange(3)
+        w = w[:, :, None] * (self.model.coordinate_mobility() > 0.0)[columns]
+        values = w[:, :, :, None, None] * block[:, None, :, None, :] * w[:, None, None]
+        rows = np.broadcast_to(columns[:, :, :, None, None], values.shape)
+        indices = rows.ravel(), np.broadcast_to(columns[:, None, None], values.shape).ravel()
+        return csr_matrix((values.ravel(), indices), shape=(3 * self.model.count,) * 2)
 
     def launch_rows(self, x, d):
         """Prepares constraint rows at x + d."""
@@ -247,9 +247,9 @@ class Dynamic:
         if terms:
             wp.capture_if(terms[0].present, launch, partial(self.when_present, launch, terms[1:]))
 
-    def add_diagonal(self, diagonal, values):
-        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian`."""
-        self._launch_each("add_diagonal", diagonal, values)
+    def add_diagonal(self, diagonal, values, policy):
+        """Adds to the diagonal blocks of a :class:`warpcloth.core.hessian.Hessian` with this ``policy`` (B,)."""
+        self._launch_each("add_diagonal", diagonal, values, policy)
 
     def add_products(self, p, q, active):
         """q += A p for the off-diagonal blocks A, in ``active`` copies (B,)."""
@@ -271,22 +271,6 @@ class Dynamic:
         for each, (pairs, blocks) in zip(self.terms, names, strict=False):
             setattr(rows, pairs, each.pairs)
             setattr(rows, blocks, each.blocks)
-
-    def rows(self):
-        """The Hessian ∂²U/∂x² = JᵀDJ at the last :meth:`launch`; waits for the device.
-
-        Returns:
-            J, scipy (rows, 3N), with columns of 0 for pinned coordinates, and D, scipy diagonal (rows, rows) [N/m].
-        """
-        from scipy.sparse import csr_matrix, diags
-
-        model, of_terms = self.model, zip(*(each.on_host() for each in self.terms), strict=True)
-        stencils, w, direction, bend = (np.concatenate(each) for each in of_terms)
-        columns = 3 * stencils.astype(np.int64)[:, :, None] + np.arange(3)
-        values = w[:, :, None] * direction[:, None, :] * (model.coordinate_mobility() > 0.0)[columns]
-        starts = 12 * np.arange(len(bend) + 1)
-        J = csr_matrix((values.ravel(), columns.ravel(), starts), shape=(len(bend), 3 * model.count))
-        return J, diags(bend)
 
     def sweeps(self, in_turn):
         """Prepares sweeps: Gauss–Seidel (``in_turn``), or Jacobi for devices with many threads."""

@@ -220,7 +220,7 @@ class Hessian(BlockMatrix):
         self.launch_masses(scale)
         for one in self._varying:
             one.add(self.values, x, correction, self.policy)
-        self.dynamic.add_diagonal(self.diagonal, self.values)
+        self.dynamic.add_diagonal(self.diagonal, self.values, self.policy)
         if further is not None:
             further(self.values)
         self.launch_locks()
@@ -249,8 +249,7 @@ class Hessian(BlockMatrix):
         """Returns the off-diagonal blocks of dynamic elements at the last :meth:`assemble`, scipy (3N, 3N); None without."""
         if not self.dynamic:
             return None
-        J, D = self.dynamic.rows()
-        whole = (J.T @ D @ J).tocoo()
+        whole = sum(each.matrix() for each in self.dynamic.terms).tocoo()
         off = whole.row // 3 != whole.col // 3
         whole.data[~off] = 0.0
         return whole.tocsc()
