@@ -141,8 +141,8 @@ class Contacts:
     positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,).
 
     The ``share`` of a contact is the curvature Σ kA φ″ along n of the contacts on its side of the vertex, divided by that of
-    the positive ones. The Hessian has this share of its φ″. Sweeps compute this share of its force anew, and leave the rest
-    ``fixed``, see :mod:`.pair_follow`.
+    the positive ones. The definite part of the Hessian has this share of its φ″. Sweeps compute this share of its
+    force anew, and leave the rest ``fixed``, see :mod:`.pair_follow`.
 
     Two edges with 4D = cd have r/c and c²kA, for φ(cd) with r is c²φ(d) with r/c. Their ``ratio`` is D/d, else 1.
     """

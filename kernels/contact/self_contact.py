@@ -92,8 +92,8 @@ def find_forces(dtype, bounded: bool):
     """Kernel over contacts: their forces; φ = ½(r − d)² if ``bounded``.
 
     If the least gap f of the filter, ``least`` [m], is above 0, ψ is added to φ, from d = 2f on, where it is C², or from r if
-    that is less: else cloth would be pressed to f, where one pair stops the whole copy. Of the Hessian of a negative contact
-    the part along n, which is negative, is left out, and half of that across n, U′/d, stays.
+    that is less: else cloth would be pressed to f, where one pair stops the whole copy. Of a negative contact the definite
+    part lacks what is along n, which is negative, and has half of U′/d across n.
     """
     vec3, _ = types(dtype)
     least_gap_of, turning = least_gap(dtype), free_to_turn(dtype)
