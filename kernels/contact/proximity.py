@@ -105,7 +105,12 @@ def take_near(dtype, of_edges: bool):
     def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, pairs: PairList):
         d = distance(corner(x, s[0]), corner(x, s[1]), corner(x, s[2]), corner(x, s[3]))
         if d < surface.max_distance + surface.skin:
-            if d < surface.skin or d < surface.skin + cutoff(surface, s):
+            r = dtype(0.0)
+            if not d < surface.skin:
+                r = cutoff(surface, s)
+                if has_obstacle(surface.layout, s) and (wp.static(of_edges) or s[0] >= surface.layout.cloth):
+                    r = surface.close
+            if d < surface.skin + r:
                 if pairs.counts[KIND] < MOST:
                     slot = wp.atomic_add(pairs.counts, KIND, 1)
                     row = i

@@ -27,8 +27,9 @@ def surfaces(dtype):
 
     ``rest`` is the rest position of each vertex of a copy [m], and ``piece`` its connected piece, −1 without an element.
     ``groups`` of items and ``vertex_groups`` say which elements meet, and ``itself`` whether cloth meets cloth. ``distance`` is
-    the contact distance of cloth with cloth, ``of_meshes`` that with meshes, and ``max_distance`` the larger one [m]. Elements
-    whose first vertices are more than ``far`` apart at rest are surely at least twice the contact distance apart [m].
+    the contact distance of cloth with cloth, ``of_meshes`` that with meshes, and ``max_distance`` the larger one [m]. With
+    meshes, edges and vertices of the meshes act at smaller distances; they are listed up to ``close`` and the skin [m].
+    Elements whose first vertices are more than ``far`` apart at rest are surely at least twice the contact distance apart [m].
     ``lowest`` and ``highest`` are corners of a box of the cloth of each copy; without obstacles they are empty.
     """
     vec3, _ = types(dtype)
@@ -45,6 +46,7 @@ def surfaces(dtype):
         distance: dtype
         of_meshes: dtype
         max_distance: dtype
+        close: dtype
         skin: dtype
         far: dtype
         lowest: wp.array(dtype=vec3)
@@ -85,11 +87,11 @@ def boxes(dtype):
     half, farthest, corner, vector_or_zero = dtype(0.5), dtype(FARTHEST), load(vec3), vector_within(dtype)
 
     @wp.func
-    def box_of(surface: surfaces(dtype), a: vec3, b: vec3, c: vec3):
-        """The box of three points, enlarged by half of the contact distance and the skin, and by a margin for rounding."""
+    def box_of(radius: dtype, a: vec3, b: vec3, c: vec3):
+        """The box of three points, enlarged by half of ``radius``, and by a margin for rounding."""
         low = wp.min(wp.min(a, b), c)
         high = wp.max(wp.max(a, b), c)
-        more = half * (surface.max_distance + surface.skin)
+        more = half * radius
         more += dtype(4.0) * epsilon(more) * wp.max(wp.max(wp.abs(low)), wp.max(wp.abs(high)))
         # min and max ignore NaN; these products do not.
         more += wp.dot(a, vec3()) + wp.dot(b, vec3()) + wp.dot(c, vec3())
@@ -98,11 +100,16 @@ def boxes(dtype):
 
     @wp.func
     def box_along(surface: surfaces(dtype), x: wp.array(dtype=vec3), p: wp.array(dtype=vec3), i: int, j: int, k: int):
-        """The box of three vertices that move from x to x + p, or that stay, if p is None."""
+        """The box of three vertices that move from x to x + p, or that stay, if p is None. Of an edge, j and k are equal."""
         a, b, c = corner(x, i), corner(x, j), corner(x, k)
-        low, high = box_of(surface, a, b, c)
+        of_mesh = i >= surface.layout.cloth
+        is_edge = i != j and j == k
+        radius = surface.skin + surface.max_distance
+        if (of_mesh or not surface.itself) and (is_edge or of_mesh == (i == j)):
+            radius = surface.skin + surface.close
+        low, high = box_of(radius, a, b, c)
         if p:
-            l, h = box_of(surface, a + vector_or_zero(p, i), b + vector_or_zero(p, j), c + vector_or_zero(p, k))
+            l, h = box_of(radius, a + vector_or_zero(p, i), b + vector_or_zero(p, j), c + vector_or_zero(p, k))
             low = wp.min(low, l)
             high = wp.max(high, h)
         return low, high

@@ -14,6 +14,7 @@ from support.pairs import between_edges, from_triangle
 from warpcloth.contact.proximity import Proximity
 from warpcloth.contact.surface import ContactSurface
 from warpcloth.kernels.contact.obstacles import CLOTH, OBSTACLE
+from warpcloth.kernels.contact.pair_potential import CLOSE
 
 R = 3e-3
 
@@ -225,6 +226,20 @@ def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
         meet = np.triu(meet) if own.shape[1] == 2 else meet
         i, j = np.nonzero(meet)
         s = np.column_stack([own[i], others[j]])
-        wanted += map(tuple, s[measure(*x[s.T]) < R + skin])
+        acts = R * np.where((own.shape[1] == 2) | (s[:, 0] >= model.count), float(CLOSE), 1.0)  # above R − skin/2
+        wanted += map(tuple, s[measure(*x[s.T]) < acts + skin])
     assert len(wanted) > 1000
     assert sorted(listed) == sorted(wanted)
+
+
+@pytest.mark.parametrize("start", [0.8, 0.6])
+def test_the_gap_of_edges_is_reported_where_they_do_not_act(start, device):
+    """A ridge of cloth across that of a mesh, with edges as long as r: 0.6 r apart, where pairs were listed or after a move."""
+    across, up = np.array([[-0.5, 0, 0], [0.5, 0, 0], [0, 0.5, 0.5], [0, 0.5, -0.5]]), np.array([0.0, R, 0.0])
+    along = wc.MeshCollider(-R * across[:, [2, 1, 0]], np.array([[0, 1, 2], [1, 0, 3]]))
+    mesh = wc.Mesh(R * across + start * up, np.array([[0, 1, 2], [1, 0, 3]]))
+    scene = wc.Scene(mesh, density=0.2, terms=[wc.Spring(stiffness=1.0)], colliders=[along], contact=wc.Contact(distance=R))
+    pairs = wc.XPBD(substeps=1).bind(scene.build(dtype="float64", device=device)).pairs
+    for height in (start, 0.6):
+        pairs.launch_begin(wp.array(R * across + height * up, dtype=wp.vec3d, device=device))
+        assert pairs.in_frame()[2] == pytest.approx(height * R, rel=1e-12)

@@ -10,6 +10,7 @@ from ..core.filled import filled
 from ..core.scan import Scan
 from ..kernels.contact import piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
+from ..kernels.contact.pair_potential import CLOSE
 
 # Of a pair in the list 36, its gap 64, two slots of contact with forces 268, blocks 104 and, with meshes, 64 of these.
 BYTES_OF_A_PAIR = 36 + 64 + 2 * (268 + 104 + 64)
@@ -19,7 +20,9 @@ class Proximity:
     """The vertex–triangle pairs and edge–edge pairs that are near one another in each copy of a surface.
 
     A pair is listed if its distance is below r_c + skin. r_c is the contact distance, but at most half the rest distance of two
-    elements of one connected piece. Pairs with a common vertex or with coordinates that are not finite are not listed.
+    elements of one connected piece. With meshes, edges and vertices of the meshes act below CLOSE r, so it is CLOSE r for them,
+    or r − skin/2 if that is more: the sides of a pair approach by at most half of the skin until :meth:`launch_kept` makes a
+    new list, so that gaps up to r are known. Pairs with a common vertex or with coordinates that are not finite are not listed.
     Positions (V,) are those of all vertices of the surface.
 
     Args:
@@ -62,9 +65,11 @@ class Proximity:
             "highest": wp.zeros(boxes, dtype=model.vec3, device=device),
         }
         values |= {"layout": surface.layout, "itself": surface.meets_itself, "distance": distance, "of_meshes": of_meshes}
-        values |= {"max_distance": self._max_distance, "skin": skin, "far": 2.0 * (distance + surface.edge_lengths.max())}
+        values |= {"close": max(float(CLOSE) * of_meshes, of_meshes - 0.5 * skin), "max_distance": self._max_distance}
+        values |= {"skin": skin, "far": 2.0 * (distance + surface.edge_lengths.max())}
         self._surface = filled(proximity_grid.surfaces(model.dtype), **values)
-        self._along = filled(proximity_grid.surfaces(model.dtype), **values | {"max_distance": 0.0, "skin": 0.0})
+        touching = dict.fromkeys(("close", "max_distance", "skin"), 0.0)
+        self._along = filled(proximity_grid.surfaces(model.dtype), **values | touching)
         self._allocate_grid()
         self._set_pieces(piece)
         self._whole = model.device.is_cpu and self._pieces.per_copy == 1 and (piece >= 0).all()
