@@ -246,7 +246,7 @@ class SelfFilter:
 
     def _launch_meshes_on(self, x, goal):
         p, contact = self._moves, self._contact
-        self.launch_fresh(x, contact.relist, part=contact.kept)
+        self.launch_fresh(x, contact.launch_list, part=contact.kept)
         contact.launch_sides(x)
         for array in (p, self._carried, self._keys):
             array.zero_()
@@ -268,7 +268,7 @@ class SelfFilter:
     def _launch_arrived(self, x, goal):
         """Puts meshes at their goal, also those that are still on their way, and lists the pairs there."""
         wp.copy(self._surface.behind(x), goal)
-        self.launch_fresh(x, self._contact.relist)
+        self.launch_fresh(x, self._contact.launch_list)
         self._contact.launch_sides(x)
 
     def _launch_shapes(self):
