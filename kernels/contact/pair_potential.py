@@ -25,7 +25,7 @@ from ..memory import load
 from ..terms.contact import bend
 from ..vectors import types
 from .obstacles import Layout, cloth_vertex, has_obstacle, in_copy
-from .self_gaps import CORNER, EDGE, INSIDE, ONE, SIDE, ZERO, along, gap_along, in_plane, nearest_of_face, vertex_of
+from .self_gaps import CORNER, EDGE, INSIDE, ONE, SIDE, ZERO, along, from_plane, gap_along, nearest_of_face, vertex_of
 from .self_pairs import Pairs, module_of
 
 MIDDLE = wp.constant(wp.float64(0.125))  # weight of the distance from the middles of edges; below 1/6 D is strictly convex
@@ -313,13 +313,13 @@ def lowest_gap(dtype, of_vertex: bool):
     def find(
         s: wp.vec4i, n: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, goal: wp.array(dtype=vec3), move: wp.array(dtype=vec3)
     ):
-        found = gap_along(VERTEX, n, wp.vec3d(), b, c, d)
+        found = gap_along(VERTEX, n, b, c, d)
         if goal:
             p = at(goal, move, s[0])
             q = at(goal, move, s[1]) - p
             t = at(goal, move, s[2]) - p
             u = at(goal, move, s[3]) - p
-            found = wp.min(found, gap_along(VERTEX, n, wp.vec3d(), q, t, u))
+            found = wp.min(found, gap_along(VERTEX, n, q, t, u))
         return found
 
     return find
@@ -453,7 +453,9 @@ def find_vertex_contacts(dtype):
                 corners = wp.matrix_from_rows(b, c, d)
                 w4 = contacts.weights[e]
                 if code == INSIDE or near == 1:
-                    y = in_plane(code == INSIDE, w4[1] * b + w4[2] * c + w4[3] * d, wp.cross(c - b, d - b), b)
+                    y = w4[1] * b + w4[2] * c + w4[3] * d
+                    if code == INSIDE:
+                        y = from_plane(wp.cross(c - b, d - b), b)
                     put_contact(e, s, w4, y, r, kA, x, pairs, contacts)
                 if near == 1:
                     continue

@@ -57,7 +57,7 @@ def allowed_fraction(dtype, of_edges: bool):
                 far = wp.max(far, wp.max(wp.abs(points[i])))
         far += way
         margin = wp.float64(2.0) * margin_of(out.least, ulp * far)
-        _w, y, _inside = nearest(of_vertex, points)
+        _w, y = nearest(of_vertex, points)
         distance = wp.length(y)
         n = y / wp.max(distance, wp.float64(1e-300))
         floor = (ONE - KEPT) * wp.max(distance - margin, ZERO) + wp.min(distance, margin)

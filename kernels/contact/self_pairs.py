@@ -70,15 +70,12 @@ def begin_pairs(dtype):
         # out
         step: StepPairs,
     ):
-        e = wp.tid()
-        if e >= pairs.counts[0] + pairs.counts[1]:
-            return
-        s = pairs.stencils[e]
-        w, y, _inside = nearest(e < pairs.counts[0], corners(x, s))
-        d = wp.length(y)
-        step.gap[e] = d
-        step.weights[e] = w
-        step.normal[e] = y / wp.max(d, wp.float64(1e-300))
+        for e in range(wp.tid(), wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0]), pairs.threads):
+            w, y = nearest(e < pairs.counts[0], corners(x, pairs.stencils[e]))
+            d = wp.length(y)
+            step.gap[e] = d
+            step.weights[e] = w
+            step.normal[e] = y / wp.max(d, wp.float64(1e-300))
 
     return begin_each_pair
 

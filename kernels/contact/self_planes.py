@@ -198,7 +198,7 @@ def part_apart(of_vertex: bool, x: CORNERS, moves: CORNERS, floor: wp.float64):
     else:
         first = wp.max(first, wp.length(relative[1]))
     advanced = ZERO
-    _w, y, _inside = nearest(of_vertex, x)
+    _w, y = nearest(of_vertex, x)
     room = wp.length(y) - floor
     enough = NEAR * room
     if room > -ROUNDED * floor:
@@ -211,7 +211,7 @@ def part_apart(of_vertex: bool, x: CORNERS, moves: CORNERS, floor: wp.float64):
                 further = wp.max(KEPT * wp.max(room, ZERO) / wp.max(first + second, wp.float64(1e-300)), further)
                 advanced = wp.min(advanced + further, ONE)
                 now = x + advanced * relative
-                _w, y, _inside = nearest(of_vertex, now)
+                _w, y = nearest(of_vertex, now)
                 room = wp.where(advanced < ONE, wp.length(y) - floor, ZERO)
     return advanced
 
@@ -260,7 +260,7 @@ def cut_by_planes(dtype):
         if needs_no_cut(e, way, margin, gap):
             return
         points = corners(x, s)
-        _w, y, _inside = nearest(of_vertex, points)
+        _w, y = nearest(of_vertex, points)
         n = y / wp.max(wp.length(y), wp.float64(1e-300))
         lowest = wp.float64(wp.inf)
         highest = -wp.float64(wp.inf)

@@ -21,20 +21,20 @@ def advance_pairs(
 ):
     """The part of each pair, and its gaps over ``keep`` times that at the start, on the way."""
     e = wp.tid()
-    _w, y, _inside = nearest(of_vertex, x[e])
+    _w, y = nearest(of_vertex, x[e])
     floor = keep * wp.length(y)
     t = part_apart(of_vertex, x[e], p[e], floor)
     part[e] = t
     for k in range(SAMPLES):
         s = t * wp.float64(k + 1) / wp.float64(SAMPLES)
-        _w, y, _inside = nearest(of_vertex, x[e] + s * p[e])
+        _w, y = nearest(of_vertex, x[e] + s * p[e])
         gaps[e, k] = wp.length(y) / floor
 
 
 @wp.kernel(module="unique", enable_backward=False)
 def nearest_of_pairs(of_vertex: bool, x: wp.array(dtype=CORNERS), out: wp.array(dtype=wp.vec3d)):
     e = wp.tid()
-    _w, y, _inside = nearest(of_vertex, x[e])
+    _w, y = nearest(of_vertex, x[e])
     out[e] = y
 
 

@@ -18,8 +18,6 @@ from support.rows import table
 from support.scenes import scene
 from warpcloth.contact.self_start import crossings
 from warpcloth.core.status import Result
-from warpcloth.kernels.contact.pair_blocks import BLOCK
-from warpcloth.kernels.contact.self_pairs import begin_pairs
 from warpcloth.scenes import knot, loop
 
 SLOW = pytest.mark.slow
@@ -250,22 +248,6 @@ def test_acting_contacts(device):
         vertices = contact.pairs.stencils.numpy().reshape(-1)[corners]
         assert (vertices == np.repeat(np.arange(model.count), np.diff(first))).all()
         assert (np.diff(corners)[np.diff(vertices) == 0] > 0).all()
-
-
-@SLOW
-@pytest.mark.host
-def test_gaps_by_blocks(device):
-    """They are those of the kernel that takes pairs one by one, to the bit, in full blocks and in others."""
-    pairs = pairs_of(layers(3, turn=17.0, gap=2e-3, n=10), device)
-    model, count = pairs.model, pairs.proximity.counts.numpy()
-    assert (count > BLOCK).all() and (count % BLOCK > 0).any()
-    arrays = pairs.begun.gap, pairs.begun.normal, pairs.begun.weights
-    found = [array.numpy()[: count.sum()].copy() for array in arrays]
-    for array in arrays:
-        array.zero_()
-    model.launch(model.kernel(begin_pairs, model.dtype), count.sum(), [pairs.pairs, model.positions], [pairs.begun])
-    for array, before in zip(arrays, found, strict=True):
-        assert (array.numpy()[: count.sum()] == before).all()
 
 
 @table("name", ["pbd", "hierarchical_pbd"], ["pbd", "hierarchical_pbd", "pbd_jacobi"])

@@ -12,7 +12,7 @@ from ..core.filled import filled
 from ..core.state import Count
 from ..core.status import Stopped
 from ..core.sums import Sums
-from ..kernels.contact import gap_notes, pair_blocks, self_pairs
+from ..kernels.contact import gap_notes, self_pairs
 from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes
 from ..kernels.contact.obstacles import find_moves
 from ..kernels.contact.pair_potential import Laws
@@ -119,10 +119,7 @@ class SelfSteps:
         self.held.first = state.add("first pin held back", model.scalars(wp.int64), Count(rest=model.per_copy))
         self.first_forced = state.add("first mesh that went through cloth", model.scalars(wp.int64))
         self.held.farthest = state.add("farthest pin held back", model.scalars(wp.float64))
-        made = (pair_blocks.begin_blocks if device.is_cpu else self_pairs.begin_pairs, gap_notes.note_gaps, add_positions)
-        self._launch = model.launcher((made, model.dtype))
-        size = pair_blocks.NUMBERS * pair_blocks.BLOCK * device.is_cpu
-        self._block = wp.zeros(size, dtype=wp.float64, device=device) if size else None
+        self._launch = model.launcher(((self_pairs.begin_pairs, gap_notes.note_gaps, add_positions), model.dtype))
         self.placed, self._ahead = [None, None, None], 0 if colliders is None else int(np.ceil(2.0 * colliders.part))
         self.contact = PairContact(surface, bounded, self._laws, self.listed)
         if surface.obstacles:
@@ -411,11 +408,7 @@ class SelfSteps:
         else:
             given = [x, None, 1.0, copies, self.surface.layout]
             self._launch(add_positions, self.surface.count, given, [self.begun_at])
-        given = [self.pairs, self.begun_at]
-        if self._block is None:
-            self._launch(self_pairs.begin_pairs, len(self.pairs.stencils), given, [self.begun])
-        else:
-            self._launch(pair_blocks.begin_blocks, 1, given, [self._block, self.begun])
+        self._launch(self_pairs.begin_pairs, self.pairs.threads, [self.pairs, self.begun_at], [self.begun])
 
     def relist(self, x):
         """Lists the pairs again at x, in copies that have moved, and computes their sides and gaps."""
