@@ -34,20 +34,6 @@ class GapNotes:
     counts: wp.array2d(dtype=wp.int32)
 
 
-@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def find_frames(
-    # state in
-    steps: wp.array(dtype=wp.int32),
-    # parameters
-    per_frame: int,
-    # out
-    some: wp.array(dtype=wp.int32),
-):
-    """Kernel over copies, where a step begins: some = 1 if a frame of one ends there."""
-    if steps[wp.tid()] % per_frame == 0:
-        some[0] = 1
-
-
 @cache
 def note_gaps(dtype):
     """Kernel over pairs at the start of a step: records their gaps if a frame ends there.
@@ -77,9 +63,9 @@ def note_gaps(dtype):
             return
         s = pairs.stencils[e]
         copy = copy_of(pairs.layout, s[0])
-        d = step.gap[e]
         if steps[copy] % per_frame != 0:
             return
+        d = step.gap[e]
         inverse = ONE / d
         if inverse > notes.nearest[copy]:
             wp.atomic_max(notes.nearest, copy, inverse)

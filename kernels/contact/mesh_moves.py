@@ -21,26 +21,6 @@ SMALL = wp.constant(wp.float64(1e-9))  # a weight, so that their sum is not 0
 
 
 @cache
-def are_away(dtype):
-    """Kernel over obstacles: away = 1 if one is not at its ``goal``."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
-    def is_each_away(
-        # state in
-        goal: wp.array(dtype=vec3),
-        x: wp.array(dtype=vec3),
-        # out
-        away: wp.array(dtype=wp.int32),
-    ):
-        t = wp.tid()
-        if wp.length_sq(goal[t] - x[t]) > dtype(0.0) or wp.isfinite(goal[t]) != wp.isfinite(x[t]):
-            away[0] = 1
-
-    return is_each_away
-
-
-@cache
 def aim_obstacles(dtype):
     """Kernel over obstacles: their moves p to ``goal``. Those that appear or vanish go there at once."""
     vec3, _ = types(dtype)

@@ -4,7 +4,6 @@ from functools import cache
 
 import warp as wp
 
-from ..memory import load
 from ..vectors import types
 from .obstacles import Layout, copy_of, vector_within
 from .proximity_grid import MODULE
@@ -188,66 +187,23 @@ def find_motion(dtype):
 
 
 @cache
-def find_motion_of_pieces(dtype):
-    """Kernel over copies of one piece each, for the CPU: :func:`find_motion` by a loop without branches."""
-    vec3, _ = types(dtype)
-    vector = load(vec3)
-
-    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
-    def find_motion_of_each_piece(
-        # state in
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        found: wp.array(dtype=vec3),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        most: dtype,
-        per_copy: int,
-        # in and out
-        pieces: pieces(dtype),
-        # out
-        moved: wp.array(dtype=wp.int32),
-        some: wp.array(dtype=wp.int32),
-        due: wp.array(dtype=wp.int32),
-    ):
-        copy = wp.tid()
-        drift = pieces.drift[copy]
-        moving = per_copy
-        i = copy * per_copy
-        end = i + per_copy
-        if d:
-            while i < end:
-                own = vector(x, i) + vector(d, i) - vector(found, i) - drift
-                moving -= wp.where(wp.dot(own, own) <= most * most, 1, 0)
-                i += 1
-        while i < end:
-            own = vector(x, i) - vector(found, i) - drift
-            moving -= wp.where(wp.dot(own, own) <= most * most, 1, 0)
-            i += 1
-        if moving != 0:
-            note_moved(active, copy, moved, some, due)
-
-    return find_motion_of_each_piece
-
-
-@cache
-def compare_lists(dtype):
-    """Kernel over vertices: due = 1 if the pairs were not listed at ``found``."""
+def compare_positions(dtype):
+    """Kernel over vertices: differ = 1 if one is at other positions in a and b, of which both may be NaN."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
-    def compare_each_listed(
+    def compare_each_position(
         # state in
-        found: wp.array(dtype=vec3),
-        listed: wp.array(dtype=vec3),
+        a: wp.array(dtype=vec3),
+        b: wp.array(dtype=vec3),
         # out
-        due: wp.array(dtype=wp.int32),
+        differ: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        if not (wp.length_sq(found[i] - listed[i]) <= dtype(0.0)):
-            due[0] = 1
+        if wp.length_sq(a[i] - b[i]) > dtype(0.0) or wp.isfinite(a[i]) != wp.isfinite(b[i]):
+            differ[0] = 1
 
-    return compare_each_listed
+    return compare_each_position
 
 
 @cache

@@ -76,7 +76,6 @@ class Proximity:
         self._along = filled(proximity_grid.surfaces(model.dtype), **values | touching)
         self._allocate_grid()
         self._set_pieces(piece)
-        self._whole = model.device.is_cpu and self._pieces.per_copy == 1 and (piece >= 0).all()
         self._shares = 8 if model.device.is_cuda else 1
         self.found, self.listed = surface.vectors(), surface.vectors()  # all 0, so that the first call makes a list
         self.flag, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
@@ -86,9 +85,8 @@ class Proximity:
         self._launch = model.launcher(
             ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
             ((kernels.write_pairs,), model.dtype),
-            ((piece_motion.extend_boxes, piece_motion.find_drift, piece_motion.compare_lists), model.dtype),
+            ((piece_motion.extend_boxes, piece_motion.find_drift, piece_motion.compare_positions), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.add_positions), model.dtype),
-            ((piece_motion.find_motion_of_pieces,), model.dtype),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
@@ -225,7 +223,7 @@ class Proximity:
         """Calls ``launch`` with x if :meth:`moved` sets the flag, or if the list is not that of ``found``."""
         for array in (self.flag, self.copies, self._due):
             array.zero_()
-        self._launch(piece_motion.compare_lists, self._vertices, [self.found, self.listed], [self._due])
+        self._launch(piece_motion.compare_positions, self._vertices, [self.found, self.listed], [self._due])
         self._launch_moved_since(x, part, None, self.flag)
         wp.capture_if(self._due, launch, x=x)
 
@@ -264,11 +262,7 @@ class Proximity:
         self._launch(piece_motion.find_drift, len(self.drift), at, [self._pieces])
         most = part * self.skin if self.surface.meets_itself else np.inf
         given, out = [*at, active, most], [self._pieces, self.copies, flag, self._due]
-        if self._whole:
-            given.append(self.model.per_copy)
-            self._launch(piece_motion.find_motion_of_pieces, self.model.copies, given, out)
-        else:
-            self._launch(piece_motion.find_motion, self._vertices, given, out)
+        self._launch(piece_motion.find_motion, self._vertices, given, out)
         if several:
             wp.capture_if(self._due, lambda: self._launch_boxes(self.found))
             given = [self._pieces, active, self._max_distance + self.skin, 2.0 * part * self.skin]

@@ -222,7 +222,7 @@ class SelfFilter:
         model, device = self.model, self.model.device
         self._moves = self._surface.vectors()
         self._carried, self._keys = (wp.zeros(model.count, dtype=wp.int64, device=device) for _ in range(2))
-        self._make(mesh_moves.are_away, mesh_moves.aim_obstacles, mesh_moves.carry_vertices)
+        self._make(mesh_moves.aim_obstacles, mesh_moves.carry_vertices, piece_motion.compare_positions)
         self._make(self_filter.push_pairs)
         self._carriers = [model.kernel(mesh_moves.find_carriers, model.dtype, each) for each in (True, False)]
 
@@ -241,7 +241,7 @@ class SelfFilter:
         for array in (self._rounds, self._proceed):
             array.zero_()
         self._walking.fill_(1)
-        self._launch_move(mesh_moves.are_away, [goal, self._surface.behind(x)], [self._proceed])
+        self._launch_move(piece_motion.compare_positions, [goal, self._surface.behind(x)], [self._proceed])
         wp.capture_while(self._proceed, self._launch_meshes_on, x=x, goal=goal)
 
     def _launch_meshes_on(self, x, goal):

@@ -107,7 +107,7 @@ class SelfSteps:
         self.most_listed = state.add("most pairs", model.scalars(wp.int32))
         self._most = Mirror(self.most_listed)
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
-        self.listed, self.far, self._ends = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
+        self.listed, self.far = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         notes = {
             "nearest": state.add("nearest", model.scalars(wp.float64)),
             "too_near": state.add("first too near", model.scalars(wp.int64)),
@@ -305,12 +305,7 @@ class SelfSteps:
 
     def _launch_begin(self, x):
         self.launch_sides(x)
-        if self.per_frame > 1:
-            self._ends.zero_()
-            self.model.launch(gap_notes.find_frames, self.model.copies, [self.steps, self.per_frame], [self._ends])
-            wp.capture_if(self._ends, self._launch_notes, x=x, per_frame=self.per_frame, notes=self._notes)
-        else:
-            self._launch_notes(x, 1, self._notes)
+        self._launch_notes(x, self.per_frame, self._notes)
         if self.friction is not None:
             self.contact.launch_rows(x)
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
