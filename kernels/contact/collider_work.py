@@ -12,25 +12,6 @@ UNCUT, NOW = wp.constant(0), wp.constant(2)  # the filter shortened no move of a
 
 
 @cache
-def half_way(dtype):
-    """Kernel over vertices: out = ½(a + b)."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def half_way_between(
-        # state in
-        a: wp.array(dtype=vec3),
-        b: wp.array(dtype=vec3),
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        out[i] = dtype(0.5) * (a[i] + b[i])
-
-    return half_way_between
-
-
-@cache
 def collider_pulls(dtype):
     """Struct of ∂U/∂x of contact and friction with a collider, of friction alone, and of the moves of the collider, or None."""
     vec3, _ = types(dtype)

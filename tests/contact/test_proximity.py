@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from support.pairs import all_pairs, pieces
+from support.pairs import all_pairs, detect, pieces
 from support.rows import table
 from warpcloth.contact.proximity import Proximity
 from warpcloth.contact.surface import ContactSurface
@@ -16,17 +16,6 @@ def proximity(mesh, distance, skin, device, **options):
     pins = mesh.isolated if len(mesh.isolated) else None
     model = Model(wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)], pins=pins), device=device, **options)
     return model, Proximity(ContactSurface(model), distance, skin)
-
-
-def detect(found, x):
-    """A detection with as much room as it takes; its stencils of either kind."""
-    positions = found.model.array(x, found.model.vec3)
-    found.launch(positions)
-    while found.overflowed:
-        found.grow()
-        found.launch(positions)
-    vt, ee = found.counts.numpy()
-    return np.split(found.stencils.numpy()[: vt + ee], [vt])
 
 
 def rows(stencils):

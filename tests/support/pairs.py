@@ -122,3 +122,14 @@ def energies(mesh, x, r, k):
     )
     D = of_two_edges(*(x[s[:, i]] for i in range(4)))
     return 0.5 * k * total, 0.5 * np.pi * k * (b * b_other * barrier(4.0 * D, r)).sum()
+
+
+def detect(found, x):
+    """A detection with as much room as it takes; its stencils of either kind."""
+    positions = found.model.array(x, found.model.vec3)
+    found.launch(positions)
+    while found.overflowed:
+        found.grow()
+        found.launch(positions)
+    vt, ee = found.counts.numpy()
+    return np.split(found.stencils.numpy()[: vt + ee], [vt])

@@ -12,6 +12,13 @@ from ..kernels.work import add_rubbing_work, add_scaled
 from .present import ColliderPulls, PresentContact
 
 
+def launch_mean(model, a, b, out):
+    """Launches out = ½(a + b), (N,)."""
+    out.zero_()
+    for each in (a, b):
+        model.launch(model.kernel(add_scaled, model.dtype), model.count, [each, 0.5], [out])
+
+
 class ColliderWork:
     """Sums the work of colliders but meshes over the steps of one stepper, from the forces that its steps used.
 
@@ -37,9 +44,8 @@ class ColliderWork:
             now.move = model.vectors()
             kept = [name for name in ("all", "friction", "move") if self._at_end and getattr(now, name)]
             self._before.append(filled(kernels.collider_pulls(model.dtype), **{name: model.vectors() for name in kept}))
-        self._half_way = None
         if colliders.part == 0.5:
-            self._half_way, self._x_step = model.kernel(kernels.half_way, model.dtype), model.vectors()
+            self._x_step = model.vectors()
         self._add = model.kernel(kernels.add_collider_work, model.dtype)
         self._rigid = model.kernel(kernels.rigid_moves, model.dtype)
 
@@ -54,8 +60,8 @@ class ColliderWork:
     def launch(self):
         """Launches the sums after a step."""
         model, colliders = self.model, self.colliders
-        if self._half_way:
-            model.launch(self._half_way, model.count, [colliders.x_before, self._x], [self._x_step])
+        if colliders.part == 0.5:
+            launch_mean(model, colliders.x_before, self._x, self._x_step)
         self.pulls.launch(self._x_step)
         if self._limit:
             self._launch_limit()
@@ -103,7 +109,6 @@ class PairWork:
         size = model.copies, len(model.scene.colliders)
         self.of_meshes, self.against_meshes = (wp.zeros(size, dtype=wp.float64, device=model.device) for _ in range(2))
         self._moves, self._x = any(model.scene.colliders[c].moves for c in model.scene.meshes), model.vectors()
-        self._half_way = model.kernel(kernels.half_way, model.dtype)
         self._pulls, self._rub = model.vectors(), model.kernel(add_rubbing_work, model.dtype)
 
     def launch(self):
@@ -127,7 +132,7 @@ class PairWork:
         start = stepper.pairs.friction.start if stepper.x_before is None else stepper.x_before
         if integrator is None:
             return start
-        model.launch(self._half_way, model.count, [start, x], [self._x])
+        launch_mean(model, start, x, self._x)
         return self._x
 
     def sums(self):
