@@ -7,7 +7,7 @@ import warp as wp
 from ..coulomb import Law
 from ..terms import contact
 from ..vectors import types
-from .colliders import gap_of, pose_types, rotated, shapes, step_poses, to_local, to_space
+from .colliders import filters, gap_of, pose_types, rotated, to_local, to_space
 
 
 @cache
@@ -45,36 +45,33 @@ def anchor_vertices(dtype, solids, law: Law, bounded: bool):
     def anchor(
         # elements
         stencil: wp.array2d(dtype=wp.int32),
-        shape: shapes(dtype),
+        colliders: filters(dtype),
         # state in
         x: wp.array(dtype=vec3),
-        poses: step_poses(dtype),
         # parameters
         collider: int,
-        per_copy: int,
         distance: dtype,
-        friction: dtype,
         # in and out
         anchors: wp.array(dtype=anchor_type),
         rest: wp.array(dtype=rest_type),
     ):
         e = wp.tid()
         i = stencil[e, 0]
-        copy = e // per_copy
-        pose = poses.before[copy, collider]
+        copy = i // colliders.per_copy
+        pose = colliders.poses.before[copy, collider]
         X = to_local(pose, x[i])
-        d, n = gap(shape, collider, X)
+        d, n = gap(colliders.shape, collider, X)
         depth = -slope(d, distance)
         if depth > dtype(0.0):
             a = X - slip(anchors[i], X, n)
-            now = poses.at[copy, collider]
+            now = colliders.poses.at[copy, collider]
             target = to_space(now, a)
             normal = rotated(now, n)
             r = rest_type()
             for k in range(3):
                 r[k] = target[k]
                 r[3 + k] = normal[k]
-            r[6] = limit(depth, friction)
+            r[6] = limit(depth, colliders.shape.friction[collider])
             r[7] = rest[e][7]
             rest[e] = r
             anchors[i] = anchor_type(a[0], a[1], a[2], r[6])

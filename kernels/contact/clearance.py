@@ -7,7 +7,7 @@ import warp as wp
 from ..rotation import epsilon
 from ..terms.contact import ROUNDED_BOX
 from ..vectors import types
-from .colliders import gap_of, shapes, step_poses, to_local
+from .colliders import filters, gap_of, to_local
 
 
 @cache
@@ -46,29 +46,27 @@ def near_colliders(dtype, ended: bool):
     @wp.kernel(module="unique", enable_backward=False)
     def find(
         # elements
-        shape: shapes(dtype),
+        colliders: filters(dtype),
         gravity: wp.array(dtype=vec3),
         per_gravity: int,
         # state in
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         end: wp.array(dtype=vec3),
-        poses: step_poses(dtype),
         # parameters
-        per_copy: int,
         h: dtype,
         # in and out
         clear: clearances(dtype),
         due: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        copy = i // per_copy
+        copy = i // colliders.per_copy
         if wp.static(ended):
             if due[0] != 0:
                 return
             way = wp.length(end[i] - x[i])
         else:
-            if i == copy * per_copy and wp.max(clear.before[copy], clear.followed[0]) != 0:
+            if i == copy * colliders.per_copy and wp.max(clear.before[copy], clear.followed[0]) != 0:
                 due[0] = 1
             if clear.near[copy] != 0:
                 return
@@ -76,8 +74,8 @@ def near_colliders(dtype, ended: bool):
         ball = clear.balls[i]
         if not (wp.length(x[i] - vec3(ball[0], ball[1], ball[2])) + way <= ball[3]):
             radius = dtype(wp.inf)
-            for c in range(shape.radius.shape[0]):
-                d, _n = gap(shape, c, to_local(poses.before[copy, c], x[i]))
+            for c in range(colliders.shape.radius.shape[0]):
+                d, _n = gap(colliders.shape, c, to_local(colliders.poses.before[copy, c], x[i]))
                 radius = wp.min(radius, d)
             radius -= clear.distance + dtype(8.0) * epsilon(radius) * wp.max(wp.abs(x[i]))
             clear.balls[i] = ball_type(x[i][0], x[i][1], x[i][2], radius)

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..rotation import epsilon
 from ..vectors import types
-from .colliders import gap_of, kept_part, rotated, shapes, step_poses, to_local, to_space
+from .colliders import filters, gap_of, kept_part, rotated, shapes, to_local, to_space
 
 ROUNDS = wp.constant(6)  # maximum number of tests of a vertex that colliders stop
 SLIDING = wp.constant(2)  # in so many of these it slides; then its move is only shortened, which terminates
@@ -28,24 +28,6 @@ class FilterNotes:
     inside: wp.array2d(dtype=wp.int64)
     pushed: wp.array(dtype=wp.vec3d)
     kicked: wp.array(dtype=wp.vec3d)
-
-
-@cache
-def filters(dtype):
-    """Struct of colliders, their ``poses`` in a step, and the numbers of the filter.
-
-    A vertex may end at the distance ``least`` [m]. One that is stopped ends at most ``landing`` farther away [m].
-    """
-
-    @wp.struct
-    class Filter:
-        shape: shapes(dtype)
-        poses: step_poses(dtype)
-        per_copy: wp.int32
-        least: dtype
-        landing: dtype
-
-    return Filter
 
 
 @wp.func

@@ -51,6 +51,24 @@ def step_poses(dtype):
     return StepPoses
 
 
+@cache
+def filters(dtype):
+    """Struct of colliders, their ``poses`` in a step, and the numbers of the filter.
+
+    A vertex may end at the distance ``least`` [m]. One that is stopped ends at most ``landing`` farther away [m].
+    """
+
+    @wp.struct
+    class Filter:
+        shape: shapes(dtype)
+        poses: step_poses(dtype)
+        per_copy: wp.int32
+        least: dtype
+        landing: dtype
+
+    return Filter
+
+
 @wp.func
 def rotated(pose: Any, v: Any):
     """A vector v in the frame of a pose, in space."""
@@ -237,37 +255,32 @@ def pose_collider(dtype, solids):
     def set_pose(
         # elements
         stencil: wp.array2d(dtype=wp.int32),
-        shape: shapes(dtype),
+        colliders: filters(dtype),
         gravity: wp.array(dtype=vec3),
         per_gravity: int,
         # state in
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
-        poses: step_poses(dtype),
         # parameters
         collider: int,
-        per_copy: int,
-        least: dtype,
         h: dtype,
         # in and out
         rest: wp.array(dtype=rest_type),
     ):
         e = wp.tid()
         i = stencil[e, 0]
-        copy = e // per_copy
-        pose = poses.at[copy, collider]
-        core = shape.core[collider]
-        radius = shape.radius[collider]
+        copy = i // colliders.per_copy
+        pose = colliders.poses.at[copy, collider]
+        core = colliders.shape.core[collider]
+        radius = colliders.shape.radius[collider]
         if wp.isfinite(core[0]) and h > dtype(0.0):
             way = h * (v[i] + h * gravity[i // per_gravity])
-            before = poses.before[copy, collider]
-            after = poses.after[copy, collider]
-            X = to_local(before, x[i])
-            way = to_local(after, x[i] + way) - X
-            t = kept(shape, collider, X, way, least)
+            X = to_local(colliders.poses.before[copy, collider], x[i])
+            way = to_local(colliders.poses.after[copy, collider], x[i] + way) - X
+            t = kept(colliders.shape, collider, X, way, colliders.least)
             if t < dtype(1.0):
                 X = X + t * way
-                d, n = gap(shape, collider, X)
+                d, n = gap(colliders.shape, collider, X)
                 position = to_space(pose, X - d * n)
                 pose = behind(position, rotated(pose, n))
                 core = vec3(dtype(wp.inf), dtype(wp.inf), dtype(wp.inf))

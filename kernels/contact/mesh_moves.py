@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from ..vectors import types
-from .colliders import gap_of, shapes, step_poses, to_local, to_space
+from .colliders import filters, gap_of, to_local, to_space
 from .obstacles import has_obstacle
 from .self_gaps import ONE, ZERO
 from .self_pairs import Pairs, StepPairs
@@ -45,15 +45,14 @@ def aim_obstacles(dtype):
 
 
 @cache
-def find_carriers(dtype, of_meshes: bool):
+def find_carriers(dtype):
     """Kernel over pairs: the key of the pair that carries each vertex of the cloth, with a mesh or with cloth that is carried.
 
     Pairs of the vertex itself with a triangle come first, as their nearest point moves as it should where the mesh turns, then
     those with the smallest gap.
     """
 
-    # Separate modules: graphs on the CPU find kernels of a module by name.
-    @wp.kernel(module=f"warpcloth.carriers.{dtype.__name__}.{of_meshes}", enable_backward=False)
+    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
     def find_each_carrier(
         # elements
         pairs: Pairs,
@@ -61,6 +60,7 @@ def find_carriers(dtype, of_meshes: bool):
         step: StepPairs,
         carried: wp.array(dtype=wp.int64),
         # parameters
+        of_meshes: bool,
         max_distance: wp.float64,
         # out
         keys: wp.array(dtype=wp.int64),
@@ -70,14 +70,14 @@ def find_carriers(dtype, of_meshes: bool):
         if e >= wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0]):
             return
         s = pairs.stencils[e]
-        if has_obstacle(pairs.layout, s) != wp.static(of_meshes):
+        if has_obstacle(pairs.layout, s) != of_meshes:
             return
         near = wp.clamp(ONE - step.gap[e] / max_distance, ZERO, ONE)
         sides = wp.where(e < pairs.counts[0], 1, 2)
         for i in range(4):
             order = wp.int64(PARTS * wp.where(i < 2 - sides, ONE + near, near))
             key = order * wp.int64(2147483648) + wp.int64(e) + wp.int64(1)
-            if wp.static(of_meshes):
+            if of_meshes:
                 if s[i] < pairs.layout.cloth:
                     wp.atomic_max(keys, s[i], key)
             else:
@@ -105,12 +105,10 @@ def carry_with_shapes(dtype, solids):
     def carry_each_vertex(
         # elements
         inverse_mass: wp.array(dtype=dtype),
-        shape: shapes(dtype),
+        colliders: filters(dtype),
         # state in
         x: wp.array(dtype=vec3),
-        poses: step_poses(dtype),
         # parameters
-        per_copy: int,
         distance: dtype,
         # out
         p: wp.array(dtype=vec3),
@@ -120,13 +118,14 @@ def carry_with_shapes(dtype, solids):
         i = wp.tid()
         if inverse_mass[i] == dtype(0.0):
             return
-        copy = i // per_copy
+        copy = i // colliders.per_copy
         nearest = distance
-        for c in range(shape.radius.shape[0]):
-            d, _n = gap(shape, c, to_local(poses.at[copy, c], x[i]))
+        for c in range(colliders.shape.radius.shape[0]):
+            now = colliders.poses.at[copy, c]
+            d, _n = gap(colliders.shape, c, to_local(now, x[i]))
             if d < nearest:
                 nearest = d
-                p[i] = to_space(poses.at[copy, c], to_local(poses.before[copy, c], x[i])) - x[i]
+                p[i] = to_space(now, to_local(colliders.poses.before[copy, c], x[i])) - x[i]
                 keys[i] = wp.int64(1)
         if wp.length_sq(p[i]) > dtype(0.0):
             some[0] = 1

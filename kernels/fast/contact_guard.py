@@ -9,8 +9,8 @@ from functools import cache
 import warp as wp
 
 from ..contact.anchors import slip_of
-from ..contact.collider_filter import FilterNotes, filters, outside
-from ..contact.colliders import gap_of, pose_types, rotated, to_local
+from ..contact.collider_filter import FilterNotes, outside
+from ..contact.colliders import filters, gap_of, pose_types, rotated, to_local
 from ..coulomb import COULOMB, huber_secant
 from ..explicit_step import kick_and_drift
 from ..memory import load, store

@@ -5,7 +5,7 @@ import warp as wp
 
 from ..core.filled import filled
 from ..kernels.contact.clearance import clearances, near_colliders
-from ..kernels.contact.colliders import shapes
+from ..kernels.contact.colliders import filters, shapes
 
 
 class Clearance:
@@ -18,7 +18,7 @@ class Clearance:
     """
 
     def __init__(self, colliders, state):
-        self._colliders, self.model = colliders, colliders.model
+        self._h, self.model = colliders.h, colliders.model
         model, device = self.model, self.model.device
         balls = np.zeros((model.count, 4))
         balls[:, 3] = -1.0
@@ -38,7 +38,8 @@ class Clearance:
         )
         halves, bounding = zip(*(collider.centred().bounds for collider in model.scene.colliders), strict=True)
         core, radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
-        self._bounds = filled(shapes(model.dtype), core=core, radius=radius)
+        bounds = filled(shapes(model.dtype), core=core, radius=radius)
+        self._bounds = filled(filters(model.dtype), shape=bounds, poses=colliders.poses, per_copy=model.per_copy)
         self._finds = [model.kernel(near_colliders, model.dtype, ended) for ended in (False, True)]
 
     def follow(self):
@@ -64,6 +65,6 @@ class Clearance:
         wp.capture_if(self._ended, launch)
 
     def _find(self, ended, x, v, end, due):
-        colliders, model = self._colliders, self.model
-        given = [self._bounds, *model.free_gravity, x, v, end, colliders.poses, model.per_copy, colliders.h]
+        model = self.model
+        given = [self._bounds, *model.free_gravity, x, v, end, self._h]
         model.launch(self._finds[ended], model.count, given, [self._clear, due])

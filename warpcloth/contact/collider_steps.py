@@ -12,7 +12,7 @@ from ..core.state import Count
 from ..kernels.contact import colliders as kernels
 from ..kernels.contact.anchors import anchor_vertices
 from ..kernels.contact.clear_elements import find_clear
-from ..kernels.contact.collider_filter import FIRST, FilterNotes, filter_step, filters, hold_locked
+from ..kernels.contact.collider_filter import FIRST, FilterNotes, filter_step, hold_locked
 from ..kernels.step import count_step
 from ..kernels.terms.contact import FLOOR
 from ..terms.refresh import STEP, Refresh
@@ -30,16 +30,15 @@ def cut_share(model, cut, steps):
     return cut.numpy() / np.maximum(steps.numpy().astype(np.float64) * free, 1.0)
 
 
-def launch_pose(kernel, shapes, poses, least, h, x, v, model, elements):
+def launch_pose(kernel, colliders, h, x, v, model, elements):
     """Launches the rest states of contact ``elements`` by :func:`warpcloth.kernels.contact.colliders.pose_collider`."""
-    given = [elements.stencil, shapes, *model.free_gravity, x, v, poses, elements.collider, elements.per_copy, least, h]
+    given = [elements.stencil, colliders, *model.free_gravity, x, v, elements.collider, h]
     model.launch(kernel, elements.count, given, [elements.rest])
 
 
-def launch_anchors(kernel, shapes, poses, anchors, x, model, elements):
+def launch_anchors(kernel, colliders, anchors, x, model, elements):
     """Launches the rest states of friction, and its anchors, by :func:`warpcloth.kernels.contact.anchors.anchor_vertices`."""
-    declared, c = model.colliders, elements.collider
-    given = [elements.stencil, shapes, x, poses, c, elements.per_copy, declared.distance, float(declared.friction[c])]
+    given = [elements.stencil, colliders, x, elements.collider, model.colliders.distance]
     model.launch(kernel, elements.count, given, [anchors, elements.rest])
 
 
@@ -94,7 +93,7 @@ class ColliderSteps:
         self._spare, self._reads, self._again = None, False, False
         self.least = FLOOR * declared.distance
         numbers = {"per_copy": model.per_copy, "least": self.least, "landing": LANDING * declared.distance}
-        self.filter = filled(filters(model.dtype), shape=self.shapes, poses=self.poses, **numbers)
+        self.filter = filled(kernels.filters(model.dtype), shape=self.shapes, poses=self.poses, **numbers)
         # Midpoint evaluates forces at the middle of a step, other integrators at its end.
         self._given = [declared.keyframes, declared.firsts, self.steps, steps_per_frame, int(np.ceil(2.0 * part))]
         self.bounded = part == 0.0
@@ -131,7 +130,7 @@ class ColliderSteps:
             launch = partial(self._anchor, kernel, self.anchors[c])
         elif declared.moves[c] or not (self.bounded or declared.half_space[c]):
             kernel = model.kernel(kernels.pose_collider, model.dtype, declared.solids)
-            launch = partial(launch_pose, kernel, self.shapes, self.poses, self.least, h, self.x_before, state.v)
+            launch = partial(launch_pose, kernel, self.filter, h, self.x_before, state.v)
         refresh = Refresh(STEP, partial(self._refresh, first, launch, state.v))
         clear = None
         if self._finds_clear:
@@ -152,7 +151,7 @@ class ColliderSteps:
     def _anchor(self, kernel, anchors, model, elements):
         if self._reads:
             wp.copy(self._spare, anchors)
-        launch_anchors(kernel, self.shapes, self.poses, anchors, self.x_before, model, elements)
+        launch_anchors(kernel, self.filter, anchors, self.x_before, model, elements)
         if self._reads:
             wp.copy(anchors, self._spare)
 

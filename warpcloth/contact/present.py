@@ -37,10 +37,12 @@ class PresentContact:
         pose_type, self._anchor_type = kernels.pose_types(model.dtype)
         self._dim, self._steps = (model.copies, len(declared.radius)), model.scalars(wp.int32)
         at, after = (wp.zeros(self._dim, dtype=pose_type, device=model.device) for _ in range(2))
-        self._poses = filled(kernels.step_poses(model.dtype), before=at, at=at, after=at)
+        poses = filled(kernels.step_poses(model.dtype), before=at, at=at, after=at)
+        values = {"shape": steps.shapes, "poses": poses, "per_copy": model.per_copy, "least": steps.least}
+        self._colliders = filled(kernels.filters(model.dtype), **values)
         self._moved = filled(kernels.step_poses(model.dtype), before=at, at=at, after=after)  # the last are not read
         self._given = [declared.keyframes, declared.firsts, self._steps, steps.steps_per_frame, 0]
-        self._move, self._shapes, self._least = model.kernel(kernels.move_colliders, model.dtype), steps.shapes, steps.least
+        self._move = model.kernel(kernels.move_colliders, model.dtype)
         self.terms = tuple(elements if elements.collider is None else self._own(elements, steps) for elements in model.terms)
 
     def _own(self, elements, steps):
@@ -66,13 +68,13 @@ class PresentContact:
             launch(x, v)
 
     def _pose(self, kernel, own, x, v):
-        launch_pose(kernel, self._shapes, self._poses, self._least, 0.0, x, v, self.model, own)
+        launch_pose(kernel, self._colliders, 0.0, x, v, self.model, own)
 
     def _anchor(self, kernel, own, anchors, x, _v):
         n = self.model.per_copy
         for steps, first, end in self._parts:
             wp.copy(anchors, steps.anchors[own.collider], first * n, 0, (end - first) * n)
-        launch_anchors(kernel, self._shapes, self._poses, anchors, x, self.model, own)
+        launch_anchors(kernel, self._colliders, anchors, x, self.model, own)
 
 
 class ColliderPulls:

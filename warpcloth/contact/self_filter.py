@@ -222,9 +222,8 @@ class SelfFilter:
         model, device = self.model, self.model.device
         self._moves = self._surface.vectors()
         self._carried, self._keys = (wp.zeros(model.count, dtype=wp.int64, device=device) for _ in range(2))
-        self._make(mesh_moves.aim_obstacles, mesh_moves.carry_vertices, piece_motion.compare_positions)
-        self._make(self_filter.push_pairs)
-        self._carriers = [model.kernel(mesh_moves.find_carriers, model.dtype, each) for each in (True, False)]
+        self._make(mesh_moves.aim_obstacles, mesh_moves.find_carriers, mesh_moves.carry_vertices)
+        self._make(self_filter.push_pairs, piece_motion.compare_positions)
 
     def _launch_move(self, factory, inputs, outputs):
         self._launch(factory, self._surface.count - self.model.count, inputs, outputs)
@@ -251,7 +250,7 @@ class SelfFilter:
         for array in (p, self._carried, self._keys):
             array.zero_()
         self._launch_move(mesh_moves.aim_obstacles, [goal], [self._surface.behind(x), self._surface.behind(p)])
-        self._launch_carriers(self._carriers[0])
+        self._launch_carriers(of_meshes=True)
         self._launch_carry_on()
         self.launch_limit(p)
         self._add(x, p, 1.0, x, self._walking)
@@ -277,7 +276,7 @@ class SelfFilter:
         for array in (self._moves, self._carried, self._keys, self._changed):
             array.zero_()
         self._walking.fill_(1)
-        given = [model.inverse_mass, colliders.shapes, x, colliders.poses, model.per_copy, model.colliders.distance]
+        given = [model.inverse_mass, colliders.filter, x, model.colliders.distance]
         model.launch(self._carry_with_shapes, model.count, given, [self._moves, self._keys, self._changed])
         wp.copy(self._carried, self._keys)
         wp.capture_if(self._changed, self._launch_walk_with_shapes, x=x)
@@ -290,15 +289,15 @@ class SelfFilter:
     def _launch_carry_on(self):
         """Finds the moves of cloth that is listed with carried cloth, and pushes what would come too near apart."""
         self._changed.fill_(1)
-        wp.capture_while(self._changed, self._launch_carriers, kernel=self._carriers[1])
+        wp.capture_while(self._changed, self._launch_carriers, of_meshes=False)
         self._launch_pushes(self.model.inverse_mass, self._moves, opens=True)
         self.model.lock(self._moves)
 
-    def _launch_carriers(self, kernel):
+    def _launch_carriers(self, of_meshes):
         model, contact = self.model, self._contact
         self._changed.zero_()
-        given = [contact.pairs, contact.begun, self._carried, contact.skin + contact.max_distance]
-        model.launch(kernel, len(contact.pairs.stencils), given, [self._keys, self._changed])
+        given = [contact.pairs, contact.begun, self._carried, of_meshes, contact.skin + contact.max_distance]
+        self._launch(mesh_moves.find_carriers, len(contact.pairs.stencils), given, [self._keys, self._changed])
         given = [contact.pairs, model.inverse_mass, model.mobility, contact.begun, self._keys, self._carried]
         self._launch(mesh_moves.carry_vertices, model.count, given, [self._moves])
         wp.copy(self._carried, self._keys)
