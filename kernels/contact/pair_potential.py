@@ -300,26 +300,23 @@ def set_shares(contacts: Contacts, first: int, count: int, extra: int, extras: i
 
 
 @cache
-def lowest_gap(dtype, of_vertex: bool):
-    """Device function (stencil, n, b, c, d, goal, move) → a lower bound of the gap; b, c and d are relative to vertex 0.
+def lowest_gap(dtype):
+    """Device function (of_vertex, stencil, n, b, c, d, goal, move) → a lower bound of the gap, with b, c and d from vertex 0.
 
     It is the gap along n there or, if less and given, at goal + move, where the pair may have passed through.
     """
     vec3, _ = types(dtype)
-    at = vertex_of(dtype)
-    VERTEX = wp.constant(of_vertex)
+    at, points = vertex_of(dtype), wp.array(dtype=vec3)
 
     @wp.func
-    def find(
-        s: wp.vec4i, n: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, goal: wp.array(dtype=vec3), move: wp.array(dtype=vec3)
-    ):
-        found = gap_along(VERTEX, n, b, c, d)
+    def find(of_vertex: bool, s: wp.vec4i, n: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, goal: points, move: points):
+        found = gap_along(of_vertex, n, b, c, d)
         if goal:
             p = at(goal, move, s[0])
             q = at(goal, move, s[1]) - p
             t = at(goal, move, s[2]) - p
             u = at(goal, move, s[3]) - p
-            found = wp.min(found, gap_along(VERTEX, n, q, t, u))
+            found = wp.min(found, gap_along(of_vertex, n, q, t, u))
         return found
 
     return find
@@ -332,8 +329,7 @@ def find_near_faces(dtype):
     A face is near if it has a force there, or may have one at goal + move if that is given. Only the first ``vertices`` count.
     """
     vec3, _ = types(dtype)
-    at = vertex_of(dtype)
-    lowest = lowest_gap(dtype, True)
+    at, lowest = vertex_of(dtype), lowest_gap(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_each_near_face(
@@ -362,7 +358,7 @@ def find_near_faces(dtype):
                 b = at(x, correction, s[1]) - a
                 c = at(x, correction, s[2]) - a
                 d = at(x, correction, s[3]) - a
-                if lowest(s, normals[e], b, c, d, goal, move) < r:
+                if lowest(True, s, normals[e], b, c, d, goal, move) < r:
                     code, w = nearest_of_face(b, c, d)
                     y = w[0] * b + w[1] * c + w[2] * d
                     if goal or wp.length(y) < r:
@@ -506,8 +502,7 @@ def width_of(areas: Areas, layout: Layout, laws: Laws, i: int, j: int):
 def find_edge_contacts(dtype):
     """Kernel over pairs of edges: their contacts, as :func:`find_vertex_contacts`."""
     vec3, _ = types(dtype)
-    at = vertex_of(dtype)
-    lowest = lowest_gap(dtype, False)
+    at, lowest = vertex_of(dtype), lowest_gap(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_contact_of_edges(
@@ -538,7 +533,7 @@ def find_edge_contacts(dtype):
             b = at(x, correction, s[1]) - a
             c = at(x, correction, s[2]) - a
             d = at(x, correction, s[3]) - a
-            if lowest(s, normals[e], b, c, d, goal, move) >= r:
+            if lowest(False, s, normals[e], b, c, d, goal, move) >= r:
                 continue
             u, t, ratio = on_two_edges(wp.vec3d(), b, c, d)
             y = u * b - (c + t * (d - c))

@@ -33,8 +33,8 @@ def advances(dtype):
 
 
 @cache
-def allowed_fraction(dtype, of_edges: bool):
-    """Device function (stencil, x, advance) → the fraction of its moves that a pair may make.
+def allowed_fraction(dtype):
+    """Device function (of_vertex, stencil, x, advance) → the fraction of its moves that a pair may make.
 
     A pair keeps a tenth of its gap. Where all vertices move by the same fraction, a plane between the sides may move with them:
     they stay apart along y while no vertex of one side comes near the height of one of the other. Where this allows less than
@@ -42,10 +42,9 @@ def allowed_fraction(dtype, of_edges: bool):
     """
     vec3, _ = types(dtype)
     ulp, vector_or_zero, advance = ulp_of(dtype), vector_within(dtype), advances(dtype)
-    of_vertex, sides = wp.constant(not of_edges), wp.constant(2 if of_edges else 1)
 
     @wp.func
-    def allowed(s: wp.vec4i, x: wp.array(dtype=vec3), out: advance):
+    def allowed(of_vertex: bool, s: wp.vec4i, x: wp.array(dtype=vec3), out: advance):
         points = corners(x, s)
         moves = CORNERS()
         far = ZERO
@@ -62,6 +61,7 @@ def allowed_fraction(dtype, of_edges: bool):
         n = y / wp.max(distance, wp.float64(1e-300))
         floor = (ONE - KEPT) * wp.max(distance - margin, ZERO) + wp.min(distance, margin)
         t = ONE
+        sides = wp.where(of_vertex, 1, 2)
         for p in range(sides):
             for q in range(sides, 4):
                 approach = wp.dot(n, moves[q] - moves[p])
@@ -79,14 +79,14 @@ def allowed_fraction(dtype, of_edges: bool):
 def take_advance(dtype, of_edges: bool):
     """The function of :func:`.proximity.search_pairs` that reduces the ``fraction`` of copies that move ``far``; its struct."""
     vec3, _ = types(dtype)
-    advance, allowed = advances(dtype), allowed_fraction(dtype, of_edges)
+    advance, allowed, of_vertex = advances(dtype), allowed_fraction(dtype), wp.constant(not of_edges)
 
     @wp.func
     def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, out: advance):
         copy = copy_of(surface.layout, s[0])
         if out.far[copy] == 0:
             return
-        t = allowed(s, x, out)
+        t = allowed(of_vertex, s, x, out)
         if t < ONE:
             wp.atomic_min(out.fraction, copy, t)
 
@@ -101,8 +101,7 @@ def advance_listed(dtype):
     that is None, as where obstacles move.
     """
     vec3, _ = types(dtype)
-    of_vertices, of_edges = (allowed_fraction(dtype, each) for each in (False, True))
-    stencil, ulp = load(wp.vec4i), ulp_of(dtype)
+    allowed, stencil, ulp = allowed_fraction(dtype), load(wp.vec4i), ulp_of(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def advance_each_pair(
@@ -126,11 +125,7 @@ def advance_listed(dtype):
         copy = copy_of(pairs.layout, s[0])
         if out.far[copy] != 0:
             return
-        t = ONE
-        if e < pairs.counts[0]:
-            t = of_vertices(s, x, out)
-        else:
-            t = of_edges(s, x, out)
+        t = allowed(e < pairs.counts[0], s, x, out)
         if t < ONE:
             wp.atomic_min(out.fraction, copy, t)
 

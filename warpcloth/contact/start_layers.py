@@ -94,16 +94,18 @@ def _offsets(turns, above, stay):
 def _normals(points, triangles):
     """Returns the normals of vertices, weighted by areas, (N, 3); 0 without triangles."""
     a, b, c = points[triangles].swapaxes(0, 1)
-    found = np.zeros_like(points)
-    for column in triangles.T:
-        np.add.at(found, column, np.cross(b - a, c - a))
+    found = _sums(np.cross(b - a, c - a), triangles, len(points))
     return found / np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None]
 
 
 def _around(points, triangles):
     """Returns the mean of the centres of the triangles of each vertex, (N, 3)."""
-    centres, found, counts = points[triangles].mean(axis=1), np.zeros_like(points), np.zeros(len(points))
-    for column in triangles.T:
-        np.add.at(found, column, centres)
-        np.add.at(counts, column, 1.0)
-    return found / np.maximum(counts, 1.0)[:, None]
+    counts = np.bincount(triangles.ravel(), minlength=len(points))
+    return _sums(points[triangles].mean(axis=1), triangles, len(points)) / np.maximum(counts, 1)[:, None]
+
+
+def _sums(values, triangles, n):
+    """Returns the sums (n, 3) of the values (T, 3) of the triangles of each vertex."""
+    found = np.zeros((n, 3))
+    np.add.at(found, triangles, values[:, None])
+    return found
