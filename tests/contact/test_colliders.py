@@ -11,7 +11,7 @@ import trimesh
 import warp as wp
 
 import warpcloth as wc
-from support.layers import DENSITY, GRAVITY, R, after_frames, falling
+from support.layers import DENSITY, GRAVITY, R, after_frames, falling, ground, positions
 from support.rows import table
 from support.scenes import scene
 from support.shapes import TILTED, Torus
@@ -196,9 +196,8 @@ def test_no_vertex_is_inside(name, what, dtype, device):
     stepper = after_frames(falling(colliders), solver, dtype=dtype, device=device)
     for speed in (1.0, 100.0):
         stepper.reset(velocities=falling(colliders, speed).velocities[None])
-        for frame in range(1, 9):
-            stepper.frame()
-            points = stepper.state.x.numpy().astype(np.float64)
+        for frame, x in enumerate(positions(stepper, 8), 1):
+            points = x.astype(np.float64)
             for collider in colliders:
                 assert collider.distances(points, frame).min() > 0.0, (speed, frame, collider.label)
 
@@ -259,8 +258,7 @@ def test_none_crosses_a_sheet_that_stands_in_the_way(name, open):
     """A sheet of 1e-6 m is as good as a thick one, and so is a mesh of no thickness."""
     wall = wc.Box(size=(40.0, 1e-6, 40.0), position=(0.25, -0.3, 0.25))
     if open:
-        grid = wc.Mesh.grid(2, 2, size=40.0)
-        wall = wc.MeshCollider(grid.points - [20.0, 0.3, 20.0], grid.triangles)
+        wall = ground(40.0, position=(0.0, -0.3, 0.0))
     animation = wc.simulate(falling([wall], 60.0), SOLVERS[name], dtype="float64")
     assert animation.points[..., 1].min() > -0.3
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 import warpcloth as wc
-from support.layers import GRAVITY, after_frames, cloth, layers, rubbing, stack
+from support.layers import GRAVITY, after_frames, cloth, ground, layers, rubbing, stack
 from support.rows import slow_but, table
 from warpcloth.core.energy import Energy
 from warpcloth.core.status import Result
@@ -217,39 +217,27 @@ def test_a_sphere_that_moves_carries_two_sheets(substeps, device):
     assert found.worst_strain == pytest.approx(other.worst_strain, rel=0.05)
 
 
+def above(corner, height, collider, **fields):
+    """A sheet above a collider, with its first corner at (corner, height, corner)."""
+    contact, sheet = wc.Contact(distance=3e-3, stiffness=1.5e4), wc.Mesh.grid(5, 5, size=0.25)
+    at = sheet.points + np.array([corner, height, corner])
+    return cloth(sheet, bending=1e-4, positions=at, colliders=[collider], contact=contact, fps=24.0, **fields)
+
+
 @pytest.mark.parametrize("of_mesh", [False, True])
 def test_a_slope_below_the_tolerance_moves_cloth(of_mesh, device):
     """½g tan θ t² without friction, but for the first of 48 steps, 1 − (47/48)², where the tolerance is 2g tan θ."""
-    sheet, ground = wc.Mesh.grid(5, 5, size=0.25), wc.Mesh.grid(3, 3, size=4.0)
-    scene = wc.Scene(
-        sheet,
-        positions=sheet.points - sheet.points.mean(axis=0) + [0.0, 2.9e-3, 0.0],
-        density=0.15,
-        terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-4)],
-        gravity=(5e-4 * GRAVITY, -GRAVITY, 0.0),
-        colliders=[wc.MeshCollider(ground.points - ground.points.mean(axis=0), ground.triangles) if of_mesh else wc.Plane()],
-        contact=wc.Contact(distance=3e-3, stiffness=1.5e4),
-        fps=24.0,
-    )
-    stepper = wc.Newton(substeps=1, tolerance=1e-3).bind(scene.build(dtype="float64", device=device))
-    for _ in range(48):
-        stepper.frame()
+    below = ground(4.0, 3) if of_mesh else wc.Plane()
+    scene = above(-0.125, 2.9e-3, below, gravity=(5e-4 * GRAVITY, -GRAVITY, 0.0))
+    stepper = after_frames(scene, wc.Newton(substeps=1, tolerance=1e-3), 48, dtype="float64", device=device)
     way = stepper.state.x.numpy()[:, 0].mean() - scene.positions[:, 0].mean()
     assert way == pytest.approx(0.5 * 5e-4 * GRAVITY * 2.0**2, rel=1.0 - (47.0 / 48.0) ** 2)
 
 
 def test_a_step_far_from_colliders_is_as_at_first(device):
     """After a reset, a sheet that had touched a plane takes no iteration in free fall, and has the bits of its first step."""
-    sheet = wc.Mesh.grid(5, 5, size=0.25)
-    scene = wc.Scene(
-        wc.Mesh(sheet.points + np.array([0.0, 0.05, 0.0]), sheet.triangles),
-        density=0.15,
-        terms=[wc.Spring(stiffness=100.0), wc.QuadraticBending(stiffness=1e-4)],
-        colliders=[wc.Plane()],
-        contact=wc.Contact(distance=3e-3, stiffness=1.5e4),
-        fps=24.0,
-    )
-    stepper, found = wc.Newton(substeps=4).bind(scene.build(dtype="float64", device=device)), []
+    scene, found = above(0.0, 0.05, wc.Plane()), []
+    stepper = after_frames(scene, wc.Newton(substeps=4), dtype="float64", device=device)
     for frames in (12, 0):
         stepper.step()
         found.append((stepper.minimiser.iterations, stepper.state.x.numpy()))

@@ -13,7 +13,7 @@ import warpcloth as wc
 from support.contacts import begin, energy, gradient, pairs_of, slope_of
 from support.crossings import crossed
 from support.judges import barrier_slope
-from support.layers import DENSITY, GRAVITY, after_frames, cloth, folded, layers, rubbing, slope
+from support.layers import DENSITY, GRAVITY, after_frames, cloth, folded, ground, layers, positions, rubbing, slope
 from support.rows import table
 from support.scenes import scene
 from warpcloth.contact.self_start import crossings
@@ -138,8 +138,7 @@ def test_a_stack_rests(dtype, mesh, device):
     soft = {"contact": replace(stack.contact, stiffness=k), "self_contact": replace(stack.self_contact, stiffness=k)}
     stack = replace(stack, free_axes=np.tile([False, True, False], (12 * 16, 1)), **soft)
     if mesh:
-        corners = [[-1.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]]
-        stack = replace(stack, colliders=[wc.MeshCollider(corners, [[0, 2, 1], [0, 3, 2]], name="floor")])
+        stack = replace(stack, colliders=[ground(2.0, name="floor")])
     rest = wc.equilibrium(stack, device=device, dtype=dtype, record=("energies", "reactions"))
     assert rest.status.ok and rest.stable, rest.status
     high = rest.points[:, 1].reshape(12, 16)
@@ -206,10 +205,9 @@ def test_pins_that_pinned_cloth_holds_back(name, rise, device):
     keyframes[:, :20, 1] += np.linspace(0.0, rise, 7)[:, None]
     solver = wc.Newton(substeps=2, integrator="midpoint") if name == "midpoint" else SOLVERS[name]
     stepper = after_frames(replace(two, pins=wc.Pins(held, keyframes)), solver, device=device, dtype="float64")
-    for _ in range(6):
-        stepper.frame()
+    for x in positions(stepper, 6):
         assert np.linalg.norm(stepper.state.v.numpy(), axis=1).max() < 1.0
-        assert crossed(stepper.state.x.numpy(), two.mesh.triangles) == 0
+        assert crossed(x, two.mesh.triangles) == 0
     assert stepper.pairs.pins_held[0].farthest == pytest.approx(rise - 0.0075, abs=0.0026)
 
 
@@ -226,9 +224,8 @@ def test_pins_that_turn_together(name, gap, held, angles, device):
     turns = [np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]) for a in angles]
     keyframes = np.stack([two.positions[held] @ turn.T for turn in turns])
     stepper = after_frames(replace(two, pins=wc.Pins(held, keyframes)), SOLVERS[name], device=device, dtype="float64")
-    for expected in keyframes[1:]:
-        stepper.frame()
-        assert stepper.state.x.numpy()[held] == pytest.approx(expected, abs=1e-12)
+    for x, expected in zip(positions(stepper, len(angles) - 1), keyframes[1:], strict=True):
+        assert x[held] == pytest.approx(expected, abs=1e-12)
     assert stepper.pairs.pins_held == []
 
 
@@ -309,9 +306,7 @@ def test_thrown_cloth(name, what, device):
     make, frames, dtype = THROWN[what]
     scene = make()
     stepper = after_frames(scene, SOLVERS[name], device=device, dtype=dtype)
-    for frame in range(1, frames + 1):
-        stepper.frame()
-        x = stepper.state.x.numpy()
+    for frame, x in enumerate(positions(stepper, frames), 1):
         assert crossed(x, scene.mesh.triangles) == 0
         assert all(each.distances(x, frame=frame).min() > 0.0 for each in scene.colliders)
         assert scene.free_axes is None or (x == scene.positions)[~scene.free_axes].all()

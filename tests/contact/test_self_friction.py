@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import warpcloth as wc
 from support.contacts import begin, energy, gradient, pairs_of, slope_of
 from support.laws import EXTRA, Sticky
-from support.layers import GRAVITY, after_frames, cloth, rubbing, slope
+from support.layers import GRAVITY, after_frames, cloth, ground, positions, rubbing, slope
 from support.rows import table
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.block_rows import block_rows
@@ -139,11 +139,8 @@ def test_sticks(name, dtype, device):
     Explicit steps swing about there, as nothing damps them: by no more than ε = 0.1 r μ, at a speed of no more than √(k/ρ) ε.
     """
     solver = wc.Newton(substeps=10) if (name, dtype) == ("newton", "float32") else SOLVERS[name]
-    stepper, ends = after_frames(slope(0.27), solver, device=device, dtype=dtype), []
-    start = np.array(stepper.state.x.numpy())
-    for _ in range(24):
-        stepper.frame()
-        ends.append(np.array(stepper.state.x.numpy()))
+    stepper = after_frames(slope(0.27), solver, device=device, dtype=dtype)
+    start, ends = stepper.state.x.numpy().copy(), list(positions(stepper, 24))
     assert np.abs(ends[-1] - start)[:, [0, 2]].max() < 1e-3
     swings = np.sqrt(10.0 * GRAVITY / 2e-3) * 0.1 * 2e-3 * 0.3
     least = {"explicit": swings, "xpbd_jacobi": 1e-7}.get(name, 1e-9)  # 100 Jacobi sweeps do not quite converge
@@ -210,14 +207,14 @@ def test_turns_with_the_cloth(axis, device):
 @table("name", ["newton"], ["newton", "xpbd"])
 def test_a_plate_that_tilts_carries_what_sticks(name, device):
     """A mesh, by its moves, as a box by its pose, to 1 % of what turns the gap of 4.2 mm by 0.3 rad, which is no slip."""
-    frames, sheet, plate = 12, wc.Mesh.grid(5, 5, size=0.25), wc.Mesh.grid(3, 3, size=0.6)
+    frames, sheet = 12, wc.Mesh.grid(5, 5, size=0.25)
     x = sheet.points - sheet.points.mean(axis=0) + [0.02, 4.2e-3, 0.03]
     turn = Rotation.from_euler("z", np.linspace(0.0, 0.3, frames + 1)[:, None])
     pose, slips = {"rotation": turn.as_quat(), "friction": 5.0}, []
     fields = {"bending": 1e-3, "contact": wc.Contact(distance=5e-3, stiffness=1e4), "fps": 24.0}
     solver = wc.Newton(substeps=2) if name == "newton" else wc.XPBD(substeps=2, iterations=100)
     for collider in (
-        wc.MeshCollider(plate.points - plate.points.mean(axis=0), plate.triangles, position=np.zeros(3), **pose),
+        ground(0.6, 3, position=np.zeros(3), **pose),
         wc.Box(size=(0.6, 0.1, 0.6), position=turn.apply([0.0, -0.05, 0.0]), **pose),
     ):
         scene = cloth(sheet, positions=x, colliders=[collider], **fields)
@@ -240,11 +237,7 @@ def test_cards(name, friction, device):
 def test_cards_stand_for_a_minute(device):
     """From 30 s on they move by less than 1e-7 m, some last places of coordinates."""
     stepper = after_frames(cards.scene(), SOLVERS["xpbd"], 720, device=device, dtype="float32")
-    found = []
-    for _ in range(720):
-        stepper.frame()
-        found.append(np.array(stepper.state.x.numpy()))
-    assert np.ptp(found, axis=0).max() < 1e-7
+    assert np.ptp(list(positions(stepper, 720)), axis=0).max() < 1e-7
 
 
 def test_nothing_is_there_without(device):

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 import warpcloth as wc
 from support.contacts import energy, gradient, slope_of
-from support.layers import after_frames, cloth, stack
+from support.layers import after_frames, cloth, ground, positions, stack
 from support.pairs import between_edges, detect, from_triangle
 from warpcloth.contact.proximity import Proximity
 from warpcloth.contact.surface import ContactSurface
@@ -16,12 +17,6 @@ from warpcloth.kernels.contact.obstacles import CLOTH, OBSTACLE
 from warpcloth.kernels.contact.pair_potential import CLOSE
 
 R = 3e-3
-
-
-def plate(side=0.4, cells=4, **given):
-    """A flat mesh at y = 0."""
-    grid = wc.Mesh.grid(cells, cells, size=side)
-    return wc.MeshCollider(grid.points - [side / 2, 0.0, side / 2], grid.triangles, **given)
 
 
 def sheet(colliders, n=6, side=0.2, height=R, layers=1, stiffness=None, **given):
@@ -37,7 +32,7 @@ def sheet(colliders, n=6, side=0.2, height=R, layers=1, stiffness=None, **given)
 def test_forces_are_the_gradient_of_the_energy(cells, device):
     """On rough meshes that are coarser and finer than the cloth, so that all kinds of features meet."""
     rng, eta = np.random.default_rng(1), 1e-7
-    flat = plate(side=0.06, cells=cells)
+    flat = ground(0.06, cells)
     rough = wc.MeshCollider(flat.points + rng.normal(scale=0.1 * R, size=flat.points.shape), flat.triangles)
     scene = sheet([rough], n=4, side=0.04, height=0.7 * R)
     x = scene.positions + rng.normal(scale=0.1 * R, size=scene.positions.shape)
@@ -56,7 +51,7 @@ def test_forces_are_the_gradient_of_the_energy(cells, device):
 def test_pressure_on_a_plane_does_not_depend_on_its_triangles(cells):
     """A sheet rests at the gap r − p/k of the closed form, and the reaction is its weight."""
     weight, stiffness = 0.2 * 9.81, 1e4
-    scene = sheet([plate(cells=cells)], stiffness=stiffness, duration=1.0)
+    scene = sheet([ground(0.4, cells)], stiffness=stiffness, duration=1.0)
     run = wc.simulate(scene, wc.Newton(substeps=1), dtype="float64", record="reactions")
     # Steps end at an acceleration of 1e-3 g, which changes the gap by a thousandth of p/k.
     assert run.points[-1, :, 1] == pytest.approx(np.full(36, R - weight / stiffness), abs=2e-3 * weight / stiffness)
@@ -74,11 +69,10 @@ MOVES = {
 def test_cloth_is_carried_by_a_mesh_that_moves(name, layers, move, device):
     """By many contact distances in a step. No vertex comes to the other side, and nothing is forced."""
     solver = {"newton": wc.Newton(substeps=1), "xpbd": wc.XPBD(substeps=2), "explicit": wc.Explicit(substeps=200)}[name]
-    mesh = plate(friction=0.3, **MOVES[move](np.maximum(np.arange(9) / 24.0 - 0.1, 0.0)))
+    mesh = ground(0.4, 4, friction=0.3, **MOVES[move](np.maximum(np.arange(9) / 24.0 - 0.1, 0.0)))
     stepper = after_frames(sheet([mesh], layers=layers), solver, dtype="float64", device=device)
-    for pose in mesh.poses[1:9]:
-        stepper.frame()
-        local = wc.scene.colliders.turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], stepper.state.x.numpy() - pose[:3])
+    for pose, x in zip(mesh.poses[1:9], positions(stepper, 8), strict=True):
+        local = wc.scene.colliders.turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], x - pose[:3])
         assert stepper.pairs.forced == [] and local[:, 1].min() > 0.0
         assert (np.diff(local[:, 1].reshape(layers, -1), axis=0) > 0.0).all()
 
@@ -86,8 +80,8 @@ def test_cloth_is_carried_by_a_mesh_that_moves(name, layers, move, device):
 def test_a_mesh_that_has_no_way_is_forced():
     """Two plates close on a sheet to less than nothing: the run is not usable, and says which mesh moved through cloth."""
     t = np.arange(6)[:, None] / 24.0
-    lid = plate(position=np.array([0.0, 0.02, 0.0]) - t * [0.0, 0.24, 0.0], name="lid")
-    run = wc.simulate(sheet([plate(name="floor"), lid], duration=5 / 24), wc.Newton(substeps=1), dtype="float64")
+    lid = ground(0.4, 4, position=np.array([0.0, 0.02, 0.0]) - t * [0.0, 0.24, 0.0], name="lid")
+    run = wc.simulate(sheet([ground(0.4, 4, name="floor"), lid], duration=5 / 24), wc.Newton(substeps=1), dtype="float64")
     assert not run.status.ok and "lid" in run.status.message
 
 
@@ -98,9 +92,7 @@ def test_a_tip_stays_below_a_triangle(device):
     corners = [[-0.1, 0.02, -0.1], [0.1, 0.02, -0.1], [0.0, 0.02, 0.13]]
     scene = replace(sheet([pyramid]), mesh=wc.Mesh(corners, [[0, 2, 1]]), positions=corners, velocities=None)
     stepper = after_frames(scene, wc.Newton(substeps=2), dtype="float64", device=device)
-    for _ in range(4):
-        stepper.frame()
-        a, b, c = stepper.state.x.numpy()
+    for a, b, c in positions(stepper, 4):
         normal = np.cross(b - a, c - a)
         assert abs(normal @ a) / np.linalg.norm(normal) < 0.05
         assert normal @ -a * np.sign(normal[1]) < 0.0
@@ -120,7 +112,7 @@ def test_pins_may_be_inside_a_mesh():
 
 def test_copies_have_the_bits_of_single_runs(device):
     """With a mesh that moves, and a stiffness that varies."""
-    scene = sheet([plate(friction=0.2, **MOVES["turns"](np.arange(7) / 24.0))], height=1.5 * R)
+    scene = sheet([ground(0.4, 4, friction=0.2, **MOVES["turns"](np.arange(7) / 24.0))], height=1.5 * R)
 
     def end(*stiffness):
         vary = {"Spring.stiffness": np.array(stiffness)}
@@ -133,7 +125,7 @@ def test_copies_have_the_bits_of_single_runs(device):
 def test_cloth_with_a_locked_axis_meets_meshes():
     """A sheet that moves in planes falls onto a floor of two triangles as onto a plane."""
     fields, ends = {"stiffness": 1e5, "free_axes": np.tile([True, True, False], (36, 1))}, []
-    for floor in (plate(side=1.0, cells=2), wc.Plane()):
+    for floor in (ground(1.0), wc.Plane()):
         scene, solver = sheet([floor], height=4.0 * R, **fields), wc.Newton(substeps=4, tolerance=1e-9)
         ends.append(after_frames(scene, solver, 4, dtype="float64").state.x.numpy())
     assert ends[0][:, 1].min() > 0.0
@@ -147,10 +139,9 @@ def test_a_ball_that_grows_carries_cloth(device):
     mesh = wc.MeshCollider(ball.vertices * sizes[:, None, None] + centre, ball.faces)
     scene = sheet([mesh], n=8, side=0.1, height=R - 0.0145)
     stepper = after_frames(scene, wc.Newton(substeps=2), dtype="float64", device=device)
-    for size in sizes[1:]:
-        stepper.frame()
+    for size, x in zip(sizes[1:], positions(stepper, 5), strict=True):
         assert stepper.pairs.forced == []
-        distance = np.linalg.norm(stepper.state.x.numpy() - centre, axis=1)
+        distance = np.linalg.norm(x - centre, axis=1)
         assert distance.min() > 0.95 * size * 0.03  # that of the faces of the ball from its centre
 
 
@@ -185,7 +176,7 @@ def test_a_mesh_holds_cloth_whose_pin_is_drawn_into_it():
 
 def test_a_copy_that_needs_more_rounds_changes_no_other(device):
     """A mesh that rises meets the sheet of one copy far from its start; that of the other lies on it with a small gap."""
-    scene = sheet([plate(**MOVES["up"](np.arange(4) / 24.0))], height=0.01 * R, stiffness=10.0)
+    scene = sheet([ground(0.4, 4, **MOVES["up"](np.arange(4) / 24.0))], height=0.01 * R, stiffness=10.0)
     both, single = (wc.Newton(substeps=1).bind(scene.build(copies=copies, dtype="float64", device=device)) for copies in (2, 1))
     both.reset(positions=np.stack([scene.positions, scene.positions + np.array([0.0, 0.05, 0.0])]))
     for _ in range(3):
@@ -200,7 +191,7 @@ def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
 
     None is missing after meshes and cloth have moved, and cloth has then moved by the room that is left.
     """
-    scene = sheet([plate(0.2, 14), plate(0.4, 2, position=(0.0, -0.02, 0.0))], pins=[0, 1, 6, 7])
+    scene = sheet([ground(0.2, 14), ground(0.4, position=(0.0, -0.02, 0.0))], pins=[0, 1, 6, 7])
     model, skin = scene.build(copies=2, dtype="float64", device=device), 0.01
     surface = ContactSurface(model, itself)
     x = surface.of_model(surface.rest)

@@ -97,6 +97,19 @@ def slope(tangent, friction=0.3, layers=1, distance=2e-3, **fields):
     )
 
 
+def ground(side, cells=2, **fields):
+    """A flat mesh of ``cells`` vertices per side at y = 0, with its middle at the origin."""
+    grid = wc.Mesh.grid(cells, cells, size=side)
+    return wc.MeshCollider(grid.points - [0.5 * side, 0.0, 0.5 * side], grid.triangles, **fields)
+
+
+def positions(stepper, frames):
+    """Yields the positions (N, 3) after each of some frames."""
+    for _ in range(frames):
+        stepper.frame()
+        yield stepper.state.x.numpy().copy()
+
+
 def after_frames(scene, solver, frames=0, steps=0, **build):
     """A stepper after some frames, and steps more."""
     stepper = solver.bind(scene.build(**build))
