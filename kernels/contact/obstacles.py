@@ -9,7 +9,7 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
-from .colliders import pose_types, to_space
+from .colliders import pose_types, step_poses, to_space
 
 # Groups of elements: cloth, cloth with a vertex that cannot move, and obstacles.
 CLOTH, HELD, OBSTACLE = wp.constant(0), wp.constant(1), wp.constant(2)
@@ -99,27 +99,6 @@ def meshes(dtype):
     return Meshes
 
 
-@cache
-def point_at(dtype):
-    """Device function (mesh, c, i, halves, per_frame) → point i of mesh c, in its frame, after ``halves`` half steps.
-
-    A frame has ``per_frame`` of them. Points move linearly between keyframes, and stand still after the last.
-    """
-
-    @wp.func
-    def point(mesh: meshes(dtype), c: int, i: int, halves: int, per_frame: int):
-        frames = mesh.frames[c]
-        frame = wp.max(wp.min(halves // per_frame, frames - 1), 0)
-        here = mesh.first_point[c] + frame * mesh.size[c] + i
-        found = mesh.points[here]
-        if frame + 1 < frames:
-            part = dtype(wp.max(halves, 0) - frame * per_frame) / dtype(per_frame)
-            found = found + part * (mesh.points[here + mesh.size[c]] - found)
-        return found
-
-    return point
-
-
 @wp.struct
 class Obstacles:
     """The collider and its vertex of each obstacle of a copy, (m,), and where the frames of colliders begin in ``present``."""
@@ -132,13 +111,24 @@ class Obstacles:
 
 @cache
 def find_obstacles(dtype):
-    """Kernel over obstacles of all copies: their positions after ``halves`` half steps, with the ``poses`` there.
+    """Kernel over obstacles of all copies: positions at the ``poses`` of a step and, as float64, their ``moves`` in it [m].
 
-    Positions are NaN while a collider is absent, that is at one point for a whole step.
+    Forces are evaluated after ``ahead`` half steps, of which a frame has ``per_frame``. Points move linearly between keyframes,
+    and stand still after the last. While a collider is absent, that is at one point for a whole step, positions are NaN, and
+    moves 0.
     """
     vec3, _ = types(dtype)
     pose_type, _anchor = pose_types(dtype)
-    at = point_at(dtype)
+
+    @wp.func
+    def point_at(mesh: meshes(dtype), pose: pose_type, c: int, vertex: int, halves: int, per_frame: int):
+        frame = wp.min(wp.max(halves, 0) // per_frame, mesh.frames[c] - 1)
+        here = mesh.first_point[c] + frame * mesh.size[c] + vertex
+        point = mesh.points[here]
+        if frame + 1 < mesh.frames[c]:
+            part = dtype(wp.max(halves, 0) - frame * per_frame) / dtype(per_frame)
+            point = point + part * (mesh.points[here + mesh.size[c]] - point)
+        return to_space(pose, point)
 
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
     def find_each_obstacle(
@@ -147,50 +137,34 @@ def find_obstacles(dtype):
         obstacles: Obstacles,
         mesh: meshes(dtype),
         # state in
-        poses: wp.array2d(dtype=pose_type),
+        poses: step_poses(dtype),
         steps: wp.array(dtype=wp.int32),
         # parameters
         per_frame: int,
-        halves: int,
+        ahead: int,
         # out
-        out: wp.array(dtype=vec3),
+        before: wp.array(dtype=vec3),
+        at: wp.array(dtype=vec3),
+        after: wp.array(dtype=vec3),
+        moves: wp.array(dtype=wp.vec3d),
     ):
         t = wp.tid()
         copy = t // layout.obstacles
         j = t - copy * layout.obstacles
         c = obstacles.collider[j]
-        when = wp.max(2 * steps[copy] + halves, 0)
-        frame = wp.min(wp.max(2 * steps[copy], 0) // per_frame, mesh.frames[c] - 1)
+        i = obstacles.vertex[j]
+        now = 2 * steps[copy]
+        frame = wp.min(wp.max(now, 0) // per_frame, mesh.frames[c] - 1)
         last = wp.min(frame + 1, mesh.frames[c] - 1)  # of this step, which ends at this frame or before
         first = obstacles.first_frame[c]
-        present = wp.max(obstacles.present[first + frame], obstacles.present[first + last])
-        found = vec3(dtype(wp.nan), dtype(wp.nan), dtype(wp.nan))
-        if present != 0:
-            found = to_space(poses[copy, c], at(mesh, c, obstacles.vertex[j], when, per_frame))
-        out[t] = found
+        before[t] = vec3(dtype(wp.nan), dtype(wp.nan), dtype(wp.nan))
+        at[t] = before[t]
+        after[t] = before[t]
+        moves[t] = wp.vec3d()
+        if wp.max(obstacles.present[first + frame], obstacles.present[first + last]) != 0:
+            before[t] = point_at(mesh, poses.before[copy, c], c, i, now, per_frame)
+            at[t] = point_at(mesh, poses.at[copy, c], c, i, now + ahead, per_frame)
+            after[t] = point_at(mesh, poses.after[copy, c], c, i, now + 2, per_frame)
+            moves[t] = wp.vec3d(after[t]) - wp.vec3d(before[t])
 
     return find_each_obstacle
-
-
-@cache
-def find_moves(dtype):
-    """Kernel over obstacles of all copies: their moves in a step [m]; 0 for those that appear or vanish."""
-    vec3, _ = types(dtype)
-
-    @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
-    def find_each_move(
-        # state in
-        before: wp.array(dtype=vec3),
-        after: wp.array(dtype=vec3),
-        # out
-        moves: wp.array(dtype=wp.vec3d),
-    ):
-        t = wp.tid()
-        found = wp.vec3d()
-        for k in range(3):
-            move = wp.float64(after[t][k]) - wp.float64(before[t][k])
-            if wp.isfinite(move):
-                found[k] = move
-        moves[t] = found
-
-    return find_each_move

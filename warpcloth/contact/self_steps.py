@@ -14,7 +14,6 @@ from ..core.status import Stopped
 from ..core.sums import Sums
 from ..kernels.contact import gap_notes, self_pairs
 from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes
-from ..kernels.contact.obstacles import find_moves
 from ..kernels.contact.pair_potential import Laws
 from ..kernels.contact.piece_motion import add_positions
 from ..kernels.contact.self_filter import HeldPins
@@ -324,16 +323,12 @@ class SelfSteps:
         self.placed = [wp.zeros(surface.count - model.count, dtype=model.vec3, device=model.device) for _ in range(3)]
         self._kept_poses = [wp.zeros_like(self._colliders.poses.before) for _ in range(3)]
         self._colliders.launch_move()
-        self._find_moves = model.kernel(find_moves, model.dtype)
         self._launch_obstacles()
 
     def _launch_obstacles(self):
         """Places the obstacles of a step, at its start where pairs are listed."""
-        surface, poses = self.surface, self._colliders.poses
-        for at, halves, out in zip((poses.before, poses.at, poses.after), (0, self._ahead, 2), self.placed, strict=True):
-            surface.launch_positions(self._colliders, at, halves, out)
-        self.model.launch(self._find_moves, len(self.placed[0]), [self.placed[0], self.placed[2]], [surface.moves_of_step])
-        wp.copy(surface.behind(self.x_before), self.placed[0])
+        self.surface.launch_positions(self._colliders, self._ahead, self.placed)
+        wp.copy(self.surface.behind(self.x_before), self.placed[0])
         self.contact.launch_obstacles(self.placed[1])
 
     def keep(self, collider):

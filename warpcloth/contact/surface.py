@@ -149,11 +149,12 @@ class ContactSurface:
         """Returns the part (B·m,) of an array (N + B·m,) that belongs to the obstacles."""
         return whole[self.model.count :]
 
-    def launch_positions(self, colliders, poses, halves, out):
-        """Places obstacles, out (B·m,) [m], ``halves`` half steps after the start of a step, with the ``poses`` (B, C) then."""
+    def launch_positions(self, colliders, ahead, placed):
+        """Places obstacles at the start of a step, ``ahead`` half steps later, and at its end, (B·m,) [m]; and finds moves."""
         model = self.model
-        given = [self.layout, self.of_obstacles, model.colliders.meshes.geometry, poses, colliders.steps]
-        model.launch(self._find, len(out), [*given, 2 * colliders.steps_per_frame, halves], [out])
+        given = [self.layout, self.of_obstacles, model.colliders.meshes.geometry, colliders.poses, colliders.steps]
+        given += [2 * colliders.steps_per_frame, ahead]
+        model.launch(self._find, self.count - model.count, given, [*placed, self.moves_of_step])
 
 
 def _welded(collider):
