@@ -1,4 +1,4 @@
-"""Factories of the kernels of the work of colliders and of their filter, and of the moves of their material."""
+"""Factories of the kernels of the work of colliders and of their filter."""
 
 from functools import cache
 
@@ -6,58 +6,31 @@ import warp as wp
 
 from ..vectors import types
 from ..work import wide_dot
-from .colliders import pose_types, step_poses, to_local, to_space
+from .colliders import filters, pose_types, step_poses, to_local, to_space
 
 UNCUT, NOW = wp.constant(0), wp.constant(2)  # the filter shortened no move of a vertex, or one in this step (1: in the last)
 
 
 @cache
 def collider_pulls(dtype):
-    """Struct of ∂U/∂x of contact and friction with a collider, of friction alone, and of the moves of the collider, or None."""
+    """Struct of ∂U/∂x of contact and friction with a collider, and of friction alone, or None."""
     vec3, _ = types(dtype)
 
     @wp.struct
     class Pulls:
         all: wp.array(dtype=vec3)
         friction: wp.array(dtype=vec3)
-        move: wp.array(dtype=vec3)
 
     return Pulls
-
-
-@cache
-def rigid_moves(dtype):
-    """Kernel over vertices: displacement in a step of the material point of a collider at x, from its ``poses``."""
-    vec3, _ = types(dtype)
-    pose_type, _anchor = pose_types(dtype)
-
-    @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
-    def moves(
-        # state in
-        x: wp.array(dtype=vec3),
-        poses: wp.array2d(dtype=pose_type),
-        step: step_poses(dtype),
-        # parameters
-        collider: int,
-        per_copy: int,
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        i = wp.tid()
-        copy = i // per_copy
-        X = to_local(poses[copy, collider], x[i])
-        out[i] = to_space(step.after[copy, collider], X) - to_space(step.before[copy, collider], X)
-
-    return moves
 
 
 @cache
 def add_collider_work(dtype):
     """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
 
-    ∇U is that of contact and friction, ∇H that of friction alone, where the step takes its forces (``now``); δ is the
-    displacement of the collider's material at the vertex. With ``before``, the trapezoidal rule takes the mean of the products
-    there and at the start of the step; ∇U and ∇H are then stored for the next step.
+    ∇U is that of contact and friction, ∇H that of friction alone, where the step takes its forces (``now``), at x; δ is the
+    displacement in the step of the collider's material there. With ``before``, the trapezoidal rule takes the mean of the
+    products there and at the start of the step; ∇U and ∇H are then stored for the next step.
 
     If the gap changes by more than the contact ``distance`` in a step, the two are in contact, and move together, for a part of
     it alone. The work of contact is then that of the part of Δx that δ shares.
@@ -66,17 +39,22 @@ def add_collider_work(dtype):
     and in the next step. The filter then changed the energy of contact: of_filter −= ∇U·(Δx − δ).
     """
     vec3, _ = types(dtype)
-    product = wide_dot(dtype)
+    product, (pose_type, _anchor) = wide_dot(dtype), pose_types(dtype)
 
     @wp.func
-    def work_on(pulls: collider_pulls(dtype), i: int, moved: vec3, distance: dtype):
+    def move_of(poses: step_poses(dtype), pose: pose_type, copy: int, collider: int, x: vec3):
+        X = to_local(pose, x)
+        return to_space(poses.after[copy, collider], X) - to_space(poses.before[copy, collider], X)
+
+    @wp.func
+    def work_on(pulls: collider_pulls(dtype), i: int, move: vec3, moved: vec3, distance: dtype):
         """∇U·δ."""
         contact = pulls.all[i]
         rubbed = wp.float64(0.0)
         if pulls.friction.shape[0] > 0:
             contact = contact - pulls.friction[i]
-            rubbed = product(pulls.friction[i], pulls.move[i])
-        work = product(contact, pulls.move[i])
+            rubbed = product(pulls.friction[i], move)
+        work = product(contact, move)
         shared = product(contact, moved)
         if wp.abs(work - shared) > wp.float64(wp.length(contact) * distance):
             work = wp.clamp(shared, wp.min(work, wp.float64(0.0)), wp.max(work, wp.float64(0.0)))
@@ -84,12 +62,16 @@ def add_collider_work(dtype):
 
     @wp.kernel(module=f"warpcloth.work.colliders.{dtype.__name__}", enable_backward=False)
     def add(
+        # elements
+        colliders: filters(dtype),
         # state in
         x_before: wp.array(dtype=vec3),
+        x: wp.array(dtype=vec3),
         uncut: wp.array(dtype=vec3),
         cuts: wp.array(dtype=wp.int32),
         now: collider_pulls(dtype),
         # parameters
+        collider: int,
         distance: dtype,
         # in and out
         before: collider_pulls(dtype),
@@ -98,18 +80,21 @@ def add_collider_work(dtype):
         of_filter: wp.array(dtype=wp.float64),
     ):
         i = wp.tid()
+        copy = i // colliders.per_copy
         moved = uncut[i] - x_before[i]
-        work = work_on(now, i, moved, distance)
+        move = move_of(colliders.poses, colliders.poses.at[copy, collider], copy, collider, x[i])
+        work = work_on(now, i, move, moved, distance)
         rubbed = wp.float64(0.0)
         if now.friction.shape[0] > 0:
-            rubbed = product(now.friction[i], moved - now.move[i])
+            rubbed = product(now.friction[i], moved - move)
         if cuts[i] == NOW:
             of_filter[i] = of_filter[i] + work + rubbed - product(now.all[i], moved)
         if before.all.shape[0] > 0:
             if cuts[i] == UNCUT:
-                work = wp.float64(0.5) * (work + work_on(before, i, moved, distance))
+                move = move_of(colliders.poses, colliders.poses.before[copy, collider], copy, collider, x_before[i])
+                work = wp.float64(0.5) * (work + work_on(before, i, move, moved, distance))
                 if now.friction.shape[0] > 0:
-                    rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], moved - before.move[i]))
+                    rubbed = wp.float64(0.5) * (rubbed + product(before.friction[i], moved - move))
             before.all[i] = now.all[i]
             if now.friction.shape[0] > 0:
                 before.friction[i] = now.friction[i]

@@ -41,13 +41,11 @@ class ColliderWork:
             self._limit = [model.kernel(each, model.dtype) for each in (add_momentum, add_scaled, kernels.limit_pulls)]
             self._elastic, self._given, self._taken = Gradient(model, terms=others), model.vectors(), model.vectors()
         for _c, now in self._solid:
-            now.move = model.vectors()
-            kept = [name for name in ("all", "friction", "move") if self._at_end and getattr(now, name)]
+            kept = [name for name in ("all", "friction") if self._at_end and getattr(now, name)]
             self._before.append(filled(kernels.collider_pulls(model.dtype), **{name: model.vectors() for name in kept}))
         if colliders.part == 0.5:
             self._x_step = model.vectors()
         self._add = model.kernel(kernels.add_collider_work, model.dtype)
-        self._rigid = model.kernel(kernels.rigid_moves, model.dtype)
 
     def begin(self, found, vertices):
         """Sets the state before the first step from the pulls ``found``, of which it takes the slice ``vertices``."""
@@ -66,10 +64,7 @@ class ColliderWork:
         if self._limit:
             self._launch_limit()
         for (c, now), before in zip(self._solid, self._before, strict=True):
-            self._launch_moves(c, self._x_step, colliders.poses.at, now.move)
-            if self._at_end:
-                self._launch_moves(c, colliders.x_before, colliders.poses.before, before.move)
-            given = [colliders.x_before, self._x, self._cuts, now, model.colliders.distance]
+            given = [colliders.filter, colliders.x_before, self._x_step, self._x, self._cuts, now, c, model.colliders.distance]
             model.launch(self._add, model.count, given, [before, *self._sums])
 
     def _launch_limit(self):
@@ -84,11 +79,6 @@ class ColliderWork:
             model.launch(add, model.count, [now.all, 1.0], [self._taken])
         for _c, now in self._solid:
             model.launch(limit, model.count, [self._given, self._taken], [now])
-
-    def _launch_moves(self, c, x, poses, out):
-        """Launches out = displacements of the material of collider c at x in a step, from its ``poses``."""
-        model = self.model
-        model.launch(self._rigid, model.count, [x, poses, self.colliders.poses, c, model.per_copy], [out])
 
 
 class PairWork:
