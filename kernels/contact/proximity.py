@@ -275,12 +275,6 @@ def sort(values: wp.array(dtype=wp.int32), first: int, end: int):
         gap = gap // 3
 
 
-@wp.func
-def kept(counts: wp.array(dtype=wp.int32), capacity: int):
-    """The number of pairs within the capacity."""
-    return wp.min(wp.min(counts[0], capacity) + counts[1], capacity)
-
-
 @wp.kernel(module="warpcloth.proximity", enable_backward=False)
 def fill_rows(
     # in and out
@@ -289,7 +283,7 @@ def fill_rows(
     """Kernel over the capacity: the items of each row; counts ``row_counts`` down to 0."""
     capacity = pairs.found.shape[0]
     k = capacity - 1 - wp.tid()
-    if k < kept(pairs.counts, capacity):
+    if k < wp.min(wp.min(pairs.counts[0], capacity) + pairs.counts[1], capacity):
         row = pairs.found[k][0]
         slot = pairs.first[row] + wp.atomic_sub(pairs.row_counts, row, 1) - 1
         pairs.items[slot] = pairs.found[k][1]

@@ -53,13 +53,10 @@ def check(mesh, x, distance, skin, dtype="float32", device="cpu", **options):
     return counts
 
 
-def lists_of(found, count=None):
+def lists_of(found):
     """The arrays of a detection, on the host, as far as they have pairs."""
-    count = found.counts.numpy().sum() if count is None else count
-    return [
-        *(each.numpy().copy() for each in (found.counts, found.rows)),
-        *(each.numpy()[:count].copy() for each in (found.stencils, found.distances)),
-    ]
+    numbers, count = [each.numpy().copy() for each in (found.counts, found.rows)], found.counts.numpy().sum()
+    return numbers + [each.numpy()[:count].copy() for each in (found.stencils, found.distances)]
 
 
 def assert_same(lists, others):
