@@ -140,7 +140,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     the order in the stencil.
     """
     vec3, _ = types(dtype)
-    box_along, level_of, cell_at, cells_about = boxes(dtype)
+    box_along, level_of, cell_of = boxes(dtype)
     number, corner, four = load(wp.int32), load(vec3), load(wp.vec4i)
     visit, out_type = take(dtype, of_edges)
     KIND = wp.constant(int(of_edges))
@@ -180,7 +180,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
             if not boxes_meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 return
         lowest = level
-        layer = cell_at(grid.size, low, high, level)[2]
+        layer = cell_of(grid.size, level, dtype(0.5) * (low + high))[2]
         buckets = grid.counts.shape[0]
         if wp.static(not of_edges):
             if p:
@@ -198,7 +198,10 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
             while present != 0:
                 if (present & 1) != 0:
                     code = code_of(copy, kind, level)
-                    one, two = cells_about(grid.size, low, high, level, grid.extents[kind, level])
+                    # Those with the centres of boxes that meet this one, half of which is in the extent.
+                    extent = grid.extents[kind, level]
+                    one = cell_of(grid.size, level, low - extent)
+                    two = cell_of(grid.size, level, high + extent)
                     if wp.static(of_edges):
                         within = ordered and level == lowest
                         if within:

@@ -82,7 +82,7 @@ def grids(dtype):
 
 @cache
 def boxes(dtype):
-    """Device functions on boxes: ``box_along``, ``level_of``, ``cell_at``, ``cells_about``."""
+    """Device functions on boxes and cells: ``box_along``, ``level_of``, ``cell_of``."""
     vec3, _ = types(dtype)
     half, farthest, corner, vector_or_zero = dtype(0.5), dtype(FARTHEST), load(vec3), vector_within(dtype)
 
@@ -127,29 +127,16 @@ def boxes(dtype):
         return level
 
     @wp.func
-    def cell_of(size: dtype, p: vec3):
-        q = vec3(dtype(2.0) * p[0], half * p[1], half * p[2]) / size
+    def cell_of(size: dtype, level: int, p: vec3):
+        """The cell of a level with the point p."""
         cell = wp.vec3i()
-        for i in range(3):
-            cell[i] = wp.int32(wp.floor(wp.clamp(q[i], -farthest, farthest)))
+        if level < LEVELS:
+            q = vec3(dtype(2.0) * p[0], half * p[1], half * p[2]) / (size * dtype(1 << level))
+            for i in range(3):
+                cell[i] = wp.int32(wp.floor(wp.clamp(q[i], -farthest, farthest)))
         return cell
 
-    @wp.func
-    def cell_at(size: dtype, low: vec3, high: vec3, level: int):
-        """The cell of the centre of a box."""
-        if level < LEVELS:
-            return cell_of(size * dtype(1 << level), half * (low + high))
-        return wp.vec3i()
-
-    @wp.func
-    def cells_about(size: dtype, low: vec3, high: vec3, level: int, extent: vec3):
-        """The first and last cells of a level with the centres of boxes that meet a box; half of theirs is in ``extent``."""
-        if level < LEVELS:
-            most = size * dtype(1 << level)
-            return cell_of(most, low - extent), cell_of(most, high + extent)
-        return wp.vec3i(), wp.vec3i()
-
-    return box_along, level_of, cell_at, cells_about
+    return box_along, level_of, cell_of
 
 
 @wp.func
@@ -178,7 +165,7 @@ def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
 def bound_cloth(dtype):
     """Kernel over vertices of the cloth: extends the box of their copy, which holds their boxes along p."""
     vec3, _ = types(dtype)
-    box_along, _level_of, _cell_at, _about = boxes(dtype)
+    box_along, _level_of, _cell_of = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def bound_each_vertex(
@@ -205,7 +192,7 @@ def count_items(dtype):
     Obstacles count where they meet the box of the cloth.
     """
     vec3, _ = types(dtype)
-    box_along, level_of, cell_at, _about = boxes(dtype)
+    box_along, level_of, cell_of = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def count_each_item(
@@ -233,7 +220,7 @@ def count_items(dtype):
             own = dtype(0.5) * (high - low)
             if wp.max(own - grid.extents[kind, level]) > dtype(0.0):  # few are
                 wp.atomic_max(grid.extents, kind, level, own)
-            cell = cell_at(grid.size, low, high, level)
+            cell = cell_of(grid.size, level, dtype(0.5) * (low + high))
             key = bucket_of(cell[0], cell[1], cell[2], code_of(v[3] >> 1, kind, level), grid.counts.shape[0])
             wp.atomic_add(grid.counts, key, 1)
         grid.keys[item] = key
@@ -245,7 +232,7 @@ def count_items(dtype):
 def fill_buckets(dtype):
     """Kernel over items: the entries of the buckets; counts ``counts`` down to 0."""
     vec3, _ = types(dtype)
-    box_along, level_of, cell_at, _about = boxes(dtype)
+    box_along, level_of, cell_of = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def fill_each_bucket(
@@ -264,7 +251,7 @@ def fill_buckets(dtype):
         v = surface.items[item]
         low, high = box_along(surface, x, p, v[0], v[1], v[2])
         level = level_of(grid.size, low, high)
-        cell = cell_at(grid.size, low, high, level)
+        cell = cell_of(grid.size, level, dtype(0.5) * (low + high))
         slot = grid.first[key] + wp.atomic_sub(grid.counts, key, 1) - 1
         grid.entries[slot] = wp.vec4i(item, cell[1], cell[2], code_of(v[3] >> 1, kind_in_grid(v, surface.groups[item]), level))
         grid.lower[slot] = low
