@@ -33,12 +33,12 @@ def clearances(dtype):
 
 
 @cache
-def near_colliders(dtype, ended: bool):
+def near_colliders(dtype):
     """Kernel over vertices: due = 1 if a vertex may come near a collider in a step.
 
     At the start of a step the motion is the prediction h v + h² g, and the contact distance further, because what refreshes
     contact looks so far. due is also 1 if a copy was near before, so that a refresh leaves anchors and half-spaces behind.
-    After a step (``ended``), a vertex moved from x to ``end``.
+    After a step, a vertex moved from x to ``end``, which is None before.
     """
     vec3, _ = types(dtype)
     gap, ball_type = gap_of(dtype, (ROUNDED_BOX,)), wp.types.vector(4, dtype)
@@ -61,7 +61,8 @@ def near_colliders(dtype, ended: bool):
     ):
         i = wp.tid()
         copy = i // colliders.per_copy
-        if wp.static(ended):
+        way = dtype(0.0)
+        if end:
             if due[0] != 0:
                 return
             way = wp.length(end[i] - x[i])
@@ -81,7 +82,7 @@ def near_colliders(dtype, ended: bool):
             clear.balls[i] = ball_type(x[i][0], x[i][1], x[i][2], radius)
             if not (way <= radius):
                 due[0] = 1
-                if wp.static(not ended):
+                if not end:
                     clear.near[copy] = 1
                     clear.some[0] = 1
 

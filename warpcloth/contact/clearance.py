@@ -40,7 +40,7 @@ class Clearance:
         core, radius = model.array(np.array(halves), model.vec3), model.array(bounding, model.dtype)
         bounds = filled(shapes(model.dtype), core=core, radius=radius)
         self._bounds = filled(filters(model.dtype), shape=bounds, poses=colliders.poses, per_copy=model.per_copy)
-        self._finds = [model.kernel(near_colliders, model.dtype, ended) for ended in (False, True)]
+        self._find_near = model.kernel(near_colliders, model.dtype)
 
     def follow(self):
         """Makes all steps refresh contact, because others read it."""
@@ -51,7 +51,7 @@ class Clearance:
         wp.copy(self._due, self._clear.some)
         self._clear.some.zero_()
         self.near.zero_()
-        self._find(False, x, v, None, self._due)
+        self._find(x, v, None, self._due)
         wp.copy(self._clear.before, self.near)
 
     def launch_refresh(self, launch):
@@ -61,10 +61,9 @@ class Clearance:
     def launch_end(self, x, end, launch):
         """Calls ``launch`` if a vertex may have come near a collider on its way from x to ``end`` (N,)."""
         wp.copy(self._ended, self._due)
-        self._find(True, x, None, end, self._ended)
+        self._find(x, None, end, self._ended)
         wp.capture_if(self._ended, launch)
 
-    def _find(self, ended, x, v, end, due):
-        model = self.model
-        given = [self._bounds, *model.free_gravity, x, v, end, self._h]
-        model.launch(self._finds[ended], model.count, given, [self._clear, due])
+    def _find(self, x, v, end, due):
+        given = [self._bounds, *self.model.free_gravity, x, v, end, self._h]
+        self.model.launch(self._find_near, self.model.count, given, [self._clear, due])
