@@ -634,6 +634,22 @@ def test_where_a_step_with_moving_pins_starts(way, walks, device):
         assert start == pytest.approx(stayed, abs=1e-15)
 
 
+def test_a_pin_pushes_cloth_that_goes_the_other_way(device):
+    """A sheet rises by 50 mm towards another one, whose pin moves down by 10 mm from 2 mm above it."""
+    pin, scene = 36 + 14, layers(gap=2e-3)
+    positions = above_a_triangle(scene.positions)
+    frames = positions[[pin]] - np.array([0.0, 1.0, 0.0]) * np.array([0.0, 0.01])[:, None, None]
+    scene = replace(scene, positions=positions, pins=wc.Pins([pin], frames), duration=1.0 / 24.0)
+    pairs = pairs_of(scene, device)
+    base, d = positions.copy(), pairs.model.vectors()
+    base[:36, 1] += 0.05
+    base[pin] = frames[-1]
+    pairs.filter.launch_start(pairs.model.array(base, pairs.model.vec3), d)
+    start = base + d.numpy()
+    assert crossed(start, scene.mesh.triangles) == 0
+    np.testing.assert_allclose(start[pin], frames[-1, 0], atol=1e-12)
+
+
 def test_directions_by_the_list(device):
     """Along moves for which the list is kept, its pairs give the fraction that a search of all pairs gives, to the bit."""
     scene, random, found = layers(turn=17.0, gap=5e-3), np.random.default_rng(0), []

@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import numpy as np
 import warp as wp
 
 from ..kernels.contact import mesh_moves, piece_motion, self_filter, self_planes
@@ -49,7 +50,10 @@ class SelfFilter:
         self._make(self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move)
         self._make(self_filter.keep_apart, self_filter.end_filter, piece_motion.add_positions)
         if model.keyframes is not None:
-            self._make(self_filter.share_of_pins, self_filter.hold_pins)
+            self._make(self_filter.share_of_pins, self_filter.hold_pins, self_filter.push_pairs)
+            self._pushed, self._forced = model.vectors(), model.scalars(wp.int64)
+            unlocked = model.coordinate_mobility().reshape(-1, 3).all(axis=1)
+            self._unlocked = model.array(np.where(unlocked, model.inverse_mass.numpy(), 0.0), model.dtype)
         self._lets_out = colliders is not None and any(each.moves and not each.is_mesh for each in model.scene.colliders)
         if self._lets_out:
             colliders.end_again()
@@ -324,8 +328,8 @@ class SelfFilter:
         """Sets d so that base + d is base if pairs stay apart on the way there, else the start of the step.
 
         Pins with keyframes are at base in any case. If pairs do not stay apart on the way of the pins alone, other vertices
-        move towards base too. Vertices stop at the contact distance of colliders: a descent from inside would take many
-        iterations to get out.
+        move towards base too, and then what is still in the way of pins moves ahead of them. Vertices stop at the contact
+        distance of colliders: a descent from inside would take many iterations to get out.
         """
         x, direction = self._contact.x_before, self._direction
         self.launch_meshes()
@@ -342,11 +346,8 @@ class SelfFilter:
         if self.model.keyframes is not None:
             self._aim(self._target, x, False, True, self.fraction, direction)
             self.launch_limit(direction, whole=True)
-            for array in (self._proceed, self._rounds):
-                array.zero_()
-            self._walking.fill_(1)
-            self._launch_end_move()
-            wp.capture_if(self._proceed, self._launch_walk_of_pins, x=x)
+            self._launch_begin_push()
+            wp.capture_if(self._proceed, self._launch_pins, x=x)
         self._add(x, base, -1.0, d)
         self._add(d, direction, 1.0, d)
 
@@ -373,11 +374,37 @@ class SelfFilter:
         given = [model.inverse_mass, model.mobility, goal, x, free, pinned, fraction, model.per_copy]
         self._launch(self_filter.aim, model.count, given, [p])
 
-    def _launch_walk_of_pins(self, x):
-        """Moves the cloth with its pins in copies that are ``_walking``, and sets their directions from there."""
+    def _launch_pins(self, x):
+        """Moves the cloth with its pins, then pins with cloth in their way ahead of them; sets directions from there."""
         self._launch_rounds(x)
-        self._aim(self._target, x, True, True, self.fraction, self._direction)
-        self.launch_limit(self._direction, whole=True)
+        self._launch_begin_push()
+        wp.capture_while(self._proceed, self._launch_pins_on, x=x)
+        for free, fraction in (True, None), (False, self.fraction):
+            self._aim(self._target, x, free, True, fraction, self._direction)
+            self.launch_limit(self._direction, whole=True)
+
+    def _launch_pins_on(self, x):
+        contact, p = self._contact, self._pushed
+        self.launch_fresh(x, contact.launch_list, self._walking)
+        contact.launch_sides(x)
+        p.zero_()
+        self._aim(self._target, x, False, True, self.fraction, p)
+        self._launch_pushes(self._unlocked, p, opens=True)
+        self.launch_limit(p)
+        self._add(x, p, 1.0, x, self._walking)
+        self.model.launch(self._count, 1, [], [self._rounds])
+        self._launch_end_push()
+
+    def _launch_begin_push(self):
+        self._rounds.zero_()
+        self._walking.fill_(1)
+        self._launch_end_push()
+
+    def _launch_end_push(self):
+        self._proceed.zero_()
+        given = [self.fraction, self._rounds, self._contact.steps, ROUNDS, self._contact.per_frame]
+        out = [self._walking, self._proceed, self._forced]
+        self.model.launch(self_filter.end_move, self.model.copies, given, out)
 
     def launch_between(self, before, d):
         """Moves d towards ``before`` (N,), whose pairs are listed, so that pairs stay apart on the way to d."""
