@@ -35,71 +35,50 @@ NONE, TWO_EDGES = wp.constant(-1), wp.constant(7)  # codes of a face that is not
 
 
 @wp.func
-def from_middles(s: wp.float64, t: wp.float64):
+def from_middles(p: wp.vec2d):
     """1 + ⅛((2s − 1)² + (2t − 1)²)."""
-    x = TWO * s - ONE
-    z = TWO * t - ONE
-    return ONE + MIDDLE * (x * x + z * z)
+    m = TWO * p - wp.vec2d(ONE, ONE)
+    return ONE + MIDDLE * wp.dot(m, m)
 
 
 @wp.func
-def on_two_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """s and t of D of the edges ab and cd, by Newton's method within the square, and D/‖y‖."""
-    u = b - a
-    v = d - c
-    w = a - c
-    uu = wp.dot(u, u)
-    vv = wp.dot(v, v)
-    uv = wp.dot(u, v)
-    s = SIDE
-    t = SIDE
+def on_two_edges(u: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """(s, t) of D of the edges 0u and cd, by Newton's method within the square, and D/‖y‖."""
+    v = c - d
+    of_square = TWO * wp.mat22d(wp.dot(u, u), wp.dot(u, v), wp.dot(u, v), wp.dot(v, v))  # ∂²‖y‖²
+    p = wp.vec2d(SIDE, SIDE)
     turn = wp.int32(0)
     while turn < 40:
         turn += 1
-        y = w + s * u - t * v
+        y = p[0] * u + p[1] * v - c
         q = wp.dot(y, y)
-        g = from_middles(s, t)
-        qs = TWO * wp.dot(y, u)
-        qt = -TWO * wp.dot(y, v)
-        gs = wp.float64(4.0) * MIDDLE * (TWO * s - ONE)
-        gt = wp.float64(4.0) * MIDDLE * (TWO * t - ONE)
-        fs = g * qs + q * gs
-        ft = g * qt + q * gt
-        ss = TWO * g * uu + TWO * gs * qs + wp.float64(8.0) * MIDDLE * q
-        tt = TWO * g * vv + TWO * gt * qt + wp.float64(8.0) * MIDDLE * q
-        st = -TWO * g * uv + gs * qt + gt * qs
-        s_held = (s <= ZERO and fs > ZERO) or (s >= ONE and fs < ZERO)
-        t_held = (t <= ZERO and ft > ZERO) or (t >= ONE and ft < ZERO)
-        ds = ZERO
-        dt = ZERO
-        if s_held and t_held:
-            turn = 40
-        elif s_held:
-            dt = -ft / tt
-        elif t_held:
-            ds = -fs / ss
-        else:
-            det = ss * tt - st * st
-            ds = -(tt * fs - st * ft) / det
-            dt = -(ss * ft - st * fs) / det
-        before = g * q
+        g = from_middles(p)
+        dq = TWO * wp.vec2d(wp.dot(y, u), wp.dot(y, v))
+        dg = wp.float64(4.0) * MIDDLE * (TWO * p - wp.vec2d(ONE, ONE))
+        slope = g * dq + q * dg
+        H = g * of_square + wp.outer(dq, dg) + wp.outer(dg, dq)
+        for i in range(2):
+            H[i, i] = H[i, i] + wp.float64(8.0) * MIDDLE * q
+        for i in range(2):
+            if (p[i] <= ZERO and slope[i] > ZERO) or (p[i] >= ONE and slope[i] < ZERO):  # it stays
+                slope[i] = ZERO
+                H[0, 1] = ZERO
+                H[1, 0] = ZERO
+        move = wp.inverse(H) * slope
         step = ONE
-        s1 = s
-        t1 = t
+        after = wp.vec2d(p[0], p[1])
         tries = wp.int32(0)
         while tries < 20:
-            s1 = wp.clamp(s + step * ds, ZERO, ONE)
-            t1 = wp.clamp(t + step * dt, ZERO, ONE)
-            y = w + s1 * u - t1 * v
-            if wp.dot(y, y) * from_middles(s1, t1) <= before * (ONE + wp.float64(1e-13)):
+            after = wp.vec2d(wp.clamp(p[0] - step * move[0], ZERO, ONE), wp.clamp(p[1] - step * move[1], ZERO, ONE))
+            y = after[0] * u + after[1] * v - c
+            if wp.dot(y, y) * from_middles(after) <= g * q * (ONE + wp.float64(1e-13)):
                 tries = 20
             step *= SIDE
             tries += 1
-        if wp.max(wp.abs(s1 - s), wp.abs(t1 - t)) < wp.float64(1e-15):
+        if wp.max(wp.abs(after - p)) < wp.float64(1e-15):
             turn = 40
-        s = s1
-        t = t1
-    return s, t, wp.sqrt(from_middles(s, t))
+        p = wp.vec2d(after[0], after[1])
+    return p, wp.sqrt(from_middles(p))
 
 
 @wp.struct
@@ -535,13 +514,13 @@ def find_edge_contacts(dtype):
             d = at(x, correction, s[3]) - a
             if lowest(False, s, normals[e], b, c, d, goal, move) >= r:
                 continue
-            u, t, ratio = on_two_edges(wp.vec3d(), b, c, d)
-            y = u * b - (c + t * (d - c))
+            p, ratio = on_two_edges(b, c, d)
+            y = p[0] * b - (c + p[1] * (d - c))
             if not goal and ratio * wp.length(y) >= r:
                 continue
             factor = ratio / CLOSE
             A = HALF_PI * width_of(areas, lists.layout, laws, s[0], s[1]) * width_of(areas, lists.layout, laws, s[2], s[3])
-            w = wp.vec4d(ONE - u, u, t - ONE, -t)
+            w = wp.vec4d(ONE - p[0], p[0], p[1] - ONE, -p[1])
             put_contact(e, s, w, y, laws.distance[law] / factor, factor * factor * laws.stiffness[law] * A, x, pairs, contacts)
             contacts.ratio[e] = ratio
 
