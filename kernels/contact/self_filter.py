@@ -165,11 +165,12 @@ def turned_gap(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec
 def share_of_pins(dtype):
     """Kernel over pairs: reduces the ``share`` of each pin, the fraction of its move to x that other pins leave it.
 
-    It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If they would pass
-    through one another, pins stop at the contact distance or, if that is smaller, at the gap at the start of the step. If pairs
-    are ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER, or LAGGING if a vertex is
-    free, or, if larger, the sine of the turn of their normal. Gaps are those of :func:`turned_gap`, which a turn as one body
-    does not change. On the chords of a turn by θ between keyframes they shrink, by up to tan θ/2 times this sine.
+    It acts on pairs of pins whose nearest points are inside a triangle or inside both edges. If they would pass through one
+    another, pins stop at the contact distance or, if that is smaller, at the gap at the start of the step. If pairs are
+    ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER, or LAGGING if a vertex is
+    free, or, if larger, the sine of the turn of their normal; there pairs only need pins on both sides. Gaps are those of
+    :func:`turned_gap`, which a turn as one body does not change. On the chords of a turn by θ between keyframes they shrink, by
+    up to tan θ/2 times this sine.
     """
     vec3, _ = types(dtype)
 
@@ -206,6 +207,8 @@ def share_of_pins(dtype):
         most = TOGETHER
         for i in range(4):
             if inverse_mass[s[i]] > dtype(0.0):
+                if not hard:
+                    return  # it makes way, and x has where it would be without contact
                 most = LAGGING
         lost = wp.where(hard, wp.max(most, turned), ONE) * floor
         if end < floor - lost:
