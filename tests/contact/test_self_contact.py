@@ -650,6 +650,26 @@ def test_a_pin_pushes_cloth_that_goes_the_other_way(device):
     np.testing.assert_allclose(start[pin], frames[-1, 0], atol=1e-12)
 
 
+@pytest.mark.parametrize("hard", [False, True])
+def test_pins_that_move_as_one_body_are_held_by_lagging_vertices_if_pairs_are_hard(hard, device):
+    """Two edges that cross, with a pin and a free vertex each; the free vertices are predicted beyond one another."""
+    scene = layers(turn=17.0, gap=6e-3)
+    pairs = pairs_of(scene, device)
+    first, end = pairs.pairs.counts.numpy().cumsum()
+    inside = np.flatnonzero((np.abs(pairs.begun.weights.numpy()[first:end]) > 0.2).all(axis=1))
+    edges = pairs.pairs.stencils.numpy()[first + inside[0]]
+    pins, free = edges[[0, 2]], edges[[1, 3]]
+    frames = scene.positions[pins] - np.array([0.0, 1e-3, 0.0]) * np.arange(2)[:, None, None]
+    scene = replace(scene, pins=wc.Pins(pins, frames), duration=1.0 / 24.0)
+    pairs, x = pairs_of(scene, device), scene.positions.copy()
+    x[pins, 1] -= 1e-3
+    x[free, 1] += np.where(free < 36, 0.03, -0.03)
+    end, v = pairs.model.array(x, pairs.model.vec3), pairs.model.vectors()
+    pairs.filter.launch_hold(end, v, hard)
+    moved = (end.numpy() - scene.positions)[pins, 1]
+    assert (moved == pytest.approx(-1e-3, abs=1e-15)) != hard
+
+
 def test_directions_by_the_list(device):
     """Along moves for which the list is kept, its pairs give the fraction that a search of all pairs gives, to the bit."""
     scene, random, found = layers(turn=17.0, gap=5e-3), np.random.default_rng(0), []
