@@ -132,7 +132,7 @@ def skirt_walking():
 
 @entry
 def twisted():
-    animation = run(twist.scene(turns=1.0, around=24, along=20, duration=2.4), wc.XPBD(substeps=8))
+    animation = run(twist.scene(turns=1.0, around=24, along=20, duration=2.4), wc.Newton())
     colour = dyed(animation, bands(animation, 0.05) % 2, (OCHRE, CREAM))
     film(animation, "twisted", size=(400, 220), colour=colour, every=2, azimuth=-20.0, elevation=14.0, ground=False)
 
@@ -155,7 +155,7 @@ def denim_and_silk(names=("denim", "silk")):
 
 @entry
 def sheets_stacked(sheets=4):
-    animation = bare(run(stack.scene(sheets=sheets, n=12), wc.Explicit(substeps=90)))
+    animation = bare(run(stack.scene(sheets=sheets, n=12), wc.Newton()))
     colour = dyed(animation, parts(animation, sheets), (INDIGO, TEAL, OCHRE, RED))
     film(animation, "sheets_stacked", colour=colour, every=4, elevation=18.0)
 
@@ -188,14 +188,14 @@ def sheet_folding():
 
 @entry
 def sleeve_and_lining():
-    animation = run(sleeve.scene(around=24, along=18), wc.Explicit(substeps=140))
+    animation = run(sleeve.scene(), wc.Newton())
     colour = dyed(animation, parts(animation, 2), (INDIGO, OCHRE))
     film(animation, "sleeve_and_lining", size=(400, 220), colour=colour, every=4, azimuth=25.0, ground=False)
 
 
 @entry
 def cloth_in_funnel():
-    animation = run(funnel.scene(n=25), wc.Newton(substeps=4))
+    animation = run(funnel.scene(), wc.Newton())
     film(animation, "cloth_in_funnel", size=(280, 320), colour=gingham(animation, 0.05, TEAL), every=2, elevation=38.0)
 
 
