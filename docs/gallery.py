@@ -196,7 +196,7 @@ def sleeve_and_lining():
 @entry
 def cloth_in_funnel():
     animation = run(funnel.scene(), wc.Newton())
-    film(animation, "cloth_in_funnel", size=(280, 320), colour=gingham(animation, 0.05, TEAL), every=2, elevation=38.0)
+    film(animation, "cloth_in_funnel", size=(280, 320), colour=gingham(animation, 0.075, TEAL), every=2, elevation=38.0)
 
 
 @entry

@@ -337,10 +337,7 @@ class SelfFilter:
         if self._lets_out:
             self._launch_shapes()
         wp.copy(self._target, base)
-        for elements in self._touching:
-            kernel = self.model.kernel(move_clear, elements.term, self.model.dtype)
-            given = [elements.stencil, elements.rest, self.model.inverse_mass]
-            self.model.launch(kernel, elements.count, given, [self._target])
+        self._launch_clear(self._target, self.model.inverse_mass)
         self._add(self._target, x, -1.0, direction)
         self.launch_limit(direction, whole=True)
         if self.model.keyframes is not None:
@@ -350,6 +347,12 @@ class SelfFilter:
             wp.capture_if(self._proceed, self._launch_pins, x=x)
         self._add(x, base, -1.0, d)
         self._add(d, direction, 1.0, d)
+
+    def _launch_clear(self, x, inverse_mass):
+        """Moves vertices with an ``inverse_mass`` above 0 to the contact distance of colliders."""
+        for elements in self._touching:
+            kernel = self.model.kernel(move_clear, elements.term, self.model.dtype)
+            self.model.launch(kernel, elements.count, [elements.stencil, elements.rest, inverse_mass], [x])
 
     def launch_touching(self, active, touching, some):
         """Sets ``touching`` (B,): whether copies are ``active`` (B,), and near colliders or in contact; ``some``: any is."""
@@ -390,6 +393,9 @@ class SelfFilter:
         p.zero_()
         self._aim(self._target, x, False, True, self.fraction, p)
         self._launch_pushes(self._unlocked, p, opens=True)
+        self._add(x, p, 1.0, p)
+        self._launch_clear(p, self._unlocked)
+        self._add(p, x, -1.0, p)
         self.launch_limit(p)
         self._add(x, p, 1.0, x, self._walking)
         self.model.launch(self._count, 1, [], [self._rounds])
