@@ -18,8 +18,8 @@ def pieces(dtype):
 
     The drift is its motion: along each axis the median of that of its ``samples`` (pieces·SAMPLES,). A part that moves alone,
     such as a fold that rolls, hardly changes it. If a copy has more than one piece (``per_copy``), each also has a box, and the
-    largest motions of its vertices, relative to the drift and in all [m]. The first are those of the ``cloth``, which meet one
-    another if it meets ``itself``, and the others are meshes.
+    largest motion of its vertices relative to the drift [m]. The first are those of the ``cloth``, which meet one another if it
+    meets ``itself``, and the others are meshes.
     """
     vec3, _ = types(dtype)
 
@@ -34,7 +34,7 @@ def pieces(dtype):
         layout: Layout
         lower: wp.array(dtype=vec3)
         upper: wp.array(dtype=vec3)
-        motion: wp.array(dtype=wp.types.vector(2, dtype))
+        motion: wp.array(dtype=dtype)
 
     return Pieces
 
@@ -150,7 +150,7 @@ def find_motion(dtype):
     is one; due = 1 then. d is (N,) or None.
     """
     vec3, _ = types(dtype)
-    vec2, vector_or_zero = wp.types.vector(2, dtype), vector_within(dtype)
+    vector_or_zero = vector_within(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def find_each_motion(
@@ -174,14 +174,12 @@ def find_motion(dtype):
             at = x[i]
             if d:
                 at = at + vector_or_zero(d, i)
-            at = at - found[i]
-            own = wp.length(at - pieces.drift[p])
+            own = wp.length((at - found[i]) - pieces.drift[p])
             if not (own <= most):
                 note_moved(active, p // pieces.per_copy, moved, some, due)
             if pieces.per_copy > 1:
-                both = vec2(own, wp.length(at))
-                if wp.max(both - pieces.motion[p]) > dtype(0.0):
-                    wp.atomic_max(pieces.motion, p, both)
+                if own > pieces.motion[p]:
+                    wp.atomic_max(pieces.motion, p, own)
 
     return find_each_motion
 
@@ -211,7 +209,7 @@ def compare_motions(dtype):
     """Kernel over pieces: moved, some and due as in :func:`find_motion`, if it and a later one of its copy may be too near.
 
     That is, if their approach may exceed ``most`` plus the excess of the distance of their boxes over ``radius``, up to which
-    pairs are listed. Else ``room`` (B,) is lowered to what is left of ``most`` plus ``spare``; it may be None.
+    pairs are listed.
     """
     vec3, _ = types(dtype)
 
@@ -223,12 +221,10 @@ def compare_motions(dtype):
         active: wp.array(dtype=wp.int32),
         radius: dtype,
         most: dtype,
-        spare: dtype,
         # out
         moved: wp.array(dtype=wp.int32),
         some: wp.array(dtype=wp.int32),
         due: wp.array(dtype=wp.int32),
-        room: wp.array(dtype=dtype),
     ):
         p = wp.tid()
         first = p + 1
@@ -237,14 +233,10 @@ def compare_motions(dtype):
         if not pieces.itself:
             first = p // pieces.per_copy * pieces.per_copy + pieces.cloth
         for q in range(first, (p // pieces.per_copy + 1) * pieces.per_copy):
-            motion = pieces.motion[p] + pieces.motion[q]
-            nearer = wp.min(wp.length(pieces.drift[q] - pieces.drift[p]) + motion[0], motion[1])
+            nearer = wp.length(pieces.drift[q] - pieces.drift[p]) + pieces.motion[p] + pieces.motion[q]
             gap = wp.max(pieces.lower[p] - pieces.upper[q], pieces.lower[q] - pieces.upper[p])
             gap = wp.max(gap, vec3())
-            rest = most + wp.max(wp.length(gap) - radius, dtype(0.0)) - nearer
-            if not (rest >= dtype(0.0)):
+            if not (nearer <= most + wp.max(wp.length(gap) - radius, dtype(0.0))):
                 note_moved(active, p // pieces.per_copy, moved, some, due)
-            elif room:
-                wp.atomic_min(room, p // pieces.per_copy, rest + spare)
 
     return compare_each_motion

@@ -23,8 +23,8 @@ TOGETHER, LAGGING = wp.constant(wp.float64(0.01)), wp.constant(wp.float64(0.5))
 def keep_apart(dtype):
     """Kernel over vertices: x ← x + u + t(δ − u), with the ``common`` move u and t at most the ``share`` that planes allow.
 
-    ``room`` (B,) bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B,) counts the vertices whose move
-    this bound alone shortened. Copies whose ``walk`` is 0 do not move.
+    ``most`` bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B,) counts the vertices whose move this
+    bound alone shortened. Copies whose ``walk`` is 0 do not move.
     """
     vec3, _ = types(dtype)
 
@@ -39,7 +39,7 @@ def keep_apart(dtype):
         walk: wp.array(dtype=wp.int32),
         # parameters
         per_copy: int,
-        room: wp.array(dtype=dtype),
+        most: wp.float64,
         # out
         x: wp.array(dtype=vec3),
         cuts: wp.array(dtype=wp.int32),
@@ -50,7 +50,7 @@ def keep_apart(dtype):
             return
         u = common[copy]
         move = wp.vec3d(target[i]) - wp.vec3d(x_ref[i]) - u
-        far = bounded_share(move, wp.float64(room[copy]))
+        far = bounded_share(move, most)
         t = wp.min(far, share[i])
         if t < ONE:
             if t < least_share[i]:

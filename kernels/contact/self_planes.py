@@ -70,7 +70,7 @@ def common_move(dtype):
 
 @cache
 def find_ways(dtype):
-    """Kernel over vertices: ``share`` with which the wanted move minus the ``common`` move is within ``room``, and ``ways``.
+    """Kernel over vertices: ``share`` with which the wanted move minus the ``common`` move is at most ``most``, and ``ways``.
 
     The ways are a bound of what it adds to the approach of a pair [m], its largest coordinate [m], and its share. The bound is
     the length of that move plus WIDE times that of the motion since ``begun``, where gaps were computed, ``relative`` to the
@@ -87,7 +87,7 @@ def find_ways(dtype):
         begun: wp.array(dtype=vec3),
         # parameters
         per_copy: int,
-        room: wp.array(dtype=dtype),
+        most: wp.float64,
         relative: bool,
         # out
         ways: wp.array(dtype=wp.vec3d),
@@ -103,7 +103,7 @@ def find_ways(dtype):
         if relative:
             one = i - i % per_copy
             since -= wp.vec3d(x[one]) - wp.vec3d(begun[one])
-        share[i] = bounded_share(own, wp.float64(room[i // per_copy]))
+        share[i] = bounded_share(own, most)
         ways[i] = wp.vec3d(wp.length(own) + WIDE * wp.length(since), far, share[i])
         least_share[i] = ZERO
 

@@ -21,7 +21,8 @@ class Proximity:
 
     A pair is listed if its distance is below r_c + skin. r_c is the contact distance, but at most half the rest distance of two
     elements of one connected piece. With meshes, edges and vertices of the meshes act below CLOSE r, so it is CLOSE r for them,
-    or r − skin/2 if that is more. Pairs with a common vertex or with coordinates that are not finite are not listed.
+    or r − skin/2 if that is more: the sides of a pair approach by at most half of the skin until :meth:`launch_kept` makes a
+    new list, so that gaps up to r are known. Pairs with a common vertex or with coordinates that are not finite are not listed.
     Positions (V,) are those of all vertices of the surface.
 
     Args:
@@ -39,9 +40,6 @@ class Proximity:
         rows: Pairs rows[i] to rows[i+1] are the vertex–triangle pairs of vertex i. Those of edges follow, by their first edge.
         found: Positions of the last list, (V,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
         flag, copies: (1,) and (B,) int32, see :meth:`moved`.
-        part_of_gaps: The ``part`` of :meth:`moved` up to which no pair with a mesh is missing that is nearer than r: ¼ or more.
-        room: How far cloth may move while meshes stand, after :meth:`moved` and the list that it asks for, so that no pair is
-            missing (B,) [m]. Where cloth meets itself, :meth:`moved` does not change it.
         listed: Positions (V,) [m] of the list that is in the arrays.
         pieces: The connected piece of each vertex of the cloth of a copy, −1 without an element, (n,).
         drift: Motion of each connected piece of all copies since ``found`` [m].
@@ -67,10 +65,8 @@ class Proximity:
             "highest": wp.zeros(boxes, dtype=model.vec3, device=device),
         }
         values |= {"layout": surface.layout, "itself": surface.meets_itself, "distance": distance, "of_meshes": of_meshes}
-        close = max(float(CLOSE) * of_meshes, of_meshes - 0.5 * skin)
-        self.part_of_gaps = 0.5 * (skin + close - of_meshes) / skin
-        values |= {"close": close, "max_distance": self._max_distance, "skin": skin}
-        values |= {"far": 2.0 * (distance + surface.edge_lengths.max())}
+        values |= {"close": max(float(CLOSE) * of_meshes, of_meshes - 0.5 * skin), "max_distance": self._max_distance}
+        values |= {"skin": skin, "far": 2.0 * (distance + surface.edge_lengths.max())}
         self._surface = filled(proximity_grid.surfaces(model.dtype), **values)
         touching = dict.fromkeys(("close", "max_distance", "skin"), 0.0)
         self._along = filled(proximity_grid.surfaces(model.dtype), **values | touching)
@@ -79,7 +75,7 @@ class Proximity:
         self._shares = 8 if model.device.is_cuda else 1
         self.found, self.listed = surface.vectors(), surface.vectors()  # all 0, so that the first call makes a list
         self.flag, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
-        self.copies, self.room = model.scalars(wp.int32), model.scalars(model.dtype)
+        self.copies = model.scalars(wp.int32)
         self._rows = Scan(model, self._vertices + self._edges)
         self._near = self.searches(kernels.take_near, "near")
         self._launch = model.launcher(
@@ -123,7 +119,7 @@ class Proximity:
         arrays = {name: wp.array(each, dtype=wp.int32, device=model.device) for name, each in arrays.items()}
         kinds = {"drift": model.vec3}
         if len(used) > 1:
-            kinds |= {"lower": model.vec3, "upper": model.vec3, "motion": wp.types.vector(2, model.dtype)}
+            kinds |= {"lower": model.vec3, "upper": model.vec3, "motion": model.dtype}
         size = model.copies * len(used)
         arrays |= {name: wp.zeros(size, dtype=kind, device=model.device) for name, kind in kinds.items()}
         numbers = {"per_copy": len(used), "cloth": len(used) - len(np.unique(surface.colliders))}
@@ -233,7 +229,7 @@ class Proximity:
         The flag is 0 while each vertex has moved by at most the fraction ``part`` of the skin since the last detection,
         relative to the drift of its connected piece, the median motion of some of its vertices. Two pieces may also have
         approached one another by twice that, plus the excess of the distance of their boxes over the contact distance and the
-        skin. Where cloth meets meshes alone, only this counts.
+        skin.
 
         Args:
             x: Positions (V,) [m].
@@ -242,32 +238,27 @@ class Proximity:
             active: Copies that count (B,) int32; None for all.
         """
         self.flag.zero_()
-        room = None if self.surface.meets_itself else self.room
-        if room is not None:
-            room.fill_(self.skin)
-        self.launch_moved_since(x, part, active, self.flag, room=room)
+        self.launch_moved_since(x, part, active, self.flag)
         return self.flag
 
-    def launch_moved_since(self, x, part, active, flag, correction=None, room=None):
+    def launch_moved_since(self, x, part, active, flag, correction=None):
         """Launches ``flag`` (1,) = 1 where :meth:`moved` sets it, at x (V,) + ``correction`` (N,); else it stays."""
         for array in (self.copies, self._due):
             array.zero_()
-        self._launch_moved_since(x, part, active, flag, correction, room)
+        self._launch_moved_since(x, part, active, flag, correction)
 
-    def _launch_moved_since(self, x, part, active, flag, correction=None, room=None):
+    def _launch_moved_since(self, x, part, active, flag, correction=None):
         several = self._pieces.per_copy > 1
         if several:
             self._pieces.motion.zero_()
         at = [x, correction, self.found]
         self._launch(piece_motion.find_drift, len(self.drift), at, [self._pieces])
-        most = part * self.skin if self.surface.meets_itself else np.inf
-        given, out = [*at, active, most], [self._pieces, self.copies, flag, self._due]
+        given, out = [*at, active, part * self.skin], [self._pieces, self.copies, flag, self._due]
         self._launch(piece_motion.find_motion, self._vertices, given, out)
         if several:
             wp.capture_if(self._due, lambda: self._launch_boxes(self.found))
             given = [self._pieces, active, self._max_distance + self.skin, 2.0 * part * self.skin]
-            given.append((1.0 - 2.0 * part) * self.skin)
-            self._launch(piece_motion.compare_motions, len(self.drift), given, [self.copies, flag, self._due, room])
+            self._launch(piece_motion.compare_motions, len(self.drift), given, [self.copies, flag, self._due])
 
     @property
     def overflowed(self):

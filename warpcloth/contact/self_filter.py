@@ -13,8 +13,7 @@ from ..kernels.step import count_step
 # A move that is longer than one list of pairs allows is made in at most ROUNDS rounds.
 ROUNDS = 32
 # The longest move of a vertex in a round, relative to the common motion, over the skin. It may have moved as far since the list
-# was made, and so may the other side of a pair: together they approach by at most the skin. Meshes stand in a round: cloth that
-# meets them alone may move by all of the skin that motions since the list left, which is half of it or more.
+# was made, and so may the other side of a pair: together they approach by at most the skin.
 WAY = 0.25
 # Vertices that cloth holds back in a collider are moved out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
 # keeps a gap of LEFT times the contact distance to other cloth, or its present gap if that is smaller.
@@ -45,7 +44,6 @@ class SelfFilter:
         self._cuts, self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(3))
         self._proceed, self._changed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.moves_together = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
-        contact.proximity.room.fill_(WAY * contact.skin)
         self._kernels = {}
         self._make(self_planes.find_ways, self_planes.cut_by_planes, self_planes.common_move)
         self._make(self_filter.keep_apart, self_filter.end_filter, piece_motion.add_positions)
@@ -158,7 +156,7 @@ class SelfFilter:
         model = self.model
         wp.copy(self._from, x, count=self.model.count)
         given = [self._share, self._least_share, self._from, target, self._common, self._walking]
-        given += [model.per_copy, self._contact.proximity.room]
+        given += [model.per_copy, WAY * self._contact.skin]
         self._launch(self_filter.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
@@ -194,7 +192,7 @@ class SelfFilter:
         model = self.model
         if self.moves_together:
             self._launch(self_planes.common_move, model.copies, [x, target, model.per_copy], [self._common])
-        given = [x, target, self._common, self._contact.begun_at, model.per_copy, self._contact.proximity.room]
+        given = [x, target, self._common, self._contact.begun_at, model.per_copy, WAY * self._contact.skin]
         given += [self._surface.obstacles == 0]
         self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
 
@@ -249,7 +247,7 @@ class SelfFilter:
 
     def _launch_meshes_on(self, x, goal):
         p, contact = self._moves, self._contact
-        self.launch_fresh(x, contact.launch_list, part=contact.kept)
+        self.launch_fresh(x, contact.launch_list)
         contact.launch_sides(x)
         for array in (p, self._carried, self._keys):
             array.zero_()
@@ -418,10 +416,10 @@ class SelfFilter:
         self.launch_limit(self._direction)
         self._add(before, self._direction, 1.0, d)
 
-    def launch_trial(self, base, d, active=None, part=None):
-        """Lists the pairs at base + d again, in ``active`` copies (B,), if they moved by ``part``, or ``kept``, of the skin."""
+    def launch_trial(self, base, d, active=None, part=WAY):
+        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if they have moved by ``part`` of the skin."""
         self._add(base, d, 1.0, self._contact.x_before, active)
-        self.launch_fresh(self._contact.x_before, self._contact.relist, active, part or self._contact.kept)
+        self.launch_fresh(self._contact.x_before, self._contact.relist, active, part)
 
     def launch_limit(self, direction, whole=False):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.

@@ -30,7 +30,7 @@ from .surface import ContactSurface
 # must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one of them. It must
 # be below 0.5, the height of a right-angled triangle with a longest side of 1, so that a flat grid has no pairs.
 SKIN = 0.35
-THICK = 0.5  # the smallest skin, over the contact distance
+THICK = 0.5  # the smallest skin, over the contact distance; while a list is kept, two parts approach by up to half of it
 
 
 class FirstGap(NamedTuple):
@@ -80,8 +80,6 @@ class SelfSteps:
         lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
         most_listed: The largest number of pairs in a list so far, (B,) int32.
         listed: 1 if the last list has pairs, else 0, (1,) int32.
-        kept: The motion over the skin after which pairs are listed anew where contacts are found: ½, up to which none that acts
-            is missing; where cloth meets itself WAY, up to which a round of the filter can miss none either.
         far: 1 if pairs that are not listed may meet on the way of the last :meth:`launch_near`, else 0, (1,) int32.
         stale: Whether the capacity of lists has grown outside of steps, so that graphs must be recorded again.
     """
@@ -99,7 +97,6 @@ class SelfSteps:
         self._laws = filled(Laws, distance=wp.vec2d(*distances), stiffness=wp.vec2d(*stiffnesses), width=surface.width)
         self.skin = max(SKIN * float(scene.mesh.edge_lengths.max()), THICK * self.max_distance)
         self.proximity = Proximity(surface, distances[0], self.skin, distances[1])
-        self.kept, self._noted = (WAY, WAY) if surface.meets_itself else (0.5, self.proximity.part_of_gaps)
         self.x_before, self.begun_at = surface.vectors(), surface.vectors()
         self.cut = state.add("vertices kept apart", model.scalars(wp.int64), Count(sums=True))
         self.steps = state.add("steps of self-contact", model.scalars(wp.int32), Count())
@@ -293,7 +290,7 @@ class SelfSteps:
             wp.copy(self._colliders.x_before, x)
         x = self.x_before
         self.filter.launch_begin()
-        self.proximity.launch_kept(x, self._noted, self.launch_list)
+        self.proximity.launch_kept(x, WAY, self.launch_list)
         wp.capture_if(self.listed, self._launch_begin, self._launch_none, x=x)
 
     def _launch_none(self, x):
