@@ -464,6 +464,19 @@ def copies_in_contact(
         some[0] = 1
 
 
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def copies_with_pairs(
+    # elements
+    pairs: Pairs,
+    # out
+    listed: wp.array(dtype=wp.int32),
+):
+    """Kernel over pairs: ``listed`` becomes 1 for their copies."""
+    e = wp.tid()
+    if e < pairs.counts[0] + pairs.counts[1]:
+        listed[copy_of(pairs.layout, pairs.stencils[e][0])] = 1
+
+
 @cache
 def aim(dtype):
     """Kernel over vertices: p = goal − x along ``free`` axes, pinned ones, or both, else 0; where ``fraction`` (B,) is below 1.

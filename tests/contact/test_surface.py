@@ -228,3 +228,29 @@ def test_the_gap_of_edges_is_reported_where_they_do_not_act(start, device):
     for height in (start, 0.6):
         pairs.launch_begin(wp.array(R * across + height * up, dtype=wp.vec3d, device=device))
         assert pairs.in_frame()[2] == pytest.approx(height * R, rel=1e-12)
+
+
+@pytest.mark.parametrize("solver", [wc.PBD(), wc.XPBD()], ids=["PBD", "XPBD"])
+def test_a_copy_without_pairs_does_not_follow_what_another_has(solver, device):
+    """Two sheets fall on a mesh, one as fast that it has pairs first; the other moves as alone, to the bit."""
+    grid, mesh = wc.Mesh.grid(8, 8, size=0.3), wc.Mesh.grid(5, 5, size=0.5)
+    positions = grid.points - grid.points.mean(axis=0) + [0.0, 0.03, 0.0]
+    scene = wc.Scene(
+        grid,
+        positions=positions,
+        density=0.15,
+        terms=[wc.Spring(stiffness=300.0)],
+        fps=24.0,
+        contact=wc.Contact(distance=4e-3, stiffness=1e4),
+        colliders=[wc.MeshCollider(mesh.points - mesh.points.mean(axis=0), mesh.triangles)],
+    )
+    falls = np.array([[0.0, -3.0, 0.0], [1.0, -8.0, 0.0]])[:, None]
+    velocities = 0.2 * np.random.default_rng(0).normal(size=(2, 64, 3)) + falls
+    found = []
+    for copies in (1, 2):
+        stepper = solver.bind(scene.build(copies=copies, dtype="float64", device=device))
+        stepper.reset(None, None, velocities[:copies])
+        for _ in range(2):
+            stepper.frame()
+        found.append(stepper.state.x.numpy()[:64])
+    assert (found[0] == found[1]).all()

@@ -462,13 +462,16 @@ class SelfFilter:
         wp.capture_if(self._contact.near.array, self.launch_trial, base=base, d=d, part=0.5)
 
     def launch_follow(self, base, d):
-        """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs."""
-        x, direction = self._contact.x_before, self._direction
+        """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs.
+
+        Copies without pairs at the start of the step stay there, as in a run of one copy, which takes no contacts then.
+        """
+        x, direction, listed = self._contact.x_before, self._direction, self._contact.with_pairs
         self._add(base, x, -1.0, direction)
         self._add(direction, d, 1.0, direction)
         self.launch_limit(direction)
-        self._add(x, direction, 1.0, x)
-        self.launch_fresh(x, self._contact.relist)
+        self._add(x, direction, 1.0, x, listed)
+        self.launch_fresh(x, self._contact.relist, listed)
 
     def _put(self, out, x):
         """Sets positions (V,) to x (N,), with the obstacles where they are now."""

@@ -16,7 +16,7 @@ from ..kernels.contact import gap_notes, self_pairs
 from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes
 from ..kernels.contact.pair_potential import Laws
 from ..kernels.contact.piece_motion import add_positions
-from ..kernels.contact.self_filter import HeldPins
+from ..kernels.contact.self_filter import HeldPins, copies_with_pairs
 from ..kernels.terms.contact import FLOOR
 from .collider_steps import cut_share
 from .pair_contact import PairContact
@@ -79,7 +79,7 @@ class SelfSteps:
         near: The :class:`warpcloth.core.capture.Mirror` of what :meth:`.SelfFilter.launch_look` found, (1,) int32.
         lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
         most_listed: The largest number of pairs in a list so far, (B,) int32.
-        listed: 1 if the last list has pairs, else 0, (1,) int32.
+        listed, with_pairs: 1 if the last list has pairs, else 0, (1,) int32; and for each copy at the start of the step (B,).
         far: 1 if pairs that are not listed may meet on the way of the last :meth:`launch_near`, else 0, (1,) int32.
         stale: Whether the capacity of lists has grown outside of steps, so that graphs must be recorded again.
     """
@@ -104,6 +104,7 @@ class SelfSteps:
         self._most = Mirror(self.most_listed)
         self.lists = state.add("lists of pairs", model.scalars(wp.int32))
         self.listed, self.far = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self.with_pairs = model.scalars(wp.int32)
         notes = {
             "nearest": state.add("nearest", model.scalars(wp.float64)),
             "too_near": state.add("first too near", model.scalars(wp.int64)),
@@ -300,6 +301,8 @@ class SelfSteps:
             each.launch_none()
 
     def _launch_begin(self, x):
+        self.with_pairs.zero_()
+        self.model.launch(copies_with_pairs, len(self.pairs.stencils), [self.pairs], [self.with_pairs])
         self.launch_sides(x)
         self._launch_notes(x, self.per_frame, self._notes)
         if self.friction is not None:
