@@ -106,7 +106,7 @@ def end_move(
 ):
     """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
 
-    After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame.
+    After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame. Pins stop.
     """
     c = wp.tid()
     if fraction[c] == ONE:
