@@ -106,7 +106,8 @@ def end_move(
 ):
     """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
 
-    After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame. Pins stop.
+    After ``most`` rounds pins stop, and meshes go through what is in their way: ``first`` is FIRST − frame for the first such
+    frame.
     """
     c = wp.tid()
     if fraction[c] == ONE:

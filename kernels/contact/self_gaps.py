@@ -83,7 +83,10 @@ def vertex_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 @wp.func
 def edge_edge(b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """w and y of the edges 0b and cd (Ericson 2004, 5.1.9). s is computed again at the end: parallel edges leave it to rounding."""
+    """w and y of the edges 0b and cd (Ericson 2004, 5.1.9).
+
+    s is computed again from t at the end, because it is rounding where edges are parallel.
+    """
     cd = d - c
     # sin² from the cross product, because |b|²|cd|² − (b·cd)² cancels for nearly parallel edges.
     normal = wp.cross(b, cd)
