@@ -162,16 +162,21 @@ def turned_gap(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec
     return wp.dot(normal, a - c), wp.length(wp.cross(n, normal))
 
 
+@wp.func
+def corner(p: wp.mat44d, i: int):
+    return wp.vec3d(p[i, 0], p[i, 1], p[i, 2])
+
+
 @cache
 def share_of_pins(dtype):
     """Kernel over pairs: reduces the ``share`` of each pin, the fraction of its move to x that other pins leave it.
 
-    It acts on pairs of pins whose nearest points are inside a triangle or inside both edges. If they would pass through one
-    another, pins stop at the contact distance or, if that is smaller, at the gap at the start of the step. If pairs are
-    ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER, or LAGGING if a vertex is
-    free, or, if larger, the sine of the turn of their normal; there pairs only need pins on both sides. Gaps are those of
-    :func:`turned_gap`, which a turn as one body does not change. On the chords of a turn by θ between keyframes they shrink, by
-    up to tan θ/2 times this sine.
+    It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If they would pass
+    through one another, pins stop at the contact distance or, if that is smaller, at the gap at the start of the step. If pairs
+    are ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER, or LAGGING if a vertex is
+    free, or, if larger, the sine of the turn of their normal. Else free vertices count as if they moved with the pins of their
+    pair, for x has where they would be without contact. Gaps are those of :func:`turned_gap`, which a turn as one body does not
+    change. On the chords of a turn by θ between keyframes they shrink, by up to tan θ/2 times this sine.
     """
     vec3, _ = types(dtype)
 
@@ -182,6 +187,7 @@ def share_of_pins(dtype):
         inverse_mass: wp.array(dtype=dtype),
         # state in
         step: StepPairs,
+        x_before: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
         # parameters
         hard: bool,
@@ -202,15 +208,23 @@ def share_of_pins(dtype):
         sides = wp.where(e < pairs.counts[0], 1, 2)
         gap = step.gap[e]
         floor = wp.min(gap, pairs.distances[e])
-        end, turned = turned_gap(
-            e < pairs.counts[0], n, wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]])
-        )
         most = TOGETHER
+        pins = wp.vec4d()
+        move = wp.vec3d()
         for i in range(4):
             if inverse_mass[s[i]] > dtype(0.0):
-                if not hard:
-                    return  # it makes way, and x has where it would be without contact
                 most = LAGGING
+            else:
+                pins[i] = ONE
+                move += wp.vec3d(x[s[i]]) - wp.vec3d(x_before[s[i]])
+        move /= wp.max(pins[0] + pins[1] + pins[2] + pins[3], ONE)
+        p = wp.mat44d()
+        for i in range(4):
+            at = wp.vec3d(x[s[i]])
+            if pins[i] == ZERO and not hard:
+                at = wp.vec3d(x_before[s[i]]) + move
+            p[i] = wp.vec4d(at[0], at[1], at[2], ZERO)
+        end, turned = turned_gap(e < pairs.counts[0], n, corner(p, 0), corner(p, 1), corner(p, 2), corner(p, 3))
         lost = wp.where(hard, wp.max(most, turned), ONE) * floor
         if end < floor - lost:
             t = wp.max(gap - floor, ZERO) / (gap - end)

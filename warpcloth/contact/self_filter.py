@@ -124,7 +124,7 @@ class SelfFilter:
     def _launch_hold(self, x, v, hard):
         model, contact = self.model, self._contact
         self._share.fill_(1.0)
-        given = [contact.pairs, model.inverse_mass, contact.begun, x, hard]
+        given = [contact.pairs, model.inverse_mass, contact.begun, contact.x_before, x, hard]
         self._launch(self_filter.share_of_pins, len(contact.pairs.stencils), given, [self._share])
         given = [model.inverse_mass, self._share, contact.x_before]
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
