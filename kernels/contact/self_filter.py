@@ -162,11 +162,6 @@ def turned_gap(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec
     return wp.dot(normal, a - c), wp.length(wp.cross(n, normal))
 
 
-@wp.func
-def corner(p: wp.mat44d, i: int):
-    return wp.vec3d(p[i, 0], p[i, 1], p[i, 2])
-
-
 @cache
 def share_of_pins(dtype):
     """Kernel over pairs: reduces the ``share`` of each pin, the fraction of its move to x that other pins leave it.
@@ -209,22 +204,20 @@ def share_of_pins(dtype):
         gap = step.gap[e]
         floor = wp.min(gap, pairs.distances[e])
         most = TOGETHER
-        pins = wp.vec4d()
-        move = wp.vec3d()
+        pins = ZERO
+        move = vec3()
         for i in range(4):
             if inverse_mass[s[i]] > dtype(0.0):
                 most = LAGGING
             else:
-                pins[i] = ONE
-                move += wp.vec3d(x[s[i]]) - wp.vec3d(x_before[s[i]])
-        move /= wp.max(pins[0] + pins[1] + pins[2] + pins[3], ONE)
-        p = wp.mat44d()
+                pins += ONE
+                move += x[s[i]] - x_before[s[i]]
+        move /= dtype(wp.max(pins, ONE))
+        at = wp.matrix(shape=(4, 3), dtype=wp.float64)
         for i in range(4):
-            at = wp.vec3d(x[s[i]])
-            if pins[i] == ZERO and not hard:
-                at = wp.vec3d(x_before[s[i]]) + move
-            p[i] = wp.vec4d(at[0], at[1], at[2], ZERO)
-        end, turned = turned_gap(e < pairs.counts[0], n, corner(p, 0), corner(p, 1), corner(p, 2), corner(p, 3))
+            follows = inverse_mass[s[i]] > dtype(0.0) and not hard
+            at[i] = wp.vec3d(wp.where(follows, x_before[s[i]] + move, x[s[i]]))
+        end, turned = turned_gap(e < pairs.counts[0], n, at[0], at[1], at[2], at[3])
         lost = wp.where(hard, wp.max(most, turned), ONE) * floor
         if end < floor - lost:
             t = wp.max(gap - floor, ZERO) / (gap - end)
