@@ -7,7 +7,7 @@ import warp as wp
 from ..memory import load
 from ..vectors import types
 from .obstacles import CLOTH, OBSTACLE, copy_of, has_obstacle, in_copy
-from .proximity_grid import MODULE, boxes, boxes_meet, bucket_of, code_of, grids, surfaces
+from .proximity_grid import MODULE, box_tests, boxes, boxes_meet, bucket_of, code_of, grids, surfaces
 from .self_gaps import nearest_of_face
 
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
@@ -136,13 +136,14 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     meets those of all levels, for it may be larger. The rows of cells near each vertex or edge are divided among ``shares``
     threads. Where there are more rows than buckets, as for long moves, it goes through the buckets instead.
 
-    Of two edges of one level, only one finds the other, by the order of their cells along z, or of their indices, which is also
-    the order in the stencil.
+    Of two edges of one level, only one finds the other, by the order of their cells along z and y, or of their indices, which
+    is also the order in the stencil.
     """
     vec3, _ = types(dtype)
     box_along, level_of, cell_of = boxes(dtype)
-    number, corner, four = load(wp.int32), load(vec3), load(wp.vec4i)
+    number, four = load(wp.int32), load(wp.vec4i)
     visit, out_type = take(dtype, of_edges)
+    ends_of, next_meeting = box_tests(dtype)
     KIND = wp.constant(int(of_edges))
 
     # Separate modules: graphs on the CPU find kernels of a module by name, and both kinds have the same name.
@@ -179,8 +180,9 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
         if group == OBSTACLE:
             if not boxes_meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 return
+        ends = ends_of(high, low)
         lowest = level
-        layer = cell_of(grid.size, level, dtype(0.5) * (low + high))[2]
+        centre = cell_of(grid.size, level, dtype(0.5) * (low + high))
         buckets = grid.counts.shape[0]
         if wp.static(not of_edges):
             if p:
@@ -205,7 +207,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                     if wp.static(of_edges):
                         within = ordered and level == lowest
                         if within:
-                            one[2] = layer
+                            one[2] = centre[2]
                     width = wp.min(two[0] - one[0] + 1, buckets)
                     height = two[1] - one[1] + 1
                     rows = wp.int64(height) * wp.int64(two[2] - one[2] + 1)
@@ -215,16 +217,20 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                     for line in range(share, wp.int32(wp.min(rows, wp.int64(buckets))), shares):
                         cz = one[2] + line // height
                         cy = one[1] + line - height * (cz - one[2])
+                        if wp.static(of_edges):
+                            if within and not everywhere and cz == centre[2] and cy < centre[1]:
+                                continue
                         run = line
                         if not everywhere:
                             run = bucket_of(one[0], cy, cz, code, buckets)
                         begin = number(grid.first, run)
                         end = number(grid.first, wp.min(run + width, buckets))
                         # A sequence beyond the last bucket continues at the first.
-                        for at in range(begin, end + number(grid.first, wp.max(run + width - buckets, 0))):
+                        more = number(grid.first, wp.max(run + width - buckets, 0))
+                        at = next_meeting(grid.boxes, begin, end, more, ends)
+                        while at < end + more:
                             slot = wp.where(at < end, at, at - end)
-                            if not boxes_meet(low, high, corner(grid.lower, slot), corner(grid.upper, slot)):
-                                continue
+                            at = next_meeting(grid.boxes, at + 1, end, more, ends)
                             entry = four(grid.entries, slot)
                             if everywhere:
                                 cy = entry[1]
@@ -241,7 +247,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                             s = wp.vec4i(own[0], own[1], other[0], other[1])
                             k = entry[0] - triangles
                             if wp.static(of_edges):
-                                if within and cz == layer and k <= i:
+                                if within and cz == centre[2] and (cy < centre[1] or (cy == centre[1] and k <= i)):
                                     continue
                                 if k < i:
                                     s = wp.vec4i(other[0], other[1], own[0], own[1])

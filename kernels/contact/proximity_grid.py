@@ -74,8 +74,7 @@ def grids(dtype):
         keys: wp.array(dtype=wp.int32)
         first: wp.array(dtype=wp.int32)
         entries: wp.array(dtype=wp.vec4i)
-        lower: wp.array(dtype=vec3)
-        upper: wp.array(dtype=vec3)
+        boxes: wp.array(dtype=wp.types.vector(8, dtype))
 
     return Grid
 
@@ -142,6 +141,31 @@ def boxes(dtype):
 @wp.func
 def boxes_meet(low: Any, high: Any, l: Any, u: Any):
     return not (l[0] > high[0] or u[0] < low[0] or l[1] > high[1] or u[1] < low[1] or l[2] > high[2] or u[2] < low[2])
+
+
+@cache
+def box_tests(dtype):
+    """Device functions ``ends_of`` (low, high) → a box as it is stored in the grid, and ``next_meeting``.
+
+    That returns the first entry from ``at`` to ``end`` whose box meets the one with low and high exchanged, ``ends``; ``more``
+    others follow from the first bucket on. It has one branch an entry: a search takes .7 of the time on the CPU.
+    """
+    vec3, _ = types(dtype)
+    vec8 = wp.types.vector(8, dtype)
+    number = f"wp::{dtype.__name__}"
+
+    @wp.func
+    def ends_of(low: vec3, high: vec3):
+        return vec8(low[0], low[1], low[2], -high[0], -high[1], -high[2], dtype(0.0), dtype(0.0))
+
+    @wp.func_native(
+        "for (; at < end + more; ++at) { "
+        f"const {number}* b = (const {number}*)boxes.data + 8 * size_t(at < end ? at : at - end); "
+        "bool apart = false; for (int n = 0; n < 8; ++n) apart |= b[n] > ends[n]; if (!apart) break; } return at;"
+    )
+    def next_meeting(boxes: wp.array(dtype=vec8), at: int, end: int, more: int, ends: vec8) -> int: ...
+
+    return ends_of, next_meeting
 
 
 @wp.func
@@ -233,6 +257,7 @@ def fill_buckets(dtype):
     """Kernel over items: the entries of the buckets; counts ``counts`` down to 0."""
     vec3, _ = types(dtype)
     box_along, level_of, cell_of = boxes(dtype)
+    ends_of, _next_meeting = box_tests(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def fill_each_bucket(
@@ -254,7 +279,6 @@ def fill_buckets(dtype):
         cell = cell_of(grid.size, level, dtype(0.5) * (low + high))
         slot = grid.first[key] + wp.atomic_sub(grid.counts, key, 1) - 1
         grid.entries[slot] = wp.vec4i(item, cell[1], cell[2], code_of(v[3] >> 1, kind_in_grid(v, surface.groups[item]), level))
-        grid.lower[slot] = low
-        grid.upper[slot] = high
+        grid.boxes[slot] = ends_of(low, high)
 
     return fill_each_bucket

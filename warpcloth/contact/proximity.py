@@ -133,7 +133,7 @@ class Proximity:
         buckets = 1 << max(4, (items - 1).bit_length())
         counts = {"levels": 4, "counts": buckets, "keys": items, "first": buckets + 1}
         arrays = {name: wp.zeros(count, dtype=wp.int32, device=model.device) for name, count in counts.items()}
-        for name, kind in (("lower", model.vec3), ("upper", model.vec3), ("entries", wp.vec4i)):
+        for name, kind in (("boxes", wp.types.vector(8, model.dtype)), ("entries", wp.vec4i)):
             arrays[name] = wp.zeros(items, dtype=kind, device=model.device)
         arrays["extents"] = wp.zeros((4, proximity_grid.LEVELS + 1), dtype=model.vec3, device=model.device)
         self._grid = filled(proximity_grid.grids(model.dtype), size=size, **arrays)
