@@ -90,9 +90,7 @@ class SelfFilter:
                 given = [self._contact.placed[0], *given, model.count]
                 self._launch_move(self_filter.walk_from_start, given, [self._surface.behind(x_before)])
             self.launch_fresh(self._contact.x_before, self._contact.relist)
-            if self._surface.moves:
-                self._contact.launch_sides(self._contact.x_before)
-        self._launch_meshes(self._contact.placed[2])
+        self._launch_meshes(self._contact.placed[2], lists=True)
         self._put(self._other, x)
         walk = partial(self._launch_end, x, v, move, parts)
         self._contact.launch_near(self._other, walk, walk)
@@ -136,6 +134,11 @@ class SelfFilter:
         """
         wp.capture_if(self._contact.proximity.moved(x, part, active), launch, x=x)
 
+    def _launch_sides(self, x, active=None):
+        """Lists pairs at x for the next round, and computes their sides there."""
+        self.launch_fresh(x, self._contact.launch_list, active)
+        self._contact.launch_sides(x)
+
     def _launch_rounds(self, x):
         """Moves x towards the target, as far as pairs stay apart, in copies that are ``_walking``."""
         self._rounds.zero_()
@@ -171,8 +174,7 @@ class SelfFilter:
     def _launch_let_out(self, x):
         """Moves vertices that are held back towards the outside, and other cloth out of their way."""
         model, out = self.model, self._outside
-        self.launch_fresh(x, self._contact.launch_list)
-        self._contact.launch_sides(x)
+        self._launch_sides(x)
         self._add(out, x, -1.0, self._pushed)
         self._launch_pushes(self._mobile, self._pushed, opens=False)
         self._add(x, self._pushed, 1.0, out)
@@ -234,8 +236,11 @@ class SelfFilter:
         """Moves meshes, and cloth out of their way, to where the step evaluates forces."""
         self._launch_meshes(self._contact.placed[1])
 
-    def _launch_meshes(self, goal):
-        """Moves meshes to their ``goal`` (B·m,) [m], and cloth that would be in their way, in the positions of the step."""
+    def _launch_meshes(self, goal, lists=False):
+        """Moves meshes to their ``goal`` (B·m,) [m], and cloth that would be in their way, in the positions of the step.
+
+        It ``lists`` pairs there first, if they may have moved since their sides were computed.
+        """
         if not self._surface.moves:
             return
         x = self._contact.x_before
@@ -243,12 +248,12 @@ class SelfFilter:
             array.zero_()
         self._walking.fill_(1)
         self._launch_move(piece_motion.compare_positions, [goal, self._surface.behind(x)], [self._proceed])
+        if lists:
+            wp.capture_if(self._proceed, self._launch_sides, x=x)
         wp.capture_while(self._proceed, self._launch_meshes_on, x=x, goal=goal)
 
     def _launch_meshes_on(self, x, goal):
-        p, contact = self._moves, self._contact
-        self.launch_fresh(x, contact.launch_list)
-        contact.launch_sides(x)
+        p = self._moves
         for array in (p, self._carried, self._keys):
             array.zero_()
         self._launch_move(mesh_moves.aim_obstacles, [goal], [self._surface.behind(x), self._surface.behind(p)])
@@ -259,18 +264,13 @@ class SelfFilter:
         self.model.launch(self._count, 1, [], [self._rounds])
         self._proceed.zero_()
         self._launch_end_move()
-        wp.capture_if(self._proceed, lambda: None, lambda: self._launch_arrived(x, goal))
+        wp.capture_if(self._proceed, lambda: None, lambda: wp.copy(self._surface.behind(x), goal))  # also of those on their way
+        self._launch_sides(x)
 
     def _launch_end_move(self):
         given = [self.fraction, self._rounds, self._contact.steps, ROUNDS, self._contact.per_frame]
         out = [self._walking, self._proceed, self._contact.first_forced]
         self.model.launch(self_filter.end_move, self.model.copies, given, out)
-
-    def _launch_arrived(self, x, goal):
-        """Puts meshes at their goal, also those that are still on their way, and lists the pairs there."""
-        wp.copy(self._surface.behind(x), goal)
-        self.launch_fresh(x, self._contact.launch_list)
-        self._contact.launch_sides(x)
 
     def _launch_shapes(self):
         """Carries cloth along with the shapes that move onto it, as far as pairs stay apart, in the positions of the step."""
@@ -385,9 +385,8 @@ class SelfFilter:
             self.launch_limit(self._direction, whole=True)
 
     def _launch_pins_on(self, x):
-        contact, p = self._contact, self._pushed
-        self.launch_fresh(x, contact.launch_list, self._walking)
-        contact.launch_sides(x)
+        p = self._pushed
+        self._launch_sides(x, self._walking)
         p.zero_()
         self._aim(self._target, x, False, True, self.fraction, p)
         self._launch_pushes(self._unlocked, p, opens=True)
