@@ -10,7 +10,7 @@ from .obstacles import copy_of, vector_within
 from .proximity_grid import surfaces
 from .self_gaps import CORNERS, ONE, ZERO, corners, nearest
 from .self_pairs import Pairs, module_of
-from .self_planes import KEPT, margin_of, needs_no_cut, part_apart, ulp_of, ways_of_sides
+from .self_planes import KEPT, WIDE, margin_of, needs_no_cut, part_apart, ulp_of
 
 
 @cache
@@ -97,11 +97,11 @@ def take_advance(dtype, of_edges: bool):
 def advance_listed(dtype):
     """Kernel over listed pairs: reduces the ``fraction`` of copies that do not move ``far``, whose list is complete.
 
-    Pairs whose ``gap`` is too wide for the ``ways`` of their vertices, see :func:`.self_planes.find_ways`, are left out, unless
-    that is None, as where obstacles move.
+    Pairs whose ``gap`` at ``begun`` is too wide for the moves of their sides relative to one another are left out.
     """
     vec3, _ = types(dtype)
-    allowed, stencil, ulp = allowed_fraction(dtype), load(wp.vec4i), ulp_of(dtype)
+    allowed, stencil, vertex, ulp = allowed_fraction(dtype), load(wp.vec4i), load(vec3), ulp_of(dtype)
+    vector_or_zero, four = vector_within(dtype), wp.types.matrix((4, 3), dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
     def advance_each_pair(
@@ -109,8 +109,8 @@ def advance_listed(dtype):
         pairs: Pairs,
         gap: wp.array(dtype=wp.float64),
         # state in
+        begun: wp.array(dtype=vec3),
         x: wp.array(dtype=vec3),
-        ways: wp.array(dtype=wp.vec3d),
         # in and out
         out: advances(dtype),
     ):
@@ -118,10 +118,21 @@ def advance_listed(dtype):
         if e >= wp.min(pairs.counts[0] + pairs.counts[1], pairs.stencils.shape[0]):
             return
         s = stencil(pairs.stencils, e)
-        if ways:
-            way, size = ways_of_sides(ways, s, wp.where(e < pairs.counts[0], 1, 2))
-            if needs_no_cut(e, way, margin_of(out.least, ulp * size), gap):
-                return
+        moves = four()
+        since = four()
+        far = dtype(0.0)
+        for i in range(4):
+            at = vertex(x, s[i])
+            moves[i] = vector_or_zero(out.direction, s[i])
+            since[i] = at - vertex(begun, s[i])
+            far = wp.max(far, wp.max(wp.abs(at)) + wp.length(moves[i]))
+        way = dtype(0.0)
+        sides = wp.where(e < pairs.counts[0], 1, 2)
+        for p in range(sides):
+            for q in range(sides, 4):
+                way = wp.max(way, wp.length(moves[q] - moves[p]) + dtype(WIDE) * wp.length(since[q] - since[p]))
+        if needs_no_cut(e, wp.float64(way), margin_of(out.least, ulp * wp.float64(far)), gap):
+            return
         copy = copy_of(pairs.layout, s[0])
         if out.far[copy] != 0:
             return

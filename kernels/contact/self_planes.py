@@ -135,9 +135,9 @@ def ways_of_sides(ways: wp.array(dtype=wp.vec3d), s: wp.vec4i, sides: int):
 
 
 @wp.func
-def needs_no_cut(e: int, way: wp.vec2d, margin: wp.float64, gap: wp.array(dtype=wp.float64)):
-    """Whether the ``gap`` of pair e is too wide, however it is divided, for moves of the length ``way`` to be shortened."""
-    return way[0] + way[1] <= WIDE * _value(gap, e) - KEPT / CLAMPED * margin
+def needs_no_cut(e: int, way: wp.float64, margin: wp.float64, gap: wp.array(dtype=wp.float64)):
+    """Whether the ``gap`` of pair e is too wide, however it is divided, for an approach by ``way`` to be shortened."""
+    return way <= WIDE * _value(gap, e) - KEPT / CLAMPED * margin
 
 
 @wp.func
@@ -257,7 +257,7 @@ def cut_by_planes(dtype):
         sides = wp.where(of_vertex, 1, 2)
         way, far = ways_of_sides(ways, s, sides)
         margin = margin_of(least, ulp * far)
-        if needs_no_cut(e, way, margin, gap):
+        if needs_no_cut(e, way[0] + way[1], margin, gap):
             return
         points = corners(x, s)
         _w, y = nearest(of_vertex, points)

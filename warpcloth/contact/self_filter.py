@@ -432,10 +432,7 @@ class SelfFilter:
             listed()
 
         def listed():
-            ways = None if len(direction) > self.model.count else self._ways
-            if ways is not None:
-                self._launch_ways(contact.x_before, target)
-            given = [contact.pairs, contact.begun.gap, contact.x_before, ways]
+            given = [contact.pairs, contact.begun.gap, contact.begun_at, contact.x_before]
             self._launch(advance_listed, len(contact.pairs.stencils), given, [self._advance])
             given = [self.fraction, self._surface.layout, whole]
             self._launch(self_filter.scale_directions, len(direction), given, [direction])
