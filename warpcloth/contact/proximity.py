@@ -12,6 +12,9 @@ from ..kernels.contact import piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 from ..kernels.contact.pair_potential import CLOSE
 
+# The longest move of a vertex in a round of the filter, relative to the common motion, over the skin. A list serves for another
+# round while its sides have approached by less than the rest of the skin. Meshes stand in a round.
+WAY = 0.25
 # Of a pair in the list 36, its gap 64, two slots of contact with forces 268, blocks 104 and, with meshes, 64 of these.
 BYTES_OF_A_PAIR = 36 + 64 + 2 * (268 + 104 + 64)
 
@@ -21,8 +24,8 @@ class Proximity:
 
     A pair is listed if its distance is below r_c + skin. r_c is the contact distance, but at most half the rest distance of two
     elements of one connected piece. With meshes, edges and vertices of the meshes act below CLOSE r, so it is CLOSE r for them,
-    or r − skin/2 if that is more: the sides of a pair approach by at most half of the skin until :meth:`launch_kept` makes a
-    new list, so that gaps up to r are known. Pairs with a common vertex or with coordinates that are not finite are not listed.
+    or more: the sides of a pair approach by at most twice ``kept`` times the skin until :meth:`launch_kept` makes a new list,
+    so that gaps up to r are known. Pairs with a common vertex or with coordinates that are not finite are not listed.
     Positions (V,) are those of all vertices of the surface.
 
     Args:
@@ -40,6 +43,7 @@ class Proximity:
         rows: Pairs rows[i] to rows[i+1] are the vertex–triangle pairs of vertex i. Those of edges follow, by their first edge.
         found: Positions of the last list, (V,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
         flag, copies: (1,) and (B,) int32, see :meth:`moved`.
+        kept: The ``part`` of :meth:`moved` up to which a list serves for another round of the filter.
         listed: Positions (V,) [m] of the list that is in the arrays.
         pieces: The connected piece of each vertex of the cloth of a copy, −1 without an element, (n,).
         drift: Motion of each connected piece of all copies since ``found`` [m].
@@ -49,6 +53,7 @@ class Proximity:
     def __init__(self, surface, distance, skin, of_meshes=0.0):
         self.surface, self.model, self.skin = surface, surface.model, skin
         model, device = self.model, self.model.device
+        self.kept = 0.5 * (1.0 - (2.0 if surface.meets_itself else 1.0) * WAY)
         self._max_distance = max(distance * surface.meets_itself, of_meshes)
         self._triangles, self._edges, self._vertices = surface.triangles, surface.edges, surface.count
         self.pieces, points = self._connected(model.in_model(model.scene.mesh.edges))
@@ -65,8 +70,8 @@ class Proximity:
             "highest": wp.zeros(boxes, dtype=model.vec3, device=device),
         }
         values |= {"layout": surface.layout, "itself": surface.meets_itself, "distance": distance, "of_meshes": of_meshes}
-        values |= {"close": max(float(CLOSE) * of_meshes, of_meshes - 0.5 * skin), "max_distance": self._max_distance}
-        values |= {"skin": skin, "far": 2.0 * (distance + surface.edge_lengths.max())}
+        values |= {"close": max(float(CLOSE) * of_meshes, of_meshes - (1.0 - 2.0 * self.kept) * skin)}
+        values |= {"max_distance": self._max_distance, "skin": skin, "far": 2.0 * (distance + surface.edge_lengths.max())}
         self._surface = filled(proximity_grid.surfaces(model.dtype), **values)
         touching = dict.fromkeys(("close", "max_distance", "skin"), 0.0)
         self._along = filled(proximity_grid.surfaces(model.dtype), **values | touching)
@@ -215,12 +220,12 @@ class Proximity:
         self._pieces.upper.fill_(-np.inf)
         self._launch(piece_motion.extend_boxes, self._vertices, [x], [self._pieces])
 
-    def launch_kept(self, x, part, launch):
-        """Calls ``launch`` with x if :meth:`moved` sets the flag, or if the list is not that of ``found``."""
+    def launch_kept(self, x, launch):
+        """Calls ``launch`` with x if :meth:`moved` sets the flag for ``kept``, or if the list is not that of ``found``."""
         for array in (self.flag, self.copies, self._due):
             array.zero_()
         self._launch(piece_motion.compare_positions, self._vertices, [self.found, self.listed], [self._due])
-        self._launch_moved_since(x, part, None, self.flag)
+        self._launch_moved_since(x, self.kept, None, self.flag)
         wp.capture_if(self._due, launch, x=x)
 
     def moved(self, x, part=0.5, active=None):
@@ -253,7 +258,8 @@ class Proximity:
             self._pieces.motion.zero_()
         at = [x, correction, self.found]
         self._launch(piece_motion.find_drift, len(self.drift), at, [self._pieces])
-        given, out = [*at, active, part * self.skin], [self._pieces, self.copies, flag, self._due]
+        most = part * self.skin if self.surface.meets_itself else np.inf
+        given, out = [*at, active, most], [self._pieces, self.copies, flag, self._due]
         self._launch(piece_motion.find_motion, self._vertices, given, out)
         if several:
             wp.capture_if(self._due, lambda: self._launch_boxes(self.found))

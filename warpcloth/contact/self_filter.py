@@ -9,12 +9,10 @@ from ..kernels.contact import mesh_moves, piece_motion, self_filter, self_planes
 from ..kernels.contact.clear_elements import move_clear
 from ..kernels.contact.self_advance import advance_listed, advances, take_advance
 from ..kernels.step import count_step
+from .proximity import WAY
 
 # A move that is longer than one list of pairs allows is made in at most ROUNDS rounds.
 ROUNDS = 32
-# The longest move of a vertex in a round, relative to the common motion, over the skin. It may have moved as far since the list
-# was made, and so may the other side of a pair: together they approach by at most the skin.
-WAY = 0.25
 # Vertices that cloth holds back in a collider are moved out in at most OUT_ROUNDS rounds of SWEEPS sweeps. Cloth that makes way
 # keeps a gap of LEFT times the contact distance to other cloth, or its present gap if that is smaller.
 OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
@@ -127,12 +125,13 @@ class SelfFilter:
         given = [model.inverse_mass, self._share, contact.x_before]
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
 
-    def launch_fresh(self, x, launch, active=None, part=WAY):
+    def launch_fresh(self, x, launch, active=None, part=None):
         """Calls ``launch`` with x if ``active`` copies (B,), or any if None, have moved by ``part`` of the skin.
 
-        With WAY the next round can miss no pair, with ½ none is missing at x.
+        By default the next round can miss no pair, with ½ none is missing at x.
         """
-        wp.capture_if(self._contact.proximity.moved(x, part, active), launch, x=x)
+        proximity = self._contact.proximity
+        wp.capture_if(proximity.moved(x, part or proximity.kept, active), launch, x=x)
 
     def _launch_sides(self, x, active=None):
         """Lists pairs at x for the next round, and computes their sides there."""
@@ -415,8 +414,8 @@ class SelfFilter:
         self.launch_limit(self._direction)
         self._add(before, self._direction, 1.0, d)
 
-    def launch_trial(self, base, d, active=None, part=WAY):
-        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if they have moved by ``part`` of the skin."""
+    def launch_trial(self, base, d, active=None, part=None):
+        """Lists the pairs at base + d again, in copies that are ``active`` (B,), as :meth:`launch_fresh` does."""
         self._add(base, d, 1.0, self._contact.x_before, active)
         self.launch_fresh(self._contact.x_before, self._contact.relist, active, part)
 

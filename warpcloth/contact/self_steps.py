@@ -21,7 +21,7 @@ from ..kernels.terms.contact import FLOOR
 from .collider_steps import cut_share
 from .pair_contact import PairContact
 from .proximity import Proximity
-from .self_filter import WAY, SelfFilter
+from .self_filter import SelfFilter
 from .self_friction import SelfFriction, Slips
 from .self_start import check_reset, check_start
 from .surface import ContactSurface
@@ -291,7 +291,7 @@ class SelfSteps:
             wp.copy(self._colliders.x_before, x)
         x = self.x_before
         self.filter.launch_begin()
-        self.proximity.launch_kept(x, WAY, self.launch_list)
+        self.proximity.launch_kept(x, self.launch_list)
         wp.capture_if(self.listed, self._launch_begin, self._launch_none, x=x)
 
     def _launch_none(self, x):
