@@ -9,7 +9,7 @@ from ..kernels.contact import mesh_moves, piece_motion, self_filter, self_planes
 from ..kernels.contact.clear_elements import move_clear
 from ..kernels.contact.self_advance import advance_listed, advances, take_advance
 from ..kernels.step import count_step
-from .proximity import WAY
+from .proximity import ROUND
 
 # A move that is longer than one list of pairs allows is made in at most ROUNDS rounds.
 ROUNDS = 32
@@ -158,7 +158,7 @@ class SelfFilter:
         model = self.model
         wp.copy(self._from, x, count=self.model.count)
         given = [self._share, self._least_share, self._from, target, self._common, self._walking]
-        given += [model.per_copy, WAY * self._contact.skin]
+        given += [model.per_copy, ROUND * self._contact.skin]
         self._launch(self_filter.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
@@ -193,7 +193,7 @@ class SelfFilter:
         model = self.model
         if self.moves_together:
             self._launch(self_planes.common_move, model.copies, [x, target, model.per_copy], [self._common])
-        given = [x, target, self._common, self._contact.begun_at, model.per_copy, WAY * self._contact.skin]
+        given = [x, target, self._common, self._contact.begun_at, model.per_copy, ROUND * self._contact.skin]
         given += [self._surface.obstacles == 0]
         self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
 
