@@ -16,6 +16,7 @@ from support.judges import barrier_slope
 from support.layers import DENSITY, GRAVITY, after_frames, cloth, folded, ground, layers, positions, rubbing, slope
 from support.rows import table
 from support.scenes import scene
+from warpcloth.contact.proximity import ROUND
 from warpcloth.contact.self_start import crossings
 from warpcloth.core.status import Result
 from warpcloth.scenes import knot, loop
@@ -458,6 +459,18 @@ def test_lists_are_kept(count, device):
     assert (found.numpy() == first).all()
     number = pairs.proximity.counts.numpy().sum()
     assert (pairs.proximity.stencils.numpy()[:number] == listed[:number]).all()
+
+
+def test_a_list_serves_for_two_rounds(device):
+    """Of sheets that move apart by five rounds, whose first uses the list of the start; they end where they should."""
+    pairs = pairs_of(layers(gap=6e-3), device)
+    model, lists = pairs.model, pairs.lists.numpy()[0]
+    away = 4.5 * ROUND * pairs.skin * np.where(np.arange(72) < 36, 1.0, -1.0)[:, None] * [0.0, 1.0, 0.0]
+    target = model.positions.numpy() + away * np.sign(model.positions.numpy()[0, 1] - model.positions.numpy()[-1, 1])
+    x = model.array(target, model.vec3)
+    pairs.filter.launch_end(x, model.vectors())
+    np.testing.assert_array_equal(x.numpy(), target)
+    assert pairs.lists.numpy()[0] - lists == 2
 
 
 @pytest.mark.parametrize("ratio", [1.5, 2.0])
