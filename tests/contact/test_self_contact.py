@@ -463,11 +463,12 @@ def test_lists_are_kept(count, device):
 
 def test_a_list_serves_for_two_rounds(device):
     """Of sheets that move apart by five rounds, whose first uses the list of the start; they end where they should."""
-    pairs = pairs_of(layers(gap=6e-3), device)
+    pairs = pairs_of(layers(gap=6e-3), device, dtype="float32")
     model, lists = pairs.model, pairs.lists.numpy()[0]
-    away = 4.5 * ROUND * pairs.skin * np.where(np.arange(72) < 36, 1.0, -1.0)[:, None] * [0.0, 1.0, 0.0]
-    target = model.positions.numpy() + away * np.sign(model.positions.numpy()[0, 1] - model.positions.numpy()[-1, 1])
-    x = model.array(target, model.vec3)
+    start, way = model.positions.numpy(), np.array([0.36, 0.48, 0.8])
+    away = 4.5 * ROUND * pairs.skin * np.sign(start[:, 1:2] - start[:, 1].mean()) * way
+    x = model.array(start + away, model.vec3)
+    target = x.numpy().copy()
     pairs.filter.launch_end(x, model.vectors())
     np.testing.assert_array_equal(x.numpy(), target)
     assert pairs.lists.numpy()[0] - lists == 2
