@@ -31,6 +31,7 @@ from typing import Any
 
 import warp as wp
 
+from .assemble import is_clear
 from .local import local_coordinate
 from .local_minimiser import local_minimiser
 from .memory import load, load_shared, store
@@ -294,10 +295,7 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool =
 
 @cache
 def sweep_turn(dtype):
-    """Struct of one launch of a Gauss–Seidel sweep: elements from ``first`` on, ``each`` per thread; h, sweeps and ω.
-
-    ``busy`` is the list of :func:`list_busy`, if the term has one.
-    """
+    """Struct of one launch of a Gauss–Seidel sweep: elements from ``first`` on, ``each`` per thread; h, sweeps and ω."""
 
     @wp.struct
     class SweepTurn:
@@ -306,7 +304,6 @@ def sweep_turn(dtype):
         h: dtype
         sweeps: int
         relaxation: dtype
-        busy: wp.array(dtype=wp.int32)
 
     return SweepTurn
 
@@ -320,52 +317,6 @@ def nth_of_thread(first: int, each: int, thread: int, k: int):
     return e
 
 
-LISTED_EVERY = wp.constant(16)  # sweeps between two lists of the elements with a force; one more is made before the third
-
-
-@cache
-def list_busy(term: Term, dtype, multipliers: bool):
-    """Kernel of one thread: busy = (count, elements in order) that may have a force, for a term with ``clear``.
-
-    These are elements with λ ≠ 0, and elements that the prediction from ``before`` and the correction so far may take out of
-    their ``clear``. The list is made before the first and the third sweep, and every LISTED_EVERY sweeps; ``sweep`` counts
-    them.
-    """
-    vec3, _ = types(dtype)
-    lambda_type = wp.types.matrix((term.rows, 3), dtype)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def find(
-        # elements
-        stencil: wp.array2d(dtype=wp.int32),
-        clear: wp.array(dtype=dtype),
-        # state in
-        before: wp.array(dtype=vec3),
-        x: wp.array(dtype=vec3),
-        d: wp.array(dtype=vec3),
-        lambdas: wp.array(dtype=lambda_type),
-        # in and out
-        sweep: wp.array(dtype=wp.int32),
-        busy: wp.array(dtype=wp.int32),
-    ):
-        now = sweep[0]
-        sweep[0] = now + 1
-        if now != 2 and now % LISTED_EVERY != 0:
-            return
-        count = wp.int32(0)
-        for e in range(stencil.shape[0]):
-            i = stencil[e, 0]
-            listed = not (clear[e] > wp.length(x[i] - before[i]) + dtype(2.0) * wp.length(d[i]))
-            if wp.static(multipliers):
-                listed = listed or not (lambdas[e] == lambda_type(dtype(0.0)))
-            if listed:
-                count += 1
-                busy[count] = e
-        busy[0] = count
-
-    return find
-
-
 @cache
 def correct_in_place(
     term: Term,
@@ -374,14 +325,14 @@ def correct_in_place(
     multipliers: bool = False,
     per_step: bool = False,
     axes: bool = False,
-    listed: bool = False,
+    cleared: bool = False,
 ):
     """Kernel of a Gauss–Seidel sweep: d += ω Δx, λ += ω Δλ, each element after the moves of those before it.
 
     A thread takes ``each`` elements in order, from first + thread·each on; a negative ``each`` reverses the order. On a GPU a
     thread takes one element of a colour, whose elements share no free vertex, or all of a copy. On the CPU one takes all. Pins
-    are never written, so elements of a colour may share them. With ``listed``, one thread takes only the list of
-    :func:`list_busy`.
+    are never written, so elements of a colour may share them. If ``cleared``, it skips elements whose vertex has moved less
+    than their ``clear``; an element that was not skipped once is never skipped again.
     """
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
@@ -389,7 +340,7 @@ def correct_in_place(
     change, share_of = element_change(term, dtype, scalar, per_step, axes), to_corner(term, dtype)
     mass_type = vec3 if axes else dtype
     number, shared, vector, vertex = load(mass_type), load_shared(dtype), load(vec3), load(wp.int32, 2)
-    rest_of, put = load(rest_type), store(vec3)
+    rest_of, put, radius_of, put_radius = load(rest_type), store(vec3), load(dtype), store(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def correct(
@@ -397,6 +348,7 @@ def correct_in_place(
         stencil: wp.array2d(dtype=wp.int32),
         stiffness: wp.array(dtype=dtype),
         rest: wp.array(dtype=rest_type),
+        clear: wp.array(dtype=dtype),
         # state in
         inverse_mass: wp.array(dtype=mass_type),
         x: wp.array(dtype=vec3),
@@ -406,13 +358,12 @@ def correct_in_place(
         lambdas: wp.array(dtype=lambda_type),
         d: wp.array(dtype=vec3),
     ):
-        count = wp.abs(turn.each)
-        if wp.static(listed):
-            count = turn.busy[0]
-        for k in range(count):
+        for k in range(wp.abs(turn.each)):
             e = nth_of_thread(turn.first, turn.each, wp.tid(), k)
-            if wp.static(listed):
-                e = turn.busy[1 + wp.where(turn.each < 0, count - 1 - k, k)]
+            if wp.static(cleared):
+                if is_clear(radius_of(clear, e), vector(d, vertex(stencil, e))):
+                    continue
+                put_radius(clear, e, dtype(0.0))
             r = rest_of(rest, e)
             before = lambda_type(dtype(0.0))
             if wp.static(multipliers):

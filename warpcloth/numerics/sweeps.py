@@ -177,8 +177,6 @@ class GaussSeidelSweep(_Sweep):
         kind: One of :data:`IN_PLACE`.
         spread: Number of sweeps over which the correction of finite stiffness is spread, or None.
         pool: The :class:`warpcloth.core.thread_pool.ThreadPool` whose threads share coloured sweeps; None for one thread.
-        before: Positions at the start of the step (N,) [m], from which one CPU thread lists the elements of terms with
-            ``clear`` that may have a force; or None.
         follows: Whether dynamic elements are found anew after some of these sweeps.
 
     Attributes:
@@ -197,7 +195,6 @@ class GaussSeidelSweep(_Sweep):
         spread=None,
         correction=None,
         pool=None,
-        before=None,
         follows=True,
     ):
         super().__init__(model, x, h, relaxation, scalar, multipliers, correction)
@@ -211,23 +208,10 @@ class GaussSeidelSweep(_Sweep):
         refreshed = [elements for elements in self.elements if elements.refresh and not elements.cells]
         self._refreshed = [elements for elements in refreshed if elements.refresh.when == EVALUATION]
         more = multipliers, spread is not None, model.mobility is not None
-        listing = before is not None and model.device.is_cpu and self.pool.threads == 1
-        self._lists = [listing and self._list_of(*each, before) for each in self.with_multipliers()]
         self._kernels = [
-            model.kernel(*_correction(elements, model.dtype, key), *more, *([True] if listed else []))
-            for elements, key, listed in zip(model.terms, self._keys, self._lists, strict=True)
+            model.kernel(*_correction(elements, model.dtype, key), *more, *([True] if elements.clear is not None else []))
+            for elements, key in zip(model.terms, self._keys, strict=True)
         ]
-
-    def _list_of(self, elements, multipliers, key, before):
-        """Returns (kernel, arguments, counter of sweeps, list) for a term with ``clear``, else None."""
-        term, dtype, scalar = key
-        if elements.clear is None or scalar:
-            return None
-        model = self.model
-        kernel = model.kernel(kernels.list_busy, term, dtype, multipliers is not None)
-        given = [elements.stencil, elements.clear, before, self.x, self.correction, multipliers]
-        sweep, busy = (wp.zeros(n, dtype=wp.int32, device=model.device) for n in (1, 1 + elements.count))
-        return kernel, given, sweep, busy
 
     def _by_colour(self, elements):
         """Returns the elements of all copies sorted by colour, and the range of each colour."""
@@ -242,8 +226,7 @@ class GaussSeidelSweep(_Sweep):
     def launch_start(self):
         """Launches d = 0, λ = 0; x must be x̃ already."""
         self._dynamic.launch_sweep_start(self.x)
-        counters = [each[2] for each in self._lists if each]
-        for array in (self.correction, *self.multipliers, *counters):
+        for array in (self.correction, *self.multipliers):
             if array is not None:
                 array.zero_()
 
@@ -262,15 +245,12 @@ class GaussSeidelSweep(_Sweep):
         for i in range(len(self.elements))[::way]:
             elements = self.elements[i]
             cells = elements.cells
-            of_elements = elements.arguments
+            of_elements = [*elements.arguments, elements.clear]
             if elements.term.cell:
                 of_elements = [cells.offsets, cells.weights, cells.rest, elements.stencil, elements.stiffness]
             elif cells:
-                of_elements = [cells.offsets, cells.shape, *of_elements]
+                of_elements = [cells.offsets, cells.shape, *elements.arguments]
             each = (cells or elements).per_copy if self.ordered else 1
-            if self._lists[i]:
-                find, listed, sweep, busy = self._lists[i]
-                model.launch(find, 1, listed, [sweep, busy])
             for first, count in self.ranges[i][::way]:
                 before, part = pool.part(count // each)
                 # On the CPU, one thread loops over all elements, in half of the time of one launch thread per element.
@@ -278,8 +258,6 @@ class GaussSeidelSweep(_Sweep):
                 turn = kernels.sweep_turn(model.dtype)()
                 turn.first, turn.each = first + before * each, way * each_thread
                 turn.h, turn.sweeps, turn.relaxation = self.h, self.spread, self.relaxation
-                if self._lists[i]:
-                    turn.busy = busy
                 given = [*of_elements, model.local_mobility, self.x, turn]
                 if part:
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])

@@ -105,7 +105,7 @@ class HierarchicalPBDStepper(LaunchedStepper):
         self.iterations = options.iterations
         self.levels = levels(model, options.levels)
         given = self.model, self.state.x, self.h, "coloured", options.relaxation
-        self.sweep = GaussSeidelSweep(*given, pool=self.pool, before=self.x_before)
+        self.sweep = GaussSeidelSweep(*given, pool=self.pool)
         self.model = self.model.with_terms(self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
         self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))

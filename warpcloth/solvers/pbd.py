@@ -124,7 +124,7 @@ class PBDStepper(LaunchedStepper):
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         given = model, self.state.x, self.h, options.sweep, options.relaxation
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool, before=self.x_before)
+            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool)
         else:
             self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread)
         self.model = model.with_terms(self.sweep.elements)

@@ -146,7 +146,7 @@ class XPBDStepper(LaunchedStepper):
         given = model, self.state.x, self.he, options.sweep, options.relaxation
         more = {"scalar": options.form == "scalar", "multipliers": True}
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool, before=self.x_before)
+            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool)
         else:
             self.sweep = JacobiSweep(*given, **more)
         self.model = model.with_terms(self.sweep.elements)
