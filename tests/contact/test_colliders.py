@@ -13,7 +13,6 @@ import warp as wp
 import warpcloth as wc
 from support.layers import DENSITY, GRAVITY, R, after_frames, falling, ground, positions
 from support.rows import table
-from support.scenes import scene
 from support.shapes import TILTED, Torus
 from support.steps import stopped_and_resumed
 from warpcloth.cli import main
@@ -330,23 +329,6 @@ def test_a_record_does_not_change_friction_on_a_mesh():
     solver = wc.XPBD(substeps=4, iterations=5)
     plain, recorded = (wc.simulate(scene, solver, record=record) for record in ((), "energies"))
     assert (plain.points == recorded.points).all() and plain.points[-1, :, 1].max() < 0.03
-
-
-@pytest.mark.filterwarnings("ignore:threads is . on . cores")
-def test_sweeps_over_lists_are_those_over_all(device):
-    """To the bit, while a sheet falls onto a ball and comes to lie on it: several threads list no elements."""
-    if device != "cpu":
-        pytest.skip("lists are for one thread of the CPU")
-    record = wc.XPBD(substeps=2, iterations=20)
-    steppers = [record.bind(scene("drape", n=10).build(threads=threads)) for threads in (1, 2)]
-    busy = [each[3] for each in steppers[0].sweep._lists if each]
-    assert len(busy) == 4 and not any(steppers[1].sweep._lists)
-    for stepper in 14 * steppers:
-        stepper.frame()
-    counts = [int(each.numpy()[0]) for each in busy]
-    assert max(counts) > 0 and min(counts) == 0  # of the floor, which is far below
-    one, two = (stepper.state.x.numpy() for stepper in steppers)
-    assert (one == two).all()
 
 
 @pytest.mark.parametrize("name", ("newton", "xpbd"))

@@ -101,11 +101,10 @@ class AcceleratedStep:
         given = [d, stepper.w, self.s, self.z, self.coefficients.array, n]
         self._launch(kernels.combine, N, given, [self.accelerated])
         if stepper.pairs is not None:
-            stepper.pairs.filter.launch_look(stepper.state.x, (self.plain, self.accelerated))
+            stepper.filter.launch_look(stepper.state.x, (self.plain, self.accelerated))
             wp.capture_if(stepper.pairs.near.array, self._launch_apart)
         for end, energy in ((self.plain, self._plain_energy), (self.accelerated, self._energy)):
-            if stepper.pairs is not None:
-                stepper.pairs.filter.launch_near_trial(stepper.state.x, end)
+            stepper.filter.launch_near_trial(stepper.state.x, end)
             self._launch_energy(end, energy)
         self._launch(kernels.next_slot, 1, [self.method.window], [self.slot])
         energies = [self._plain_energy, self._energy]
@@ -113,16 +112,15 @@ class AcceleratedStep:
             self._launch(kernels.note_lowest, model.copies, [*energies, self._noise], [self._lowest, self._stayed.array])
         given = [self.plain, self.accelerated, *energies, self._stayed and self._stayed.array, self.slot, n]
         self._launch(kernels.accept, N, given, [d, self.s])
-        if stepper.pairs is not None:
-            stepper.pairs.filter.launch_near_trial(stepper.state.x, d)
+        stepper.filter.launch_near_trial(stepper.state.x, d)
 
     def _launch_apart(self):
         """Shortens both steps so that pairs stay apart."""
         stepper, d = self.stepper, self.stepper.correction
         # A line search for w has listed the pairs of its trial.
-        stepper.pairs.filter.launch_trial(stepper.state.x, d, part=0.5)
+        stepper.filter.launch_trial(stepper.state.x, d, part=0.5)
         for each in (self.plain, self.accelerated):
-            stepper.pairs.filter.launch_between(d, each)
+            stepper.filter.launch_between(d, each)
 
     def _launch_energy(self, d, out):
         """Launches out (B,) = φ(d) [J]."""

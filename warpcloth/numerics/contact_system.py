@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ..contact.no_filter import filter_of
 from ..core.capture import Mirror, Segment
 from ..core.dynamic import dynamic_of
 from ..core.hessian import Hessian
@@ -132,7 +133,7 @@ class ContactSystem(CorrectedSystem):
         held = model.inverse_mass.numpy() == 0.0
         self._diagonal = wp.array(np.where(held, -1, self.matrix.diagonal.numpy()), dtype=wp.int32, device=model.device)
         self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
-        self._search, self._pairs = Search(model, x, sums, s, pairs), pairs
+        self._search, self._pairs = Search(model, x, sums, s, filter_of(pairs)), pairs
         self._listed = None if pairs is None else Mirror(pairs.listed)
         self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
         self._active = Mirror(model.scalars(wp.int32))
@@ -150,8 +151,7 @@ class ContactSystem(CorrectedSystem):
         self._shorten = Segment(device, self._launch_shorten)
 
     def _launch_shorten(self):
-        if self._pairs is not None:
-            self._pairs.filter.launch_limit(self._search.direction)
+        filter_of(self._pairs).launch_limit(self._search.direction)
         self._search.launch(self._active.array)
 
     def _launch_assemble(self):

@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from ..contact.no_filter import filter_of
 from ..core.capture import Mirror, Segment
 from ..core.hessian import Hessian
 from ..core.status import Result
@@ -89,7 +90,8 @@ class Minimiser:
         self.warm = self._last and _resembles_the_last_step(model)
         self.adaptive = hessian == "adaptive"
         self.sums = Sums(model)
-        self.search = Search(model, base, self.sums, s, pairs, last)
+        self.filter = filter_of(pairs)
+        self.search = Search(model, base, self.sums, s, self.filter, last)
         self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
         if linear == "cg":
@@ -248,8 +250,8 @@ class Minimiser:
             self.model.launch(copies_near_colliders, self.model.copies, given, [self._wanted, self._unsolved])
             wp.capture_if(self._unsolved, self._launch_beside)
         elif self.pairs is not None and self._last:
-            self._note_stay(1, self.pairs.filter.fraction)
-            self.pairs.filter.launch_touching(self.active, self._wanted, self._unsolved)
+            self._note_stay(1, self.filter.fraction)
+            self.filter.launch_touching(self.active, self._wanted, self._unsolved)
             wp.capture_if(self._unsolved, self._launch_apart)
         self._progress.proceed.zero_()
         given = [self.search.acceleration, self._limits]
@@ -261,8 +263,8 @@ class Minimiser:
         Cloth at rest is almost in balance at the start of the step, while x̃ is h²g below, from where contact would push it
         back. Cloth that slides is so at the last d, which does not stop what is slower than the tolerance.
         """
-        for goal, stays in (self.pairs.filter.back, 1), (self.right, 0):
-            self.pairs.filter.launch_back(goal, self.correction, self.search.direction)
+        for goal, stays in (self.filter.back, 1), (self.right, 0):
+            self.filter.launch_back(goal, self.correction, self.search.direction)
             self.search.launch_guess(self._wanted)
             self._note_stay(stays)
 
@@ -324,7 +326,7 @@ class Minimiser:
     def _of_pairs(self):
         """Returns the fraction that pairs leave, the most pairs of a list so far, and the room of lists."""
         pairs = self.pairs
-        return (None, None, 0) if pairs is None else (pairs.filter.fraction, pairs.most_listed, len(pairs.pairs.stencils))
+        return (None, None, 0) if pairs is None else (self.filter.fraction, pairs.most_listed, len(pairs.pairs.stencils))
 
     def _launch_assemble(self):
         self.hessian.assemble_after_gradient(self.base, self.search.inertia.s, self.correction)
@@ -353,6 +355,5 @@ class Minimiser:
 
     def _launch_search(self):
         self._launch_mean(self.search.direction)
-        if self.pairs is not None:
-            self.pairs.filter.launch_limit(self.search.direction)
+        self.filter.launch_limit(self.search.direction)
         self.search.launch(self.active)

@@ -20,7 +20,7 @@ class Search:
         base: The positions at d = 0, (N,) vectors [m]; the caller's array, read only.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia, 1/h² [1/s²].
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter gives the start; or None.
+        contact: The filter of contact, which gives the start, see :func:`warpcloth.contact.no_filter.filter_of`.
         correction: The array for d (N,) [m], by default its own.
 
     Attributes:
@@ -34,8 +34,8 @@ class Search:
         lanes: The :class:`warpcloth.core.sums.Lanes` of sums over vertices.
     """
 
-    def __init__(self, model, base, sums, s, pairs=None, correction=None):
-        self.model, self.base, self.sums, self.pairs = model, base, sums, pairs
+    def __init__(self, model, base, sums, s, contact, correction=None):
+        self.model, self.base, self.sums, self._contact = model, base, sums, contact
         self.lanes = lanes = Lanes(model, model.per_copy)
         self.gradient_of, self.energy_of = plan(model).gradient(corrected=True), EnergyParts(model, lanes, sums)
         self.inertia = kernels.inertia_struct(model.dtype)()
@@ -64,10 +64,7 @@ class Search:
 
     def launch_start(self):
         """Launches d = 0, φ and ∇φ."""
-        if self.pairs is None:
-            self.correction.zero_()
-        else:
-            self.pairs.filter.launch_start(self.base, self.correction)
+        self._contact.launch_start(self.base, self.correction)
         self.launch_again()
 
     def launch_again(self):
@@ -119,8 +116,7 @@ class Search:
     def _launch_trial(self, active=None):
         """Launches ∇φ at the trial, and the parts of what a trial sums. Pairs are listed for ``active`` copies (B,), or all."""
         model, lanes = self.model, self.lanes
-        if self.pairs is not None:
-            self.pairs.filter.launch_trial(self.base, self.trial, active)
+        self._contact.launch_trial(self.base, self.trial, active)
         self.gradient_of.add(self.base, self.gradient, self.trial)
         given = [self.inertia, self.trial, self.direction, model.per_copy, lanes.count]
         self._launch(kernels.finish_gradient, lanes.dim, given, [self.gradient, self._parts])

@@ -271,8 +271,7 @@ class ADMMStepper(ImplicitStepper):
         model = self.model
         given = [self.correction, self._w, self._active.array, model.per_copy]
         model.launch(self._plain_step, model.count, given, [self.correction])
-        if self.pairs is not None:
-            self.pairs.filter.launch_near_trial(self.state.x, self.correction)
+        self.filter.launch_near_trial(self.state.x, self.correction)
 
     def _each(self):
         return zip(self._terms, self._split, self._kernels, strict=True)

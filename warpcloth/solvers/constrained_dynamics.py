@@ -137,7 +137,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._sums, self._row_sums = Sums(model), RowSums(model, self.constraints.per_copy)
         self._search = None
         if options.stabilisation == "line-search":
-            self._search = Search(model, self.state.x, self._sums, 1.0 / self.he**2, self.pairs)
+            self._search = Search(model, self.state.x, self._sums, 1.0 / self.he**2, self.filter)
             self.correction, self._direction, self._step = self._search.correction, self._search.direction, self._search.step
         else:
             self.correction, self._direction = model.vectors(), model.vectors()
@@ -243,16 +243,14 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         model, constraints = self.model, self.constraints
         constraints.launch_moves(self._change, self._moves)
         self._of_vectors(kernels.mismatch, model.count, [self._moves, self._mismatch], [self._direction])
-        if self.pairs is not None:
-            self.pairs.filter.launch_limit(self._direction)
+        self.filter.launch_limit(self._direction)
         if self._search:
             self._search.launch(self._active.array)
         else:
             self._of_vectors(kernels.begin_step, model.copies, [self._active.array], [self._step])
             given = [self._step, self._direction, model.per_copy]
             self._of_vectors(kernels.add_step, model.count, given, [self.correction])
-        if self.pairs is not None:
-            self.pairs.filter.launch_trial(self.state.x, self.correction)
+        self.filter.launch_trial(self.state.x, self.correction)
         given = [self._step, self._change, constraints.per_copy]
         self._of_rows(kernels.add_step, constraints.count, given, [constraints.multipliers])
         self._launch_linearise()

@@ -28,8 +28,7 @@ class ImplicitStepper(Stepper):
         self._finish = Segment(self.model.device, self._launch_end)
 
     def _launch_end(self):
-        if self.pairs is not None:
-            self.pairs.filter.launch_trial(self.state.x, self.correction)  # there the filter starts
+        self.filter.launch_trial(self.state.x, self.correction)  # there the filter starts
         self.launch_finish(self.correction)
 
     def follow_contact(self):

@@ -215,8 +215,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
             self._accelerated.launch_move()
         else:
             self.launch_plain_step(self.correction)
-            if self.pairs is not None:
-                self.pairs.filter.launch_trial(self.state.x, self.correction)
+            self.filter.launch_trial(self.state.x, self.correction)
         self._launch_gradient()
 
     def launch_plain_step(self, out):

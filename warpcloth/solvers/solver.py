@@ -7,6 +7,7 @@ import warp as wp
 
 from ..base.turns import in_turn, methods_in_turn
 from ..contact.collider_steps import ColliderSteps
+from ..contact.no_filter import filter_of
 from ..contact.self_steps import SelfSteps
 from ..core.capture import Segment
 from ..core.reset import Reset
@@ -93,6 +94,11 @@ class Stepper:
         stepper._motion = motion
         stepper.__init__(options, model)
         return stepper
+
+    @property
+    def filter(self):
+        """The :class:`warpcloth.contact.self_filter.SelfFilter`, or one that does nothing."""
+        return filter_of(self.pairs)
 
     @property
     def results(self):
@@ -194,18 +200,15 @@ class Stepper:
         if self.pairs is not None:
             self.pairs.launch_begin(self.state.x)
         self.integrator.launch_prediction()
-        if self.pairs is not None and self.model.keyframes is not None:
-            self.pairs.filter.launch_hold(*self.state, self.hard_pairs)
+        if self.model.keyframes is not None:
+            self.filter.launch_hold(*self.state, self.hard_pairs)
         if self.colliders is not None:
             self.colliders.launch_clear(self.model.terms, self.state.x)
 
     def launch_first(self, correction):
         """Launches the first d = x − x̃ of a step: 0, or as near to it as pairs stay apart, which are then listed there."""
-        if self.pairs is None:
-            correction.zero_()
-        else:
-            self.pairs.filter.launch_start(self.state.x, correction)
-            self.pairs.filter.launch_trial(self.state.x, correction)
+        self.filter.launch_start(self.state.x, correction)
+        self.filter.launch_trial(self.state.x, correction)
 
     def launch_finish(self, correction):
         """Launches x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser (N,) [m]."""
@@ -217,16 +220,14 @@ class Stepper:
         if self.colliders is not None:
             self.colliders.correction, self.colliders.he = correction, self.he
             self.colliders.launch_end(*self.state, self.integrator.move)
-        if self.pairs is not None:
-            self.pairs.filter.launch_end(*self.state, self.integrator.move, self.integrator.parts)
+        self.filter.launch_end(*self.state, self.integrator.move, self.integrator.parts)
 
     def launch_end_of(self, pins, keyframes, count, x, v):
         """Launches the end of an explicit step in x and v (N,): the move of pins, and the filters of contact."""
         self.launch_pins_of(pins, keyframes, count, x, v)
         if self.colliders is not None:
             self.colliders.launch_end(x, v)
-        if self.pairs is not None:
-            self.pairs.filter.launch_end(x, v)
+        self.filter.launch_end(x, v)
 
     def take(self, steps):
         """Calls ``steps``, and repeats it from the same state with more memory while the list of pairs overflows."""
