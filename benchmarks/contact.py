@@ -23,12 +23,11 @@ from warpcloth.scenes import drape
 # What kernels do, by the files that have them; those of other files count as the rest of a step.
 PARTS = {
     "listing": ("proximity", "proximity_grid", "piece_motion", "scan", "obstacles"),
-    "narrow phase": ("self_contact", "pair_potential", "self_planes", "self_gaps", "self_pairs", "contact_areas"),
-    "filter": ("self_filter", "self_advance", "collider_filter", "crossing"),
-    "elements": ("assemble", "sparse", "energies", "gradient", "fast"),
+    "narrow phase": ("self_contact", "pair_potential", "self_planes", "self_gaps", "self_pairs"),
+    "filter": ("self_filter", "self_advance", "collider_filter"),
+    "elements": ("assemble", "sparse", "transpose"),
     "pairs": ("pair_sums", "self_friction", "pair_sweeps", "colliders", "collider_work"),
-    "matrix": ("sums of blocks", "hessian"),
-    "solves": ("linear", "groups", "multigrid"),
+    "solves": ("linear", "multigrid"),
     "search": ("search", "minimise", "reduce"),
 }
 

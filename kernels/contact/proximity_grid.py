@@ -147,8 +147,9 @@ def boxes_meet(low: Any, high: Any, l: Any, u: Any):
 def box_tests(dtype):
     """Device functions ``ends_of`` (low, high) → a box as it is stored in the grid, and ``next_meeting``.
 
-    That returns the first entry from ``at`` to ``end`` whose box meets the one with low and high exchanged, ``ends``; ``more``
-    others follow from the first bucket on. It has one branch an entry: a search takes .7 of the time on the CPU.
+    ``next_meeting`` returns the first entry from ``at`` to ``end`` whose box meets the given one; ``ends`` is that box with low
+    and high exchanged, and ``more`` entries follow from the first bucket on. It has one branch an entry: a search takes .7 of
+    the time on the CPU.
     """
     vec3, _ = types(dtype)
     vec8 = wp.types.vector(8, dtype)

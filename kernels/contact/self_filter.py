@@ -485,6 +485,21 @@ def copies_with_pairs(
         listed[copy_of(pairs.layout, pairs.stencils[e][0])] = 1
 
 
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def divide_copies(
+    # state in
+    far: wp.array(dtype=wp.int32),
+    # in and out
+    walk: wp.array(dtype=wp.int32),
+    # out
+    stand: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies: ``walk`` also becomes 1 where ``far`` is; ``stand`` is 1 in the others."""
+    c = wp.tid()
+    walk[c] = wp.max(walk[c], far[c])
+    stand[c] = 1 - walk[c]
+
+
 @cache
 def aim(dtype):
     """Kernel over vertices: p = goal − x along ``free`` axes, pinned ones, or both, else 0; where ``fraction`` (B,) is below 1.

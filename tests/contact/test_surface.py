@@ -272,3 +272,25 @@ def test_a_copy_without_pairs_does_not_follow_what_another_has(solver, device):
             stepper.frame()
         found.append(stepper.state.x.numpy()[:64])
     assert (found[0] == found[1]).all()
+
+
+def test_a_copy_that_stays_apart_does_not_walk_with_another(device):
+    """Two sheets approach each other, in one copy too slowly to meet; it moves as alone, to the bit, 100 m from the origin.
+
+    Rounding decides it: of twelve directions of one of the sheets this one alone differed where both copies walked in rounds.
+    """
+    grid = wc.Mesh.grid(8, 8, size=0.4)
+    points = grid.points - grid.points.mean(axis=0)
+    turned = points @ np.linalg.qr(np.random.default_rng(6).normal(size=(3, 3)))[0]
+    other = turned + np.array([0.0, 0.04 - turned[:, 1].min(), 0.0])
+    mesh = wc.Mesh(np.concatenate([points, other]) + 100.0 * np.array([1, 1, -1]), [*grid.triangles, *(grid.triangles + 64)])
+    terms, contact = [wc.Spring(stiffness=200.0)], wc.SelfContact(distance=6e-3)
+    scene = wc.Scene(mesh, density=0.15, terms=terms, fps=24.0, gravity=(0, 0, 0), self_contact=contact)
+    velocities = np.repeat([[0.0, 1.0, 0.0], [0.4, -1.0, 0.0]], 64, axis=0)
+    found = []
+    for speeds in ([0.7], [0.7, 1.0]):
+        stepper = wc.XPBD(substeps=2).bind(scene.build(copies=len(speeds), device=device))
+        stepper.reset(None, None, np.array(speeds)[:, None, None] * velocities)
+        stepper.frame()
+        found.append(stepper.state.x.numpy()[:128])
+    assert (found[0] == found[1]).all()

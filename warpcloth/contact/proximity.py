@@ -13,8 +13,8 @@ from ..kernels.contact import proximity as kernels
 from ..kernels.contact.pair_potential import CLOSE
 
 # The longest move of a vertex in a round of the filter, relative to the common motion, over the skin. A list serves for another
-# round while its sides have approached by less than the rest of the skin. Meshes stand in a round. A round stays below this by
-# a 64th, so that a list serves for two of them, whatever rounding does to positions.
+# round while its sides have approached by less than the rest of the skin. Meshes stand in a round. A round moves a vertex by a
+# 64th less, so that a list serves two rounds despite rounding.
 WAY = 0.25
 ROUND = WAY * 63 / 64
 # Of a pair in the list 36, its gap 64, two slots of contact with forces 268, blocks 104 and, with meshes, 64 of these.

@@ -39,7 +39,7 @@ class SelfFilter:
         self._ways.fill_(wp.vec3d(0.0, 0.0, 1.0))
         self._share, self._least_share = (wp.ones(contact.surface.count, dtype=wp.float64, device=device) for _ in range(2))
         self._common = wp.zeros(model.copies, dtype=wp.vec3d, device=device)
-        self._cuts, self._rounds, self._walking = (model.scalars(wp.int32) for _ in range(3))
+        self._cuts, self._rounds, self._walking, self._near, self._stands = (model.scalars(wp.int32) for _ in range(5))
         self._proceed, self._changed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         self.moves_together = not len(model.scene.fixed) and model.mobility is None and not model.scene.colliders
         self._kernels = {}
@@ -102,16 +102,25 @@ class SelfFilter:
     def _launch_end(self, x, v, move, parts):
         model, start = self.model, self._contact.x_before
         wp.copy(self._target, x)
-        self._walking.fill_(1)
+        self._launch_divide(start)
+        wp.copy(self._walking, self._near)
         self._launch_rounds(start)
         if self._lets_out:
             self._turns.zero_()
-            self._walking.fill_(1)
+            wp.copy(self._walking, self._near)
             self._launch_held(start)
             wp.capture_while(self._within, self._launch_let_out, x=start)
         wp.copy(x, start, count=model.count)
         given = [model.inverse_mass, model.mobility, self._target, x, self._contact.h, self._contact.h / parts]
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
+
+    def _launch_divide(self, start):
+        """Finds the copies that are ``_near`` something; others end at the target, as in a run of their own."""
+        model, contact = self.model, self._contact
+        self._near.zero_()
+        model.launch(self_filter.copies_with_pairs, len(contact.pairs.stencils), [contact.pairs], [self._near])
+        model.launch(self_filter.divide_copies, model.copies, [contact.proximity.copies], [self._near, self._stands])
+        self._add(self._target, None, 1.0, start, self._stands)
 
     def launch_hold(self, x, v, hard):
         """Shortens moves of pins to x that other pins are in the way of; corrects v. ``hard`` pairs are constraints."""

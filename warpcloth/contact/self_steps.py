@@ -30,7 +30,7 @@ from .surface import ContactSurface
 # must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one of them. It must
 # be below 0.5, the height of a right-angled triangle with a longest side of 1, so that a flat grid has no pairs.
 SKIN = 0.35
-THICK = 0.5  # the smallest skin, over the contact distance; while a list is kept, two parts approach by up to half of it
+THICK = 0.5  # the smallest skin, over the contact distance; see ``kept`` of :class:`.proximity.Proximity`
 
 
 class FirstGap(NamedTuple):
