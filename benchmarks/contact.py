@@ -1,4 +1,4 @@
-"""Where the time of a frame with contact goes: kernels by what they do, launches, and the two floors.
+"""Where the time of a frame with contact goes: kernels by what they do, and launches.
 
     python benchmarks/contact.py [--device cpu|cuda:0] [--sizes 64 128] [--solver Newton(substeps=1)] [--frame 14]
 

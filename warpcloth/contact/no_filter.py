@@ -4,8 +4,6 @@
 class NoFilter:
     """Stands for a :class:`warpcloth.contact.self_filter.SelfFilter` where cloth meets neither itself nor a mesh."""
 
-    fraction = None
-
     def launch_start(self, _base, d):
         """Launches d = 0."""
         d.zero_()
