@@ -7,7 +7,7 @@ from functools import cache
 
 import warp as wp
 
-from .contact.pair_sums import pair_blocks
+from .contact.pair_sums import pair_blocks, turned_pull
 from .contact.self_pairs import Pairs
 from .memory import add_to, load
 from .vectors import types
@@ -61,7 +61,7 @@ def operand_at(dtype, turned: bool):
 
 @cache
 def product_of_pairs(dtype, lanes: int, turned: bool):
-    """Device function (pairs, blocks, i, lane, x, p, ratio) → Σ wᵢwⱼ ∂²U/∂y² vⱼ over the other vertices j of each pair.
+    """Device function (pairs, blocks, i, lane, x, p, ratio) → Σ ∂²U/∂xᵢ∂xⱼ vⱼ over the other vertices j of each pair.
 
     It takes every ``lanes``-th pair of vertex i.
     """
@@ -83,12 +83,19 @@ def product_of_pairs(dtype, lanes: int, turned: bool):
             code = whole(pairs.corners, k)
             e = code // 4
             s = stencil(pairs.stencils, e)
+            own = code - 4 * e
             w = blocks.weights[e]
             y = vec3()
+            z = vec3()
             for j in range(4):
-                if j != code - 4 * e:
-                    y += w[j] * vector(x, p, ratio, s[j])
-            total += w[code - 4 * e] * (blocks.blocks[e] * y)
+                if j != own:
+                    v = vector(x, p, ratio, s[j])
+                    y += w[j] * v
+                    if blocks.turns:
+                        z += wp.dot(blocks.normal[e], v) * blocks.turns[e][j]
+            total += w[own] * (blocks.blocks[e] * y)
+            if blocks.turns:
+                total += turned_pull(w[own], blocks.turns[e][own], blocks.normal[e], blocks.twisted[e], y, z)
         return total
 
     return product

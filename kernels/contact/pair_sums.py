@@ -26,6 +26,9 @@ class PairForces:
     :class:`..term.HessianPolicy` gives the negative part; ``block`` is their sum. For kernels that scatter, ``pressing`` lists
     the ``count`` [0] pairs with a force, in order, and ``joining`` the ``count`` [1] ones that join vertices: those with a mesh
     may have only one.
+
+    If w changes with the positions, the rest also has the ``turns`` hᵢ [1/m] about the ``normal`` n, by the numbers α [N] and
+    β [N·m] of ``twist``, see :func:`turned_pull`; ``twisted`` is their share. Else these arrays are None.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -34,6 +37,10 @@ class PairForces:
     definite: wp.array(dtype=wp.mat33d)
     rest: wp.array(dtype=wp.mat33d)
     block: wp.array(dtype=wp.mat33d)
+    turns: wp.array(dtype=wp.types.matrix((4, 3), wp.float64))
+    normal: wp.array(dtype=wp.vec3d)
+    twist: wp.array(dtype=wp.vec2d)
+    twisted: wp.array(dtype=wp.vec2d)
     pressing: wp.array(dtype=wp.int32)
     joining: wp.array(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
@@ -56,15 +63,24 @@ def note_pressing(forces: PairForces, e: int, s: wp.vec4i):
 
 @cache
 def pair_blocks(dtype):
-    """Struct of what products of each pair read, in the precision of the matrix: w, 0 at pins, and ∂²U/∂y² [N/m]."""
-    _, mat33 = types(dtype)
+    """Struct of what products of each pair read, in the precision of the matrix: w, 0 at pins, ∂²U/∂y² [N/m], and its turns."""
+    vec3, mat33 = types(dtype)
 
     @wp.struct
     class PairBlocks:
         weights: wp.array(dtype=wp.types.vector(4, dtype))
         blocks: wp.array(dtype=mat33)
+        turns: wp.array(dtype=wp.types.matrix((4, 3), dtype))
+        normal: wp.array(dtype=vec3)
+        twisted: wp.array(dtype=wp.types.vector(2, dtype))
 
     return PairBlocks
+
+
+@wp.func
+def turned_pull(w: Any, h: Any, n: Any, twisted: Any, y: Any, z: Any):
+    """wᵢα z + (α hᵢ·y + β hᵢ·z) n, what turns add to wᵢ ∂²U/∂y² y for y = Σ wⱼpⱼ and z = Σ hⱼ n·pⱼ."""
+    return (w * twisted[0]) * z + (twisted[0] * wp.dot(h, y) + twisted[1] * wp.dot(h, z)) * n
 
 
 @dataclass(frozen=True)
@@ -83,6 +99,7 @@ class PairTerm:
             pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.pair_sweeps`.
         row: Device function (pairs, data, e, x, d) → :class:`PairRow`.
         isotropic: Whether D is that of a vertex without locked axes, because ``push`` needs one D for all directions.
+        turns: Whether w changes with the positions, see :class:`PairForces`.
     """
 
     name: str
@@ -93,6 +110,7 @@ class PairTerm:
     push: Callable
     row: Callable
     isotropic: bool
+    turns: bool = False
 
     def of(self, dtype, scatters):
         """Returns the name of the module of its sums. Those that gather are in one of their own, for the CPU needs none."""
@@ -200,8 +218,8 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
 @cache
 def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
     """Kernel over acting pairs: ``block`` with the ``policy`` (B,), and the :func:`pair_blocks` if products are gathered."""
-    _, mat33 = types(dtype)
-    vec4 = wp.types.vector(4, dtype)
+    vec3, mat33 = types(dtype)
+    vec4, vec2, mat43 = wp.types.vector(4, dtype), wp.types.vector(2, dtype), wp.types.matrix((4, 3), dtype)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
     def set_blocks_of_pairs(
@@ -218,22 +236,33 @@ def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
         for t in range(wp.tid(), pairs.number[0], pairs.threads):
             e = pairs.acting[t]
             s = pairs.stencils[e]
-            block = forces.definite[e] + wp.max(policy[s[0] // pairs.layout.per_copy], ZERO) * forces.rest[e]
+            share = wp.max(policy[s[0] // pairs.layout.per_copy], ZERO)
+            block = forces.definite[e] + share * forces.rest[e]
             forces.block[e] = block
+            if forces.turns:
+                forces.twisted[e] = share * forces.twist[e]
             if wp.static(not scatters):
                 w = forces.weights[e]
                 for i in range(4):
                     if inverse_mass[s[i]] == dtype(0.0):
                         w[i] = ZERO
-                out.weights[e] = vec4(dtype(w[0]), dtype(w[1]), dtype(w[2]), dtype(w[3]))
+                out.weights[e] = vec4(w)
                 out.blocks[e] = mat33(block)
+                if forces.turns:
+                    turns = forces.turns[e]
+                    for i in range(4):
+                        if inverse_mass[s[i]] == dtype(0.0):
+                            turns[i] = wp.vec3d()
+                    out.turns[e] = mat43(turns)
+                    out.normal[e] = vec3(forces.normal[e])
+                    out.twisted[e] = vec2(forces.twisted[e])
 
     return set_blocks_of_pairs
 
 
 @cache
 def pair_diagonal(term: PairTerm, dtype, scatters: bool):
-    """Kernel over threads: adds Σ wᵢ² ∂²U/∂y² to the diagonal blocks of a Hessian, except those of pins."""
+    """Kernel over threads: adds ∂²U/∂xᵢ² = Σ wᵢ² ∂²U/∂y², with its turns, to the diagonal of a Hessian, except at pins."""
     _, mat33 = types(dtype)
     range_of, corners_at = taken_by(scatters)
 
@@ -258,9 +287,16 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
             block = forces.block[e]
             for i in range(corner, end_corner):
                 if inverse_mass[s[i]] > dtype(0.0):
+                    own = w[i] * w[i] * block
+                    if forces.turns:
+                        h = forces.turns[e][i]
+                        n = forces.normal[e]
+                        twisted = forces.twisted[e]
+                        mixed = (w[i] * twisted[0]) * wp.outer(h, n)
+                        own += mixed + wp.transpose(mixed) + (twisted[1] * wp.dot(h, h)) * wp.outer(n, n)
                     if wp.static(scatters):
-                        values[diagonal[s[i]]] = values[diagonal[s[i]]] + mat33(w[i] * w[i] * block)
-                    total += w[i] * w[i] * block
+                        values[diagonal[s[i]]] = values[diagonal[s[i]]] + mat33(own)
+                    total += own
         if wp.static(not scatters):
             values[diagonal[v]] = values[diagonal[v]] + mat33(total)
 
@@ -269,7 +305,7 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
 
 @cache
 def pair_products(term: PairTerm, dtype, scatters: bool):
-    """Kernel over threads: q += wᵢ ∂²U/∂y² Σⱼ wⱼpⱼ over the other vertices j of each pair, in active copies."""
+    """Kernel over threads: q += wᵢ ∂²U/∂y² Σⱼ wⱼpⱼ over the other vertices j of each pair, with its turns, in active copies."""
     vec3, _ = types(dtype)
     range_of, corners_at = taken_by(scatters)
 
@@ -300,12 +336,21 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
                 w = forces.weights[e]
                 block = forces.block[e]
                 y = wp.vec3d()
+                z = wp.vec3d()
                 for i in range(4):
                     if inverse_mass[s[i]] > dtype(0.0):
                         y += w[i] * wp.vec3d(p[s[i]])
+                        if forces.turns:
+                            z += wp.dot(forces.normal[e], wp.vec3d(p[s[i]])) * forces.turns[e][i]
                 for i in range(corner, end_corner):
                     if inverse_mass[s[i]] > dtype(0.0):
-                        pull = w[i] * (block * (y - w[i] * wp.vec3d(p[s[i]])))
+                        others = y - w[i] * wp.vec3d(p[s[i]])
+                        pull = w[i] * (block * others)
+                        if forces.turns:
+                            h = forces.turns[e][i]
+                            n = forces.normal[e]
+                            turned = z - wp.dot(n, wp.vec3d(p[s[i]])) * h
+                            pull += turned_pull(w[i], h, n, forces.twisted[e], others, turned)
                         if wp.static(scatters):
                             q[s[i]] = q[s[i]] + vec3(pull)
                         total += pull

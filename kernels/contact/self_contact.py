@@ -2,8 +2,15 @@
 
 U = Σ kA φ(d) over the contacts, with φ as for colliders (:mod:`..terms.contact`). The nearest points minimise ‖y‖, so their
 motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian of a contact is
-wᵢwⱼ kA (φ″ nnᵀ + φ′/d P), see :func:`free_to_turn`. Its second part is negative, and as large as the first at small gaps. The
-definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All is in float64 for every precision.
+
+    wᵢwⱼ kA (φ″ nnᵀ + φ′/d P) − kA φ′ (wᵢ hⱼnᵀ + wⱼ nhᵢᵀ + d hᵢ·hⱼ nnᵀ)
+
+P projects on the directions across n that the nearest points do not follow: all between two vertices, one on an edge, none
+where two edges cross and on a face. hᵢ = ∂wᵢ/∂θ G ∂y/∂θ, G the inverse of the products of ∂y/∂θ, is how wᵢ changes where the
+nearest points, at parameters θ, follow. For two edges it is exact to d² over the square of their length. The second part is
+negative, and as large as the first at small gaps; the third is as large as the stiffness of a spring with the force kA φ′ of the
+length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All is in float64 for
+every precision.
 """
 
 from functools import cache
@@ -42,49 +49,66 @@ def least_gap(dtype):
 
 
 @cache
-def free_to_turn(dtype):
-    """Device function (contacts, e, n, x, d) → P, the projection on directions across n that the nearest points do not follow.
+def nearest_turns(dtype):
+    """Device function (contacts, e, n, x, d) → P and the rows hᵢ of a contact, see the module.
 
-    ∂²d/∂y² is P/d, up to terms smaller by d over the length of an edge: P is 1 − nnᵀ between two vertices, (n × t)(n × t)ᵀ on
-    an edge along t, and 0 where two edges cross and on a face.
+    The nearest points move along the edges u and v, of a face or of the two edges, of which each has a weight that grows and
+    one that falls. On a flat mesh they may be on an edge by rounding alone, and move along the face.
     """
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
 
     @wp.func
-    def free(contacts: Contacts, e: int, n: wp.vec3d, x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3)):
+    def turns(contacts: Contacts, e: int, n: wp.vec3d, x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3)):
         s = contacts.parts[e]
         bits = contacts.touching[e]
-        # The corners of the side that may be an edge: of a face, or of the two edges.
-        first = wp.int32(1)
-        end = wp.int32(4)
+        grows = wp.vec2i(-1, -1)
+        falls = wp.vec2i(-1, -1)
+        free = wp.float64(0.0)
         if contacts.code[e] == TWO_EDGES:
-            first = wp.where((bits & 3) == 3, 0, 2)
-            end = first + 2
-        touching = wp.int32(0)
-        t = wp.vec3d()
-        a = wp.vec3d()
-        for i in range(4):
-            if (bits >> i) & 1 == 1:
-                touching += 1
-                if i >= first and i < end:
-                    a = at(x, correction, s[i])
-                    t = a - t
-        found = wp.mat33d()
-        if end == 4 and first == 1:
+            if (bits & 3) == 3:
+                grows[0] = 1
+                falls[0] = 0
+            if (bits & 12) == 12:
+                grows[1] = 2
+                falls[1] = 3
+            free = SIDE * contacts.gap[e] * contacts.gap[e] / (contacts.ratio[e] * contacts.ratio[e])
+        else:
+            corner = wp.int32(1)
+            while corner < 3 and (bits >> corner) & 1 == 0:
+                corner += 1
+            edges = wp.int32(0)
             for i in range(1, 4):
-                if (bits >> i) & 1 == 0:
-                    o = at(x, correction, s[i]) - a
-                    if wp.abs(wp.dot(n, o)) <= ON_EDGE * wp.length(o):  # beyond the edge only by rounding, as on a flat mesh
-                        return found
-        if touching == 2:
-            found = UNITY - wp.outer(n, n)
-        if touching == 3:
-            u = wp.cross(n, t)
-            found = wp.outer(u, u) / wp.max(wp.dot(u, u), wp.float64(1e-300))
-        return found
+                if i != corner:
+                    o = at(x, correction, s[i]) - at(x, correction, s[corner])
+                    if (bits >> i) & 1 == 1 or wp.abs(wp.dot(n, o)) <= ON_EDGE * wp.length(o):
+                        grows[edges] = corner
+                        falls[edges] = i
+                        edges += 1
+        u = wp.vec3d()
+        v = wp.vec3d()
+        uu = ONE
+        vv = ONE
+        if grows[0] >= 0:
+            u = at(x, correction, s[grows[0]]) - at(x, correction, s[falls[0]])
+            uu = wp.dot(u, u) + free
+        if grows[1] >= 0:
+            v = at(x, correction, s[grows[1]]) - at(x, correction, s[falls[1]])
+            vv = wp.dot(v, v) + free
+        uv = wp.dot(u, v)
+        both = wp.max(uu * vv - uv * uv, wp.float64(1e-14) * uu * vv)
+        along_u = (vv * u - uv * v) / both
+        along_v = (uu * v - uv * u) / both
+        h = wp.matrix(shape=(4, 3), dtype=wp.float64)
+        if grows[0] >= 0:
+            h[grows[0]] = h[grows[0]] + along_u
+            h[falls[0]] = h[falls[0]] - along_u
+        if grows[1] >= 0:
+            h[grows[1]] = h[grows[1]] + along_v
+            h[falls[1]] = h[falls[1]] - along_v
+        return UNITY - wp.outer(n, n) - wp.outer(u, along_u) - wp.outer(v, along_v), h
 
-    return free
+    return turns
 
 
 @cache
@@ -96,7 +120,7 @@ def find_forces(dtype, bounded: bool):
     part lacks what is along n, which is negative, and has half of U′/d across n.
     """
     vec3, _ = types(dtype)
-    least_gap_of, turning = least_gap(dtype), free_to_turn(dtype)
+    least_gap_of, turns_of = least_gap(dtype), nearest_turns(dtype)
 
     @wp.kernel(module=f"{module_of(dtype)}.{bounded}", enable_backward=False)
     def find_forces_of_pairs(
@@ -142,7 +166,14 @@ def find_forces(dtype, bounded: bool):
             if k < ZERO:
                 definite = SIDE * bend_across * (UNITY - along_n)
             forces.definite[e] = definite
-            forces.rest[e] = curvature * along_n + bend_across * turning(contacts, e, n, x, correction) - definite
+            across, turns = turns_of(contacts, e, n, x, correction)
+            forces.rest[e] = curvature * along_n + bend_across * across - definite
+            for i in range(4):
+                if pairs.stencils[e][i] != contacts.parts[e][i]:  # an obstacle
+                    turns[i] = wp.vec3d()
+            forces.turns[e] = turns
+            forces.normal[e] = n
+            forces.twist[e] = wp.vec2d(-pull, -pull * gap)
             note_pressing(forces, e, pairs.stencils[e])
 
     return find_forces_of_pairs
@@ -230,4 +261,6 @@ def row_of_contact(pairs: Pairs, contacts: Contacts, e: int, x: wp.array(dtype=A
     return found
 
 
-CONTACT_OF_PAIRS = PairTerm("self-contact", MODULE, 1, Contacts, near_contact, push_contact, row_of_contact, isotropic=False)
+CONTACT_OF_PAIRS = PairTerm(
+    "self-contact", MODULE, 1, Contacts, near_contact, push_contact, row_of_contact, isotropic=False, turns=True
+)

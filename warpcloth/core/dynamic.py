@@ -69,6 +69,8 @@ class DynamicElements:
         model, room = self.model, self.room
         kinds = {"weights": wp.vec4d, "energy": wp.float64, "force": wp.vec3d}
         kinds |= dict.fromkeys(("definite", "rest", "block"), wp.mat33d)
+        if self.term.turns:
+            kinds |= {"turns": wp.types.matrix((4, 3), wp.float64), "normal": wp.vec3d, "twist": wp.vec2d, "twisted": wp.vec2d}
         kinds |= dict.fromkeys(("pressing", "joining"), wp.int32) if model.device.is_cpu else {}
         self.forces = filled(pair_sums.PairForces, **{name: room(kind) for name, kind in kinds.items()})
         if model.device.is_cpu:
@@ -89,7 +91,12 @@ class DynamicElements:
     def _hold_blocks(self):
         self.blocks, model = pair_sums.pair_blocks(self.model.dtype)(), self.model
         if not self.scatters:
-            self.blocks.weights, self.blocks.blocks = map(self.room, (wp.types.vector(4, model.dtype), model.mat33))
+            kinds = {"weights": wp.types.vector(4, model.dtype), "blocks": model.mat33}
+            if self.term.turns:
+                kinds |= {"turns": wp.types.matrix((4, 3), model.dtype), "normal": model.vec3}
+                kinds["twisted"] = wp.types.vector(2, model.dtype)
+            for name, kind in kinds.items():
+                setattr(self.blocks, name, self.room(kind))
 
     @property
     def capacity(self):
@@ -149,8 +156,14 @@ class DynamicElements:
         arrays = self.pairs.stencils, self.forces.weights, self.forces.block
         stencils, w, block = (array.numpy()[acting] for array in arrays)
         columns = 3 * stencils.astype(np.int64)[:, :, None] + np.arange(3)
-        w = w[:, :, None] * (self.model.coordinate_mobility() > 0.0)[columns]
-        values = w[:, :, :, None, None] * block[:, None, :, None, :] * w[:, None, None]
+        values = np.einsum("pi,pac,pj->piajc", w, block, w)
+        if self.term.turns:
+            h, n, twisted = (getattr(self.forces, name).numpy()[acting] for name in ("turns", "normal", "twisted"))
+            mixed = np.einsum("p,pi,pja,pc->piajc", twisted[:, 0], w, h, n)
+            values += mixed + mixed.transpose(0, 3, 4, 1, 2)
+            values += np.einsum("p,pib,pjb,pa,pc->piajc", twisted[:, 1], h, h, n, n)
+        free = (self.model.coordinate_mobility() > 0.0)[columns]
+        values *= free[:, :, :, None, None] & free[:, None, None]
         rows = np.broadcast_to(columns[:, :, :, None, None], values.shape)
         indices = rows.ravel(), np.broadcast_to(columns[:, None, None], values.shape).ravel()
         return csr_matrix((values.ravel(), indices), shape=(3 * self.model.count,) * 2)
