@@ -6,11 +6,11 @@ motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/
     wᵢwⱼ kA (φ″ nnᵀ + φ′/d P) − kA φ′ (wᵢ hⱼnᵀ + wⱼ nhᵢᵀ + d hᵢ·hⱼ nnᵀ)
 
 P projects on the directions across n that the nearest points do not follow: all between two vertices, one on an edge, none
-where two edges cross and on a face. hᵢ = ∂wᵢ/∂θ G ∂y/∂θ, G the inverse of the products of ∂y/∂θ, is how wᵢ changes where the
-nearest points, at parameters θ, follow. For two edges it is exact to d² over the square of their length. The second part is
-negative, and as large as the first at small gaps; the third is as large as the stiffness of a spring with the force kA φ′ of the
-length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All is in float64 for
-every precision.
+where two edges cross and on a face. hᵢ = ∂wᵢ/∂θ G ∂y/∂θ, G the inverse of the products of ∂y/∂θ, says how wᵢ changes as the
+parameters θ of the nearest points follow. For two edges it is exact up to d² over the square of their length. The part of P is
+negative, and as large as that of φ″ at small gaps. The part of h is as large as the stiffness that the force kA φ′ gives to a
+string of the length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All is in
+float64 for every precision.
 """
 
 from functools import cache
@@ -21,7 +21,7 @@ import warp as wp
 from ..memory import load
 from ..terms import contact
 from ..vectors import types
-from .pair_potential import ENDING, STARTING, TWO_EDGES, Contacts
+from .pair_potential import ENDING, MIDDLE, STARTING, TWO, TWO_EDGES, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
 from .self_gaps import ON_EDGE, ONE, SIDE, ZERO, farthest, vertex_of
 from .self_pairs import MODULE, Pairs, module_of
@@ -48,9 +48,26 @@ def least_gap(dtype):
     return least_gap_of
 
 
+@wp.func
+def from_middle(contacts: Contacts, e: int, own: wp.vec4i, x: wp.vec3d, u: wp.vec3d, v: wp.vec3d):
+    """½∂γ/∂(s, t)/γ of two edges, γ that of :func:`.pair_potential.from_middles`, and x from the second to the first.
+
+    The weights of obstacles are not stored: there the other edge and d n give s or t.
+    """
+    w = contacts.weights[e]
+    across = contacts.gap[e] * contacts.normal[e] - x
+    s = w[1]
+    t = -w[3]
+    if own[0] != contacts.parts[e][0]:
+        s = wp.dot(across - t * v, u) / wp.dot(u, u)
+    if own[2] != contacts.parts[e][2]:
+        t = wp.dot(across - s * u, v) / wp.dot(v, v)
+    return (TWO * MIDDLE / (contacts.ratio[e] * contacts.ratio[e])) * wp.vec2d(TWO * s - ONE, TWO * t - ONE)
+
+
 @cache
 def nearest_turns(dtype):
-    """Device function (contacts, e, n, x, d) → P and the rows hᵢ of a contact, see the module.
+    """Device function (contacts, e, stencil, x, d) → P and the rows hᵢ of a contact, see the module.
 
     The nearest points move along the edges u and v, of a face or of the two edges, of which each has a weight that grows and
     one that falls. On a flat mesh they may be on an edge by rounding alone, and move along the face.
@@ -59,12 +76,13 @@ def nearest_turns(dtype):
     at = vertex_of(dtype)
 
     @wp.func
-    def turns(contacts: Contacts, e: int, n: wp.vec3d, x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3)):
+    def turns(contacts: Contacts, e: int, own: wp.vec4i, x: wp.array(dtype=vec3), correction: wp.array(dtype=vec3)):
         s = contacts.parts[e]
         bits = contacts.touching[e]
+        n = contacts.normal[e]
         grows = wp.vec2i(-1, -1)
         falls = wp.vec2i(-1, -1)
-        free = wp.float64(0.0)
+        edges = wp.int32(0)
         if contacts.code[e] == TWO_EDGES:
             if (bits & 3) == 3:
                 grows[0] = 1
@@ -72,12 +90,10 @@ def nearest_turns(dtype):
             if (bits & 12) == 12:
                 grows[1] = 2
                 falls[1] = 3
-            free = SIDE * contacts.gap[e] * contacts.gap[e] / (contacts.ratio[e] * contacts.ratio[e])
         else:
             corner = wp.int32(1)
             while corner < 3 and (bits >> corner) & 1 == 0:
                 corner += 1
-            edges = wp.int32(0)
             for i in range(1, 4):
                 if i != corner:
                     o = at(x, correction, s[i]) - at(x, correction, s[corner])
@@ -87,25 +103,43 @@ def nearest_turns(dtype):
                         edges += 1
         u = wp.vec3d()
         v = wp.vec3d()
-        uu = ONE
-        vv = ONE
         if grows[0] >= 0:
             u = at(x, correction, s[grows[0]]) - at(x, correction, s[falls[0]])
-            uu = wp.dot(u, u) + free
         if grows[1] >= 0:
             v = at(x, correction, s[grows[1]]) - at(x, correction, s[falls[1]])
-            vv = wp.dot(v, v) + free
+        # The second derivatives of half the square of the distance by the parameters.
+        uu = wp.dot(u, u)
+        vv = wp.dot(v, v)
         uv = wp.dot(u, v)
+        middle = wp.vec2d()
+        if contacts.code[e] == TWO_EDGES:
+            q = contacts.gap[e] * contacts.gap[e]
+            middle = from_middle(contacts, e, own, at(x, correction, s[0]) - at(x, correction, s[2]), u, v)
+            free = SIDE / (contacts.ratio[e] * contacts.ratio[e])
+            uu += q * (free - wp.float64(4.0) * middle[0] * middle[0])
+            vv += q * (free - wp.float64(4.0) * middle[1] * middle[1])
+            uv -= wp.float64(4.0) * q * middle[0] * middle[1]
+        if grows[0] < 0:
+            uu = ONE
+            uv = ZERO
+            middle[0] = ZERO
+        if grows[1] < 0:
+            vv = ONE
+            uv = ZERO
+            middle[1] = ZERO
         both = wp.max(uu * vv - uv * uv, wp.float64(1e-14) * uu * vv)
         along_u = (vv * u - uv * v) / both
         along_v = (uu * v - uv * u) / both
-        h = wp.matrix(shape=(4, 3), dtype=wp.float64)
+        h = wp.outer(contacts.weights[e], TWO * (middle[0] * along_u + middle[1] * along_v))
         if grows[0] >= 0:
             h[grows[0]] = h[grows[0]] + along_u
             h[falls[0]] = h[falls[0]] - along_u
         if grows[1] >= 0:
             h[grows[1]] = h[grows[1]] + along_v
             h[falls[1]] = h[falls[1]] - along_v
+        for i in range(4):
+            if own[i] != s[i]:  # an obstacle
+                h[i] = wp.vec3d()
         return UNITY - wp.outer(n, n) - wp.outer(u, along_u) - wp.outer(v, along_v), h
 
     return turns
@@ -166,11 +200,8 @@ def find_forces(dtype, bounded: bool):
             if k < ZERO:
                 definite = SIDE * bend_across * (UNITY - along_n)
             forces.definite[e] = definite
-            across, turns = turns_of(contacts, e, n, x, correction)
+            across, turns = turns_of(contacts, e, pairs.stencils[e], x, correction)
             forces.rest[e] = curvature * along_n + bend_across * across - definite
-            for i in range(4):
-                if pairs.stencils[e][i] != contacts.parts[e][i]:  # an obstacle
-                    turns[i] = wp.vec3d()
             forces.turns[e] = turns
             forces.normal[e] = n
             forces.twist[e] = wp.vec2d(-pull, -pull * gap)

@@ -37,7 +37,10 @@ def stretched(gravity, friction):
 
 
 def roofed(gravity, friction):
-    """A sheet in tension on a flat roof with two edges, where it slides by 3 mm; over many edges φ has several minima."""
+    """A sheet in tension on a flat roof with two edges, where it slides by 3 mm.
+
+    Over many edges, and from 300 m/s² on, φ has several minima.
+    """
     grid, slope = wc.Mesh.grid(8, 8, size=0.5), 0.1
     x, _, z = grid.points.T
     top, foot = 0.5 / 7.0 * 1.5, 1.0
@@ -76,7 +79,7 @@ COLLIDERS = {
     "slides": (partial(stretched, 981.0, 0.3), 1),
     "sticks": (partial(stretched, 981.0, 30.0), 1),
     "without friction": (partial(stretched, 300.0, 0.0), 1),
-    "roof": (partial(roofed, 280.0, 0.3), 1),
+    "roof": (partial(roofed, 250.0, 0.3), 1),
 }
 PRESSED = {
     "both stages": (partial(PAIR, gap=2.2e-3), 1),
