@@ -18,7 +18,9 @@ from support.rows import table
 from support.scenes import scene
 from warpcloth.contact.proximity import ROUND
 from warpcloth.contact.self_start import crossings
+from warpcloth.core.hessian import Hessian
 from warpcloth.core.status import Result
+from warpcloth.kernels.term import HessianPolicy
 from warpcloth.scenes import knot, loop
 
 SLOW = pytest.mark.slow
@@ -82,6 +84,30 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
         assert slope_of(energy, pairs, x, direction, eta) == pytest.approx((force * direction).sum(), abs=1e-5 * size)
     assert np.abs(force.sum(axis=0)).max() < 1e-13 * size
     assert np.abs(np.cross(x, force).sum(axis=0)).max() < 1e-13 * size
+
+
+@pytest.mark.parametrize("gap", [4e-3, 1e-3, 1e-4])
+@pytest.mark.parametrize("move", ["any", "sliding"])
+def test_the_matrix_is_the_derivative_of_the_forces(gap, move, device):
+    """By central differences over η, with errors of (η/d)² and, by rounding of x, ε‖H‖x/η; also of sheets that slide.
+
+    Below r/4 = 1.25 mm edges act too. With fixed weights and normals, nothing would resist sliding.
+    """
+    scene, rng, eta = layers(turn=17.0, gap=gap), np.random.default_rng(1), 1e-4 * gap
+    x = scene.positions + min(2e-5, 0.1 * gap) * rng.normal(size=scene.positions.shape)
+    pairs = pairs_of(scene, device)
+    begin(pairs, x)
+    model = pairs.model
+    p = rng.normal(size=x.shape) if move == "any" else np.arange(len(x))[:, None] // 36 * [1.0, 0.0, 0.3]
+    expected, found = slope_of(gradient, pairs, x, p, eta), model.vectors()
+    hessian = Hessian(model, HessianPolicy.RAW, terms=[], dynamic=pairs.forces.terms)
+    hessian.prepare()
+    hessian.assemble(model.array(x, model.vec3), 0.0)
+    hessian.multiply(model.array(p, model.vec3), found, wp.ones(1, dtype=wp.int32, device=device))
+    dense = ((hessian.matrix() + hessian.coupling()) @ p.ravel()).reshape(-1, 3)
+    rounding = np.finfo(float).eps * np.abs(hessian.values.numpy()).max()
+    assert found.numpy() == pytest.approx(dense, abs=1e2 * rounding)
+    assert found.numpy() == pytest.approx(expected, abs=1e-6 * np.abs(expected).max() + rounding * np.abs(x).max() / eta)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
