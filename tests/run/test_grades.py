@@ -150,8 +150,14 @@ def test_what_is_right_is_usable(name, device):
 @pytest.mark.parametrize("name", slow_but(["hanging", "drape"], ["hanging", "drape", "net", "resting"]))
 @pytest.mark.parametrize("solver", [wc.XPBD(substeps=1, iterations=2), wc.PBD(substeps=1, iterations=2)])
 def test_the_distance_is_that_from_the_solution_of_the_step(name, solver, device):
-    """Of the first step, against Newton's. It is short, so that the function is nearly quadratic."""
+    """Of the first step, against Newton's. It is short, so that a Newton step of which the system is solved has it to 1.3 %.
+
+    Not so in ``hanging`` after 1/60 s: the cloth that sweeps leave is compressed so much that φ has 411 directions of negative
+    curvature, and such a Newton step half of the distance.
+    """
     cloth = scene(name)
+    if name == "hanging":
+        cloth = replace(cloth, fps=240.0, duration=1 / 240)
     cloth = replace(cloth, colliders=[replace(each, friction=0.0) for each in cloth.colliders])
     noise = np.random.default_rng(0).normal(scale=0.03, size=cloth.positions.shape)
     cloth = replace(cloth, velocities=noise)
