@@ -66,6 +66,7 @@ def product_of_pairs(dtype, lanes: int, turned: bool):
     It takes every ``lanes``-th pair of vertex i.
     """
     vec3, _ = types(dtype)
+    vec2 = wp.types.vector(2, dtype)
     vector, whole, stencil = operand_at(dtype, turned), load(wp.int32), load(wp.vec4i)
 
     @wp.func
@@ -86,7 +87,7 @@ def product_of_pairs(dtype, lanes: int, turned: bool):
             own = code - 4 * e
             w = blocks.weights[e]
             y = vec3()
-            z = vec3()
+            z = vec2()
             for j in range(4):
                 if j != own:
                     v = vector(x, p, ratio, s[j])
@@ -95,7 +96,7 @@ def product_of_pairs(dtype, lanes: int, turned: bool):
                         z += wp.dot(blocks.normal[e], v) * blocks.turns[e][j]
             total += w[own] * (blocks.blocks[e] * y)
             if blocks.turns:
-                total += turned_pull(w[own], blocks.turns[e][own], blocks.normal[e], blocks.twisted[e], y, z)
+                total += turned_pull(w[own], blocks.turns[e][own], blocks.ways[e], blocks.normal[e], blocks.twisted[e], y, z)
         return total
 
     return product

@@ -27,8 +27,9 @@ class PairForces:
     the ``count`` [0] pairs with a force, in order, and ``joining`` the ``count`` [1] ones that join vertices: those with a mesh
     may have only one.
 
-    If w changes with the positions, the rest also has the ``turns`` hᵢ [1/m] about the ``normal`` n, by the numbers α [N] and
-    β [N·m] of ``twist``, see :func:`turned_pull`; ``twisted`` is their share. Else these arrays are None.
+    If w changes with the positions, the rest also has ``turns`` tᵢ [1/m], two numbers for each vertex, along two ``ways`` e
+    across the ``normal`` n, by the numbers α [N] and β [N·m] of ``twist``, see :func:`turned_pull`; ``twisted`` is their share.
+    Else these arrays are None.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -37,7 +38,8 @@ class PairForces:
     definite: wp.array(dtype=wp.mat33d)
     rest: wp.array(dtype=wp.mat33d)
     block: wp.array(dtype=wp.mat33d)
-    turns: wp.array(dtype=wp.types.matrix((4, 3), wp.float64))
+    turns: wp.array(dtype=wp.types.matrix((4, 2), wp.float64))
+    ways: wp.array(dtype=wp.types.matrix((2, 3), wp.float64))
     normal: wp.array(dtype=wp.vec3d)
     twist: wp.array(dtype=wp.vec2d)
     twisted: wp.array(dtype=wp.vec2d)
@@ -70,7 +72,8 @@ def pair_blocks(dtype):
     class PairBlocks:
         weights: wp.array(dtype=wp.types.vector(4, dtype))
         blocks: wp.array(dtype=mat33)
-        turns: wp.array(dtype=wp.types.matrix((4, 3), dtype))
+        turns: wp.array(dtype=wp.types.matrix((4, 2), dtype))
+        ways: wp.array(dtype=wp.types.matrix((2, 3), dtype))
         normal: wp.array(dtype=vec3)
         twisted: wp.array(dtype=wp.types.vector(2, dtype))
 
@@ -78,9 +81,9 @@ def pair_blocks(dtype):
 
 
 @wp.func
-def turned_pull(w: Any, h: Any, n: Any, twisted: Any, y: Any, z: Any):
-    """wᵢα z + (α hᵢ·y + β hᵢ·z) n, what turns add to wᵢ ∂²U/∂y² y for y = Σ wⱼpⱼ and z = Σ hⱼ n·pⱼ."""
-    return (w * twisted[0]) * z + (twisted[0] * wp.dot(h, y) + twisted[1] * wp.dot(h, z)) * n
+def turned_pull(w: Any, t: Any, ways: Any, n: Any, twisted: Any, y: Any, z: Any):
+    """wᵢα eᵀz + n tᵢ·(α e y + β z), what turns add to wᵢ ∂²U/∂y² y for y = Σ wⱼpⱼ and z = Σ tⱼ n·pⱼ."""
+    return (w * twisted[0]) * (wp.transpose(ways) * z) + wp.dot(t, twisted[0] * (ways * y) + twisted[1] * z) * n
 
 
 @dataclass(frozen=True)
@@ -219,7 +222,12 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
 def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
     """Kernel over acting pairs: ``block`` with the ``policy`` (B,), and the :func:`pair_blocks` if products are gathered."""
     vec3, mat33 = types(dtype)
-    vec4, vec2, mat43 = wp.types.vector(4, dtype), wp.types.vector(2, dtype), wp.types.matrix((4, 3), dtype)
+    vec4, vec2, mat42, mat23 = (
+        wp.types.vector(4, dtype),
+        wp.types.vector(2, dtype),
+        wp.types.matrix((4, 2), dtype),
+        wp.types.matrix((2, 3), dtype),
+    )
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
     def set_blocks_of_pairs(
@@ -252,8 +260,9 @@ def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
                     turns = forces.turns[e]
                     for i in range(4):
                         if inverse_mass[s[i]] == dtype(0.0):
-                            turns[i] = wp.vec3d()
-                    out.turns[e] = mat43(turns)
+                            turns[i] = wp.vec2d()
+                    out.turns[e] = mat42(turns)
+                    out.ways[e] = mat23(forces.ways[e])
                     out.normal[e] = vec3(forces.normal[e])
                     out.twisted[e] = vec2(forces.twisted[e])
 
@@ -289,11 +298,11 @@ def pair_diagonal(term: PairTerm, dtype, scatters: bool):
                 if inverse_mass[s[i]] > dtype(0.0):
                     own = w[i] * w[i] * block
                     if forces.turns:
-                        h = forces.turns[e][i]
+                        t = forces.turns[e][i]
                         n = forces.normal[e]
                         twisted = forces.twisted[e]
-                        mixed = (w[i] * twisted[0]) * wp.outer(h, n)
-                        own += mixed + wp.transpose(mixed) + (twisted[1] * wp.dot(h, h)) * wp.outer(n, n)
+                        mixed = (w[i] * twisted[0]) * wp.outer(wp.transpose(forces.ways[e]) * t, n)
+                        own += mixed + wp.transpose(mixed) + (twisted[1] * wp.dot(t, t)) * wp.outer(n, n)
                     if wp.static(scatters):
                         values[diagonal[s[i]]] = values[diagonal[s[i]]] + mat33(own)
                     total += own
@@ -336,7 +345,7 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
                 w = forces.weights[e]
                 block = forces.block[e]
                 y = wp.vec3d()
-                z = wp.vec3d()
+                z = wp.vec2d()
                 for i in range(4):
                     if inverse_mass[s[i]] > dtype(0.0):
                         y += w[i] * wp.vec3d(p[s[i]])
@@ -347,10 +356,10 @@ def pair_products(term: PairTerm, dtype, scatters: bool):
                         others = y - w[i] * wp.vec3d(p[s[i]])
                         pull = w[i] * (block * others)
                         if forces.turns:
-                            h = forces.turns[e][i]
+                            t = forces.turns[e][i]
                             n = forces.normal[e]
-                            turned = z - wp.dot(n, wp.vec3d(p[s[i]])) * h
-                            pull += turned_pull(w[i], h, n, forces.twisted[e], others, turned)
+                            turned = z - wp.dot(n, wp.vec3d(p[s[i]])) * t
+                            pull += turned_pull(w[i], t, forces.ways[e], n, forces.twisted[e], others, turned)
                         if wp.static(scatters):
                             q[s[i]] = q[s[i]] + vec3(pull)
                         total += pull

@@ -3,14 +3,13 @@
 U = Σ kA φ(d) over the contacts, with φ as for colliders (:mod:`..terms.contact`). The nearest points minimise ‖y‖, so their
 motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian of a contact is
 
-    wᵢwⱼ kA (φ″ nnᵀ + φ′/d P) − kA φ′ (wᵢ hⱼnᵀ + wⱼ nhᵢᵀ + d hᵢ·hⱼ nnᵀ)
+    kA (φ″ wᵢwⱼ nnᵀ + φ′/d (wᵢwⱼ (1 − nnᵀ) − VᵢᵀG Vⱼ)),  Vᵢ = cᵢ yᵀ + wᵢ (u, v)ᵀ
 
-P projects on the directions across n that the nearest points do not follow: all between two vertices, one on an edge, none
-where two edges cross and on a face. hᵢ = ∂wᵢ/∂θ G ∂y/∂θ, G the inverse of the products of ∂y/∂θ, says how wᵢ changes as the
-parameters θ of the nearest points follow. For two edges it is exact up to d² over the square of their length. The part of P is
-negative, and as large as that of φ″ at small gaps. The part of h is as large as the stiffness that the force kA φ′ gives to a
-string of the length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All is in
-float64 for every precision.
+for nearest points that move along the edges u and v, with cᵢ = ∂wᵢ/∂θ by their parameters θ, and G⁻¹ = LLᵀ the second
+derivatives of ½‖y‖² by θ. For two edges, where D² = γ(θ)‖y‖², ∂γ/∂θ wᵢ/γ is added to cᵢ, and G is that of D²/γ. The part of φ′
+is negative. Across n it is as large as that of φ″ at small gaps. What joins n and directions across it is as large as the
+stiffness that the force kA φ′ gives to a string of the length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts over
+a valley by their share of it. All is in float64 for every precision.
 """
 
 from functools import cache
@@ -50,7 +49,7 @@ def least_gap(dtype):
 
 @wp.func
 def from_middle(contacts: Contacts, e: int, own: wp.vec4i, x: wp.vec3d, u: wp.vec3d, v: wp.vec3d):
-    """½∂γ/∂(s, t)/γ of two edges, γ that of :func:`.pair_potential.from_middles`, and x from the second to the first.
+    """∂γ/∂(s, t)/γ of two edges, γ that of :func:`.pair_potential.from_middles`, and x from the second to the first.
 
     The weights of obstacles are not stored: there the other edge and d n give s or t.
     """
@@ -62,12 +61,12 @@ def from_middle(contacts: Contacts, e: int, own: wp.vec4i, x: wp.vec3d, u: wp.ve
         s = wp.dot(across - t * v, u) / wp.dot(u, u)
     if own[2] != contacts.parts[e][2]:
         t = wp.dot(across - s * u, v) / wp.dot(v, v)
-    return (TWO * MIDDLE / (contacts.ratio[e] * contacts.ratio[e])) * wp.vec2d(TWO * s - ONE, TWO * t - ONE)
+    return (TWO * TWO * MIDDLE / (contacts.ratio[e] * contacts.ratio[e])) * wp.vec2d(TWO * s - ONE, TWO * t - ONE)
 
 
 @cache
 def nearest_turns(dtype):
-    """Device function (contacts, e, stencil, x, d) → P and the rows hᵢ of a contact, see the module.
+    """Device function (contacts, e, stencil, x, d) → the rows L⁻¹cᵢ and L⁻¹(u, v) of a contact, see the module.
 
     The nearest points move along the edges u and v, of a face or of the two edges, of which each has a weight that grows and
     one that falls. On a flat mesh they may be on an edge by rounding alone, and move along the face.
@@ -107,18 +106,18 @@ def nearest_turns(dtype):
             u = at(x, correction, s[grows[0]]) - at(x, correction, s[falls[0]])
         if grows[1] >= 0:
             v = at(x, correction, s[grows[1]]) - at(x, correction, s[falls[1]])
-        # The second derivatives of half the square of the distance by the parameters.
+        # Of half the squared distance, by the parameters: the second derivatives LLᵀ.
         uu = wp.dot(u, u)
         vv = wp.dot(v, v)
         uv = wp.dot(u, v)
         middle = wp.vec2d()
         if contacts.code[e] == TWO_EDGES:
-            q = contacts.gap[e] * contacts.gap[e]
             middle = from_middle(contacts, e, own, at(x, correction, s[0]) - at(x, correction, s[2]), u, v)
+            q = contacts.gap[e] * contacts.gap[e]
             free = SIDE / (contacts.ratio[e] * contacts.ratio[e])
-            uu += q * (free - wp.float64(4.0) * middle[0] * middle[0])
-            vv += q * (free - wp.float64(4.0) * middle[1] * middle[1])
-            uv -= wp.float64(4.0) * q * middle[0] * middle[1]
+            uu += q * (free - middle[0] * middle[0])
+            vv += q * (free - middle[1] * middle[1])
+            uv -= q * middle[0] * middle[1]
         if grows[0] < 0:
             uu = ONE
             uv = ZERO
@@ -127,20 +126,21 @@ def nearest_turns(dtype):
             vv = ONE
             uv = ZERO
             middle[1] = ZERO
-        both = wp.max(uu * vv - uv * uv, wp.float64(1e-14) * uu * vv)
-        along_u = (vv * u - uv * v) / both
-        along_v = (uu * v - uv * u) / both
-        h = wp.outer(contacts.weights[e], TWO * (middle[0] * along_u + middle[1] * along_v))
-        if grows[0] >= 0:
-            h[grows[0]] = h[grows[0]] + along_u
-            h[falls[0]] = h[falls[0]] - along_u
-        if grows[1] >= 0:
-            h[grows[1]] = h[grows[1]] + along_v
-            h[falls[1]] = h[falls[1]] - along_v
+        first = wp.sqrt(uu)
+        lower = uv / first
+        second = wp.sqrt(wp.max(vv - lower * lower, wp.float64(1e-14) * vv))
+        c = wp.outer(contacts.weights[e], middle)
+        for k in range(2):
+            if grows[k] >= 0:
+                c[grows[k], k] = c[grows[k], k] + ONE
+                c[falls[k], k] = c[falls[k], k] - ONE
         for i in range(4):
+            c[i, 0] = c[i, 0] / first
+            c[i, 1] = (c[i, 1] - lower * c[i, 0]) / second
             if own[i] != s[i]:  # an obstacle
-                h[i] = wp.vec3d()
-        return UNITY - wp.outer(n, n) - wp.outer(u, along_u) - wp.outer(v, along_v), h
+                c[i] = wp.vec2d()
+        one = u / first
+        return c, wp.matrix_from_rows(one, (v - lower * one) / second)
 
     return turns
 
@@ -200,9 +200,11 @@ def find_forces(dtype, bounded: bool):
             if k < ZERO:
                 definite = SIDE * bend_across * (UNITY - along_n)
             forces.definite[e] = definite
-            across, turns = turns_of(contacts, e, pairs.stencils[e], x, correction)
+            turns, ways = turns_of(contacts, e, pairs.stencils[e], x, correction)
+            across = UNITY - along_n - wp.transpose(ways) * ways
             forces.rest[e] = curvature * along_n + bend_across * across - definite
             forces.turns[e] = turns
+            forces.ways[e] = ways
             forces.normal[e] = n
             forces.twist[e] = wp.vec2d(-pull, -pull * gap)
             note_pressing(forces, e, pairs.stencils[e])

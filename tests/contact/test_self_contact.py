@@ -86,15 +86,15 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
     assert np.abs(np.cross(x, force).sum(axis=0)).max() < 1e-13 * size
 
 
-@pytest.mark.parametrize("gap", [4e-3, 1e-3, 1e-4])
+@pytest.mark.parametrize(("gap", "turn"), [(4e-3, 17.0), (1e-3, 17.0), (1e-4, 17.0), (1e-3, 0.0)])
 @pytest.mark.parametrize("move", ["any", "sliding"])
-def test_the_matrix_is_the_derivative_of_the_forces(gap, move, device):
-    """By central differences over η, with errors of (η/d)² and, by rounding of x, ε‖H‖x/η; also of sheets that slide.
+def test_the_matrix_is_the_derivative_of_the_forces(gap, turn, move, device):
+    """By central differences over η, with errors of (pη/d)² and, by rounding of x, ε‖H‖x/η; also of sheets that slide.
 
-    Below r/4 = 1.25 mm edges act too. With fixed weights and normals, nothing would resist sliding.
+    Below r/4 = 1.25 mm edges act too, without a turn nearly parallel ones. With fixed weights and normals, nothing resists sliding.
     """
-    scene, rng, eta = layers(turn=17.0, gap=gap), np.random.default_rng(1), 1e-4 * gap
-    x = scene.positions + min(2e-5, 0.1 * gap) * rng.normal(size=scene.positions.shape)
+    scene, rng, eta = layers(turn=turn, gap=gap), np.random.default_rng(1), 1e-4 * gap
+    x = scene.positions + 0.1 * gap * rng.normal(size=scene.positions.shape)
     pairs = pairs_of(scene, device)
     begin(pairs, x)
     model = pairs.model
@@ -107,7 +107,7 @@ def test_the_matrix_is_the_derivative_of_the_forces(gap, move, device):
     dense = ((hessian.matrix() + hessian.coupling()) @ p.ravel()).reshape(-1, 3)
     rounding = np.finfo(float).eps * np.abs(hessian.values.numpy()).max()
     assert found.numpy() == pytest.approx(dense, abs=1e2 * rounding)
-    assert found.numpy() == pytest.approx(expected, abs=1e-6 * np.abs(expected).max() + rounding * np.abs(x).max() / eta)
+    assert found.numpy() == pytest.approx(expected, abs=1e-5 * np.abs(expected).max() + rounding * np.abs(x).max() / eta)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])

@@ -70,7 +70,8 @@ class DynamicElements:
         kinds = {"weights": wp.vec4d, "energy": wp.float64, "force": wp.vec3d}
         kinds |= dict.fromkeys(("definite", "rest", "block"), wp.mat33d)
         if self.term.turns:
-            kinds |= {"turns": wp.types.matrix((4, 3), wp.float64), "normal": wp.vec3d, "twist": wp.vec2d, "twisted": wp.vec2d}
+            kinds |= {"turns": wp.types.matrix((4, 2), wp.float64), "ways": wp.types.matrix((2, 3), wp.float64)}
+            kinds |= {"normal": wp.vec3d, "twist": wp.vec2d, "twisted": wp.vec2d}
         kinds |= dict.fromkeys(("pressing", "joining"), wp.int32) if model.device.is_cpu else {}
         self.forces = filled(pair_sums.PairForces, **{name: room(kind) for name, kind in kinds.items()})
         if model.device.is_cpu:
@@ -93,8 +94,8 @@ class DynamicElements:
         if not self.scatters:
             kinds = {"weights": wp.types.vector(4, model.dtype), "blocks": model.mat33}
             if self.term.turns:
-                kinds |= {"turns": wp.types.matrix((4, 3), model.dtype), "normal": model.vec3}
-                kinds["twisted"] = wp.types.vector(2, model.dtype)
+                kinds |= {"turns": wp.types.matrix((4, 2), model.dtype), "ways": wp.types.matrix((2, 3), model.dtype)}
+                kinds |= {"normal": model.vec3, "twisted": wp.types.vector(2, model.dtype)}
             for name, kind in kinds.items():
                 setattr(self.blocks, name, self.room(kind))
 
@@ -158,10 +159,11 @@ class DynamicElements:
         columns = 3 * stencils.astype(np.int64)[:, :, None] + np.arange(3)
         values = np.einsum("pi,pac,pj->piajc", w, block, w)
         if self.term.turns:
-            h, n, twisted = (getattr(self.forces, name).numpy()[acting] for name in ("turns", "normal", "twisted"))
-            mixed = np.einsum("p,pi,pja,pc->piajc", twisted[:, 0], w, h, n)
+            names = "turns", "ways", "normal", "twisted"
+            t, ways, n, twisted = (getattr(self.forces, name).numpy()[acting] for name in names)
+            mixed = np.einsum("p,pi,pjk,pka,pc->piajc", twisted[:, 0], w, t, ways, n)
             values += mixed + mixed.transpose(0, 3, 4, 1, 2)
-            values += np.einsum("p,pib,pjb,pa,pc->piajc", twisted[:, 1], h, h, n, n)
+            values += np.einsum("p,pik,pjk,pa,pc->piajc", twisted[:, 1], t, t, n, n)
         free = (self.model.coordinate_mobility() > 0.0)[columns]
         values *= free[:, :, :, None, None] & free[:, None, None]
         rows = np.broadcast_to(columns[:, :, :, None, None], values.shape)
