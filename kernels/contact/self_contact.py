@@ -8,8 +8,8 @@ motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/
 for nearest points that move along the edges u and v, with cᵢ = ∂wᵢ/∂θ by their parameters θ, and G⁻¹ = LLᵀ the second
 derivatives of ½‖y‖² by θ. For two edges, where D² = γ(θ)‖y‖², ∂γ/∂θ wᵢ/γ is added to cᵢ, and G is that of D²/γ. The part of φ′
 is negative. Across n it is as large as that of φ″ at small gaps. What joins n and directions across it is as large as the
-stiffness that the force kA φ′ gives to a string of the length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts over
-a valley by their share of it. All is in float64 for every precision.
+stiffness that the force kA φ′ gives to a string of the length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts
+over a valley by their share of it. All is in float64 for every precision.
 """
 
 from functools import cache

@@ -91,7 +91,8 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
 def test_the_matrix_is_the_derivative_of_the_forces(gap, turn, move, device):
     """By central differences over η, with errors of (pη/d)² and, by rounding of x, ε‖H‖x/η; also of sheets that slide.
 
-    Below r/4 = 1.25 mm edges act too, without a turn nearly parallel ones. With fixed weights and normals, nothing resists sliding.
+    Below r/4 = 1.25 mm edges act too, without a turn nearly parallel ones. With fixed weights and normals nothing resists
+    sliding.
     """
     scene, rng, eta = layers(turn=turn, gap=gap), np.random.default_rng(1), 1e-4 * gap
     x = scene.positions + 0.1 * gap * rng.normal(size=scene.positions.shape)
