@@ -27,9 +27,9 @@ class PairForces:
     the ``count`` [0] pairs with a force, in order, and ``joining`` the ``count`` [1] ones that join vertices: those with a mesh
     may have only one.
 
-    If w changes with the positions, the rest also has ``turns`` tᵢ [1/m], two numbers for each vertex, along two ``ways`` e
-    across the ``normal`` n, by the numbers α [N] and β [N·m] of ``twist``, see :func:`turned_pull`; ``twisted`` is their share.
-    Else these arrays are None.
+    If w changes with the positions, the rest has more entries, see :func:`turned_pull`: of the ``turns`` t, two numbers [1/m]
+    for each vertex, two vectors e, the ``ways``, the ``normal`` n, and ``twist``, α [N] and β [N·m]. ``twisted`` is the share
+    of ``twist`` that the policy gives. Without, these arrays are None.
     """
 
     weights: wp.array(dtype=wp.vec4d)

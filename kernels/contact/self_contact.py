@@ -6,10 +6,10 @@ motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/
     kA (φ″ wᵢwⱼ nnᵀ + φ′/d (wᵢwⱼ (1 − nnᵀ) − VᵢᵀG Vⱼ)),  Vᵢ = cᵢ yᵀ + wᵢ (u, v)ᵀ
 
 for nearest points that move along the edges u and v, with cᵢ = ∂wᵢ/∂θ by their parameters θ, and G⁻¹ = LLᵀ the second
-derivatives of ½‖y‖² by θ. For two edges, where D² = γ(θ)‖y‖², ∂γ/∂θ wᵢ/γ is added to cᵢ, and G is that of D²/γ. The part of φ′
-is negative. Across n it is as large as that of φ″ at small gaps. What joins n and directions across it is as large as the
-stiffness that the force kA φ′ gives to a string of the length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts
-over a valley by their share of it. All is in float64 for every precision.
+derivatives of ½‖y‖² by θ. For two edges with D² = γ(θ)‖y‖², cᵢ also has wᵢ ∂γ/∂θ/γ, and G⁻¹ is that of ½D²/γ. The part of φ′
+is negative. Across n it is as large as that of φ″ at small gaps. Its entries that join n with directions across n have the size
+of kA φ′ over the length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All
+is in float64 for every precision.
 """
 
 from functools import cache
@@ -48,13 +48,15 @@ def least_gap(dtype):
 
 
 @wp.func
-def from_middle(contacts: Contacts, e: int, own: wp.vec4i, x: wp.vec3d, u: wp.vec3d, v: wp.vec3d):
-    """∂γ/∂(s, t)/γ of two edges, γ that of :func:`.pair_potential.from_middles`, and x from the second to the first.
+def from_middle(contacts: Contacts, e: int, own: wp.vec4i, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """∂γ/∂(s, t)/γ of two edges ab and cd, γ that of :func:`.pair_potential.from_middles`.
 
     The weights of obstacles are not stored: there the other edge and d n give s or t.
     """
     w = contacts.weights[e]
-    across = contacts.gap[e] * contacts.normal[e] - x
+    u = b - a
+    v = c - d
+    across = contacts.gap[e] * contacts.normal[e] - (a - c)
     s = w[1]
     t = -w[3]
     if own[0] != contacts.parts[e][0]:
@@ -68,8 +70,8 @@ def from_middle(contacts: Contacts, e: int, own: wp.vec4i, x: wp.vec3d, u: wp.ve
 def nearest_turns(dtype):
     """Device function (contacts, e, stencil, x, d) → the rows L⁻¹cᵢ and L⁻¹(u, v) of a contact, see the module.
 
-    The nearest points move along the edges u and v, of a face or of the two edges, of which each has a weight that grows and
-    one that falls. On a flat mesh they may be on an edge by rounding alone, and move along the face.
+    The nearest points move along u and v, edges of a face or the two edges. Along each one weight grows and one falls. On a
+    flat mesh they may be on an edge by rounding alone, and move along the face.
     """
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
@@ -96,7 +98,8 @@ def nearest_turns(dtype):
             for i in range(1, 4):
                 if i != corner:
                     o = at(x, correction, s[i]) - at(x, correction, s[corner])
-                    if (bits >> i) & 1 == 1 or wp.abs(wp.dot(n, o)) <= ON_EDGE * wp.length(o):
+                    on = (bits >> i) & 1 == 1 or wp.abs(wp.dot(n, o)) <= ON_EDGE * wp.length(o)
+                    if on and wp.length(o) > ZERO:
                         grows[edges] = corner
                         falls[edges] = i
                         edges += 1
@@ -106,13 +109,15 @@ def nearest_turns(dtype):
             u = at(x, correction, s[grows[0]]) - at(x, correction, s[falls[0]])
         if grows[1] >= 0:
             v = at(x, correction, s[grows[1]]) - at(x, correction, s[falls[1]])
-        # Of half the squared distance, by the parameters: the second derivatives LLᵀ.
+        # LLᵀ
         uu = wp.dot(u, u)
         vv = wp.dot(v, v)
         uv = wp.dot(u, v)
         middle = wp.vec2d()
         if contacts.code[e] == TWO_EDGES:
-            middle = from_middle(contacts, e, own, at(x, correction, s[0]) - at(x, correction, s[2]), u, v)
+            a = at(x, correction, s[0])
+            b = at(x, correction, s[1])
+            middle = from_middle(contacts, e, own, a, b, at(x, correction, s[2]), at(x, correction, s[3]))
             q = contacts.gap[e] * contacts.gap[e]
             free = SIDE / (contacts.ratio[e] * contacts.ratio[e])
             uu += q * (free - middle[0] * middle[0])
@@ -128,7 +133,10 @@ def nearest_turns(dtype):
             middle[1] = ZERO
         first = wp.sqrt(uu)
         lower = uv / first
-        second = wp.sqrt(wp.max(vv - lower * lower, wp.float64(1e-14) * vv))
+        square = vv - lower * lower
+        inverse = ZERO  # along parallel edges the nearest point has one way
+        if square > wp.float64(1e-14) * vv:
+            inverse = ONE / wp.sqrt(square)
         c = wp.outer(contacts.weights[e], middle)
         for k in range(2):
             if grows[k] >= 0:
@@ -136,11 +144,11 @@ def nearest_turns(dtype):
                 c[falls[k], k] = c[falls[k], k] - ONE
         for i in range(4):
             c[i, 0] = c[i, 0] / first
-            c[i, 1] = (c[i, 1] - lower * c[i, 0]) / second
+            c[i, 1] = (c[i, 1] - lower * c[i, 0]) * inverse
             if own[i] != s[i]:  # an obstacle
                 c[i] = wp.vec2d()
         one = u / first
-        return c, wp.matrix_from_rows(one, (v - lower * one) / second)
+        return c, wp.matrix_from_rows(one, (v - lower * one) * inverse)
 
     return turns
 

@@ -13,8 +13,10 @@ from support.layers import after_frames, cloth, ground, positions, stack
 from support.pairs import between_edges, detect, from_triangle
 from warpcloth.contact.proximity import WAY, Proximity
 from warpcloth.contact.surface import ContactSurface
+from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.contact.obstacles import CLOTH, OBSTACLE
 from warpcloth.kernels.contact.pair_potential import CLOSE
+from warpcloth.kernels.term import HessianPolicy
 
 R = 3e-3
 
@@ -28,14 +30,14 @@ def sheet(colliders, n=6, side=0.2, height=R, layers=1, stiffness=None, **given)
     return wc.Scene(mesh, colliders=colliders, self_contact=itself, **fields | given)
 
 
-@pytest.mark.parametrize("cells", (3, 12))
-def test_forces_are_the_gradient_of_the_energy(cells, device):
-    """On rough meshes that are coarser and finer than the cloth, so that all kinds of features meet."""
+@pytest.mark.parametrize(("cells", "gap"), ((3, 0.7), (12, 0.7), (3, 0.15), (12, 0.15), (30, 0.15)))
+def test_forces_and_matrix_are_derivatives_of_the_energy(cells, gap, device):
+    """On rough meshes that are coarser and finer than the cloth, so that all kinds of features meet; edges below r/4."""
     rng, eta = np.random.default_rng(1), 1e-7
     flat = ground(0.06, cells)
-    rough = wc.MeshCollider(flat.points + rng.normal(scale=0.1 * R, size=flat.points.shape), flat.triangles)
-    scene = sheet([rough], n=4, side=0.04, height=0.7 * R)
-    x = scene.positions + rng.normal(scale=0.1 * R, size=scene.positions.shape)
+    rough = wc.MeshCollider(flat.points + rng.normal(scale=0.1 * gap * R, size=flat.points.shape), flat.triangles)
+    scene = sheet([rough], n=4, side=0.04, height=gap * R)
+    x = scene.positions + rng.normal(scale=0.1 * gap * R, size=scene.positions.shape)
     stepper = wc.Newton(dt=1 / 24).bind(replace(scene, positions=x).build(dtype="float64", device=device))
     stepper.pairs.launch_begin(stepper.state.x)
     found = gradient(stepper.pairs, x)
@@ -45,6 +47,15 @@ def test_forces_are_the_gradient_of_the_energy(cells, device):
         step[i, axis] = 1.0
         # Third derivatives of φ are of the order of kA/r², and U is rounded.
         assert found[i, axis] == pytest.approx(slope_of(energy, stepper.pairs, x, step, eta), abs=1e-6 * np.abs(found).max())
+    model, product = stepper.model, stepper.model.vectors()
+    hessian = Hessian(model, HessianPolicy.RAW, terms=[], dynamic=stepper.pairs.forces.terms)
+    hessian.prepare()
+    for _ in range(3):
+        p = rng.normal(size=x.shape)
+        expected = slope_of(gradient, stepper.pairs, x, p, 1e-4 * eta)
+        hessian.assemble(model.array(x, model.vec3), 0.0)
+        hessian.multiply(model.array(p, model.vec3), product, wp.ones(1, dtype=wp.int32, device=device))
+        assert product.numpy() == pytest.approx(expected, abs=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("cells", (2, 9, 40))

@@ -18,7 +18,7 @@ def sagging(stiffness, apart):
     """A crumpled sheet, which descends slowly, beside a spring at rest and one between pins that is too long by ``apart`` [m].
 
     The first of these has no force but what its length is rounded by, the other one has a large energy that stays. The corners
-    of the sheet are pinned: moves that only inertia resists would descend for ever.
+    of the sheet are pinned, for where inertia alone resists it would descend for ever.
     """
     grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
     corner = LENGTH * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

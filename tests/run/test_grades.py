@@ -150,10 +150,10 @@ def test_what_is_right_is_usable(name, device):
 @pytest.mark.parametrize("name", slow_but(["hanging", "drape"], ["hanging", "drape", "net", "resting"]))
 @pytest.mark.parametrize("solver", [wc.XPBD(substeps=1, iterations=2), wc.PBD(substeps=1, iterations=2)])
 def test_the_distance_is_that_from_the_solution_of_the_step(name, solver, device):
-    """Of the first step, against Newton's. It is short, so that a Newton step of which the system is solved has it to 1.3 %.
+    """Of the first step, against Newton's. The step is short: one step of Newton's method gives the distance to 1.3 %.
 
-    Not so in ``hanging`` after 1/60 s: the cloth that sweeps leave is compressed so much that φ has 411 directions of negative
-    curvature, and such a Newton step half of the distance.
+    Not so in ``hanging`` after 1/60 s: sweeps leave cloth so compressed that φ has 411 directions of negative curvature, and one
+    step of Newton's method gives half of the distance.
     """
     cloth = scene(name)
     if name == "hanging":
