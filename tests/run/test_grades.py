@@ -152,8 +152,8 @@ def test_what_is_right_is_usable(name, device):
 def test_the_distance_is_that_from_the_solution_of_the_step(name, solver, device):
     """Of the first step, against Newton's. The step is short: one step of Newton's method gives the distance to 1.3 %.
 
-    Not so in ``hanging`` after 1/60 s: sweeps leave cloth so compressed that φ has 411 directions of negative curvature, and one
-    step of Newton's method gives half of the distance.
+    Not so in ``hanging`` after 1/60 s: sweeps leave cloth so compressed that φ has 411 directions of negative curvature, and
+    one step of Newton's method gives half of the distance.
     """
     cloth = scene(name)
     if name == "hanging":
