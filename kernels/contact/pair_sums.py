@@ -28,8 +28,8 @@ class PairForces:
     may have only one.
 
     If w changes with the positions, the rest has more entries, see :func:`turned_pull`: of the ``turns`` t, two numbers [1/m]
-    for each vertex, two vectors e, the ``ways``, the ``normal`` n, and ``twist``, α [N] and β [N·m]. ``twisted`` is the share
-    of ``twist`` that the policy gives. Without, these arrays are None.
+    for each vertex, two vectors e, the ``ways``, the ``normal`` n of the data, and ``twist``, α [N] and β [N·m]. ``twisted`` is
+    the share of ``twist`` that the policy gives. Without, these arrays are None.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -102,7 +102,7 @@ class PairTerm:
             pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.pair_sweeps`.
         row: Device function (pairs, data, e, x, d) → :class:`PairRow`.
         isotropic: Whether D is that of a vertex without locked axes, because ``push`` needs one D for all directions.
-        turns: Whether w changes with the positions, see :class:`PairForces`.
+        turns: Whether w changes with the positions, see :class:`PairForces`. The data then has a ``normal``.
     """
 
     name: str

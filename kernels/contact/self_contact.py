@@ -18,6 +18,7 @@ from typing import Any
 import warp as wp
 
 from ..memory import load
+from ..rotation import epsilon
 from ..terms import contact
 from ..vectors import types
 from .pair_potential import ENDING, MIDDLE, STARTING, TWO, TWO_EDGES, Contacts
@@ -48,7 +49,7 @@ def least_gap(dtype):
 
 
 @wp.func
-def from_middle(contacts: Contacts, e: int, own: wp.vec4i, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+def slope_of_middles(contacts: Contacts, e: int, own: wp.vec4i, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """∂γ/∂(s, t)/γ of two edges ab and cd, γ that of :func:`.pair_potential.from_middles`.
 
     The weights of obstacles are not stored: there the other edge and d n give s or t.
@@ -109,7 +110,7 @@ def nearest_turns(dtype):
             u = at(x, correction, s[grows[0]]) - at(x, correction, s[falls[0]])
         if grows[1] >= 0:
             v = at(x, correction, s[grows[1]]) - at(x, correction, s[falls[1]])
-        # LLᵀ
+        # The entries of LLᵀ.
         uu = wp.dot(u, u)
         vv = wp.dot(v, v)
         uv = wp.dot(u, v)
@@ -117,7 +118,7 @@ def nearest_turns(dtype):
         if contacts.code[e] == TWO_EDGES:
             a = at(x, correction, s[0])
             b = at(x, correction, s[1])
-            middle = from_middle(contacts, e, own, a, b, at(x, correction, s[2]), at(x, correction, s[3]))
+            middle = slope_of_middles(contacts, e, own, a, b, at(x, correction, s[2]), at(x, correction, s[3]))
             q = contacts.gap[e] * contacts.gap[e]
             free = SIDE / (contacts.ratio[e] * contacts.ratio[e])
             uu += q * (free - middle[0] * middle[0])
@@ -134,8 +135,8 @@ def nearest_turns(dtype):
         first = wp.sqrt(uu)
         lower = uv / first
         square = vv - lower * lower
-        inverse = ZERO  # along parallel edges the nearest point has one way
-        if square > wp.float64(1e-14) * vv:
+        inverse = ZERO  # parallel edges give the nearest point one way; 16 ε bounds the rounding of the products in the square
+        if square > wp.float64(16.0) * epsilon(vv) * vv:
             inverse = ONE / wp.sqrt(square)
         c = wp.outer(contacts.weights[e], middle)
         for k in range(2):
@@ -213,7 +214,6 @@ def find_forces(dtype, bounded: bool):
             forces.rest[e] = curvature * along_n + bend_across * across - definite
             forces.turns[e] = turns
             forces.ways[e] = ways
-            forces.normal[e] = n
             forces.twist[e] = wp.vec2d(-pull, -pull * gap)
             note_pressing(forces, e, pairs.stencils[e])
 

@@ -47,15 +47,17 @@ def test_forces_and_matrix_are_derivatives_of_the_energy(cells, gap, device):
         step[i, axis] = 1.0
         # Third derivatives of φ are of the order of kA/r², and U is rounded.
         assert found[i, axis] == pytest.approx(slope_of(energy, stepper.pairs, x, step, eta), abs=1e-6 * np.abs(found).max())
-    model, product = stepper.model, stepper.model.vectors()
+    model, product, near = stepper.model, stepper.model.vectors(), 1e-6 * gap * R
     hessian = Hessian(model, HessianPolicy.RAW, terms=[], dynamic=stepper.pairs.forces.terms)
     hessian.prepare()
     for _ in range(3):
         p = rng.normal(size=x.shape)
-        expected = slope_of(gradient, stepper.pairs, x, p, 1e-4 * eta)
+        expected = slope_of(gradient, stepper.pairs, x, p, near)
         hessian.assemble(model.array(x, model.vec3), 0.0)
         hessian.multiply(model.array(p, model.vec3), product, wp.ones(1, dtype=wp.int32, device=device))
-        assert product.numpy() == pytest.approx(expected, abs=1e-4 * np.abs(expected).max())
+        # The error is of (p near/d)², and of x, rounded, times the matrix over near.
+        rounding = np.finfo(float).eps * np.abs(hessian.values.numpy()).max() * np.abs(x).max() / near
+        assert product.numpy() == pytest.approx(expected, abs=1e-7 * np.abs(expected).max() + rounding)
 
 
 @pytest.mark.parametrize("cells", (2, 9, 40))

@@ -71,9 +71,11 @@ class DynamicElements:
         kinds |= dict.fromkeys(("definite", "rest", "block"), wp.mat33d)
         if self.term.turns:
             kinds |= {"turns": wp.types.matrix((4, 2), wp.float64), "ways": wp.types.matrix((2, 3), wp.float64)}
-            kinds |= {"normal": wp.vec3d, "twist": wp.vec2d, "twisted": wp.vec2d}
+            kinds |= dict.fromkeys(("twist", "twisted"), wp.vec2d)
         kinds |= dict.fromkeys(("pressing", "joining"), wp.int32) if model.device.is_cpu else {}
         self.forces = filled(pair_sums.PairForces, **{name: room(kind) for name, kind in kinds.items()})
+        if self.term.turns:
+            self.forces.normal = data.normal
         if model.device.is_cpu:
             self.forces.count = wp.zeros(2, dtype=wp.int32, device=model.device)
         self._hold_blocks()
