@@ -31,6 +31,7 @@ from .self_pairs import Pairs, module_of
 MIDDLE = wp.constant(wp.float64(0.125))  # weight of the distance from the middles of edges; below 1/6 D is strictly convex
 CLOSE = wp.constant(wp.float64(0.25))  # contact distance of edges over that of vertices
 TWO, HALF_PI = wp.constant(wp.float64(2.0)), wp.constant(wp.float64(1.5707963267948966))
+SIX = wp.types.vector(6, wp.int32)
 NONE, TWO_EDGES = wp.constant(-1), wp.constant(7)  # codes of a face that is not near, and of a pair of edges
 
 
@@ -113,7 +114,9 @@ class Contacts:
 
     Slot e < C of 2C is that of the pair e. Those from C + 3·rows[i] on are for terms of vertex i whose faces have their nearest
     points elsewhere; F faces share at most 1.5 F edges, and as many vertices. kA is 0 in slots without a contact. ``code`` says
-    where the nearest point of a face is. ``near`` (C,) lists the pairs of the near faces of vertex i from rows[i] on.
+    where the nearest point of a face is. ``near`` (C,) lists the pairs of the near faces of vertex i from rows[i] on, and
+    ``counts`` (V,) has the number of these and of its slots from C + 3·rows[i] on. ``multiplicities`` (C,) are those of the
+    terms of a near face, of its edges 12, 23 and 31 and its corners 1 to 3: 0 if another face owns them.
 
     ``parts`` has the vertices of the surface of a contact, and bit i of ``touching`` is 1 if wᵢ is not 0. The stencil has the
     first vertex of the cloth with w = 0 in place of each obstacle. Obstacles give the ``offset`` o = Σ wⱼXⱼ [m] of their
@@ -136,6 +139,8 @@ class Contacts:
     fixed: wp.array(dtype=wp.float64)
     code: wp.array(dtype=wp.int32)
     near: wp.array(dtype=wp.int32)
+    counts: wp.array(dtype=wp.vec2i)
+    multiplicities: wp.array(dtype=SIX)
     parts: wp.array(dtype=wp.vec4i)
     touching: wp.array(dtype=wp.int32)
     offset: wp.array(dtype=wp.vec3d)
@@ -257,9 +262,9 @@ def slot_of(contacts: Contacts, first: int, count: int, extra: int, i: int):
 
 
 @wp.func
-def set_shares(contacts: Contacts, first: int, count: int, extra: int, extras: int):
-    """Sets the shares of the contacts of a vertex with ``count`` near faces and ``extras`` other slots."""
-    for i in range(count + extras):
+def set_shares(contacts: Contacts, first: int, count: int, extra: int, extras: int, lane: int, lanes: int):
+    """Sets the shares of every ``lanes``-th contact of a vertex with ``count`` near faces and ``extras`` other slots."""
+    for i in range(lane, count + extras, lanes):
         one = slot_of(contacts, first, count, extra, i)
         if contacts.stiffness[one] > ZERO:
             total = ZERO
@@ -348,12 +353,32 @@ def find_near_faces(dtype):
     return find_each_near_face
 
 
-@cache
-def find_vertex_contacts(dtype):
-    """Kernel over vertices: their contacts at x, or x + correction, with the faces of :func:`find_near_faces`.
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def list_near_faces(
+    # elements
+    lists: Pairs,
+    # parameters
+    vertices: int,
+    threads: int,
+    # out
+    contacts: Contacts,
+):
+    """Kernel over vertices: their ``near`` faces and how many there are; 0 where the list has overflowed."""
+    for v in range(wp.tid(), vertices, threads):
+        first = lists.rows[v]
+        end = lists.rows[v + 1]
+        near = wp.int32(0)
+        if contacts.code.shape[0] // 2 + 3 * end <= contacts.code.shape[0]:
+            for e in range(first, end):
+                if _number(contacts.code, e) != NONE:
+                    contacts.near[first + near] = e
+                    near += 1
+        contacts.counts[v] = wp.vec2i(near, 0)
 
-    ``distant`` contacts may have no force.
-    """
+
+@cache
+def count_multiplicities(dtype):
+    """Kernel over the listed pairs of a vertex and a face: the multiplicities of the terms that a near face owns."""
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
     points = wp.array(dtype=vec3)
@@ -377,6 +402,57 @@ def find_vertex_contacts(dtype):
         return edges
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
+    def count_each_multiplicity(
+        # elements
+        lists: Pairs,
+        # state in
+        x: wp.array(dtype=vec3),
+        correction: wp.array(dtype=vec3),
+        # parameters
+        vertices: int,
+        # out
+        contacts: Contacts,
+    ):
+        for e in range(wp.tid(), wp.min(lists.counts[0], lists.stencils.shape[0]), lists.threads):
+            s = _stencil(lists.stencils, e)
+            if s[0] >= vertices or _number(contacts.code, e) == NONE:
+                continue
+            first = lists.rows[s[0]]
+            near = contacts.counts[s[0]][0]
+            if near < 2:
+                continue
+            end = first + near
+            a = at(x, correction, s[0])
+            found = SIX()
+            for i in range(1, 4):
+                j = wp.where(i == 3, 1, i + 1)
+                owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[j])
+                if owner == e:
+                    P = at(x, correction, s[i]) - a
+                    Q = at(x, correction, s[j]) - a
+                    if along(P, Q) > ZERO and along(Q, P) > ZERO:
+                        m -= faces - 1
+                    found[i - 1] = m
+                owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[i])
+                if owner == e:
+                    m += 1 + faces
+                    m -= edges_at(lists.stencils, contacts.code, contacts.near, first, end, s[i], a, x, correction)
+                    found[i + 2] = m
+            contacts.multiplicities[e] = found
+
+    return count_each_multiplicity
+
+
+@cache
+def find_vertex_contacts(dtype):
+    """Kernel over vertices: their contacts at x, or x + correction, with the faces of :func:`list_near_faces`.
+
+    ``distant`` contacts may have no force.
+    """
+    vec3, _ = types(dtype)
+    at = vertex_of(dtype)
+
+    @wp.kernel(module=module_of(dtype), enable_backward=False)
     def find_contacts_of_vertex(
         # elements
         lists: Pairs,
@@ -394,23 +470,14 @@ def find_vertex_contacts(dtype):
         contacts: Contacts,
     ):
         for v in range(wp.tid(), vertices, threads):
-            first = lists.rows[v]
-            end = lists.rows[v + 1]
-            extra = contacts.code.shape[0] // 2 + 3 * first
-            if first == end or extra + 3 * (end - first) > contacts.code.shape[0]:  # the latter where the list has overflowed
-                continue
-            near = wp.int32(0)
-            for e in range(first, end):
-                if _number(contacts.code, e) != NONE:
-                    contacts.near[first + near] = e
-                    near += 1
+            near = contacts.counts[v][0]
             if near == 0:
                 continue
-            cloth = lists.layout.cloth
+            first = lists.rows[v]
+            extra = contacts.code.shape[0] // 2 + 3 * first
             a = at(x, correction, v)
-            end = first + near
             extras = wp.int32(0)
-            for k in range(first, end):
+            for k in range(first, first + near):
                 e = _number(contacts.near, k)
                 code = _number(contacts.code, e)
                 s = _stencil(lists.stencils, e)
@@ -419,7 +486,7 @@ def find_vertex_contacts(dtype):
                 if has_obstacle(lists.layout, s):
                     r = laws.distance[1]
                     kA = laws.stiffness[1] * areas.of_vertices[v]
-                    if v >= cloth:
+                    if v >= lists.layout.cloth:
                         r *= CLOSE
                         kA /= CLOSE * CLOSE
                 b = at(x, correction, s[1]) - a
@@ -434,14 +501,13 @@ def find_vertex_contacts(dtype):
                     put_contact(e, s, w4, y, r, kA, x, pairs, contacts)
                 if near == 1:
                     continue
+                multiplicities = contacts.multiplicities[e]
                 for i in range(1, 4):
                     j = wp.where(i == 3, 1, i + 1)
                     P = corners[i - 1]
                     Q = corners[j - 1]
-                    owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[j])
-                    if along(P, Q) > ZERO and along(Q, P) > ZERO:
-                        m -= faces - 1
-                    if owner == e and m != 0:
+                    m = multiplicities[i - 1]
+                    if m != 0:
                         t = along(P, Q) / (along(P, Q) + along(Q, P))
                         y = (t - ONE) * P - t * Q
                         if distant or wp.length(y) < r:
@@ -451,20 +517,37 @@ def find_vertex_contacts(dtype):
                             slot = wp.where(code == code_between(i, j), e, extra + extras)
                             extras += wp.where(slot == e, 0, 1)
                             put_contact(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
-                    owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[i])
-                    if owner == e:
-                        m += 1 + faces
-                        m -= edges_at(lists.stencils, contacts.code, contacts.near, first, end, s[i], a, x, correction)
-                    if owner == e and m != 0 and (distant or wp.length(P) < r):
+                    m = multiplicities[i + 2]
+                    if m != 0 and (distant or wp.length(P) < r):
                         w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                         w4[i] = -ONE
                         slot = wp.where(code == code_between(i, i), e, extra + extras)
                         extras += wp.where(slot == e, 0, 1)
                         put_contact(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
-            if extras > 0:
-                set_shares(contacts, first, near, extra, extras)
+            contacts.counts[v] = wp.vec2i(near, extras)
 
     return find_contacts_of_vertex
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def share_contacts(
+    # elements
+    lists: Pairs,
+    # parameters
+    vertices: int,
+    lanes: int,
+    threads: int,
+    # out
+    contacts: Contacts,
+):
+    """Kernel over vertices, each of ``lanes`` threads: the shares of their contacts, see :func:`set_shares`."""
+    for thread in range(wp.tid(), vertices * lanes, threads):
+        v = thread // lanes
+        counts = contacts.counts[v]
+        if counts[1] > 0:
+            first = lists.rows[v]
+            extra = contacts.code.shape[0] // 2 + 3 * first
+            set_shares(contacts, first, counts[0], extra, counts[1], thread - v * lanes, lanes)
 
 
 @wp.func

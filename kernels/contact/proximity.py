@@ -133,8 +133,8 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     ``take`` (dtype, of_edges) returns a device function (surface, x, s, i, k, triangles, out) and the struct of ``out``. s is
     the stencil of a pair, i its vertex or edge, and k its triangle or other edge. The boxes are at x, or along moves ``p`` from
     there, of the cloth or of all vertices. A box meets those of its own level and those above, but that of a vertex that moves
-    meets those of all levels, for it may be larger. The rows of cells near each vertex or edge are divided among ``shares``
-    threads. Where there are more rows than buckets, as for long moves, it goes through the buckets instead.
+    meets those of all levels, for it may be larger. ``shares`` threads share the search of a vertex or edge.
+    Where there are more rows of cells than buckets, as for long moves, it goes through the buckets instead.
 
     Of two edges of one level, only one finds the other, by the order of their cells along z and y, or of their indices, which
     is also the order in the stencil.
@@ -214,7 +214,11 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                     everywhere = rows > wp.int64(buckets)
                     if everywhere:
                         width = 1
-                    for line in range(share, wp.int32(wp.min(rows, wp.int64(buckets))), shares):
+                    # Many rows are divided among the threads; else the entries of each row, for most may lie in few of them.
+                    by_rows = rows >= wp.int64(shares * shares)
+                    stride = wp.where(by_rows, 1, shares)
+                    skipped = wp.where(by_rows, 0, share)
+                    for line in range(share - skipped, wp.int32(wp.min(rows, wp.int64(buckets))), shares // stride):
                         cz = one[2] + line // height
                         cy = one[1] + line - height * (cz - one[2])
                         if wp.static(of_edges):
@@ -227,10 +231,10 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                         end = number(grid.first, wp.min(run + width, buckets))
                         # A sequence beyond the last bucket continues at the first.
                         more = number(grid.first, wp.max(run + width - buckets, 0))
-                        at = next_meeting(grid.boxes, begin, end, more, ends)
+                        at = next_meeting(grid.boxes, begin + skipped, end, more, stride, ends)
                         while at < end + more:
                             slot = wp.where(at < end, at, at - end)
-                            at = next_meeting(grid.boxes, at + 1, end, more, ends)
+                            at = next_meeting(grid.boxes, at + stride, end, more, stride, ends)
                             entry = four(grid.entries, slot)
                             if everywhere:
                                 cy = entry[1]

@@ -147,9 +147,9 @@ def boxes_meet(low: Any, high: Any, l: Any, u: Any):
 def box_tests(dtype):
     """Device functions ``ends_of`` (low, high) → a box as it is stored in the grid, and ``next_meeting``.
 
-    ``next_meeting`` returns the first entry from ``at`` to ``end`` whose box meets the given one; ``ends`` is that box with low
-    and high exchanged, and ``more`` entries follow from the first bucket on. It has one branch an entry: a search takes .7 of
-    the time on the CPU.
+    ``next_meeting`` returns the first of every ``stride``-th entry from ``at`` to ``end`` whose box meets the given one;
+    ``ends`` is that box with low and high exchanged, and ``more`` entries follow from the first bucket on. It has one branch
+    an entry: a search takes .7 of the time on the CPU.
     """
     vec3, _ = types(dtype)
     vec8 = wp.types.vector(8, dtype)
@@ -160,11 +160,11 @@ def box_tests(dtype):
         return vec8(low[0], low[1], low[2], -high[0], -high[1], -high[2], dtype(0.0), dtype(0.0))
 
     @wp.func_native(
-        "for (; at < end + more; ++at) { "
+        "for (; at < end + more; at += stride) { "
         f"const {number}* b = (const {number}*)boxes.data + 8 * size_t(at < end ? at : at - end); "
         "bool apart = false; for (int n = 0; n < 8; ++n) apart |= b[n] > ends[n]; if (!apart) break; } return at;"
     )
-    def next_meeting(boxes: wp.array(dtype=vec8), at: int, end: int, more: int, ends: vec8) -> int: ...
+    def next_meeting(boxes: wp.array(dtype=vec8), at: int, end: int, more: int, stride: int, ends: vec8) -> int: ...
 
     return ends_of, next_meeting
 

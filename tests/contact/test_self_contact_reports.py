@@ -1,11 +1,13 @@
 """What a run says of contact of cloth with itself: pairs, lists, moves that were kept, gaps, and where it cannot go on."""
 
 import csv
+import gc
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 from pxr import Usd, UsdGeom
 
 import warpcloth as wc
@@ -224,6 +226,17 @@ def test_no_memory_for_pairs(solver, tmp_path, monkeypatch, device):
         assert found.status.message.startswith(f"stopped before the end of frame {frame + 1}: the cloth has ")
         assert "pairs that are near one another, which takes" in found.status.message
         assert (np.float32(found.points) == np.float32(whole.points)[: frame + 1]).all()  # as the file holds them
+
+
+@pytest.mark.parametrize("solver", [SOLVER, wc.Newton(substeps=2)], ids=["xpbd", "newton"])
+def test_pairs_take_the_memory_that_is_asked_for(solver, device):
+    """To 15 %, with friction; arrays of the mesh are far smaller here."""
+    stepper = solver.bind(replace(sheets(n=10, gap=0.2), self_contact=wc.SelfContact(friction=0.3)).build(device=device))
+    stepper.pairs.grow_to(1e5)
+    capacity = stepper.pairs.proximity.capacity
+    arrays = {each.ptr: each for each in gc.get_objects() if type(each) is wp.array and each.ptr and each.size >= capacity}
+    taken = sum(each.capacity for each in arrays.values()) / capacity
+    assert abs(taken / proximity.BYTES_OF_A_PAIR - 1.0) < 0.15
 
 
 def test_work_of_pins_where_a_step_makes_room(device):

@@ -4,6 +4,7 @@ import warp as wp
 
 from ..core.dynamic import DynamicElements
 from ..core.filled import filled
+from ..kernels.block_rows import LANES
 from ..kernels.contact import pair_follow
 from ..kernels.contact import pair_potential as potential
 from ..kernels.contact import self_contact as kernels
@@ -40,7 +41,8 @@ class PairContact(DynamicElements):
         self.obstacles, self._goal = (surface.vectors() for _ in range(2)) if surface.obstacles else (None, None)
         self._of_edges = not bounded  # the filter alone keeps edges, and vertices of meshes, apart in explicit steps
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
-        made = potential.find_near_faces, potential.find_vertex_contacts, potential.find_edge_contacts
+        made = potential.find_near_faces, potential.count_multiplicities, potential.find_vertex_contacts
+        made = *made, potential.find_edge_contacts
         self._launch = model.launcher((made, model.dtype))
         self._corners = model.device.is_cuda
 
@@ -60,7 +62,9 @@ class PairContact(DynamicElements):
             kinds |= {"parts": wp.vec4i, "offset": wp.vec3d, "travel": wp.vec3d}
         arrays = {name: wp.zeros(slots, dtype=kind, device=device) for name, kind in kinds.items()}
         contacts = filled(potential.Contacts, **{"parts": pairs.stencils, "moves": self.surface.moves_of_step} | arrays)
-        contacts.near = wp.zeros(len(lists.stencils), dtype=wp.int32, device=device)
+        for name, kind in (("near", wp.int32), ("multiplicities", potential.SIX)):
+            setattr(contacts, name, wp.zeros(len(lists.stencils), dtype=kind, device=device))
+        contacts.counts = wp.zeros(self.surface.count, dtype=wp.vec2i, device=device)
         contacts.followed.mode = wp.zeros(1, dtype=wp.int32, device=device)
         self.hold_pairs(pairs, contacts, contacts.stiffness)
         if self._in_turn is not None:
@@ -90,8 +94,13 @@ class PairContact(DynamicElements):
         vertices = self.surface.count if self._of_edges else self.model.count
         self._launch(potential.find_near_faces, self.lists.threads, [self.lists, *positions, vertices], [self.data])
         threads = 1 if self.model.device.is_cpu else vertices
+        self.model.launch(potential.list_near_faces, threads, [self.lists, vertices, threads], [self.data])
+        given = [self.lists, x, correction, vertices]
+        self._launch(potential.count_multiplicities, self.lists.threads, given, [self.data])
         given = [self.lists, self._areas, x, correction, self._laws, goal is not None, vertices, threads]
         self._launch(potential.find_vertex_contacts, threads, given, [self.pairs, self.data])
+        lanes, threads = (1, 1) if self.model.device.is_cpu else (LANES, LANES * vertices)
+        self.model.launch(potential.share_contacts, threads, [self.lists, vertices, lanes, threads], [self.data])
         if self._of_edges:
             given = [self.lists, self._areas, *positions]
             self._launch(potential.find_edge_contacts, self.lists.threads, given, [self.pairs, self.data])

@@ -17,8 +17,8 @@ from ..kernels.contact.pair_potential import CLOSE
 # 64th less, so that a list serves two rounds despite rounding.
 WAY = 0.25
 ROUND = WAY * 63 / 64
-# Of a pair in the list 36, its gap 64, two slots of contact with forces 268, blocks 104 and, with meshes, 64 of these.
-BYTES_OF_A_PAIR = 36 + 64 + 2 * (268 + 104 + 64)
+# Of a pair in the list, its gap, and two slots each of contact and of friction with forces and blocks.
+BYTES_OF_A_PAIR = 4800
 
 
 class Proximity:
