@@ -17,8 +17,8 @@ from ..kernels.contact.pair_potential import CLOSE
 # 64th less, so that a list serves two rounds despite rounding.
 WAY = 0.25
 ROUND = WAY * 63 / 64
-# Of a pair in the list, with its gap, and two slots each of contact and of friction with forces and blocks; in float32 on the CPU.
-BYTES_OF_A_PAIR = 4800
+# Of a pair in the list, with its gap, and two slots each of contact and of friction with forces and blocks, at most.
+BYTES_OF_A_PAIR = 5400
 
 
 class Proximity:
