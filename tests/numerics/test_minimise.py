@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.optimize import brentq
 
 import warpcloth as wc
 from support.steps import swinging
 from warpcloth.core import sums
 from warpcloth.core.status import Result
+from warpcloth.kernels import minimise as kernels
 from warpcloth.numerics.minimise import Minimiser
 
 EPS = float(np.finfo(np.float32).eps)
@@ -240,3 +242,31 @@ def test_sums_are_shared_by_blocks(device, monkeypatch):
                 found.append([array.numpy() for array in (state.energy, state.square, state.acceleration)])
     np.testing.assert_allclose(*found, rtol=1e-9)
     assert np.abs(ends[0] - ends[2]).max() < 1e-12 and np.abs(ends[1] - ends[3]).max() < 1e-12
+
+
+def test_a_factor_of_the_negative_part_that_failed_waits_for_an_iteration(device):
+    """The factors of the matrices of five iterations, in copies whose matrix is definite with ½, all, and none of that part."""
+
+    def scalars(*values, dtype=wp.float64):
+        return wp.array(values, dtype=dtype, device=device)
+
+    progress, limits = kernels.DescentState(), kernels.Limits()
+    for name in ("active", "reduced", "iterations"):
+        setattr(progress, name, scalars(*[int(name == "active")] * 3, dtype=wp.int32))
+    progress.residual, progress.previous = scalars(1.0, 1.0, 1.0), scalars(0.0, 0.0, 0.0)
+    progress.proceed, progress.more, unsolved, wanted = (wp.zeros(3, dtype=wp.int32, device=device) for _ in range(4))
+    limits.tolerance, policy, tolerance = scalars(1e-3), scalars(0.0, 0.0, 0.0), scalars(0.0, 0.0, 0.0)
+    definite, found = np.array([0.5, 1.0, 0.0]), [[], [], []]
+    for iteration in range(5):
+        progress.iterations.fill_(iteration)
+        given = [1, limits, progress, policy, tolerance, wanted, unsolved]
+        wp.launch(kernels.begin_newton(), 3, inputs=given, device=device)
+        while unsolved.numpy()[0]:
+            for copy in np.flatnonzero(wanted.numpy()):
+                found[copy].append(policy.numpy()[copy])
+            negative = scalars(*(policy.numpy() > definite).astype(int).tolist(), dtype=wp.int32)
+            unsolved.zero_()
+            wp.launch(kernels.find_indefinite(), 3, inputs=[negative, progress, policy, wanted, unsolved], device=device)
+    assert found[0] == [1.0, 0.75, 0.5, 0.5, 0.75, 0.5, 0.5, 0.75, 0.5]
+    assert found[1] == [1.0] * 5
+    assert found[2] == [1.0, 0.75, 0.5, 0.25, 0.0, 0.0, 0.25, 0.0, 0.0, 0.25, 0.0]
