@@ -10,8 +10,9 @@ from functools import cache
 import warp as wp
 
 from .block_pattern import find_column
-from .block_rows import block_rows, lanes_of_rows, product_of_row
+from .block_rows import block_rows, lanes_of_rows, product_of_row, symmetric_product
 from .linear import Solves
+from .memory import load
 from .reduce import stands_aside, sum_of_lanes
 from .vectors import types
 
@@ -19,7 +20,7 @@ MODULE = "warpcloth.multigrid"
 # Weight of Jacobi sweeps. All below 2 converge, because S/ω is at most A⁻¹.
 OMEGA = 1.8
 # New coarse matrices cost about as much as so many cycles, and the sweeps of the finest level as one.
-SPARED = 3
+SPARED = 4
 # The other preconditioner is tried again after so many solves.
 AGED = 64
 # A solve with diagonal blocks ends once it has cost this many times a solve with multigrid.
@@ -464,9 +465,12 @@ def end_choice():
 
 @cache
 def subtract_product(dtype, block: int, terms: int = 0):
-    """Kernel over the lanes of block rows: out = r − A x, minus a ``further`` product with x if that is not None."""
+    """Kernel over (copies, threads): out = r − A x, minus a ``further`` product with x if that is not None.
+
+    ``out`` may be r. On CUDA threads share rows; on the CPU a copy has one, and ``scratch`` takes A x.
+    """
     vec3, _ = types(dtype)
-    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
+    remaining, lanes, multiply = residual(dtype, block, terms), lanes_of_rows(block), symmetric_product(dtype)
 
     @wp.kernel(module=_module(dtype, terms), enable_backward=False)
     def subtract_rows(
@@ -481,23 +485,33 @@ def subtract_product(dtype, block: int, terms: int = 0):
         per_copy: int,
         # out
         out: wp.array(dtype=vec3),
+        scratch: wp.array(dtype=vec3),
     ):
-        thread = wp.tid()
-        i = thread // wp.static(lanes)
-        if active[i // per_copy] == 0:
+        copy, thread = wp.tid()
+        if active[copy] == 0:
             return
-        lane = thread - i * wp.static(lanes)
-        total = remaining(i, lane, matrix, x, further, r)
-        if lane == 0:
-            out[i] = total
+        if wp.static(block == 0):
+            multiply(matrix, copy * per_copy, (copy + 1) * per_copy, x, scratch)
+            for i in range(copy * per_copy, (copy + 1) * per_copy):
+                total = r[i] - scratch[i]
+                if further:
+                    total -= further[i]
+                out[i] = total
+        else:
+            i = copy * per_copy + thread // wp.static(lanes)
+            lane = thread % wp.static(lanes)
+            total = remaining(i, lane, matrix, x, further, r)
+            if lane == 0:
+                out[i] = total
 
     return subtract_rows
 
 
 @cache
 def restrict(dtype):
-    """Kernel over (copies, coarse rows): r_c = Pᵀr, x_c = S r_c."""
+    """Kernel over (copies, threads), which share the coarse rows: r_c = Pᵀr, x_c = S r_c."""
     vec3, mat33 = types(dtype)
+    index, weight, vector = load(wp.int32), load(dtype), load(vec3)
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def restrict_rows(
@@ -512,27 +526,30 @@ def restrict(dtype):
         active: wp.array(dtype=wp.int32),
         per_copy: int,
         coarse_per_copy: int,
+        threads: int,
         # out
         coarse_r: wp.array(dtype=vec3),
         coarse_x: wp.array(dtype=vec3),
     ):
-        copy, i = wp.tid()
+        copy, thread = wp.tid()
         if active[copy] == 0:
             return
-        total = vec3()
-        for s in range(offsets[i], offsets[i + 1]):
-            total += weights[s] * r[copy * per_copy + sources[s]]
-        at = copy * coarse_per_copy + i
-        coarse_r[at] = total
-        coarse_x[at] = sweep[at] * total
+        for i in range(thread, coarse_per_copy, threads):
+            total = vec3()
+            for s in range(index(offsets, i), index(offsets, i + 1)):
+                total += weight(weights, s) * vector(r, copy * per_copy + index(sources, s))
+            at = copy * coarse_per_copy + i
+            coarse_r[at] = total
+            coarse_x[at] = sweep[at] * total
 
     return restrict_rows
 
 
 @cache
 def prolong(dtype):
-    """Kernel over (copies, rows): d = P x_c."""
+    """Kernel over (copies, threads), which share the rows: d = P x_c."""
     vec3, _ = types(dtype)
+    index, weight, vector = load(wp.int32), load(dtype), load(vec3)
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def prolong_rows(
@@ -546,25 +563,30 @@ def prolong(dtype):
         active: wp.array(dtype=wp.int32),
         per_copy: int,
         coarse_per_copy: int,
+        threads: int,
         # out
         d: wp.array(dtype=vec3),
     ):
-        copy, i = wp.tid()
+        copy, thread = wp.tid()
         if active[copy] == 0:
             return
-        total = vec3()
-        for s in range(offsets[i], offsets[i + 1]):
-            total += weights[s] * coarse_x[copy * coarse_per_copy + parents[s]]
-        d[copy * per_copy + i] = total
+        for i in range(thread, per_copy, threads):
+            total = vec3()
+            for s in range(index(offsets, i), index(offsets, i + 1)):
+                total += weight(weights, s) * vector(coarse_x, copy * coarse_per_copy + index(parents, s))
+            d[copy * per_copy + i] = total
 
     return prolong_rows
 
 
 @cache
 def sweep_after(dtype, block: int, terms: int = 0):
-    """Kernel over the lanes of block rows: x += d + S(r − A d), minus a ``further`` product with d if that is not None."""
+    """Kernel over (copies, threads): x += d + S(r − A d), minus a ``further`` product with d if that is not None.
+
+    Threads are those of :func:`subtract_product`, and ``scratch`` takes A d.
+    """
     vec3, mat33 = types(dtype)
-    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
+    remaining, lanes, multiply = residual(dtype, block, terms), lanes_of_rows(block), symmetric_product(dtype)
 
     @wp.kernel(module=_module(dtype, terms), enable_backward=False)
     def sweep_rows(
@@ -580,14 +602,24 @@ def sweep_after(dtype, block: int, terms: int = 0):
         per_copy: int,
         # in and out
         x: wp.array(dtype=vec3),
+        # out
+        scratch: wp.array(dtype=vec3),
     ):
-        thread = wp.tid()
-        i = thread // wp.static(lanes)
-        if active[i // per_copy] == 0:
+        copy, thread = wp.tid()
+        if active[copy] == 0:
             return
-        lane = thread - i * wp.static(lanes)
-        total = remaining(i, lane, matrix, d, further, r)
-        if lane == 0:
-            x[i] = x[i] + d[i] + sweep[i] * total
+        if wp.static(block == 0):
+            multiply(matrix, copy * per_copy, (copy + 1) * per_copy, d, scratch)
+            for i in range(copy * per_copy, (copy + 1) * per_copy):
+                total = r[i] - scratch[i]
+                if further:
+                    total -= further[i]
+                x[i] = x[i] + d[i] + sweep[i] * total
+        else:
+            i = copy * per_copy + thread // wp.static(lanes)
+            lane = thread % wp.static(lanes)
+            total = remaining(i, lane, matrix, d, further, r)
+            if lane == 0:
+                x[i] = x[i] + d[i] + sweep[i] * total
 
     return sweep_rows

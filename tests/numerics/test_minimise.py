@@ -254,11 +254,12 @@ def test_a_factor_of_the_negative_part_that_failed_waits_for_an_iteration(device
     for name in ("active", "reduced", "iterations"):
         setattr(progress, name, scalars(*[int(name == "active")] * 3, dtype=wp.int32))
     progress.residual, progress.previous = scalars(1.0, 1.0, 1.0), scalars(0.0, 0.0, 0.0)
-    progress.proceed, progress.more, unsolved, wanted = (wp.zeros(3, dtype=wp.int32, device=device) for _ in range(4))
+    progress.proceed, progress.more, unsolved, wanted, outdated = (wp.zeros(3, dtype=wp.int32, device=device) for _ in range(5))
     limits.tolerance, policy, tolerance = scalars(1e-3), scalars(0.0, 0.0, 0.0), scalars(0.0, 0.0, 0.0)
     definite, found = np.array([0.5, 1.0, 0.0]), [[], [], []]
     for iteration in range(5):
         progress.iterations.fill_(iteration)
+        outdated.zero_()
         given = [1, limits, progress, policy, tolerance, wanted, unsolved]
         wp.launch(kernels.begin_newton(), 3, inputs=given, device=device)
         while unsolved.numpy()[0]:
@@ -266,7 +267,9 @@ def test_a_factor_of_the_negative_part_that_failed_waits_for_an_iteration(device
                 found[copy].append(policy.numpy()[copy])
             negative = scalars(*(policy.numpy() > definite).astype(int).tolist(), dtype=wp.int32)
             unsolved.zero_()
-            wp.launch(kernels.find_indefinite(), 3, inputs=[negative, progress, policy, wanted, unsolved], device=device)
+            given = [negative, progress, policy, outdated, wanted, unsolved]
+            wp.launch(kernels.find_indefinite(), 3, inputs=given, device=device)
+        assert (outdated.numpy() == progress.reduced.numpy()).all()
     assert found[0] == [1.0, 0.75, 0.5, 0.5, 0.75, 0.5, 0.5, 0.75, 0.5]
     assert found[1] == [1.0] * 5
     assert found[2] == [1.0, 0.75, 0.5, 0.25, 0.0, 0.0, 0.25, 0.0, 0.0, 0.25, 0.0]

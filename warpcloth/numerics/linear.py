@@ -37,6 +37,7 @@ class ConjugateGradients:
 
     Attributes:
         iteration: Number of iterations of the last solve, (B,) int32.
+        outdated: Copies of which the next solve with coarse matrices computes them again, (B,) int32; None without a choice.
     """
 
     capturable = True
@@ -44,6 +45,7 @@ class ConjugateGradients:
     def __init__(self, matrix, iterations, multigrid=None, choice=None):
         model = self.model = matrix.model
         self.matrix, self.multigrid, self.choice = matrix, multigrid, choice
+        self.outdated = None if choice is None else choice.outdated
         matrix.prepare()
 
         def per_unknown(dtype):
@@ -78,8 +80,8 @@ class ConjugateGradients:
 
     def outdate(self):
         """Launches that the next solve with coarse matrices computes them again."""
-        if self.choice is not None:
-            self.choice.launch_outdated()
+        if self.outdated is not None:
+            self.outdated.fill_(1)
 
     def update(self):
         """Launches the preconditioner of :meth:`solve_again` for the present A."""
@@ -171,7 +173,7 @@ class Factorised:
         hessian: The :class:`warpcloth.core.hessian.Hessian`.
     """
 
-    capturable = False
+    capturable, outdated = False, None
 
     def __init__(self, hessian):
         self.hessian, self.model = hessian, hessian.model

@@ -314,7 +314,7 @@ class Minimiser:
         """Launches the choice of the copies that are solved again, with a clamped Hessian."""
         self._unsolved.zero_()
         if self.adaptive:
-            out = [self._progress, self.hessian.policy, self._wanted, self._unsolved]
+            out = [self._progress, self.hessian.policy, self.linear.outdated, self._wanted, self._unsolved]
             self._launch(kernels.find_indefinite, self.model.copies, [self.linear.negative], out)
 
     def _launch_end(self):

@@ -18,6 +18,7 @@ class PreconditionerChoice:
         kept: The arrays (B,) on which the choice depends, by name, 0 at the start.
         by_blocks, by_cycles: The copies of the present solve by preconditioner, (B,) int32.
         due: Those of which it computes the coarse matrices, (B,) int32.
+        outdated: Those of which the next solve with coarse matrices computes them, (B,) int32.
         any_blocks, any_cycles, any_due: Whether there are any, (1,) int32.
     """
 
@@ -25,19 +26,16 @@ class PreconditionerChoice:
         model = self._model = multigrid.model
         self._iterations, self._cycle, self._choice = iterations, multigrid.cycle, kernels.ChoiceState()
         made = {"present": model.scalars(wp.vec4i), "past": model.scalars(wp.vec4d)}
-        made |= {name: model.scalars(wp.int32) for name in ("by_blocks", "by_cycles", "outdated", "due")}
+        of_copies = "by_blocks", "by_cycles", "due", "outdated"
+        made |= {name: model.scalars(wp.int32) for name in of_copies}
         flags = "any_blocks", "any_cycles", "any_due"
         made |= {name: wp.zeros(1, dtype=wp.int32, device=model.device) for name in flags}
         for name, array in made.items():
             setattr(self._choice, name, array)
         self.kept = {"preconditioner": made["present"], "gains of preconditioners": made["past"]}
-        self.by_blocks, self.by_cycles, self.due = made["by_blocks"], made["by_cycles"], made["due"]
+        self.by_blocks, self.by_cycles, self.due, self.outdated = (made[name] for name in of_copies)
         self.any_blocks, self.any_cycles, self.any_due = (made[name] for name in flags)
         self._launch = model.launcher(((kernels.begin_choice, kernels.end_choice),))
-
-    def launch_outdated(self):
-        """Launches that each copy computes its coarse matrices in its next solve with them, so at least once in a step."""
-        self._choice.outdated.fill_(1)
 
     def launch_begin(self, solves, wanted):
         """Divides the copies that are ``wanted`` (B,) by preconditioner, and sets their largest number of iterations."""
