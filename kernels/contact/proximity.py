@@ -214,7 +214,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                     everywhere = rows > wp.int64(buckets)
                     if everywhere:
                         width = 1
-                    # Many rows are divided among the threads; else the entries of each row, for most may lie in few of them.
+                    # Many rows are divided among the threads. Of few rows the entries are, for most of these rows may be empty.
                     by_rows = rows >= wp.int64(shares * shares)
                     stride = wp.where(by_rows, 1, shares)
                     skipped = wp.where(by_rows, 0, share)

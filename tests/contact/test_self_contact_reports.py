@@ -228,15 +228,17 @@ def test_no_memory_for_pairs(solver, tmp_path, monkeypatch, device):
         assert (np.float32(found.points) == np.float32(whole.points)[: frame + 1]).all()  # as the file holds them
 
 
-@pytest.mark.parametrize("solver, least", [(SOLVER, 0.4), (wc.Newton(substeps=2), 0.8)], ids=["xpbd", "newton"])
-def test_pairs_take_at_most_the_memory_that_is_asked_for(solver, least, device):
-    """With friction; sweeps need no matrix. Arrays of the mesh are far smaller here."""
+@pytest.mark.parametrize("solver", [SOLVER, wc.Newton(substeps=2)], ids=["xpbd", "newton"])
+def test_pairs_take_at_most_the_memory_that_is_asked_for(solver, device):
+    """With friction; meshes, float64 and CUDA take more. Arrays of the mesh are far smaller here."""
+    before = [each for each in gc.get_objects() if type(each) is wp.array]  # keeps them, so that new ones are others
     stepper = solver.bind(replace(sheets(n=10, gap=0.2), self_contact=wc.SelfContact(friction=0.3)).build(device=device))
     stepper.pairs.grow_to(1e5)
     capacity = stepper.pairs.proximity.capacity
-    arrays = {each.ptr: each for each in gc.get_objects() if type(each) is wp.array and each.ptr and each.size >= capacity}
-    taken = sum(each.capacity for each in arrays.values()) / capacity
-    assert least <= taken / proximity.BYTES_OF_A_PAIR <= 1.0
+    known = {each.ptr for each in before}
+    arrays = {each.ptr: each for each in gc.get_objects() if type(each) is wp.array and each.size >= capacity}
+    taken = sum(each.capacity for each in arrays.values() if each.ptr not in known) / capacity
+    assert 0.6 <= taken / proximity.BYTES_OF_A_PAIR <= 1.0
 
 
 def test_work_of_pins_where_a_step_makes_room(device):

@@ -244,20 +244,20 @@ def test_sums_are_shared_by_blocks(device, monkeypatch):
     assert np.abs(ends[0] - ends[2]).max() < 1e-12 and np.abs(ends[1] - ends[3]).max() < 1e-12
 
 
-def test_a_factor_of_the_negative_part_that_failed_waits_for_an_iteration(device):
-    """The factors of the matrices of five iterations, in copies whose matrix is definite with ½, all, and none of that part."""
+def test_the_negative_part_is_reduced_as_far_as_needed_and_restored_by_quarters(device):
+    """The factors of the matrices of four iterations, in copies whose matrix is definite with ½, all, and none of that part."""
 
     def scalars(*values, dtype=wp.float64):
         return wp.array(values, dtype=dtype, device=device)
 
     progress, limits = kernels.DescentState(), kernels.Limits()
-    for name in ("active", "reduced", "iterations"):
+    for name in ("active", "iterations"):
         setattr(progress, name, scalars(*[int(name == "active")] * 3, dtype=wp.int32))
     progress.residual, progress.previous = scalars(1.0, 1.0, 1.0), scalars(0.0, 0.0, 0.0)
     progress.proceed, progress.more, unsolved, wanted, outdated = (wp.zeros(3, dtype=wp.int32, device=device) for _ in range(5))
     limits.tolerance, policy, tolerance = scalars(1e-3), scalars(0.0, 0.0, 0.0), scalars(0.0, 0.0, 0.0)
     definite, found = np.array([0.5, 1.0, 0.0]), [[], [], []]
-    for iteration in range(5):
+    for iteration in range(4):
         progress.iterations.fill_(iteration)
         outdated.zero_()
         given = [1, limits, progress, policy, tolerance, wanted, unsolved]
@@ -267,9 +267,9 @@ def test_a_factor_of_the_negative_part_that_failed_waits_for_an_iteration(device
                 found[copy].append(policy.numpy()[copy])
             negative = scalars(*(policy.numpy() > definite).astype(int).tolist(), dtype=wp.int32)
             unsolved.zero_()
-            given = [negative, progress, policy, outdated, wanted, unsolved]
+            given = [negative, policy, outdated, wanted, unsolved]
             wp.launch(kernels.find_indefinite(), 3, inputs=given, device=device)
-        assert (outdated.numpy() == progress.reduced.numpy()).all()
-    assert found[0] == [1.0, 0.75, 0.5, 0.5, 0.75, 0.5, 0.5, 0.75, 0.5]
-    assert found[1] == [1.0] * 5
-    assert found[2] == [1.0, 0.75, 0.5, 0.25, 0.0, 0.0, 0.25, 0.0, 0.0, 0.25, 0.0]
+        assert outdated.numpy().tolist() == [1, 0, 1]
+    assert found[0] == [1.0] + 4 * [0.75, 0.5]
+    assert found[1] == [1.0] * 4
+    assert found[2] == [1.0, 0.75, 0.5] + 4 * [0.25, 0.0]

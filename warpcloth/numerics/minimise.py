@@ -127,7 +127,7 @@ class Minimiser:
         """Allocates what the kernels know of the descent, and what the host reads of it."""
         model, flag = self.model, partial(wp.zeros, 1, dtype=wp.int32, device=self.model.device)
         self._progress, self._limits = kernels.DescentState(), kernels.Limits()
-        for name in ("active", "stays", "end", "iterations", "reduced"):
+        for name in ("active", "stays", "end", "iterations"):
             setattr(self._progress, name, model.scalars(wp.int32))
         for name in ("residual", "previous"):
             setattr(self._progress, name, model.scalars())
@@ -314,7 +314,7 @@ class Minimiser:
         """Launches the choice of the copies that are solved again, with a clamped Hessian."""
         self._unsolved.zero_()
         if self.adaptive:
-            out = [self._progress, self.hessian.policy, self.linear.outdated, self._wanted, self._unsolved]
+            out = [self.hessian.policy, self.linear.outdated, self._wanted, self._unsolved]
             self._launch(kernels.find_indefinite, self.model.copies, [self.linear.negative], out)
 
     def _launch_end(self):

@@ -36,8 +36,8 @@ class Newton(ImplicitStep):
             than 100; in ``flag`` one takes 137.
         hessian: Treatment of an indefinite Hessian (Choi and Ko 2002 for springs). ``"clamp"`` and ``"absolute"`` make the
             block of each element semi-definite in every iteration; ``"adaptive"`` reduces its negative part by quarters, only
-            as far as the matrix needs to be definite, and restores a quarter after an iteration that had not to reduce it;
-            ``"raw"`` changes nothing.
+            as far as the matrix needs to be definite, and restores a quarter in each further iteration; ``"raw"`` changes
+            nothing.
         linear: ``"cg"`` solves by conjugate gradients, to the accuracy that the Newton iteration needs, and meshes of 200
             vertices and more with a multigrid cycle as preconditioner where this takes less work. ``"factorised"``
             factorises on the host, which is 3 to 6 times slower for ``hanging`` with 32² and 64² vertices, but takes any
