@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from .block_pattern import find_column
-from .block_rows import block_rows, lanes_of_rows, product_of_row, symmetric_product
+from .block_rows import block_rows, lanes_of_rows, product_of_row
 from .linear import Solves
 from .memory import load
 from .reduce import stands_aside, sum_of_lanes
@@ -467,10 +467,10 @@ def end_choice():
 def subtract_product(dtype, block: int, terms: int = 0):
     """Kernel over (copies, threads): out = r − A x, minus a ``further`` product with x if that is not None.
 
-    ``out`` may be r. On CUDA threads share rows; on the CPU a copy has one, and ``scratch`` takes A x.
+    ``out`` may be r. On CUDA threads share rows; on the CPU a copy has one, for each would copy the structs.
     """
     vec3, _ = types(dtype)
-    remaining, lanes, multiply = residual(dtype, block, terms), lanes_of_rows(block), symmetric_product(dtype)
+    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
 
     @wp.kernel(module=_module(dtype, terms), enable_backward=False)
     def subtract_rows(
@@ -485,18 +485,13 @@ def subtract_product(dtype, block: int, terms: int = 0):
         per_copy: int,
         # out
         out: wp.array(dtype=vec3),
-        scratch: wp.array(dtype=vec3),
     ):
         copy, thread = wp.tid()
         if active[copy] == 0:
             return
         if wp.static(block == 0):
-            multiply(matrix, copy * per_copy, (copy + 1) * per_copy, x, scratch)
             for i in range(copy * per_copy, (copy + 1) * per_copy):
-                total = r[i] - scratch[i]
-                if further:
-                    total -= further[i]
-                out[i] = total
+                out[i] = remaining(i, 0, matrix, x, further, r)
         else:
             i = copy * per_copy + thread // wp.static(lanes)
             lane = thread % wp.static(lanes)
@@ -583,10 +578,10 @@ def prolong(dtype):
 def sweep_after(dtype, block: int, terms: int = 0):
     """Kernel over (copies, threads): x += d + S(r − A d), minus a ``further`` product with d if that is not None.
 
-    Threads are those of :func:`subtract_product`, and ``scratch`` takes A d.
+    Threads are those of :func:`subtract_product`.
     """
     vec3, mat33 = types(dtype)
-    remaining, lanes, multiply = residual(dtype, block, terms), lanes_of_rows(block), symmetric_product(dtype)
+    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
 
     @wp.kernel(module=_module(dtype, terms), enable_backward=False)
     def sweep_rows(
@@ -602,19 +597,13 @@ def sweep_after(dtype, block: int, terms: int = 0):
         per_copy: int,
         # in and out
         x: wp.array(dtype=vec3),
-        # out
-        scratch: wp.array(dtype=vec3),
     ):
         copy, thread = wp.tid()
         if active[copy] == 0:
             return
         if wp.static(block == 0):
-            multiply(matrix, copy * per_copy, (copy + 1) * per_copy, d, scratch)
             for i in range(copy * per_copy, (copy + 1) * per_copy):
-                total = r[i] - scratch[i]
-                if further:
-                    total -= further[i]
-                x[i] = x[i] + d[i] + sweep[i] * total
+                x[i] = x[i] + d[i] + sweep[i] * remaining(i, 0, matrix, d, further, r)
         else:
             i = copy * per_copy + thread // wp.static(lanes)
             lane = thread % wp.static(lanes)

@@ -44,7 +44,7 @@ class _Level:
     def block_rows(self):
         """Returns the :func:`warpcloth.kernels.block_rows.block_rows`, which holds no references."""
         rows = block_rows(self._dtype)()
-        rows.offsets, rows.columns, rows.diagonal, rows.values = self.offsets, self.columns, self.diagonal, self.values
+        rows.offsets, rows.columns, rows.values = self.offsets, self.columns, self.values
         return rows
 
 
@@ -174,7 +174,6 @@ class Multigrid:
         self.sweep = self._levels[0].sweep
         self._factor = wp.zeros(model.count, dtype=model.mat33, device=model.device)
         self._further = None if hessian.apart is None else model.vectors()
-        self._scratch = None if self._block else model.vectors()
         self.cycle = self._cost_of_cycle()
 
     def _make_kernels(self):
@@ -237,7 +236,7 @@ class Multigrid:
         for finer, level, transfer in zip(self._levels, self._levels[1:], self._transfers, strict=False):
             launch, further = self._with_dynamic(finer, x, active)
             given = [finer.block_rows(), x, further, right, active, finer.n]
-            launch(kernels.subtract_product, (B, self._threads(finer.n * self._lanes)), given, [finer.r, self._scratch])
+            launch(kernels.subtract_product, (B, self._threads(finer.n * self._lanes)), given, [finer.r])
             threads = self._threads(level.n)
             given = [*transfer.columns, finer.r, level.sweep, active, finer.n, level.n, threads]
             self._launch(kernels.restrict, (B, threads), given, [level.r, level.x])
@@ -254,8 +253,7 @@ class Multigrid:
                 self.model.lock(level.d)
             launch, further = self._with_dynamic(level, level.d, active)
             given = [level.block_rows(), level.sweep, level.d, further, level.r, active, level.n]
-            out = [level.x if k else z, self._scratch]
-            launch(kernels.sweep_after, (B, self._threads(level.n * self._lanes)), given, out)
+            launch(kernels.sweep_after, (B, self._threads(level.n * self._lanes)), given, [level.x if k else z])
 
     def _threads(self, count):
         """Returns the number of threads of a copy that share ``count`` items: one on the CPU."""
