@@ -197,7 +197,7 @@ def find_indefinite():
     """Kernel over copies: those whose matrix is indefinite are to be solved again, with a lower factor in ``policy``.
 
     ``unsolved`` is 0 before, and then 1 if there are any. With the factor 0 a matrix is definite. Coarse matrices of the one
-    that was not are ``outdated`` (B,), which may be None: with them multigrid takes 1.7 times the iterations.
+    that was not are ``outdated`` (B,), which may be None: for the next matrix they are poor preconditioners.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)

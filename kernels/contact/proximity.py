@@ -133,8 +133,8 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     ``take`` (dtype, of_edges) returns a device function (surface, x, s, i, k, triangles, out) and the struct of ``out``. s is
     the stencil of a pair, i its vertex or edge, and k its triangle or other edge. The boxes are at x, or along moves ``p`` from
     there, of the cloth or of all vertices. A box meets those of its own level and those above, but that of a vertex that moves
-    meets those of all levels, for it may be larger. ``shares`` threads share the search of a vertex or edge.
-    Where there are more rows of cells than buckets, as for long moves, it goes through the buckets instead.
+    meets those of all levels, for it may be larger. ``shares`` threads share the search of a vertex or edge. Where there are
+    more rows of cells than buckets, as for long moves, it goes through the buckets instead.
 
     Of two edges of one level, only one finds the other, by the order of their cells along z and y, or of their indices, which
     is also the order in the stencil.

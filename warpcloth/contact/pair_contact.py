@@ -41,9 +41,8 @@ class PairContact(DynamicElements):
         self.obstacles, self._goal = (surface.vectors() for _ in range(2)) if surface.obstacles else (None, None)
         self._of_edges = not bounded  # the filter alone keeps edges, and vertices of meshes, apart in explicit steps
         self._find = model.kernel(kernels.find_forces, model.dtype, bounded)
-        made = potential.find_near_faces, potential.count_multiplicities, potential.find_vertex_contacts
-        made = *made, potential.find_edge_contacts
-        self._launch = model.launcher((made, model.dtype))
+        of_vertices = potential.find_near_faces, potential.count_multiplicities, potential.find_vertex_contacts
+        self._launch = model.launcher(((*of_vertices, potential.find_edge_contacts), model.dtype))
         self._corners = model.device.is_cuda
 
     def list_corners(self):
@@ -93,14 +92,14 @@ class PairContact(DynamicElements):
         positions = [self._normals, x, correction, goal, move, self._laws]
         vertices = self.surface.count if self._of_edges else self.model.count
         self._launch(potential.find_near_faces, self.lists.threads, [self.lists, *positions, vertices], [self.data])
-        threads = 1 if self.model.device.is_cpu else vertices
+        threads, lanes = (1, 1) if self.model.device.is_cpu else (vertices, LANES)
         self.model.launch(potential.list_near_faces, threads, [self.lists, vertices, threads], [self.data])
         given = [self.lists, x, correction, vertices]
         self._launch(potential.count_multiplicities, self.lists.threads, given, [self.data])
         given = [self.lists, self._areas, x, correction, self._laws, goal is not None, vertices, threads]
         self._launch(potential.find_vertex_contacts, threads, given, [self.pairs, self.data])
-        lanes, threads = (1, 1) if self.model.device.is_cpu else (LANES, LANES * vertices)
-        self.model.launch(potential.share_contacts, threads, [self.lists, vertices, lanes, threads], [self.data])
+        given = [self.lists, vertices, lanes, lanes * threads]
+        self.model.launch(potential.share_contacts, lanes * threads, given, [self.data])
         if self._of_edges:
             given = [self.lists, self._areas, *positions]
             self._launch(potential.find_edge_contacts, self.lists.threads, given, [self.pairs, self.data])
