@@ -305,16 +305,42 @@ def end_filter(dtype):
 
 
 @cache
+def find_short(dtype):
+    """Kernel over vertices: ``walk`` is 1 for copies that colliders cut since ``before`` and of which x is not the target."""
+    vec3, _ = types(dtype)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_each_short(
+        # state in
+        x: wp.array(dtype=vec3),
+        target: wp.array(dtype=vec3),
+        before: wp.array(dtype=wp.int64),
+        cut: wp.array(dtype=wp.int64),
+        # parameters
+        per_copy: int,
+        # out
+        walk: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        copy = i // per_copy
+        if cut[copy] > before[copy] and not (x[i] == target[i]):
+            walk[copy] = 1
+            some[0] = 1
+
+    return find_each_short
+
+
+@cache
 def walk_from_start(dtype):
-    """Kernel over vertices from ``first`` on: x = x_before, the start of the step, in copies that colliders cut since."""
+    """Kernel over vertices from ``first`` on: x = x_before, the start of the step, in copies that ``walk``."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
     def walk_each_from_start(
         # state in
         x_before: wp.array(dtype=vec3),
-        before: wp.array(dtype=wp.int64),
-        cut: wp.array(dtype=wp.int64),
+        walk: wp.array(dtype=wp.int32),
         # parameters
         layout: Layout,
         first: int,
@@ -323,7 +349,7 @@ def walk_from_start(dtype):
     ):
         i = wp.tid()
         copy = copy_of(layout, first + i)
-        if cut[copy] > before[copy]:
+        if walk[copy] == 1:
             x[i] = x_before[i]
 
     return walk_each_from_start

@@ -21,7 +21,7 @@ from warpcloth.contact.self_start import crossings
 from warpcloth.core.hessian import Hessian
 from warpcloth.core.status import Result
 from warpcloth.kernels.term import HessianPolicy
-from warpcloth.scenes import knot, loop
+from warpcloth.scenes import drape, knot, loop
 
 SLOW = pytest.mark.slow
 SOLVERS = {
@@ -339,6 +339,18 @@ def test_thrown_cloth(name, what, device):
         assert all(each.distances(x, frame=frame).min() > 0.0 for each in scene.colliders)
         assert scene.free_axes is None or (x == scene.positions)[~scene.free_axes].all()
     assert stepper.inside == []
+
+
+def test_vertices_that_leave_a_collider_stop_no_others(device, speed=15.0, h=1.0 / 60.0):
+    """A sheet is thrown onto a ball so soft that the filter moves vertices out of it. Its corners go on, by 0.4 of its side."""
+    scene = drape.scene(n=24, self_contact=True, friction=0.0)
+    contact = replace(scene.contact, stiffness=1e-4 * scene.contact.stiffness)
+    scene = replace(scene, contact=contact, velocities=np.tile([0.0, -speed, 0.0], (24**2, 1)))
+    stepper = wc.Newton(substeps=1).bind(scene.build(device=device, dtype="float64"))
+    moved = next(iter(positions(stepper, 1))) - scene.positions
+    assert stepper.colliders.notes.cut.numpy()[0] > 0
+    corners = moved[[0, 23, -24, -1], 1]
+    np.testing.assert_allclose(corners, -h * (speed + h * 9.81), rtol=0.01)
 
 
 @table("name", ("xpbd",), list(SOLVERS)[:4])

@@ -76,18 +76,11 @@ class SelfFilter:
     def launch_end(self, x, v, move=None, parts=1):
         """Moves the cloth from its start of the step towards x, as far as pairs stay apart; corrects x, v and ``move``, (N,).
 
-        If iterates stay apart, the move starts at the last one; or at the start of the step, if that is inside a collider, out
-        of which the filter of colliders has moved x. Pins have moved in ``parts`` equal parts of the step.
+        If iterates stay apart, the move starts at the last one. Where the filter of colliders has moved x out of one and that
+        way is cut, the move starts at the start of the step instead, which is outside. Pins have moved in ``parts`` equal parts
+        of the step.
         """
         model = self.model
-        if self._cut_before is not None:
-            colliders = self._colliders
-            given, x_before = [self._cut_before, colliders.notes.cut, self._surface.layout], self._contact.x_before
-            self._launch(self_filter.walk_from_start, model.count, [colliders.x_before, *given, 0], [x_before])
-            if self._surface.moves:
-                given = [self._contact.placed[0], *given, model.count]
-                self._launch_move(self_filter.walk_from_start, given, [self._surface.behind(x_before)])
-            self.launch_fresh(self._contact.x_before, self._contact.relist)
         self._launch_meshes(self._contact.placed[2], lists=True)
         self._put(self._other, x)
         walk = partial(self._launch_end, x, v, move, parts)
@@ -105,6 +98,8 @@ class SelfFilter:
         self._launch_divide(start)
         wp.copy(self._walking, self._near)
         self._launch_rounds(start)
+        if self._cut_before is not None:
+            self._launch_from_start(start)
         if self._lets_out:
             self._turns.zero_()
             wp.copy(self._walking, self._near)
@@ -113,6 +108,26 @@ class SelfFilter:
         wp.copy(x, start, count=model.count)
         given = [model.inverse_mass, model.mobility, self._target, x, self._contact.h, self._contact.h / parts]
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
+
+    def _launch_from_start(self, x):
+        """Moves copies from the start of the step, if a vertex has left a collider and x (V,) is not the target."""
+        self._walking.zero_()
+        self._proceed.zero_()
+        given = [x, self._target, self._cut_before, self._colliders.notes.cut, self.model.per_copy]
+        self._launch(self_filter.find_short, self.model.count, given, [self._walking, self._proceed])
+        wp.capture_if(self._proceed, self._launch_again, x=x)
+
+    def _launch_again(self, x):
+        layout = self._surface.layout
+        self._launch(self_filter.walk_from_start, self.model.count, [self._colliders.x_before, self._walking, layout, 0], [x])
+        if self._surface.moves:
+            given = [self._contact.placed[0], self._walking, layout, self.model.count]
+            self._launch_move(self_filter.walk_from_start, given, [self._surface.behind(x)])
+            wp.copy(self._short, self._walking)
+            self.launch_fresh(x, self._contact.relist)
+            self._launch_meshes(self._contact.placed[2], lists=True)
+            wp.copy(self._walking, self._short)
+        self._launch_rounds(x)
 
     def _launch_divide(self, start):
         """Finds the copies that are ``_near`` something; others end at the target, as in a run of their own."""
@@ -328,7 +343,8 @@ class SelfFilter:
         self._make(self_filter.aim)
         if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
-            self._make(self_filter.walk_from_start)
+            self._short = wp.zeros_like(self._walking)
+            self._make(self_filter.find_short, self_filter.walk_from_start)
 
     def launch_start(self, base, d):
         """Sets d so that base + d is base if pairs stay apart on the way there, else the start of the step.
