@@ -1,8 +1,8 @@
-"""Factories of the kernels of a multigrid cycle for a symmetric matrix of 3×3 blocks, in every copy.
+"""Factories of the kernels of the levels of multigrid, in every copy, and of the choice of a preconditioner.
 
-A level has block compressed rows A, the diagonal blocks S of its Jacobi sweeps, and vectors r, x and d. P interpolates vectors
-of the next coarser level. It has one weight for all coordinates, and all copies have the same. ``active[copy]`` is 1 while a
-copy iterates, and ``due[copy]`` where its matrices are computed; None means all copies.
+A level has block compressed rows A of a symmetric matrix of 3×3 blocks, and the diagonal blocks S of its Jacobi sweeps. P
+interpolates vectors of the next coarser level. It has one weight for all coordinates, and all copies have the same.
+``due[copy]`` is 1 where matrices are computed; None means all copies.
 """
 
 from functools import cache
@@ -10,13 +10,14 @@ from functools import cache
 import warp as wp
 
 from .block_pattern import find_column
-from .block_rows import block_rows, lanes_of_rows, product_of_row
 from .linear import Solves
-from .memory import load
+from .memory import load, store
 from .reduce import stands_aside, sum_of_lanes
 from .vectors import types
 
 MODULE = "warpcloth.multigrid"
+# Threads that share a row in sums over all of its blocks.
+LANES = 32
 # Weight of Jacobi sweeps. All below 2 converge, because S/ω is at most A⁻¹.
 OMEGA = 1.8
 # New coarse matrices cost about as much as so many cycles (3.0 to 3.5 on a core, 3.3 to 3.9 on an H200), and the sweeps of the
@@ -38,54 +39,28 @@ class Rows:
     weights: wp.array(dtype=wp.float64)
 
 
-@cache
-def residual(dtype, block: int, terms: int):
-    """Device function (i, lane, matrix, x, further, r) → r[i] − (A x)[i] − further[i], in all lanes of the row.
-
-    ``further`` may be None.
-    """
-    vec3, _ = types(dtype)
-    lanes = lanes_of_rows(block)
-    product, sum_over = product_of_row(dtype, lanes, terms), sum_of_lanes(dtype, lanes)
-
-    @wp.func
-    def residual_of_row(
-        i: int,
-        lane: int,
-        matrix: block_rows(dtype),
-        x: wp.array(dtype=vec3),
-        further: wp.array(dtype=vec3),
-        r: wp.array(dtype=vec3),
-    ):
-        total = r[i] - sum_over(product(matrix, i, lane, x, x, dtype(0.0)))
-        if further:
-            total -= further[i]
-        return total
-
-    return residual_of_row
-
-
-def _module(dtype, terms=0):
+def _module(dtype):
     """The name of a module, in which no two kernels have one name."""
-    return f"{MODULE}.{dtype.__name__}" + f".{terms}" * (terms > 0)
+    return f"{MODULE}.{dtype.__name__}"
 
 
 @cache
 def find_slots():
-    """Kernel over coarse rows: the block of PᵀAP to which each multiple of a block of A is added, or −1 left of the diagonal.
+    """Kernel over rows: the block of a product L R to which each multiple of a block is added.
 
-    The multiples come in the order of the rows of A with this parent, of the blocks of a row, and of the parents of its column.
-    ``mirrors`` has the transposed block of each block of PᵀAP, ``counts`` the number of multiples that are not left out.
+    The multiples come in the order of the entries of a row of L, and of those of R in the row of its column. If the product is
+    ``symmetric``, 1, blocks left of the diagonal are those right of it, transposed: their multiples have −1, and ``mirrors``
+    has the transposed block of each, else −1. ``counts`` is the number of multiples of each row that are not left out.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def find_each_slot(
         # elements
-        A: Rows,
-        P: Rows,
-        transposed: Rows,
-        coarse: Rows,
+        left: Rows,
+        right: Rows,
+        product: Rows,
         # parameters
+        symmetric: int,
         firsts: wp.array(dtype=wp.int32),
         # out
         slots: wp.array(dtype=wp.int32),
@@ -93,22 +68,22 @@ def find_slots():
         mirrors: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        first, end = coarse.offsets[i], coarse.offsets[i + 1]
+        first, end = product.offsets[i], product.offsets[i + 1]
         at, count = int(firsts[i]), wp.int32(0)
         for t in range(first, end):
-            j = coarse.columns[t]
-            mirrors[t] = find_column(coarse.columns, coarse.offsets[j], coarse.offsets[j + 1], i)
-        for s in range(transposed.offsets[i], transposed.offsets[i + 1]):
-            row = transposed.columns[s]
-            for block in range(A.offsets[row], A.offsets[row + 1]):
-                column = A.columns[block]
-                for p in range(P.offsets[column], P.offsets[column + 1]):
-                    slot = wp.int32(-1)
-                    if P.columns[p] >= i:
-                        slot = find_column(coarse.columns, first, end, P.columns[p])
-                        count += 1
-                    slots[at] = slot
-                    at += 1
+            mirrors[t] = -1
+            if symmetric == 1:
+                j = product.columns[t]
+                mirrors[t] = find_column(product.columns, product.offsets[j], product.offsets[j + 1], i)
+        for s in range(left.offsets[i], left.offsets[i + 1]):
+            k = left.columns[s]
+            for p in range(right.offsets[k], right.offsets[k + 1]):
+                slot = wp.int32(-1)
+                if symmetric == 0 or right.columns[p] >= i:
+                    slot = find_column(product.columns, first, end, right.columns[p])
+                    count += 1
+                slots[at] = slot
+                at += 1
         counts[i] = count
 
     return find_each_slot
@@ -116,18 +91,18 @@ def find_slots():
 
 @cache
 def list_multiples(dtype):
-    """Kernel over coarse rows: the multiples Σ weight·A of which each block of PᵀAP is the sum, and where they end.
+    """Kernel over rows: the multiples weight·block of which each block of L R is the sum, and where they end.
 
-    ``slots`` and ``firsts`` are those of :func:`find_slots`, ``starts`` the first multiple of each row.
+    One of L and R has weights, the other blocks. ``slots`` and ``firsts`` are those of :func:`find_slots`, ``starts`` the first
+    multiple of each row.
     """
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def list_each_multiple(
         # elements
-        A: Rows,
-        P: Rows,
-        transposed: Rows,
-        coarse: Rows,
+        left: Rows,
+        right: Rows,
+        product: Rows,
         # state in
         slots: wp.array(dtype=wp.int32),
         # parameters
@@ -139,7 +114,7 @@ def list_multiples(dtype):
         weights: wp.array(dtype=dtype),
     ):
         i = wp.tid()
-        first, end = coarse.offsets[i], coarse.offsets[i + 1]
+        first, end = product.offsets[i], product.offsets[i + 1]
         for t in range(first, end):
             ends[t] = 0
         for at in range(firsts[i], firsts[i + 1]):
@@ -151,28 +126,33 @@ def list_multiples(dtype):
             ends[t] = before
             before += count
         at = int(firsts[i])
-        for s in range(transposed.offsets[i], transposed.offsets[i + 1]):
-            row = transposed.columns[s]
-            for block in range(A.offsets[row], A.offsets[row + 1]):
-                column = A.columns[block]
-                for p in range(P.offsets[column], P.offsets[column + 1]):
-                    slot = slots[at]
-                    at += 1
-                    if slot >= 0:
-                        sources[ends[slot]] = block
-                        weights[ends[slot]] = dtype(transposed.weights[s] * P.weights[p])
-                        ends[slot] = ends[slot] + 1
+        for s in range(left.offsets[i], left.offsets[i + 1]):
+            k = left.columns[s]
+            for p in range(right.offsets[k], right.offsets[k + 1]):
+                slot = slots[at]
+                at += 1
+                if slot >= 0:
+                    source, weight = int(p), dtype(0.0)
+                    if left.weights:
+                        weight = dtype(left.weights[s])
+                    else:
+                        source = s
+                        weight = dtype(right.weights[p])
+                    sources[ends[slot]] = source
+                    weights[ends[slot]] = weight
+                    ends[slot] = ends[slot] + 1
 
     return list_each_multiple
 
 
 @cache
-def multiply_by_transfers(dtype):
-    """Kernel over (copies, upper blocks): A_c = Σ weight·A, a block of PᵀAP, which is stored with its transpose."""
+def add_multiples(dtype):
+    """Kernel over (copies, threads), which share the blocks of a product: out = Σ weight·value, and its transpose, if any."""
     _, mat33 = types(dtype)
+    index, weight, value, put = load(wp.int32), load(dtype), load(mat33), store(mat33)
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
-    def multiply_blocks(
+    def add_each_multiple(
         # elements
         offsets: wp.array(dtype=wp.int32),
         sources: wp.array(dtype=wp.int32),
@@ -183,22 +163,25 @@ def multiply_by_transfers(dtype):
         # parameters
         due: wp.array(dtype=wp.int32),
         per_copy: int,
-        coarse_per_copy: int,
+        count: int,
+        threads: int,
         # out
-        coarse: wp.array(dtype=mat33),
+        out: wp.array(dtype=mat33),
     ):
-        copy, t = wp.tid()
+        copy, thread = wp.tid()
         if stands_aside(due, copy):
             return
-        block = blocks[t]
-        total = mat33()
-        for s in range(offsets[block[0]], offsets[block[0] + 1]):
-            total += weights[s] * values[copy * per_copy + sources[s]]
-        first = copy * coarse_per_copy
-        coarse[first + block[0]] = total
-        coarse[first + block[1]] = wp.transpose(total)
+        for t in range(thread, blocks.shape[0], threads):
+            block = blocks[t]
+            total = mat33()
+            for s in range(index(offsets, block[0]), index(offsets, block[0] + 1)):
+                total += weight(weights, s) * value(values, copy * per_copy + index(sources, s))
+            first = copy * count
+            put(out, first + block[0], total)
+            if block[1] >= 0:
+                put(out, first + block[1], wp.transpose(total))
 
-    return multiply_blocks
+    return add_each_multiple
 
 
 @cache
@@ -295,14 +278,16 @@ def factorise_diagonal(dtype):
 
 
 @cache
-def scale_sweeps(dtype):
-    """Kernel over block rows: S[i] = ω LᵀL/Σⱼ‖L[i] A[i, j] L[j]ᵀ‖, L the inverse factors of the diagonal blocks.
+def scale_sweeps(dtype, block: int):
+    """Kernel over (block rows, lanes): S[i] = ω LᵀL/Σⱼ‖L[i] A[i, j] L[j]ᵀ‖, L the inverse factors of the diagonal blocks.
 
     So no eigenvalue of S A is above ω, whatever A is: a symmetric matrix is at most the diagonal matrix of the sums of norms in
     its block rows (Baker et al. 2011, *Multigrid smoothers for ultraparallel computing*, have numbers instead of blocks).
     ``own`` bounds the norm of the diagonal block. Those of the others are bounded by √(‖·‖₁‖·‖∞) and by the Frobenius norm.
     """
-    _, mat33 = types(dtype)
+    vec3, mat33 = types(dtype)
+    lanes = LANES if block > 1 else 1
+    sum_over = sum_of_lanes(dtype, lanes)
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def scale(
@@ -319,12 +304,12 @@ def scale_sweeps(dtype):
         # out
         sweep: wp.array(dtype=mat33),
     ):
-        i = wp.tid()
+        i, lane = wp.tid()
         if stands_aside(due, i // per_copy):
             return
         left = factor[i]
-        total = own
-        for s in range(offsets[i], offsets[i + 1]):
+        total = dtype(0.0)
+        for s in range(offsets[i] + lane, offsets[i + 1], wp.static(lanes)):
             j = columns[s]
             if j != i:
                 block = left * values[s] * wp.transpose(factor[j])
@@ -334,7 +319,9 @@ def scale_sweeps(dtype):
                     rows = wp.max(rows, wp.abs(block[a, 0]) + wp.abs(block[a, 1]) + wp.abs(block[a, 2]))
                     across = wp.max(across, wp.abs(block[0, a]) + wp.abs(block[1, a]) + wp.abs(block[2, a]))
                 total += wp.sqrt(wp.min(rows * across, wp.ddot(block, block)))
-        sweep[i] = dtype(OMEGA) / total * (wp.transpose(left) * left)
+        total = own + sum_over(vec3(total, dtype(0.0), dtype(0.0)))[0]
+        if lane == 0:
+            sweep[i] = dtype(OMEGA) / total * (wp.transpose(left) * left)
 
     return scale
 
@@ -462,154 +449,3 @@ def end_choice():
         choice.present[copy] = now
 
     return end
-
-
-@cache
-def subtract_product(dtype, block: int, terms: int = 0):
-    """Kernel over (copies, threads): out = r − A x, minus a ``further`` product with x if that is not None.
-
-    ``out`` may be r. On CUDA threads share rows; on the CPU a copy has one, for each would copy the structs.
-    """
-    vec3, _ = types(dtype)
-    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
-
-    @wp.kernel(module=_module(dtype, terms), enable_backward=False)
-    def subtract_rows(
-        # elements
-        matrix: block_rows(dtype),
-        # state in
-        x: wp.array(dtype=vec3),
-        further: wp.array(dtype=vec3),
-        r: wp.array(dtype=vec3),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        # out
-        out: wp.array(dtype=vec3),
-    ):
-        copy, thread = wp.tid()
-        if active[copy] == 0:
-            return
-        if wp.static(block == 0):
-            for i in range(copy * per_copy, (copy + 1) * per_copy):
-                out[i] = remaining(i, 0, matrix, x, further, r)
-        else:
-            i = copy * per_copy + thread // wp.static(lanes)
-            lane = thread % wp.static(lanes)
-            total = remaining(i, lane, matrix, x, further, r)
-            if lane == 0:
-                out[i] = total
-
-    return subtract_rows
-
-
-@cache
-def restrict(dtype):
-    """Kernel over (copies, threads), which share the coarse rows: r_c = Pᵀr, x_c = S r_c."""
-    vec3, mat33 = types(dtype)
-    index, weight, vector = load(wp.int32), load(dtype), load(vec3)
-
-    @wp.kernel(module=_module(dtype), enable_backward=False)
-    def restrict_rows(
-        # elements
-        offsets: wp.array(dtype=wp.int32),
-        sources: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=dtype),
-        # state in
-        r: wp.array(dtype=vec3),
-        sweep: wp.array(dtype=mat33),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        coarse_per_copy: int,
-        threads: int,
-        # out
-        coarse_r: wp.array(dtype=vec3),
-        coarse_x: wp.array(dtype=vec3),
-    ):
-        copy, thread = wp.tid()
-        if active[copy] == 0:
-            return
-        for i in range(thread, coarse_per_copy, threads):
-            total = vec3()
-            for s in range(index(offsets, i), index(offsets, i + 1)):
-                total += weight(weights, s) * vector(r, copy * per_copy + index(sources, s))
-            at = copy * coarse_per_copy + i
-            coarse_r[at] = total
-            coarse_x[at] = sweep[at] * total
-
-    return restrict_rows
-
-
-@cache
-def prolong(dtype):
-    """Kernel over (copies, threads), which share the rows: d = P x_c."""
-    vec3, _ = types(dtype)
-    index, weight, vector = load(wp.int32), load(dtype), load(vec3)
-
-    @wp.kernel(module=_module(dtype), enable_backward=False)
-    def prolong_rows(
-        # elements
-        offsets: wp.array(dtype=wp.int32),
-        parents: wp.array(dtype=wp.int32),
-        weights: wp.array(dtype=dtype),
-        # state in
-        coarse_x: wp.array(dtype=vec3),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        coarse_per_copy: int,
-        threads: int,
-        # out
-        d: wp.array(dtype=vec3),
-    ):
-        copy, thread = wp.tid()
-        if active[copy] == 0:
-            return
-        for i in range(thread, per_copy, threads):
-            total = vec3()
-            for s in range(index(offsets, i), index(offsets, i + 1)):
-                total += weight(weights, s) * vector(coarse_x, copy * coarse_per_copy + index(parents, s))
-            d[copy * per_copy + i] = total
-
-    return prolong_rows
-
-
-@cache
-def sweep_after(dtype, block: int, terms: int = 0):
-    """Kernel over (copies, threads): x += d + S(r − A d), minus a ``further`` product with d if that is not None.
-
-    Threads are those of :func:`subtract_product`.
-    """
-    vec3, mat33 = types(dtype)
-    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
-
-    @wp.kernel(module=_module(dtype, terms), enable_backward=False)
-    def sweep_rows(
-        # elements
-        matrix: block_rows(dtype),
-        # state in
-        sweep: wp.array(dtype=mat33),
-        d: wp.array(dtype=vec3),
-        further: wp.array(dtype=vec3),
-        r: wp.array(dtype=vec3),
-        # parameters
-        active: wp.array(dtype=wp.int32),
-        per_copy: int,
-        # in and out
-        x: wp.array(dtype=vec3),
-    ):
-        copy, thread = wp.tid()
-        if active[copy] == 0:
-            return
-        if wp.static(block == 0):
-            for i in range(copy * per_copy, (copy + 1) * per_copy):
-                x[i] = x[i] + d[i] + sweep[i] * remaining(i, 0, matrix, d, further, r)
-        else:
-            i = copy * per_copy + thread // wp.static(lanes)
-            lane = thread % wp.static(lanes)
-            total = remaining(i, lane, matrix, d, further, r)
-            if lane == 0:
-                x[i] = x[i] + d[i] + sweep[i] * total
-
-    return sweep_rows

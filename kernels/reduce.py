@@ -117,6 +117,36 @@ def sum_of_lanes(dtype, lanes: int):
 
 
 @cache
+def largest_of_warp(dtype):
+    """Device function (value, key) → the largest of each component in the first thread of a warp with one key, 0 in the others.
+
+    Where keys differ or threads are missing, as on the CPU, it is the value. All threads must call it.
+    """
+    vec3, _ = types(dtype)
+
+    @wp.func_native(
+        "\n#if defined(__CUDA_ARCH__)\n"
+        "const unsigned all = 0xffffffffu; "
+        "if (__activemask() == all && __all_sync(all, key == __shfl_sync(all, key, 0))) { for (int c = 0; c < 3; ++c) { "
+        "for (int n = 16; n > 0; n /= 2) { "
+        "auto other = __shfl_xor_sync(all, value.c[c], n); if (other > value.c[c]) value.c[c] = other; } "
+        "if (threadIdx.x & 31) value.c[c] = 0; } }"
+        "\n#endif\nreturn value;"
+    )
+    def largest_in_warp(value: vec3, key: int) -> vec3: ...
+
+    return largest_in_warp
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+__syncthreads();
+#endif
+""")
+def wait_for_block(): ...
+
+
+@cache
 def partial_sum(block: int):
     """Kernel over (copies, lanes): the parts of Σ values."""
     store, _add_up = block_sums(block)

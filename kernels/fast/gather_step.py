@@ -6,6 +6,7 @@ import warp as wp
 
 from ..explicit_step import kick_and_drift
 from ..memory import load, store
+from ..reduce import wait_for_block
 from ..vectors import types
 from .contact_guard import guard_type, in_ball, touching_step
 from .gather_forces import move_of, sum_at_vertices
@@ -138,14 +139,6 @@ def gather_step(
         gather_one(thread, chain, inverse_mass, gravity[copy], guard, h, unit, x, v, residual, x_after, v_after, residual_after)
 
     return step_vertices
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-__syncthreads();
-#endif
-""")
-def wait_for_block(): ...
 
 
 @cache

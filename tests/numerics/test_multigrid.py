@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from scipy.linalg import block_diag
 
 import warpcloth as wc
 from support.continuum import flat, hill, jittered
@@ -14,10 +15,12 @@ from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.linear import turn_and_multiply
 from warpcloth.kernels.multigrid import OMEGA
 from warpcloth.kernels.term import HessianPolicy
+from warpcloth.numerics.additive_multigrid import AdditiveMultigrid, multigrid_of
 from warpcloth.numerics.interpolation import interpolations, neighbours
 from warpcloth.numerics.linear import ConjugateGradients
-from warpcloth.numerics.multigrid import COARSEST, Multigrid
+from warpcloth.numerics.multigrid import COARSEST
 from warpcloth.numerics.preconditioner_choice import PreconditionerChoice
+from warpcloth.numerics.v_cycle import VCycle
 
 FAN = wc.Mesh([[0, 0, 0], [1, 0, 0], [0.5, 1, 0], [0.5, -1, 0], [0.5, 0, 1]], [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
 MESHES = {
@@ -90,10 +93,10 @@ def applied(multigrid, count, copies):
     return found
 
 
-def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels(device):
+def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels():
     """x ← x + S(b − Ax), coarse correction P(PᵀAP)⁻¹Pᵀ, sweep, by dense matrices; A has negative eigenvalues."""
-    hessian = compressed(device)
-    multigrid = Multigrid(hessian)
+    hessian = compressed("cpu")
+    multigrid = VCycle(hessian)
     multigrid.update()
     B, n = 2, hessian.per_copy
     cycles = applied(multigrid, n, B)
@@ -120,10 +123,46 @@ def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels(device):
         np.testing.assert_allclose(E @ P @ C @ P.T @ E.T, rest, atol=1e-6 * np.abs(rest).max())
 
 
+def test_additive_multigrid_is_symmetric_positive_definite_and_that_of_its_levels(device):
+    """M = S + P̄ M_c P̄ᵀ with P̄ = P − S A P by dense matrices, and the inverse on the last level; A has negative eigenvalues."""
+    hessian = compressed(device)
+    multigrid = AdditiveMultigrid(hessian)
+    multigrid.update()
+    B, n = 2, hessian.per_copy
+    found = applied(multigrid, n, B)
+    transfers = interpolations(
+        hessian.model.rest_points, neighbours(hessian.model.scene.mesh), hessian.model.inverse_mass.numpy()[:n] > 0.0, COARSEST
+    )
+    assert multigrid.sizes == [n, *(P.shape[1] for P in transfers)] and len(transfers) > 1
+
+    def sweeps(level, copy):
+        blocks = level.sweep.numpy()[copy * level.n : (copy + 1) * level.n]
+        return block_diag(*blocks)
+
+    for copy, A in enumerate(hessian.matrices()):
+        A = A.toarray()
+        assert np.linalg.eigvalsh(A)[0] < 0.0
+        S = sweeps(multigrid.levels[0], copy)
+        # No eigenvalue of S A is above ω.
+        root = np.linalg.cholesky(S)
+        assert np.linalg.eigvalsh(root.T @ A @ root)[-1] <= OMEGA * (1.0 + 1e-9)
+        expected, to_finest = np.zeros_like(A), np.eye(len(A))
+        for k, P in enumerate(transfers):
+            S, P = sweeps(multigrid.levels[k], copy), np.kron(P.toarray(), np.eye(3))
+            expected += to_finest @ S @ to_finest.T
+            A, to_finest = P.T @ A @ P, to_finest @ (P - S @ A @ P)
+        last = multigrid.levels[-1]
+        inverse = last.values.numpy().reshape(B, last.n, last.n, 3, 3)[copy].swapaxes(1, 2).reshape(3 * last.n, -1)
+        expected += to_finest @ inverse @ to_finest.T
+        M = found[copy]
+        np.testing.assert_allclose(M, expected, atol=1e-10 * np.abs(M).max())
+        assert np.linalg.eigvalsh(0.5 * (M + M.T))[0] > 0.0
+
+
 def test_coarse_matrices_are_products_with_the_interpolation(device):
     """PᵀAP of each copy, and on the coarsest level its inverse, in float64."""
     hessian = compressed(device)
-    multigrid = Multigrid(hessian)
+    multigrid = multigrid_of(hessian)
     multigrid.update()
     found = interpolations(
         hessian.model.rest_points,
@@ -135,7 +174,7 @@ def test_coarse_matrices_are_products_with_the_interpolation(device):
         A = A.toarray()
         for k, P in enumerate(found):
             P = np.kron(P.toarray(), np.eye(3))
-            A, level = P.T @ A @ P, multigrid._levels[k + 1]
+            A, level = P.T @ A @ P, multigrid.levels[k + 1]
             n = level.n
             offsets, columns, values = (each.numpy() for each in (level.offsets, level.columns, level.values))
             dense = np.zeros((3 * n, 3 * n))
@@ -143,9 +182,9 @@ def test_coarse_matrices_are_products_with_the_interpolation(device):
                 for s in range(offsets[copy * n + i], offsets[copy * n + i + 1]):
                     j = columns[s] - copy * n
                     dense[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = values[s]
-            if level is multigrid._levels[-1] and np.linalg.eigvalsh(A)[0] > 0.0:
+            if level is multigrid.levels[-1] and np.linalg.eigvalsh(A)[0] > 0.0:
                 np.testing.assert_allclose(dense @ A, np.eye(3 * n), atol=1e-8)
-            elif level is not multigrid._levels[-1]:
+            elif level is not multigrid.levels[-1]:
                 np.testing.assert_allclose(dense, A, atol=1e-10 * np.abs(A).max())
 
 
@@ -173,7 +212,7 @@ def weighed(n, stiffness, device, make):
 
 def chosen(hessian):
     """Conjugate gradients that choose their preconditioner."""
-    multigrid = Multigrid(hessian)
+    multigrid = multigrid_of(hessian)
     return ConjugateGradients(hessian, 10_000, multigrid, PreconditionerChoice(multigrid, 10_000))
 
 
@@ -181,7 +220,7 @@ def iterations(n, stiffness, device, used):
     """Of such a solve by multigrid if ``used``, or else with diagonal blocks."""
 
     def make(hessian):
-        return ConjugateGradients(hessian, 10_000, Multigrid(hessian) if used else None)
+        return ConjugateGradients(hessian, 10_000, multigrid_of(hessian) if used else None)
 
     return int(weighed(n, stiffness, device, make).iteration.numpy()[0])
 

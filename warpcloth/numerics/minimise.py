@@ -17,8 +17,9 @@ from ..kernels.elementwise import mismatch
 from ..kernels.linear import rounding
 from ..kernels.term import HessianPolicy
 from ..kernels.terms.air import AIR
+from .additive_multigrid import multigrid_of
 from .linear import ConjugateGradients, Factorised
-from .multigrid import LEAST, Multigrid
+from .multigrid import LEAST
 from .preconditioner_choice import PreconditionerChoice
 from .search import Search
 
@@ -95,7 +96,7 @@ class Minimiser:
         self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
         if linear == "cg":
-            multigrid = Multigrid(self.hessian) if model.per_copy >= LEAST else None
+            multigrid = multigrid_of(self.hessian) if model.per_copy >= LEAST else None
             choice = multigrid and PreconditionerChoice(multigrid, linear_iterations)
             self.linear = ConjugateGradients(self.hessian, linear_iterations, multigrid, choice)
             self.kept = choice.kept if choice else {}

@@ -15,8 +15,8 @@ from ..core.hessian import BlockMatrix, BlockSum, ElementBlocks, pattern_of
 from ..core.sums import RowSums
 from ..kernels import constraint_jacobian as jacobian
 from ..kernels import primal as kernels
+from .additive_multigrid import multigrid_of
 from .linear import ConjugateGradients
-from .multigrid import Multigrid
 
 
 class _Products(ElementBlocks):
@@ -84,7 +84,7 @@ class PrimalSolver:
     def __init__(self, constraints, iterations):
         model, self._constraints = constraints.model, constraints
         self.model, self._matrix = model, PrimalMatrix(constraints)
-        self._linear = ConjugateGradients(self._matrix, iterations, Multigrid(self._matrix))
+        self._linear = ConjugateGradients(self._matrix, iterations, multigrid_of(self._matrix))
         self._sums = RowSums(model, constraints.per_copy)
 
         def rows(dtype=model.dtype):
