@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from ..memory import load
+from ..reduce import largest_of_warp
 from ..rotation import epsilon
 from ..vectors import types
 from .obstacles import OBSTACLE, Layout, vector_within
@@ -218,6 +219,14 @@ def count_items(dtype):
     """
     vec3, _ = types(dtype)
     box_along, level_of, cell_of = boxes(dtype)
+    largest_in_warp, number = largest_of_warp(dtype), f"wp::{dtype.__name__}"
+
+    # Atomic operations do not change what a multiprocessor has in its cache.
+    @wp.func_native(
+        f"const volatile {number}* at = (const volatile {number}*)((const char*)a.data + i * a.strides[0]) + 3 * j; "
+        f"return wp::vec_t<3, {number}>(at[0], at[1], at[2]);"
+    )
+    def extent_now(a: wp.array2d(dtype=vec3), i: int, j: int) -> vec3: ...
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def count_each_item(
@@ -237,14 +246,15 @@ def count_items(dtype):
             copy = v[3] >> 1
             if not boxes_meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 level = -1
+        kind = kind_in_grid(v, surface.groups[item])
+        own = largest_in_warp(dtype(0.5) * (high - low), LEVELS * kind + wp.max(level, -1))
         key = wp.int32(-1)
         if level >= 0:
-            kind = kind_in_grid(v, surface.groups[item])
             if (grid.levels[kind] & (1 << level)) == 0:
                 wp.atomic_or(grid.levels, kind, 1 << level)
-            own = dtype(0.5) * (high - low)
-            if wp.max(own - grid.extents[kind, level]) > dtype(0.0):  # few are
-                wp.atomic_max(grid.extents, kind, level, own)
+            if wp.max(own) > dtype(0.0):
+                if wp.max(own - extent_now(grid.extents, kind, level)) > dtype(0.0):  # few are
+                    wp.atomic_max(grid.extents, kind, level, own)
             cell = cell_of(grid.size, level, dtype(0.5) * (low + high))
             key = bucket_of(cell[0], cell[1], cell[2], code_of(v[3] >> 1, kind, level), grid.counts.shape[0])
             wp.atomic_add(grid.counts, key, 1)
