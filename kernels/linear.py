@@ -66,10 +66,13 @@ def add_blocks(dtype):
         values: wp.array(dtype=mat33),
     ):
         s = wp.tid()
-        total = values[s]
-        for n in range(offsets[s], offsets[s + 1]):
-            total += blocks[sources[n]]
-        values[s] = total
+        first = offsets[s]
+        end = offsets[s + 1]
+        if first < end:  # a collider has blocks on the diagonal alone
+            total = values[s]
+            for n in range(first, end):
+                total += blocks[sources[n]]
+            values[s] = total
 
     return gather_blocks
 
