@@ -237,6 +237,80 @@ def measure_start(block: int):
 
 
 @cache
+def work_of_guess(dtype, block: int):
+    """Kernel over (copies, lanes): trial = d + p, the parts of ``WORK`` there, and of ‖p‖² in the row ``SQUARE``.
+
+    See :func:`finish_gradient`.
+    """
+    vec3, _ = types(dtype)
+    store, _add_up = block_sums(block)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def find_work(
+        # elements
+        inertia: inertia_struct(dtype),
+        # state in
+        correction: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        # parameters
+        per_copy: int,
+        lanes: int,
+        # out
+        trial: wp.array(dtype=vec3),
+        parts: wp.array3d(dtype=wp.float64),
+    ):
+        copy, lane = wp.tid()
+        work, square = wp.float64(0.0), wp.float64(0.0)
+        for j in range(lane, per_copy, lanes):
+            i = copy * per_copy + j
+            d = correction[i] + direction[i]
+            trial[i] = d
+            square += wp.float64(wp.dot(direction[i], direction[i]))
+            if inertia.inverse_mass[i] > dtype(0.0):
+                pull = inertia.load * inertia.gravity[i // inertia.shared]
+                work += wp.float64(inertia.mass[i]) * wp.float64(wp.dot(dtype(0.5) * inertia.s * d - pull, d))
+        store(lane, work, parts[WORK], copy)
+        store(lane, square, parts[SQUARE], copy)
+
+    return find_work
+
+
+@cache
+def bound_guess(block: int):
+    """Kernel over (copies, lanes of one block): ``hopeful`` is 1 for ``active`` copies where a guess may lower φ, else 0.
+
+    It may not if φ without pairs, whose energies are not negative, is as high as φ at d, or if it is d. ``some`` becomes 1 if
+    any copy is.
+    """
+    _store, add_up = block_sums(block)
+
+    @wp.kernel(module=MODULE, enable_backward=False)
+    def bound(
+        # state in
+        of_vertices: wp.array3d(dtype=wp.float64),
+        of_terms: wp.array3d(dtype=wp.float64),
+        search: LineSearch,
+        # parameters
+        active: wp.array(dtype=wp.int32),
+        # out
+        hopeful: wp.array(dtype=wp.int32),
+        some: wp.array(dtype=wp.int32),
+    ):
+        copy, lane = wp.tid()
+        energy = add_up(lane, of_vertices[WORK], copy)
+        for k in range(of_terms.shape[0]):
+            energy += add_up(lane, of_terms[k], copy)
+        square = add_up(lane, of_vertices[SQUARE], copy)
+        if lane == 0:
+            hopeful[copy] = 0
+            if active[copy] == 1 and energy < search.energy[copy] and square > wp.float64(0.0):
+                hopeful[copy] = 1
+                some[0] = 1
+
+    return bound
+
+
+@cache
 def check_guess(block: int):
     """Kernel over (copies, lanes of one block): keeps the step to a guess if φ is lower there, else sets it to 0.
 

@@ -479,6 +479,23 @@ def copies_near_colliders(
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def copies_free(
+    # state in
+    fraction: wp.array(dtype=wp.float64),
+    # in and out
+    wanted: wp.array(dtype=wp.int32),
+    # out
+    some: wp.array(dtype=wp.int32),
+):
+    """Kernel over copies: ``wanted`` becomes 0 where the fraction of the direction is below 1; ``some`` is 1 if one is left."""
+    copy = wp.tid()
+    if fraction[copy] < ONE:
+        wanted[copy] = 0
+    elif wanted[copy] == 1:
+        some[0] = 1
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
 def copies_in_contact(
     # elements
     pairs: Pairs,

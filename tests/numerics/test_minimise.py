@@ -6,6 +6,7 @@ import warp as wp
 from scipy.optimize import brentq
 
 import warpcloth as wc
+from support.layers import layers
 from support.steps import swinging
 from warpcloth.core import sums
 from warpcloth.core.status import Result
@@ -220,6 +221,26 @@ def test_steps_start_from_the_last_correction(device):
         warm.step()
         ends.append(warm.state.x.numpy())
     np.testing.assert_array_equal(*ends)
+
+
+def test_a_guess_is_ruled_out_without_its_pairs_only_if_it_raises_the_energy(device):
+    """Two sheets, a gap of half the contact distance apart. A guess that is where d is lowers nothing either."""
+    scene = layers(gap=0.5 * 5e-3)
+    stepper = wc.Newton(substeps=1).bind(scene.build(device=device, dtype="float64"))
+    search, model = stepper.minimiser.search, stepper.model
+    search.launch_start()
+    one, hopeful, some = model.scalars(wp.int32), model.scalars(wp.int32), wp.zeros(1, dtype=wp.int32, device=device)
+    one.fill_(1)
+    found, rng = [], np.random.default_rng(0)
+    apart = np.where(np.arange(72)[:, None] < 36, -1.0, 1.0) * [0.0, 1.0, 0.0]
+    for p in (0.0 * apart, 1e-4 * apart, -1e-5 * apart, -1e-3 * apart, 1e-2 * rng.normal(size=apart.shape)):
+        search.direction.assign(p)
+        search.launch_bound(one, hopeful, some)
+        assert hopeful.numpy() == some.numpy()
+        search.launch_guess(one)
+        found.append((int(hopeful.numpy()[0]), int(search.state.moved.numpy()[0])))
+        search.launch_start()
+    assert found == [(0, 0), (1, 1), (1, 0), (1, 0), (0, 0)]
 
 
 @pytest.mark.slow

@@ -389,10 +389,15 @@ class SelfFilter:
 
         wp.capture_if(self._contact.listed, in_contact)
 
-    def launch_back(self, goal, d, direction):
-        """Sets the direction of free vertices from d, where pairs are listed, to ``goal`` (N,) [m]; 0 if pairs would meet."""
+    def launch_aim(self, goal, d, direction):
+        """Sets the direction of free vertices from d to ``goal`` (N,) [m]."""
         self._aim(goal, d, True, False, None, direction)
+
+    def launch_whole(self, direction, wanted, some):
+        """Clears ``wanted`` (B,) where pairs would meet along the direction from their list; ``some`` is 1 if any is left."""
         self.launch_limit(direction, whole=True)
+        some.zero_()
+        self.model.launch(self_filter.copies_free, self.model.copies, [self.fraction], [wanted, some])
 
     def _aim(self, goal, x, free, pinned, fraction, p):
         model = self.model

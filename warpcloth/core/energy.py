@@ -55,11 +55,12 @@ class EnergyParts:
         keys = [(elements.term, model.dtype, lanes.block, elements.clear is not None) for elements in model.terms]
         self._kernels = [model.kernel(assemble.energy_parts, *key) for key in keys]
 
-    def launch(self, x, correction, other):
-        """Launches the ``parts``, and other (B,) += the energy of dynamic elements [J]."""
+    def launch(self, x, correction, other=None):
+        """Launches the ``parts``, and other (B,) += the energy of dynamic elements [J], if it is given."""
         model, lanes = self.model, self._lanes
         model.refresh(EVALUATION, Moment(x, correction))
         for k, (elements, kernel) in enumerate(zip(model.terms, self._kernels, strict=True)):
             given = [*elements.arguments, x, correction, elements.clear, elements.per_copy, lanes.count]
             model.launch(kernel, lanes.dim, given, [self.parts[k]])
-        self._dynamic.add_energy(self._sums, other)
+        if other is not None:
+            self._dynamic.add_energy(self._sums, other)

@@ -126,7 +126,7 @@ def without_filter(stepper):
     kept = stepper.pairs.filter
     kept.launch_end = kept.launch_limit = lambda *given, **options: None
     kept.launch_start = lambda base, d: d.zero_()
-    kept.launch_back = lambda goal, d, direction: direction.zero_()
+    kept.launch_aim = lambda goal, d, direction: direction.zero_()
     stepper.pairs.contact.least = 0.0
     stepper.record_again()
 

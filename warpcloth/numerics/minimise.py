@@ -135,7 +135,8 @@ class Minimiser:
         self._progress.proceed, self._progress.more = flag(), flag()
         self._limits.tolerance, self._limits.scale = wp.zeros(1, dtype=wp.float64, device=model.device), model.scalars()
         self._limits.iterations = flag()
-        self.active, self._wanted, self._unsolved = self._progress.active, model.scalars(wp.int32), flag()
+        self.active, self._unsolved = self._progress.active, flag()
+        self._wanted, self._hopeful = model.scalars(wp.int32), model.scalars(wp.int32)
         read = ("end", "iterations", "residual", "proceed")
         self._read = {name: Mirror(getattr(self._progress, name)) for name in read}
         self._given = {name: Mirror(getattr(self._limits, name)) for name in ("tolerance", "iterations", "scale")}
@@ -265,9 +266,17 @@ class Minimiser:
         back. Cloth that slides is so at the last d, which does not stop what is slower than the tolerance.
         """
         for goal, stays in (self.filter.back, 1), (self.right, 0):
-            self.filter.launch_back(goal, self.correction, self.search.direction)
-            self.search.launch_guess(self._wanted)
-            self._note_stay(stays)
+            self.filter.launch_aim(goal, self.correction, self.search.direction)
+            self.search.launch_bound(self._wanted, self._hopeful, self._unsolved)
+            wp.capture_if(self._unsolved, self._launch_if_apart, stays=stays)
+
+    def _launch_if_apart(self, stays):
+        self.filter.launch_whole(self.search.direction, self._hopeful, self._unsolved)
+        wp.capture_if(self._unsolved, self._launch_guess, stays=stays)
+
+    def _launch_guess(self, stays):
+        self.search.launch_guess(self._hopeful)
+        self._note_stay(stays)
 
     def _launch_beside(self):
         """Launches the start of vertices near colliders at the contact distance, at the start of the step, or at the last d."""

@@ -7,6 +7,7 @@ from ..core.energy import EnergyParts
 from ..core.sums import Lanes
 from ..fast.plan import plan
 from ..kernels import search as kernels
+from ..terms.refresh import EVALUATION, Moment
 
 # Halvings of a step before a copy counts as stuck, because 2⁻³⁰ of a Newton step moves nothing.
 HALVINGS = 30
@@ -55,8 +56,8 @@ class Search:
         self._parts, self._slopes = lanes.parts(kernels.ROWS), lanes.parts()
         self._launch = model.launcher(
             ((kernels.set_trial, kernels.take_trial), model.dtype),
-            ((kernels.begin_search, kernels.finish_gradient), model.dtype, lanes.block),
-            ((kernels.measure_start, kernels.check_guess, kernels.check_trial), lanes.block),
+            ((kernels.begin_search, kernels.finish_gradient, kernels.work_of_guess), model.dtype, lanes.block),
+            ((kernels.measure_start, kernels.bound_guess, kernels.check_guess, kernels.check_trial), lanes.block),
         )
         # Relative increase of φ that the approximate Wolfe condition counts as rounding. The energy of a spring of strain e has
         # a relative error of 2ε/e, so that √ε covers strains down to √ε; ε is that of float64, in which energies are computed.
@@ -91,6 +92,19 @@ class Search:
         self._launch_sums(kernels.check_guess)
         wp.capture_if(self.state.proceed, self._return_to_start)
         self._take_trial()
+
+    def launch_bound(self, active, hopeful, some):
+        """Launches ``hopeful`` (B,) = 1 for ``active`` copies where φ may be lower at d + p, else 0; ``some`` (1,): any is.
+
+        It lists no pairs.
+        """
+        some.zero_()
+        given = [self.inertia, self.correction, self.direction, self.model.per_copy, self.lanes.count]
+        self._launch(kernels.work_of_guess, self.lanes.dim, given, [self.trial, self._parts])
+        self.energy_of.launch(self.base, self.trial)
+        self.model.refresh(EVALUATION, Moment(self.base, self.correction))
+        given = [self._parts, self.energy_of.parts, self.state, active]
+        self._launch(kernels.bound_guess, self.lanes.of_block, given, [hopeful, some])
 
     def _begin(self, active):
         """Launches the first trial, with steps of 1."""
