@@ -27,7 +27,7 @@ PARTS = {
     "filter": ("self_filter", "self_advance", "collider_filter"),
     "elements": ("assemble", "sparse", "transpose"),
     "pairs": ("pair_sums", "self_friction", "pair_sweeps", "colliders", "collider_work"),
-    "solves": ("linear", "multigrid"),
+    "solves": ("linear", "multigrid", "v_cycle", "additive_multigrid"),
     "search": ("search", "minimise", "reduce"),
 }
 
