@@ -1,14 +1,12 @@
-"""Factories of the kernels of a V-cycle on the CPU, see :mod:`warpcloth.numerics.v_cycle`.
-
-A copy has one thread, for each thread would copy the structs. ``active[copy]`` is 1 while a copy iterates.
-"""
+"""Factories of the kernels of a V-cycle, see :mod:`warpcloth.numerics.v_cycle`. ``active[copy]`` is 1 while a copy iterates."""
 
 from functools import cache
 
 import warp as wp
 
-from .block_rows import block_rows, product_of_row
+from .block_rows import block_rows, lanes_of_rows, product_of_row
 from .memory import load
+from .reduce import sum_of_lanes
 from .vectors import types
 
 
@@ -18,10 +16,40 @@ def _module(dtype, terms=0):
 
 
 @cache
-def subtract_product(dtype, terms: int = 0):
-    """Kernel over copies: out = r − A x, minus a ``further`` product with x if that is not None. ``out`` may be r."""
+def residual(dtype, block: int, terms: int):
+    """Device function (i, lane, matrix, x, further, r) → r[i] − (A x)[i] − further[i], in all lanes of the row.
+
+    ``further`` may be None.
+    """
     vec3, _ = types(dtype)
-    product = product_of_row(dtype, 1, terms)
+    lanes = lanes_of_rows(block)
+    product, sum_over = product_of_row(dtype, lanes, terms), sum_of_lanes(dtype, lanes)
+
+    @wp.func
+    def residual_of_row(
+        i: int,
+        lane: int,
+        matrix: block_rows(dtype),
+        x: wp.array(dtype=vec3),
+        further: wp.array(dtype=vec3),
+        r: wp.array(dtype=vec3),
+    ):
+        total = r[i] - sum_over(product(matrix, i, lane, x, x, dtype(0.0)))
+        if further:
+            total -= further[i]
+        return total
+
+    return residual_of_row
+
+
+@cache
+def subtract_product(dtype, block: int, terms: int = 0):
+    """Kernel over (copies, threads): out = r − A x, minus a ``further`` product with x if that is not None.
+
+    ``out`` may be r. On CUDA threads share rows; on the CPU a copy has one, for each would copy the structs.
+    """
+    vec3, _ = types(dtype)
+    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
 
     @wp.kernel(module=_module(dtype, terms), enable_backward=False)
     def subtract_rows(
@@ -37,21 +65,25 @@ def subtract_product(dtype, terms: int = 0):
         # out
         out: wp.array(dtype=vec3),
     ):
-        copy = wp.tid()
+        copy, thread = wp.tid()
         if active[copy] == 0:
             return
-        for i in range(copy * per_copy, (copy + 1) * per_copy):
-            total = r[i] - product(matrix, i, 0, x, x, dtype(0.0))
-            if further:
-                total -= further[i]
-            out[i] = total
+        if wp.static(block == 0):
+            for i in range(copy * per_copy, (copy + 1) * per_copy):
+                out[i] = remaining(i, 0, matrix, x, further, r)
+        else:
+            i = copy * per_copy + thread // wp.static(lanes)
+            lane = thread % wp.static(lanes)
+            total = remaining(i, lane, matrix, x, further, r)
+            if lane == 0:
+                out[i] = total
 
     return subtract_rows
 
 
 @cache
 def restrict(dtype):
-    """Kernel over copies: r_c = Pᵀr, x_c = S r_c."""
+    """Kernel over (copies, threads), which share the coarse rows: r_c = Pᵀr, x_c = S r_c."""
     vec3, mat33 = types(dtype)
     index, weight, vector = load(wp.int32), load(dtype), load(vec3)
 
@@ -68,14 +100,15 @@ def restrict(dtype):
         active: wp.array(dtype=wp.int32),
         per_copy: int,
         coarse_per_copy: int,
+        threads: int,
         # out
         coarse_r: wp.array(dtype=vec3),
         coarse_x: wp.array(dtype=vec3),
     ):
-        copy = wp.tid()
+        copy, thread = wp.tid()
         if active[copy] == 0:
             return
-        for i in range(coarse_per_copy):
+        for i in range(thread, coarse_per_copy, threads):
             total = vec3()
             for s in range(index(offsets, i), index(offsets, i + 1)):
                 total += weight(weights, s) * vector(r, copy * per_copy + index(sources, s))
@@ -88,7 +121,7 @@ def restrict(dtype):
 
 @cache
 def prolong(dtype):
-    """Kernel over copies: d = P x_c."""
+    """Kernel over (copies, threads), which share the rows: d = P x_c."""
     vec3, _ = types(dtype)
     index, weight, vector = load(wp.int32), load(dtype), load(vec3)
 
@@ -104,13 +137,14 @@ def prolong(dtype):
         active: wp.array(dtype=wp.int32),
         per_copy: int,
         coarse_per_copy: int,
+        threads: int,
         # out
         d: wp.array(dtype=vec3),
     ):
-        copy = wp.tid()
+        copy, thread = wp.tid()
         if active[copy] == 0:
             return
-        for i in range(per_copy):
+        for i in range(thread, per_copy, threads):
             total = vec3()
             for s in range(index(offsets, i), index(offsets, i + 1)):
                 total += weight(weights, s) * vector(coarse_x, copy * coarse_per_copy + index(parents, s))
@@ -120,10 +154,13 @@ def prolong(dtype):
 
 
 @cache
-def sweep_after(dtype, terms: int = 0):
-    """Kernel over copies: x += d + S(r − A d), minus a ``further`` product with d if that is not None."""
+def sweep_after(dtype, block: int, terms: int = 0):
+    """Kernel over (copies, threads): x += d + S(r − A d), minus a ``further`` product with d if that is not None.
+
+    Threads are those of :func:`subtract_product`.
+    """
     vec3, mat33 = types(dtype)
-    product = product_of_row(dtype, 1, terms)
+    remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
 
     @wp.kernel(module=_module(dtype, terms), enable_backward=False)
     def sweep_rows(
@@ -140,13 +177,17 @@ def sweep_after(dtype, terms: int = 0):
         # in and out
         x: wp.array(dtype=vec3),
     ):
-        copy = wp.tid()
+        copy, thread = wp.tid()
         if active[copy] == 0:
             return
-        for i in range(copy * per_copy, (copy + 1) * per_copy):
-            total = r[i] - product(matrix, i, 0, d, d, dtype(0.0))
-            if further:
-                total -= further[i]
-            x[i] = x[i] + d[i] + sweep[i] * total
+        if wp.static(block == 0):
+            for i in range(copy * per_copy, (copy + 1) * per_copy):
+                x[i] = x[i] + d[i] + sweep[i] * remaining(i, 0, matrix, d, further, r)
+        else:
+            i = copy * per_copy + thread // wp.static(lanes)
+            lane = thread % wp.static(lanes)
+            total = remaining(i, lane, matrix, d, further, r)
+            if lane == 0:
+                x[i] = x[i] + d[i] + sweep[i] * total
 
     return sweep_rows

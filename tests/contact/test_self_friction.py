@@ -72,7 +72,7 @@ def test_contact_that_is_gathered_is_what_is_scattered(dtype, device):
             rows = block_rows(model.dtype)()
             rows.offsets, rows.pairs, rows.blocks = nothing, term.pairs, term.blocks
             given = [rows, p, None, zero, active[1:], model.count]
-            model.launch(subtract_product(model.dtype, 1), 1, given, [product])
+            model.launch(subtract_product(model.dtype, 1, 1), (1, model.count), given, [product])
             np.testing.assert_allclose(-product.numpy(), found[3].numpy(), atol=near * np.abs(found[3].numpy()).max())
         return [array.numpy() for array in found]
 

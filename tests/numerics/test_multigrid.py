@@ -93,9 +93,9 @@ def applied(multigrid, count, copies):
     return found
 
 
-def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels():
+def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels(device):
     """x ← x + S(b − Ax), coarse correction P(PᵀAP)⁻¹Pᵀ, sweep, by dense matrices; A has negative eigenvalues."""
-    hessian = compressed("cpu")
+    hessian = compressed(device)
     multigrid = VCycle(hessian)
     multigrid.update()
     B, n = 2, hessian.per_copy

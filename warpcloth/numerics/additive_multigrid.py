@@ -21,8 +21,8 @@ class AdditiveMultigrid(Multigrid):
     inverse, or S. P̄ has the diagonal blocks of pairs of self-contact, but not what couples their vertices; so do coarse
     matrices.
 
-    It takes 1.1 to 1.3 times the iterations of the V-cycle in contact, and 1.5 times in hanging cloth. On a GPU launches cost
-    most, so that an iteration takes about half the time; on a CPU the V-cycle is faster.
+    It takes 1.1 to 1.3 times the iterations of the V-cycle in contact, and 1.5 times in hanging cloth. On a GPU launches and
+    products with pairs cost most, so that an iteration takes about half the time.
     """
 
     def __init__(self, hessian):
@@ -94,5 +94,5 @@ class AdditiveMultigrid(Multigrid):
 
 
 def multigrid_of(hessian):
-    """Returns the multigrid that is faster on the device of a :class:`warpcloth.core.hessian.Hessian`."""
-    return (AdditiveMultigrid if hessian.model.device.is_cuda else VCycle)(hessian)
+    """Returns the multigrid of a :class:`warpcloth.core.hessian.Hessian`: additive for self-contact on CUDA, else a V-cycle."""
+    return (AdditiveMultigrid if hessian.model.device.is_cuda and hessian.dynamic else VCycle)(hessian)

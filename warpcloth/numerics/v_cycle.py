@@ -1,9 +1,9 @@
-"""A V-cycle of multigrid, on the CPU."""
+"""A V-cycle of multigrid."""
 
 import warp as wp
 
 from ..kernels import v_cycle as kernels
-from ..kernels.block_rows import block_rows
+from ..kernels.block_rows import block_rows, lanes_of_rows
 from ..kernels.linear import multiply
 from .multigrid import Multigrid
 
@@ -21,12 +21,15 @@ class VCycle(Multigrid):
         )
         products = kernels.subtract_product, kernels.sweep_after
         self._launch = model.launcher(
-            (products, model.dtype), ((kernels.restrict, kernels.prolong), model.dtype), ((multiply,), model.dtype)
+            (products, model.dtype, self._block),
+            ((kernels.restrict, kernels.prolong), model.dtype),
+            ((multiply,), model.dtype),
         )
-        self._launch_finest = model.launcher((products, model.dtype, terms)) if terms else self._launch
+        self._launch_finest = model.launcher((products, model.dtype, self._block, terms)) if terms else self._launch
+        self._of_row = lanes_of_rows(self._block)
         of_levels = [len(level.columns) // model.copies for level in self.levels]
         blocks = 2 * sum(of_levels[:-1]) + of_levels[-1] * self.dense + sum(4 * n for n in self.sizes[:-1])
-        self.cycle = self._cost_of_cycle(blocks, 0)
+        self.cycle = self._cost_of_cycle(blocks, 4 * len(self.transfers) + self.dense + 1)
 
     def refine(self, r, z, active):
         """Launches the rest of a cycle: from z = S r to z ≈ A⁻¹ r, in the copies that are ``active`` (B,)."""
@@ -34,9 +37,10 @@ class VCycle(Multigrid):
         for k, (transfer, coarser) in enumerate(zip(self.transfers, self.levels[1:], strict=True)):
             launch, further = self._with_dynamic(k, x, active)
             given = [self._rows(k), x, further, right, active, self.sizes[k]]
-            launch(kernels.subtract_product, B, given, [self._r[k]])
+            launch(kernels.subtract_product, (B, self._threads(self.sizes[k] * self._of_row)), given, [self._r[k]])
             given = [*transfer.columns[:2], self._weights[k][1], self._r[k], coarser.sweep, active, *self.sizes[k : k + 2]]
-            self._launch(kernels.restrict, B, given, [self._r[k + 1], self._x[k + 1]])
+            threads = self._threads(coarser.n)
+            self._launch(kernels.restrict, (B, threads), [*given, threads], [self._r[k + 1], self._x[k + 1]])
             right, x = self._r[k + 1], self._x[k + 1]
         if self.dense:
             last = self.levels[-1]
@@ -44,12 +48,17 @@ class VCycle(Multigrid):
             self._launch(multiply, B * last.n, given, [self._x[-1]])
         for k in reversed(range(len(self.transfers))):
             given = [*self.transfers[k].rows[:2], self._weights[k][0], self._x[k + 1], active, *self.sizes[k : k + 2]]
-            self._launch(kernels.prolong, B, given, [self._d[k]])
+            threads = self._threads(self.sizes[k])
+            self._launch(kernels.prolong, (B, threads), [*given, threads], [self._d[k]])
             if k == 0:
                 self.model.lock(self._d[k])
             launch, further = self._with_dynamic(k, self._d[k], active)
             given = [self._rows(k), self.levels[k].sweep, self._d[k], further, self._r[k], active, self.sizes[k]]
-            launch(kernels.sweep_after, B, given, [self._x[k] if k else z])
+            launch(kernels.sweep_after, (B, self._threads(self.sizes[k] * self._of_row)), given, [self._x[k] if k else z])
+
+    def _threads(self, count):
+        """Returns the number of threads of a copy that share ``count`` items: one on the CPU."""
+        return count if self._block else 1
 
     def _rows(self, k):
         """Returns the :func:`warpcloth.kernels.block_rows.block_rows` of a level, which holds no references."""
