@@ -68,7 +68,7 @@ def add_blocks(dtype):
         s = wp.tid()
         first = offsets[s]
         end = offsets[s + 1]
-        if first < end:  # a collider has blocks on the diagonal alone
+        if first < end:  # colliders add to blocks on the diagonal only
             total = values[s]
             for n in range(first, end):
                 total += blocks[sources[n]]

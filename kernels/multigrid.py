@@ -49,8 +49,8 @@ def find_slots():
     """Kernel over rows: the block of a product L R to which each multiple of a block is added.
 
     The multiples come in the order of the entries of a row of L, and of those of R in the row of its column. If the product is
-    ``symmetric``, 1, blocks left of the diagonal are those right of it, transposed: their multiples have −1, and ``mirrors``
-    has the transposed block of each, else −1. ``counts`` is the number of multiples of each row that are not left out.
+    ``symmetric``, 1, multiples of blocks left of the diagonal are left out, with slot −1. ``mirrors`` then has the transpose
+    of each block, else −1. ``counts`` is the number of multiples of each row that are not left out.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)

@@ -118,9 +118,9 @@ def sum_of_lanes(dtype, lanes: int):
 
 @cache
 def largest_of_warp(dtype):
-    """Device function (value, key) → the largest of each component in the first thread of a warp with one key, 0 in the others.
+    """Device function (value, key) → the value; but if all threads of a warp have one key, their largest value, by components.
 
-    Where keys differ or threads are missing, as on the CPU, it is the value. All threads must call it.
+    Only the first thread gets that, the others get 0. All threads must call it.
     """
     vec3, _ = types(dtype)
 

@@ -238,9 +238,9 @@ def measure_start(block: int):
 
 @cache
 def work_of_guess(dtype, block: int):
-    """Kernel over (copies, lanes): trial = d + p, the parts of ``WORK`` there, and of ‖p‖² in the row ``SQUARE``.
+    """Kernel over (copies, lanes): trial = d + p, and the parts of two sums.
 
-    See :func:`finish_gradient`.
+    The row ``WORK`` has that of :func:`finish_gradient` at the trial, ``SQUARE`` that of ‖p‖².
     """
     vec3, _ = types(dtype)
     store, _add_up = block_sums(block)
@@ -279,8 +279,8 @@ def work_of_guess(dtype, block: int):
 def bound_guess(block: int):
     """Kernel over (copies, lanes of one block): ``hopeful`` is 1 for ``active`` copies where a guess may lower φ, else 0.
 
-    It may not if φ without pairs, whose energies are not negative, is as high as φ at d, or if it is d. ``some`` becomes 1 if
-    any copy is.
+    Pairs have no negative energy. So φ is not lower at the guess if it is as high there without pairs as φ is at d; nor if the
+    guess is d. ``some`` becomes 1 if a copy is hopeful.
     """
     _store, add_up = block_sums(block)
 

@@ -221,7 +221,7 @@ def count_items(dtype):
     box_along, level_of, cell_of = boxes(dtype)
     largest_in_warp, number = largest_of_warp(dtype), f"wp::{dtype.__name__}"
 
-    # Atomic operations do not change what a multiprocessor has in its cache.
+    # Volatile, because a cached value would miss what other multiprocessors have stored.
     @wp.func_native(
         f"const volatile {number}* at = (const volatile {number}*)((const char*)a.data + i * a.strides[0]) + 3 * j; "
         f"return wp::vec_t<3, {number}>(at[0], at[1], at[2]);"
@@ -247,7 +247,7 @@ def count_items(dtype):
             if not boxes_meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 level = -1
         kind = kind_in_grid(v, surface.groups[item])
-        own = largest_in_warp(dtype(0.5) * (high - low), LEVELS * kind + wp.max(level, -1))
+        own = largest_in_warp(dtype(0.5) * (high - low), (LEVELS + 2) * kind + level)
         key = wp.int32(-1)
         if level >= 0:
             if (grid.levels[kind] & (1 << level)) == 0:

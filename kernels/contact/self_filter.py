@@ -306,7 +306,10 @@ def end_filter(dtype):
 
 @cache
 def find_short(dtype):
-    """Kernel over vertices: ``walk`` is 1 for copies that colliders cut since ``before`` and of which x is not the target."""
+    """Kernel over vertices: ``walk`` of a copy becomes 1 if it is cut more often than ``before`` and not at its target.
+
+    ``some`` becomes 1 too.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -329,6 +332,20 @@ def find_short(dtype):
             some[0] = 1
 
     return find_each_short
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def take_back(
+    # state in
+    before: wp.array(dtype=wp.int64),
+    walk: wp.array(dtype=wp.int32),
+    # in and out
+    first: wp.array(dtype=wp.int64),
+):
+    """Kernel over copies: ``first`` is what it was ``before`` in copies that ``walk`` again."""
+    copy = wp.tid()
+    if walk[copy] == 1:
+        first[copy] = before[copy]
 
 
 @cache

@@ -353,6 +353,30 @@ def test_vertices_that_leave_a_collider_stop_no_others(device, speed=15.0, h=1.0
     np.testing.assert_allclose(corners, -h * (speed + h * 9.81), rtol=0.01)
 
 
+def test_a_copy_that_moves_again_moves_no_other(device, r=5e-3):
+    """Sheets that almost touch, at rest, beside a copy of them that is thrown onto a soft ball; a mesh moves far away."""
+    solid = trimesh.creation.icosahedron()
+    mesh = wc.MeshCollider(0.1 * solid.vertices, solid.faces, position=np.arange(5)[:, None] * [0, 2e-3, 0] + [3, 0, 0])
+    ball, contact = wc.Sphere(radius=0.1, position=[0.0, -0.12, 0.0]), wc.Contact(distance=r, stiffness=10.0)
+    fields = {"fps": 60.0, "duration": 4 / 60, "colliders": [ball, mesh], "contact": contact}
+    scene = layers(gap=0.06 * r, distance=r, stiffness=1e-2, **fields)
+    velocities = np.zeros((2, 72, 3))
+    velocities[1, :, 1] = -15.0
+
+    def ends(velocities):
+        count = len(velocities)
+        model = scene.build(device=device, dtype="float64", copies=count, vary={"velocities": velocities})
+        stepper = wc.Newton(substeps=1).bind(model)
+        for _ in range(3):
+            stepper.step()
+        return stepper.state.x.numpy().reshape(count, -1, 3), stepper.colliders.notes.cut.numpy()
+
+    both, cut = ends(velocities)
+    assert cut[0] == 0 < cut[1]
+    for copy in range(2):
+        assert (ends(velocities[[copy]])[0][0] == both[copy]).all()
+
+
 @table("name", ("xpbd",), list(SOLVERS)[:4])
 def test_contact_in_a_frame_that_moves(name, device):
     """Two sheets that fall on a plane at rest, and at rest on a plane that rises as fast, move the same relative to it."""

@@ -80,8 +80,8 @@ class Proximity:
         self._along = filled(proximity_grid.surfaces(model.dtype), **values | touching)
         self._allocate_grid()
         self._set_pieces(piece)
-        # More than a million threads only repeat work: of 1, 2, 4 and 8 shares, 8, 4 and 1 are fastest with 64², 256² and 512²
-        # vertices on an H200.
+        # Threads that share a search repeat work, so they are at most a million. Of 1, 2, 4 and 8 shares 8 is fastest with 64²
+        # vertices, 4 with 256², and 1 with 512² (one H200).
         most = min((1 << 20) // max(self._edges, 1), 8)
         self._shares = 1 << max(most.bit_length() - 1, 0) if model.device.is_cuda else 1
         self.found, self.listed = surface.vectors(), surface.vectors()  # all 0, so that the first call makes a list

@@ -76,11 +76,13 @@ class SelfFilter:
     def launch_end(self, x, v, move=None, parts=1):
         """Moves the cloth from its start of the step towards x, as far as pairs stay apart; corrects x, v and ``move``, (N,).
 
-        If iterates stay apart, the move starts at the last one. Where the filter of colliders has moved x out of one and that
-        way is cut, the move starts at the start of the step instead, which is outside. Pins have moved in ``parts`` equal parts
-        of the step.
+        If iterates stay apart, the move starts at the last one. That may be inside a collider. So a copy of which vertices were
+        moved out of colliders, and which does not arrive at x, moves again from the start of the step, which is outside. Pins
+        have moved in ``parts`` equal parts of the step.
         """
         model = self.model
+        if self._cut_before is not None and self._surface.moves:
+            wp.copy(self._forced_before, self._contact.first_forced)
         self._launch_meshes(self._contact.placed[2], lists=True)
         self._put(self._other, x)
         walk = partial(self._launch_end, x, v, move, parts)
@@ -110,7 +112,10 @@ class SelfFilter:
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
 
     def _launch_from_start(self, x):
-        """Moves copies from the start of the step, if a vertex has left a collider and x (V,) is not the target."""
+        """Moves copies again, from the start of the step, of which a vertex left a collider and which are not at the target.
+
+        Meshes move again too, and what their first move noted of these copies is taken back.
+        """
         self._walking.zero_()
         self._proceed.zero_()
         given = [x, self._target, self._cut_before, self._colliders.notes.cut, self.model.per_copy]
@@ -123,10 +128,12 @@ class SelfFilter:
         if self._surface.moves:
             given = [self._contact.placed[0], self._walking, layout, self.model.count]
             self._launch_move(self_filter.walk_from_start, given, [self._surface.behind(x)])
-            wp.copy(self._short, self._walking)
+            given = [self._forced_before, self._walking]
+            self.model.launch(self_filter.take_back, self.model.copies, given, [self._contact.first_forced])
+            wp.copy(self._again, self._walking)
             self.launch_fresh(x, self._contact.relist)
-            self._launch_meshes(self._contact.placed[2], lists=True)
-            wp.copy(self._walking, self._short)
+            self._launch_meshes(self._contact.placed[2], lists=True, active=self._again)
+            wp.copy(self._walking, self._again)
         self._launch_rounds(x)
 
     def _launch_divide(self, start):
@@ -259,17 +266,21 @@ class SelfFilter:
         """Moves meshes, and cloth out of their way, to where the step evaluates forces."""
         self._launch_meshes(self._contact.placed[1])
 
-    def _launch_meshes(self, goal, lists=False):
+    def _launch_meshes(self, goal, lists=False, active=None):
         """Moves meshes to their ``goal`` (B·m,) [m], and cloth that would be in their way, in the positions of the step.
 
-        It ``lists`` pairs there first, if they may have moved since their sides were computed.
+        It ``lists`` pairs there first, if they may have moved since their sides were computed. Copies that are not ``active``
+        (B,) stay; None for all.
         """
         if not self._surface.moves:
             return
         x = self._contact.x_before
         for array in (self._rounds, self._proceed):
             array.zero_()
-        self._walking.fill_(1)
+        if active is None:
+            self._walking.fill_(1)
+        else:
+            wp.copy(self._walking, active)
         self._launch_move(piece_motion.compare_positions, [goal, self._surface.behind(x)], [self._proceed])
         if lists:
             wp.capture_if(self._proceed, self._launch_sides, x=x)
@@ -343,7 +354,7 @@ class SelfFilter:
         self._make(self_filter.aim)
         if self._colliders is not None and not self._lets_out:
             self._cut_before = wp.zeros_like(self._colliders.notes.cut)
-            self._short = wp.zeros_like(self._walking)
+            self._again, self._forced_before = wp.zeros_like(self._walking), model.scalars(wp.int64)
             self._make(self_filter.find_short, self_filter.walk_from_start)
 
     def launch_start(self, base, d):
@@ -394,7 +405,10 @@ class SelfFilter:
         self._aim(goal, d, True, False, None, direction)
 
     def launch_whole(self, direction, wanted, some):
-        """Clears ``wanted`` (B,) where pairs would meet along the direction from their list; ``some`` is 1 if any is left."""
+        """Limits the direction as :meth:`launch_limit` if it is ``whole``, and clears ``wanted`` (B,) of copies that it stops.
+
+        ``some`` (1,) is 1 if a copy is still wanted, else 0.
+        """
         self.launch_limit(direction, whole=True)
         some.zero_()
         self.model.launch(self_filter.copies_free, self.model.copies, [self.fraction], [wanted, some])

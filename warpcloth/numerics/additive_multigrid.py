@@ -1,4 +1,4 @@
-"""Additive multigrid with smoothed interpolation, which multiplies by no matrix in an iteration and so needs few launches."""
+"""Additive multigrid with smoothed interpolation, which has no products with A and so few launches."""
 
 import numpy as np
 import warp as wp
@@ -9,7 +9,7 @@ from ..kernels.block_rows import LANES
 from .multigrid import Multigrid
 from .v_cycle import VCycle
 
-# On CUDA a block of so many threads takes all levels of at most SMALL vertices.
+# On CUDA one block, of THREADS threads, takes all levels of at most SMALL vertices.
 THREADS, SMALL = 1024, 128
 
 
@@ -18,8 +18,7 @@ class AdditiveMultigrid(Multigrid):
 
     This is the simplified additive variant of a cycle by Vassilevski and Yang (2014, *Reducing communication in algebraic
     multigrid using additive variants*). With 2S − S A S in place of S it would be the V-cycle. M of the coarsest level is its
-    inverse, or S. P̄ has the diagonal blocks of pairs of self-contact, but not what couples their vertices; so do coarse
-    matrices.
+    inverse, or S. Of pairs of self-contact, P̄ and coarse matrices take the diagonal blocks only.
 
     It takes 1.1 to 1.3 times the iterations of the V-cycle in contact, and 1.5 times in hanging cloth. On a GPU launches and
     products with pairs cost most, so that an iteration takes about half the time.
