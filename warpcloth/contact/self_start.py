@@ -131,15 +131,14 @@ def _too_near(contact, x):
 def _refuse_meshes(contact, stencils, gaps, least):
     """Raises ValueError if cloth starts at a mesh, with a gap below ``least`` [m]."""
     model, surface = contact.model, contact.surface
-    for s, gap in zip(stencils, gaps, strict=True):
-        behind = s[s >= model.count]
-        if len(behind) and gap < least:
-            mesh = model.scene.colliders[surface.colliders[(behind[0] - model.count) % surface.obstacles]].label
-            own = s[s < model.count][:1]
-            raise ValueError(
-                f"{_named(model, own)}{_of_copy(model, own[0])}, or an element at it, starts {gap:.3g} m from {mesh}; it must "
-                f"start more than {least:.3g} m away, a thousandth of the contact distance and rounding"
-            )
+    for k in np.flatnonzero((gaps < least) & (stencils >= model.count).any(axis=1))[:1]:
+        s = stencils[k]
+        behind, own = s[s >= model.count], s[s < model.count][:1]
+        mesh = model.scene.colliders[surface.colliders[(behind[0] - model.count) % surface.obstacles]].label
+        raise ValueError(
+            f"{_named(model, own)}{_of_copy(model, own[0])}, or an element at it, starts {gaps[k]:.3g} m from {mesh}; it must "
+            f"start more than {least:.3g} m away, a thousandth of the contact distance and rounding"
+        )
 
 
 def _longest_edge(model, points):

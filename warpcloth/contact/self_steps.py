@@ -123,6 +123,7 @@ class SelfSteps:
             self._prepare_obstacles()
         self.filter = SelfFilter(self, colliders)
         self.friction, self.stale = None, False
+        self._make_room(state.x)
         self._hold()
         state.add("positions of the list", self.proximity.found)
         self.near = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
@@ -174,6 +175,14 @@ class SelfSteps:
         finally:
             for array, before in zip(self._carried, kept, strict=True):
                 wp.copy(array, before)
+
+    def _make_room(self, x):
+        """Grows the lists for the pairs at the start x (N,), before :meth:`_hold` allocates most of what pairs take."""
+        wp.copy(self.x_before, x, count=self.model.count)
+        self.proximity.launch(self.x_before)
+        if self.proximity.overflowed:
+            self.proximity.grow()
+        self.proximity.set_skin(self.skin)  # so that the first step makes a list
 
     def _hold(self):
         """Allocates arrays for the pairs that the list can hold."""

@@ -128,8 +128,10 @@ class ContactSurface:
         """Returns the vertices that share a triangle with each vertex of a copy, (n + m + 1,) offsets and (…,) vertices."""
         own = self.items[: self.triangles // self.model.copies, :3].astype(np.int64)  # of the first copy
         own[own >= self.model.count] -= self.model.count - self.model.per_copy
-        pairs = np.unique(np.concatenate([own[:, [i, j]] for i in range(3) for j in range(3) if i != j]), axis=0)
-        return np.searchsorted(pairs[:, 0], np.arange(len(self.rest) + 1)), pairs[:, 1]
+        count = np.int64(len(self.rest))
+        keys = np.sort(np.concatenate([own[:, i] * count + own[:, (i + k) % 3] for i in range(3) for k in (1, 2)]))
+        one, other = np.divmod(keys[np.flatnonzero(np.diff(keys, prepend=-1))], count)
+        return np.searchsorted(one, np.arange(count + 1)), other
 
     def pieces(self, piece):
         """The pieces of a copy with its obstacles, (n + m,): those of the cloth, −1 without an element, then each collider."""
