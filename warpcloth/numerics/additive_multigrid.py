@@ -17,7 +17,7 @@ class AdditiveMultigrid(Multigrid):
     """Approximates A⁻¹ by M = S + P̄ M_c P̄ᵀ with P̄ = P − S A P; M_c does the same for the next coarser level.
 
     This is the simplified additive variant of a cycle by Vassilevski and Yang (2014, *Reducing communication in algebraic
-    multigrid using additive variants*). With 2S − S A S in place of S it would be the V-cycle. M of the coarsest level is its
+    multigrid using additive variants*). If S were 2S − S A S, it would be the V-cycle. M of the coarsest level is its
     inverse, or S. Of pairs of self-contact, P̄ and coarse matrices take the diagonal blocks only.
 
     It takes 1.1 to 1.3 times the iterations of the V-cycle in contact, and 1.5 times in hanging cloth. On a GPU launches and
@@ -68,13 +68,14 @@ class AdditiveMultigrid(Multigrid):
         self._structs.append(found)
         self._arrays.append(arrays)
 
-    def _end_coarse(self, k, due):
-        """Launches P̄ of transfer k from AP."""
-        transfer, finer, mobility = self.transfers[k], self.levels[k], self.model.mobility if k == 0 else None
-        arrays = self._arrays[k]
-        given = [transfer.pattern.rows, arrays["slots"], arrays["weights"], mobility, finer.sweep, due, finer.n]
-        dim = self.model.copies, len(transfer.pattern.columns)
-        self._launch(kernels.smooth_interpolation, dim, given, [transfer.values, arrays["by_column"]])
+    def update_coarse(self, due):
+        """Launches the coarse matrices and P̄ for the present A in the copies that are ``due`` (B,); None for all."""
+        super().update_coarse(due)
+        for k, (transfer, arrays) in enumerate(zip(self.transfers, self._arrays, strict=True)):
+            pattern, mobility, finer = transfer.pattern, self.model.mobility if k == 0 else None, self.levels[k]
+            given = [pattern.rows, arrays["slots"], arrays["weights"], mobility, finer.sweep, due, finer.n]
+            dim = self.model.copies, len(pattern.columns)
+            self._launch(kernels.smooth_interpolation, dim, given, [transfer.values, arrays["by_column"]])
 
     def refine(self, r, z, active):
         """Launches z += P̄ M_c P̄ᵀ r, so from z = S r to z = M r, in the copies that are ``active`` (B,)."""

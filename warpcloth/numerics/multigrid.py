@@ -186,16 +186,12 @@ class Multigrid:
 
     def update_coarse(self, due):
         """Launches the coarse matrices for the present A in the copies that are ``due`` (B,), or in all if that is None."""
-        for k, (finer, level, transfer) in enumerate(zip(self.levels, self.levels[1:], self.transfers, strict=False)):
+        for finer, level, transfer in zip(self.levels, self.levels[1:], self.transfers, strict=False):
             transfer.launch_matrix(finer.values, due, level.values)
-            self._end_coarse(k, due)
             if level is not self.levels[-1] or not self.dense:
                 self._set_sweeps(level, 1.0, due)
         if self.dense:
             self._invert(self.levels[-1], due)
-
-    def _end_coarse(self, k, due):
-        """Launches what else depends on AP of transfer k."""
 
     def _set_sweeps(self, level, own, due):
         count = self.model.copies * level.n
