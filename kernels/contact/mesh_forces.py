@@ -23,10 +23,9 @@ def keep_forces(
 
     ``colliders`` is the collider of each obstacle of a copy; −1 keeps contact of cloth with cloth.
     """
-    t = wp.tid()
-    if t >= pairs.number[0]:
+    e = wp.tid()
+    if e >= pairs.number[0]:
         return
-    e = pairs.acting[t]
     own = obstacle_of(pairs.layout, parts[e])
     if own >= 0:
         own = colliders[own]
@@ -48,8 +47,7 @@ def work_of_meshes(
     out: wp.array2d(dtype=wp.float64),
 ):
     """Kernel of one thread: out (B, C) += Σ ∂U/∂y·travel, the work of mesh colliders on the cloth in a step [J]."""
-    for t in range(pairs.number[0]):
-        e = pairs.acting[t]
+    for e in range(pairs.number[0]):
         other = obstacle_of(pairs.layout, parts[e])
         if other >= 0:
             c = colliders[other]

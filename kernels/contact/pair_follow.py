@@ -10,7 +10,7 @@ from ..memory import load
 from ..terms import contact
 from .pair_potential import Contacts
 from .self_gaps import ONE, SIDE, ZERO
-from .self_pairs import Pairs
+from .self_pairs import Pairs, slot_with
 
 slope, _number = contact.slope, load(wp.int32)
 
@@ -25,8 +25,8 @@ def carry_forces(
     contacts: Contacts,
 ):
     """Kernel over contacts: carries over λ along n, before the contacts are found elsewhere."""
-    for t in range(wp.tid(), pairs.number[0], pairs.threads):
-        e = pairs.acting[t]
+    for e in range(wp.tid(), pairs.number[0], pairs.threads):
+        contacts.followed.keys[e] = pairs.keys[e]
         contacts.followed.carried[e] = wp.dot(multipliers[e], contacts.normal[e])
         contacts.followed.stencils[e] = contacts.parts[e]
 
@@ -43,33 +43,35 @@ def start_forces(
     contacts: Contacts,
 ):
     """Kernel over contacts: the start of λ is that of the same contact before, else −h²kAφ′, but 0 below r/2."""
-    for t in range(wp.tid(), pairs.number[0], pairs.threads):
-        e = pairs.acting[t]
+    for e in range(wp.tid(), pairs.number[0], pairs.threads):
         gap = contacts.gap[e]
         r = contacts.distance[e]
         found = ZERO
         if gap >= SIDE * r:
             found = -contacts.stiffness[e] * slope(gap, r) * h * h
-        # The list may have been made anew, so that the contact is now in another slot of its row.
-        half = contacts.code.shape[0] // 2
+        # The list may have been made anew, so that the contact now has another key of its row.
+        half = lists.stencils.shape[0]
+        key = pairs.keys[e]
         row = contacts.parts[e][0]
-        if e >= lists.counts[0] and e < half:
+        if key >= lists.counts[0] and key < half:
             row = vertices
             above = lists.rows.shape[0] - 1
             while above - row > 1:
                 middle = (row + above) // 2
-                if _number(lists.rows, middle) <= e:
+                if _number(lists.rows, middle) <= key:
                     row = middle
                 else:
                     above = middle
         first = contacts.followed.rows[row]
         end = wp.min(contacts.followed.rows[row + 1], half)
-        if e >= half:
+        if key >= half:
             first = half + 3 * first
             end = wp.min(half + 3 * end, 2 * half)
         for k in range(first, end):
-            if contacts.followed.carried[k] > ZERO and contacts.parts[e] == contacts.followed.stencils[k]:
-                found = contacts.followed.carried[k]
+            before = slot_with(contacts.followed.slots, contacts.followed.keys, contacts.followed.number, k)
+            if before >= 0 and contacts.followed.carried[before] > ZERO:
+                if contacts.parts[e] == contacts.followed.stencils[before]:
+                    found = contacts.followed.carried[before]
         contacts.followed.start[e] = wp.where(contacts.stiffness[e] > ZERO, found, ZERO)
 
 
@@ -92,6 +94,7 @@ def count_sweep(
 def fix_forces(
     # elements
     lists: Pairs,
+    pairs: Pairs,
     # parameters
     h: wp.float64,
     # in and out
@@ -105,18 +108,23 @@ def fix_forces(
     v = wp.tid()
     first = lists.rows[v]
     count = lists.rows[v + 1] - first
-    extra = contacts.code.shape[0] // 2 + 3 * first
-    if count < 2 or extra + 3 * count > contacts.code.shape[0]:
+    half = lists.stencils.shape[0]
+    extra = half + 3 * first
+    if count < 2 or extra + 3 * count > 2 * half:
         return
     for i in range(4 * count):
-        one = wp.where(i < count, first + i, extra + i - count)
+        one = slot_with(pairs.slots, pairs.keys, pairs.number, wp.where(i < count, first + i, extra + i - count))
+        if one < 0:
+            continue
         k = contacts.stiffness[one]
         share = wp.where(k > ZERO, contacts.share[one], ZERO)
-        if k != ZERO and share < ONE:
+        if share < ONE:
             held = ZERO
             whole = ZERO
             for j in range(4 * count):
-                other = wp.where(j < count, first + j, extra + j - count)
+                other = slot_with(pairs.slots, pairs.keys, pairs.number, wp.where(j < count, first + j, extra + j - count))
+                if other < 0:
+                    continue
                 A = contacts.stiffness[other]
                 if A > ZERO and wp.dot(contacts.normal[one], contacts.normal[other]) > ZERO:
                     held += contacts.followed.start[other]

@@ -25,8 +25,8 @@ from ..memory import load
 from ..terms.contact import bend
 from ..vectors import types
 from .obstacles import Layout, cloth_vertex, has_obstacle, in_copy
-from .self_gaps import CORNER, EDGE, INSIDE, ONE, SIDE, ZERO, along, from_plane, gap_along, nearest_of_face, vertex_of
-from .self_pairs import Pairs, module_of
+from .self_gaps import CORNER, EDGE, INSIDE, ONE, SIDE, ZERO, along, gap_along, nearest_of_face, vertex_of, vertex_triangle
+from .self_pairs import Pairs, module_of, slot_with, take_slot
 
 MIDDLE = wp.constant(wp.float64(0.125))  # weight of the distance from the middles of edges; below 1/6 D is strictly convex
 CLOSE = wp.constant(wp.float64(0.25))  # contact distance of edges over that of vertices
@@ -86,7 +86,8 @@ def on_two_edges(u: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 class Followed:
     """The ``start`` of each λ where contacts are found anew; those ``carried`` from the last ones, with their stencils, rows.
 
-    ``mode`` (1,) is 0 in a sweep, STARTING if it only adds the start, and ENDING if it only removes the forces.
+    The last ones also have their ``number``, ``keys`` and ``slots``. ``mode`` (1,) is 0 in a sweep, STARTING if it only adds
+    the start, and ENDING if it only removes the forces.
     """
 
     mode: wp.array(dtype=wp.int32)
@@ -94,6 +95,9 @@ class Followed:
     carried: wp.array(dtype=wp.float64)
     stencils: wp.array(dtype=wp.vec4i)
     rows: wp.array(dtype=wp.int32)
+    number: wp.array(dtype=wp.int32)
+    keys: wp.array(dtype=wp.int32)
+    slots: wp.array(dtype=wp.int32)
 
 
 STARTING, ENDING = wp.constant(1), wp.constant(2)
@@ -109,14 +113,28 @@ class Laws:
 
 
 @wp.struct
+class NearFaces:
+    """The near faces of each vertex at some positions.
+
+    ``code`` (C,) says where the nearest point of the face of a pair is. ``near`` (C,) lists the pairs of the near faces of
+    vertex i from rows[i] on, and ``counts`` (V,) has the number of these, and that of terms of the vertex whose faces have
+    their nearest points elsewhere. ``multiplicities`` (C,) are those of the terms of a near face, of its edges 12, 23 and 31
+    and its corners 1 to 3: 0 if another face owns them.
+    """
+
+    code: wp.array(dtype=wp.int32)
+    near: wp.array(dtype=wp.int32)
+    counts: wp.array(dtype=wp.vec2i)
+    multiplicities: wp.array(dtype=SIX)
+
+
+@wp.struct
 class Contacts:
     """The contacts at some positions, by slots: w, n, d, r [m], kA with the sign of m [N/m], ``share``, and ``fixed`` λ [kg·m].
 
-    Slot e < C of 2C is that of the pair e. Those from C + 3·rows[i] on are for terms of vertex i whose faces have their nearest
-    points elsewhere; F faces share at most 1.5 F edges, and as many vertices. kA is 0 in slots without a contact. ``code`` says
-    where the nearest point of a face is. ``near`` (C,) lists the pairs of the near faces of vertex i from rows[i] on, and
-    ``counts`` (V,) has the number of these and of its slots from C + 3·rows[i] on. ``multiplicities`` (C,) are those of the
-    terms of a near face, of its edges 12, 23 and 31 and its corners 1 to 3: 0 if another face owns them.
+    Of C listed pairs, the contact of pair e has the key e. Keys from C + 3·rows[i] on are of terms of vertex i whose faces have
+    their nearest points elsewhere; F faces share at most 1.5 F edges, and as many vertices. ``code`` says whether a contact is
+    that of two edges.
 
     ``parts`` has the vertices of the surface of a contact, and bit i of ``touching`` is 1 if wᵢ is not 0. The stencil has the
     first vertex of the cloth with w = 0 in place of each obstacle. Obstacles give the ``offset`` o = Σ wⱼXⱼ [m] of their
@@ -138,9 +156,6 @@ class Contacts:
     ratio: wp.array(dtype=wp.float64)
     fixed: wp.array(dtype=wp.float64)
     code: wp.array(dtype=wp.int32)
-    near: wp.array(dtype=wp.int32)
-    counts: wp.array(dtype=wp.vec2i)
-    multiplicities: wp.array(dtype=SIX)
     parts: wp.array(dtype=wp.vec4i)
     touching: wp.array(dtype=wp.int32)
     offset: wp.array(dtype=wp.vec3d)
@@ -207,7 +222,8 @@ def count_faces(stencils: STENCILS, codes: NUMBERS, near: NUMBERS, first: int, e
 
 @wp.func
 def put_contact(
-    slot: int,
+    key: int,
+    code: int,
     s: wp.vec4i,
     w: wp.vec4d,
     y: wp.vec3d,
@@ -217,16 +233,24 @@ def put_contact(
     pairs: Pairs,
     contacts: Contacts,
 ):
-    """Stores a contact in a slot, and lists it."""
+    """Stores a contact in a new slot, if there is one."""
     gap = wp.length(y)
+    own = cloth_vertex(pairs.layout, s)
+    of_cloth = wp.vec4i(s[0], s[1], s[2], s[3])
+    for i in range(4):
+        if s[i] >= pairs.layout.cloth:
+            of_cloth[i] = own
+    slot = take_slot(pairs, key, of_cloth)
+    if slot < 0:
+        return slot
     contacts.parts[slot] = s
+    contacts.code[slot] = code
     touching = wp.int32(0)
     for i in range(4):
         if w[i] != ZERO:
             touching += 1 << i
     contacts.touching[slot] = touching
     if pairs.layout.obstacles > 0:
-        own = cloth_vertex(pairs.layout, s)
         o = wp.vec3d()
         travel = wp.vec3d()
         for i in range(4):
@@ -234,11 +258,9 @@ def put_contact(
             if j >= 0:
                 o += w[i] * wp.vec3d(x[s[i]])
                 travel += w[i] * contacts.moves[j]
-                s[i] = own
                 w[i] = ZERO
         contacts.offset[slot] = o
         contacts.travel[slot] = travel
-    pairs.stencils[slot] = s
     contacts.weights[slot] = w
     contacts.normal[slot] = y / wp.max(gap, wp.float64(1e-300))
     contacts.gap[slot] = gap
@@ -247,36 +269,38 @@ def put_contact(
     contacts.share[slot] = ONE
     contacts.ratio[slot] = ONE
     contacts.fixed[slot] = ZERO
-    pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = slot
-    if pairs.corner_counts:
-        for i in range(4):
-            wp.atomic_add(pairs.corner_counts, s[i], 1)
+    return slot
 
 
 @wp.func
-def slot_of(contacts: Contacts, first: int, count: int, extra: int, i: int):
-    """The slot of contact i of a vertex: the first ``count`` are those of its near faces, others lie from ``extra`` on."""
+def slot_of(pairs: Pairs, near: NUMBERS, first: int, count: int, extra: int, i: int):
+    """The slot of contact i of a vertex, or −1: the first ``count`` are of near faces, others have keys from ``extra`` on."""
+    key = extra + i - count
     if i < count:
-        return contacts.near[first + i]
-    return extra + i - count
+        key = near[first + i]
+    return slot_with(pairs.slots, pairs.keys, pairs.number, key)
 
 
 @wp.func
-def set_shares(contacts: Contacts, first: int, count: int, extra: int, extras: int, lane: int, lanes: int):
-    """Sets the shares of every ``lanes``-th contact of a vertex with ``count`` near faces and ``extras`` other slots."""
+def set_shares(
+    pairs: Pairs, contacts: Contacts, near: NUMBERS, first: int, count: int, extra: int, extras: int, lane: int, lanes: int
+):
+    """Sets the shares of every ``lanes``-th contact of a vertex with ``count`` near faces and ``extras`` other terms."""
     for i in range(lane, count + extras, lanes):
-        one = slot_of(contacts, first, count, extra, i)
-        if contacts.stiffness[one] > ZERO:
+        one = slot_of(pairs, near, first, count, extra, i)
+        if one >= 0 and contacts.stiffness[one] > ZERO:
             total = ZERO
             positive = ZERO
             for j in range(count + extras):
-                other = slot_of(contacts, first, count, extra, j)
+                other = slot_of(pairs, near, first, count, extra, j)
+                if other < 0:
+                    continue
                 r = contacts.distance[other]
                 gap = contacts.gap[other]
                 # Contacts beyond r have no force, so that others have the same share with a goal as without.
                 beyond = gap >= r and contacts.gap[one] < contacts.distance[one]
                 turn = wp.dot(contacts.normal[one], contacts.normal[other])
-                if contacts.stiffness[other] != ZERO and not beyond and turn > ZERO:
+                if not beyond and turn > ZERO:
                     curvature = contacts.stiffness[other] * bend(wp.min(gap, r), r) * turn * turn
                     total += curvature
                     positive += wp.max(curvature, ZERO)
@@ -329,7 +353,7 @@ def find_near_faces(dtype):
         laws: Laws,
         vertices: int,
         # out
-        contacts: Contacts,
+        faces: NearFaces,
     ):
         for e in range(wp.tid(), wp.min(lists.counts[0], lists.stencils.shape[0]), lists.threads):
             s = _stencil(lists.stencils, e)
@@ -347,8 +371,7 @@ def find_near_faces(dtype):
                     y = w[0] * b + w[1] * c + w[2] * d
                     if goal or wp.length(y) < r:
                         found = code
-                        contacts.weights[e] = wp.vec4d(ONE, -w[0], -w[1], -w[2])
-            contacts.code[e] = found
+            faces.code[e] = found
 
     return find_each_near_face
 
@@ -361,19 +384,19 @@ def list_near_faces(
     vertices: int,
     threads: int,
     # out
-    contacts: Contacts,
+    faces: NearFaces,
 ):
-    """Kernel over vertices: their ``near`` faces and how many there are; none where the list has no room for their slots."""
+    """Kernel over vertices: their ``near`` faces and how many there are; none where there are no keys for their contacts."""
     for v in range(wp.tid(), vertices, threads):
         first = lists.rows[v]
         end = lists.rows[v + 1]
         near = wp.int32(0)
-        if contacts.code.shape[0] // 2 + 3 * end <= contacts.code.shape[0]:
+        if 3 * end <= lists.stencils.shape[0]:
             for e in range(first, end):
-                if _number(contacts.code, e) != NONE:
-                    contacts.near[first + near] = e
+                if _number(faces.code, e) != NONE:
+                    faces.near[first + near] = e
                     near += 1
-        contacts.counts[v] = wp.vec2i(near, 0)
+        faces.counts[v] = wp.vec2i(near, 0)
 
 
 @cache
@@ -411,14 +434,14 @@ def count_multiplicities(dtype):
         # parameters
         vertices: int,
         # out
-        contacts: Contacts,
+        near_faces: NearFaces,
     ):
         for e in range(wp.tid(), wp.min(lists.counts[0], lists.stencils.shape[0]), lists.threads):
             s = _stencil(lists.stencils, e)
-            if s[0] >= vertices or _number(contacts.code, e) == NONE:
+            if s[0] >= vertices or _number(near_faces.code, e) == NONE:
                 continue
             first = lists.rows[s[0]]
-            near = contacts.counts[s[0]][0]
+            near = near_faces.counts[s[0]][0]
             if near < 2:
                 continue
             end = first + near
@@ -426,19 +449,19 @@ def count_multiplicities(dtype):
             found = SIX()
             for i in range(1, 4):
                 j = wp.where(i == 3, 1, i + 1)
-                owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[j])
+                owner, faces, m, _lowest = count_faces(lists.stencils, near_faces.code, near_faces.near, first, end, s[i], s[j])
                 if owner == e:
                     P = at(x, correction, s[i]) - a
                     Q = at(x, correction, s[j]) - a
                     if along(P, Q) > ZERO and along(Q, P) > ZERO:
                         m -= faces - 1
                     found[i - 1] = m
-                owner, faces, m, _lowest = count_faces(lists.stencils, contacts.code, contacts.near, first, end, s[i], s[i])
+                owner, faces, m, _lowest = count_faces(lists.stencils, near_faces.code, near_faces.near, first, end, s[i], s[i])
                 if owner == e:
                     m += 1 + faces
-                    m -= edges_at(lists.stencils, contacts.code, contacts.near, first, end, s[i], a, x, correction)
+                    m -= edges_at(lists.stencils, near_faces.code, near_faces.near, first, end, s[i], a, x, correction)
                     found[i + 2] = m
-            contacts.multiplicities[e] = found
+            near_faces.multiplicities[e] = found
 
     return count_each_multiplicity
 
@@ -465,21 +488,23 @@ def find_vertex_contacts(dtype):
         distant: bool,
         vertices: int,
         threads: int,
+        # in and out
+        faces: NearFaces,
         # out
         pairs: Pairs,
         contacts: Contacts,
     ):
         for v in range(wp.tid(), vertices, threads):
-            near = contacts.counts[v][0]
+            near = faces.counts[v][0]
             if near == 0:
                 continue
             first = lists.rows[v]
-            extra = contacts.code.shape[0] // 2 + 3 * first
+            extra = lists.stencils.shape[0] + 3 * first
             a = at(x, correction, v)
             extras = wp.int32(0)
             for k in range(first, first + near):
-                e = _number(contacts.near, k)
-                code = _number(contacts.code, e)
+                e = _number(faces.near, k)
+                code = _number(faces.code, e)
                 s = _stencil(lists.stencils, e)
                 r = laws.distance[0]
                 kA = SIDE * laws.stiffness[0] * areas.of_vertices[v]
@@ -493,15 +518,12 @@ def find_vertex_contacts(dtype):
                 c = at(x, correction, s[2]) - a
                 d = at(x, correction, s[3]) - a
                 corners = wp.matrix_from_rows(b, c, d)
-                w4 = contacts.weights[e]
                 if code == INSIDE or near == 1:
-                    y = w4[1] * b + w4[2] * c + w4[3] * d
-                    if code == INSIDE:
-                        y = from_plane(wp.cross(c - b, d - b), b)
-                    put_contact(e, s, w4, y, r, kA, x, pairs, contacts)
+                    w4, y = vertex_triangle(b, c, d)
+                    put_contact(e, code, s, w4, y, r, kA, x, pairs, contacts)
                 if near == 1:
                     continue
-                multiplicities = contacts.multiplicities[e]
+                multiplicities = faces.multiplicities[e]
                 for i in range(1, 4):
                     j = wp.where(i == 3, 1, i + 1)
                     P = corners[i - 1]
@@ -514,17 +536,17 @@ def find_vertex_contacts(dtype):
                             w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                             w4[i] = t - ONE
                             w4[j] = -t
-                            slot = wp.where(code == code_between(i, j), e, extra + extras)
-                            extras += wp.where(slot == e, 0, 1)
-                            put_contact(slot, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
+                            key = wp.where(code == code_between(i, j), e, extra + extras)
+                            extras += wp.where(key == e, 0, 1)
+                            put_contact(key, code, s, w4, y, r, wp.float64(m) * kA, x, pairs, contacts)
                     m = multiplicities[i + 2]
                     if m != 0 and (distant or wp.length(P) < r):
                         w4 = wp.vec4d(ONE, ZERO, ZERO, ZERO)
                         w4[i] = -ONE
-                        slot = wp.where(code == code_between(i, i), e, extra + extras)
-                        extras += wp.where(slot == e, 0, 1)
-                        put_contact(slot, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
-            contacts.counts[v] = wp.vec2i(near, extras)
+                        key = wp.where(code == code_between(i, i), e, extra + extras)
+                        extras += wp.where(key == e, 0, 1)
+                        put_contact(key, code, s, w4, -P, r, wp.float64(m) * kA, x, pairs, contacts)
+            faces.counts[v] = wp.vec2i(near, extras)
 
     return find_contacts_of_vertex
 
@@ -533,6 +555,9 @@ def find_vertex_contacts(dtype):
 def share_contacts(
     # elements
     lists: Pairs,
+    # state in
+    faces: NearFaces,
+    pairs: Pairs,
     # parameters
     vertices: int,
     lanes: int,
@@ -543,11 +568,11 @@ def share_contacts(
     """Kernel over vertices, each of ``lanes`` threads: the shares of their contacts, see :func:`set_shares`."""
     for thread in range(wp.tid(), vertices * lanes, threads):
         v = thread // lanes
-        counts = contacts.counts[v]
+        counts = faces.counts[v]
         if counts[1] > 0:
             first = lists.rows[v]
-            extra = contacts.code.shape[0] // 2 + 3 * first
-            set_shares(contacts, first, counts[0], extra, counts[1], thread - v * lanes, lanes)
+            extra = lists.stencils.shape[0] + 3 * first
+            set_shares(pairs, contacts, faces.near, first, counts[0], extra, counts[1], thread - v * lanes, lanes)
 
 
 @wp.func
@@ -585,7 +610,6 @@ def find_edge_contacts(dtype):
     ):
         end = wp.min(lists.counts[0] + lists.counts[1], lists.stencils.shape[0])
         for e in range(lists.counts[0] + wp.tid(), end, lists.threads):
-            contacts.code[e] = TWO_EDGES
             s = _stencil(lists.stencils, e)
             law = wp.where(has_obstacle(lists.layout, s), 1, 0)
             if lists.distances[e] != wp.float64(dtype(laws.distance[law])):
@@ -604,7 +628,9 @@ def find_edge_contacts(dtype):
             factor = ratio / CLOSE
             A = HALF_PI * width_of(areas, lists.layout, laws, s[0], s[1]) * width_of(areas, lists.layout, laws, s[2], s[3])
             w = wp.vec4d(ONE - p[0], p[0], p[1] - ONE, -p[1])
-            put_contact(e, s, w, y, laws.distance[law] / factor, factor * factor * laws.stiffness[law] * A, x, pairs, contacts)
-            contacts.ratio[e] = ratio
+            kA = factor * factor * laws.stiffness[law] * A
+            slot = put_contact(e, TWO_EDGES, s, w, y, laws.distance[law] / factor, kA, x, pairs, contacts)
+            if slot >= 0:
+                contacts.ratio[slot] = ratio
 
     return find_contact_of_edges

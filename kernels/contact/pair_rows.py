@@ -1,6 +1,6 @@
 """Factories of the constraint rows of pairs, for each :class:`.pair_sums.PairTerm`.
 
-Each copy has rows for all pairs; those of other copies, or without a force, are inactive, see :mod:`..constraint_rows`. With
+Each copy has rows for all slots; those of other copies, or without a pair, are inactive, see :mod:`..constraint_rows`. With
 ``curved``, pairs of a term with one row have a second one, which adds the stiffness −λC″. λ is found anew, as −C/α and the
 ``fixed`` force, for pairs may have other slots than in the last rows.
 """
@@ -29,8 +29,44 @@ class PairSlopes:
 
 
 @wp.func
-def row_of_pair(copy: int, e: int, layout: RowLayout, rows: int):
-    return copy * layout.rows_per_copy + layout.first + e * rows
+def row_of_pair(copy: int, e: int, ranks: wp.array(dtype=wp.int32), layout: RowLayout, rows: int):
+    """The first row of the pair in slot e, by its rank, or in the order of slots without ``ranks``."""
+    rank = e
+    if ranks:
+        rank = ranks[e]
+    return copy * layout.rows_per_copy + layout.first + rank * rows
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def count_first_corners(
+    # elements
+    pairs: Pairs,
+    # out
+    counts: wp.array(dtype=wp.int32),
+):
+    """Kernel over vertices: the number of pairs whose first corner they are."""
+    i = wp.tid()
+    found = wp.int32(0)
+    for k in range(pairs.first[i], pairs.first[i + 1]):
+        found += wp.where(pairs.corners[k] % 4 == 0, 1, 0)
+    counts[i] = found
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def rank_pairs(
+    # elements
+    pairs: Pairs,
+    starts: wp.array(dtype=wp.int32),
+    # out
+    ranks: wp.array(dtype=wp.int32),
+):
+    """Kernel over vertices: the ranks of pairs by their first corner, from ``starts`` on, and then by key."""
+    i = wp.tid()
+    rank = starts[i]
+    for k in range(pairs.first[i], pairs.first[i + 1]):
+        if pairs.corners[k] % 4 == 0:
+            ranks[pairs.corners[k] // 4] = rank
+            rank += 1
 
 
 @cache
@@ -53,13 +89,16 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
         h: wp.float64,
         least: wp.float64,
         layout: RowLayout,
+        ranks: wp.array(dtype=wp.int32),
         # out, and the multipliers in and out
         slopes: PairSlopes,
         rows: row_values(dtype),
     ):
         copy, e = wp.tid()
-        s = pairs.stencils[e]
-        start = row_of_pair(copy, e, layout, Q)
+        empty = e >= pairs.number[0]
+        start = copy * layout.rows_per_copy + layout.first + e * Q
+        if not empty:
+            start = row_of_pair(copy, e, ranks, layout, Q)
         for j in range(Q):
             rows.multipliers[start + j] = dtype(0.0)
             rows.gap[start + j] = dtype(0.0)
@@ -68,6 +107,10 @@ def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
             rows.residual[start + j] = ZERO
             rows.rounding[start + j] = ZERO
             rows.carried[start + j] = ZERO
+        if empty:
+            slopes.first[e] = wp.vec3d()
+            return
+        s = pairs.stencils[e]
         if s[0] // pairs.layout.per_copy != copy:
             return
         slopes.first[e] = wp.vec3d()
@@ -133,6 +176,7 @@ def apply_pair_rows(dtype, two: bool):
         v: wp.array(dtype=vec3),
         # parameters
         layout: RowLayout,
+        ranks: wp.array(dtype=wp.int32),
         # in and out
         rows: wp.array(dtype=dtype),
     ):
@@ -140,7 +184,7 @@ def apply_pair_rows(dtype, two: bool):
         if wp.length_sq(slopes.first[e]) == ZERO:
             return
         s = pairs.stencils[e]
-        row = row_of_pair(s[0] // pairs.layout.per_copy, e, layout, Q)
+        row = row_of_pair(s[0] // pairs.layout.per_copy, e, ranks, layout, Q)
         moved = wp.vec3d()
         for i in range(4):
             moved += slopes.weights[e][i] * wp.vec3d(v[s[i]])
@@ -166,6 +210,7 @@ def gather_pair_rows(dtype, two: bool):
         rows: wp.array(dtype=dtype),
         # parameters
         layout: RowLayout,
+        ranks: wp.array(dtype=wp.int32),
         # in and out
         out: wp.array(dtype=vec3),
     ):
@@ -174,7 +219,7 @@ def gather_pair_rows(dtype, two: bool):
         for k in range(pairs.first[i], pairs.first[i + 1]):
             e = pairs.corners[k] // 4
             if wp.length_sq(slopes.first[e]) > ZERO:
-                row = row_of_pair(i // pairs.layout.per_copy, e, layout, Q)
+                row = row_of_pair(i // pairs.layout.per_copy, e, ranks, layout, Q)
                 pull = wp.float64(rows[row]) * slopes.first[e]
                 if wp.static(two):
                     pull += wp.float64(rows[row + 1]) * slopes.second[e]

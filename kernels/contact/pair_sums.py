@@ -20,7 +20,7 @@ from .self_pairs import Pairs
 
 @wp.struct
 class PairForces:
-    """Values of each pair at some positions, in float64: w, U [J], ∂U/∂y [N] and ∂²U/∂y² [N/m]; 0 for pairs without a force.
+    """Values of each pair at some positions, in float64: w, U [J], ∂U/∂y [N] and ∂²U/∂y² [N/m].
 
     ∂²U/∂y² is the ``definite`` part, positive semi-definite, and the ``rest``, of which the matrix takes the factor that a
     :class:`..term.HessianPolicy` gives the negative part; ``block`` is their sum. For kernels that scatter, ``pressing`` lists
@@ -220,7 +220,7 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
 
 @cache
 def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
-    """Kernel over acting pairs: ``block`` with the ``policy`` (B,), and the :func:`pair_blocks` if products are gathered."""
+    """Kernel over pairs: ``block`` with the ``policy`` (B,), and the :func:`pair_blocks` if products are gathered."""
     vec3, mat33 = types(dtype)
     vec4, vec2, mat42, mat23 = (
         wp.types.vector(4, dtype),
@@ -241,8 +241,7 @@ def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
         # out
         out: pair_blocks(dtype),
     ):
-        for t in range(wp.tid(), pairs.number[0], pairs.threads):
-            e = pairs.acting[t]
+        for e in range(wp.tid(), pairs.number[0], pairs.threads):
             s = pairs.stencils[e]
             share = wp.max(policy[s[0] // pairs.layout.per_copy], ZERO)
             block = forces.definite[e] + share * forces.rest[e]

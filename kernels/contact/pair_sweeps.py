@@ -71,10 +71,10 @@ def mobility(dtype, axes: bool, isotropic: bool):
 
 @cache
 def sweep_pairs(term: PairTerm, dtype, axes: bool):
-    """Kernel of one thread, which takes each acting pair in turn."""
+    """Kernel of one thread, which takes each pair in turn."""
     vec3, _ = types(dtype)
     moved, respond, greatest = mobility(dtype, axes, term.isotropic)
-    near, push, number, stencil = term.near(dtype), term.push, load(wp.int32), load(wp.vec4i)
+    near, push, stencil = term.near(dtype), term.push, load(wp.vec4i)
 
     @wp.kernel(module="unique", enable_backward=False)
     def sweep_each_pair(
@@ -96,9 +96,8 @@ def sweep_pairs(term: PairTerm, dtype, axes: bool):
         count = pairs.number[0]
         turn = wp.int32(0)
         while turn < count:
-            own = wp.where(backward, count - 1 - turn, turn)
+            e = wp.where(backward, count - 1 - turn, turn)
             turn += 1
-            e = number(pairs.acting, own)
             before = wp.vec3d()
             if multipliers:
                 before = multipliers[e]
@@ -146,7 +145,7 @@ def number_corners(
 
 @cache
 def touch_pairs(term: PairTerm, dtype):
-    """Kernel over acting pairs of a Jacobi sweep: v, n and w of those that touch or have a force, counted at their vertices."""
+    """Kernel over pairs of a Jacobi sweep: v, n and w of those that touch or have a force, counted at their vertices."""
     vec3, _ = types(dtype)
     near = term.near(dtype)
 
@@ -162,10 +161,9 @@ def touch_pairs(term: PairTerm, dtype):
         # out
         swept: SweptPairs,
     ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
+        e = wp.tid()
+        if e >= pairs.number[0]:
             return
-        e = pairs.acting[t]
         swept.touches[e] = 0
         held = wp.bool(False)
         if multipliers:
@@ -189,7 +187,7 @@ def touch_pairs(term: PairTerm, dtype):
 
 @cache
 def press_pairs(term: PairTerm, dtype, axes: bool):
-    """Kernel over acting pairs of a Jacobi sweep: λ of the prox, with D = Σ nᵢwᵢ²/mᵢ, nᵢ the touching pairs of vertex i.
+    """Kernel over pairs of a Jacobi sweep: λ of the prox, with D = Σ nᵢwᵢ²/mᵢ, nᵢ the touching pairs of vertex i.
 
     D ⪰ J W Jᵀ, so the sum of the moves does not overshoot; the fixed point is that of :func:`sweep_pairs`. It stores wᵢλ −
     w′ᵢλ′ for each corner, w′ and λ′ of the last sweep, and then λ and w for the next one.
@@ -213,10 +211,9 @@ def press_pairs(term: PairTerm, dtype, axes: bool):
         multipliers: wp.array(dtype=wp.vec3d),
         forces: PairForces,
     ):
-        t = wp.tid()
-        if t >= pairs.number[0]:
+        e = wp.tid()
+        if e >= pairs.number[0]:
             return
-        e = pairs.acting[t]
         if swept.touches[e] == 0:
             for i in range(4):
                 swept.moves[swept.slots[4 * e + i]] = wp.vec3d()

@@ -178,8 +178,7 @@ def find_forces(dtype, bounded: bool):
         # out
         forces: PairForces,
     ):
-        for t in range(wp.tid(), pairs.number[0], pairs.threads):
-            e = pairs.acting[t]
+        for e in range(wp.tid(), pairs.number[0], pairs.threads):
             k = contacts.stiffness[e]
             r = contacts.distance[e]
             gap = contacts.gap[e]
@@ -280,8 +279,6 @@ def row_of_contact(pairs: Pairs, contacts: Contacts, e: int, x: wp.array(dtype=A
     """
     found = PairRow()
     k = contacts.stiffness[e]
-    if k == ZERO:
-        return found
     r = contacts.distance[e]
     gap = contacts.gap[e]
     n = contacts.normal[e]

@@ -523,10 +523,10 @@ def copies_in_contact(
     some: wp.array(dtype=wp.int32),
 ):
     """Kernel over contacts: ``touching`` becomes 1 for their copies if these are ``active``, and then ``some``."""
-    t = wp.tid()
-    if t >= pairs.number[0]:
+    e = wp.tid()
+    if e >= pairs.number[0]:
         return
-    copy = pairs.stencils[pairs.acting[t]][0] // pairs.layout.per_copy
+    copy = pairs.stencils[e][0] // pairs.layout.per_copy
     if active[copy] != 0:
         touching[copy] = 1
         some[0] = 1

@@ -23,7 +23,7 @@ from .obstacles import Layout, copy_of, in_copy, obstacle_of
 from .pair_potential import TWO_EDGES, Contacts
 from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
 from .self_gaps import ONE, ZERO, perpendicular
-from .self_pairs import Pairs
+from .self_pairs import Pairs, take_slot
 
 
 @wp.struct
@@ -168,7 +168,7 @@ def slip_at(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=Any), d
 
 @cache
 def begin_friction(dtype, law: Law, bounded: bool):
-    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force and friction, which act.
+    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force and friction.
 
     ``friction`` has μ of cloth with cloth, then that of each obstacle of a copy.
     """
@@ -190,8 +190,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
         pairs: Pairs,
         rubbed: RubbedPairs,
     ):
-        for t in range(wp.tid(), touching.number[0], touching.threads):
-            e = touching.acting[t]
+        for e in range(wp.tid(), touching.number[0], touching.threads):
             k = contacts.share[e] * contacts.stiffness[e]
             if not (k > ZERO and contacts.gap[e] < contacts.distance[e]):
                 continue
@@ -200,35 +199,31 @@ def begin_friction(dtype, law: Law, bounded: bool):
             limit = limit_of(-slope(contacts.gap[e], contacts.distance[e]), friction[own])
             if limit == ZERO:
                 continue
-            s = touching.stencils[e]
             for i in range(4):
                 if (contacts.touching[e] & (1 << i)) == 0:
                     parts[i] = -1
-            rubbed.parts[e] = parts
-            pairs.stencils[e] = s
-            rubbed.limit[e] = limit
+            slot = take_slot(pairs, touching.keys[e], touching.stencils[e])
+            rubbed.parts[slot] = parts
+            rubbed.limit[slot] = limit
             n = contacts.normal[e]
             w = contacts.weights[e]
             sides = wp.where(contacts.code[e] == TWO_EDGES, 2, 1)
             if touching.layout.obstacles > 0:
-                rubbed.travel[e] = contacts.travel[e]
+                rubbed.travel[slot] = contacts.travel[e]
                 if own > 0 and moves:
                     R = turn_of(touching.layout, rings, parts, w, sides, x, moves, x)
-                    rubbed.travel[e] -= contacts.gap[e] * (R * n - n)
-            rubbed.normal[e] = n
-            rubbed.weights[e] = w
-            rubbed.stiffness[e] = k
-            rubbed.sides[e] = sides
-            pairs.acting[wp.atomic_add(pairs.number, 0, 1)] = e
-            for i in range(4):
-                wp.atomic_add(pairs.corner_counts, s[i], 1)
+                    rubbed.travel[slot] -= contacts.gap[e] * (R * n - n)
+            rubbed.normal[slot] = n
+            rubbed.weights[slot] = w
+            rubbed.stiffness[slot] = k
+            rubbed.sides[slot] = sides
 
     return begin_friction_of_pairs
 
 
 @cache
 def set_anchors(dtype, law: Law):
-    """Kernel over acting pairs at the start of a step: a; ξ is from ``kept`` of the last step, if there are ``steps``."""
+    """Kernel over pairs at the start of a step: a; ξ is from ``kept`` of the last step, if there are ``steps``."""
     vec3, _ = types(dtype)
     kept_of = law.kept
 
@@ -244,8 +239,7 @@ def set_anchors(dtype, law: Law):
         # in and out
         rubbed: RubbedPairs,
     ):
-        for turn in range(wp.tid(), pairs.number[0], pairs.threads):
-            e = pairs.acting[turn]
+        for e in range(wp.tid(), pairs.number[0], pairs.threads):
             s = rubbed.parts[e]
             n = rubbed.normal[e]
             sides = rubbed.sides[e]
@@ -298,7 +292,7 @@ def set_anchors(dtype, law: Law):
 
 @cache
 def find_friction(dtype, law: Law):
-    """Kernel over acting pairs: the forces at x, or x + correction."""
+    """Kernel over pairs: the forces at x, or x + correction."""
     vec3, _ = types(dtype)
     energy, secant, bend = law.energy, law.secant, law.bend
 
@@ -313,14 +307,8 @@ def find_friction(dtype, law: Law):
         # out
         forces: PairForces,
     ):
-        for turn in range(wp.tid(), pairs.number[0], pairs.threads):
-            e = pairs.acting[turn]
+        for e in range(wp.tid(), pairs.number[0], pairs.threads):
             limit = rubbed.limit[e]
-            forces.energy[e] = ZERO
-            forces.force[e] = wp.vec3d()
-            forces.definite[e] = wp.mat33d()
-            if limit == ZERO:
-                continue
             n = rubbed.normal[e]
             w = rubbed.weights[e]
             k = rubbed.stiffness[e]
@@ -342,7 +330,7 @@ def find_friction(dtype, law: Law):
 
 @cache
 def end_friction(dtype):
-    """Kernel over acting pairs at the end x of a step: pairs ``kept`` for the next step, all but ``first``, and their ξ."""
+    """Kernel over pairs at the end x of a step: pairs ``kept`` for the next step, all but ``first``, and their ξ."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
@@ -360,11 +348,10 @@ def end_friction(dtype):
         kept: Pairs,
         slips: wp.array(dtype=SLIP),
     ):
-        for turn in range(wp.tid(), pairs.number[0], pairs.threads):
-            e = pairs.acting[turn]
+        for e in range(wp.tid(), pairs.number[0], pairs.threads):
             parts = rubbed.parts[e]
             kept.stencils[e] = parts
-            for i in range(4 * turn, 4 * turn + 4):
+            for i in range(4 * e, 4 * e + 4):
                 kept.corners[i] = pairs.corners[i]
             s = pairs.stencils[e]
             sides = rubbed.sides[e]
@@ -388,10 +375,7 @@ def near_friction(dtype):
 
     @wp.func
     def near_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: points, correction: points, always: bool):
-        u = wp.vec3d()
-        if rubbed.limit[e] > ZERO:
-            u = slip_at(pairs, rubbed, e, x, correction)
-        return rubbed.limit[e] > ZERO, u, rubbed.normal[e], rubbed.weights[e]
+        return True, slip_at(pairs, rubbed, e, x, correction), rubbed.normal[e], rubbed.weights[e]
 
     return near_of
 
@@ -421,14 +405,13 @@ def row_of_friction(law: Law):
     @wp.func
     def row_of(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=Any), d: wp.array(dtype=Any)):
         found = PairRow()
-        if rubbed.limit[e] > ZERO:
-            u = slip_at(pairs, rubbed, e, x, d)
-            found.weights = rubbed.weights[e]
-            found.first = perpendicular(rubbed.normal[e])
-            found.second = wp.cross(rubbed.normal[e], found.first)
-            found.C = wp.vec2d(wp.dot(u, found.first), wp.dot(u, found.second))
-            found.size = wp.length(u)
-            found.stiffness = rubbed.stiffness[e] * secant(found.size, rubbed.limit[e])
+        u = slip_at(pairs, rubbed, e, x, d)
+        found.weights = rubbed.weights[e]
+        found.first = perpendicular(rubbed.normal[e])
+        found.second = wp.cross(rubbed.normal[e], found.first)
+        found.C = wp.vec2d(wp.dot(u, found.first), wp.dot(u, found.second))
+        found.size = wp.length(u)
+        found.stiffness = rubbed.stiffness[e] * secant(found.size, rubbed.limit[e])
         return found
 
     return row_of

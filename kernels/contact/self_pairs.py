@@ -12,15 +12,16 @@ from .self_gaps import corners, nearest
 
 @wp.struct
 class Pairs:
-    """The near pairs of :class:`warpcloth.contact.proximity.Proximity`, or the slots of an energy.
+    """The near pairs of :class:`warpcloth.contact.proximity.Proximity`, or the contacts of an energy.
 
     Near pairs have the fields up to ``distances``: ``counts`` of vertex–triangle pairs, which come first, and of edge–edge
     pairs; those of vertex i in rows ``rows`` [i] to rows[i+1]; and r or, if less, half the rest distance [m], in the precision
     of the model. Kernels over pairs have so many ``threads``: on the CPU one, for each there copies structs.
 
-    An energy has ``stencils``, of cloth alone, and the others. ``acting`` lists the ``number`` (1,) of slots that act.
-    ``corners`` lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted. ``corner_counts`` is
-    scratch, 0 between launches. The last three are empty if no kernel sums over vertices.
+    An energy has ``stencils``, of cloth alone, and the others. Its contacts are in the first ``number`` (1,) slots, on a GPU in
+    any order. The ``keys`` of slots do not depend on that order, and ``slots`` has the slot of each key that is there, see
+    :func:`slot_with`. ``corners`` lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted by key.
+    ``corner_counts`` is scratch, 0 between launches. The last three are empty if no kernel sums over vertices.
     """
 
     layout: Layout
@@ -29,8 +30,9 @@ class Pairs:
     counts: wp.array(dtype=wp.int32)
     rows: wp.array(dtype=wp.int32)
     distances: wp.array(dtype=wp.float64)
-    acting: wp.array(dtype=wp.int32)
     number: wp.array(dtype=wp.int32)
+    keys: wp.array(dtype=wp.int32)
+    slots: wp.array(dtype=wp.int32)
     corner_counts: wp.array(dtype=wp.int32)
     first: wp.array(dtype=wp.int32)
     corners: wp.array(dtype=wp.int32)
@@ -80,20 +82,52 @@ def begin_pairs(dtype):
     return begin_each_pair
 
 
+@wp.func
+def take_slot(pairs: Pairs, key: int, s: wp.vec4i):
+    """Returns the slot of a new contact, or −1 if none is free; ``number`` counts it in any case."""
+    slot = wp.atomic_add(pairs.number, 0, 1)
+    if slot >= pairs.stencils.shape[0]:
+        return -1
+    pairs.keys[slot] = key
+    pairs.stencils[slot] = s
+    if pairs.slots:
+        pairs.slots[key] = slot
+    if pairs.corner_counts:
+        for i in range(4):
+            wp.atomic_add(pairs.corner_counts, s[i], 1)
+    return slot
+
+
+@wp.func
+def slot_with(slots: wp.array(dtype=wp.int32), keys: wp.array(dtype=wp.int32), number: wp.array(dtype=wp.int32), key: int):
+    """The slot of the contact with a key, or −1. Entries of ``slots`` without a contact are old (Briggs and Torczon 1993)."""
+    slot = slots[key]
+    if slot < number[0] and keys[slot] == key:
+        return slot
+    return -1
+
+
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
-def forget_contacts(
+def bound_number(
+    # in and out
+    pairs: Pairs,
+    most: wp.array(dtype=wp.int32),
+):
+    """Kernel of one thread: ``most`` (1,), the largest number of contacts, and the number of those that have a slot."""
+    most[0] = wp.max(most[0], pairs.number[0])
+    pairs.number[0] = wp.min(pairs.number[0], pairs.stencils.shape[0])
+
+
+@wp.kernel(module="warpcloth.self_contact", enable_backward=False)
+def forget_forces(
     # elements
     pairs: Pairs,
     # out
-    marks: wp.array(dtype=wp.float64),
     multipliers: wp.array(dtype=wp.vec3d),
 ):
-    """Kernel over acting contacts: their ``marks``, 0 in slots without a contact, and λ become 0; either may be None."""
-    for t in range(wp.tid(), pairs.number[0], pairs.threads):
-        if marks:
-            marks[pairs.acting[t]] = wp.float64(0.0)
-        if multipliers:
-            multipliers[pairs.acting[t]] = wp.vec3d()
+    """Kernel over contacts: their λ become 0."""
+    for e in range(wp.tid(), pairs.number[0], pairs.threads):
+        multipliers[e] = wp.vec3d()
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
@@ -101,12 +135,12 @@ def fill_corners(
     # in and out
     pairs: Pairs,
 ):
-    """Kernel over pairs: lists the corners of acting pairs at each vertex, and counts ``corner_counts`` down to 0."""
+    """Kernel over contacts: lists 4·key + corner at each vertex, and counts ``corner_counts`` down to 0."""
     for t in range(wp.tid(), pairs.number[0], pairs.threads):
-        e = pairs.acting[pairs.number[0] - 1 - t]
+        e = pairs.number[0] - 1 - t
         s = pairs.stencils[e]
         for i in range(4):
-            pairs.corners[pairs.first[s[i]] + wp.atomic_sub(pairs.corner_counts, s[i], 1) - 1] = 4 * e + i
+            pairs.corners[pairs.first[s[i]] + wp.atomic_sub(pairs.corner_counts, s[i], 1) - 1] = 4 * pairs.keys[e] + i
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
@@ -114,9 +148,12 @@ def sort_corners(
     # in and out
     pairs: Pairs,
 ):
-    """Kernel over vertices: sorts the corners of each vertex."""
+    """Kernel over vertices: sorts the corners of each vertex by their keys, and replaces these by their slots."""
     i = wp.tid()
     sort(pairs.corners, pairs.first[i], pairs.first[i + 1])
+    for k in range(pairs.first[i], pairs.first[i + 1]):
+        key = pairs.corners[k] // 4
+        pairs.corners[k] = 4 * pairs.slots[key] + pairs.corners[k] - 4 * key
 
 
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)

@@ -135,7 +135,7 @@ def end(what, name, device):
         assert stepper.results[0] in (Result.CONVERGED, Result.ROUNDED)
     if what in RUBBING:
         contact = stepper.pairs.contact
-        signs = contact.data.stiffness.numpy()[contact.pairs.acting.numpy()[: contact.pairs.number.numpy()[0]]]
+        signs = contact.data.stiffness.numpy()[: contact.pairs.number.numpy()[0]]
         assert (signs > 0.0).sum() > 10 and (signs < 0.0).any() == (what == "rubs over a valley")
         assert (stepper.pairs.friction.data.limit.numpy() > 0.0).sum() > 10
     return x

@@ -45,8 +45,8 @@ class Potential:
     def multiplicities(self):
         """Of the contacts of vertices at the last positions, m."""
         found, (faces, _) = self.steps.contact, self.steps.proximity.counts.numpy()
-        acting = found.pairs.acting.numpy()[: found.pairs.number.numpy()[0]]
-        acting = acting[(acting < faces) | (acting >= found.capacity // 2)]
+        keys = found.pairs.keys.numpy()[: found.pairs.number.numpy()[0]]
+        acting = np.flatnonzero((keys < faces) | (keys >= len(found.lists.stencils)))
         areas = self.steps.model.scene.mesh.vertex_areas[found.pairs.stencils.numpy()[acting, 0]]
         return found.data.stiffness.numpy()[acting] / (0.5 * STIFFNESS * areas)
 

@@ -28,17 +28,18 @@ def available_memory():
     return min((room for room in rooms if room is not None), default=None)
 
 
-def refuse_memory(what, size):
+def refuse_memory(what, size, device=None):
     """Checks that the arrays of an option fit in the free memory.
 
     Args:
         what: Option and value, which begin the error message: "frames is 1000000000".
         size: Bytes needed.
+        device: The Warp device that has the arrays; None for the host.
 
     Raises:
         ValueError: Fewer bytes are free.
     """
-    room = available_memory()
+    room = device.free_memory if device is not None and device.is_cuda else available_memory()
     if room is not None and size > room:
         raise ValueError(
             f"{what}, which takes {shown_bytes(size)} of memory; it must fit in the {shown_bytes(room)} that are free"

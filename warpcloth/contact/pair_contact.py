@@ -2,16 +2,21 @@
 
 import warp as wp
 
+from ..base.limits import refuse_memory
+from ..core.capture import Mirror
 from ..core.dynamic import DynamicElements
 from ..core.filled import filled
 from ..kernels.block_rows import LANES
 from ..kernels.contact import pair_follow
 from ..kernels.contact import pair_potential as potential
 from ..kernels.contact import self_contact as kernels
+from ..kernels.contact.self_pairs import bound_number
 
 # Sweeps, of a hierarchy those of the finest level, find contacts anew after so many, which costs as much as 2 or 3 sweeps.
 # Sooner, XPBD gains no less energy.
 EVERY = 10
+# Of a contact, and of its friction, with forces and blocks.
+BYTES_OF_A_CONTACT = 2000
 
 
 class PairContact(DynamicElements):
@@ -27,6 +32,8 @@ class PairContact(DynamicElements):
         obstacles: Positions (V,) [m] with the obstacles where forces are evaluated.
         least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
         lists: The listed pairs.
+        slots: The number of contacts that fit after the next :meth:`hold`.
+        most: The largest number of contacts so far, also of those that did not fit, :class:`.Mirror` of (1,) int32.
         turn: The number of sweeps of the step that count towards EVERY, (1,) int32.
     """
 
@@ -35,6 +42,7 @@ class PairContact(DynamicElements):
         model = surface.model
         super().__init__(model, kernels.CONTACT_OF_PAIRS, listed)
         self.least, self._laws, device = 0.0, laws, model.device
+        self.slots, self.most = max(8192, model.count // 2), Mirror(wp.zeros(1, dtype=wp.int32, device=device))
         areas = [wp.array(surface.of_model(each), dtype=wp.float64, device=device) for each in surface.areas()]
         rest = wp.array(surface.rest, dtype=wp.vec3d, device=device)
         self._areas = filled(potential.Areas, of_vertices=areas[0], of_edges=areas[1], rest=rest)
@@ -51,21 +59,26 @@ class PairContact(DynamicElements):
             self.hold(self.lists, self._normals)
 
     def hold(self, lists, normals):
-        """Takes the listed pairs and their normals (capacity,), and allocates contacts."""
+        """Takes the listed pairs and their normals (capacity,), and allocates contacts.
+
+        Raises:
+            ValueError: There is not enough memory.
+        """
+        slots, listed, device = self.slots, len(lists.stencils), self.model.device
+        refuse_memory(f"the cloth has {slots} contacts", BYTES_OF_A_CONTACT * slots, device)
         self.lists, self._normals = lists, normals
-        slots, device = 2 * len(lists.stencils), self.model.device
-        pairs = self.new_pairs(slots, self.surface.layout, self._corners)
+        pairs = self.new_pairs(slots, 2 * listed, self.surface.layout, self._corners)
         kinds = {"weights": wp.vec4d, "normal": wp.vec3d, "code": wp.int32, "touching": wp.int32}
         kinds |= dict.fromkeys(("gap", "distance", "stiffness", "share", "ratio", "fixed"), wp.float64)
         if self.surface.obstacles:
             kinds |= {"parts": wp.vec4i, "offset": wp.vec3d, "travel": wp.vec3d}
         arrays = {name: wp.zeros(slots, dtype=kind, device=device) for name, kind in kinds.items()}
         contacts = filled(potential.Contacts, **{"parts": pairs.stencils, "moves": self.surface.moves_of_step} | arrays)
-        for name, kind in (("near", wp.int32), ("multiplicities", potential.SIX)):
-            setattr(contacts, name, wp.zeros(len(lists.stencils), dtype=kind, device=device))
-        contacts.counts = wp.zeros(self.surface.count, dtype=wp.vec2i, device=device)
+        kinds = {"code": wp.int32, "near": wp.int32, "multiplicities": potential.SIX}
+        arrays = {name: wp.zeros(listed, dtype=kind, device=device) for name, kind in kinds.items()}
+        self._faces = filled(potential.NearFaces, counts=wp.zeros(self.surface.count, dtype=wp.vec2i, device=device), **arrays)
         contacts.followed.mode = wp.zeros(1, dtype=wp.int32, device=device)
-        self.hold_pairs(pairs, contacts, contacts.stiffness)
+        self.hold_pairs(pairs, contacts)
         if self._in_turn is not None:
             self._hold_followed()
 
@@ -91,18 +104,19 @@ class PairContact(DynamicElements):
     def _launch_listed(self, x, correction, goal, move):
         positions = [self._normals, x, correction, goal, move, self._laws]
         vertices = self.surface.count if self._of_edges else self.model.count
-        self._launch(potential.find_near_faces, self.lists.threads, [self.lists, *positions, vertices], [self.data])
+        self._launch(potential.find_near_faces, self.lists.threads, [self.lists, *positions, vertices], [self._faces])
         threads, lanes = (1, 1) if self.model.device.is_cpu else (vertices, LANES)
-        self.model.launch(potential.list_near_faces, threads, [self.lists, vertices, threads], [self.data])
+        self.model.launch(potential.list_near_faces, threads, [self.lists, vertices, threads], [self._faces])
         given = [self.lists, x, correction, vertices]
-        self._launch(potential.count_multiplicities, self.lists.threads, given, [self.data])
+        self._launch(potential.count_multiplicities, self.lists.threads, given, [self._faces])
         given = [self.lists, self._areas, x, correction, self._laws, goal is not None, vertices, threads]
-        self._launch(potential.find_vertex_contacts, threads, given, [self.pairs, self.data])
-        given = [self.lists, vertices, lanes, lanes * threads]
+        self._launch(potential.find_vertex_contacts, threads, given, [self._faces, self.pairs, self.data])
+        given = [self.lists, self._faces, self.pairs, vertices, lanes, lanes * threads]
         self.model.launch(potential.share_contacts, lanes * threads, given, [self.data])
         if self._of_edges:
             given = [self.lists, self._areas, *positions]
             self._launch(potential.find_edge_contacts, self.lists.threads, given, [self.pairs, self.data])
+        self.model.launch(bound_number, 1, [], [self.pairs, self.most.array])
         if self._corners:
             self.launch_corners()
 
@@ -132,7 +146,8 @@ class PairContact(DynamicElements):
     def _hold_followed(self):
         followed, device = self.data.followed, self.model.device
         followed.start, followed.carried, followed.stencils = map(self.room, (wp.float64, wp.float64, wp.vec4i))
-        followed.rows = wp.zeros_like(self.lists.rows)
+        followed.rows, followed.number = wp.zeros_like(self.lists.rows), wp.zeros_like(self.pairs.number)
+        followed.keys, followed.slots = wp.zeros_like(self.pairs.keys), wp.zeros_like(self.pairs.slots)
         self.turn, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
 
     def launch_sweep_start(self, x):
@@ -149,11 +164,13 @@ class PairContact(DynamicElements):
 
     def _launch_follow(self, x, correction, h, adds):
         """Finds the contacts where the iterate is now; those that add forces take over those of the last ones."""
-        wp.copy(self.data.followed.rows, self.lists.rows)
+        followed = self.data.followed
+        wp.copy(followed.rows, self.lists.rows)
         self._follow(x, correction)
         launch = self.model.launch
         if adds:
-            self.data.followed.carried.zero_()
+            wp.copy(followed.number, self.pairs.number)
+            wp.copy(followed.slots, self.pairs.slots)
             launch(pair_follow.carry_forces, self.pairs.threads, [self.pairs, self.multipliers], [self.data])
             self._launch_all(potential.ENDING, x, correction, h)
         self._launch_found(self._positions, None, x, correction)
@@ -162,7 +179,7 @@ class PairContact(DynamicElements):
         if adds:
             vertices = self.surface.count
             launch(pair_follow.start_forces, self.pairs.threads, [self.lists, self.pairs, h, vertices], [self.data])
-            launch(pair_follow.fix_forces, vertices, [self.lists, h], [self.data])
+            launch(pair_follow.fix_forces, vertices, [self.lists, self.pairs, h], [self.data])
             self._launch_all(potential.STARTING, x, correction, h)
 
     def _launch_all(self, mode, x, correction, h):

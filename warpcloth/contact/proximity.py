@@ -17,9 +17,8 @@ from ..kernels.contact.pair_potential import CLOSE
 # 64th less, so that a list serves two rounds despite rounding.
 WAY = 0.25
 ROUND = WAY * 63 / 64
-# Of a pair in the list, its gap, and the two slots of its contacts and of their friction, with forces and blocks: 2280 to 2616
-# on the CPU, up to 3584 on CUDA without meshes, which add up to 336.
-BYTES_OF_A_PAIR = 4000
+# Of a pair in the list, with its gap, its near face, and its keys.
+BYTES_OF_A_PAIR = 200
 
 
 class Proximity:
@@ -152,7 +151,7 @@ class Proximity:
 
     def _allocate(self, capacity):
         model, rows = self.model, self._vertices + self._edges
-        refuse_memory(f"the cloth has {capacity} pairs that are near one another", BYTES_OF_A_PAIR * capacity)
+        refuse_memory(f"the cloth has {capacity} pairs that are near one another", BYTES_OF_A_PAIR * capacity, model.device)
 
         def zeros(count, dtype=wp.int32):
             return wp.zeros(count, dtype=dtype, device=model.device)

@@ -49,12 +49,13 @@ class Slips:
             self.from_host(other.to_host())
 
     def to_host(self):
-        """Returns copies of the arrays, by name, without unused rows: contacts are numbered anew, in the same order."""
+        """Returns copies of the arrays, by name, without empty slots: contacts are numbered anew, as ``corners`` has them."""
         found = {name: array.numpy() for name, array in self._arrays.items()}
         slots, corners = np.divmod(found["corners"][: found["first"][-1]], 4)
-        used, slots = np.unique(slots, return_inverse=True)
+        used, at, slots = np.unique(slots, return_index=True, return_inverse=True)
+        used, ranks = used[np.argsort(at)], np.argsort(np.argsort(at))
         found |= {name: found[name][used] for name in ("stencils", "slips")}
-        return found | {"first": np.array(found["first"]), "corners": (4 * slots + corners).astype(np.int32)}
+        return found | {"first": np.array(found["first"]), "corners": (4 * ranks[slots] + corners).astype(np.int32)}
 
     def from_host(self, values):
         """Sets everything to what :meth:`to_host` returned."""
@@ -75,6 +76,7 @@ class SelfFriction(DynamicElements):
     Args:
         surface: The :class:`warpcloth.contact.surface.ContactSurface`.
         slips: :class:`Slips`, a part of the state of the solver.
+        keys: The number of the keys of contacts.
         steps: Steps since the start of each copy, (B,) int32.
         law: The :class:`warpcloth.kernels.coulomb.Law` of friction.
         friction: μ of cloth with cloth, then that of each obstacle of a copy, (1 + m,).
@@ -87,7 +89,7 @@ class SelfFriction(DynamicElements):
 
     stored = True
 
-    def __init__(self, surface, slips, steps, law, friction, bounded, ahead):
+    def __init__(self, surface, slips, keys, steps, law, friction, bounded, ahead):
         self.surface = surface
         model = surface.model
         super().__init__(model, kernels.friction_of_pairs(law), wp.zeros(1, dtype=wp.int32, device=model.device))
@@ -103,16 +105,16 @@ class SelfFriction(DynamicElements):
             ((kernels.set_anchors, kernels.find_friction), model.dtype, law),
             ((kernels.begin_friction,), model.dtype, law, bounded),
         )
-        self.hold(slips.room)
+        self.hold(slips.room, keys)
 
-    def hold(self, room):
-        """Allocates arrays for ``room`` pairs. The slips of the last step are kept."""
+    def hold(self, room, keys):
+        """Allocates arrays for ``room`` pairs with ``keys``. The slips of the last step are kept."""
         self._kept.hold(room)
         kinds = {"parts": wp.vec4i, "weights": wp.vec4d, "sides": wp.int32, "normal": wp.vec3d, "anchor": wp.vec3d}
         kinds |= {"stiffness": wp.float64, "limit": wp.float64} | ({"travel": wp.vec3d} if self.surface.obstacles else {})
         arrays = {name: wp.zeros(room, dtype=kind, device=self.model.device) for name, kind in kinds.items()}
         data = filled(kernels.RubbedPairs, ahead=self._ahead, **arrays)
-        self.hold_pairs(self.new_pairs(room, self.surface.layout), data, data.limit)
+        self.hold_pairs(self.new_pairs(room, keys, self.surface.layout), data)
 
     def launch_begin(self, touching, contacts, x):
         """At the start of a step, at x (V,): takes the contacts there, and the slips of the last step."""

@@ -172,6 +172,10 @@ def crossings(points, edges, triangles):
     """
     edges = np.repeat(edges, triangles.shape[1], axis=0)
     triangles = triangles.reshape(-1, 3)
+    for axis in points.T:  # most are apart along one
+        ends, corners = axis[edges.T], axis[triangles.T]
+        meet = (ends.min(axis=0) <= corners.max(axis=0)) & (ends.max(axis=0) >= corners.min(axis=0))
+        edges, triangles = edges[meet], triangles[meet]
     apart = ~(edges[:, :, None] == triangles[:, None, :]).any(axis=(1, 2))
     edges, triangles = edges[apart], triangles[apart]
     (p, q), corners = points[edges].swapaxes(0, 1), points[triangles].swapaxes(0, 1)

@@ -133,7 +133,7 @@ class SelfSteps:
             slips = state.add_part("friction", Slips(model, self.contact.capacity))
             slips.grow = self._grow_outside
             ahead = 1.0 if colliders is None else colliders.part
-            self.friction = SelfFriction(surface, slips, self.steps, *friction, bounded, ahead)
+            self.friction = SelfFriction(surface, slips, self._keys, self.steps, *friction, bounded, ahead)
         if not bounded:
             self.filter.iterates()
             self.contact.follow(self.filter.launch_meshes, self.filter.launch_follow, self.x_before)
@@ -147,9 +147,9 @@ class SelfSteps:
         Raises:
             ValueError: Cloth crosses or nearly touches cloth at the positions x (B·n, 3) of copies in ``mask`` (B,).
         """
-        before = len(self.pairs.stencils)
+        before = self.capacities
         check_reset(self, mask, x)
-        return len(self.pairs.stencils) > before
+        return self.capacities != before
 
     def at_start(self):
         """Returns, at the start, U [J] and the number of pairs that touch times ½Σ(r − d)² [m²], both (B,)."""
@@ -159,9 +159,9 @@ class SelfSteps:
         self.forces.launch(x)
         self.forces.add_energy(Sums(self.model), energy)
         touching = self.contact.pairs
-        acting = touching.acting.numpy()[: touching.number.numpy()[0]]
-        copies = touching.stencils.numpy()[acting, 0] // self.model.per_copy
-        distance, gap = (array.numpy()[acting] for array in (self.contact.data.distance, self.contact.data.gap))
+        number = touching.number.numpy()[0]
+        copies = touching.stencils.numpy()[:number, 0] // self.model.per_copy
+        distance, gap = (array.numpy()[:number] for array in (self.contact.data.distance, self.contact.data.gap))
         open_by = np.maximum(distance - gap, 0.0)
         touching, squares = (np.bincount(copies, each, self.model.copies) for each in (open_by > 0.0, open_by**2))
         return energy.numpy(), 0.5 * touching * squares
@@ -198,34 +198,47 @@ class SelfSteps:
         self.begun = filled(self_pairs.StepPairs, normal=room(wp.vec3d), weights=room(wp.vec4d), gap=room(wp.float64))
         self.contact.hold(self.pairs, self.begun.normal)
 
+    @property
+    def _keys(self):
+        """The number of the keys of contacts."""
+        return 2 * len(self.pairs.stencils)
+
+    @property
+    def capacities(self):
+        """The numbers of pairs and of contacts that fit."""
+        return len(self.pairs.stencils), self.contact.capacity
+
     def grow(self):
-        """Grows the lists for the pairs that did not fit. Graphs must then be recorded again.
+        """Makes room for the pairs and contacts that did not fit. Graphs must then be recorded again.
 
         Raises:
             Stopped: There is no memory for them.
         """
         try:
-            self.grow_to(self._wanted)
+            self.grow_to(*self._wanted)
         except ValueError as error:
             raise Stopped(str(error)) from None
 
-    def grow_to(self, pairs):
-        """Grows the lists to 1.5 times this number of pairs."""
-        self.proximity.grow(pairs)
+    def grow_to(self, pairs, contacts=0):
+        """Makes room for 1.5 times these numbers of pairs and of contacts, where they do not fit."""
+        if pairs > len(self.pairs.stencils):
+            self.proximity.grow(pairs)
+        if contacts > self.contact.capacity:
+            self.contact.slots = int(1.5 * contacts)
         self._hold()
         if self.friction is not None:
-            self.friction.hold(self.contact.capacity)
+            self.friction.hold(self.contact.capacity, self._keys)
 
-    def _grow_outside(self, pairs):
-        self.grow_to(pairs)
+    def _grow_outside(self, contacts):
+        self.grow_to(0, contacts)
         self.stale = True
 
     @property
     def overflowed(self):
-        """Whether the lists so far had more pairs than their capacity. The host reads the device."""
-        most = self.most
-        if most > len(self.pairs.stencils):
-            self._wanted = most  # the state, with this number, may be put back before the lists grow
+        """Whether there were more pairs or contacts so far than fit. The host reads the device."""
+        most = self.most, int(self.contact.most.read()[0])
+        if any(found > room for found, room in zip(most, self.capacities, strict=True)):
+            self._wanted = most  # the state, with the first number, may be put back before the lists grow
             return True
         return False
 
@@ -350,9 +363,10 @@ class SelfSteps:
             self.model.launch(keep_forces, each.capacity, given, [each.forces])
 
     def launch_present(self, x):
-        """Lists the pairs near x (N,), with meshes where they are after the last step; poses stay those that sums need."""
+        """Lists the pairs and contacts at x (N,), with meshes where they are after the last step; poses stay those for sums."""
         if not self.surface.moves:
             self.launch_begin(x)
+            self.contact.launch_rows(x)
             return
         poses = self._colliders.poses
         kept = list(zip(self._kept_poses, (poses.before, poses.at, poses.after), strict=True))
@@ -361,6 +375,7 @@ class SelfSteps:
         self._colliders.launch_move()
         self.launch_begin(x)
         self.contact.launch_obstacles(self.placed[0])
+        self.contact.launch_rows(x)
         if self.friction is not None:
             self.friction.data.travel.zero_()
         for spare, array in kept:
@@ -384,14 +399,16 @@ class SelfSteps:
         self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [notes])
 
     def launch_begin_at_start(self, x, longest):
-        """Lists all pairs near x (N,) at the start of a run, and grows the lists. The longest edge is ``longest`` [m]."""
+        """Lists all pairs near x (N,) at the start of a run, and makes room. The longest edge is ``longest`` [m]."""
         self.proximity.set_skin(max(self.skin, SKIN * longest))
         if self.surface.moves:
             self._colliders.launch_move()
         self.launch_begin(x)
+        self.contact.launch_rows(x)
         while self.overflowed:
             self.grow()
             self.launch_begin(x)
+            self.contact.launch_rows(x)
         self.proximity.set_skin(self.skin)
 
     def launch_list(self, x):

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.contact import pair_sums, pair_sweeps
-from ..kernels.contact.self_pairs import Pairs, fill_corners, forget_contacts, sort_corners
+from ..kernels.contact.self_pairs import Pairs, fill_corners, forget_forces, sort_corners
 from .filled import filled
 from .scan import Scan
 
@@ -30,7 +30,7 @@ class DynamicElements:
         data: The ``data`` of the term.
         forces: :class:`warpcloth.kernels.contact.pair_sums.PairForces`.
         blocks: :func:`warpcloth.kernels.contact.pair_sums.pair_blocks`, empty if sums are scattered.
-        multipliers: λ of sweeps [kg·m], 0 in slots without a pair; None without sweeps.
+        multipliers: λ of sweeps [kg·m], 0 in empty slots; None without sweeps.
         stored: Whether its energy is not a function of positions alone, but stored in the state.
         scatters: Whether sums are scattered.
     """
@@ -54,17 +54,20 @@ class DynamicElements:
         if self.pairs is not None:
             self._hold_blocks()
 
-    def new_pairs(self, slots, layout, corners=True):
-        """Returns pairs with a number of slots, and with lists of ``corners`` at each vertex if kernels sum over vertices."""
-        sizes, device = {"acting": slots, "number": 1}, self.model.device
+    def new_pairs(self, slots, keys, layout, corners=True):
+        """Returns pairs with a number of slots, and with lists of ``corners`` at each vertex if kernels sum over vertices.
+
+        The numbers of ``keys`` are below ``keys``; without, no slot is found by its key.
+        """
+        sizes, device = {"number": 1, "keys": slots, "slots": keys}, self.model.device
         if corners:
             sizes |= {"corner_counts": self.model.count, "first": self.model.count + 1, "corners": 4 * slots}
         lists = {name: wp.zeros(size, dtype=wp.int32, device=device) for name, size in sizes.items()}
         return filled(Pairs, layout=layout, stencils=wp.zeros(slots, dtype=wp.vec4i, device=device), **lists)
 
-    def hold_pairs(self, pairs, data, marks):
-        """Takes the arrays of pairs, with ``marks``, 0 in slots without one, and allocates those of forces and sweeps."""
-        self.pairs, self.data, self._marks = pairs, data, marks
+    def hold_pairs(self, pairs, data):
+        """Takes the arrays of pairs, and allocates those of forces and sweeps."""
+        self.pairs, self.data = pairs, data
         pairs.threads = 1 if self.model.device.is_cpu else self.capacity
         model, room = self.model, self.room
         kinds = {"weights": wp.vec4d, "energy": wp.float64, "force": wp.vec3d}
@@ -114,14 +117,18 @@ class DynamicElements:
         """Prepares the lists of the corners of pairs at each vertex, which sweeps and rows need, if they are not there."""
 
     def launch_none(self):
-        """Empties the list of acting pairs. Only their slots are cleared, for there may be a thousand times as many."""
-        self.model.launch(forget_contacts, self.pairs.threads, [self.pairs], [self._marks, self.multipliers])
+        """Empties the list of pairs."""
+        self._forget()
         self.pairs.number.zero_()
         if self.pairs.first:
             self.pairs.first.zero_()
 
+    def _forget(self):
+        if self.multipliers is not None:
+            self.model.launch(forget_forces, self.pairs.threads, [self.pairs], [self.multipliers])
+
     def launch_corners(self):
-        """Lists the corners of acting pairs at each vertex."""
+        """Lists the corners of pairs at each vertex."""
         self._vertices.launch(self.pairs.corner_counts, self.pairs.first)
         self.model.launch(fill_corners, self.pairs.threads, [], [self.pairs])
         self.model.launch(sort_corners, self.model.count, [], [self.pairs])
@@ -155,7 +162,7 @@ class DynamicElements:
         """Returns ∂²U/∂x² as last added to a Hessian, scipy CSR (3N, 3N), 0 along pinned coordinates; waits for the device."""
         from scipy.sparse import csr_matrix
 
-        acting = np.sort(self.pairs.acting.numpy()[: self.pairs.number.numpy()[0]])
+        acting = np.argsort(self.pairs.keys.numpy()[: self.pairs.number.numpy()[0]])
         arrays = self.pairs.stencils, self.forces.weights, self.forces.block
         stencils, w, block = (array.numpy()[acting] for array in arrays)
         columns = 3 * stencils.astype(np.int64)[:, :, None] + np.arange(3)
@@ -189,11 +196,11 @@ class DynamicElements:
             self._touch = model.kernel(pair_sweeps.touch_pairs, self.term, model.dtype)
             self._press = model.kernel(pair_sweeps.press_pairs, self.term, model.dtype, axes)
             self._move = model.kernel(pair_sweeps.move_by_pairs, model.dtype, axes)
-        self.hold_pairs(self.pairs, self.data, self._marks)
+        self.hold_pairs(self.pairs, self.data)
 
     def launch_sweep_start(self, x):
         """Launches λ = 0 for all pairs before the first sweep, at x̃ (N,)."""
-        self.model.launch(forget_contacts, self.pairs.threads, [self.pairs], [None, self.multipliers])
+        self._forget()
         if not self._in_turn:
             self.launch_corner_slots()
 

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ..core.scan import Scan
 from ..kernels.contact import pair_rows as kernels
 
 
@@ -16,7 +17,7 @@ class PairRows:
 
     Attributes:
         elements: None, because the number of the elements changes.
-        per_copy: Number of pairs with rows in each copy, the capacity.
+        per_copy: Number of pairs that have rows in each copy, the capacity.
         count: Number of rows of one copy.
     """
 
@@ -32,6 +33,12 @@ class PairRows:
         self._slopes = kernels.PairSlopes()
         for name, kind in (("weights", wp.vec4d), ("first", wp.vec3d), ("second", wp.vec3d)):
             setattr(self._slopes, name, wp.zeros(capacity, dtype=kind, device=model.device))
+        self._ranks = None
+        if model.device.is_cuda:  # where slots are in any order
+            self._ranks, self._starts, self._counts = (
+                wp.zeros(size, dtype=wp.int32, device=model.device) for size in (capacity, model.count + 1, model.count)
+            )
+            self._firsts = Scan(model, model.count)
         factories = kernels.apply_pair_rows, kernels.gather_pair_rows
         self._apply, self._gather = (model.kernel(factory, model.dtype, self._rows == 2) for factory in factories)
 
@@ -43,17 +50,21 @@ class PairRows:
         """As of the rows of a term."""
         model, of = self.model, self._of
         of.launch_rows(x, d)
-        given = [of.pairs, model.inverse_mass, of.data, x, d, h, least, self._layout]
+        if self._ranks:
+            model.launch(kernels.count_first_corners, model.count, [of.pairs], [self._counts])
+            self._firsts.launch(self._counts, self._starts)
+            model.launch(kernels.rank_pairs, model.count, [of.pairs, self._starts], [self._ranks])
+        given = [of.pairs, model.inverse_mass, of.data, x, d, h, least, self._layout, self._ranks]
         model.launch(self._linearise, (model.copies, self.per_copy), given, [self._slopes, values])
 
     def launch_apply(self, v, out, active=None):
         """Launches out += J v, of all copies."""
-        given = [self._of.pairs, self._slopes, v, self._layout]
+        given = [self._of.pairs, self._slopes, v, self._layout, self._ranks]
         self.model.launch(self._apply, self.per_copy, given, [out])
 
     def launch_transpose(self, rows, out, active=None):
         """Launches out += Jᵀ rows, of all copies."""
-        given = [self._of.pairs, self._slopes, rows, self._layout]
+        given = [self._of.pairs, self._slopes, rows, self._layout, self._ranks]
         self.model.launch(self._gather, self.model.count, given, [out])
 
     def entries(self):
@@ -64,7 +75,8 @@ class PairRows:
         w = self._slopes.weights.numpy()[binds]
         stencils = self._of.pairs.stencils.numpy()[binds].astype(np.int64)
         layout, copy = self._layout, stencils[:, 0] // self.model.per_copy
-        first = copy * layout.rows_per_copy + layout.first + self._rows * binds
+        ranks = self._ranks.numpy()[binds] if self._ranks else binds
+        first = copy * layout.rows_per_copy + layout.first + self._rows * ranks
         values = slopes[:, :, None, :] * w[:, None, :, None]
         rows = np.broadcast_to((first[:, None] + np.arange(self._rows))[:, :, None, None], values.shape)
         columns = np.broadcast_to((3 * stencils[:, :, None] + np.arange(3))[:, None], values.shape)

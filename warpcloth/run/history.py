@@ -330,7 +330,7 @@ class History:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
             self._of_pairs = PairWork(stepper, self._works[3]) if pushes else None
-            self._room = None if stepper.pairs is None else stepper.pairs.proximity.capacity
+            self._room = None if stepper.pairs is None else stepper.pairs.capacities
         self._note()
 
     def _recorded_step(self, x, v):
@@ -430,8 +430,8 @@ class History:
             pairs.grow()
             self._stepper.record_again()
             pairs.launch_present(self._stepper.state.x)
-        if self._each_step is not None and self._room != pairs.proximity.capacity:  # which steps enlarge too
-            self._each_step, self._room = Segment(self.model.device, self._each_step.record), pairs.proximity.capacity
+        if self._each_step is not None and self._room != pairs.capacities:  # which steps enlarge too
+            self._each_step, self._room = Segment(self.model.device, self._each_step.record), pairs.capacities
 
     def _note(self):
         """Evaluates the present state."""
