@@ -273,7 +273,7 @@ def test_the_rotations(tmp_path, monkeypatch):
 # --- All blocks of a page, as they stand there.
 
 # Modules whose names differ from those of their packages.
-MODULES = {"libigl": "igl", "pillow": "PIL"}
+MODULES = {"libigl": "igl", "pillow": "PIL", "pyuipc": "uipc"}
 # Runs the blocks of a page one after the other, commands by the function behind them. Packages that the page does not say to
 # install are not found. Other commands are left out: .ci/run runs those of the README, a cluster needs several machines, and
 # bench compiles again what it measures, as test_bench.py has it do. What commands measure in two processes is measured here in

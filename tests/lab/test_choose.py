@@ -140,10 +140,11 @@ def test_the_longest_time():
 
 
 def test_all_simulators_that_are_lacking_are_named(monkeypatch):
-    for name in ("newton", "pbd"):
-        monkeypatch.setitem(sys.modules, {"pbd": "pypbd"}.get(name, name), None)
-    with pytest.raises(ImportError, match=r"-e '\.\[newton\]' in the checkout; .* pyPBD needs it: pip install -e '\.\[pbd\]'"):
-        setups_of_runs(SceneRef("hanging"), others=["newton", "pbd"])
+    for module in ("newton", "pypbd", "uipc"):
+        monkeypatch.setitem(sys.modules, module, None)
+    words = r"-e '\.\[newton\]' in the checkout; .* pyPBD needs it: .* -e '\.\[pbd\]' .*; .* -e '\.\[uipc\]' in the checkout"
+    with pytest.raises(ImportError, match=words):
+        setups_of_runs(SceneRef("hanging"), others=["newton", "pbd", "uipc"])
 
 
 def test_ladders_of_others_double_substeps_and_iterations():

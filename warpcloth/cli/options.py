@@ -20,7 +20,7 @@ from .terminal import aligned
 _HELP = "help"
 DEFAULT = "newton"  # the default solver
 _MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")  # those of warpcloth.mesh.loading, which loads Warp
-_SIMULATORS = ("newton", "pbd")  # those of warpcloth.others.simulators, which loads Warp
+_SIMULATORS = ("newton", "pbd", "uipc")  # those of warpcloth.others.simulators, which loads Warp
 
 
 def asks_for_help(arguments):
@@ -144,7 +144,7 @@ def add_with(parser):
         nargs="+",
         metavar="SIMULATOR",
         choices=_SIMULATORS,
-        help="measure solvers of other simulators too: newton, the physics engine, or pbd, which is pyPBD; extras install them",
+        help="measure solvers of other simulators too: newton, the engine, pbd (pyPBD) or uipc (libuipc); extras install them",
     )
 
 

@@ -253,7 +253,7 @@ def _shear_modulus(scene, axes):
             d = (mesh.points[springs.stencil[:, 1]] - mesh.points[springs.stencil[:, 0]]) @ axes.T
             found += float((springs.stiffness * (d[:, 0] * d[:, 1]) ** 2 / (d**2).sum(axis=1)).sum())
         elif isinstance(term, IsotropicMembrane):
-            stencil, mu, _lam = _lame(term, scene)
+            stencil, mu, _lam = lame(term, scene)
             found += float(np.nan_to_num(Mesh(mesh.points, stencil).triangle_areas) @ mu)
     return found / float(np.nansum(mesh.triangle_areas))
 
@@ -273,7 +273,7 @@ def _add_term(builder, scene, term, method):
         i, j, k, l = (hinges[:, c].tolist() for c in (2, 3, 0, 1))
         builder.add_edges(i, j, k, l, rest=angle.tolist(), edge_ke=ke.tolist(), edge_kd=kd.tolist())
     else:
-        stencil, mu, lam = _lame(term, scene)
+        stencil, mu, lam = lame(term, scene)
         ka, none = (lam if method == "vbd" else lam + mu), [0.0] * len(mu)
         given = {"tri_ke": mu.tolist(), "tri_ka": ka.tolist(), "tri_kd": none, "tri_drag": none, "tri_lift": none}
         builder.add_triangles(*(stencil[:, c].tolist() for c in range(3)), **given)
@@ -314,7 +314,7 @@ def _add_surface(builder, mesh):
     builder.add_edges(lone, lone, *(edges[:, c].tolist() for c in range(2)), rest=none, edge_ke=none, edge_kd=none)
 
 
-def _lame(term, scene):
+def lame(term, scene):
     """Returns the triangles (T, 3) of an isotropic membrane, and μ and λ (T,) [N/m]."""
     found = term.elements(scene.mesh, scene.positions)
     count = len(found.stencil)

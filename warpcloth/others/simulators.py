@@ -2,8 +2,9 @@
 
 from .newton_runs import NEWTON
 from .pbd_runs import PBD
+from .uipc_runs import UIPC
 
-SIMULATORS = {"newton": NEWTON, "pbd": PBD}
+SIMULATORS = {"newton": NEWTON, "pbd": PBD, "uipc": UIPC}
 
 
 def check_installed(names):
