@@ -24,6 +24,11 @@ from .rotation import epsilon
 from .vectors import types
 
 MODULE = "warpcloth.conjugate_gradients"  # of the kernels over copies
+# A rough solve ends when the quadratic model of φ has fallen by the fraction SHARE of a bound of its total decrease, or when an
+# iteration lowers it by at most the fraction LAST of its decrease so far.
+SHARE, LAST = wp.constant(wp.float64(0.7)), wp.constant(wp.float64(0.1))
+# Solves are accurate if ‖b‖ is below this fraction of its largest value, in the norm of the preconditioner.
+NEAR = wp.constant(wp.float64(1e-6))
 
 
 @cache
@@ -276,7 +281,8 @@ class Solves:
     """The conjugate gradients of each copy, (B,) arrays.
 
     ``rz`` is rᵀz, ``first`` its first value; ``negative`` is 1 after a direction of negative curvature. ``iteration`` counts
-    iterations from 1, up to ``most``; ``proceed`` (1,) is 1 if a copy is active.
+    iterations from 1, up to ``most``; ``proceed`` (1,) is 1 if a copy is active. The last three are those of :func:`is_enough`,
+    or None.
 
     A launch that turns directions writes the values ``next``, from which the launch that advances takes them over. So no
     thread reads what another one of the same launch writes.
@@ -293,6 +299,9 @@ class Solves:
     next_iteration: wp.array(dtype=wp.int32)
     most: wp.array(dtype=wp.int32)
     proceed: wp.array(dtype=wp.int32)
+    decrease: wp.array(dtype=wp.float64)
+    largest: wp.array(dtype=wp.float64)
+    accurate: wp.array(dtype=wp.int32)
 
 
 @cache
@@ -504,6 +513,25 @@ def turn_and_multiply(dtype, block: int, terms: int = 0):
     return turn_directions_and_multiply
 
 
+@wp.func
+def is_enough(solves: Solves, copy: int, pq: wp.float64):
+    """Whether the first iteration found x = P b, as A − P⁻¹ has no part in P b; or a solve that is not ``accurate`` is done.
+
+    ``decrease`` is twice the decrease of ½xᵀAx − bᵀx, at most bᵀPb if A ≥ P⁻¹; ``largest`` is the largest bᵀPb of solves.
+    """
+    rz, bound, first = solves.next_rz[copy], solves.first[copy], solves.next_iteration[copy] == 1
+    fall = rz * rz / pq
+    decrease = wp.where(first, fall, solves.decrease[copy] + fall)
+    solves.decrease[copy] = decrease
+    if first:
+        if pq <= rz:
+            return True
+        solves.largest[copy] = wp.max(solves.largest[copy], bound)
+    if solves.accurate[copy] == 1 or bound <= NEAR * NEAR * solves.largest[copy]:
+        return False
+    return decrease >= SHARE * bound or (fall <= LAST * decrease and not first)
+
+
 @cache
 def advance(dtype, numbers: bool, block: int):
     """Kernel over (copies, lanes): x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy; the parts of rᵀz.
@@ -556,6 +584,8 @@ def advance(dtype, numbers: bool, block: int):
                     total += multiplied(r[i], z[i])
         store(lane, total, parts, copy)
         if lane == 0:
+            if going and solves.accurate:
+                going = not is_enough(solves, copy, pq)
             solves.active[copy] = wp.where(going, 1, 0)
             solves.rz[copy] = solves.next_rz[copy]
             solves.iteration[copy] = solves.next_iteration[copy]

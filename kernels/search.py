@@ -15,6 +15,8 @@ MODULE = "warpcloth.search"
 # The part of the slope by which φ must fall, below ½, by which a quadratic falls at its minimum (Goldstein 1965).
 # A jump over a kink of friction, which 1e-4 accepts for ever, lowers φ by 3 % of the slope.
 ENOUGH = wp.constant(wp.float64(0.25))
+# Change of an objective, relative to its summands, that counts as rounding.
+NOISE = wp.constant(wp.float64(1e-10))
 # Rows of the sums over vertices that a trial needs, and their number.
 WORK, SLOPE, SQUARE, LARGEST, ROWS = 0, 1, 2, 3, 4
 
@@ -405,3 +407,37 @@ def take_trial(dtype):
             search.energy[i] = search.trial_energy[i]
 
     return take
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def check_quadratic(
+    # state in
+    pull: wp.array(dtype=wp.float64),
+    fraction: wp.array(dtype=wp.float64),
+    # parameters
+    most: int,
+    # in and out
+    search: LineSearch,
+):
+    """Kernel over copies: as :func:`check_trial`, for φ(d) = ½dᵀAd − cᵀd + U(d) of which U at d and at the trial is measured.
+
+    U is ``energy`` and ``other``, p·∂U/∂x is ``pull`` and ``trial_slope``, φ′(0) is ``slope``, and pᵀAp ``square`` before p was
+    shortened to a ``fraction``. A step is accepted if φ falls by 1e-4 of what the slope says, or if the
+    change is rounding and the slope has fallen to 0.8. A copy with a slope that is not below 0 keeps its step; and the last one
+    after ``most`` trials.
+    """
+    copy = wp.tid()
+    if search.searching[copy] == 0:
+        return
+    step, slope, part = search.step[copy], search.slope[copy], fraction[copy]
+    linear, curved = slope - pull[copy], step * part * part * search.square[copy]
+    change = search.other[copy] - search.energy[copy] + step * (linear + wp.float64(0.5) * curved)
+    level = wp.abs(change) <= NOISE * (wp.abs(search.energy[copy]) + step * wp.abs(linear))
+    flat = curved + linear + search.trial_slope[copy] <= -wp.float64(0.8) * slope
+    lower = change <= wp.float64(1.0e-4) * step * slope or (level and flat)
+    if lower or not slope < wp.float64(0.0):
+        search.searching[copy] = 0
+    else:
+        search.step[copy] = wp.float64(0.5) * step
+        if search.trials[0] < most:
+            search.proceed[0] = 1

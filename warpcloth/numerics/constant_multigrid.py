@@ -47,6 +47,8 @@ class CopyCycles:
             positive definite.
     """
 
+    capturable = True
+
     def __init__(self, model, matrices):
         start = time.perf_counter()
         self.model = model

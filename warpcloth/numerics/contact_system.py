@@ -7,102 +7,102 @@ from ..contact.no_filter import filter_of
 from ..core.capture import Mirror, Segment
 from ..core.dynamic import dynamic_of
 from ..core.hessian import Hessian
+from ..kernels import linear as kernels
 from ..kernels.accelerate import plain_step
 from ..kernels.contact.clear_elements import add_hessian
+from ..kernels.elementwise import add_step, negate
+from ..kernels.search import LineSearch, check_quadratic, set_trial
 from ..kernels.term import HessianPolicy
 from ..model.host_values import host_values
+from .linear import ConjugateGradients
 from .search import HALVINGS, Search
 
-# An accurate solve ends at this residual, relative to b, in the norm of A⁻¹.
+# An accurate solve ends at this residual, relative to b, in the norm of A⁻¹. For rough ones see kernels/linear.py.
 TOLERANCE = 1e-3
-# A rough solve ends when the quadratic model of φ has fallen by the fraction SHARE of a bound of its total decrease, or when an
-# iteration lowers it by at most the fraction LAST of its decrease so far. The projections of the next iteration change more.
-SHARE, LAST = 0.7, 0.1
-# Solves are accurate once ‖∇φ‖ is below this fraction of its largest value in a step, in the norm of A⁻¹, as Anderson
-# acceleration needs.
-NEAR = 1e-6
 ITERATIONS = 200
-# Change of ψ, relative to its summands, that counts as rounding.
-NOISE = 1e-10
 
 
-class CorrectedSystem:
+class CorrectedSystem(ConjugateGradients):
     """Solves (A + D) w = b, D the semi-definite matrix of contact, by conjugate gradients with A⁻¹ as preconditioner.
 
-    A p follows from the residuals, so that an iteration costs a solve with A and a product with D.
+    A p follows from the residuals, so that an iteration costs a solve with A and a product with D. All of it is one segment if
+    solves with A may be captured; else there are segments between them.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        x: x̃ (N,) [m].
-        linear: Solves with A, ``solve(b, x)``.
+        x, d: x̃ and the correction (N,) [m], at which D is found; the caller's arrays, read only.
+        linear: Solves with A, ``solve(b, x)``, and says whether that is ``capturable``.
+        b, w: The right-hand side (N,) [N], and A⁻¹ b (N,) [m], which is replaced; the caller's arrays.
+        wanted: Which copies to solve for, (B,) int32; the caller's array.
 
     Attributes:
         matrix: D, a :class:`warpcloth.core.hessian.Hessian`.
     """
 
-    def __init__(self, model, x, linear):
-        self.model, self.x, self._linear = model, x, linear
-        right, self._result = model.vectors(), model.vectors()
-        self._right, self._found = Mirror(right), Mirror(self._result)
-        self.matrix = Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=(), dynamic=model.dynamic)
-        self.matrix.prepare()
-        self._p, self._q = Mirror(model.vectors()), Mirror(model.vectors())
-        self._all = wp.full(model.copies, 1, dtype=wp.int32, device=model.device)
-        self._free = model.coordinate_mobility().reshape(-1, 3) > 0.0
+    def __init__(self, model, x, d, linear, b, w, wanted):
+        super().__init__(Hessian(model, HessianPolicy.CLAMP, corrected=True, terms=(), dynamic=model.dynamic), ITERATIONS)
+        self.x, self._d, self._linear, self._b, self._w, self._wanted = x, d, linear, b, w, wanted
+        self.tolerance.fill_(TOLERANCE)
+        self._Ap, self._all = model.vectors(), wp.full(model.copies, 1, dtype=wp.int32, device=model.device)
+        solves = self._solves
+        solves.decrease, solves.largest, solves.accurate = model.scalars(), model.scalars(), self._all
+        self._plus, self._minus = (wp.full(model.copies, s, dtype=wp.float64, device=model.device) for s in (1.0, -1.0))
+        self._back = model.scalars()
+        self._launch_on = model.launcher(((plain_step, add_step, set_trial), model.dtype), ((negate,), wp.float64))
 
     def record(self):
-        """Captures the launches of an iteration."""
-        self._multiply = Segment(self.model.device, lambda: self.matrix.multiply(self._p.array, self._q.array, self._all))
+        """Captures the launches before and after solves with A."""
+        self._begin, self._advance = self._part(self._launch_begin), self._part(self._launch_iteration)
 
-    def _product(self, p):
-        """Returns D p for p (N, 3)."""
-        self._p.write(np.where(self._free, p, 0.0))
-        self._multiply()
-        return self._q.read().astype(np.float64)
+    def _part(self, launch, whole=False):
+        """Returns a segment; or the function itself if it is a part of a ``whole`` segment, or whole and solves on the host."""
+        return Segment(self.model.device, launch) if whole == self._linear.capturable else launch
 
-    def _scaled(self, factors, array):
-        """Returns the vectors (N, 3) of each copy times the factor of the copy, (B,)."""
-        return (array.reshape(self.model.copies, -1) * factors[:, None]).reshape(array.shape)
+    def _launch_all(self):
+        """Launches w = (A + D)⁻¹ b, given w = A⁻¹ b."""
+        self._begin()
+        wp.capture_while(self._solves.proceed, self._launch_next)
 
-    def _dot(self, one, other):
-        B = self.model.copies
-        return np.einsum("bi,bi->b", one.reshape(B, -1), other.reshape(B, -1))
+    def _launch_next(self):
+        self._linear.solve(self.r, self.z)
+        self._advance()
 
-    def _solve(self, b, z, Dz, going, closely):
-        """Returns w = (A + D)⁻¹ b and A w of the copies that are ``going`` (B,).
+    def _launch_begin(self):
+        """Launches D at d, and the first iteration, with z = w."""
+        self._launch_matrix()
+        wp.copy(self.r, self._b)
+        wp.copy(self.z, self._w)
+        for array in (self._w, self.p, self._Ap, self.iteration):
+            array.zero_()
+        wp.copy(self.active, self._wanted)
+        self._launch_iteration()
 
-        Args:
-            b: Right-hand side.
-            z: A⁻¹ b.
-            Dz: D z.
-            going: Which copies to solve for, (B,).
-            closely: Which copies to solve accurately, (B,).
-        """
-        p, Ap, r, w, Aw, fall = z, b, b, 0.0, 0.0, 0.0
-        rz = first = self._dot(r, z)
-        for iteration in range(ITERATIONS):
-            q = Ap + (Dz if iteration == 0 else self._product(p))
-            step = self._over(rz, self._dot(p, q), going)
-            w, Aw = w + self._scaled(step, p), Aw + self._scaled(step, Ap)
-            fall = fall + step * rz
-            enough = (fall >= SHARE * first) | ((step * rz <= LAST * fall) & (iteration > 0))
-            going = going & (closely | ~enough)
-            if not going.any():
-                break
-            r = r - self._scaled(step, q)
-            self._right.write(r)
-            self._linear.solve(self._right.array, self._result)
-            z = self._found.read().astype(np.float64)
-            before, rz = rz, self._dot(r, z)
-            going = going & (rz > TOLERANCE**2 * first)
-            if not going.any():
-                break
-            ratio = self._over(rz, before, going)
-            p, Ap = z + self._scaled(ratio, p), r + self._scaled(ratio, Ap)
-        return w, Aw
+    def _launch_iteration(self):
+        """Launches an iteration after z = A⁻¹ r. The diagonal blocks that advance z stay 0, and so then is z."""
+        solves, size = self._solves, [self.matrix.per_copy, self._lanes]
+        self._launch_dot(self.r, self.z, self.active, self._parts)
+        for along, p in ((self.z, self.p), (self.r, self._Ap)):  # the second launch writes the same into ``solves``
+            self._launch(kernels.turn, self._dim, [along, self._parts, *size], [solves, p])
+        self.matrix.multiply(self.p, self.q, solves.next_active)
+        self._add(self._plus, self._Ap, self.q)
+        self._launch_dot(self.p, self.q, solves.next_active, self._pq_parts)
+        given = [self.preconditioner, self.p, self.q, self._pq_parts, *size]
+        self._launch(kernels.advance, self._dim, given, [solves, self._w, self.r, self.z, self._parts])
 
-    def _over(self, one, other, where):
-        return np.divide(one, other, out=np.zeros(self.model.copies), where=where & (other > 0.0))
+    def _add(self, step, change, out):
+        """Launches ``out`` += step·``change``, with the step of the copy (B,)."""
+        self._launch_on(add_step, self.model.count, [step, change, self.model.per_copy], [out])
+
+    def _launch_back(self, direction):
+        """Launches ``direction`` = −w."""
+        direction.zero_()
+        self._add(self._minus, self._w, direction)
+
+    def _launch_step(self, step, direction, active):
+        """Launches w = −step·``direction`` in copies that are ``active`` (B,); the step of others is 0."""
+        self._launch_on(plain_step, self.model.count, [self._w, self._w, active, self.model.per_copy], [self._w])
+        self._launch_on(negate, self.model.copies, [step], [self._back])
+        self._add(self._back, direction, self._w)
 
 
 class ContactSystem(CorrectedSystem):
@@ -115,58 +115,60 @@ class ContactSystem(CorrectedSystem):
     Without :meth:`start`, all copies always are careful.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        x: x̃ (N,) [m].
-        gradient: ∇φ (N,) [N] at the d of :meth:`correct`; the caller's array, read only.
-        linear: Solves with A, ``solve(b, x)``.
+        given: The arguments of :class:`CorrectedSystem`, with b = ∇φ.
         sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia [1/s²].
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None.
 
     Attributes:
         careful: Which copies are careful, (B,) booleans.
     """
 
-    def __init__(self, model, x, gradient, linear, sums, s, pairs):
-        super().__init__(model, x, linear)
+    def __init__(self, *given, sums, s, pairs):
+        super().__init__(*given)
+        model = self.model
         touching = [elements for elements in model.terms if elements.collider is not None]
         self._touching = [(elements, model.kernel(add_hessian, elements.term, model.dtype)) for elements in touching]
         held = model.inverse_mass.numpy() == 0.0
         self._diagonal = wp.array(np.where(held, -1, self.matrix.diagonal.numpy()), dtype=wp.int32, device=model.device)
-        self._gradient, self._inertia = gradient, model.array(s * host_values(model.mass), model.dtype) if touching else None
-        self._search, self._pairs = Search(model, x, sums, s, filter_of(pairs)), pairs
+        self._inertia = model.array(s * host_values(model.mass), model.dtype) if touching else None
+        self._search, self._pairs = Search(model, self.x, sums, s, filter_of(pairs)), pairs
         self._listed = None if pairs is None else Mirror(pairs.listed)
-        self._direction, self._step = Mirror(self._search.direction), Mirror(self._search.step)
-        self._active = Mirror(model.scalars(wp.int32))
-        self.careful, self._marked = np.ones(model.copies, dtype=bool), np.zeros(model.copies, dtype=bool)
-        self._marks = Mirror(model.scalars(wp.int32))  # the careful copies on the device
+        self.careful = np.ones(model.copies, dtype=bool)
+        self._marks, self._searched = (Mirror(model.scalars(wp.int32)) for _ in range(2))  # careful copies, on the device
+        if pairs is None:
+            self._solves.accurate = self._marks.array
         self.record()
         self._left, self._more = (np.zeros(model.copies, dtype=int) for _ in range(2))
-        self._start = np.zeros(model.copies)
 
     def record(self):
         super().record()
-        device, search = self.model.device, self._search
-        self._assemble = Segment(device, self._launch_assemble)
-        self._begin = Segment(device, search.launch_again)
-        self._shorten = Segment(device, self._launch_shorten)
+        self._solve = self._part(self._launch_all, whole=True)
+        self._shorten = Segment(self.model.device, self._launch_shorten)
 
-    def _launch_shorten(self):
-        filter_of(self._pairs).launch_limit(self._search.direction)
-        self._search.launch(self._active.array)
-
-    def _launch_assemble(self):
-        self.matrix.assemble(self.x, 0.0, self._search.correction, self._launch_touching)
+    def _launch_matrix(self):
+        self.matrix.assemble(self.x, 0.0, self._d, self._launch_touching)
 
     def _launch_touching(self, values):
         """Adds the blocks of vertices near colliders."""
         for elements, kernel in self._touching:
-            given = [*elements.arguments, elements.clear, self._diagonal, self.x, self._search.correction]
-            given += [self._gradient, self._inertia, self._marks.array, self.model.per_copy]
+            given = [*elements.arguments, elements.clear, self._diagonal, self.x, self._d, self._b]
+            given += [self._inertia, self._marks.array, self.model.per_copy]
             self.model.launch(kernel, elements.count, given, [values])
+
+    def _launch_shorten(self):
+        search = self._search
+        wp.copy(search.correction, self._d)
+        search.launch_again()
+        self._launch_back(search.direction)
+        filter_of(self._pairs).launch_limit(search.direction)
+        search.launch(self._searched.array)
+        self._launch_step(search.step, search.direction, self._searched.array)
 
     def start(self):
         """Makes no copy careful, before the first iteration of a step whose iterates stay if φ would rise."""
-        self.careful[:], self._left[:], self._more[:], self._start[:] = False, 0, 1, 0.0
+        self.careful[:], self._left[:], self._more[:] = False, 0, 1
+        self._solves.largest.zero_()
 
     def note(self, rose):
         """Notes in which copies φ rose in the last iteration, (B,) booleans."""
@@ -174,112 +176,98 @@ class ContactSystem(CorrectedSystem):
         self._left = np.where(rose, self._more, self._left - 1)
         self.careful = self._left > 0
 
-    def correct(self, d, w, active):
-        """Replaces w = A⁻¹ ∇φ by (A + D)⁻¹ ∇φ at d, for careful copies times a step length."""
-        if not (self._touching or self.careful.any() or self._listed.read()[0]):
+    def correct(self, active):
+        """Replaces w = A⁻¹ ∇φ by (A + D)⁻¹ ∇φ at d, for careful copies times a step length; ``active`` are (B,) booleans."""
+        some = self.careful.any()
+        if not (self._touching or some or self._listed.read()[0]):
             return  # D is 0
-        wp.copy(self._search.correction, d)
-        if (self.careful != self._marked).any():
-            self._marked[:] = self.careful
-            self._marks.write(self.careful)
-        self._assemble()
-        found = w.numpy().astype(np.float64)
-        pressed = self._product(found)
-        if pressed.any():
-            b = self._gradient.numpy().astype(np.float64)
-            first = self._dot(b, found)
-            self._start = np.maximum(self._start, first)
-            closely = self.careful | (first <= NEAR**2 * self._start) | (self._pairs is not None)
-            found, _ = self._solve(b, found, pressed, active, closely)
-        elif not self.careful.any():
-            return
-        if self.careful.any():
-            self._begin()
-            self._direction.write(-found)
-            self._active.write(active & self.careful)
+        self._marks.update(self.careful)
+        self._solve()
+        if some:
+            self._searched.update(active & self.careful)
             self._shorten()
-            step = self._step.read() if self._pairs is None else self._step.read() * self._pairs.filter.fraction.numpy()
-            found = self._scaled(np.where(self.careful, step, 1.0), found)
-        self._found.write(found)
-        wp.copy(w, self._result)
 
 
 class PairSystem(CorrectedSystem):
     """Lowers ψ(d) = ½(d − c)ᵀA(d − c) + U(d), U the energy of dynamic elements, by Newton's method with a line search.
 
     Args:
-        model, x, linear: See :class:`CorrectedSystem`.
-        sums: :class:`warpcloth.core.sums.Sums`.
-        d, w: d and A⁻¹∇ψ there (N,) [m], the caller's arrays.
+        given: The arguments of :class:`CorrectedSystem`, with b = ∇ψ.
+        sums, pairs: See :class:`ContactSystem`.
+
+    Attributes:
+        correct: Function that replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1. Away from other cloth w minimises ψ.
     """
 
-    def __init__(self, model, x, linear, sums, pairs, d, w):
-        super().__init__(model, x, linear)
-        self._pairs, self._d, self._w, self._plain_step = pairs, d, w, model.kernel(plain_step, model.dtype)
-        self._sums, self._dynamic = sums, dynamic_of(model)
-        trial, pull = model.vectors(), model.vectors()
-        self._trial, self._pull, self._energy = Mirror(trial), Mirror(pull), Mirror(model.scalars())
+    def __init__(self, *given, sums, pairs):
+        super().__init__(*given)
+        model = self.model
+        self._pairs, self._sums, self._dynamic = pairs, sums, dynamic_of(model)
+        self._trial, self._pull, self._direction = (model.vectors() for _ in range(3))
+        self._state = state = LineSearch()
+        for name in ("energy", "other", "slope", "trial_slope", "square", "step"):
+            setattr(state, name, model.scalars())
+        state.searching = model.scalars(wp.int32)
+        state.trials, state.proceed = (wp.zeros(1, dtype=wp.int32, device=model.device) for _ in range(2))
+        self._pulled = model.scalars()
         self.record()
 
     def record(self):
         super().record()
-        device, trial = self.model.device, self._trial.array
-        self._press = Segment(device, self._launch_press)
-        self._bound = Segment(device, lambda: self._pairs.filter.launch_limit(self._pull.array))
-        self._look = Segment(device, self._launch_look)
-        self._assemble = Segment(device, lambda: self.matrix.assemble_after_gradient(self.x, 0.0, trial))
+        self._look, self._search = self._part(self._launch_look), self._part(self._launch_search)
+        self.correct = self._part(self._launch_correct, whole=True)
 
-    def _launch_press(self):
-        """Launches U and ∂U/∂x at the trial."""
-        self._pairs.filter.launch_trial(self.x, self._trial.array, part=0.5)
-        self._dynamic.launch(self.x, self._trial.array)
-        self._energy.array.zero_()
-        self._dynamic.add_energy(self._sums, self._energy.array)
-        self._pull.array.zero_()
-        self._dynamic.add_gradient(self._pull.array)
-        self.model.lock(self._pull.array)
+    def _launch_correct(self):
+        self._look()
+        wp.capture_if(self._pairs.near.array, self._launch_near)
 
     def _launch_look(self):
         """Tests whether cloth may be near other cloth on the way from d to d − w."""
-        given = [self._d, self._w, self._all, self.model.per_copy]
-        self.model.launch(self._plain_step, self.model.count, given, [self._trial.array])
-        self._pairs.filter.launch_look(self.x, (self._trial.array,))
+        self._launch_on(plain_step, self.model.count, [self._d, self._w, self._all, self.model.per_copy], [self._trial])
+        self._pairs.filter.launch_look(self.x, (self._trial,))
 
-    def _pressed(self, d):
-        self._trial.write(d)
-        self._press()
-        return self._energy.read().copy(), self._pull.read().astype(np.float64)
+    def _launch_near(self):
+        self._launch_all()
+        self._search()
 
-    def _limited(self, *vectors):
-        """Returns ``vectors`` times the fraction for which pairs stay apart while d moves by minus the first of them."""
-        self._pull.write(-vectors[0])
-        self._bound()
-        return (self._scaled(self._pairs.filter.fraction.numpy(), each) for each in vectors)
+    def _launch_matrix(self):
+        for array in (self._state.step, self._direction):  # which may be NaN
+            array.zero_()
+        self._launch_trial()
+        wp.copy(self._state.energy, self._state.other)
+        self.matrix.assemble_after_gradient(self.x, 0.0, self._d)
 
-    def correct(self, gradient, active):
-        """Replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1. Away from other cloth w minimises ψ as it is."""
-        self._look()
-        if not self._pairs.near.read()[0]:
-            return
-        d, b, found = (array.numpy().astype(np.float64) for array in (self._d, gradient, self._w))
-        energy, pull = self._pressed(d)
-        self._assemble()
-        Aw, pressed = b, self._product(found)
-        if pressed.any():
-            found, Aw = self._solve(b, found, pressed, active, True)
-        found, Aw = self._limited(found, Aw)
-        slope, linear, square = (self._dot(one, found) for one in (b, b - pull, Aw))
-        step, wanted = np.ones(self.model.copies), active & (slope > 0.0)
-        for _ in range(HALVINGS):
-            after, now = self._pressed(d - self._scaled(step, found))
-            change = after - energy - step * linear + 0.5 * step**2 * square
-            with np.errstate(invalid="ignore"):
-                level = np.abs(change) <= NOISE * (np.abs(energy) + step * np.abs(linear))
-                rises = step * square - linear - self._dot(now, found)
-                lower = (change <= -1e-4 * step * slope) | (level & (rises <= 0.8 * slope))
-            wanted = wanted & ~lower
-            if not wanted.any():
-                break
-            step = np.where(wanted, 0.5 * step, step)
-        self._found.write(self._scaled(step, found))
-        wp.copy(self._w, self._result)
+    def _launch_trial(self):
+        """Launches U and ∂U/∂x at the trial d + step·p."""
+        given = [self._d, self._direction, self.model.per_copy]
+        self._launch_on(set_trial, self.model.count, given, [self._state, self._trial, self._pull])
+        self._pairs.filter.launch_trial(self.x, self._trial, part=0.5)
+        self._dynamic.launch(self.x, self._trial)
+        self._dynamic.add_energy(self._sums, self._state.other)
+        self._dynamic.add_gradient(self._pull)
+        self.model.lock(self._pull)
+
+    def _launch_search(self):
+        """Launches the search for a step along −w, shortened so that pairs stay apart."""
+        state, direction = self._state, self._direction
+        self.matrix.multiply(self._w, self.q, self._wanted)
+        wp.copy(self.z, self._b)
+        for other in (self.r, self.q):  # A w = b − r − D w
+            self._add(self._minus, other, self.z)
+        self._sums.dot(self._w, self.z, state.square)
+        self._launch_back(direction)
+        self._pairs.filter.launch_limit(direction)
+        self._sums.dot(self._b, direction, state.slope)
+        self._sums.dot(self._pull, direction, self._pulled)
+        state.step.fill_(1.0)
+        wp.copy(state.searching, self._wanted)
+        state.trials.zero_()
+        self._launch_check()
+        wp.capture_while(state.proceed, self._launch_check)
+        self._launch_step(state.step, direction, self._all)
+
+    def _launch_check(self):
+        self._launch_trial()
+        self._sums.dot(self._pull, self._direction, self._state.trial_slope)
+        given = [self._pulled, self._pairs.filter.fraction, HALVINGS]
+        self.model.launch(check_quadratic, self.model.copies, given, [self._state])

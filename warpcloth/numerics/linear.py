@@ -430,7 +430,7 @@ class CopyFactors:
         ValueError: A matrix is not finite or not positive definite.
     """
 
-    error = 0.0
+    error, capturable = 0.0, False
 
     def __init__(self, model, matrices):
         self.per_copy, found = model.per_copy, {}
@@ -473,7 +473,7 @@ class AxisSolves:
 
         self.model, self._found, self._take = model, model.vectors(), model.kernel(linear.take_axes, model.dtype)
         free = (model.mobility.numpy()[: model.per_copy] > 0.0).astype(np.float64)
-        self._parts = []
+        self._parts, self.capturable = [], solver.capturable
         for column in np.unique(free, axis=1).T:
             kept, rest = diags(column), diags(1.0 - column)
             factors = solver(model, [(kept @ matrix @ kept + rest).tocsc() for matrix in matrices])
@@ -506,7 +506,7 @@ class DiagonalScaling:
         diagonal: D of each copy, (B, n), above 0.
     """
 
-    seconds, error = 0.0, 0.0  # there is nothing to factorise
+    seconds, error, capturable = 0.0, 0.0, True  # there is nothing to factorise
 
     def __init__(self, model, diagonal):
         self.model, self._inverse = model, model.array(1.0 / diagonal.ravel(), model.dtype)

@@ -184,8 +184,8 @@ class ADMMStepper(ImplicitStepper):
         self.primal, self.dual = np.zeros(model.copies), np.zeros(model.copies)
         self._pressed = None
         if model.dynamic:
-            given = model, self.state.x, self._factors, self._sums, self.pairs, self.correction, self._w
-            self._pressed = PairSystem(*given)
+            given = model, self.state.x, self.correction, self._factors, self._force, self._w, self._active.array
+            self._pressed = PairSystem(*given, sums=self._sums, pairs=self.pairs)
         self._record()
         self.ready()
 
@@ -218,7 +218,7 @@ class ADMMStepper(ImplicitStepper):
         self._active.update(active)
         self._factors.solve(self._force, self._w)
         if self._pressed is not None:
-            self._pressed.correct(self._force, active)
+            self._pressed.correct()
         self._move()
 
     def _ratios_of(self, elements, scale):

@@ -145,12 +145,12 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._linear = solve_copies(model, matrices) if options.linear == "factorised" else DiagonalScaling(model, self._sizes)
         self.factorise_seconds = self._linear.seconds
         self.correction, self.gradient, self.w = (model.vectors() for _ in range(3))
+        self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
         self._contact = None
         if model.colliders is not None or model.dynamic:
-            given = model, self.state.x, self.gradient, self._linear, self.sums, self.inertia.s, self.pairs
-            self._contact = ContactSystem(*given)
+            given = model, self.state.x, self.correction, self._linear, self.gradient, self.w, self._active.array
+            self._contact = ContactSystem(*given, sums=self.sums, s=self.inertia.s, pairs=self.pairs)
         self._gradient_of = plan(model).gradient(corrected=True)
-        self._acceleration, self._active = Mirror(model.scalars()), Mirror(model.scalars(wp.int32))
         self._plain_step = model.kernel(plain_step, model.dtype)
         self._scale = ResidualScale(model).acceleration
         self._accelerated = None
@@ -186,7 +186,7 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         if self._contact:
             if self._accelerated:
                 self._contact.note(self._accelerated.stayed())
-            self._contact.correct(self.correction, self.w, active)
+            self._contact.correct(active)
         if self._accelerated:
             self._accelerated.propose(active)
         self._move()
