@@ -42,7 +42,7 @@ def scene(
         terms=[wc.Spring(pairs="edges", stiffness=stiffness, damping=0.01), wc.QuadraticBending(stiffness=1e-5)],
         pins=wc.Pins(np.flatnonzero(ends), keyframes),
         gravity=(0.0, 0.0, 0.0),
-        self_contact=wc.SelfContact(distance=2e-3, stiffness=2e4, held_pins="allow"),
+        self_contact=wc.SelfContact(distance=2e-3, held_pins="allow"),
         duration=duration,
         fps=fps,
         name="twist",

@@ -32,6 +32,7 @@ Columns:
   compile s   additional time when all kernels must be compiled
   factor s    time to factorise constant matrices
   MB          peak memory: of the process on a CPU, of Warp's memory pool on CUDA
+  kB/vertex   on CUDA, this memory over the vertices of all cloths
 With colliders or self-contact, the last column compares the time of a frame with that of the same cloth without contact, and
 divides the difference by the numbers of vertices, substeps and colliders, counting self-contact as one. With self-contact it
 also has the largest number of near pairs, how often they were listed, the moves that the filter kept, and the least gap.
@@ -174,7 +175,8 @@ def _write(arguments, run, device):
     print(json_text(facts) if arguments.json else _text(facts))
 
 
-_HEAD = ("ms a frame", "quartiles", "cloths/s", "ns", "GB/s", "share", "launches", "start s", "compile s", "factor s", "MB", "")
+_TIMES = ("start s", "compile s", "factor s")
+_HEAD = ("ms a frame", "quartiles", "cloths/s", "ns", "GB/s", "share", "launches", *_TIMES, "MB", "kB/vertex", "")
 
 
 def _text(facts):
@@ -205,7 +207,8 @@ def _cells(row):
         return (_scene_of(row), row["label"], *[""] * (len(_HEAD) - 1), f"refused: {row['reason']}")
     low, high = row["spread"]
     compiling = None if row["cold_start_s"] is None else max(row["cold_start_s"] - row["start_s"], 0.0)
-    numbers = (row["start_s"], compiling, row["factorise_s"] or None, row["memory"] and 1e-6 * row["memory"])
+    of_vertex = None if row["device"] == "cpu" or row["memory"] is None else 1e-3 * row["memory"] / row["vertices"]
+    numbers = (row["start_s"], compiling, row["factorise_s"] or None, row["memory"] and 1e-6 * row["memory"], of_vertex)
     return (
         *(_scene_of(row), row["label"], _number(row["ms"]), f"{low:.3g}–{high:.3g}"),
         *(
