@@ -96,6 +96,7 @@ MOMENTS = {
     "tablecloth": ({"n": 25}, 1.2, {}),
     "twist": ({"around": 16, "along": 14, "turns": 1.0}, 1.0, {}),
     "usd_cloth": ({"duration": 6.0}, 3.5, {}),
+    "winding": ({"layers": 4, "width": 0.12, "edge": 0.02, "duration": 0.2}, 0.2, {"azimuth": 25.0, "elevation": 12.0}),
 }
 
 

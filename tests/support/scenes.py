@@ -94,6 +94,7 @@ FOLDING = {
     "knot": {"along": 40, "across": 1, "duration": 0.8},
     "funnel": {"n": 9, "duration": 0.8},
     "sleeve": {"around": 12, "along": 6, "duration": 0.6},
+    "winding": {"layers": 2, "width": 0.02, "edge": 0.02, "duration": 0.1},
 }
 QUICK = {
     "newton": wc.Newton(substeps=4),
