@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from ..kernels.contact.start_crossings import Fans, find_crossings
 from .start_layers import apart
 
 
@@ -116,16 +117,31 @@ def _too_near(contact, x):
     least += ulps
     _refuse_meshes(contact, stencils, found, least)
     own = (stencils < contact.model.count).all(axis=1)  # pairs of cloth with cloth
+    bits = _may_cross(contact, x)[own]
     of_vertices, stencils, found = int(own[:of_vertices].sum()), stencils[own], found[own]
     near, y = stencils[found < least], contact.begun.normal.numpy()[: len(own)][own] * found[:, None]
     split = int(np.count_nonzero(found[:of_vertices] < least))
-    edges = stencils[of_vertices:]
     through = [
         each
-        for own, other in ((edges[:, :2], edges[:, 2:]), (edges[:, 2:], edges[:, :2]))
-        for each in crossings(points, own, _triangles_of(contact.model, other))
+        for bit, ends, others in ((1, [0, 1], [2, 3]), (2, [2, 3], [0, 1]))
+        for edges in [stencils[bits & bit > 0]]
+        for each in crossings(points, edges[:, ends], _triangles_of(contact.model, edges[:, others]))
     ]
     return _Start(near, split, np.where(found > ulps, y.T, 0.0).T[found < least], through, least)
+
+
+def _may_cross(contact, x):
+    """Returns the bits of :func:`warpcloth.kernels.contact.start_crossings.find_crossings` of all listed pairs at x (N,)."""
+    model, pairs = contact.model, contact.pairs
+    triangles = np.asarray(model.in_model(model.scene.mesh.triangles), dtype=np.int32)
+    order = np.argsort(triangles, axis=None, kind="stable")
+    first = np.searchsorted(triangles.ravel()[order], np.arange(model.per_copy + 1))
+    fans = Fans()
+    fans.first = wp.array(first, dtype=wp.int32, device=model.device)
+    fans.triangles = wp.array(triangles[order // 3], dtype=wp.vec3i, device=model.device)
+    found = wp.zeros(int(contact.proximity.counts.numpy().sum()), dtype=wp.uint8, device=model.device)
+    model.launch(model.kernel(find_crossings, model.dtype), pairs.threads, [pairs, fans, x], [found])
+    return found.numpy()
 
 
 def _refuse_meshes(contact, stencils, gaps, least):
@@ -172,10 +188,6 @@ def crossings(points, edges, triangles):
     """
     edges = np.repeat(edges, triangles.shape[1], axis=0)
     triangles = triangles.reshape(-1, 3)
-    for axis in points.T:  # most are apart along one
-        ends, corners = axis[edges.T], axis[triangles.T]
-        meet = (ends.min(axis=0) <= corners.max(axis=0)) & (ends.max(axis=0) >= corners.min(axis=0))
-        edges, triangles = edges[meet], triangles[meet]
     apart = ~(edges[:, :, None] == triangles[:, None, :]).any(axis=(1, 2))
     edges, triangles = edges[apart], triangles[apart]
     (p, q), corners = points[edges].swapaxes(0, 1), points[triangles].swapaxes(0, 1)
