@@ -84,10 +84,10 @@ def on_two_edges(u: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 @wp.struct
 class Followed:
-    """The ``start`` of each λ where contacts are found anew; those ``carried`` from the last ones, with their stencils, rows.
+    """The ``start`` of λ where contacts are found anew, and the λ ``carried`` over from the previous contacts.
 
-    The last ones also have their ``number``, ``keys`` and ``slots``. ``mode`` (1,) is 0 in a sweep, STARTING if it only adds
-    the start, and ENDING if it only removes the forces.
+    ``stencils``, ``rows``, ``number``, ``keys`` and ``slots`` are those of the previous contacts. ``mode`` (1,) is 0 in a
+    sweep, STARTING if it only adds the start, and ENDING if it only removes the forces.
     """
 
     mode: wp.array(dtype=wp.int32)
@@ -114,12 +114,12 @@ class Laws:
 
 @wp.struct
 class NearFaces:
-    """The near faces of each vertex at some positions.
+    """The near faces of each of V vertices at some positions, for a list with room for C pairs.
 
-    ``code`` (C,) says where the nearest point of the face of a pair is. ``near`` (C,) lists the pairs of the near faces of
-    vertex i from rows[i] on, and ``counts`` (V,) has the number of these, and that of terms of the vertex whose faces have
-    their nearest points elsewhere. ``multiplicities`` (C,) are those of the terms of a near face, of its edges 12, 23 and 31
-    and its corners 1 to 3: 0 if another face owns them.
+    ``code`` (C,) says where the nearest point of the face of a pair is; it is NONE if the face is not near. ``near`` (C,) has
+    the pairs of the near faces of vertex i from rows[i] on. ``counts`` (V,) has their number, and the number of contacts of the
+    vertex with keys from C on. ``multiplicities`` (C,) are m of the edges 12, 23 and 31 and of the corners 1 to 3 of a face, 0
+    if another near face counts them.
     """
 
     code: wp.array(dtype=wp.int32)
@@ -132,9 +132,9 @@ class NearFaces:
 class Contacts:
     """The contacts at some positions, by slots: w, n, d, r [m], kA with the sign of m [N/m], ``share``, and ``fixed`` λ [kg·m].
 
-    Of C listed pairs, the contact of pair e has the key e. Keys from C + 3·rows[i] on are of terms of vertex i whose faces have
-    their nearest points elsewhere; F faces share at most 1.5 F edges, and as many vertices. ``code`` says whether a contact is
-    that of two edges.
+    The list has room for C pairs. The contact of pair e has the key e. Keys of vertex i from C + 3·rows[i] on are for contacts
+    with an edge or a corner of near faces whose nearest points are elsewhere. Three keys for each face suffice, because F faces
+    share at most 1.5 F edges and 1.5 F vertices. ``code`` is TWO_EDGES if a contact is that of two edges.
 
     ``parts`` has the vertices of the surface of a contact, and bit i of ``touching`` is 1 if wᵢ is not 0. The stencil has the
     first vertex of the cloth with w = 0 in place of each obstacle. Obstacles give the ``offset`` o = Σ wⱼXⱼ [m] of their
@@ -233,7 +233,7 @@ def put_contact(
     pairs: Pairs,
     contacts: Contacts,
 ):
-    """Stores a contact in a new slot, if there is one."""
+    """Takes a new slot for a contact and stores it there; returns the slot, or −1 if none is free."""
     gap = wp.length(y)
     own = cloth_vertex(pairs.layout, s)
     of_cloth = wp.vec4i(s[0], s[1], s[2], s[3])
@@ -274,7 +274,7 @@ def put_contact(
 
 @wp.func
 def slot_of(pairs: Pairs, near: NUMBERS, first: int, count: int, extra: int, i: int):
-    """The slot of contact i of a vertex, or −1: the first ``count`` are of near faces, others have keys from ``extra`` on."""
+    """The slot of contact i of a vertex, or −1. The first ``count`` are of near faces; keys of others begin at ``extra``."""
     key = extra + i - count
     if i < count:
         key = near[first + i]
@@ -386,7 +386,7 @@ def list_near_faces(
     # out
     faces: NearFaces,
 ):
-    """Kernel over vertices: their ``near`` faces and how many there are; none where there are no keys for their contacts."""
+    """Kernel over vertices: lists their ``near`` faces and counts them; 0 if keys of their contacts would reach 2C."""
     for v in range(wp.tid(), vertices, threads):
         first = lists.rows[v]
         end = lists.rows[v + 1]

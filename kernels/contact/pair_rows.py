@@ -30,7 +30,7 @@ class PairSlopes:
 
 @wp.func
 def row_of_pair(copy: int, e: int, ranks: wp.array(dtype=wp.int32), layout: RowLayout, rows: int):
-    """The first row of the pair in slot e, by its rank, or in the order of slots without ``ranks``."""
+    """The first row of the pair in slot e. Rows are in the order of ``ranks``, or of slots if that is None."""
     rank = e
     if ranks:
         rank = ranks[e]
@@ -44,7 +44,7 @@ def count_first_corners(
     # out
     counts: wp.array(dtype=wp.int32),
 ):
-    """Kernel over vertices: the number of pairs whose first corner they are."""
+    """Kernel over vertices: the number of pairs of which the vertex is corner 0."""
     i = wp.tid()
     found = wp.int32(0)
     for k in range(pairs.first[i], pairs.first[i + 1]):
@@ -60,7 +60,7 @@ def rank_pairs(
     # out
     ranks: wp.array(dtype=wp.int32),
 ):
-    """Kernel over vertices: the ranks of pairs by their first corner, from ``starts`` on, and then by key."""
+    """Kernel over vertices: numbers the pairs of which the vertex is corner 0, by their keys, from ``starts`` [i] on."""
     i = wp.tid()
     rank = starts[i]
     for k in range(pairs.first[i], pairs.first[i + 1]):

@@ -168,7 +168,7 @@ def slip_at(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=Any), d
 
 @cache
 def begin_friction(dtype, law: Law, bounded: bool):
-    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force and friction.
+    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force and friction, for which there is room.
 
     ``friction`` has μ of cloth with cloth, then that of each obstacle of a copy.
     """

@@ -18,10 +18,11 @@ class Pairs:
     pairs; those of vertex i in rows ``rows`` [i] to rows[i+1]; and r or, if less, half the rest distance [m], in the precision
     of the model. Kernels over pairs have so many ``threads``: on the CPU one, for each there copies structs.
 
-    An energy has ``stencils``, of cloth alone, and the others. Its contacts are in the first ``number`` (1,) slots, on a GPU in
-    any order. The ``keys`` of slots do not depend on that order, and ``slots`` has the slot of each key that is there, see
-    :func:`slot_with`. ``corners`` lists 4·slot + corner of those at vertex i, from ``first`` [i] to first[i+1], sorted by key.
-    ``corner_counts`` is scratch, 0 between launches. The last three are empty if no kernel sums over vertices.
+    An energy has ``stencils``, of cloth alone, and the others. Its contacts are in the first ``number`` (1,) slots, on a
+    GPU in any order. ``keys`` number contacts by their pairs, so that they do not depend on that order. ``slots`` [key] is
+    the slot of a key, if a contact has it, see :func:`slot_with`. ``corners`` lists 4·slot + corner of contacts at vertex
+    i, from ``first`` [i] to first[i+1], sorted by key. ``corner_counts`` is scratch, 0 between launches. The last three are
+    empty if no kernel sums over vertices.
     """
 
     layout: Layout
@@ -100,7 +101,7 @@ def take_slot(pairs: Pairs, key: int, s: wp.vec4i):
 
 @wp.func
 def slot_with(slots: wp.array(dtype=wp.int32), keys: wp.array(dtype=wp.int32), number: wp.array(dtype=wp.int32), key: int):
-    """The slot of the contact with a key, or −1. Entries of ``slots`` without a contact are old (Briggs and Torczon 1993)."""
+    """The slot of a key, or −1 if no contact has it. Entries of ``slots`` may be stale (Briggs and Torczon 1993)."""
     slot = slots[key]
     if slot < number[0] and keys[slot] == key:
         return slot
@@ -113,7 +114,7 @@ def bound_number(
     pairs: Pairs,
     most: wp.array(dtype=wp.int32),
 ):
-    """Kernel of one thread: ``most`` (1,), the largest number of contacts, and the number of those that have a slot."""
+    """Kernel of one thread: raises ``most`` (1,) to the number of contacts, and limits that to the number of slots."""
     most[0] = wp.max(most[0], pairs.number[0])
     pairs.number[0] = wp.min(pairs.number[0], pairs.stencils.shape[0])
 
@@ -148,7 +149,7 @@ def sort_corners(
     # in and out
     pairs: Pairs,
 ):
-    """Kernel over vertices: sorts the corners of each vertex by their keys, and replaces these by their slots."""
+    """Kernel over vertices: sorts the corners of each vertex by key, and then replaces 4·key + corner by 4·slot + corner."""
     i = wp.tid()
     sort(pairs.corners, pairs.first[i], pairs.first[i + 1])
     for k in range(pairs.first[i], pairs.first[i + 1]):

@@ -37,7 +37,7 @@ def may_cross(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 @cache
 def find_crossings(dtype):
-    """Kernel over listed pairs of edges ab and cd of cloth: bit 0 if ab may cross a triangle at cd, bit 1 the other way round."""
+    """Kernel over listed pairs of edges of cloth: bit 0 if the first may cross a triangle at the second, bit 1 the reverse."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)

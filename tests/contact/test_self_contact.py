@@ -281,7 +281,7 @@ def test_acting_contacts(device):
 
 @table("name", ["newton", "xpbd"], [name for name in SOLVERS if "pbd" not in name or "xpbd" in name])
 def test_contacts_that_do_not_fit_at_first(name, device):
-    """Steps with too many contacts are taken again with more room: the motion is that of enough room, to the bit."""
+    """Steps with too many contacts are taken again with more room: the motion is the same to the bit as with enough room."""
     contact = wc.SelfContact(distance=5e-3, stiffness=1e5, friction=0.3)
     scene, found = layers(3, turn=17.0, gap=2e-3, self_contact=contact), []
     for slots in (16, 8192):

@@ -223,7 +223,7 @@ def test_no_memory_for_pairs(solver, tmp_path, monkeypatch, device):
         found = wc.simulate(scene, solver, output=output, **given)
         frame = found.status.frame
         assert 0 < frame < 4 and found.status.result is Result.STOPPED and not found.status.ok
-        assert found.status.message.startswith(f"stopped before the end of frame {frame + 1}: the cloth has ")
+        assert found.status.message.startswith(f"stopped before the end of frame {frame + 1}: the cloth needs room for ")
         assert "pairs that are near one another, which takes" in found.status.message
         assert (np.float32(found.points) == np.float32(whole.points)[: frame + 1]).all()  # as the file holds them
 
@@ -242,7 +242,13 @@ def test_pairs_and_contacts_take_at_most_the_memory_that_is_asked_for(solver, ro
     known = {each.ptr for each in before}
     arrays = {each.ptr: each for each in gc.get_objects() if type(each) is wp.array and each.size >= capacity}
     taken = sum(each.capacity for each in arrays.values() if each.ptr not in known) / capacity
-    assert 0.5 <= taken / asked <= 1.0
+    assert 0.45 <= taken / asked <= 1.0
+
+
+def test_more_pairs_than_numbers(device):
+    stepper = SOLVER.bind(sheets(n=4, gap=0.2).build(device=device))
+    with pytest.raises(ValueError, match="room for 300000000 pairs that are near one another; it must be at most 268435455"):
+        stepper.pairs.grow_to(2e8)
 
 
 def test_work_of_pins_where_a_step_makes_room(device):

@@ -69,7 +69,7 @@ def test_meshes_that_are_not_those_of_its_bending_are_refused():
 
 
 def test_a_cpu_is_refused_and_it_has_a_row():
-    with pytest.raises(ValueError, match="device is 'cpu'; libuipc has CUDA only"):
+    with pytest.raises(ValueError, match="device is 'cpu'; libuipc runs on CUDA only"):
         LibUipc(1).bind(declared(), "cpu")
     with pytest.raises(ValueError, match="iterations"):
         LibUipc(1, 0)
@@ -148,7 +148,7 @@ def test_contact_begins_at_the_distances_of_the_scene(uipc):
 @pytest.fixture
 def cuda(uipc):
     if not wp.is_cuda_available():
-        pytest.skip("libuipc has CUDA only")
+        pytest.skip("libuipc runs on CUDA only")
     return "cuda:0"
 
 

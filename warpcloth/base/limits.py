@@ -34,7 +34,7 @@ def refuse_memory(what, size, device=None):
     Args:
         what: Option and value, which begin the error message: "frames is 1000000000".
         size: Bytes needed.
-        device: The Warp device that has the arrays; None for the host.
+        device: Warp device on which the arrays are allocated; None for the host.
 
     Raises:
         ValueError: Fewer bytes are free.

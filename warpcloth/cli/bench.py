@@ -32,7 +32,7 @@ Columns:
   compile s   additional time when all kernels must be compiled
   factor s    time to factorise constant matrices
   MB          peak memory: of the process on a CPU, of Warp's memory pool on CUDA
-  kB/vertex   on CUDA, this memory over the vertices of all cloths
+  kB/vertex   on CUDA, this memory divided by the number of vertices of all cloths
 With colliders or self-contact, the last column compares the time of a frame with that of the same cloth without contact, and
 divides the difference by the numbers of vertices, substeps and colliders, counting self-contact as one. With self-contact it
 also has the largest number of near pairs, how often they were listed, the moves that the filter kept, and the least gap.

@@ -144,7 +144,7 @@ def add_with(parser):
         nargs="+",
         metavar="SIMULATOR",
         choices=_SIMULATORS,
-        help="measure solvers of other simulators too: newton, the engine, pbd (pyPBD) or uipc (libuipc); extras install them",
+        help="measure other simulators too: newton (the physics engine), pbd (pyPBD), uipc (libuipc); extras install them",
     )
 
 

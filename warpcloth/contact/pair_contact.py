@@ -15,8 +15,8 @@ from ..kernels.contact.self_pairs import bound_number
 # Sweeps, of a hierarchy those of the finest level, find contacts anew after so many, which costs as much as 2 or 3 sweeps.
 # Sooner, XPBD gains no less energy.
 EVERY = 10
-# Of a contact, and of its friction, with forces and blocks.
-BYTES_OF_A_CONTACT = 2000
+# Memory of a contact with friction, including forces and blocks [bytes]: up to 2153 in float64, with meshes.
+BYTES_OF_A_CONTACT = 2200
 
 
 class PairContact(DynamicElements):
@@ -32,8 +32,8 @@ class PairContact(DynamicElements):
         obstacles: Positions (V,) [m] with the obstacles where forces are evaluated.
         least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
         lists: The listed pairs.
-        slots: The number of contacts that fit after the next :meth:`hold`.
-        most: The largest number of contacts so far, also of those that did not fit, :class:`.Mirror` of (1,) int32.
+        slots: Number of slots that the next :meth:`hold` allocates.
+        most: The largest number of contacts so far, including those that did not fit, :class:`.Mirror` of (1,) int32.
         turn: The number of sweeps of the step that count towards EVERY, (1,) int32.
     """
 
@@ -42,7 +42,8 @@ class PairContact(DynamicElements):
         model = surface.model
         super().__init__(model, kernels.CONTACT_OF_PAIRS, listed)
         self.least, self._laws, device = 0.0, laws, model.device
-        self.slots, self.most = max(8192, model.count // 2), Mirror(wp.zeros(1, dtype=wp.int32, device=device))
+        self.most = Mirror(wp.zeros(1, dtype=wp.int32, device=device))
+        self.slots = max(2048, min(8 * model.count, 8192), model.count // 2)  # some launches take all slots
         areas = [wp.array(surface.of_model(each), dtype=wp.float64, device=device) for each in surface.areas()]
         rest = wp.array(surface.rest, dtype=wp.vec3d, device=device)
         self._areas = filled(potential.Areas, of_vertices=areas[0], of_edges=areas[1], rest=rest)
@@ -65,7 +66,7 @@ class PairContact(DynamicElements):
             ValueError: There is not enough memory.
         """
         slots, listed, device = self.slots, len(lists.stencils), self.model.device
-        refuse_memory(f"the cloth has {slots} contacts", BYTES_OF_A_CONTACT * slots, device)
+        refuse_memory(f"the cloth needs room for {slots} contacts", BYTES_OF_A_CONTACT * slots, device)
         self.lists, self._normals = lists, normals
         pairs = self.new_pairs(slots, 2 * listed, self.surface.layout, self._corners)
         kinds = {"weights": wp.vec4d, "normal": wp.vec3d, "code": wp.int32, "touching": wp.int32}

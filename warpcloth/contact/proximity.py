@@ -17,8 +17,9 @@ from ..kernels.contact.pair_potential import CLOSE
 # 64th less, so that a list serves two rounds despite rounding.
 WAY = 0.25
 ROUND = WAY * 63 / 64
-# Of a pair in the list, with its gap, its near face, and its keys.
+# Memory of a listed pair, with its gap, its near face and two keys [bytes].
 BYTES_OF_A_PAIR = 200
+MOST = (1 << 28) - 1  # four corners of each of two keys
 
 
 class Proximity:
@@ -151,7 +152,10 @@ class Proximity:
 
     def _allocate(self, capacity):
         model, rows = self.model, self._vertices + self._edges
-        refuse_memory(f"the cloth has {capacity} pairs that are near one another", BYTES_OF_A_PAIR * capacity, model.device)
+        what = f"the cloth needs room for {capacity} pairs that are near one another"
+        if capacity > MOST:
+            raise ValueError(f"{what}; it must be at most {MOST}, because corners of contacts are numbered in 32 bits")
+        refuse_memory(what, BYTES_OF_A_PAIR * capacity, model.device)
 
         def zeros(count, dtype=wp.int32):
             return wp.zeros(count, dtype=dtype, device=model.device)

@@ -49,7 +49,7 @@ class Slips:
             self.from_host(other.to_host())
 
     def to_host(self):
-        """Returns copies of the arrays, by name, without empty slots: contacts are numbered anew, as ``corners`` has them."""
+        """Returns copies of the arrays, by name, without empty slots. Contacts are numbered in the order of ``corners``."""
         found = {name: array.numpy() for name, array in self._arrays.items()}
         slots, corners = np.divmod(found["corners"][: found["first"][-1]], 4)
         used, at, slots = np.unique(slots, return_index=True, return_inverse=True)
@@ -76,7 +76,7 @@ class SelfFriction(DynamicElements):
     Args:
         surface: The :class:`warpcloth.contact.surface.ContactSurface`.
         slips: :class:`Slips`, a part of the state of the solver.
-        keys: The number of the keys of contacts.
+        keys: Number of keys that contacts may have.
         steps: Steps since the start of each copy, (B,) int32.
         law: The :class:`warpcloth.kernels.coulomb.Law` of friction.
         friction: μ of cloth with cloth, then that of each obstacle of a copy, (1 + m,).
@@ -108,7 +108,7 @@ class SelfFriction(DynamicElements):
         self.hold(slips.room, keys)
 
     def hold(self, room, keys):
-        """Allocates arrays for ``room`` pairs with ``keys``. The slips of the last step are kept."""
+        """Allocates arrays for ``room`` pairs, whose keys are below ``keys``. The slips of the last step are kept."""
         self._kept.hold(room)
         kinds = {"parts": wp.vec4i, "weights": wp.vec4d, "sides": wp.int32, "normal": wp.vec3d, "anchor": wp.vec3d}
         kinds |= {"stiffness": wp.float64, "limit": wp.float64} | ({"travel": wp.vec3d} if self.surface.obstacles else {})

@@ -200,12 +200,12 @@ class SelfSteps:
 
     @property
     def _keys(self):
-        """The number of the keys of contacts."""
+        """Number of keys that contacts may have."""
         return 2 * len(self.pairs.stencils)
 
     @property
     def capacities(self):
-        """The numbers of pairs and of contacts that fit."""
+        """The numbers of pairs and of contacts for which there is room."""
         return len(self.pairs.stencils), self.contact.capacity
 
     def grow(self):
@@ -220,7 +220,7 @@ class SelfSteps:
             raise Stopped(str(error)) from None
 
     def grow_to(self, pairs, contacts=0):
-        """Makes room for 1.5 times these numbers of pairs and of contacts, where they do not fit."""
+        """Makes room for 1.5 times ``pairs`` if these do not fit, and for 1.5 times ``contacts`` if these do not."""
         if pairs > len(self.pairs.stencils):
             self.proximity.grow(pairs)
         if contacts > self.contact.capacity:
@@ -235,7 +235,7 @@ class SelfSteps:
 
     @property
     def overflowed(self):
-        """Whether there were more pairs or contacts so far than fit. The host reads the device."""
+        """Whether there have been more pairs or contacts than fit. The host reads the device."""
         most = self.most, int(self.contact.most.read()[0])
         if any(found > room for found, room in zip(most, self.capacities, strict=True)):
             self._wanted = most  # the state, with the first number, may be put back before the lists grow
@@ -363,7 +363,7 @@ class SelfSteps:
             self.model.launch(keep_forces, each.capacity, given, [each.forces])
 
     def launch_present(self, x):
-        """Lists the pairs and contacts at x (N,), with meshes where they are after the last step; poses stay those for sums."""
+        """Lists pairs and contacts at x (N,), with meshes at the end of the last step. Poses that sums need are kept."""
         if not self.surface.moves:
             self.launch_begin(x)
             self.contact.launch_rows(x)

@@ -57,7 +57,7 @@ class DynamicElements:
     def new_pairs(self, slots, keys, layout, corners=True):
         """Returns pairs with a number of slots, and with lists of ``corners`` at each vertex if kernels sum over vertices.
 
-        The numbers of ``keys`` are below ``keys``; without, no slot is found by its key.
+        Keys are below ``keys``.
         """
         sizes, device = {"number": 1, "keys": slots, "slots": keys}, self.model.device
         if corners:

@@ -196,7 +196,7 @@ class PairSystem(CorrectedSystem):
         sums, pairs: See :class:`ContactSystem`.
 
     Attributes:
-        correct: Function that replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1. Away from other cloth w minimises ψ.
+        correct: Function that replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1. Away from other cloth U is 0, and w stays.
     """
 
     def __init__(self, *given, sums, pairs):

@@ -17,7 +17,7 @@ class PairRows:
 
     Attributes:
         elements: None, because the number of the elements changes.
-        per_copy: Number of pairs that have rows in each copy, the capacity.
+        per_copy: Number of slots; each copy has rows for all of them.
         count: Number of rows of one copy.
     """
 

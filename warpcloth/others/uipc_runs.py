@@ -43,12 +43,12 @@ class LibUipc:
             ValueError: The device is a CPU.
         """
         if str(device) == "cpu":
-            raise ValueError("device is 'cpu'; libuipc has CUDA only")
+            raise ValueError("device is 'cpu'; libuipc runs on CUDA only")
         return UipcSteps(scene, self, wp.get_device(device).ordinal)
 
 
 class UipcSteps:
-    """A scene in an engine of libuipc, on the CUDA device of a number."""
+    """A scene in an engine of libuipc, on the CUDA device with the index ``ordinal``."""
 
     def __init__(self, scene, solver, ordinal):
         uipc, self._substeps = engine(), solver.substeps
