@@ -23,7 +23,7 @@ COLOURS = (
 )
 MARKERS = "so^vDPXph<>*"
 _SERIES = (0, 2, 7, 6, 5, 3, 4, 1, 8, 9, 10, 11)  # order of colours for series that belong to no solver
-_OTHERS = ("0.22", "0.4", "0.55", "0.31", "0.48", "0.63")  # greys, with hollow markers
+_OTHERS = ("0.22", "0.4", "0.55", "0.31", "0.48", "0.63", "0.71")  # greys, with hollow markers
 # Dashes of variants of one solver, such as its integrators, and of lines that are laws.
 DASHES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
 # sRGB of cells of maps, by how good their result is. They differ in lightness too, for people who do not see red.
