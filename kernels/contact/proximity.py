@@ -6,8 +6,9 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
-from .obstacles import CLOTH, OBSTACLE, copy_of, has_obstacle, in_copy
-from .proximity_grid import MODULE, box_tests, boxes, boxes_meet, bucket_of, code_of, grids, surfaces
+from .local_motion import bucket_of, differences, motions
+from .obstacles import CLOTH, OBSTACLE, copy_of, has_obstacle, in_copy, vector_within
+from .proximity_grid import MODULE, box_tests, boxes, boxes_meet, code_of, grids, surfaces
 from .self_gaps import nearest_of_face
 
 MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
@@ -132,15 +133,18 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
 
     ``take`` (dtype, of_edges) returns a device function (surface, x, s, i, k, triangles, out) and the struct of ``out``. s is
     the stencil of a pair, i its vertex or edge, and k its triangle or other edge. The boxes are at x, or along moves ``p`` from
-    there, of the cloth or of all vertices. A box meets those of its own level and those above, but that of a vertex that moves
-    meets those of all levels, for it may be larger. ``shares`` threads share the search of a vertex or edge. Where there are
-    more rows of cells than buckets, as for long moves, it goes through the buckets instead.
+    there, of the cloth or of all vertices. Of calm cloth they are boxes at x, on level 0, that meet the box that an element
+    sweeps relative to all calm cloth nearby. A box meets those of its own level and those above, but that of a vertex that
+    moves meets those of all levels, for it may be larger. ``shares`` threads share the search of a vertex or edge. Where there
+    are more rows of cells than buckets, as for long moves, it goes through the buckets instead.
 
     Of two edges of one level, only one finds the other, by the order of their cells along z and y, or of their indices, which
     is also the order in the stencil.
     """
     vec3, _ = types(dtype)
-    box_along, level_of, cell_of = boxes(dtype)
+    box_at, box_along, stored_box, cell_of = boxes(dtype)
+    relative_box, _all_calm = differences(dtype)
+    vector, vector_or_zero = load(vec3), vector_within(dtype)
     number, four = load(wp.int32), load(wp.vec4i)
     visit, out_type = take(dtype, of_edges)
     ends_of, next_meeting = box_tests(dtype)
@@ -154,6 +158,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
         # state in
         x: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
+        motion: motions(dtype),
         grid: grids(dtype),
         # parameters
         triangles: int,
@@ -173,16 +178,30 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
             if surface.piece[j] < 0:
                 return
             group = surface.vertex_groups[j]
-        low, high = box_along(surface, x, p, own[0], own[1], own[1])
-        level = level_of(grid.size, low, high)
+        low, high, level = stored_box(surface, motion, x, p, grid.size, own[0], own[1], own[1])
         if level < 0:
             return
+        centre = cell_of(grid.size, level, dtype(0.5) * (low + high))
+        near = low
+        far = high
+        calm = wp.bool(False)
+        apart = wp.bool(False)
+        if p:
+            calm = surface.itself
+            if calm:
+                # Level 0 has the boxes at x of calm elements; this one moves relative to them.
+                m = vector(motion.low, own[0])
+                n = vector(motion.high, own[0])
+                apart = m[0] > n[0]
+                a = vector_or_zero(p, own[0])
+                b = vector_or_zero(p, own[1])
+                near, far, _radius = box_at(surface, x, own[0], own[1], own[1])
+                near, far = relative_box(near, far, wp.min(a, b), wp.max(a, b), m, n, dtype(4.0))
+                low, high = box_along(surface, x, p, own[0], own[1], own[1])
         if group == OBSTACLE:
             if not boxes_meet(low, high, surface.lowest[copy], surface.highest[copy]):
                 return
-        ends = ends_of(high, low)
         lowest = level
-        centre = cell_of(grid.size, level, dtype(0.5) * (low + high))
         buckets = grid.counts.shape[0]
         if wp.static(not of_edges):
             if p:
@@ -198,12 +217,16 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                     level += 1
             present = grid.levels[kind] >> level
             while present != 0:
-                if (present & 1) != 0:
+                of_calm = calm and level == 0 and kind == KIND
+                if (present & 1) != 0 and not (of_calm and apart):
+                    l = wp.where(of_calm, near, low)
+                    h = wp.where(of_calm, far, high)
+                    ends = ends_of(h, l)
                     code = code_of(copy, kind, level)
                     # Those with the centres of boxes that meet this one, half of which is in the extent.
                     extent = grid.extents[kind, level]
-                    one = cell_of(grid.size, level, low - extent)
-                    two = cell_of(grid.size, level, high + extent)
+                    one = cell_of(grid.size, level, l - extent)
+                    two = cell_of(grid.size, level, h + extent)
                     if wp.static(of_edges):
                         within = ordered and level == lowest
                         if within:

@@ -15,10 +15,10 @@ from ..memory import load
 from ..reduce import largest_of_warp
 from ..rotation import epsilon
 from ..vectors import types
+from .local_motion import FARTHEST, bucket_of, differences, motions
 from .obstacles import OBSTACLE, Layout, vector_within
 
 LEVELS = wp.constant(30)  # levels of the grid; the last has one cell
-FARTHEST = 1e9  # largest cell coordinate; the outermost cells contain everything beyond
 MODULE = "warpcloth.proximity"
 
 
@@ -82,8 +82,9 @@ def grids(dtype):
 
 @cache
 def boxes(dtype):
-    """Device functions on boxes and cells: ``box_along``, ``level_of``, ``cell_of``."""
+    """Device functions on boxes and cells: ``box_at``, ``box_along``, ``stored_box``, ``cell_of``."""
     vec3, _ = types(dtype)
+    _relative_box, all_calm = differences(dtype)
     half, farthest, corner, vector_or_zero = dtype(0.5), dtype(FARTHEST), load(vec3), vector_within(dtype)
 
     @wp.func
@@ -99,15 +100,21 @@ def boxes(dtype):
         return low - edge, high + edge
 
     @wp.func
-    def box_along(surface: surfaces(dtype), x: wp.array(dtype=vec3), p: wp.array(dtype=vec3), i: int, j: int, k: int):
-        """The box of three vertices that move from x to x + p, or that stay, if p is None. Of an edge, j and k are equal."""
-        a, b, c = corner(x, i), corner(x, j), corner(x, k)
+    def box_at(surface: surfaces(dtype), x: wp.array(dtype=vec3), i: int, j: int, k: int):
+        """The box of three vertices and its radius. Of an edge, j and k are equal."""
         of_mesh = i >= surface.layout.cloth
         is_edge = i != j and j == k
         radius = surface.skin + surface.max_distance
         if (of_mesh or not surface.itself) and (is_edge or of_mesh == (i == j)):
             radius = surface.skin + surface.close
-        low, high = box_of(radius, a, b, c)
+        low, high = box_of(radius, corner(x, i), corner(x, j), corner(x, k))
+        return low, high, radius
+
+    @wp.func
+    def box_along(surface: surfaces(dtype), x: wp.array(dtype=vec3), p: wp.array(dtype=vec3), i: int, j: int, k: int):
+        """The box of three vertices that move from x to x + p, or that stay, if p is None. Of an edge, j and k are equal."""
+        a, b, c = corner(x, i), corner(x, j), corner(x, k)
+        low, high, radius = box_at(surface, x, i, j, k)
         if p:
             l, h = box_of(radius, a + vector_or_zero(p, i), b + vector_or_zero(p, j), c + vector_or_zero(p, k))
             low = wp.min(low, l)
@@ -127,6 +134,34 @@ def boxes(dtype):
         return level
 
     @wp.func
+    def stored_box(
+        surface: surfaces(dtype),
+        motion: motions(dtype),
+        x: wp.array(dtype=vec3),
+        p: wp.array(dtype=vec3),
+        size: dtype,
+        i: int,
+        j: int,
+        k: int,
+    ):
+        """The box of three vertices in the grid, and its level.
+
+        If they move and are calm, it is their box at x, on level 0. Other boxes along moves of the cloth are above it.
+        """
+        low, high = box_along(surface, x, p, i, j, k)
+        level = level_of(size, low, high)
+        if p:
+            if surface.itself and i < surface.layout.cloth and level >= 0:
+                level = wp.max(level, 1)
+                if all_calm(motion, i, j, k):
+                    l, h, _radius = box_at(surface, x, i, j, k)
+                    if level_of(size, l, h) == 0:
+                        low = l
+                        high = h
+                        level = wp.int32(0)
+        return low, high, level
+
+    @wp.func
     def cell_of(size: dtype, level: int, p: vec3):
         """The cell of a level with the point p."""
         cell = wp.vec3i()
@@ -136,7 +171,7 @@ def boxes(dtype):
                 cell[i] = wp.int32(wp.floor(wp.clamp(q[i], -farthest, farthest)))
         return cell
 
-    return box_along, level_of, cell_of
+    return box_at, box_along, stored_box, cell_of
 
 
 @wp.func
@@ -181,17 +216,11 @@ def code_of(copy: int, kind: int, level: int):
     return (4 * copy + kind) * 32 + level
 
 
-@wp.func
-def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
-    key = wp.uint32(x) + wp.uint32(y) * wp.uint32(73856093) + wp.uint32(z) * wp.uint32(19349663)
-    return wp.int32((key + wp.uint32(code) * wp.uint32(83492791)) & wp.uint32(buckets - 1))
-
-
 @cache
 def bound_cloth(dtype):
     """Kernel over vertices of the cloth: extends the box of their copy, which holds their boxes along p."""
     vec3, _ = types(dtype)
-    box_along, _level_of, _cell_of = boxes(dtype)
+    _box_at, box_along, *_ = boxes(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def bound_each_vertex(
@@ -218,7 +247,7 @@ def count_items(dtype):
     Obstacles count where they meet the box of the cloth.
     """
     vec3, _ = types(dtype)
-    box_along, level_of, cell_of = boxes(dtype)
+    *_, stored_box, cell_of = boxes(dtype)
     largest_in_warp, number = largest_of_warp(dtype), f"wp::{dtype.__name__}"
 
     # Volatile, because a cached value would miss what other multiprocessors have stored.
@@ -235,13 +264,13 @@ def count_items(dtype):
         # state in
         x: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
+        motion: motions(dtype),
         # in and out
         grid: grids(dtype),
     ):
         item = wp.tid()
         v = surface.items[item]
-        low, high = box_along(surface, x, p, v[0], v[1], v[2])
-        level = level_of(grid.size, low, high)
+        low, high, level = stored_box(surface, motion, x, p, grid.size, v[0], v[1], v[2])
         if surface.groups[item] == OBSTACLE:
             copy = v[3] >> 1
             if not boxes_meet(low, high, surface.lowest[copy], surface.highest[copy]):
@@ -267,7 +296,7 @@ def count_items(dtype):
 def fill_buckets(dtype):
     """Kernel over items: the entries of the buckets; counts ``counts`` down to 0."""
     vec3, _ = types(dtype)
-    box_along, level_of, cell_of = boxes(dtype)
+    *_, stored_box, cell_of = boxes(dtype)
     ends_of, _next_meeting = box_tests(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -277,6 +306,7 @@ def fill_buckets(dtype):
         # state in
         x: wp.array(dtype=vec3),
         p: wp.array(dtype=vec3),
+        motion: motions(dtype),
         # in and out
         grid: grids(dtype),
     ):
@@ -285,8 +315,7 @@ def fill_buckets(dtype):
         if key < 0:
             return
         v = surface.items[item]
-        low, high = box_along(surface, x, p, v[0], v[1], v[2])
-        level = level_of(grid.size, low, high)
+        low, high, level = stored_box(surface, motion, x, p, grid.size, v[0], v[1], v[2])
         cell = cell_of(grid.size, level, dtype(0.5) * (low + high))
         slot = grid.first[key] + wp.atomic_sub(grid.counts, key, 1) - 1
         grid.entries[slot] = wp.vec4i(item, cell[1], cell[2], code_of(v[3] >> 1, kind_in_grid(v, surface.groups[item]), level))

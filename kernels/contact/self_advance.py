@@ -6,8 +6,9 @@ import warp as wp
 
 from ..memory import load
 from ..vectors import types
-from .obstacles import copy_of, vector_within
-from .proximity_grid import surfaces
+from .local_motion import differences
+from .obstacles import copy_of, has_obstacle, vector_within
+from .proximity_grid import boxes, boxes_meet, surfaces
 from .self_gaps import CORNERS, ONE, ZERO, corners, nearest
 from .self_pairs import Pairs, module_of
 from .self_planes import KEPT, WIDE, margin_of, needs_no_cut, part_apart, ulp_of
@@ -18,7 +19,8 @@ def advances(dtype):
     """Struct of the moves ``direction`` [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m].
 
     The direction is that of the cloth (N,), or of all vertices of the surface. ``far`` is 1 for copies that move so far that
-    pairs may meet which are not in the list (B,).
+    pairs may meet which are not in the list (B,). Of cloth the list has all pairs that may meet while their sides move by at
+    most ``alike`` relative to one another, from the positions ``found`` of the list to the end of the direction [m].
     """
     vec3, _ = types(dtype)
 
@@ -28,6 +30,8 @@ def advances(dtype):
         fraction: wp.array(dtype=wp.float64)
         far: wp.array(dtype=wp.int32)
         least: wp.float64
+        alike: dtype
+        found: wp.array(dtype=vec3)
 
     return Advance
 
@@ -77,15 +81,52 @@ def allowed_fraction(dtype):
 
 @cache
 def take_advance(dtype, of_edges: bool):
-    """The function of :func:`.proximity.search_pairs` that reduces the ``fraction`` of copies that move ``far``; its struct."""
+    """The function of :func:`.proximity.search_pairs` that reduces the ``fraction`` of copies that move ``far``; its struct.
+
+    It leaves out pairs that the list has, and those whose boxes stay apart while they move relative to one another.
+    """
     vec3, _ = types(dtype)
     advance, allowed, of_vertex = advances(dtype), allowed_fraction(dtype), wp.constant(not of_edges)
+    (box_at, *_), (relative_box, _all_calm) = boxes(dtype), differences(dtype)
+    vector, vector_or_zero = load(vec3), vector_within(dtype)
+
+    @wp.func
+    def is_listed(x: wp.array(dtype=vec3), s: wp.vec4i, out: advance):
+        way = dtype(0.0)
+        sides = wp.where(of_vertex, 1, 2)
+        for p in range(sides):
+            own = vector(x, s[p]) + vector_or_zero(out.direction, s[p]) - vector(out.found, s[p])
+            for q in range(sides, 4):
+                other = vector(x, s[q]) + vector_or_zero(out.direction, s[q]) - vector(out.found, s[q])
+                way = wp.max(way, wp.length(own - other))
+        return way <= out.alike
+
+    @wp.func
+    def stay_apart(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, out: advance):
+        j = wp.where(of_vertex, 0, 1)
+        k = wp.where(of_vertex, 1, 2)
+        a = vector_or_zero(out.direction, s[0])
+        b = vector_or_zero(out.direction, s[j])
+        low, high, _radius = box_at(surface, x, s[0], s[j], s[j])
+        l, h, _radius = box_at(surface, x, s[k], s[wp.where(of_vertex, 2, 3)], s[3])
+        c = vector_or_zero(out.direction, s[k])
+        d = vector_or_zero(out.direction, s[2])
+        e = vector_or_zero(out.direction, s[3])
+        m = wp.min(wp.min(c, d), e)
+        n = wp.max(wp.max(c, d), e)
+        low, high = relative_box(low, high, wp.min(a, b), wp.max(a, b), m, n, dtype(2.0))
+        return not boxes_meet(low, high, l, h)
 
     @wp.func
     def take(surface: surfaces(dtype), x: wp.array(dtype=vec3), s: wp.vec4i, i: int, k: int, triangles: int, out: advance):
         copy = copy_of(surface.layout, s[0])
         if out.far[copy] == 0:
             return
+        if stay_apart(surface, x, s, out):
+            return
+        if not has_obstacle(surface.layout, s):
+            if is_listed(x, s, out):
+                return
         t = allowed(of_vertex, s, x, out)
         if t < ONE:
             wp.atomic_min(out.fraction, copy, t)
@@ -95,7 +136,7 @@ def take_advance(dtype, of_edges: bool):
 
 @cache
 def advance_listed(dtype):
-    """Kernel over listed pairs: reduces the ``fraction`` of copies that do not move ``far``, whose list is complete.
+    """Kernel over listed pairs: reduces the ``fraction`` of copies.
 
     Pairs whose ``gap`` at ``begun`` is too wide for the moves of their sides relative to one another are left out.
     """
@@ -134,8 +175,6 @@ def advance_listed(dtype):
         if needs_no_cut(e, wp.float64(way), margin_of(out.least, ulp * wp.float64(far)), gap):
             return
         copy = copy_of(pairs.layout, s[0])
-        if out.far[copy] != 0:
-            return
         t = allowed(e < pairs.counts[0], s, x, out)
         if t < ONE:
             wp.atomic_min(out.fraction, copy, t)

@@ -243,3 +243,44 @@ def test_no_pair_is_missing_while_nothing_has_moved(device):
     assert not moved(both)
     both[-1, 0] += 0.6 * skin
     assert moved(both)
+
+
+# Moves of sheet 0, of sheet 1, and of one vertex of each beside them, in metres along y, and the part that a copy may make.
+APPROACH, COMMON = 0.3, (3.0, -2.0, 1.0)
+MOVES = {
+    "sheets approach": (0.0, -APPROACH, None),
+    "sheets approach in common motion": (0.0, -APPROACH, COMMON),
+    "one vertex moves": ((4, APPROACH), 0.0, None),
+    "another vertex moves in common motion": (0.0, (4, -APPROACH), COMMON),
+    "one vertex and a sheet approach": ((4, 0.5 * APPROACH), -0.5 * APPROACH, None),
+    "two vertices meet": ((4, 0.5 * APPROACH), (4, -0.5 * APPROACH), None),
+}
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", MOVES)
+def test_moves_stop_at_pairs_that_were_far_apart(name, dtype, device):
+    """Two sheets of 3 × 3 vertices, 0.2 m apart, keep a tenth of it; another sheet, and a copy without moves, change nothing.
+
+    The first is smaller and below the inside of a triangle of the second, so that no edges cross.
+    """
+    gap, few = 0.2, wc.Mesh.grid(3, 3, size=0.02)
+    starts, scales = np.array([[0.004, 0.0, 0.001], [0.0, gap, 0.0], [5.0, 0.0, 0.0]]), np.array([0.1, 1.0, 1.0])
+    points = few.points * scales[:, None, None] + starts[:, None]
+    mesh = wc.Mesh(points.reshape(-1, 3), np.concatenate([few.triangles + 9 * k for k in range(3)]))
+    scene = wc.Scene(mesh, density=0.1, terms=[wc.Spring(stiffness=1.0)], self_contact=wc.SelfContact(distance=1e-3))
+    *moves, common = MOVES[name]
+    p = np.zeros((27, 3))
+    for k, move in enumerate(moves):
+        at, height = (9 * k + move[0], move[1]) if isinstance(move, tuple) else (slice(9 * k, 9 * k + 9), move)
+        p[at, 1] += height
+    p[:18] += common or 0.0
+    stepper = wc.Newton().bind(scene.build(copies=2, dtype=dtype, device=device))
+    model, pairs = stepper.model, stepper.pairs
+    order = np.arange(27) if model.order is None else model.order
+    pairs.launch_begin(stepper.state.x)
+    direction = model.array(np.concatenate([p[order], 0.0 * p]), model.vec3)
+    pairs.filter.launch_limit(direction)
+    # To rounding of the positions and of the gap.
+    bound = 64 * np.finfo(model.numpy_dtype).eps * (np.abs(mesh.points).max() + np.abs(p).max()) / APPROACH + 2e-6 / gap
+    np.testing.assert_allclose(pairs.filter.fraction.numpy(), [0.9 * gap / APPROACH, 1.0], rtol=0, atol=bound)

@@ -8,7 +8,7 @@ from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.filled import filled
 from ..core.scan import Scan
-from ..kernels.contact import piece_motion, proximity_grid
+from ..kernels.contact import local_motion, piece_motion, proximity_grid
 from ..kernels.contact import proximity as kernels
 from ..kernels.contact.pair_potential import CLOSE
 
@@ -19,6 +19,8 @@ WAY = 0.25
 ROUND = WAY * 63 / 64
 # Memory of a listed pair, with its gap, its near face and two keys [bytes].
 BYTES_OF_A_PAIR = 200
+# Edges along a cluster of vertices whose moves have a mean.
+CLUSTER = 8
 MOST = (1 << 28) - 1  # four corners of each of two keys
 
 
@@ -50,6 +52,7 @@ class Proximity:
         listed: Positions (V,) [m] of the list that is in the arrays.
         pieces: The connected piece of each vertex of the cloth of a copy, −1 without an element, (n,).
         drift: Motion of each connected piece of all copies since ``found`` [m].
+        alike: See :meth:`launch_along` [m].
     """
 
     @in_turn
@@ -80,6 +83,7 @@ class Proximity:
         self._along = filled(proximity_grid.surfaces(model.dtype), **values | touching)
         self._allocate_grid()
         self._set_pieces(piece)
+        self._set_clusters(points)
         # Threads that share a search repeat work, so they are at most a million. Of 1, 2, 4 and 8 shares 8 is fastest with 64²
         # vertices, 4 with 256², and 1 with 512² (one H200).
         most = min((1 << 20) // max(self._edges, 1), 8)
@@ -94,6 +98,7 @@ class Proximity:
             ((kernels.write_pairs,), model.dtype),
             ((piece_motion.extend_boxes, piece_motion.find_drift, piece_motion.compare_positions), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.add_positions), model.dtype),
+            ((local_motion.find_means, local_motion.note_moves, local_motion.bound_moves), model.dtype),
         )
         self.counts = wp.zeros(2, dtype=wp.int32, device=device)
         self._mirror = Mirror(self.counts)
@@ -137,6 +142,31 @@ class Proximity:
         meets = {"layout": surface.layout, "itself": surface.meets_itself}
         self._pieces = filled(piece_motion.pieces(model.dtype), **numbers, **meets, **arrays)
         self.drift = self._pieces.drift
+
+    def _set_clusters(self, points):
+        """Divides each piece of the cloth into clusters of vertices, in cubes of CLUSTER edges at rest, for all copies."""
+        model, n, device = self.model, self.model.per_copy, self.model.device
+        copies, used = np.arange(model.copies)[:, None], np.flatnonzero(self.pieces >= 0)
+        cubes = np.floor(points[used] / (CLUSTER * np.median(self.surface.edge_lengths))).astype(np.int64)
+        _, cluster = np.unique(np.column_stack([self.pieces[used], cubes]), axis=0, return_inverse=True)
+        sizes = np.bincount(cluster.ravel())
+        members = used[np.argsort(cluster.ravel(), kind="stable")]
+        of_vertices = np.full(n, -1)
+        of_vertices[used] = cluster.ravel()
+        numbers = {
+            "first": np.concatenate([[0], np.cumsum(np.tile(sizes, model.copies))]),
+            "members": (members + n * copies).ravel(),
+            "cluster": np.where(of_vertices < 0, -1, of_vertices + len(sizes) * copies).ravel(),
+            "calm": np.zeros(model.count),
+        }
+        arrays = {name: wp.array(each.astype(np.int32), device=device) for name, each in numbers.items()}
+        counts = {"mean": len(sizes) * model.copies, "lowest": model.copies, "highest": model.copies}
+        counts |= {"low": self._vertices, "high": self._vertices, "tables": (4, 1 << max(4, (model.count // 4).bit_length()))}
+        arrays |= {name: wp.zeros(count, dtype=model.vec3, device=device) for name, count in counts.items()}
+        arrays["some"] = wp.zeros(1, dtype=wp.int32, device=device)
+        self.alike = (1.0 - 2.0**-6) * self.skin
+        values = {"layout": self.surface.layout, "size": self._grid.size, "alike": (1.0 - 2.0**-10) * self.alike}
+        self._motion = filled(local_motion.motions(model.dtype), **values, **arrays)
 
     def _allocate_grid(self):
         model, items, lengths = self.model, self._triangles + self._edges, self.surface.edge_lengths
@@ -205,8 +235,24 @@ class Proximity:
         return [self.model.kernel(kernels.search_pairs, self.model.dtype, each, take, name) for each in (False, True)]
 
     def launch_along(self, x, p, searches, out):
-        """Launches ``searches`` of pairs whose boxes meet while vertices move from x (V,) by p [m], (V,) or (N,)."""
-        self._launch_grid(self._along, x, p, searches, out)
+        """Launches ``searches`` of pairs whose boxes meet while vertices move from x (V,) by p [m], (V,) or (N,).
+
+        Pairs of the cloth may be left out whose sides move by at most ``alike`` relative to one another, from ``found`` on.
+        """
+        if not self.surface.meets_itself:
+            self._launch_grid(self._along, x, p, searches, out)
+            return
+        motion, model = self._motion, self.model
+        for array, start in ((motion.lowest, np.inf), (motion.highest, -np.inf)):
+            array.fill_(start)
+        for k, start in enumerate((np.inf, -np.inf) * 2):
+            motion.tables[k].fill_(start)
+        motion.some.zero_()
+        moving = len(motion.mean) + len(p) - model.count
+        self._launch(local_motion.find_means, moving, [p], [motion])
+        self._launch(local_motion.note_moves, model.count, [x, p, self.found], [motion])
+        self._launch(local_motion.bound_moves, self._vertices, [x], [motion])
+        wp.capture_if(motion.some, lambda: self._launch_grid(self._along, x, p, searches, out))
 
     def _launch_grid(self, surface, x, p, searches, out):
         grid, items, model = self._grid, self._triangles + self._edges, self.model
@@ -216,12 +262,12 @@ class Proximity:
             surface.lowest.fill_(np.inf)
             surface.highest.fill_(-np.inf)
             self._launch(proximity_grid.bound_cloth, model.count, [surface, x, p], [])
-        self._launch(proximity_grid.count_items, items, [surface, x, p], [grid])
+        self._launch(proximity_grid.count_items, items, [surface, x, p, self._motion], [grid])
         self._buckets.launch(grid.counts, grid.first)
-        self._launch(proximity_grid.fill_buckets, items, [surface, x, p], [grid])
+        self._launch(proximity_grid.fill_buckets, items, [surface, x, p, self._motion], [grid])
         for search, count in zip(searches, (self._vertices if self._triangles else 0, self._edges), strict=True):
             if count:
-                given = [surface, x, p, grid, self._triangles, self._shares]
+                given = [surface, x, p, self._motion, grid, self._triangles, self._shares]
                 self.model.launch(search, (count, self._shares), given, [out])
 
     def _launch_boxes(self, x):

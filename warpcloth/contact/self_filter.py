@@ -249,6 +249,7 @@ class SelfFilter:
         self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
         self.fraction = self._advance.fraction = model.scalars()
         self._advance.far, self._advance.least = self._contact.proximity.copies, self._contact.least
+        self._advance.found, self._advance.alike = self._contact.proximity.found, self._contact.proximity.alike
 
     # Meshes that move, and cloth that they carry along, see :mod:`warpcloth.kernels.contact.mesh_moves`.
 
