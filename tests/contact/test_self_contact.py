@@ -210,6 +210,28 @@ def test_a_sheet_rests_far_from_the_origin(dtype, device):
     assert k * (r - d + 25.0 * r * r * to_f**2 / f) == pytest.approx(np.full(16, w), abs=(ulp * steepness).max())
 
 
+def test_impact_far_from_the_origin_in_float32(device, n=24, edge=4e-3, far=4.0):
+    """Strains are those of float64 but for the rounding of positions, ½ulp at each end and axis, in flight and after impact."""
+    length, there = edge * (n - 1), np.array([far, 0.0, far])
+    mesh, radius, distance = wc.Mesh.grid(n, n, size=length, pattern="alternating"), 0.3 * length, 0.4 * edge
+    scene = wc.Scene(
+        mesh,
+        density=0.15,
+        terms=[wc.Spring(pairs=("structural", "shear"), stiffness=300.0), wc.QuadraticBending(stiffness=1e-5)],
+        positions=mesh.points + there + [-0.5 * length, 2.0 * radius + 2.0 * distance, -0.5 * length],
+        colliders=[wc.Sphere(radius=radius, position=(far, radius, far), friction=0.3)],
+        contact=wc.Contact(distance=distance),
+        self_contact=wc.SelfContact(distance=distance, friction=0.3),
+    )
+    options = {"frames": 4, "device": device}
+    found = [wc.simulate(scene, wc.Newton(substeps=4), dtype=dtype, **options) for dtype in ("float32", "float64")]
+    ends = [np.asarray(each.points, dtype=np.float64)[:, mesh.edges] for each in found]
+    strains = [np.linalg.norm(x[:, :, 1] - x[:, :, 0], axis=2) / mesh.edge_lengths - 1.0 for x in ends]
+    assert np.abs(strains[1][-1]).max() > 1e-3
+    assert np.percentile(np.abs(strains[0] - strains[1]), 99) < np.sqrt(3.0) * np.spacing(np.float32(far)) / edge
+    assert not any(crossed(each.points[-1], mesh.triangles) for each in found)
+
+
 @pytest.mark.host
 def test_pins_that_cloth_holds_back(device):
     """Pins that are to go through a sheet: the rest is not called an equilibrium."""
