@@ -1,6 +1,6 @@
 """Checkpoints, from which an interrupted run continues with the same bits as an uninterrupted one.
 
-A run that writes a file replaces its checkpoint, beside the frames, after each chunk of frames, and deletes it at the end.
+A run with a file replaces its checkpoint after each chunk of frames, and deletes it at the end.
 """
 
 import json
@@ -32,7 +32,7 @@ def facts_of(scene, solver, device, dtype, vary, threads, record=()):
     """Returns everything that the bits of a run depend on, by name.
 
     Raises:
-        ValueError: The scene cannot be hashed, see :func:`warpcloth.base.digest.digest_of`.
+        ValueError: The scene cannot be hashed.
     """
     device = wp.get_device(device)
     return {
@@ -52,8 +52,6 @@ class Checkpoint:
     """The state of a run after the last frame of a chunk.
 
     Attributes:
-        frame: Number of the frame.
-        facts: See :func:`facts_of`.
         chunks: Time code of the first frame, and name of the file, of each chunk so far.
         span: Time codes of the first and of the last frame.
         state, watch: Values of :class:`warpcloth.core.state.State` and :class:`warpcloth.run.watch.Watch` on the host.
@@ -107,7 +105,7 @@ class Checkpoint:
         """Checks that it is of a run with the same facts.
 
         Raises:
-            ValueError: A fact differs. The message names the first.
+            ValueError: A fact differs.
         """
         for name, called in _CALLED.items():
             if self.facts.get(name) != facts[name]:

@@ -1,6 +1,6 @@
 """Lists scenes, solvers and their options for the command line, by parsing source files.
 
-Nothing here imports Warp, so that help and shell completion respond at once.
+Nothing here imports Warp.
 """
 
 import ast
@@ -62,7 +62,7 @@ def _defaults(arguments):
 
 @cache
 def list_solvers():
-    """Returns a dict of the solvers of this package: by name a dict from options to the words that they take, or ()."""
+    """Returns the solvers of this package: their options, and the words that each takes, by name."""
     folder, classes = _PACKAGE / "solvers", {}
     for path in folder.glob("*.py"):
         classes |= {node.name: node for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ClassDef)}
@@ -77,7 +77,6 @@ def list_failures():
 
 
 def _assigned(node, name):
-    """Returns the literal that a module or class assigns to a name."""
     return ast.literal_eval(_value(node, name))
 
 
@@ -96,7 +95,6 @@ def _options(record, classes):
 
 
 def _words(annotation):
-    """Returns the words of each Literal[…] in an annotation."""
     found = [node for node in ast.walk(annotation) if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal"]
     return tuple(word for literal in found for word in ast.literal_eval(ast.Tuple(_elements(literal.slice), ast.Load())))
 

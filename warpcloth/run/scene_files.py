@@ -32,7 +32,7 @@ class SceneSource:
         path: The file.
         function: Function that returns a :class:`warpcloth.Scene`, called with ``parameters`` by name.
         parameters: Its parameters, `inspect.Parameter` by name.
-        pins: Selection of fixed vertices that replace the pins of the scene, or None.
+        pins: Selection of fixed vertices in place of the pins of the scene, or None.
     """
 
     path: Path
@@ -41,7 +41,7 @@ class SceneSource:
     pins: str | None = None
 
     def values(self, texts):
-        """Returns the values of all parameters: those of ``texts``, text by name, converted, and defaults.
+        """Returns the values of all parameters: converted ``texts`` by name, else defaults.
 
         Raises:
             ValueError: The function does not take a name or a value, or a required value is missing.
@@ -60,8 +60,7 @@ class SceneSource:
         """Builds the scene for the values of the parameters.
 
         Raises:
-            ValueError: The function raises (the message has its file and line) or returns no scene, or ``pins`` selects no
-                vertex.
+            ValueError: The function raises (with file and line) or returns no scene, or ``pins`` selects no vertex.
         """
         if self.path.suffix != ".py":
             scene = self.function(**values)
@@ -77,10 +76,6 @@ class SceneSource:
 
 def find_source(name, pins=None):
     """Finds a scene: a Python file, a USD stage, a mesh file, or the name of a file in one of :func:`folders`.
-
-    Args:
-        name: Path or name.
-        pins: See :class:`SceneSource`.
 
     Raises:
         FileNotFoundError: There is no such file or name.

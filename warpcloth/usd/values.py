@@ -1,4 +1,4 @@
-"""Reads and checks values of a stage. Errors name the attribute."""
+"""Reads and checks values of a stage; errors name the attribute."""
 
 import os
 import textwrap
@@ -24,16 +24,7 @@ _listening = False
 
 @contextmanager
 def sentences(path, raised=ValueError, what=""):
-    """Context that turns errors of pxr about a file into exceptions, and warnings of pxr into Python warnings.
-
-    Args:
-        path: The file.
-        raised: Type of the exception.
-        what: Text before the message of pxr.
-
-    Raises:
-        ValueError: pxr reported an error; ``raised`` gives another type.
-    """
+    """Context that turns pxr's errors about a file into exceptions ``raised``, and its warnings into Python's."""
     global _listening
     heard = None if _listening else UsdUtils.CoalescingDiagnosticDelegate()  # every nested delegate would get all messages
     _listening = True
@@ -59,7 +50,6 @@ def reason_of(error):
 
 
 def _plain(text):
-    """A message of pxr, shortened, without line breaks and without the memory address of the stage."""
     return textwrap.shorten(text.partition(" (instantiating stage on")[0], 500, placeholder=" …")
 
 
@@ -67,7 +57,7 @@ def refuse_path(path):
     """Checks that a layer can refer to a path.
 
     Raises:
-        ValueError: The path has control characters, such as a line break, or is not UTF-8.
+        ValueError: It has control characters, or is not UTF-8.
     """
     text = os.fspath(path)
     if any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
@@ -78,8 +68,8 @@ def check_stage(stage, path):
     """Checks the layers, the up axis, units, rates and times of a stage.
 
     Raises:
-        ValueError: A sublayer is missing, the up axis is neither Y nor Z, a unit, rate or time is out of range, or the end is
-            before the start.
+        ValueError: A sublayer is missing, the up axis is not Y or Z, a unit, rate or time is out of range, or the end is before
+            the start.
     """
     for error in stage.GetCompositionErrors():
         if type(error).__name__ == "ErrorInvalidSublayerPath":
@@ -106,7 +96,7 @@ def check_stage(stage, path):
 
 
 def check_composed(prim, path):
-    """Checks that no file is missing to which a prim or an ancestor refers.
+    """Checks that all files to which a prim or an ancestor refers are there.
 
     Raises:
         ValueError: pxr could not compose the prim.
@@ -122,10 +112,10 @@ def _refuse_outside(where, name, value, least, most):
 
 
 def value_of(attribute, time=None):
-    """Returns the value of an attribute at a time code, or at the default time; None if it has none.
+    """Returns the value of an attribute at a time code or the default time, or None.
 
     Raises:
-        ValueError: The file is broken there, or the value has a type that Python does not have.
+        ValueError: The file is broken there, or Python lacks the type.
     """
     try:
         with redirect_stderr(StringIO()):  # pxr prints a value that it cannot convert to Python
@@ -137,10 +127,10 @@ def value_of(attribute, time=None):
 
 
 def token_of(attribute, allowed):
-    """Returns the value of an attribute with a fixed set of tokens.
+    """Returns the value of an attribute, one of ``allowed``.
 
     Raises:
-        ValueError: The value is not one of ``allowed``.
+        ValueError: It is none of these.
     """
     value = value_of(attribute)
     if value not in allowed:
@@ -149,7 +139,7 @@ def token_of(attribute, allowed):
 
 
 def array_of(attribute, components=(), whole=False, time=None):
-    """Returns the rows of an array attribute (count, *components), as int32 if ``whole``; None if it has no value.
+    """Returns the rows of an array attribute (count, *components), int32 if ``whole``; or None.
 
     Raises:
         ValueError: The rows have another type or shape, or cannot be read.
@@ -168,7 +158,7 @@ def checked_rows(name, value, components=(), whole=False):
 
 
 def refuse_outside(name, numbers, count, what):
-    """Checks that numbers are indices from 0 to ``count`` − 1.
+    """Checks that numbers are indices below ``count``.
 
     Raises:
         ValueError: A number is out of range; the message names the first.
@@ -180,7 +170,7 @@ def refuse_outside(name, numbers, count, what):
 
 
 def refuse_unknown(name, values, where="", infinite=False):
-    """Checks that numbers are finite, or with ``infinite`` only that none is NaN.
+    """Checks that numbers are finite, or with ``infinite`` not NaN.
 
     Raises:
         ValueError: A number is not; the message names the first.
