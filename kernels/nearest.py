@@ -21,7 +21,7 @@ def from_segment(a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Squared distance of the origin to a triangle, which may be flat: to its plane, or else to its sides."""
+    """Squared distance of the origin to a triangle, which may be flat."""
     nearest = wp.min(from_segment(a, b), wp.min(from_segment(b, c), from_segment(c, a)))
     n = wp.cross(b - a, c - a)
     longest_sq = wp.max(wp.length_sq(b - a), wp.max(wp.length_sq(c - b), wp.length_sq(a - c)))
@@ -37,9 +37,8 @@ def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 def distances():
     """Kernel over points: out[i] = distance of points[i] to the triangles of ``mesh``, faces[i] = the nearest.
 
-    All coordinates are in [−1, 1]³, in float32 in ``mesh`` and in float64 in ``x``. A query of the mesh finds the nearest
-    triangle; its distance is computed in float64. Queries omit flat triangles and can be wrong about nearly flat ones, so those
-    in ``flat`` are tested one by one.
+    Coordinates are in [−1, 1]³, in float32 in ``mesh``, in float64 in ``x`` and the distance. Queries can miss nearly flat
+    triangles, so those in ``flat`` are tested one by one.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,7 +1,6 @@
-"""Factories of the explicit step by blocks: one thread per copy computes the forces of all terms and the update in one pass.
+"""The explicit step by blocks: one thread per copy computes all forces and the update in one pass.
 
-Each element is in the block of its lowest vertex. After a block, no element adds to the forces on its vertices or reads their
-positions, so x and v are updated in place.
+Each element is in the block of its lowest vertex. After a block, its vertices are complete, so x and v are updated in place.
 """
 
 from functools import cache
@@ -28,9 +27,8 @@ def block_step(
 ):
     """Kernel over copies, block by block: v, x after a step with a = g − ∇U/m.
 
-    ``gradient`` is that of the other terms, and is reset to 0. ``flags`` are compiler flags for the CPU. ``compensated`` is as
-    in :func:`..explicit_step.kick_and_drift`, for terms without damping, and evaluates forces at x + residual. ``guarded``
-    includes contact with colliders, see :mod:`.contact_guard`; ``moving``: some colliders move.
+    ``gradient`` is that of other terms, and is reset. ``flags`` are compiler flags of the CPU, ``compensated`` that of
+    :func:`..explicit_step.kick_and_drift`, ``guarded`` includes contact with colliders, of which some move if ``moving``.
     """
     vec3, _ = types(dtype)
     add, step = add_block_forces(parts, dtype, compensated), kick_and_drift(dtype, symplectic, compensated)

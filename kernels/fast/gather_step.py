@@ -1,4 +1,4 @@
-"""Factories of the explicit step that gathers: each vertex sums over its elements; x is read and written in two arrays."""
+"""The explicit step that gathers: each vertex sums over its elements, from two arrays into two others."""
 
 from functools import cache
 
@@ -18,10 +18,7 @@ from .term_facts import TermFacts, chain_of
 def gather_vertex(
     parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: int = 1, residual_type=None, guarded=False, moving=False
 ):
-    """Device function with which ``lanes`` threads set x, v of a vertex after a step, with a = g − ∇U/m, in other arrays.
-
-    ``residual_type``, ``guarded`` and ``moving`` are as in :func:`gather_step`.
-    """
+    """Device function with which ``lanes`` threads set x, v of a vertex after a step, with a = g − ∇U/m."""
     vec3, _ = types(dtype)
     compensated, packed, stored = residual_type is not None, residual_type is wp.int32, residual_type or vec3
     total_of = sum_at_vertices(parts, dtype, residual_type, lanes)
@@ -100,11 +97,10 @@ def gather_step(
 ):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
-    Without damping v may be ``v_after``. ``fast`` allows errors of the last one or two bits in quotients and roots; NaN stays
-    NaN. ``alone`` is for one copy. ``residual_type`` is None, or, for terms without damping in float32, the type of the
-    residual of :func:`..explicit_step.kick_and_drift`: vectors, with a ``unit`` of 1, or int32, packed by
-    :mod:`.packed_residual` in units of ``unit``. ``guarded`` includes contact with colliders, see :mod:`.contact_guard`;
-    ``moving``: some colliders move.
+    Without damping v may be ``v_after``. ``fast`` allows errors of two bits in quotients and roots. ``alone`` is for one copy.
+    ``residual_type`` is None, or, in float32 without damping, that of the residual of :func:`..explicit_step.kick_and_drift`:
+    vectors, with a ``unit`` of 1, or int32 of :mod:`.packed_residual` in units of ``unit``. ``guarded`` includes contact with
+    colliders, of which some move if ``moving``.
     """
     vec3, _ = types(dtype)
     stored = residual_type or vec3
@@ -145,7 +141,7 @@ def gather_step(
 def gather_steps_of_copies(
     parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, threads: int, guarded: bool = False
 ):
-    """Kernel over (copies, threads): x, v after several steps. A block of ``threads``, which synchronise, takes a copy.
+    """Kernel over (copies, threads): x, v after several steps, a block of ``threads`` per copy.
 
     Every other step writes x_other and v_other. Without damping v may be v_other.
     """

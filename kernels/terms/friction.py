@@ -50,7 +50,7 @@ def slip(y: Any, rest: Any):
 
 @wp.func
 def bounded_hessian(y: Any, rest: Any, negative: Any):
-    """0, as the bounded Hessian of contact includes that of friction."""
+    """0: the bounded Hessian of contact includes friction."""
     return wp.matrix(shape=(3, 3), dtype=y.dtype)
 
 
