@@ -1,6 +1,6 @@
-"""The catalogue of energies: each has a file of its own, with its record, and two lines here.
+"""The catalogue of energies: each has a file with its record, and two lines here.
 
-USD stages, the command line and charts look up an energy by name in :data:`TERMS`. :func:`register` adds one from outside.
+:data:`TERMS` has them by name; :func:`register` adds one from outside.
 """
 
 from ..base.extensions import note
@@ -39,15 +39,10 @@ TERMS = {name: globals()[name] for name in __all__}
 
 
 def register(energy):
-    """Adds the record of an energy to :data:`TERMS`, so that stages, charts and tests know it by its name.
-
-    It replaces a record of the same name that was registered before.
+    """Adds the record of an energy to :data:`TERMS`, in place of one of that name; also a decorator.
 
     Args:
         energy: A frozen dataclass that derives from :class:`warpcloth.terms.declared.Declared`.
-
-    Returns:
-        The same class, so that this can be used as a decorator.
 
     Raises:
         ValueError: It is not such a class, or it has the name of an energy of the package.

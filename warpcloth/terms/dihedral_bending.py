@@ -14,8 +14,8 @@ class DihedralBending(Bending):
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated as in :class:`warpcloth.QuadraticBending`.
-        damping: β [N·m·s]. It damps the rate of θ.
-        name: To tell two terms of one kind apart.
+        damping: β [N·m·s] on the rate of θ.
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = DIHEDRAL_BENDING
