@@ -10,18 +10,18 @@ from ..base.checks import did_you_mean, shown
 
 @dataclass(frozen=True)
 class Measure:
-    """A field of numbers, one set for each triangle or each vertex.
+    """A field of numbers of triangles or vertices.
 
     Attributes:
         name: Its name.
-        shape: Shape of the value of one element, () for a number.
-        unit: SI unit, "1" if it has none.
+        shape: Shape of one value, () for a number.
+        unit: SI unit, or "1".
         text: Its definition.
-        neutral: Its value without deformation, the middle of a colour scale; None if scales start at 0.
-        rate: Whether it is a rate, from the previous frame to this one.
-        needs: "directions" or "material", options of :func:`warpcloth.analyze`; "" for neither.
-        summed: Whether :func:`scalars` uses it; scalars of rotations and unit vectors would be constant.
-        undefined: Why an element with a reference and finite points may have no value.
+        neutral: Undeformed value, the middle of a colour scale, or None if scales start at 0.
+        rate: Whether it is a rate from the previous frame.
+        needs: "directions" or "material", options of :func:`warpcloth.analyze`, or "".
+        summed: Whether :func:`scalars` uses it, unlike rotations and unit vectors.
+        undefined: Why an element may have no value.
     """
 
     name: str
@@ -86,15 +86,15 @@ MEASURES = {on: {measure.name: measure for measure in listed} for on, listed in 
 
 
 def chosen(names, on, given=("directions", "material", "rate")):
-    """Returns the measures of a list of names, each once.
+    """Returns the measures of a list of names.
 
     Args:
-        names: Names, or "all" for those whose needs are met.
+        names: Names, or "all" with met needs.
         on: "triangle" or "vertex".
-        given: The needs that are met.
+        given: Met needs.
 
     Raises:
-        ValueError: There is no name, or no such measure.
+        ValueError: There is no such measure, or none.
     """
     known = MEASURES[on]
     if isinstance(names, str):
@@ -118,10 +118,10 @@ def chosen(names, on, given=("directions", "material", "rate")):
 
 
 def scalars(measure, values):
-    """Returns the scalars of a field, for colours and summaries, as arrays (E,) by name.
+    """Returns the scalars of a field, arrays (E,) by name.
 
-    A number gives itself, a vector each component, such as ``stretch_1``, and a matrix its Frobenius norm, such as
-    ``spin_norm``. Rotations and unit vectors give none.
+    Vectors give components, such as ``stretch_1``, matrices the Frobenius norm, such as ``spin_norm``, rotations and unit
+    vectors none.
 
     Args:
         measure: The :class:`Measure`.

@@ -17,10 +17,10 @@ class Exclusion:
     """Elements or a frame that could not be measured.
 
     Attributes:
-        frame: Number of the frame; None for the rest shape.
-        kind: "triangle" or "vertex"; "frame" for a whole frame, without elements.
+        frame: Frame number, or None for the rest shape.
+        kind: "triangle", "vertex", or "frame" without elements.
         elements: Indices (k,).
-        reason: The reason, as the end of a sentence.
+        reason: The end of a sentence.
     """
 
     frame: float | None
@@ -45,13 +45,13 @@ class Sample:
 
     Attributes:
         row: Index of the row.
-        reference: Number of the reference frame; None for the rest shape.
-        frame: Number of the frame.
-        index: Index of the frame in its sequence.
-        time: Time of the frame [s]; NaN if the sequence has no times.
+        reference: Reference frame, or None for the rest shape.
+        frame: Frame number.
+        index: Its index in the sequence.
+        time: Its time [s], or NaN.
         points: (n, 3) [m], read-only.
-        values: Arrays (E, *shape) by name of measure, NaN for excluded elements; the next sample overwrites them.
-        excluded: List of :class:`Exclusion` that occur first in this row.
+        values: Arrays (E, *shape) by measure, NaN where excluded, overwritten by the next sample.
+        excluded: :class:`Exclusion` that occur first here.
     """
 
     row: int
@@ -71,11 +71,11 @@ class Analysis(Mapping[str, np.ndarray]):
     Attributes:
         mesh: The mesh, with E triangles or vertices.
         on: "triangle" or "vertex".
-        measures: The :class:`warpcloth.analysis.measures.Measure` of each array, by name.
-        references: Number of each row's reference frame; None for the rest shape.
-        frames: Numbers of the frames (rows,).
-        times: Times of the frames (rows,) [s].
-        excluded: List of :class:`Exclusion`, elements that could not be measured; their values are NaN.
+        measures: :class:`warpcloth.analysis.measures.Measure` by name.
+        references: Reference frame of each row, or None for the rest shape.
+        frames: Frame numbers (rows,).
+        times: (rows,) [s].
+        excluded: List of :class:`Exclusion`, whose values are NaN.
         arrays: The arrays by name.
     """
 

@@ -1,4 +1,4 @@
-"""Writes fields of many rows as arrays of one NPZ file."""
+"""Writes fields of many rows as arrays of an NPZ file."""
 
 import math
 import shutil
@@ -11,11 +11,10 @@ from ..base.outputs import Output
 
 
 class NpzWriter(Output):
-    """Writes fields of all rows, (rows, E, *shape) by name, and ``frames``, ``references`` and ``times``, for ``numpy.load``.
+    """Writes fields of all rows, (rows, E, *shape), and ``frames``, ``references`` (NaN: rest) and ``times`` [s], (rows,)
+    float64.
 
-    The last three are (rows,) float64: frame labels, labels of references, NaN for the rest shape, and times [s]. Memory holds
-    them and one row of the fields. Fields are written to files beside the output, and `close` copies them into one file,
-    without compression. Missing rows are left out.
+    Memory holds one row. Fields go to files beside the output, which `close` copies into one.
 
     Attributes:
         rows: Number of rows appended.
@@ -26,12 +25,12 @@ class NpzWriter(Output):
 
         Args:
             path: File to write.
-            rows: Largest number of rows.
-            fields: (shape of a row, dtype) of each field, by name.
+            rows: Maximum number of rows.
+            fields: (shape of a row, dtype) by name.
 
         Raises:
             FileNotFoundError: The folder does not exist.
-            ValueError: The path is a folder or a device, or a field has the name of an array above.
+            ValueError: The path is a folder or a device, or a field has a reserved name.
         """
         self._heads = {name: np.empty(rows) for name in ("frames", "references", "times")}
         self._fields = {name: (tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in fields.items()}
@@ -47,12 +46,12 @@ class NpzWriter(Output):
 
         Args:
             frame: Label of the frame.
-            reference: Label of the frame that it is measured against; None is the rest shape.
-            time: Time of the frame [s].
-            values: The fields by name, each (E, *shape), of the declared dtype; others are ignored.
+            reference: Label of its reference, or None for the rest shape.
+            time: Its time [s].
+            values: Fields (E, *shape) by name; others are ignored.
 
         Raises:
-            ValueError: A field has another shape or dtype than declared, or there are too many rows.
+            ValueError: A shape or dtype is another than declared, or there are too many rows.
         """
         if self.rows == self._promised:
             raise ValueError(f"{self.path}: {self._promised} rows were promised, and this is one more")
@@ -81,7 +80,6 @@ class NpzWriter(Output):
 
 
 def _copy(part, member, shape, dtype):
-    """Copies the complete rows, after the header of an array."""
     header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(member, header)
     part.truncate(math.prod(shape) * dtype.itemsize)
@@ -90,6 +88,6 @@ def _copy(part, member, shape, dtype):
 
 
 def _member(archive, name):
-    """Opens a member of an archive, which may exceed 4 GiB, without a date, so that equal arrays give equal files."""
+    """Opens a member of an archive, above 4 GiB too, without a date, so equal arrays give equal files."""
     info = zipfile.ZipInfo(f"{name}.npy")
     return archive.open(info, "w", force_zip64=True)
