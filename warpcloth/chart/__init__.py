@@ -1,4 +1,4 @@
-"""Plots of measured cloth and of solvers, with matplotlib, the extra "chart"."""
+"""Plots of measured cloth and of solvers, with the extra "chart"."""
 
 from ..picture.colour import Scale, range_over
 from ..picture.picture import draw

@@ -11,7 +11,7 @@ _FAR = 30.0  # from a line to its name [pt]; beyond, a legend is easier to read
 
 
 def plot_distances(path, found, names, device="cpu"):
-    """Plots the distances of two animations over time and, if they have the same triangles, differences of stretches below.
+    """Plots the distances of two animations over time, and below differences of stretches, if any.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -20,9 +20,7 @@ def plot_distances(path, found, names, device="cpu"):
         device: The Warp device that compared them.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
@@ -53,7 +51,7 @@ def plot_distances(path, found, names, device="cpu"):
 
 
 def plot_surface_distances(path, found, names, device="cpu"):
-    """Plots the RMS distances of two surfaces over time from each, of all points and of inner ones, and the 95 % of the latter.
+    """Plots RMS distances of two surfaces over time from each, of all and of inner points, and the 95 % of the latter.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -62,9 +60,7 @@ def plot_surface_distances(path, found, names, device="cpu"):
         device: The Warp device that compared them.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
@@ -85,7 +81,7 @@ def plot_surface_distances(path, found, names, device="cpu"):
 
 
 def _draw(axes, times, lines):
-    """Draws values over time; returns (x, y, label, colour) of the last value of each line."""
+    """Draws values over time; returns (x, y, label, colour) of each line's end."""
     ends = []
     for k, (label, values) in enumerate(lines.items()):
         style = series_style(k)

@@ -8,8 +8,6 @@ def plot_failure(path, found):
     """Draws the result of :func:`failure_chart`.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     plot_panels(path, FAILURES[found["failure"]].PANELS, found["rows"], found["title"], found["machine"])

@@ -1,4 +1,4 @@
-"""Draws maps in charts of failures: cells coloured by value or by series, with laws as lines."""
+"""Draws maps in charts of failures: cells by value or series, laws as lines."""
 
 import numpy as np
 
@@ -18,10 +18,10 @@ def draw_map(axes, panel, rows, lines):
         axes: Axes of matplotlib.
         panel: The map.
         rows: Its points.
-        lines: Line styles by label of the law, shared by all maps of a figure.
+        lines: Line styles by label, shared by all maps.
 
     Returns:
-        The cells, for a colour bar; None if they are coloured by series.
+        The cells, for a colour bar; None if coloured by series.
     """
     xs, ys = (sorted({row[name] for row in rows}) for name in "xy")
     values, crossed = np.full((len(ys), len(xs)), np.nan), []
@@ -56,11 +56,11 @@ def _edges(values, scale):
 
 
 def add_keys(figure, maps, lines):
-    """Adds colour bars to a figure, one for all maps with the same colours, and a legend of lines, kinds and crosses.
+    """Adds colour bars, one for maps of the same colours, and a legend of lines, kinds and crosses.
 
     Args:
         figure: Figure of matplotlib.
-        maps: (axes, panel, cells) of each map, with the cells of :func:`draw_map`.
+        maps: (axes, panel, cells of :func:`draw_map`).
         lines: Line styles by label.
     """
     from matplotlib.lines import Line2D

@@ -1,4 +1,4 @@
-"""Draws panels of measured points with laws as lines, for charts of failures."""
+"""Draws measured points with laws as lines, for charts of failures."""
 
 import math
 
@@ -31,14 +31,12 @@ def plot_panels(path, panels, rows, title, facts):
     Args:
         path: The file, .png, .svg or .pdf.
         panels: :class:`warpcloth.lab.panels.Panel` records.
-        rows: Points, see :func:`warpcloth.lab.panels.point`.
+        rows: Points of :func:`warpcloth.lab.panels.point`.
         title: Title of the figure.
         facts: The machine, as of :func:`warpcloth.lab.machine.machine`.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
@@ -71,7 +69,7 @@ def plot_panels(path, panels, rows, title, facts):
 
 
 def _draw(axes, panel, rows):
-    """Draws points and laws; returns (x, y, label, colour) of the end of each line."""
+    """Draws points and laws; returns (x, y, label, colour) of each line's end."""
     from matplotlib.ticker import LogLocator
 
     axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
@@ -110,5 +108,4 @@ def _draw(axes, panel, rows):
 
 
 def _between(low, high, scale):
-    """Returns points of a line, equidistant on the axis."""
     return np.geomspace(low, high, 400) if scale == "log" else np.linspace(low, high, 721)

@@ -1,4 +1,4 @@
-"""Draws speed against accuracy: settings with their Pareto front, and the convergence of methods."""
+"""Draws speed against accuracy with the Pareto front, and the convergence of methods."""
 
 import textwrap
 
@@ -19,22 +19,19 @@ _ERRORS = {
 
 
 def plot_time(path, found):
-    """Draws the error of each setting over its time, with the scatter of the times, and names each line at its end.
+    """Draws the error of each setting over its time, with the scatter of times, and names each line.
 
-    Two panels show the error of positions and the 99th percentile of the error of strains. In each panel the settings that no
-    other beats by more than the spread of times are joined and numbered, with their names beside the panel. Settings without an
-    error are named with the reason. Runs that are not usable are crossed. The error of the reference solution is a line; points
-    below it mean nothing. For solvers of other simulators, dots show the error relative to the motion to which the solver
-    itself converges.
+    Panels show errors of positions and the 99th percentile of errors of strains. Settings that no other beats beyond the spread
+    are joined, numbered and named. Settings without an error are named with the reason; runs that are not usable are crossed. A
+    line is the error of the reference, below which points mean nothing. For other simulators, dots are errors relative to the
+    motion to which they converge.
 
     Args:
         path: The file, .png, .svg or .pdf.
         found: As :func:`warpcloth.lab.work_precision.time_diagram` returns it.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     rows, reference = found["rows"], found["reference"]
     curves = {name: front(rows, reference[name], name) for name in _ERRORS}
@@ -87,16 +84,14 @@ def plot_time(path, found):
 
 
 def plot_solver(path, found):
-    """Draws the gap of the objective within a step over iterations and over time, down to the rounding of float64.
+    """Draws the gap of a step's objective over iterations and time, down to rounding.
 
     Args:
         path: The file, .png, .svg or .pdf.
         found: As :func:`warpcloth.lab.work_precision.solver_diagram` returns it.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     texts = _missing("ended early:", found)
     figure, panels, notes = _figure(path, texts)
@@ -122,16 +117,14 @@ def plot_solver(path, found):
 
 
 def plot_spectrum(path, found):
-    """Draws μ over its rank, and beside it measured errors on lines predicted by the spectrum, down to their rounding.
+    """Draws μ over its rank, and measured errors on lines predicted by the spectrum.
 
     Args:
         path: The file, .png, .svg or .pdf.
         found: As :func:`warpcloth.lab.work_precision.spectrum_diagram` returns it.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     texts = _missing("not drawn:", found)
     figure, panels, notes = _figure(path, texts)
@@ -160,18 +153,17 @@ def _doubt(row):
 
 
 def _floor(axes, value, label, colour=GREY):
-    """Draws a line below which errors mean nothing."""
     axes.axhline(value, color=colour, linestyle="--", linewidth=0.8, label=label)
 
 
 def _missing(head, found):
-    """Returns lines of text that name settings without a point, with the reason."""
+    """Returns lines that name settings without a point, with the reason."""
     lines = [line for each in without_point(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]
     return ["", head, *lines] if lines else []
 
 
 def _figure(path, texts):
-    """Returns a figure with two panels on logarithmic scales, and one for text."""
+    """Returns a figure with two logarithmic panels and one for text."""
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 
@@ -187,7 +179,6 @@ def _figure(path, texts):
 
 
 def _finish(figure, axes, notes, title, texts, found):
-    """Adds the title, the legend, the text below it, and the machine."""
     known = {}
     for each in axes:
         number_axis(each.xaxis)

@@ -7,7 +7,7 @@ from .style import dress, headline, name_ends, series_style, small_print
 
 
 def plot_residuals(path, found, fps, device="cpu"):
-    """Plots the RMS residual of each frame of a fit over time.
+    """Plots the RMS residual of each frame of a fit.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -16,9 +16,7 @@ def plot_residuals(path, found, fps, device="cpu"):
         device: The Warp device of the fit.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     check_path(path, PICTURES)
     from matplotlib.figure import Figure

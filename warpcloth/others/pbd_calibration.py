@@ -1,4 +1,4 @@
-"""Stiffness of scenes in pyPBD against that in warpcloth, by samples."""
+"""Stiffness of scenes in pyPBD against that in warpcloth."""
 
 from ..terms import CorotatedMembrane
 from .calibration import calibrated

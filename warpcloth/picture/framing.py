@@ -15,16 +15,16 @@ _NOTHING = "no triangle, line or pin has positions that are finite and below 1e1
 
 
 def frame_motion(subjects, pictures, view, aspect):
-    """Returns the camera that shows all of a motion, and the height of the ground below it [m].
+    """Returns the camera that shows all of a motion, and the height of the ground [m].
 
     Args:
-        subjects: List of :class:`Subject`, side by side, all with one up axis.
-        pictures: Iterable over pictures, each a list with, for each subject, the positions (n, 3) [m] of its shapes.
+        subjects: List of :class:`Subject` with one up axis, side by side.
+        pictures: For each picture a list, by subject, of the positions (n, 3) [m] of its shapes.
         view: Azimuth and elevation [°], and zoom.
-        aspect: Width of the picture of a subject by its height.
+        aspect: Width over height of a subject's picture.
 
     Raises:
-        ValueError: Nothing can be drawn, because no triangle, line or ball has positions that are finite and near enough.
+        ValueError: Nothing has finite positions near enough.
     """
     azimuth, elevation, zoom = view
     up_axis = subjects[0].up_axis
@@ -55,7 +55,7 @@ def frame_motion(subjects, pictures, view, aspect):
 
 
 def _fitted(subject):
-    """Returns the indices of the shapes that the camera frames: the cloth, and surroundings that are not much larger."""
+    """Returns the indices of the framed shapes: the cloth, and surroundings that are not much larger."""
     drawn = [each[seen_points(shape)] for shape, each in zip(subject.shapes, subject.read(0), strict=True)]
     finite = [located(each) for each in drawn]
     sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]
@@ -63,12 +63,12 @@ def _fitted(subject):
 
 
 def seen_points(shape):
-    """Returns the indices of the points of a shape that belong to a triangle, line or ball."""
+    """Returns the points of a shape in a triangle, line or ball."""
     return np.unique(np.concatenate([shape.triangles.ravel(), shape.lines.ravel(), shape.balls]))
 
 
 def drawn_points(shape, points, seen):
-    """Returns what is drawn of a frame of a shape.
+    """Returns what is drawn of a frame.
 
     Args:
         shape: The :class:`Shape`.
@@ -76,7 +76,7 @@ def drawn_points(shape, points, seen):
         seen: Its :func:`seen_points`.
 
     Returns:
-        tuple: The points of triangles, lines and balls whose points are all :func:`located`, (m, 3), and the number of others.
+        tuple: The points (m, 3) of elements whose points are all :func:`located`, and the number of other elements.
     """
     known = are_located(points)
     if known[seen].all():
