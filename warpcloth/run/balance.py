@@ -83,7 +83,7 @@ class Elastic:
         return self._value(Energy(self.model, self._sums, terms=unit), x) if unit else np.zeros(self.model.copies)
 
     def gradient(self, x):
-        """Returns points (B·n, 3) in the order of the scene as a device array in that of the model."""
+        """Returns ∂U/∂x [N] of the soft terms at x, (B·n, 3), in the order of the scene."""
         gradient = self.model.vectors()
         self._gradient.add(x, gradient)
         return self.model.in_scene_order(gradient.numpy()).astype(np.float64)

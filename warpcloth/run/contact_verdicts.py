@@ -14,9 +14,11 @@ class Inside(NamedTuple):
     """A vertex that ended a step inside a collider, because it could not move out.
 
     Attributes:
+        vertex: Its index in the mesh.
         frame: The frame in or before which it came in.
         collider: Name of the collider.
         other: For a free vertex, the obstacle on its other side: a collider, or ``"other cloth"``. None for a held vertex.
+        copy: Index of its copy.
     """
 
     vertex: int
@@ -37,6 +39,7 @@ class Forced(NamedTuple):
     Attributes:
         frame: The frame in whose steps it did.
         collider: Name of the mesh, or "a mesh" if several move.
+        copy: Index of the copy.
     """
 
     frame: int

@@ -277,7 +277,7 @@ class History:
         energies: Energies of each kept frame, (F, B, K) [J].
         reactions: Reactions of each kept frame, (F, B, p, 3) [N].
         forces: Total force and friction force on each collider in each kept frame, (F, B, C, 2, 3) [N].
-        pairs: :data:`PAIRS` of each kept frame, (F, B, K).
+        pairs: :data:`PAIRS` of each kept frame, (F, B, 5).
         cuts: Fraction of the moves that contact cut short in each kept frame, (F, B).
         find: Function that is called after each frame for ``found``, or None.
         totals: Work of pins (without their kinetic energy), loads, colliders, friction, filter and air up to the last kept
