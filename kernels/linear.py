@@ -264,7 +264,6 @@ def invert_diagonal(dtype):
 
 
 def _unknowns(dtype, numbers):
-    """Types of an unknown and of a diagonal block, and name of the module."""
     vec3, mat33 = types(dtype)
     name = f"{MODULE}.{dtype.__name__}"
     return (dtype, dtype, f"{name}.numbers") if numbers else (vec3, mat33, name)

@@ -273,7 +273,6 @@ def contact(solid: Solid):
 
     @wp.func
     def clearance(y: Any, rest: Any):
-        """d − r, minus a bound of rounding."""
         d, _n = gap(y, rest)
         return y.dtype(0.999) * (d - rest[11])
 

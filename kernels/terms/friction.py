@@ -94,12 +94,10 @@ def friction(law: Law):
 
     @wp.func
     def project(y: Any, rest: Any):
-        """y minus the gradient of the energy."""
         return y - gradient(y, rest)
 
     @wp.func
     def prox(v: Any, rest: Any, compliance: Any):
-        """v moved towards the anchor."""
         u = slip(v, rest)
         l = wp.length(u)
         p = v

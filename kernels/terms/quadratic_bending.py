@@ -24,7 +24,6 @@ def rest_state(points, stencil):
     x0, x1, x2, x3 = columns_of(points, *stencil.T)
 
     def cotangent(apex, b, c):
-        """The cotangent, and twice the area."""
         sides = b - apex, c - apex
         double = cross_length(*sides)
         return dot(*sides) / double, double

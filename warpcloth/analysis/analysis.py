@@ -163,7 +163,6 @@ class Analyzer:
         return found
 
     def _check_times(self):
-        """Raises ValueError if the reciprocal of a time step is not a finite number of this precision."""
         if any(measure.rate for measure in self.measures):
             times, least = self.sequence.times, np.finfo(self.dtype).tiny
             rule = f"must be from {least:g} to {1.0 / least:g}, of which {np.dtype(self.dtype)} has the reciprocal"
@@ -242,7 +241,6 @@ class Analyzer:
             excluded = []
 
     def _refer(self, held):
-        """Sets the reference of the elements once; returns which have none there."""
         if self._reference is not held:
             self._without, self._reference = self._elements.refer(held.points, held.rounding), held
         return self._without
@@ -283,7 +281,6 @@ class _Held:
 
 
 def _missing(labels):
-    """Returns exclusions of missing frames, one if there are very many."""
     if len(labels) <= _MOST:
         return [_frame(label, "is missing") for label in labels]
     return [_frame(labels[0], f"is missing, and so are {len(labels) - 1} more, the last of them {labels[-1]:g}")]

@@ -247,7 +247,6 @@ class _Pair:
             self.kept = ~(without[0] | without[1])
 
     def measure(self, i, j):
-        """Returns the numbers of frames i and j by name; empty if a point is not finite."""
         points = [sequence[index] for sequence, index in zip(self.sequences, (i, j), strict=True)]
         labels = [sequence.labels[index] for sequence, index in zip(self.sequences, (i, j), strict=True)]
         lost = [np.flatnonzero(~np.isfinite(x).all(axis=1)) for x in points]
@@ -274,7 +273,6 @@ class _Pair:
         return {"stretch_rms": _rms(apart), "stretch_largest": apart.max(axis=0)}
 
     def _surfaces(self, points, labels, apart):
-        """Returns distances both ways; ``apart`` are those of corresponding vertices, or None."""
         mean, rms, largest = np.full((3, 2), np.nan)
         for k, used in enumerate(self.used):
             found = surface_distances(points[k][used], points[1 - k], self.triangles[1 - k], self.device)

@@ -88,7 +88,6 @@ def _fans_cross(corners):
 
 
 def _sectors_overlap(v, a, b, c, d):
-    """:func:`_fans_cross` in one plane."""
     above = _above(v, a, b)
 
     def holds(left, right, ray):

@@ -101,11 +101,7 @@ def _nearest(mesh, used, chosen):
 
 
 def _sets(tree, k, widen):
-    """Finds the k nearest points of each point of a tree; ``widen`` adds points until they determine a rotation.
-
-    Returns:
-        tuple: The size of each set (n,), and all sets, each in order of index.
-    """
+    """Finds the sizes (n,) and members of the sets of k nearest points; ``widen`` adds points until they determine a rotation."""
     points, n = tree.data, tree.n
     most = min(max(k, _FEW), n) if widen else k
     todo = [(np.arange(start, min(start + 4096, n)), 3, most) for start in range(0, n, 4096)]
@@ -134,6 +130,5 @@ def _sets(tree, k, widen):
 
 
 def _on_a_line(sets):
-    """Returns which sets (m, k, 3) lie on a line, (m,)."""
     spread = np.linalg.svd(sets - sets.mean(axis=1, keepdims=True), compute_uv=False)
     return ~(spread[:, 1] > _LINE * spread[:, 0])

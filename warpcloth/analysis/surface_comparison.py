@@ -193,7 +193,6 @@ def capture_to_up_axis(b: Capture, axis_a: UpAxis | None, axis_b: UpAxis | None)
 
 
 def _measured(a, b, labels, excluded, samples, device):
-    """Returns the numbers of a frame by name; empty, with a note in ``excluded``, if it cannot be measured."""
     surfaces, lost = [], False
     for surface, label, notes in zip((a, b), labels, excluded, strict=True):
         bad = np.flatnonzero(~np.isfinite(surface.points).all(axis=1))
@@ -233,7 +232,6 @@ def _measured(a, b, labels, excluded, samples, device):
 
 
 def _distances(x, triangles, y, others, samples, device):
-    """Returns the four numbers of all and of inner points, and the latter's share of area."""
     faces, weights, areas = surface_samples(x, triangles, samples)
     points = np.concatenate([np.einsum("kc,kci->ki", weights, x[triangles[faces]]), x])
     areas = np.concatenate([areas, np.zeros(len(x))])  # vertices count for the largest distance alone

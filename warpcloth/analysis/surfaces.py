@@ -55,7 +55,6 @@ class _Elements:
         wp.launch(kernel, self.count if count is None else count, inputs=inputs, outputs=outputs, device=self.device)
 
     def chosen(self, struct):
-        """Returns a struct with the arrays of chosen results."""
         found = struct()
         for name in struct.vars:
             if name in self.results:
@@ -73,7 +72,6 @@ class _Elements:
 
     @in_turn
     def read(self):
-        """Returns the results by name, NumPy arrays (E, *shape)."""
         return {name: found.numpy() for name, found in self.results.items()}
 
     def _kind(self, shape):

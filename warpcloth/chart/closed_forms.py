@@ -55,7 +55,6 @@ def plot_physics(path, results, facts=None):
 
 
 def _floor(left, right, floors):
-    """Draws a line at the largest floor, outside the range of the picture if below errors."""
     if not floors:
         return
     (low, high), floor = left.get_ylim(), max(floors)

@@ -81,7 +81,6 @@ def plot_surface_distances(path, found, names, device="cpu"):
 
 
 def _draw(axes, times, lines):
-    """Draws values over time; returns (x, y, label, colour) of each line's end."""
     ends = []
     for k, (label, values) in enumerate(lines.items()):
         style = series_style(k)

@@ -92,7 +92,6 @@ def _coordinates(name, values):
 
 
 def _ticks(name, values, at):
-    """Returns ticks and labels: powers of ten, else a few of the values."""
     if AXES[name].logarithmic and at[-1] - at[0] >= 1.0:
         powers = np.arange(math.ceil(at[0] - 1e-6), at[-1] + 1e-6)
         powers = powers[:: math.ceil(len(powers) / _TICKS)]
@@ -131,7 +130,6 @@ def _hatch(axes, coordinates, rows):
 
 
 def _line(axes, coordinates, rows, name, style):
-    """Draws the line where a limit is 1; returns whether there is one."""
     ratios = np.array([[cell["rules"].get(name) or np.nan for cell in row] for row in rows], dtype=float)
     if min(ratios.shape) < 2:
         return False

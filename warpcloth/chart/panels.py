@@ -69,7 +69,6 @@ def plot_panels(path, panels, rows, title, facts):
 
 
 def _draw(axes, panel, rows):
-    """Draws points and laws; returns (x, y, label, colour) of each line's end."""
     from matplotlib.ticker import LogLocator
 
     axes.set(xscale=panel.scales[0], yscale=panel.scales[1])

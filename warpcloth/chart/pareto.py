@@ -157,13 +157,11 @@ def _floor(axes, value, label, colour=GREY):
 
 
 def _missing(head, found):
-    """Returns lines that name settings without a point, with the reason."""
     lines = [line for each in without_point(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]
     return ["", head, *lines] if lines else []
 
 
 def _figure(path, texts):
-    """Returns a figure with two logarithmic panels and one for text."""
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 

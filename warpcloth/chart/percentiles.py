@@ -79,7 +79,6 @@ def _panel(axes, at, percentiles, neutral):
 
 
 def _alone(known):
-    """Returns which rows have no neighbour with values."""
     padded = np.pad(known, 1)
     return known & ~padded[:-2] & ~padded[2:]
 

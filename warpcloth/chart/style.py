@@ -76,7 +76,6 @@ def series_style(k):
 
 
 def _style(k):
-    """Returns the :class:`Style` k; all with k < 144 differ."""
     return Style(COLOURS[k % len(COLOURS)], MARKERS[(k + k // len(COLOURS)) % len(MARKERS)])
 
 
@@ -143,7 +142,6 @@ def add_legend(figure, handles, columns):
 
 
 def _bottom(figure):
-    """Returns the height of the small print over that of the figure."""
     return 2.0 * PRINT / 72.0 / figure.get_size_inches()[1]
 
 
@@ -189,11 +187,7 @@ def name_all_ends(figure, panels, far=math.inf):
 
 
 def _begin_names(figure, axes, ends, far):
-    """Writes names at the ends of lines, and widens the panel if they can be legible.
-
-    Returns:
-        The former limits of x; other texts; names; widths and heights [pt]; whether they can be legible.
-    """
+    """Writes names at the ends of lines, and widens the panel if they can be legible."""
     from matplotlib.patheffects import withStroke
 
     before, others = axes.get_xlim(), list(axes.texts)
@@ -240,15 +234,8 @@ def _drawn(axes):
 
 
 def _put(axes, note, size, drawn, taken, far):
-    """Moves a name to its best position; returns whether it is legible there.
-
-    Args:
-        axes: The panel.
-        note: The name, an annotation.
-        size: Width and height of the name [pt].
-        drawn: Points of lines [pixels].
-        taken: Corners (low, high) of positioned names [pixels], to which this one is added.
-        far: As of :func:`name_ends`.
+    """Moves a name to its best position, away from ``drawn`` points and ``taken`` boxes [pixels]; returns whether it is legible
+    there.
     """
     point = axes.figure.dpi / 72.0
     anchor, best = axes.transData.transform(note.xy), None

@@ -316,7 +316,6 @@ class Arap:
         return Segment(self.device, fit_cells)
 
     def _compressed(self, rows, columns, values, count):
-        """Returns entries as (offsets, columns, values) on the device, sorted by row and column."""
         order = np.lexsort((columns, rows))
         offsets = np.searchsorted(rows[order], np.arange(count + 1))
         indices = [wp.array(part.astype(np.int32), dtype=wp.int32, device=self.device) for part in (offsets, columns[order])]
@@ -330,7 +329,6 @@ class Arap:
 
 
 def _points(name, value, count, label):
-    """Returns ``value`` as finite points (count, 3), float64, rows called ``label``."""
     found = numeric(name, value, f"have shape {(count, 3)}")
     if found.shape != (count, 3):
         raise ValueError(f"{name} has shape {found.shape}; it must be {(count, 3)}")
@@ -376,7 +374,6 @@ def edge_weights(mesh, weights):
 
 
 def _summed(rows, columns, values, n):
-    """Adds up entries of equal rows and columns, and drops zeros off the diagonal."""
     keys, inverse = np.unique(rows.astype(np.int64) * n + columns, return_inverse=True)
     rows, columns = np.divmod(keys, n)
     values = np.stack([np.bincount(inverse, axis) for axis in values.T], axis=1)

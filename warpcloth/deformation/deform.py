@@ -153,7 +153,6 @@ def deform(
 
 
 def _refuse_beyond_float32(keyframes, fps):
-    """Raises ValueError if positions or velocities overflow float32."""
     limit = np.finfo(np.float32).max
     rule = f"cannot be written: a file holds float32, up to {limit:.2g}"
     refuse("pins.keyframes", keyframes, ~(np.abs(keyframes) <= limit), rule)

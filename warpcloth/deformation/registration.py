@@ -179,7 +179,6 @@ def resample(
 
 
 def _filled(points, frames, count):
-    """Returns points (F, n, 3) of all frames, interpolated between ``frames`` (F,)."""
     after = np.searchsorted(frames, np.arange(count)).clip(min=min(1, len(frames) - 1))
     before = np.maximum(after - 1, 0)
     share = (np.arange(count) - frames[before]) / np.maximum(frames[after] - frames[before], 1)
@@ -273,7 +272,6 @@ class Registration:
         return x, distances, observed, rms, share, count, bool(moved <= tolerance)
 
     def _pairs(self, x, points, normals):
-        """Returns each point's distance, triangle, weights and projection on the template, and whether it counts."""
         distances, faces, weights = nearest_on_surface(points, x, self._triangles, self._device)
         normal = _normals(x, self._triangles)[faces]
         beyond = Boundary(x, self._triangles).has(faces, weights)
@@ -287,7 +285,6 @@ class Registration:
         return distances, faces, weights, projection, counts
 
     def _step(self, x, points, normals, areas):
-        """Returns the step of free coordinates to the minimum for held rotations and nearest points."""
         from scipy.sparse import coo_matrix, identity
         from scipy.sparse.linalg import splu
 
@@ -330,7 +327,6 @@ def _normals(x, triangles):
 
 
 def _vertex_normals(x, triangles):
-    """Unit normals (n, 3) of vertices, weighted by area."""
     a, b, c = x[triangles].transpose(1, 0, 2)
     normal = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     sums = np.stack([np.bincount(triangles.ravel(), column, len(x)) for column in normal.T], axis=1)

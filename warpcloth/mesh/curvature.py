@@ -49,7 +49,6 @@ def curvature_operator(mesh):
     tangential = csr_array((slopes, (np.repeat(np.arange(3 * T), 2), ends.ravel())), shape=(3 * T, n))
 
     def summed(direction):
-        """Returns Σ l/A sym(n ⊗ direction) over the sides of each triangle, (3T, 3T)."""
         both = outward[..., :, None] * direction[..., None, :]
         both = (both + both.swapaxes(2, 3)) * (0.5 * length / area[:, None])[..., None, None]
         entries = both[:, :, [0, 1, 0], [0, 1, 1]].swapaxes(1, 2)  # (T, 3 entries, 3 sides)
@@ -133,7 +132,6 @@ def _normal_derivatives(mesh, p, outward, length, partner):
     rows, columns, values = [], [], []
 
     def add(triangles, vertices, points):
-        """Adds entries of triangles (t,), fitted to vertices (t, J) at points (t, J, 2)."""
         of_corners, bubbles = _bubbles(points, p[triangles, 0], slope[triangles])
         fit = bubble[triangles] @ np.linalg.pinv(bubbles, rcond=1e-8)  # (t, 3, J)
         sides = (3 * triangles[:, None] + np.arange(3))[..., None]

@@ -29,7 +29,6 @@ def without_slivers(points, triangles):
 
 
 def _flat(corners, least):
-    """Returns which triangles (T, 3, 3) have a height of at most ``least`` times the longest side."""
     sides = corners - np.roll(corners, 1, axis=1)
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     return ~(doubled > least * np.einsum("tki,tki->tk", sides, sides).max(axis=1))

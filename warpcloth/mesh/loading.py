@@ -87,7 +87,6 @@ def read_faces(path, name=None):
 
 
 def _chosen(path, geometries, name):
-    """Returns the name of a geometry; None stands for the only one."""
     names = ", ".join(repr(each) for each in sorted(geometries, key=str))
     if name is None and len(geometries) > 1:
         raise ValueError(f"{path}: has several geometries, name one of them: {names}")
@@ -143,7 +142,6 @@ def _check_count(path, data, ending, loaded):
 
 
 def _faces(path, geometry, transform, drop_unused):
-    """Returns the `FileFaces` of a trimesh.Trimesh, equal points welded."""
     points, triangles = np.asarray(geometry.vertices, dtype=np.float64), np.asarray(geometry.faces, dtype=np.int64)
     if not np.array_equal(transform, np.eye(4)):
         points = points @ transform[:3, :3].T + transform[:3, 3]

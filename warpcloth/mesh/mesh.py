@@ -440,7 +440,6 @@ class Mesh:
         return np.stack(np.divmod(keys, len(self.points)), axis=1).astype(np.int32)
 
     def _flat(self):
-        """Whether a height is at most FLATTEST times the longest side, or not finite, (T,)."""
         with np.errstate(invalid="ignore", over="ignore"):
             a, b, c = columns_of(self.points, *self.triangles.T)
             longest_squared = np.max([dot(side, side) for side in (a - c, b - a, c - b)], axis=0)
@@ -509,7 +508,6 @@ def _refuse(name, rows, bad, rule):
 
 
 def _rows(name, value, width, kinds):
-    """Returns the value as an array (count, width) of NumPy's ``kinds``, count at least 1."""
     try:
         array = np.asarray(value)
     except ValueError as error:

@@ -65,6 +65,5 @@ def _index(word, count):
 
 
 def _texture_index(word, count):
-    """:func:`_index` for texture coordinates; −1 for none."""
     index = optional_number(word)
     return index - 1 if index > 0 else count + index if -count <= index < 0 else -1

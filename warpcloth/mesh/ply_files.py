@@ -118,7 +118,6 @@ def _text_row(words, properties):
 
 
 def _binary_row(data, at, order, properties):
-    """Returns the values of a row, and where the next begins."""
     row = []
     for _, kind, length in properties:
         several = _list_length(*struct.unpack_from(order + np.dtype(length).char, data, at)) if length else 1

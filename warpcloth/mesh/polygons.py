@@ -82,16 +82,13 @@ def _normals(corners):
 
 
 def _heights(corners, normals):
-    """Returns heights of triangles (T, 3, 3) over their longest sides."""
     sides = corners - np.roll(corners, 1, axis=1)
     return np.linalg.norm(normals, axis=1) / np.einsum("tki,tki->tk", sides, sides).max(axis=1)
 
 
 def _ears(points, starts, counts, outlines):
-    """Cuts faces (F,) from first corners in points (C, 3), numbers of corners, and area vectors (F, 3).
-
-    Returns:
-        Triangles (T, 3), rows of ``points``, and which faces could be cut (F,).
+    """Cuts faces with these first corners in points (C, 3), numbers of corners and area vectors (F, 3) into triangles (T, 3),
+    and returns which could be cut.
     """
     import mapbox_earcut
 
@@ -170,7 +167,6 @@ def _crossing(p, face):
 
 
 def _pass(a, b, c, d):
-    """Returns which lines ab have c and d on either side."""
     least = _TOUCHING * np.linalg.norm(b - a, axis=1)
     left, right = _cross(b - a, c - a), _cross(b - a, d - a)
     return (np.minimum(left, right) < -least) & (np.maximum(left, right) > least)

@@ -37,7 +37,6 @@ def piece_count(mesh):
 
 @np.errstate(invalid="ignore", over="ignore")  # points may be infinite
 def _seam_pairs(points, counts, corners):
-    """:func:`seam_pairs` of faces with numbers of corners (F,) and vertices (C,)."""
     first, group = first_of_equals(points)
     if len(first) == len(points):
         return np.empty((0, 2), dtype=np.int64)

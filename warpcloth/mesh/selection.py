@@ -108,7 +108,6 @@ class _Reader:
         self.fail(column, f"found {shown(word)}, expected {what}" if word else f"the text ends, expected {what}")
 
     def accept(self, *words):
-        """Reads and returns the next token if it is one of these words, else None."""
         word = self.tokens[self.position][1]
         if word not in words:
             return None

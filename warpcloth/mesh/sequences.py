@@ -266,7 +266,6 @@ def _open_files(path, labels, paths, prim, fps):
 
 
 def _read_file(paths, prim, counts, corners, count, frame):
-    """Reads the points (n, 3) of a file with the faces of the first file."""
     path = paths[frame]
     found = read_faces(path, prim)
     for name, here, there in (("vertices", len(found.points), count), ("faces", len(found.counts), len(counts))):
@@ -378,7 +377,6 @@ def _open_cache(path, fps, mesh):
 
 
 def _array(name, frames, mesh):
-    """Returns the number of frames that fit the mesh, a function that reads one, and their type."""
     shape = mesh.points.shape
     if isinstance(frames, (list, tuple)):
         for index, frame in enumerate(frames):

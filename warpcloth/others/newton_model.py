@@ -252,7 +252,6 @@ def _shear_modulus(scene, axes):
 
 
 def _add_term(builder, scene, term, method):
-    """Adds springs, membranes and hinges to a builder, but for style3d."""
     if isinstance(term, Spring):
         found = term.elements(scene.mesh, scene.positions)
         count = len(found.stencil)
@@ -348,7 +347,6 @@ def _refuse_style3d(scene):
 
 
 def _add_style3d(builder, scene, solvers):
-    """Adds cloth of style3d: the flat mesh with :func:`panel_moduli`."""
     mesh, axes = scene.mesh, _plane_axes(scene.mesh)
     moduli = panel_moduli(scene)
     solvers.SolverStyle3D.register_custom_attributes(builder)

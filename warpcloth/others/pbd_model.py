@@ -135,7 +135,6 @@ def refuse_inexpressible(scene, method):
 
 
 def _fraction(w, stiffness, dt, iterations):
-    """Returns the fraction by which an iteration satisfies a constraint."""
     with np.errstate(invalid="ignore"):
         found = 1.0 - (1.0 + w * stiffness * dt**2) ** (-1.0 / iterations)
     return np.where(w > 0.0, found, 0.0)

@@ -121,7 +121,6 @@ def _distances(scene):
 
 
 def _add_cloth(made, scene, element, half, uipc):
-    """Adds a shell of half thickness ``half`` [m], and springs."""
     law, view, mesh = uipc.constitution, uipc.view, scene.mesh
     rest = uipc.geometry.trimesh(mesh.points.copy(), mesh.triangles.astype(np.int32))
     uipc.geometry.label_surface(rest)
@@ -156,7 +155,6 @@ def _add_cloth(made, scene, element, half, uipc):
 
 
 def _indices(rows, sought):
-    """Returns the indices of rows with the sought vertices in any order."""
     index = {frozenset(row): i for i, row in enumerate(rows.tolist())}
     return [index[frozenset(row)] for row in sought.tolist()]
 
@@ -180,7 +178,6 @@ def _add_collider(made, collider, element, outer, own, uipc):
 
 
 def _surface(collider):
-    """Returns vertices (n, 3) [m] and triangles (T, 3) on the surface of a shape, in its frame."""
     if collider.is_mesh:
         return collider.frames[0], collider.triangles
     from trimesh import creation

@@ -138,7 +138,6 @@ class _Gif(Output):
         return Image.open(io.BytesIO(self._held[k])).convert("RGB")
 
     def _palette(self):
-        """Returns an image with 256 colours for all frames, weighted by the square root of their pixels."""
         colours, found = np.nonzero(self._pixels)[0], self._pixels[self._pixels > 0]
         means = np.round(self._sums[colours] / found[:, None]).astype(np.uint8)
         rows = np.repeat(means, np.ceil(np.sqrt(found / found.min())).astype(int), axis=0)

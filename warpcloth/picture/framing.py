@@ -55,7 +55,6 @@ def frame_motion(subjects, pictures, view, aspect):
 
 
 def _fitted(subject):
-    """Returns the indices of the framed shapes: the cloth, and surroundings that are not much larger."""
     drawn = [each[seen_points(shape)] for shape, each in zip(subject.shapes, subject.read(0), strict=True)]
     finite = [located(each) for each in drawn]
     sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]

@@ -48,13 +48,11 @@ class Overlay:
 
     @cached_property
     def _ticks(self):
-        """Values and labels of the ticks of the bar."""
         room = _BAR * self.height / (2.4 * self.letters)
         return bar_ticks(self.scale, max(2, min(6, int(room))))
 
     @cached_property
     def _head(self):
-        """Lines above the bar: the name, broken after _, and the unit."""
         lines, widest = [""], max(8 * self.letters, 0.16 * self.width)
         for part in self.title.replace("_", "_\n").split("\n"):
             if lines[-1] and self._length(lines[-1] + part) > widest:
@@ -98,7 +96,6 @@ class Overlay:
         return canvas
 
     def _write(self, pen, position, text, anchor="lm"):
-        """Writes text with an outline in the background's colour."""
         rim = max(1, self.letters // 8)
         pen.text(position, text, INK, self._font, anchor, stroke_width=rim, stroke_fill=self.background)
 
@@ -152,7 +149,6 @@ def bar_unit(scale, unit):
 
 
 def _exponent(scale):
-    """Returns the power of ten of a bar's labels."""
     most = max(abs(scale.low), abs(scale.high))
     exponent = 3 * int(np.floor(np.log10(most) / 3.0)) if most > 0.0 else 0
     return exponent if not -3 < exponent < 6 else 0

@@ -218,21 +218,12 @@ def _page(
     progress=None,
     largest=None,
 ):
-    """Returns the text of the page of some frames of a subject.
+    """Returns the text of the page of the ``chosen`` frames of a subject.
 
-    Args:
-        subject: The subject.
-        chosen: Indices of the frames.
-        values: List of `MeasuredScalar` or `GivenScalar`.
-        opened: Whether the page opens with the first of these.
-        scaling: Range of the only bar, or None; and colour map, or None.
-        seen_from: Azimuth and elevation [°], and zoom.
-        ground: Whether there is one, or its height [m].
-        progress: Function (frames coded, frames), or None.
-        largest: Maximum size [bytes], or None for that of a file.
+    ``values`` are `MeasuredScalar` or `GivenScalar`, ``scaling`` the range and map of the only one, or None each.
 
     Raises:
-        TooLarge: The page would be larger.
+        TooLarge: The page would be larger than ``largest`` [bytes], by default than a file may be.
     """
     given, colormap = scaling
     largest = largest or LARGEST
@@ -304,7 +295,6 @@ def _page(
 
 
 def _left_out(labels, counts):
-    """Returns a sentence about what is not shown in which frames, or ""."""
     lost = [f"{label:g}" for label, count in zip(labels, counts, strict=True) if count]
     if not lost:
         return ""
@@ -328,7 +318,6 @@ class _Motion:
         self._shapes, self.moves, self.left_out = subject.shapes, [False] * len(self._seen), []
 
     def note(self, picture):
-        """Notes and returns the positions of a frame."""
         self._first = picture if self._first is None else self._first
         self.left_out.append(0)
         for k, (points, start, seen) in enumerate(zip(picture, self._first, self._seen, strict=True)):
@@ -340,7 +329,6 @@ class _Motion:
         return picture
 
     def coders(self):
-        """Returns what codes the positions of each shape."""
         found = []
         for low, high in zip(self._low, self._high, strict=True):
             known = np.isfinite(low).all()

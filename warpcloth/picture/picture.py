@@ -68,7 +68,6 @@ def draw(
 
 
 def _paint_cloth(axes, view, points, triangles, colours, on, directions):
-    """Draws triangles and directions; returns how many triangles are not finite."""
     corners = view.project(points)[triangles]
     placed = np.isfinite(corners).all(axis=(1, 2))
     outlines, colours = (_whole if on == "triangle" else _thirds)(corners[placed], colours[placed])
@@ -115,7 +114,6 @@ def _check(points, triangles, values, on):
 
 
 def _whole(corners, colours):
-    """Returns outlines (T, 3, 3) and shaded colours (T, 3) of triangles."""
     return corners, colours * brightness(corners, _LEAST_LIGHT)[:, None]
 
 
@@ -128,7 +126,6 @@ def _thirds(corners, colours):
 
 
 def _segments(view, directions):
-    """Returns projected ends (S, 2, 3) and greys (S, 3) of finite segments."""
     ends, greys = [], []
     for (name, (centres, vectors)), grey in zip(directions.items(), cycle(_GREYS), strict=False):
         if np.shape(centres) != np.shape(vectors) or np.shape(centres)[1:] != (3,):
@@ -161,7 +158,6 @@ def _layout(window, title, count=1):
 
 
 def _explain(figure, beside, scale, unit, excluded, unplaced):
-    """Adds the colour bar, and notes on what has no value or is not drawn."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 

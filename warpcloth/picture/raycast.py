@@ -280,7 +280,6 @@ class RayCaster:
         g.backs = wp.array(np.concatenate([none, *backs]), dtype=wp.vec3)
 
     def _launch_rows(self, kernel, inputs, outputs):
-        """Launches over the pixels; on the CPU threads take free rows."""
         width, height = self._size
         step = _ROWS if self._device.is_cpu else height
         launches = iter(

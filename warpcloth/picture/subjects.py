@@ -188,7 +188,6 @@ def _of_stage(path, name, prim, fps, camera=None):
 
 
 def _prim_shape(prim, code, size):
-    """Returns the shape of a `DrawnPrim` beside cloth of a size."""
     edge = np.linalg.norm(np.diff(prim.points(code)[prim.edges], axis=1), axis=-1).mean() if len(prim.edges) else 0.0
     radius = max(prim.radius, min((_THINNEST if prim.cloth else _THINNEST_LINE) * size, 0.2 * edge))
     colour = prim.colour or (CLOTH if prim.cloth else LINES if len(prim.edges) else SURROUNDINGS)
@@ -209,7 +208,6 @@ def _of_sequence(sequence, mesh):
 
 
 def _of_frames(name, mesh, frames, times, pins=(), scene=None):
-    """Returns frames (F, n, 3) of a mesh, with a scene's strings, bars and colliders."""
     positions, count = _reader(frames, mesh)
     times = None if times is None else np.asarray(times, dtype=float)
     shapes, read = _with_surroundings(scene, _cloth(mesh, positions(0), pins), positions)
@@ -221,7 +219,6 @@ def _of_frames(name, mesh, frames, times, pins=(), scene=None):
 
 
 def _reader(frames, mesh):
-    """Returns a function (index) → frame (n, 3), and the number of frames."""
     if not hasattr(frames, "exact"):
         frames = frames if isinstance(frames, (list, tuple)) else np.asarray(frames)
     if not len(frames):
@@ -233,7 +230,6 @@ def _reader(frames, mesh):
 
 
 def _of_animation(animation, scene, copy, azimuth):
-    """Returns the frames of a run, of a batch all or one."""
     points = animation.points
     if points.ndim == 3 and copy is not None:
         raise ValueError(f"copy is {shown(copy)}; the animation is of one cloth, so that it must be None")
@@ -261,13 +257,8 @@ def _of_animation(animation, scene, copy, azimuth):
 
 
 def _with_surroundings(scene, cloth, positions, offsets=0.0):
-    """Returns the shapes of a cloth and of its scene, and a function that reads positions.
-
-    Args:
-        scene: The scene, or None.
-        cloth: The shape of the cloth.
-        positions: Function (index) → positions of the cloth.
-        offsets: Offsets of the cloths of a batch, (B, 1, 3) [m], or 0.
+    """Returns the shapes of a cloth and of its scene, and a function that reads positions, with ``offsets`` (B, 1, 3) [m] of a
+    batch, or 0.
     """
     if scene is None:
         return [cloth], lambda frame: [positions(frame)]
@@ -319,7 +310,6 @@ def _repeated(shape, batch):
 
 
 def _strings(mesh, lines):
-    """Returns the shapes of strings and bars, from pairs and a thickness by name."""
     count, least = len(mesh.points), _THINNEST_LINE * _size(mesh.points)
     return [Shape(count, lines=pairs, radius=max(width / 2.0, least), colour=LINES) for pairs, width in (lines or {}).values()]
 

@@ -258,7 +258,6 @@ class Balance:
 
     @cached_property
     def _strained(self):
-        """The elastic energy of a uniform strain of :data:`STRAIN`, (B,) [J]."""
         model, elastic = self.model, self.elastic
         terms = [each for each in elastic.soft if not each.cells and each.term.vertices > 1 and each.collider is None]
         if not terms:

@@ -174,7 +174,6 @@ def crossings_at_start(model):
 
 
 def _count_crossing(own, others):
-    """Returns how many triangles (T, 3, 3) cross others (S, 3, 3); touching ones do not."""
     from scipy.spatial import cKDTree
 
     if not len(own):

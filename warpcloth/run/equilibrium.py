@@ -203,13 +203,11 @@ def equilibrium(
 
 
 def _only_hangs(scene):
-    """Whether a scene has gravity and energies alone."""
     others = scene.colliders, scene.loads, scene.air_terms
     return not any(others) and scene.self_contact is None and scene.pins.keyframes is None
 
 
 def _is_at_rest(model, base):
-    """Whether the cloth starts from its rest shape."""
     points = model.rest_points
     return bool(np.abs(base.numpy() - points).max() <= 1e-6 * np.ptp(points, axis=0).max())
 
@@ -235,7 +233,6 @@ def _start_softly(model, base, descent, linear):
 
 
 def _with_colliders_at_rest(scene):
-    """Returns the scene with static colliders at their last keyframes; refuses friction."""
     for collider in scene.colliders:
         if collider.friction:
             raise ValueError(
@@ -302,7 +299,6 @@ class _Descent:
 
     @property
     def residual(self):
-        """The unbalanced fraction of the load after the last descent."""
         return self.unbalanced / self.load
 
     def settle(self, s, load, most):
@@ -362,7 +358,6 @@ class _Wind:
         self._set(self._seconds)
 
     def hold(self):
-        """Makes the force constant."""
         self._set(1e9 * self._seconds)
 
     def adapt(self, residual):
@@ -421,7 +416,6 @@ def _halved(found, least):
 
 
 def _with_pins(pins, points, part):
-    """Returns points (n, 3) [m] with moved pins after the fraction ``part`` of their keyframes."""
     if pins.keyframes is None:
         return points
     at = part * (len(pins.keyframes) - 1)

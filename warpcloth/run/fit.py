@@ -136,7 +136,6 @@ def fit(
     rest = None
 
     def evaluated(logs):
-        """Returns residuals (m,), their derivatives (m, P) by the logarithms, and the status."""
         nonlocal rest
         key = logs.tobytes()
         if key not in runs:
@@ -197,7 +196,6 @@ def _checked_names(start, scene):
 
 
 def _parameters_of(scene):
-    """Returns the names in ``vary`` that take one number: a list by label, and a set that has those by class too."""
     quantities = [
         (term, field)
         for term in (*scene.terms, *scene.contact_terms, *scene.air_terms)
@@ -247,7 +245,6 @@ def _of_vertices(scene, measured, vertices, resting):
 
 
 def _positions(scene, measured, count):
-    """Returns positions (F, count, 3) [m] of an animation at frames 1 … F of a scene, NaN where it has none."""
     sequence = measured if isinstance(measured, Sequence) else open_sequence(measured)
     where = "measured" if sequence.path is None else sequence.path
     if len(sequence.mesh.points) != count:
@@ -290,7 +287,6 @@ def _listed(vary, k):
 
 
 def _of_frames(residuals, frames, count):
-    """Returns the RMS of residuals (m,) by frame, NaN without any; ``frames`` (m,) has -1 for none."""
     squares = np.bincount(frames[frames >= 0], residuals[frames >= 0] ** 2, count)
     numbers = np.bincount(frames[frames >= 0], minlength=count)
     return np.sqrt(np.divide(squares, numbers, out=np.full(count, np.nan), where=numbers > 0))

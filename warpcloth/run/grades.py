@@ -93,7 +93,6 @@ class Grades:
 
 
 def _compared(energy, most):
-    """Compares an energy with its maximum, in words."""
     if most <= 0.0:
         return "where it can have none"
     if energy < 2.0 * most:

@@ -241,7 +241,6 @@ def last_frame(scene: Scene) -> int:
 
 
 def _time_of(stepper):
-    """Returns when the wind is taken after a step, a :class:`warpcloth.terms.refresh.Moment`."""
     air = stepper.model.scene.air
     if air is None or not air.changes:
         return {}
@@ -252,8 +251,6 @@ def _time_of(stepper):
 
 
 def _kept(name):
-    """Returns a property for the rows of one name."""
-
     def get(history):
         return np.array(history._rows[name])
 
@@ -327,7 +324,6 @@ class History:
         self._note()
 
     def _recorded_step(self, x, v):
-        """Allocates the sums over steps, and captures their launches."""
         model, evaluation = self.model, self._evaluation
         self._before = before = kernels.past(model.dtype)()
         before.x, before.gradient, before.force = (model.vectors() for _ in range(3))
@@ -414,7 +410,6 @@ class History:
             self.found = self.find()
 
     def _make_room(self):
-        """Allocates memory for all pairs, and captures their launches again."""
         pairs = self._stepper.pairs
         if pairs is None:
             return

@@ -90,6 +90,5 @@ class Pull:
 
     @cached_property
     def _box(self):
-        """Corners of the cloth's box at the start, (1, 8, 3) [m]."""
         ends = np.stack([self._scene.positions.min(axis=0), self._scene.positions.max(axis=0)])
         return np.stack(np.meshgrid(*ends.T), axis=-1).reshape(1, 8, 3)

@@ -364,7 +364,6 @@ def no_common_frame(where: str, times: np.ndarray, scene: Scene) -> str:
 
 
 def _normals(corners):
-    """Unit normals (k, 3) of triangles with corners (k, 3, 3); 0 without area."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
 
@@ -392,7 +391,6 @@ def _bound(name, triangles, weights, of_mesh):
 
 
 def _starts(path, scene, rows):
-    """Returns (triangle, weights (3,)) of the nearest point by name, from rows (line, name, position (3,)) at time 0."""
     if not rows:
         return {}
     lines, names, points = zip(*rows, strict=True)

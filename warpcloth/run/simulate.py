@@ -298,7 +298,6 @@ def simulate(
 
 @in_turn
 def _self_contact(stepper, watch, in_file, held):
-    """Returns the :class:`SelfContactSummary` of a run that has ended, and notes the gaps of its last frame."""
     pairs, model = stepper.pairs, stepper.model
     if pairs is None:
         return None
@@ -337,7 +336,6 @@ def _resume(checkpoint, frames, stepper, watch):
 
 
 def _refuse_size(frames, scene, dtype, copies, output):
-    """Raises ValueError if the frames do not fit in the free memory or, with an output, on the disk."""
     of = f" of {copies:,} copies" if copies > 1 else ""
     what, numbers = f"frames is {frames:,}{of}", 6 * len(scene.mesh.points) * (int(frames) + 1)
     if output is None:

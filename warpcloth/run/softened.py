@@ -45,6 +45,5 @@ def softened(model, factor):
 
 
 def _stretches(elements):
-    """Whether a term is that of springs or membranes, whose local coordinates are edges."""
     term = elements.term
     return term.vertices in (2, 3) and term.rows == term.vertices - 1 and elements.refresh is None and elements.cells is None

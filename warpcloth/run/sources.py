@@ -157,7 +157,6 @@ class MovingPins(Source):
 
     @cached_property
     def _weights(self):
-        """Weights of the patches at each vertex, (n, P)."""
         from scipy.spatial import cKDTree
 
         pins = self._points[self._balance.model.scene.pins.vertices]
@@ -231,7 +230,6 @@ class DrivenLoads(Source):
 
     @staticmethod
     def _during(values, frame):
-        """Returns the larger of the values at the ends of a frame, between which they are linear."""
         last = len(values) - 1
         return np.maximum(values[min(frame - 1, last)], values[min(frame, last)])
 

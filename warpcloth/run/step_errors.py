@@ -120,7 +120,6 @@ class StepErrors:
 
 
 def _measured(stepper):
-    """Returns an object with ``measure`` and, if ``solves``, ``solve``."""
     if stepper.integrator is None:
         return _Stored(stepper)
     return (_Gaps if any(elements.hard for elements in stepper.model.terms) else _Residuals)(stepper)
@@ -238,7 +237,6 @@ class _Residuals(_Stored):
         self._taken.launch()
 
     def launch_sums(self, first):
-        """Launches the largest ‖rᵢ‖/mᵢ; with ``first`` also Σ ‖rᵢ‖²/mᵢ."""
         self.model.lock(self.residual)
         self.model.lock(self.weighted)
         self.sums.largest(self.model.inverse_mass, self.residual, self.bound)
@@ -246,13 +244,11 @@ class _Residuals(_Stored):
             self.sums.dot(self.weighted, self.weighted, self.energies[4])
 
     def launch_before(self, step, x, d):
-        """Launches the energy at x + d, before contact changed positions."""
         if self._pushes:
             self._before.add(x, self.energies[3], d)
             self.launch_contact(step, x, d, self.energies[3])
 
     def launch_contact(self, step, x, d, out):
-        """Launches out (B,) += the energy of contact at x + d [J]."""
         if step.contact is not None:
             step.contact.add(x, out, d)
 
@@ -293,7 +289,6 @@ class _Step:
             self._forces = self.model.vectors(), self.model.vectors() if dynamic else None
 
     def launch(self):
-        """Launches ∇φ at the end of the step, its sums, and the energy of contact."""
         stepper, of, d = self.stepper, self._of, self.stepper.correction
         self._launch_residual(d)
         of.launch_sums(True)
@@ -314,7 +309,6 @@ class _Step:
         of.kernels(kernels.finish_residual, model.count, given, [of.residual, of.weighted])
 
     def solve(self):
-        """Returns the largest ‖H⁻¹r‖ of a vertex, (B,) [m], and :attr:`StepError.gap`."""
         model = self.model
         if self._newton is None:
             terms, dynamic = self._copy_by_copy(), model.dynamic

@@ -151,7 +151,6 @@ class Watch:
             self.messages[copy] = f"stopped before the end of frame {number}{of_copy}: {why}"
 
     def _carried(self):
-        """Returns pairs (object, names of attributes that change from frame to frame)."""
         yield self, ("worst_strain", "good", "alive", "growth", "seconds")
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
@@ -176,7 +175,6 @@ class Watch:
             self.grades.go_on()
 
     def _strain(self, points):
-        """Returns the largest |l/L − 1| of each copy, (B,), for points (B, n, 3); NaN for diverged copies."""
         squares = np.zeros((int(self.alive.sum()), len(self.rest)))
         with np.errstate(over="ignore", invalid="ignore"):
             for column in np.moveaxis(points[self.alive], -1, 0):  # by columns, 15 times as fast as by rows of three

@@ -99,7 +99,6 @@ class Air:
 
 
 def _check_function(wind):
-    """Checks that a function is Warp's, and takes a position and a time."""
     if not isinstance(wind, wp.Function):
         raise ValueError(f"air.wind is {shown(wind)}, which is not a Warp function; decorate it with @wp.func")
     for overload in (*getattr(wind, "user_templates", {}).values(), *getattr(wind, "user_overloads", {}).values()):

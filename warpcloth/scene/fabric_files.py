@@ -157,7 +157,6 @@ def _is_number(value):
 
 
 def _matched(text, names):
-    """Returns (name, direction or None) of a column, or None if unknown."""
     if text in names:  # T2 is a number of FAST, and not that of the weft
         return text, None
     for name in names:
@@ -169,7 +168,6 @@ def _matched(text, names):
 
 
 def _keys(path, names, columns):
-    """Returns the indices of columns by (name, direction)."""
     found: dict[tuple[str, int], int] = {}
     for k, text in enumerate(names):
         match = _matched(text, columns)

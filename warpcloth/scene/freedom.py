@@ -91,7 +91,6 @@ def rank_of(pairs, free):
 
 
 def _held(scene):
-    """Finds the held pairs (E, 2), each once, and whether some are hard."""
     mesh, found, hard = scene.mesh, [np.empty((0, 2), dtype=np.int64)], False
     area, size = mesh.triangle_areas.sum(), np.linalg.norm(np.ptp(mesh.points, axis=0))
     bending = [term.stiffness for term in scene.terms if isinstance(term, Bending)]
@@ -109,7 +108,6 @@ def _held(scene):
 
 
 def _rigid(mesh, pairs, free):
-    """Counts the degrees of freedom of pieces as rigid bodies along free axes (n, 3)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -85,7 +85,6 @@ def _free(cloth):
 
 
 def _common(cloths, whole):
-    """Returns gravity, duration and fps of the whole scene."""
     found = {}
     for field in _COMMON:
         if field in whole:

@@ -44,7 +44,6 @@ class Fabrics(dict[str, Fabric]):
 
 
 def _plate(name, density, millimetres, warp, weft, shear, ratio):
-    """A fabric that bends as a plate of its thickness."""
     t = 1e-3 * millimetres
     whole = t**2 / 12.0 / (1.0 - ratio**2 * weft / warp)
     return Fabric(

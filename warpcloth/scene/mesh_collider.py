@@ -68,7 +68,6 @@ class MeshCollider(Collider):
         self._refuse_turned_over()
 
     def _refuse_turned_over(self):
-        """Raises ValueError if a closed surface is inside out at a keyframe."""
         if len(self.frames) == 1 or not self.closed:
             return
         found = np.array([self._filling(vertices) for vertices in self.frames])
@@ -131,7 +130,6 @@ class MeshCollider(Collider):
 
     @cached_property
     def _directed_sides(self):
-        """Sides of triangles as they are and reversed, sorted numbers (3T,) each."""
         sides = self.welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         return [np.sort(each @ [sides.max() + 1, 1]) for each in (sides, sides[:, ::-1])]
 

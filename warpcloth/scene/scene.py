@@ -286,7 +286,6 @@ class Scene:
         return self._with_stiffness(self._with_distance(declared, "self_contact", 1.0), "self_contact")
 
     def _with_stiffness(self, contact, name):
-        """Returns contact with its own stiffness or :func:`default_stiffness`."""
         if contact.stiffness is not None:
             return contact
         weight = self._areal_mass * float(np.linalg.norm(self.gravity))
@@ -328,7 +327,6 @@ class Scene:
 
     @property
     def _areal_mass(self):
-        """Mass per area [kg/m²] of the vertices that have an area."""
         areas = self.touching_areas
         return float(self.vertex_masses[areas > 0.0].sum() / areas.sum())
 
@@ -557,7 +555,6 @@ def _checked_pin_axes(axes, count):
 
 
 def _described(term):
-    """Returns a term in one line."""
     parts = []
     for field in fields(term):
         value = getattr(term, field.name)

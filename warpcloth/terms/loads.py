@@ -196,7 +196,6 @@ def checked_loads(loads: Any, mesh: Mesh) -> Loads:
 
 
 def _within(load, mesh, elements):
-    """Returns which edges or triangles have all vertices among those of a load, (count,)."""
     chosen = np.zeros(len(mesh.points), dtype=bool)
     chosen[distinct_vertices(f"{load.label}.vertices", load.vertices, mesh)] = True
     return chosen[elements].all(axis=1)

@@ -58,7 +58,6 @@ class Sparse(Declared):
 
 
 def _evaluate(model, elements, moment):
-    """Evaluates the cells, and sets the rest state of each of their vertices."""
     cells, d = elements.cells, moment.correction
     kernel = model.kernel(kernels.evaluate, cells.term, model.dtype, d is not None)
     given = [cells.offsets, elements.stencil, cells.weights, cells.rest, moment.x, d]

@@ -427,7 +427,6 @@ class ChunkWriter:
             self._folder.rmdir()
 
     def _copy_frames(self, single):
-        """Copies all chunks to a binary layer, without a temporary name."""
         layer = Sdf.Layer.FindOrOpen(str(single))
         for _, path in self._chunks:
             chunk = Sdf.Layer.FindOrOpen(str(path))
@@ -475,7 +474,6 @@ def check_scene(fps, up_axis):
 
 
 def _facts(metadata, where="metadata"):
-    """Converts metadata to what a file can keep: numbers, texts and dicts of these."""
     facts = {}
     for name, value in metadata.items():
         if isinstance(value, dict):
@@ -532,5 +530,4 @@ def _export(layer, file, meant=None):
 
 
 def _writing(path):
-    """Turns pxr's errors about a file that cannot be written into one OSError."""
     return sentences(path, OSError, "could not be written: ")

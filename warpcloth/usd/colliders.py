@@ -344,7 +344,6 @@ def _hull(points):
 
 
 def _centre(points):
-    """Returns the centre (3,) of the smallest sphere around points."""
     import trimesh
     from scipy.spatial import QhullError
 

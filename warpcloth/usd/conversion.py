@@ -134,7 +134,6 @@ def _times(sequence):
 
 
 def _interval(sequence, values, name):
-    """Returns the interval of evenly spaced values; 1 for one frame."""
     intervals = np.diff(values)
     if not len(intervals):
         return 1.0
@@ -146,7 +145,6 @@ def _interval(sequence, values, name):
 
 
 def _velocities(sequence):
-    """Returns a function (frame) → velocities (n, 3) [m/s] in a stage, or None."""
     if sequence.path is None or Path(sequence.path).suffix.lower() not in STAGE_ENDINGS:
         return None
     path = os.fspath(sequence.path)

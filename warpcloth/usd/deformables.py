@@ -146,14 +146,12 @@ def _kappa(mesh):
 
 
 def _hinge_sizes(mesh):
-    """Returns |e| [m] and A₁ + A₂ [m²] of each hinge, (H,)."""
     x0, x1, x2, x3 = (mesh.points[mesh.hinges[:, i]] for i in range(4))
     first, second = (0.5 * np.linalg.norm(np.cross(x1 - x0, x - x0), axis=1) for x in (x2, x3))
     return np.linalg.norm(x1 - x0, axis=1), first + second
 
 
 def _mean_kappa(mesh):
-    """Returns the one κ/D of equal bending energy."""
     edges, areas = _hinge_sizes(mesh)
     return areas.sum() / (areas**2 / edges).sum()
 
@@ -226,7 +224,6 @@ def _targets(prim, name):
 
 
 def _anchors(stage, prim, values, surroundings, codes):
-    """Returns the vertices (a,) of an attachment and the positions of its anchors (F or 1, a, 3) [m]."""
     for field, allowed in (("(kind of points)", "point"), ("(kind of anchors)", "xform")):
         kind = values.get(field)
         if kind != allowed:
@@ -368,7 +365,6 @@ def _material_of(scene, law):
 
 
 def _of_membrane(term, law, refuse):
-    """Returns the named stiffness of a membrane by a law."""
     isotropic = isinstance(term, NeoHookeanMembrane | StVKMembrane)
     if not isotropic and not (isinstance(term, OrthotropicMembrane) and np.all(term.weft_ratio == 1.0)):
         refuse(f"{type(term).__name__} with warp and weft or with another law")

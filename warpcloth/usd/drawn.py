@@ -239,7 +239,6 @@ def camera_of(stage, path, name):
 
 
 def _radius(prim, points, edges, transform):
-    """Returns half the mean width of curves [m], by default a fraction of the mean segment."""
     widths = array_of(UsdGeom.Curves(prim).GetWidthsAttr())
     if widths is not None and len(widths) and np.isfinite(widths).all() and widths.mean() > 0.0:
         return 0.5 * float(widths.mean()) * abs(np.linalg.det(transform[:3, :3])) ** (1 / 3)

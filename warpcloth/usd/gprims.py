@@ -69,7 +69,6 @@ def _define(stage, path, collider, mesh):
 
 
 def _define_mesh(stage, path, collider):
-    """Defines a mesh with the triangles of a collider, with time samples if it deforms."""
     gprim, frames = UsdGeom.Mesh.Define(stage, path), collider.frames
     gprim.CreateFaceVertexCountsAttr(np.full(len(collider.triangles), 3, np.int32))
     gprim.CreateFaceVertexIndicesAttr(collider.triangles.ravel())
@@ -88,7 +87,6 @@ def _define_mesh(stage, path, collider):
 
 
 def _move(gprim, collider):
-    """Writes position, rotation and the scale of a box, with time samples if the collider moves."""
     translate, orient = gprim.AddTranslateOp(), gprim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
     poses = collider.poses
     for frame, pose in enumerate(poses):
@@ -101,7 +99,6 @@ def _move(gprim, collider):
 
 
 def _add_physics(stage, prim, collider):
-    """Writes UsdPhysics schemas (kinematic if it moves), friction and name of a collider."""
     UsdPhysics.CollisionAPI.Apply(prim)
     if prim.IsA(UsdGeom.Mesh):
         UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(UsdPhysics.Tokens.none)

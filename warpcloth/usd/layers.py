@@ -107,7 +107,6 @@ def define_lines(layer, mesh, lines):
 
 
 def _define_curves(stage, path, paths, width):
-    """Defines curves along paths of vertices; where curves meet, each has its own point."""
     width = float(np.float32(width))
     curves = UsdGeom.BasisCurves.Define(stage, path)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
@@ -157,7 +156,6 @@ def _add_primvars(geometry, mesh):
 
 
 def _add_pins(geometry, target, pins, count):
-    """Adds a GeomSubset of points for each set of pins, which may overlap."""
     for name, vertices in pins.items():
         if not Sdf.Path.IsValidIdentifier(name):
             raise ValueError(f"pins: {name!r} must be a name of letters, digits and _, not starting with a digit")
@@ -285,7 +283,6 @@ def artist_target(artist, surroundings, primvars, **options):
 
 
 def _widths(curves, surroundings):
-    """Returns the widths (k,) of curves in the prim's units."""
     try:
         widths = array_of(UsdGeom.Curves(curves).GetWidthsAttr())
         widths = np.empty(0) if widths is None else widths
@@ -318,7 +315,6 @@ def declare_primvars(layer, artist, target, path):
 
 
 def _block(artist, over, name):
-    """Blocks an attribute; returns whether it had a value."""
     attribute = artist.GetAttribute(name)
     if not (attribute and attribute.HasAuthoredValue()):
         return False

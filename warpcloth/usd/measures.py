@@ -207,7 +207,6 @@ def _over(rest, source, mesh, primvars, coloured):
 
 
 def _facts_of(stage, source):
-    """Returns metadata of the source's root layer, with rates and range."""
     root = stage.GetRootLayer()
     rates = {"timeCodesPerSecond": source.time_codes_per_second, "framesPerSecond": source.fps or source.time_codes_per_second}
     start = {"startTimeCode": root.startTimeCode} if root.HasStartTimeCode() else {}

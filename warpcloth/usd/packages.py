@@ -42,7 +42,6 @@ class Contents:
         return f"{os.path.dirname(self._names[files[0]])}/{os.path.basename(path.removesuffix(']'))}"
 
     def _files(self, path):
-        """Returns the files of a path (one, tiles of a texture, or none), and their origins: themselves or a package."""
         if _TILES in path:
             head, tail = map(glob.escape, path.split(_TILES, 1))
             files = sorted(glob.glob(f"{head}[0-9][0-9][0-9][0-9]{tail}"))

@@ -119,14 +119,12 @@ def _teller(field, values):
 
 
 def _names_of(each):
-    """Names of the prims of the cloths, or their paths if two are equal."""
     paths = [one.prim.strip("/") for one in each]
     names = [path.rsplit("/", 1)[-1] for path in paths]
     return names if len(set(names)) == len(names) else [path.replace("/", "_") for path in paths]
 
 
 def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law, fabric):
-    """The scene of one cloth without colliders and contact."""
     refuse_other_rest(cloth)
     rest = surroundings.mesh.points
     surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
@@ -305,7 +303,6 @@ def _term(values, key):
 
 
 def _load(values, key, surroundings, frames, fps):
-    """A load; time samples of its value are keyframes."""
     prefix, kind = f"{LOADS_NAMESPACE}:{key}", kind_of(values, key, LOADS, "loads")
     quantity, given = LOADS[kind].quantity, {"vertices": values.get("loads.vertices", key)}
     wrong = [load.quantity for load in LOADS.values() if load.quantity != quantity]
@@ -347,7 +344,6 @@ def _pinned(values, cloth, surroundings):
 
 
 def _with_held(vertices, keyframes, held, start):
-    """The pins (p,) and their keyframes or None, with those of attachments."""
     both = np.union1d(vertices, held.vertices).astype(np.int32)
     if len(both) == len(vertices) and (keyframes is not None or held.keyframes is None):
         return vertices, keyframes
@@ -380,7 +376,6 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
 
 
 def _frames(cloth, surroundings, frames, fps):
-    """Yields the positions (n, 3) [m] of the mesh in world space, frame by frame."""
     attribute, moving, rest = UsdGeom.PointBased(cloth).GetPointsAttr(), moving_space(cloth), surroundings.mesh.points
     count, first = len(rest), np.arange(len(rest))
     if surroundings.point_vertices is not None:
@@ -398,7 +393,6 @@ def _frames(cloth, surroundings, frames, fps):
 
 
 def _samples(attribute, surroundings, frames, fps):
-    """Values of a vector attribute at frames 0 to ``frames``, or to its last sample."""
     return (_vectors_at(attribute, code) for code in frame_codes(time_codes_of(attribute), surroundings, frames, fps))
 
 
@@ -411,7 +405,6 @@ def _vectors_at(attribute, code):
 
 
 def _free_axes(values):
-    """Axes along which vertices may move, (n, 3) bool, or None."""
     free_axes = values.get("free_axes")
     if free_axes is None:
         return None
@@ -427,7 +420,6 @@ def _of_fields(kind, name, values):
 
 
 def _air(values, surroundings, frames, fps):
-    """The air around all cloths, or None."""
     names = ("density", "normal_drag", "tangential_drag")
     given = {name: _teller(f"air.{name}", values).get(f"air.{name}") for name in names}
     given = {name: float(value) for name, value in given.items() if value is not None}
@@ -440,7 +432,6 @@ def _air(values, surroundings, frames, fps):
 
 
 def _keyframes_of(attribute, surroundings, frames, fps):
-    """Values of an attribute at each frame up to its last sample."""
     most = max(frames, attribute.GetNumTimeSamples() - 1)
     return [_value_at(attribute, code) for code in frame_codes(time_codes_of(attribute), surroundings, most, fps)]
 
@@ -539,7 +530,6 @@ def write_scene(scene: Scene, path: FilePath, law: str | None = None) -> str:
 
 
 def _scene_values(scene):
-    """Values of a scene and its mesh to write, by field, except terms and pins."""
     mesh = scene.mesh
     given = {"name": scene.name, "duration": scene.duration, "gravity": scene.gravity}
     given |= {"masses": scene.masses} if scene.density is None else {"density": scene.density}
@@ -577,7 +567,6 @@ def _scene_values(scene):
 
 
 def _kind_and_name(part, key):
-    """The type of a term or load, and its name if not ``key``."""
     kind, name = type(part).__name__, part.name or ""
     return {"type": kind, "name": None if name == ("" if key == kind else key) else name}
 

@@ -463,7 +463,6 @@ def curve_edges(prim, count):
 
 
 def _texture_coordinates(prim, count, corners):
-    """`primvars:st` at vertices (n, 2), or at corners (C, 2) on seams; the other is None."""
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
     if not (primvar and primvar.HasValue()):
         return None, None
