@@ -27,8 +27,7 @@ def of_element(term: Term, dtype, corrected: bool):
 
     A third, with the factor of the negative part, gives kₑ Aₑ ∂²u/∂y².
 
-    If ``corrected``, energy and gradient are computed in float64, also from float32. Else rounding, ε k L in a spring, exceeds
-    the weight of stiff cloth and hides a slow descent.
+    If ``corrected``, energy and gradient are computed in float64, also from float32.
     """
     vec3, _ = types(dtype)
     indices, numbers, vectors = wp.array2d(dtype=wp.int32), wp.array(dtype=dtype), wp.array(dtype=vec3)

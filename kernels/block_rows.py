@@ -1,6 +1,6 @@
 """Products of a matrix of 3×3 blocks with vectors: block compressed rows, and pairs outside them.
 
-On CUDA LANES threads share a row. 4 are fastest in contact (``drape``, 128² vertices, one H200).
+On CUDA LANES threads share a row.
 """
 
 from functools import cache
@@ -137,7 +137,7 @@ def product_of_row(dtype, lanes: int, terms: int = 0, turned: bool = False):
 def symmetric_product(dtype):
     """Device function (matrix, first, end, p, q) of one thread: q = A p in the rows of a copy.
 
-    It reads only the diagonal and what is right of it, in 0.76 of the time (64², CPU).
+    It reads only the diagonal and what is right of it.
     """
     vec3, mat33 = types(dtype)
     column, block, vector, add = load(wp.int32), load(mat33), load(vec3), add_to(vec3)

@@ -14,8 +14,7 @@ def set_damped_rest(term: Term, dtype, parts: int, both: bool):
     """Kernel over elements: out[e] = the rest state of damping for s̃ = s(x) plus a change.
 
     With d = scale·move, the change is (s(x) − s(x − d))/parts, or, with ``both``, (2s(x) − s(x + d) − s(x − d))/parts. With 0
-    parts it is 0, as for Euler. For BDF2 d is the last move, with 3 parts; for midpoint hₑ v, with both and 2 parts: about
-    −½ddᵀ∂²s, as s at the mean of two states is not the mean of s.
+    parts it is 0, as for Euler. For BDF2 d is the last move, with 3 parts; for midpoint hₑ v, with both and 2 parts.
     """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)

@@ -1,6 +1,6 @@
 """Kernels that apply a function of :mod:`.rotation` to every matrix of an array.
 
-On CUDA, blocks load and store matrices through shared memory, which makes the SVD twice as fast on an H200.
+On CUDA, blocks load and store matrices through shared memory.
 """
 
 from functools import cache

@@ -15,8 +15,8 @@ def smooth():
     """Kernel over pixels from ``first`` on: means of ``visible`` over seven pixels of one surface in a row or column, weights
     1, 2, 3, 4, 3, 2, 1.
 
-    So the four parts of a sample sequence that neighbours have weigh equally. Weights decrease with the angle of normals and
-    the distance from the tangent plane. With ``step`` > 1, only similar visibility of the sky is smoothed.
+    Weights decrease with the angle of normals and the distance from the tangent plane. With ``step`` > 1, only similar
+    visibility of the sky is smoothed.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -69,7 +69,7 @@ def start_bdf2(dtype):
 def predict_bdf2(dtype):
     """Kernel over vertices: v ← (4v₀ − v₋₁)/3 + hₑ g, move ← (x₀ − x₋₁)/3 + hₑ v, x += move, v₋₁ ← v₀.
 
-    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v. Displacements keep digits that large coordinates lose.
+    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v.
     """
     vec3, _ = types(dtype)
 
@@ -179,7 +179,7 @@ def count_step():
 def finish(dtype):
     """Kernel over vertices, after a prediction and a correction d: x += d, v += d/hₑ.
 
-    d keeps digits that large coordinates lose; pins keep x and v.
+    Pins keep x and v.
     """
     vec3, _ = types(dtype)
 

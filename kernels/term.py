@@ -9,8 +9,8 @@ from typing import Any
 class HessianPolicy(IntEnum):
     """The factor of the negative part of ∂²u/∂y² in ``hessian``, between these too.
 
-    ``RAW`` keeps that part. ``CLAMP`` drops its negative part, ``ABSOLUTE`` flips the sign of that part. Both are
-    semi-definite, in closed form, and equal ``RAW`` where that is.
+    ``RAW`` keeps that part, ``CLAMP`` drops it, ``ABSOLUTE`` flips its sign. The latter two are semi-definite, in closed form,
+    and equal ``RAW`` where that is.
     """
 
     RAW = 1

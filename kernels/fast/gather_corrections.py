@@ -18,10 +18,7 @@ from .term_facts import TermFacts, chain_of, elements_struct
 
 
 def slot_rows(slots):
-    """Numbers of rows of pairs of a vertex, and of slots per row, 2 or 4, some empty, ordered by row, vertex, slot.
-
-    The order by slot takes 1.25 times as long (springs, H200, 1024² vertices).
-    """
+    """Numbers of rows of pairs of a vertex, and of slots per row, 2 or 4, some empty, ordered by row, vertex, slot."""
     slots += slots % 2
     width = 2 if slots % 4 else 4
     return slots // width, width

@@ -1,7 +1,6 @@
 """Residuals of compensated summation in an int32: three 10-bit integers, −512 to 511 units, a power of two [m].
 
-They take a third of the memory traffic of a vector. Numbers are converted through the last bits of floats, as a GPU converts
-integers slowly.
+Numbers are converted through the last bits of floats, as a GPU converts integers slowly.
 """
 
 import warp as wp

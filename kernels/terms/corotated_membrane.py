@@ -2,8 +2,7 @@
 simple geometric model for elastic deformation*).
 
 F (3×2) is the deformation gradient of a triangle (:mod:`..membrane`), A its rest area, R the nearest matrix with RᵀR = I; where
-not unique, the smallest rotation, so that a collapsed triangle has a force. The energy per area is μΣ(σᵢ − 1)². A term
-½λ(tr(RᵀF) − 2)² for Poisson's effect has no projection.
+not unique, the smallest rotation, so that a collapsed triangle has a force. The energy per area is μΣ(σᵢ − 1)².
 """
 
 from typing import Any

@@ -80,12 +80,7 @@ def cloths_of(
     prim: str | Iterable[str] | None = None,
     fps: float | None = None,
 ) -> Cloths:
-    """Returns the :class:`Cloths` of a source; arguments are those of :func:`warpcloth.intersections`.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The source is not supported, or has no triangles.
-    """
+    """Returns the :class:`Cloths` of a source, by the arguments of :func:`warpcloth.intersections`."""
     if fps is not None:
         number("fps", fps, above=0.0)
     prims = [prim] if isinstance(prim, str) else prim if prim is None else list(prim) if isinstance(prim, Iterable) else []

@@ -191,12 +191,7 @@ def turned_up(points: np.ndarray, axis: UpAxis) -> np.ndarray:
 
 
 def matching(a, b, frames=None):
-    """Returns the indices of frames at one time (F, 2), F at least 1, and those of a and of b without a partner.
-
-    Args:
-        a: A `Sequence` or `Capture`.
-        b: Likewise.
-        frames: Number of frames to keep after the first, or None.
+    """Returns the indices of frames of two sequences or captures at one time (F, 2), F at least 1, and those without a partner.
 
     Raises:
         ValueError: One has no times, or no frames match.

@@ -28,12 +28,7 @@ class Crossings:
         self._fans, self._hinges, self._twins = _neighbours(self._triangles, np.flatnonzero(self._proper))
 
     def pairs(self, points: np.ndarray, judged: np.ndarray) -> np.ndarray:
-        """Returns the pairs that intersect, (P, 2), the smaller index first, sorted.
-
-        Args:
-            points: (n, 3) [m], finite at the judged triangles.
-            judged: Which triangles, with area, to test, (T,).
-        """
+        """Returns the pairs that intersect, (P, 2), sorted, of ``judged`` triangles (T,), with area, at points (n, 3) [m]."""
         from igl.predicates import find_self_intersections
 
         judged = judged & self._proper

@@ -24,17 +24,14 @@ class Pair:
 
 
 def pairs_of(labels, reference=None, pairs=None, lag=None, every=1):
-    """Returns the rows of an analysis.
+    """Returns the rows of an analysis, :class:`Pair` records, and (number, reason) of frames left out.
 
     Args:
         labels: Numbers of the frames (F,), ascending.
         reference: "rest" (default), "first", "previous" or the number of a frame; rates are from the frame before.
         pairs: Instead, "1:2,1:3,72:75" or pairs of numbers, reference and frame, also for rates.
-        lag: Instead, the distance K from reference to frame, also for rates.
+        lag: Instead, the distance from reference to frame, also for rates.
         every: Use every k-th frame.
-
-    Returns:
-        tuple: A list of :class:`Pair`, and (number, reason) of frames left out.
 
     Raises:
         ValueError: More than one of the three is given, a number has no frame or is paired with itself, or there is no row.

@@ -86,16 +86,7 @@ MEASURES = {on: {measure.name: measure for measure in listed} for on, listed in 
 
 
 def chosen(names, on, given=("directions", "material", "rate")):
-    """Returns the measures of a list of names.
-
-    Args:
-        names: Names, or "all" with met needs.
-        on: "triangle" or "vertex".
-        given: Met needs.
-
-    Raises:
-        ValueError: There is no such measure, or none.
-    """
+    """Returns the measures of a list of names, or "all" whose needs are ``given``; raises ValueError without any."""
     known = MEASURES[on]
     if isinstance(names, str):
         names = (names,)
@@ -118,14 +109,10 @@ def chosen(names, on, given=("directions", "material", "rate")):
 
 
 def scalars(measure, values):
-    """Returns the scalars of a field, arrays (E,) by name.
+    """Returns the scalars of a field (E, *shape), arrays (E,) by name.
 
     Vectors give components, such as ``stretch_1``, matrices the Frobenius norm, such as ``spin_norm``, rotations and unit
     vectors none.
-
-    Args:
-        measure: The :class:`Measure`.
-        values: (E, *shape).
     """
     if not measure.summed:
         return {}

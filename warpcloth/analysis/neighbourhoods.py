@@ -18,19 +18,17 @@ _FEW = 8
 
 
 def neighbourhoods(mesh, chosen):
-    """Returns the neighbourhood of each vertex, itself included.
+    """Returns the neighbourhood of each vertex, itself included: those of vertex i are members[offsets[i]:offsets[i + 1]],
+    int32.
 
     Rings follow edges; nearest points are in space at rest, maybe of another layer. A vertex without a triangle has none and is
-    in none; without a finite position it has no nearest points.
+    in none; without a finite position it has no nearest points. A percentage that determines no rotation takes more vertices,
+    with a warning.
 
     Args:
-        mesh: The :class:`warpcloth.Mesh`.
+        mesh: The mesh.
         chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices (the default of
-            "nearest"); or sets of vertices, (n, k) or n lists. A percentage that determines no rotation takes more vertices,
-            with a warning.
-
-    Returns:
-        tuple: offsets (n + 1,) and members, int32: members[offsets[i]:offsets[i + 1]] are those of vertex i.
+            "nearest"); or sets of vertices, (n, k) or n lists.
 
     Raises:
         ValueError: ``chosen`` is none of these.
@@ -101,7 +99,7 @@ def _nearest(mesh, used, chosen):
 
 
 def _sets(tree, k, widen):
-    """Finds the sizes (n,) and members of the sets of k nearest points; ``widen`` adds points until they determine a rotation."""
+    """Finds sizes (n,) and members of the sets of k nearest points; ``widen`` adds points until they determine a rotation."""
     points, n = tree.data, tree.n
     most = min(max(k, _FEW), n) if widen else k
     todo = [(np.arange(start, min(start + 4096, n)), 3, most) for start in range(0, n, 4096)]

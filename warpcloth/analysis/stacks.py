@@ -21,16 +21,8 @@ class NpzWriter(Output):
     """
 
     def __init__(self, path, rows, fields):
-        """Starts the files.
-
-        Args:
-            path: File to write.
-            rows: Maximum number of rows.
-            fields: (shape of a row, dtype) by name.
-
-        Raises:
-            FileNotFoundError: The folder does not exist.
-            ValueError: The path is a folder or a device, or a field has a reserved name.
+        """Starts the files for at most ``rows`` rows of fields, (shape of a row, dtype) by name; raises ValueError for a
+        reserved name.
         """
         self._heads = {name: np.empty(rows) for name in ("frames", "references", "times")}
         self._fields = {name: (tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in fields.items()}
@@ -42,17 +34,7 @@ class NpzWriter(Output):
         self._parts = {name: tempfile.TemporaryFile(dir=self.folder) for name in self._fields}
 
     def append(self, frame, reference, time, values):
-        """Adds a row.
-
-        Args:
-            frame: Label of the frame.
-            reference: Label of its reference, or None for the rest shape.
-            time: Its time [s].
-            values: Fields (E, *shape) by name; others are ignored.
-
-        Raises:
-            ValueError: A shape or dtype is another than declared, or there are too many rows.
-        """
+        """Adds a row: labels of the frame and its reference (None: rest), time [s], and fields (E, *shape) by name."""
         if self.rows == self._promised:
             raise ValueError(f"{self.path}: {self._promised} rows were promised, and this is one more")
         arrays = {name: np.asarray(values[name]) for name in self._fields}

@@ -52,21 +52,7 @@ class Summary:
 
 
 def summarise(name, unit, values, positions, weights, *, frame, reference, time):
-    """Returns the `Summary` of a scalar field.
-
-    Args:
-        name: Name of the scalar.
-        unit: Unit of the scalar.
-        values: (E,), NaN where excluded.
-        positions: Of the elements in this frame (E, 3) [m].
-        weights: Rest areas (E,) [m²].
-        frame: Label of the frame.
-        reference: Label of its reference, or None for the rest shape.
-        time: Its time [s].
-
-    Raises:
-        ValueError: A shape is another, or a weight is negative or not finite.
-    """
+    """Returns the `Summary` of values (E,), NaN where excluded, at positions (E, 3) [m], weighted by rest areas (E,) [m²]."""
     values, weights, positions = np.asarray(values, dtype=np.float64), np.asarray(weights), np.asarray(positions)
     if values.ndim != 1 or weights.shape != values.shape or positions.shape != (*values.shape, 3):
         shapes = f"values {values.shape}, weights {weights.shape} and positions {positions.shape}"
@@ -139,12 +125,7 @@ class CsvWriter(Output):
     )
 
     def __init__(self, path):
-        """Starts the table.
-
-        Raises:
-            FileNotFoundError: The folder does not exist.
-            ValueError: The path is a folder or a device.
-        """
+        """Starts the table; raises FileNotFoundError without the folder, ValueError for a folder or a device."""
         super().__init__(path, "x", **TEXT)
         self._table = csv.writer(self.file, lineterminator="\n")
         self._table.writerow(self.COLUMNS)
@@ -169,16 +150,8 @@ class JsonWriter(Output):
     """
 
     def __init__(self, path, input, measures):
-        """Starts the document.
-
-        Args:
-            path: File to write.
-            input: Texts and numbers about the input by name.
-            measures: Measures by name, with ``shape``, ``unit`` and ``neutral``.
-
-        Raises:
-            FileNotFoundError: The folder does not exist.
-            ValueError: The path is a folder or a device.
+        """Starts the document with texts and numbers about the input, and the measures by name with ``shape``, ``unit`` and
+        ``neutral``.
         """
         self.facts = {}
         shown = {name: {key: getattr(each, key) for key in ("shape", "unit", "neutral")} for name, each in measures.items()}

@@ -216,15 +216,10 @@ class Neighbourhoods(_Elements):
 
 
 def material_directions(mesh, chosen):
-    """Returns two material directions of each triangle as coefficients α: α₁(X₁ − X₀) + α₂(X₂ − X₀).
+    """Returns two material directions of each triangle as coefficients α of α₁(X₁ − X₀) + α₂(X₂ − X₀), (T, 2, 2), in columns.
 
-    Args:
-        mesh: A mesh of triangles.
-        chosen: "st", along which one texture coordinate grows and the other is constant; or a vector (3,), projected to the
-            triangle at rest, and the perpendicular.
-
-    Returns:
-        np.ndarray: (T, 2, 2), warp and weft in columns; NaN if undefined.
+    They are those along which one texture coordinate grows and the other is constant, for "st", or a vector (3,), projected to
+    the triangle at rest, and the perpendicular; NaN if undefined.
 
     Raises:
         ValueError: ``chosen`` is neither, there are no texture coordinates, or no triangle has directions.

@@ -11,17 +11,7 @@ _FAR = 30.0  # from a line to its name [pt]; beyond, a legend is easier to read
 
 
 def plot_distances(path, found, names, device="cpu"):
-    """Plots the distances of two animations over time, and below differences of stretches, if any.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: The :class:`warpcloth.Comparison`.
-        names: Names of the two files.
-        device: The Warp device that compared them.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
-    """
+    """Plots the distances of a :class:`warpcloth.Comparison` over time, and below differences of stretches, if any."""
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 
@@ -51,16 +41,8 @@ def plot_distances(path, found, names, device="cpu"):
 
 
 def plot_surface_distances(path, found, names, device="cpu"):
-    """Plots RMS distances of two surfaces over time from each, of all and of inner points, and the 95 % of the latter.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: The :class:`warpcloth.SurfaceComparison`.
-        names: Names of the two files.
-        device: The Warp device that compared them.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
+    """Plots RMS distances of a :class:`warpcloth.SurfaceComparison` over time from each, of all and of inner points, and the 95
+    % of the latter.
     """
     check_path(path, PICTURES)
     from matplotlib.figure import Figure

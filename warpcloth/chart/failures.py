@@ -5,9 +5,5 @@ from .panels import plot_panels
 
 
 def plot_failure(path, found):
-    """Draws the result of :func:`failure_chart`.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
-    """
+    """Draws the result of :func:`failure_chart`."""
     plot_panels(path, FAILURES[found["failure"]].PANELS, found["rows"], found["title"], found["machine"])

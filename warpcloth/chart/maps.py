@@ -41,17 +41,10 @@ _TICKS = 4
 
 
 def plot_maps(path, survey, cells, accuracy=None, facts=None):
-    """Draws the verdict of each cell, a panel for each method, with lines where :mod:`warpcloth.lab.stability_limits` are 1.
+    """Draws the verdict of each cell of :meth:`warpcloth.lab.stability.Survey.table`, (setup, y, x), a panel for each method.
 
-    Args:
-        path: The file, .png, .svg or .pdf.
-        survey: The :class:`warpcloth.lab.stability.Survey`.
-        cells: (setup, y, x), from :meth:`warpcloth.lab.stability.Survey.table`.
-        accuracy: Error above which cells are inaccurate, or None.
-        facts: The machine, as of :func:`warpcloth.lab.machine.machine`; None for this one.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
+    Lines are where :mod:`warpcloth.lab.stability_limits` are 1; ``accuracy`` is the error above which cells are inaccurate, or
+    None.
     """
     check_path(path, PICTURES)
     from matplotlib.figure import Figure

@@ -12,16 +12,8 @@ _REFUSED = {"facecolor": "white", "edgecolor": "0.8", "hatch": "////"}
 
 
 def draw_map(axes, panel, rows, lines):
-    """Draws the cells and laws of a :class:`warpcloth.lab.panels.Map`.
-
-    Args:
-        axes: Axes of matplotlib.
-        panel: The map.
-        rows: Its points.
-        lines: Line styles by label, shared by all maps.
-
-    Returns:
-        The cells, for a colour bar; None if coloured by series.
+    """Draws the cells and laws of a :class:`warpcloth.lab.panels.Map`; returns cells for a colour bar, or None if coloured by
+    series.
     """
     xs, ys = (sorted({row[name] for row in rows}) for name in "xy")
     values, crossed = np.full((len(ys), len(xs)), np.nan), []
@@ -56,13 +48,7 @@ def _edges(values, scale):
 
 
 def add_keys(figure, maps, lines):
-    """Adds colour bars, one for maps of the same colours, and a legend of lines, kinds and crosses.
-
-    Args:
-        figure: Figure of matplotlib.
-        maps: (axes, panel, cells of :func:`draw_map`).
-        lines: Line styles by label.
-    """
+    """Adds colour bars, one for maps (axes, panel, cells) of the same colours, and a legend of lines, kinds and crosses."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -26,18 +26,7 @@ _FAR = 16.0  # from a line to its name [pt]; beyond, a legend is easier to read
 
 
 def plot_panels(path, panels, rows, title, facts):
-    """Draws points as markers or cells, and laws as lines.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        panels: :class:`warpcloth.lab.panels.Panel` records.
-        rows: Points of :func:`warpcloth.lab.panels.point`.
-        title: Title of the figure.
-        facts: The machine, as of :func:`warpcloth.lab.machine.machine`.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
-    """
+    """Draws :class:`warpcloth.lab.panels.Panel` records: points as markers or cells, and laws as lines."""
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 

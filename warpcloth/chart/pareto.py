@@ -84,15 +84,7 @@ def plot_time(path, found):
 
 
 def plot_solver(path, found):
-    """Draws the gap of a step's objective over iterations and time, down to rounding.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: As :func:`warpcloth.lab.work_precision.solver_diagram` returns it.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
-    """
+    """Draws the gap of a step's objective, of :func:`warpcloth.lab.work_precision.solver_diagram`, over iterations and time."""
     texts = _missing("ended early:", found)
     figure, panels, notes = _figure(path, texts)
     seen, floor = {}, max((row["floor"] for row in found["rows"]), default=None)
@@ -117,15 +109,7 @@ def plot_solver(path, found):
 
 
 def plot_spectrum(path, found):
-    """Draws μ over its rank, and measured errors on lines predicted by the spectrum.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: As :func:`warpcloth.lab.work_precision.spectrum_diagram` returns it.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
-    """
+    """Draws μ over its rank, and measured errors on lines predicted by the spectrum."""
     texts = _missing("not drawn:", found)
     figure, panels, notes = _figure(path, texts)
     good = [row for row in found["rows"] if row["points"]]

@@ -7,17 +7,7 @@ from .style import dress, headline, name_ends, series_style, small_print
 
 
 def plot_residuals(path, found, fps, device="cpu"):
-    """Plots the RMS residual of each frame of a fit.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: The :class:`warpcloth.Fit`.
-        fps: Frames per second of the scene.
-        device: The Warp device of the fit.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
-    """
+    """Plots the RMS residual of each frame of a :class:`warpcloth.Fit`."""
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
 

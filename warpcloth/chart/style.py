@@ -117,13 +117,8 @@ def headline(figure, text):
 
 
 def small_print(figure, facts=None, device="cpu", others=()):
-    """Writes versions and the machine below a figure.
-
-    Args:
-        figure: Figure of matplotlib with a constrained layout.
-        facts: The machine, as of :func:`warpcloth.lab.machine.machine`; None for this one.
-        device: The Warp device, if ``facts`` is None.
-        others: Names of other simulators in the chart.
+    """Writes versions and the machine below a figure with a constrained layout: that of ``facts``, or this one and its Warp
+    device.
     """
     text = in_words(machine(device) if facts is None else facts, others)
     low = _bottom(figure)
@@ -146,19 +141,10 @@ def _bottom(figure):
 
 
 def name_ends(figure, axes, ends, far=math.inf):
-    """Writes the name of each line beside its end, in its colour, without overlaps, inside the panel, which is widened.
+    """Writes the name of each line (x, y, text, colour) beside its end, in its colour, inside the panel, which is widened.
 
-    Names cover no text and little of the lines.
-
-    Args:
-        figure: Figure of the axes, which are otherwise finished.
-        axes: A panel.
-        ends: (x, y, text, colour) of each line.
-        far: Maximum distance of a name's height from its line's end [pt].
-
-    Returns:
-        Whether names are legible; else (too far, over another line, above 40 % of the width) none is written, and the chart
-        needs a legend.
+    Names cover no text and little of the lines, within ``far`` [pt] in height. Returns whether they are legible; else (too far,
+    over another line, above 40 % of the width) none is written, and the chart needs a legend.
     """
     (legible,) = name_all_ends(figure, [(axes, ends)], far)
     return legible

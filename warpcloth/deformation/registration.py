@@ -245,12 +245,9 @@ class Registration:
     def solve(self, surface: Surface, start: np.ndarray, iterations: int, tolerance: float) -> tuple:
         """Moves the template from ``start`` (n, 3) [m] onto a surface.
 
-        Returns:
-            tuple: Points (n, 3) [m], distances (n,) [m], observed (n,), RMS [m], share of the area that counts, iterations, and
-            whether the last moved no vertex by more than ``tolerance`` [m].
-
-        Raises:
-            ValueError: No point counts; the message is the end of a sentence.
+        Returns points (n, 3) [m], distances (n,) [m], observed (n,), RMS [m], share of the area that counts, iterations, and
+        whether the last moved no vertex by more than ``tolerance`` [m]. Raises ValueError with the end of a sentence if no
+        point counts.
         """
         triangles = solid_triangles(surface)
         used, corners = np.unique(triangles, return_inverse=True)

@@ -24,13 +24,8 @@ _DIGITS = 4  # of a frame number, at least
 
 
 def open_pc2(path):
-    """Opens a .pc2 file.
-
-    Returns:
-        Frame numbers (F,) float64, and points (F, n, 3) float32 that are read when used.
-
-    Raises:
-        ValueError: It is another file, or its length is not that of its header.
+    """Opens a .pc2 file: frame numbers (F,) float64, and points (F, n, 3) float32 that are read when used; refuses broken
+    files.
     """
     with open(path, "rb") as file:
         head = file.read(_PC2.size)
@@ -46,14 +41,7 @@ def open_pc2(path):
 
 
 def open_mdd(path):
-    """Opens an .mdd file.
-
-    Returns:
-        Times (F,) [s] float64, and points (F, n, 3) float32 that are read when used.
-
-    Raises:
-        ValueError: Its length is not that of its header.
-    """
+    """Opens an .mdd file: times (F,) [s] float64, points (F, n, 3) float32 that are read when used; refuses broken files."""
     with open(path, "rb") as file:
         head = file.read(_MDD.size)
         if len(head) < _MDD.size:
@@ -75,14 +63,7 @@ def _mapped(path, dtype, start, frames, count):
 
 
 def write_pc2(file, frames, labels, count):
-    """Writes a .pc2 file.
-
-    Args:
-        file: The open file.
-        frames: Points (n, 3) [m] of each frame.
-        labels: Frame numbers (F,), evenly spaced.
-        count: Number of points n.
-    """
+    """Writes a .pc2 file of ``count`` points (n, 3) [m] in each of the frames with evenly spaced labels (F,)."""
     spacing = float(labels[1] - labels[0]) if len(labels) > 1 else 1.0
     file.write(_PC2.pack(_SIGNATURE, 1, count, float(labels[0]), spacing, len(labels)))
     for points in frames:
@@ -97,14 +78,8 @@ def write_mdd(file, frames, times, count):
 
 
 def write_npz(file, frames, shape, dtype, arrays):
-    """Writes an .npz file for :func:`warpcloth.open_sequence`.
-
-    Args:
-        file: The open file.
-        frames: Arrays (n, 3) of each frame, by name, such as "points".
-        shape: (F, n, 3).
-        dtype: Type of these arrays.
-        arrays: Other arrays by name.
+    """Writes an .npz file for :func:`warpcloth.open_sequence`: frames (n, 3) by name, to (F, n, 3) of a dtype, and other
+    arrays.
     """
     header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": tuple(shape)}
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
@@ -119,13 +94,9 @@ def write_npz(file, frames, shape, dtype, arrays):
 
 
 def write_obj(file, points, mesh, digits=17):
-    """Writes an .obj file: vertices in order, texture coordinates, and a group for each part.
+    """Writes an .obj file: points (n, 3) [m] in order, texture coordinates, and a group for each part.
 
-    Args:
-        file: The open file.
-        points: (n, 3) [m].
-        mesh: The :class:`warpcloth.Mesh`.
-        digits: Digits of coordinates: 9 keep all bits of float32, 17 of float64.
+    9 ``digits`` keep all bits of float32, 17 those of float64.
     """
     coordinates = mesh.texture_coordinates
     corner = "%d" if coordinates is None else "%d/%d"
@@ -157,8 +128,7 @@ def numbered_paths(path, labels):
     In cloth.####.obj it replaces the signs, with at least as many digits. Negative or fractional labels are numbered from 0.
 
     Raises:
-        ValueError: The name has # or a digit after these signs, or a file with another number is there, which would be read as
-            a frame.
+        ValueError: The name has # or a digit after these signs, or a file with another number exists.
     """
     path, numbers = Path(path), np.asarray(labels)
     if numbers.dtype.kind != "i" or numbers.min() < 0:

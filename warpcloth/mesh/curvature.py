@@ -20,11 +20,8 @@ _RINGS = 4  # largest number of rings of triangles to fit to
 
 
 def curvature_operator(mesh):
-    """Returns K, a sparse matrix (3T, n): rows 3t to 3t + 2 of K f are κ₁₁, κ₂₂, κ₁₂ of triangle t [unit of f/m²], in axes of
+    """Returns K (3T, n), sparse: rows 3t to 3t + 2 of K f are κ₁₁, κ₂₂, κ₁₂ of triangle t [unit of f/m²], in axes of
     :func:`warpcloth.kernels.membrane.side_axes`.
-
-    Raises:
-        ValueError: More than two triangles share an edge, or two triangles share three vertices.
     """
     from scipy.sparse import csr_array
 

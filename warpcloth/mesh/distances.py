@@ -14,16 +14,10 @@ _FLAT = 1e-3
 
 
 def surface_distances(points, x, triangles, device="cpu"):
-    """Returns the distance (k,) [m] of each point to a surface of triangles, degenerate ones included.
+    """Returns the distance (k,) [m] of points (k, 3) to a surface of triangles (T, 3) of x (n, 3) [m], all finite.
 
     Warp finds the triangle in float32, its distance is computed in float64: never too small, and too large by at most about
     1e-7 of the size.
-
-    Args:
-        points: (k, 3) [m], finite.
-        x: Vertices of the surface (n, 3) [m], finite.
-        triangles: (T, 3), at least one.
-        device: A Warp device.
     """
     return _nearest(points, x, triangles, device)[0]
 
@@ -78,15 +72,10 @@ def nearest_weights(points, corners):
 
 
 def surface_samples(x, triangles, count):
-    """Returns samples of a surface by area: triangles (k,), weights of corners (k, 3) and areas (k,) [m²].
+    """Returns at least ``count`` samples of a surface by area: triangles (k,), weights of corners (k, 3) and areas (k,) [m²].
 
-    Each triangle is cut into m² equal parts, none above 3/count of the whole area. In each part, three points with the weights
-    (2/3, 1/6, 1/6) are exact for polynomials of degree 2 (Strang & Fix 1973).
-
-    Args:
-        x: Vertices (n, 3) [m], finite.
-        triangles: (T, 3), at least one; the surface has an area.
-        count: Minimum number of points.
+    Each triangle is cut into m² equal parts, none above 3/count of the whole area. Three points of each, with the weights (2/3,
+    1/6, 1/6), are exact for polynomials of degree 2 (Strang & Fix 1973).
     """
     areas = areas_of(x, triangles)
     cuts = np.maximum(np.ceil(np.sqrt(count / 3.0 * areas / areas.sum())), 1).astype(int)

@@ -50,18 +50,9 @@ class FileFaces(NamedTuple):
 
 
 def faces_of(path, points, rows, st=None, lines=None, first=0):
-    """Returns the `FileFaces` of a file, without lines and points.
+    """Returns the `FileFaces` of a file, without lines and points, from points (n, 3) [m] and rows of vertices from 0.
 
-    Args:
-        path: The file, for messages.
-        points: (n, 3) [m].
-        rows: Vertices of each face, from 0.
-        st: As in `FileFaces`.
-        lines: The line of each face (F,) in text.
-        first: Number of the first vertex and face in it.
-
-    Raises:
-        ValueError: A corner is not a vertex.
+    ``lines`` (F,) are the lines of faces in text, ``first`` is the number of the first vertex and face there, for messages.
     """
     points, counts = np.asarray(points, dtype=np.float64).reshape(-1, 3), np.fromiter(map(len, rows), np.int64, len(rows))
     try:

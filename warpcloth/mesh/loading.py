@@ -34,7 +34,7 @@ def read_file(path, name=None, kind=Mesh):
 
     Args:
         path: An .obj, .ply, .stl, .off, .glb or .gltf file.
-        name: Geometry (OBJ: object; glTF: node; STL: solid), if there are several.
+        name: Geometry (object, node or solid), if there are several.
         kind: `Mesh` or `Surface`.
 
     Returns:

@@ -4,16 +4,10 @@ import numpy as np
 
 
 def turned_over(triangles, chosen):
-    """Returns which of ``chosen`` triangles (t,) must be turned over to wind like their neighbours, (t,) booleans.
+    """Returns which of the ``chosen`` triangles (t,) of (T, 3) must be turned over to wind like their neighbours, (t,).
 
-    In each piece the fewer are turned over; neighbours share an edge that no third triangle has.
-
-    Args:
-        triangles: (T, 3).
-        chosen: The indices of some triangles (t,).
-
-    Raises:
-        ValueError: A piece has one side only, like a Möbius strip; the message names a triangle.
+    In each piece the fewer are turned over; neighbours share an edge that no third triangle has. A piece with one side only
+    raises ValueError.
     """
     from scipy.sparse import coo_array  # loaded late, as importing this package stays light
     from scipy.sparse.csgraph import connected_components

@@ -11,11 +11,7 @@ _TOUCHING = 1e-5  # how far sides must pass through each other to cross, relativ
 
 
 def triangles_of(points, counts, holes=()):
-    """Cuts faces into triangles like :func:`cut`.
-
-    Raises:
-        ValueError: A face crosses or touches itself, or is far from planar; the message has its index.
-    """
+    """Cuts faces like :func:`cut`, and raises ValueError for one that crosses or touches itself or is far from planar."""
     triangles, bad = cut(points, counts, holes)
     for face in bad[:1]:
         raise ValueError(f"face {face} crosses or touches itself, or is not planar; its outline must be simple and nearly flat")
@@ -28,19 +24,12 @@ def loose_triangles_of(points, counts, holes=()):
 
 
 def cut(points, counts, holes=()):
-    """Cuts faces into triangles, each of k corners into k − 2.
+    """Cuts faces (F,) of ``counts`` corners (C, 3) into triangles (T, 3) of corners, each of k corners into k − 2, but for
+    ``holes``.
 
     A face becomes a fan from its first corner if none of its triangles is flat or turned over. Others are cut by ear clipping
-    (mapbox-earcut) in a coordinate plane, and flipped until all diagonals are Delaunay.
-
-    Args:
-        points: Corners of one face after another, (C, 3).
-        counts: Corners of each face (F,), at least 3.
-        holes: Faces to leave out.
-
-    Returns:
-        Triangles (T, 3), rows of ``points``, by face, and the faces that cross or touch themselves or are far from planar,
-        which are fans.
+    (mapbox-earcut) in a coordinate plane, and flipped until all diagonals are Delaunay. Faces that cross or touch themselves or
+    are far from planar become fans, and are returned too.
     """
     solid = np.ones(len(counts), dtype=bool)
     solid[np.asarray(holes, dtype=np.int64)] = False

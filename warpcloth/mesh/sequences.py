@@ -220,14 +220,8 @@ def as_sequence(mesh: Mesh, frames: ArrayLike | HasPoints, dt: float | None = No
 
 
 def numbered_files(path: FilePath, endings: List[str] = FRAME_ENDINGS) -> tuple[np.ndarray, list[Path]] | None:
-    """Returns the numbers (F,), ascending, and paths of the mesh files of a folder or pattern; None if it is neither.
-
-    Args:
-        path: The folder or pattern.
-        endings: Allowed endings.
-
-    Raises:
-        ValueError: There are none, or several kinds, or a name is refused.
+    """Returns the numbers (F,), ascending, and paths of the mesh files of a folder or pattern, of one of the ``endings``; None
+    if it is neither.
     """
     path = os.fspath(path)
     if os.path.isdir(path):

@@ -29,14 +29,8 @@ class Calibration(NamedTuple):
 
 
 def calibrated(coarse, fine, membrane, device="cpu"):
-    """Measures the :class:`Calibration` of a solver on three samples.
-
-    Args:
-        coarse: The :class:`warpcloth.others.runs.OtherSolver` record, with steps and iterations that converge to the rest shape
-            of strips.
-        fine: That for the cantilever.
-        membrane: The membrane of the second strip, or None.
-        device: A Warp device.
+    """Measures the :class:`Calibration` of a solver, with settings ``coarse`` that converge to the rest shape of strips, one of
+    ``membrane`` or None, and ``fine`` to that of the cantilever.
     """
     return Calibration(
         _ratio(hanging_strip(Spring(pairs=("structural", "shear"), stiffness=50.0)), coarse, device, 2),
@@ -65,15 +59,7 @@ def _strip(terms, rows, gravity, fps):
 def rest_of(scene, record, device="cpu"):
     """Returns the rest shape of a scene by another simulator, (n, 3) float64 [m].
 
-    Velocities become 0 whenever the kinetic energy falls, until peaks no longer move the cloth.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        record: The record of the solver.
-        device: A Warp device.
-
-    Raises:
-        ValueError: It does not come to rest, or the solver does not take the scene.
+    Velocities become 0 whenever the kinetic energy falls, until peaks no longer move the cloth; ValueError if it does not rest.
     """
     masses = scene.vertex_masses[:, None]
     with wp.ScopedDevice(device):

@@ -126,14 +126,7 @@ def newton_model(scene, method, device="cpu"):
 
 
 def newton_solver(model, scene, method, iterations):
-    """Returns the solver of Newton for a model of :func:`newton_model`.
-
-    Args:
-        model: The ``newton.Model``.
-        scene: Its :class:`warpcloth.Scene`.
-        method: One of :data:`METHODS`.
-        iterations: Iterations per step; none in semi-implicit steps.
-    """
+    """Returns the solver of Newton for a model of :func:`newton_model`; semi-implicit steps have no iterations."""
     solvers = engine().solvers
     if method == "semi-implicit":
         return solvers.SolverSemiImplicit(model, enable_tri_contact=False)
@@ -153,11 +146,7 @@ def newton_solver(model, scene, method, iterations):
 
 
 def refuse_inexpressible(scene, method):
-    """Checks that a solver of Newton can run a scene.
-
-    Raises:
-        ValueError: It cannot, or there is no such solver; the message names what it lacks.
-    """
+    """Raises ValueError with what a solver of Newton lacks to run a scene."""
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; it must be one of {', '.join(METHODS)}")
     whose = f"Newton's {method} solver"
@@ -198,13 +187,8 @@ def refuse_inexpressible(scene, method):
 
 
 def panel_moduli(scene):
-    """Returns the :class:`PanelModuli` of the cloth of a scene, by pulling it along two axes and shearing it a little.
-
-    Args:
-        scene: The scene; its cloth is flat along two axes of space, with a straight end.
-
-    Raises:
-        ValueError: Its cloth has no straight end.
+    """Returns the :class:`PanelModuli` of a cloth that is flat along two axes of space with a straight end, by pulling and
+    shearing it.
     """
     axes = _plane_axes(scene.mesh)
     return PanelModuli(np.array([_strip_modulus(scene, axes, i) for i in (0, 1)]), _shear_modulus(scene, axes))

@@ -55,15 +55,9 @@ def frame_of(gravity):
 
 
 def pbd_model(scene, method, dt, iterations=1):
-    """Returns a scene as a ``pypbd.SimulationModel``, with float64 arrays in the order of the scene.
+    """Returns a scene as a ``pypbd.SimulationModel`` for steps ``dt`` [s], with float64 arrays in the order of the scene.
 
     Positions are rotated, velocities per scaled time (:func:`frame_of`), pins have mass 0.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        method: One of :data:`METHODS`.
-        dt: The step [s].
-        iterations: Iterations per step.
 
     Raises:
         ImportError: pyPBD is not installed.
@@ -99,11 +93,7 @@ def pbd_model(scene, method, dt, iterations=1):
 
 
 def refuse_inexpressible(scene, method):
-    """Checks that pyPBD can run a scene.
-
-    Raises:
-        ValueError: It cannot, or there is no such method; the message names what pyPBD lacks.
-    """
+    """Raises ValueError with what pyPBD lacks to run a scene."""
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; it must be one of {', '.join(METHODS)}")
 

@@ -46,12 +46,7 @@ def engine():
 
 
 def uipc_scene(scene, dt, iterations=1):
-    """Returns a scene as a ``uipc.Scene``, vertices in its order.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        dt: The step [s].
-        iterations: Minimum of Newton iterations per step; contact adds more.
+    """Returns a scene as a ``uipc.Scene`` for steps ``dt`` [s] of at least ``iterations``, vertices in its order.
 
     Raises:
         ImportError: libuipc is not installed.
@@ -79,11 +74,7 @@ def uipc_scene(scene, dt, iterations=1):
 
 
 def refuse_inexpressible(scene):
-    """Checks that libuipc can run a scene, without libuipc.
-
-    Raises:
-        ValueError: It cannot; the message names what libuipc lacks.
-    """
+    """Raises ValueError with what libuipc lacks to run a scene; this does not need libuipc."""
     mesh, (outer, own) = scene.mesh, _distances(scene)
     refused = {
         "vertices outside of triangles in this comparison": not (mesh.vertex_areas > 0.0).all(),

@@ -93,15 +93,8 @@ class Scale:
 
 
 def range_over(summaries, neutral=None):
-    """Returns one range for all frames, from the smallest 1st to the largest 99th percentile.
-
-    Args:
-        summaries: Summaries of a scalar, one per frame, with ``percentiles`` of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %; those
-            that are not finite are ignored.
-        neutral: Value about which the range is symmetric, or None.
-
-    Returns:
-        tuple: (low, high), low below high in any case.
+    """Returns (low, high) over all frames: the smallest 1st and the largest 99th percentile of ``summaries``, symmetric about
+    ``neutral``.
     """
     return range_of([summary.percentiles for summary in summaries], neutral)
 
@@ -133,12 +126,7 @@ def byte_colour(linear):
 
 
 def check_colormap(name):
-    """Checks that matplotlib has a colour map.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-        ValueError: There is no such map; the message suggests some.
-    """
+    """Raises ValueError if matplotlib has no colour map of a name, with similar names."""
     require_matplotlib()
     from difflib import get_close_matches
 

@@ -26,8 +26,7 @@ def check_path(path, endings):
     """Checks that a picture can be written.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        OSError: The folder cannot be written.
+        OSError: The folder does not exist, or cannot be written.
         ImportError: matplotlib is not installed.
         ValueError: The ending is another, or the path is a folder or a device.
     """

@@ -30,15 +30,10 @@ _BINS = 64
 
 
 def check_film(path, size):
-    """Checks that a picture or film can be written.
-
-    Args:
-        path: The file.
-        size: Width and height [px].
+    """Checks that a picture or film of a size [px] can be written.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        OSError: The folder cannot be written.
+        OSError: The folder does not exist, or cannot be written.
         ImportError: PyAV, which writes films, is not installed.
         ValueError: The ending or the size is not supported, or the path is a folder or a device.
     """
@@ -55,15 +50,7 @@ def check_film(path, size):
 
 
 def check_times(path, times):
-    """Checks that a film can store the times of its pictures.
-
-    Args:
-        path: The file.
-        times: Times of the pictures [s], ascending (F,).
-
-    Raises:
-        ValueError: An interval is out of range.
-    """
+    """Checks that a film can store the times of its pictures (F,) [s]."""
     ending, intervals = Path(path).suffix.lower(), np.diff(times)
     if not len(intervals) or ending not in _INTERVALS:
         return
@@ -75,15 +62,8 @@ def check_times(path, times):
 
 
 def open_film(path, size, times):
-    """Opens a file for pictures.
-
-    Args:
-        path: Ends with .png, .gif, .webp or .mp4.
-        size: Width and height [px].
-        times: Times of the pictures [s], ascending (F,); the last lasts as long as the one before.
-
-    Returns:
-        Output: With a method ``add`` that takes a Pillow image.
+    """Opens a .png, .gif, .webp or .mp4 file for Pillow images at ascending times (F,) [s]; the last lasts as long as the one
+    before.
     """
     kind = {".png": _Still, ".gif": _Gif, ".webp": _WebP, ".mp4": _Video}[Path(path).suffix.lower()]
     return kind(path, size, np.asarray(times, dtype=float))

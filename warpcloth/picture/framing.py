@@ -15,16 +15,10 @@ _NOTHING = "no triangle, line or pin has positions that are finite and below 1e1
 
 
 def frame_motion(subjects, pictures, view, aspect):
-    """Returns the camera that shows all of a motion, and the height of the ground [m].
+    """Returns the camera that shows all of a motion of :class:`Subject`\\s, side by side, and the height of the ground [m].
 
-    Args:
-        subjects: List of :class:`Subject` with one up axis, side by side.
-        pictures: For each picture a list, by subject, of the positions (n, 3) [m] of its shapes.
-        view: Azimuth and elevation [°], and zoom.
-        aspect: Width over height of a subject's picture.
-
-    Raises:
-        ValueError: Nothing has finite positions near enough.
+    ``pictures`` are lists, by subject, of positions (n, 3) [m] of shapes; ``view`` is azimuth and elevation [°] and zoom.
+    Raises ValueError if nothing has finite positions near enough.
     """
     azimuth, elevation, zoom = view
     up_axis = subjects[0].up_axis
@@ -67,16 +61,7 @@ def seen_points(shape):
 
 
 def drawn_points(shape, points, seen):
-    """Returns what is drawn of a frame.
-
-    Args:
-        shape: The :class:`Shape`.
-        points: Positions (n, 3) [m].
-        seen: Its :func:`seen_points`.
-
-    Returns:
-        tuple: The points (m, 3) of elements whose points are all :func:`located`, and the number of other elements.
-    """
+    """Returns the points (m, 3) of elements of a shape whose points are all :func:`located`, and the number of others."""
     known = are_located(points)
     if known[seen].all():
         return points[seen], 0

@@ -20,14 +20,8 @@ def neutral_of(measure):
 
 
 def scale_of(analyzers, name, measure, given=None, colormap=None):
-    """Returns one scale for all rows of some analyses, symmetric about the undeformed value, if any.
-
-    Args:
-        analyzers: List of :class:`warpcloth.Analyzer`.
-        name: The scalar.
-        measure: Its :class:`warpcloth.analysis.measures.Measure`.
-        given: (low, high), or None for that of percentiles.
-        colormap: Map of matplotlib, or None.
+    """Returns one scale of a scalar for all rows of some analyses: ``given``, else of percentiles, symmetric about the
+    undeformed value.
     """
     neutral = neutral_of(measure)
     if given is None:

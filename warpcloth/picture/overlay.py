@@ -65,15 +65,8 @@ class Overlay:
         return self._font.getlength(text)
 
     def draw(self, panels, time=None, excluded=False):
-        """Puts panels in rows, and draws the bar, names and time.
-
-        Args:
-            panels: Images (height, width, 3) uint8, of one height in a row.
-            time: Text in the lower left, or None.
-            excluded: Whether to explain the colour of missing values.
-
-        Returns:
-            PIL.Image.Image: The whole picture.
+        """Returns a Pillow image of panels (height, width, 3) uint8 in rows, with the bar, names, time, and the colour of
+        missing values.
         """
         canvas = Image.new("RGB", (self.width, self.height), self.background)
         pen = ImageDraw.Draw(canvas)

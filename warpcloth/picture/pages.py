@@ -162,13 +162,7 @@ def notebook_html(source):
 
 
 def check_page(path):
-    """Checks that a page can be written.
-
-    Raises:
-        FileNotFoundError: The folder does not exist.
-        OSError: The folder cannot be written.
-        ValueError: The ending is not .html, or the path is a folder or a device.
-    """
+    """Checks that a page can be written; raises OSError or ValueError."""
     path = Path(path)
     if path.suffix.lower() != ENDING:
         raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {ENDING}")

@@ -41,8 +41,7 @@ def draw(
         both_sides: Whether a second panel shows the opposite side.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
+        OSError, ImportError: The file cannot be written, or matplotlib is not installed.
         ValueError: A shape is another, a triangle refers to no vertex, no point is finite, or the file is not .png.
     """
     check_path(path, (".png",))
@@ -85,14 +84,8 @@ def _paint_cloth(axes, view, points, triangles, colours, on, directions):
 
 
 def paint(axes, outlines, depths, colours, widths):
-    """Draws polygons from the back to the front.
-
-    Args:
-        axes: Axes of matplotlib.
-        outlines: Corners (P, k, 2), right and up.
-        depths: Towards the viewer (P,).
-        colours: sRGB (P, 3) or with alpha (P, 4).
-        widths: Widths of the edges [pt], one or (P,).
+    """Draws polygons (P, k, 2) from the back to the front by depths (P,), in sRGB (P, 3) or with alpha (P, 4), edges of widths
+    [pt].
     """
     from matplotlib.collections import PolyCollection
 

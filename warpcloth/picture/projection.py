@@ -80,11 +80,8 @@ class View:
 
 
 def brightness(corners, least):
-    """Returns the brightness (T,) of triangles, from ``least`` to 1, in light from the upper left, on both sides.
-
-    Args:
-        corners: (T, 3, 3), right, up and towards the viewer.
-        least: Brightness without light.
+    """Returns the brightness (T,) of triangles (T, 3, 3) in view, from ``least`` to 1, in light from the upper left, on both
+    sides.
     """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)[:, None]

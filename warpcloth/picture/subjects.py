@@ -84,14 +84,7 @@ class Subject:
         return f"{self.labels[0]:g} to {self.labels[-1]:g}"
 
     def between(self, frames):
-        """Returns the indices of frames between two numbers.
-
-        Args:
-            frames: (first, last), None for an end; or None for all.
-
-        Raises:
-            ValueError: There are none, or `frames` is not allowed.
-        """
+        """Returns the indices of frames between two numbers, None for an end; refuses an empty range."""
         if frames is None:
             return np.arange(len(self))
         if not isinstance(frames, Several) or isinstance(frames, str) or len(frames) != 2:
@@ -106,20 +99,10 @@ class Subject:
 
 
 def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0, camera=None):
-    """Returns the :class:`Subject` of a source.
+    """Returns the :class:`Subject` of a source of :func:`warpcloth.render`, whose arguments these are; raises ValueError
+    without anything to draw.
 
-    Args:
-        source: Any source of :func:`warpcloth.render`.
-        mesh: The mesh of frames that have none.
-        prim: Cloth in a stage, or geometry in a file.
-        fps: Frames per second, instead of the source's.
-        copy: Index of a cloth of a batch, or None for all.
-        azimuth: Azimuth for which cloths of a batch are side by side [°].
-        camera: A Camera prim of a stage, or None.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The source is not supported, or has nothing to draw.
+    A batch shows ``copy`` or all cloths, side by side for an ``azimuth`` [°].
     """
     if isinstance(source, (str, os.PathLike)):
         found = _of_path(os.fspath(source), mesh, prim, fps, camera)

@@ -169,12 +169,8 @@ class Balance:
         return 0.5 * (self.mass * np.einsum("bij,bij->bi", velocities, velocities)).sum(axis=1)
 
     def gains(self, frame, points, velocities):
-        """Returns the energy of each copy over the energy that its sources can have added, (B,).
-
-        Args:
-            frame: Number of the frame, in order from 1.
-            points: (B·n, 3) [m] in the order of the scene.
-            velocities: (B·n, 3) [m/s].
+        """Returns the energy of each copy over that of its sources, (B,), in frames in order from 1, of points [m] and
+        velocities [m/s], (B·n, 3).
         """
         with np.errstate(all="ignore"):
             points, velocities = points.astype(np.float64, copy=False), velocities.astype(np.float64, copy=False)
@@ -207,13 +203,8 @@ class Balance:
     def surplus(self, frame, error, velocities, converged):
         """Returns all energy of each copy in the last checked frame, over the maximum of a correct run, (B,).
 
-        Where that maximum is only an estimate, it is multiplied by ``GAIN``, and the energy of contact does not count.
-
-        Args:
-            frame: Number of the frame.
-            error: Its :class:`warpcloth.run.step_errors.StepError`.
-            velocities: (B·n, 3) [m/s].
-            converged: Whether all steps of a copy so far met the tolerance, (B,).
+        An estimated maximum is multiplied by ``GAIN``, without the energy of contact. ``converged`` (B,) are copies whose steps
+        met the tolerance so far.
         """
         contact, pushed = (np.where(self.driven, 0.0, each) for each in (error.contact, np.fmax(error.pushed, 0.0)))
         stored = error.elastic + contact

@@ -65,11 +65,7 @@ class Checkpoint:
     watch: dict
 
     def write(self, folder):
-        """Writes it into a folder, in place of an older one.
-
-        Raises:
-            OSError: It cannot be written; the older one stays.
-        """
+        """Writes it into a folder, in place of an older one, which an OSError leaves."""
         arrays = {f"state {name}": values for name, values in self.state.items()}
         arrays |= {f"watch {name}": values for name, values in self.watch.items()}
         facts = {"frame": self.frame, "facts": self.facts, "chunks": self.chunks, "span": self.span}
@@ -86,11 +82,7 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path):
-        """Reads the checkpoint in a file.
-
-        Raises:
-            ValueError: The file has none that can be read.
-        """
+        """Reads the checkpoint in a file; refuses files without."""
         try:
             with np.load(path) as file:
                 (facts, keys), parts = json.loads(str(file["about"])), {"state": {}, "watch": {}}
@@ -102,11 +94,7 @@ class Checkpoint:
             raise ValueError(f"{path}: is no checkpoint that can be read; run without resume to begin anew") from None
 
     def refuse_other(self, output, facts):
-        """Checks that it is of a run with the same facts.
-
-        Raises:
-            ValueError: A fact differs.
-        """
+        """Raises ValueError with the first fact in which a run differs."""
         for name, called in _CALLED.items():
             if self.facts.get(name) != facts[name]:
                 theirs, mine = called.format(self.facts.get(name)), called.format(facts[name])

@@ -10,15 +10,10 @@ import numpy as np
 
 
 def pulled(balance, way, held):
-    """Returns the elastic energy that a body may add on its way, (B,) [J].
+    """Returns the elastic energy that a body may add on its ``way`` [m] relative to ``held`` coordinates (n, 3), (B,) [J].
 
     ½Σk way² is the energy gained at the start if all that is not held moves by the way along these springs, summed over the
     three axes, each the mean of both senses (0.9 to 3 times too large).
-
-    Args:
-        balance: The balance of the run.
-        way: Way of the body relative to what is held [m].
-        held: Held coordinates, (n, 3) booleans.
     """
     model, cloth, energy = balance.model, balance.cloth, np.zeros(balance.model.copies)
     for move in way * np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))]):

@@ -36,9 +36,7 @@ class Source:
     def energy(self, frame, speed):
         """Returns the energy added up to a frame, (B,) [J]; called for each frame in order from 1.
 
-        Args:
-            frame: Number of the frame.
-            speed: Maximum RMS speed of each copy so far, plus the speed that falling adds in a frame, (B,) [m/s].
+        ``speed`` is the maximum RMS speed of each copy so far, plus the speed that falling adds in a frame, (B,) [m/s].
         """
         return 0.0
 

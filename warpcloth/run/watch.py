@@ -14,18 +14,10 @@ from .grades import Grades
 
 
 def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
-    """Yields the frames of a stepper while a copy is good: the loop of every run.
+    """Yields the number of each frame up to ``frames``, and the frame, while a copy is good; diverged copies are NaN.
 
-    Args:
-        stepper: The stepper.
-        watch: It also notes how the last frame ended.
-        frames: Number of the last frame.
-        ahead: Number of frames computed ahead.
-        first: Number of the stepper's frame.
-        keeps: Function (number of a frame) → whether it includes the state; or None.
-
-    Yields:
-        The number of each frame and the :class:`warpcloth.run.frames_ahead.Frame`; diverged copies are NaN.
+    This is the loop of every run. The watch also notes how the last frame ended. ``first`` is the stepper's frame, ``keeps`` a
+    function (number) → whether a frame includes the state, or None.
     """
     if first == frames:
         return
@@ -84,12 +76,7 @@ class Watch:
         self.least_gap = np.full(model.copies, np.inf)
 
     def passes(self, number, frame):
-        """Checks a frame, sets diverged copies to NaN, and returns whether a copy is still good.
-
-        Args:
-            number: Number of the frame, in order from 1.
-            frame: The frame.
-        """
+        """Checks a frame, in order from 1, sets diverged copies to NaN, and returns whether a copy is still good."""
         self.last, points, velocities = frame, frame.points, frame.velocities
         self.seconds.append(frame.seconds)
         B, n = self.model.copies, self.model.per_copy
@@ -186,13 +173,7 @@ class Watch:
 
     @in_turn
     def status(self, solver, faults=(), warnings=()):
-        """Returns the :class:`Status` of a run from its last frame.
-
-        Args:
-            solver: Its record.
-            faults: Further faults, tuples (copy, frame, sentence).
-            warnings: Sentences after the message of a usable run.
-        """
+        """Returns the :class:`Status` of a run, from its last frame, further faults (copy, frame, sentence) and warnings."""
         results, residual = self.last.results, self.last.residual
         ended = [Result.STOPPED if self.stopped and alive else Result.DIVERGED for alive in self.alive]
         results = [ended[copy] if copy in self.messages else result for copy, result in enumerate(results)]

@@ -338,17 +338,7 @@ def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:
 
 
 def refuse_inside(colliders: Sequence[Collider], positions: np.ndarray, free: np.ndarray, copy: str = "") -> None:
-    """Checks that no free vertex starts inside a collider.
-
-    Args:
-        colliders: The colliders of the scene.
-        positions: Initial positions, (n, 3) [m].
-        free: Which vertices move, (n,).
-        copy: Words for messages that name the copy, or "".
-
-    Raises:
-        ValueError: One does. The message names the first vertex and its collider.
-    """
+    """Raises ValueError with the first free vertex of positions (n, 3) [m] in a collider, and a ``copy`` in words, or ""."""
     for collider in colliders:
         found = collider.distances(positions)
         for vertex in np.flatnonzero(free & ~(found > 0.0))[:1]:

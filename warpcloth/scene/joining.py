@@ -16,14 +16,8 @@ _WHOLE = ("colliders", "contact", "self_contact", "air")
 
 
 def fields_of_cloths(cloths, whole):
-    """Returns the fields of a scene of several cloths, without pins.
-
-    Args:
-        cloths: A :class:`warpcloth.Scene` for each name.
-        whole: Fields of the whole scene by name.
-
-    Raises:
-        ValueError: There is no cloth, a name, mesh or field is refused, or cloths differ in a field of the whole scene.
+    """Returns the fields of a scene of several cloths, without pins; refuses fields that may not be set, and differing ones of
+    the whole.
     """
     if not (isinstance(cloths, Mapping) and cloths and all(hasattr(cloth, "mesh") for cloth in cloths.values())):
         raise ValueError(f"cloths is {shown(cloths)}; it must be a mapping of names to scenes, with one cloth or more")

@@ -7,12 +7,9 @@ _SPRING, _BODY = 0.05, 0.15
 
 
 def lines_of(scene):
-    """Finds the pairs of vertices that a term joins, at least one of them without a triangle.
+    """Finds the pairs of vertices (E, 2) that a term joins, one without a triangle, and their thickness [m], by label.
 
     Springs give their pairs, rigid bodies the minimum spanning tree of vertices without a triangle, edge meshes none.
-
-    Returns:
-        dict: Pairs (E, 2) and the largest thickness [m] by label.
     """
     mesh = scene.mesh
     lines: dict[str, tuple[np.ndarray, float]] = {}

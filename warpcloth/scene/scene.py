@@ -525,11 +525,8 @@ def _checked_axes(free_axes, n):
 
 
 def checked_pins(pins: Any, mesh: Mesh) -> Pins:
-    """Returns `Pins` with indices of a mesh, int32, from pins, indices or a selection.
-
-    Raises:
-        ValueError: A vertex is not in the mesh or occurs twice, keyframes have a wrong shape or are not finite, or axes are not
-            among x, y and z.
+    """Returns `Pins` with int32 indices of a mesh, from pins, indices or a selection; refuses repeated vertices, wrong
+    keyframes and axes.
     """
     pins = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins)
     vertices = distinct_vertices("pins.vertices", pins.vertices, mesh)

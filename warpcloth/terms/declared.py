@@ -131,11 +131,7 @@ class Declared:
         return numeric(f"{self.label}.{field}", getattr(self, field), "be a number or an array of numbers")
 
     def of_elements(self, field: str, count: int) -> np.ndarray:
-        """Returns a numeric field as one value (…) or one per element (count, …).
-
-        Raises:
-            ValueError: It has another shape.
-        """
+        """Returns a numeric field as one value (…) or one per element (count, …); refuses other shapes."""
         values, shape = self._numeric(field), self.quantities()[field].shape
         if values.shape not in (shape, (count, *shape)):
             one = f"of shape {shape}" if shape else "number"
@@ -214,11 +210,7 @@ class Damped(Declared):
 
 
 def own_indices(name, given):
-    """Returns indices as (E,) int32.
-
-    Raises:
-        ValueError: They are not a list of whole numbers below 2³¹.
-    """
+    """Returns indices as (E,) int32; refuses all but whole numbers below 2³¹."""
     found = as_array(given)
     found = found.astype(np.int32) if found.size == 0 else found
     if found.ndim != 1 or found.dtype.kind not in "iu":
@@ -230,10 +222,8 @@ def own_indices(name, given):
 
 
 def own_stencil(label, parameter, given, vertices, count):
-    """Returns indices (E, ``vertices``), or (E,) if ``vertices`` is 1, as (E, ``vertices``) int32.
-
-    Raises:
-        ValueError: The shape is another, an index is not below ``count``, or a pair names one vertex twice.
+    """Returns indices below ``count`` (E, ``vertices``), or (E,) of one vertex, as (E, ``vertices``) int32; refuses pairs of
+    one vertex.
     """
     stencil = as_array(given)
     if vertices == 1 and stencil.ndim == 1:

@@ -180,11 +180,7 @@ LOADS = {kind.__name__: kind for kind in (Force, Traction, Pressure)}
 
 
 def checked_loads(loads: Any, mesh: Mesh) -> Loads:
-    """Returns one load or several as :class:`Loads`.
-
-    Raises:
-        ValueError: One is not a load, or does not fit the mesh.
-    """
+    """Returns one load or several as :class:`Loads`; refuses what is none or does not fit the mesh."""
     if not isinstance(loads, Iterable):
         loads = (loads,)
     loads = Loads(loads)

@@ -226,11 +226,7 @@ class Values:
             )
 
     def authored(self, field, key=None):
-        """Returns the authored attributes of a field as (row, Usd.Attribute), in order of precedence.
-
-        Raises:
-            ValueError: An attribute has another type than its row.
-        """
+        """Returns the authored attributes of a field, (row, Usd.Attribute) in order of precedence; refuses wrong types."""
         for row in attributes():
             for prim in self.locations.get(row.location, ()) if row.field == field else ():
                 attribute = prim and prim.GetAttribute(row.name.replace("<name>", str(key)))
@@ -267,11 +263,7 @@ class Values:
 
 
 def kind_of(values, key, catalogue=TERMS, group="terms"):
-    """Returns the name of the energy of a term, or of the kind of a load.
-
-    Raises:
-        ValueError: There is none of that name.
-    """
+    """Returns the name of a term's energy, or of a load's kind; refuses unknown ones."""
     kind = values.get(f"{group}.type", key)
     if kind not in catalogue:
         given = "not given" if kind is None else repr(kind)

@@ -57,13 +57,8 @@ class ChunkWriter:
     _clip_set = METADATA_KEY
 
     def __init__(self, output, mesh, chunk, whole=False):
-        """Checks the output; `_put_on` comes next.
-
-        Args:
-            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file; for a link the file behind it.
-            mesh: The `Mesh`.
-            chunk: Number of frames per chunk.
-            whole: Whether only `close` writes the root, and an error removes the chunks.
+        """Checks the output, a stage or the link to one; `_put_on` comes next. If ``whole``, only `close` writes the root, and
+        an error removes the chunks.
         """
         self._whole = whole
         self._output = check_output(output)
@@ -89,14 +84,8 @@ class ChunkWriter:
     def _put_on(self, rest, targets, root_metadata, metadata, source=None, files=(), refit=None):
         """Sets the layer below the samples, and locks the output for this writer.
 
-        Args:
-            rest: Layer of everything not sampled, with the sampled attributes without samples.
-            targets: The `Target` of each sampled prim, the main one first.
-            root_metadata: Metadata that USD reads from root layers only, and rates.
-            metadata: Numbers and texts for customLayerData, or None.
-            source: File of the artist's stage below, or None.
-            files: Real paths of all files of that stage.
-            refit: Function that raises ValueError if the source, read again, no longer fits.
+        ``rest`` has everything not sampled and the declarations of the rest, ``targets`` the sampled prims, the main one first,
+        ``source`` is the artist's stage of ``files``, and ``refit`` raises ValueError if that no longer fits.
 
         Raises:
             BlockingIOError: Another writer has the output.
@@ -145,8 +134,7 @@ class ChunkWriter:
         """Writes the pending frames. Without frames nothing is written.
 
         Args:
-            single_file: Whether to make one file that includes the source, and remove the folder, in constant memory; .usdz
-                always is one file.
+            single_file: Whether to make one file that includes the source, and remove the folder; .usdz always is one.
             keep: Whether to keep the chunks beside a single file, so that the run can be resumed.
 
         Raises:
@@ -199,15 +187,8 @@ class ChunkWriter:
         return [(time, path.name) for time, path in self._chunks], self._span
 
     def resume(self, run, chunks, span, frames):
-        """Continues an interrupted run; call it before the first frame is appended.
-
-        Later chunks of that run are removed once new ones replace them.
-
-        Args:
-            run: Its folder.
-            chunks: From :meth:`written`.
-            span: From :meth:`written`.
-            frames: Number of frames in the chunks.
+        """Continues an interrupted run before the first frame is appended, from :meth:`written`; later chunks are removed once
+        replaced.
 
         Raises:
             FileNotFoundError: One of the chunks is gone.
@@ -448,7 +429,6 @@ def check_output(path):
     """Returns the absolute path of the file that a writer writes, for a link that behind it.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
         ValueError: The ending is not that of a stage or differs from that behind the link, or the path is a folder.
     """
     output = Path(os.path.abspath(followed(path)))

@@ -27,15 +27,9 @@ _SAME = 1e-5
 def read_colliders(stage, cloths, surroundings, codes):
     """Reads the colliders of a stage, in the order of its prims.
 
-    A collider is a shape, visible or not, with PhysicsCollisionAPI or `warpcloth:collider`, on it or on the Xform above.
-    Planes, spheres, capsules and cubes become primitives if their scale allows it; other shapes, and those that change in size,
-    meshes.
-
-    Args:
-        stage: The posed stage.
-        cloths: The prims of the cloth, which are not colliders.
-        surroundings: The `StageMesh` of a cloth.
-        codes: Function from the time codes of samples to those of frames.
+    A collider is a shape, visible or not, with PhysicsCollisionAPI or `warpcloth:collider`, on it or on the Xform above, and no
+    cloth. Planes, spheres, capsules and cubes become primitives if their scale allows it; other shapes, and those that change
+    in size, meshes. ``codes`` turns time codes of samples into those of frames.
 
     Raises:
         ValueError: A prim cannot be a collider; the message has its path.

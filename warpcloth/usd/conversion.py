@@ -22,8 +22,7 @@ _UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
 def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
     """Writes an animation in another format. All frames are checked before the first is written; few are in memory at a time.
 
-    New files replace older ones by renames at the end, which an interrupt cannot split; after an earlier error older files are
-    as before.
+    New files replace older ones by renames at the end, which an interrupt cannot split.
 
     Args:
         source: Path of an animation, as for :func:`warpcloth.open_sequence`.

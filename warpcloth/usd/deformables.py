@@ -35,11 +35,7 @@ _NEAR = 1e-5  # distance of an anchor from its point, relative to size and posit
 
 
 def thickness_of(values):
-    """Returns the thickness [m] that the names give, or None.
-
-    Raises:
-        ValueError: It varies, or the mass model is neither shell nor solid.
-    """
+    """Returns the thickness [m] that the names give, or None; refuses one that varies, and mass models but shell and solid."""
     _token(values, "(mass model)", "newton:massModel", "shell", "solid")
     several = values.get("(thicknesses)")
     if several is None:
@@ -51,12 +47,8 @@ def thickness_of(values):
 
 
 def masses_of(values, mesh):
-    """Returns masses (n,) [kg] from `physics:masses` and its element type, or None.
-
-    Masses of faces, or of the whole, are spread over vertices by area.
-
-    Raises:
-        ValueError: The element type or the number of masses is wrong.
+    """Returns masses (n,) [kg] from `physics:masses`, or None; those of faces, or of the whole, are spread over vertices by
+    area.
     """
     masses = values.get("(masses)")
     if masses is None:
@@ -171,14 +163,7 @@ class Held(NamedTuple):
 
 
 def attachments_of(stage, cloth, surroundings, start, codes):
-    """Returns what the enabled PhysicsAttachments of a cloth hold.
-
-    Args:
-        stage: The stage.
-        cloth: The prim of the cloth.
-        surroundings: Its `StageMesh`.
-        start: Positions (n, 3) [m] at the start.
-        codes: Function from the time codes of samples to those of frames.
+    """Returns what the enabled PhysicsAttachments of a cloth hold, with positions (n, 3) [m] at the start.
 
     Raises:
         ValueError: An attachment is of another kind, or its anchors are not at its points.

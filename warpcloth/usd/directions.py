@@ -12,11 +12,7 @@ _COLOURS = ((0.05, 0.05, 0.05), (0.95, 0.95, 0.95))
 
 
 def check_directions(directions, mesh):
-    """Checks names and interpolations of directions.
-
-    Raises:
-        ValueError: A name is not allowed, or an interpolation is neither "vertex" nor, with triangles, "uniform".
-    """
+    """Checks that names are allowed, and interpolations "vertex" or, with triangles, "uniform"."""
     allowed = ("vertex", "uniform") if len(mesh.triangles) else ("vertex",)
     for name, interpolation in directions.items():
         if not (isinstance(name, str) and Sdf.Path.IsValidIdentifier(name)):
@@ -26,18 +22,9 @@ def check_directions(directions, mesh):
 
 
 def define_directions(stage, prim, mesh, directions, material, nowhere):
-    """Defines linear BasisCurves `<prim>_<name>` beside a prim.
+    """Defines linear BasisCurves `<prim>_<name>` beside a prim, in the stage's edit target, and returns their `Target` records.
 
-    Args:
-        stage: The stage; its edit target is written.
-        prim: Path of the prim.
-        mesh: The `Mesh`.
-        directions: "vertex" or "uniform" by name, for segments of vertices or of triangles.
-        material: The material to bind.
-        nowhere: As for `segments`.
-
-    Returns:
-        list: The `Target` of each, in the space of the prim's parent at its first time.
+    They are in the space of the prim's parent at its first time; ``directions`` are "vertex" or "uniform" by name.
 
     Raises:
         ValueError: The stage has another prim at that path.
@@ -70,12 +57,8 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
 
 
 def segments(centres, vectors, nowhere):
-    """Returns the ends c ± v/2 (2E, 3) [m] of a segment for each element, all finite; of length 0 if c or v is NaN.
-
-    Args:
-        centres: c (E, 3) [m].
-        vectors: v (E, 3) [m].
-        nowhere: (3,) [m], position of segments if no centre is finite.
+    """Returns the ends c ± v/2 (2E, 3) [m] of segments of centres and vectors (E, 3) [m]; of length 0 where NaN, ``nowhere``
+    (3,) without any.
     """
     placed = np.isfinite(centres).all(axis=1)[:, None]
     # In the middle of the others, so that invisible segments do not enlarge the extent.

@@ -79,17 +79,10 @@ class DrawnStage:
 
 
 def read_drawn(path, prim=None):
-    """Reads all meshes, solids and linear curves that a stage shows. Solids keep their first size.
+    """Reads all meshes, solids (in their first size) and linear curves that a stage shows, at the first frame.
 
     The cloth is the named prim, else what an earlier run animated, else each prim whose points move, else all. Invisible prims,
     guides, proxies and prototypes of point instancers are ignored.
-
-    Args:
-        path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the cloth, or None.
-
-    Returns:
-        DrawnStage: Only its first frame has been read.
 
     Raises:
         FileNotFoundError: There is no such file.

@@ -34,14 +34,7 @@ CURVE_WIDTH = 0.05
 
 
 def scene_layer(mesh, pins, up_axis, name):
-    """Builds a complete stage of one cloth at rest, to be animated.
-
-    Returns:
-        The layer, the `Target` in it, and its root's metadata.
-
-    Raises:
-        ValueError: A name is not allowed.
-    """
+    """Builds a complete stage of one cloth at rest; returns the layer, the `Target` in it, and its root's metadata."""
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -196,16 +189,10 @@ def bind_material(prim, material):
 
 
 def over_layer(source, prim, mesh, primvars, history, layer=None):
-    """Builds a layer over the artist's prim, to be animated. The artist's default points stay the rest shape; without them ours
-    are written.
+    """Builds a layer over the artist's prim, to be animated, added to ``layer`` if that is not None.
 
-    Args:
-        source: File of the stage.
-        prim: Path or name of the prim, or None.
-        mesh: The `Mesh` that is simulated.
-        primvars: Interpolation of sampled primvars by name; the artist's of that name are blocked.
-        history: Types of history primvars by name; likewise.
-        layer: A layer of other prims of the source to add to, or None.
+    The artist's default points stay the rest shape; without them ours are written. The artist's primvars named as ours are
+    blocked.
 
     Returns:
         The layer, the `Target`, the artist's root metadata, the `StageMesh`, real paths of all files of the stage, and a
@@ -247,11 +234,7 @@ def over_layer(source, prim, mesh, primvars, history, layer=None):
 
 
 def artist_prim(surroundings, mesh):
-    """Returns the stage, to be kept alive, and the artist's prim in it.
-
-    Raises:
-        ValueError: The prim is an instance, or the mesh has other vertices or triangles.
-    """
+    """Returns the stage, to be kept alive, and the artist's prim in it; refuses instances and meshes of another topology."""
     where = f"{surroundings.path}, prim {surroundings.prim}"
     count = len(surroundings.mesh.points)
     if count != len(mesh.points):
@@ -294,11 +277,7 @@ def _widths(curves, surroundings):
 
 
 def declare_primvars(layer, artist, target, path):
-    """Declares the sampled primvars in a layer, and blocks the artist's of the same names.
-
-    Raises:
-        ValueError: One of the artist's has another type.
-    """
+    """Declares the sampled primvars in a layer, and blocks the artist's of the same names, which must be of these types."""
     sampled = {name: kind for name, kind in target.attributes.items() if name.startswith("primvars:")}
     over = layer.GetPrimAtPath(target.prim)
     for name, kind in sampled.items():
@@ -340,12 +319,8 @@ def root_metadata(stage):
 
 
 def flattened_layer(base_paths, describe, named):
-    """Flattens layers, without their clips, into an anonymous one.
-
-    Args:
-        base_paths: Their files, strongest first.
-        describe: Function that writes the root's metadata.
-        named: Function (path of a file, stage) → path in the layer.
+    """Flattens layers, strongest first and without clips, into an anonymous one; ``named`` (path, stage) gives paths of files
+    in it.
     """
     root = Sdf.Layer.CreateAnonymous(".usda")
     # Rates first, because they scale the times of the layers below.

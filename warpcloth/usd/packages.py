@@ -58,16 +58,7 @@ class Contents:
             return [], []
 
     def write(self, layer, package, meant):
-        """Writes a package of a layer and all files that :meth:`named` found.
-
-        Args:
-            layer: The file of the layer.
-            package: The file to write.
-            meant: The final path, for messages.
-
-        Raises:
-            OSError: It could not be written.
-        """
+        """Writes a package, ``meant`` for a path, of a layer's file and all files of :meth:`named`; raises OSError."""
         writer = Sdf.ZipFileWriter.CreateNew(str(package))
         for file, name in {str(layer): os.path.basename(layer), **self._names}.items():
             writer.AddFile(file, name)

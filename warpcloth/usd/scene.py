@@ -176,11 +176,7 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law, fabri
 
 
 def read_limits(stage, cloth, surroundings):
-    """The strain limits that the prim of a cloth declares, a list of `Limit`, and their mesh.
-
-    Raises:
-        ValueError: A value is not allowed.
-    """
+    """The strain limits that the prim of a cloth declares, a list of `Limit`, and their mesh."""
     with errors_at(f"{surroundings.path}, prim {cloth.GetPath()}"):
         values = Values(stage, cloth)
         kinds = {key: kind_of(values, key) for key in values.terms}

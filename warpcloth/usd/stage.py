@@ -191,10 +191,7 @@ def flattened(path: FilePath) -> str:
 def find_prim(stage, path, prim=None):
     """Finds the prim of the cloth: a Mesh, or linear BasisCurves.
 
-    Args:
-        stage: The stage to search.
-        path: Its file, for messages.
-        prim: Path or name of it or of the Xform above; None for the only one, or the one that an earlier run animated.
+    ``prim`` is its path or name, or that of the Xform above; None for the only one, or what an earlier run animated.
 
     Raises:
         ValueError: The prim is missing or of another type, or there are several and ``prim`` is None.
@@ -297,16 +294,10 @@ def space_codes(prim):
 
 
 def local_to_metres(prim, where, time=None, shrinks=False):
-    """The transform (4, 4), for row vectors, from the space and units of a prim to world space [m].
-
-    Args:
-        prim: The prim.
-        where: File and prim, for messages; may be empty.
-        time: Time code; None for a constant transform.
-        shrinks: Whether the scale may be 0.
+    """The transform (4, 4), for row vectors, from the space and units of a prim to world space [m], at a time code or constant.
 
     Raises:
-        ValueError: The transform is animated without ``time``, not affine, not finite or singular.
+        ValueError: The transform is animated without ``time``, not affine, not finite or, without ``shrinks``, singular.
     """
     where = f"{where}: " if where else ""
     moving = moving_space(prim) if time is None else None
@@ -369,11 +360,7 @@ def _rest_points(prim, time=None):
 
 
 def topology(attribute, time=None):
-    """An integer array attribute at a time code or the default time, else the first sample; empty without a value.
-
-    Raises:
-        ValueError: It is not an array of integers, or cannot be read.
-    """
+    """An integer array attribute at a time code or the default time, else the first sample; empty without a value."""
     found = array_of(attribute, whole=True, time=time)
     if time is None and (found is None or len(found) == 0):  # fallbacks of the schema are empty
         found = array_of(attribute, whole=True, time=Usd.TimeCode.EarliestTime())
@@ -381,11 +368,7 @@ def topology(attribute, time=None):
 
 
 def refuse_change(name, now, fixed, code):
-    """Checks that an integer array is unchanged at a time code.
-
-    Raises:
-        ValueError: It differs; the message names the first entry.
-    """
+    """Raises ValueError with the first changed entry if an integer array has changed at a time code."""
     if len(now) != len(fixed):
         raise ValueError(f"{len(now)} {name} at time code {code:g}, must stay {len(fixed)}")
     if not np.array_equal(now, fixed):
@@ -394,11 +377,7 @@ def refuse_change(name, now, fixed, code):
 
 
 def refuse_moving_topology(prim):
-    """Checks that faces or curves do not change over time.
-
-    Raises:
-        ValueError: They do; the message names the first entry.
-    """
+    """Raises ValueError with the first changed entry if faces or curves change over time."""
     if prim.IsA(UsdGeom.Mesh):
         mesh = UsdGeom.Mesh(prim)
         sampled = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr())
@@ -431,11 +410,7 @@ def face_corners(prim, points, triangles_of=triangles_of):
 
 
 def triangles_of_faces(prim):
-    """Returns the number of triangles (F,) of each face, 0 for a hole.
-
-    Raises:
-        ValueError: The index of a hole is not that of a face.
-    """
+    """Returns the number of triangles (F,) of each face, 0 for a hole."""
     mesh = UsdGeom.Mesh(prim)
     triangles = topology(mesh.GetFaceVertexCountsAttr()) - 2
     holes = topology(mesh.GetHoleIndicesAttr())

@@ -59,14 +59,7 @@ class StageSurfaces:
 
 
 def read_surfaces(path, prims=None):
-    """Reads the named meshes of a stage, or those that `read_drawn` takes for cloth, without colliders.
-
-    Args:
-        path: A .usd, .usda, .usdc or .usdz file.
-        prims: Paths or names of prims, or None.
-
-    Returns:
-        StageSurfaces: No frame but the first has been read.
+    """Reads the named meshes of a stage, or those that `read_drawn` takes for cloth, without colliders, at the first frame.
 
     Raises:
         FileNotFoundError: There is no such file.

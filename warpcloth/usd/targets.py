@@ -135,11 +135,7 @@ class Target:
 
 
 def check_primvars(primvars, mesh):
-    """Checks the interpolations of primvars by name.
-
-    Raises:
-        ValueError: A name is invalid or taken, or an interpolation is not "vertex" or, for triangles, "uniform".
-    """
+    """Checks that names are free, and interpolations "vertex" or, for triangles, "uniform"."""
     for name, interpolation in primvars.items():
         valid = isinstance(name, str) and Sdf.Path.IsValidNamespacedIdentifier(name) and not name.endswith(":indices")
         if not valid or name.startswith("primvars:"):

@@ -54,11 +54,7 @@ def _plain(text):
 
 
 def refuse_path(path):
-    """Checks that a layer can refer to a path.
-
-    Raises:
-        ValueError: It has control characters, or is not UTF-8.
-    """
+    """Raises ValueError if a path has control characters, or is not UTF-8, as a layer cannot refer to it."""
     text = os.fspath(path)
     if any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
         raise ValueError(f"{text!r}: a path in USD must be UTF-8 without line breaks and other control characters")
@@ -96,11 +92,7 @@ def check_stage(stage, path):
 
 
 def check_composed(prim, path):
-    """Checks that all files to which a prim or an ancestor refers are there.
-
-    Raises:
-        ValueError: pxr could not compose the prim.
-    """
+    """Raises ValueError if a file to which a prim or an ancestor refers is missing."""
     for error in prim.GetStage().GetCompositionErrors():
         if prim.GetPath().HasPrefix(error.rootSite.path) or error.rootSite.path.HasPrefix(prim.GetPath()):
             raise ValueError(f"{path}, prim {prim.GetPath()}: {_plain(str(error))} It must be there")
@@ -112,11 +104,7 @@ def _refuse_outside(where, name, value, least, most):
 
 
 def value_of(attribute, time=None):
-    """Returns the value of an attribute at a time code or the default time, or None.
-
-    Raises:
-        ValueError: The file is broken there, or Python lacks the type.
-    """
+    """Returns the value of an attribute at a time code or the default time, or None; refuses values that cannot be read."""
     try:
         with redirect_stderr(StringIO()):  # pxr prints a value that it cannot convert to Python
             return attribute.Get(Usd.TimeCode.Default() if time is None else time)
@@ -127,11 +115,7 @@ def value_of(attribute, time=None):
 
 
 def token_of(attribute, allowed):
-    """Returns the value of an attribute, one of ``allowed``.
-
-    Raises:
-        ValueError: It is none of these.
-    """
+    """Returns the value of an attribute, which must be one of ``allowed``."""
     value = value_of(attribute)
     if value not in allowed:
         raise ValueError(f"{attribute.GetName()} is {shown(value)}, must be one of {', '.join(map(str, allowed))}")
@@ -139,11 +123,7 @@ def token_of(attribute, allowed):
 
 
 def array_of(attribute, components=(), whole=False, time=None):
-    """Returns the rows of an array attribute (count, *components), int32 if ``whole``; or None.
-
-    Raises:
-        ValueError: The rows have another type or shape, or cannot be read.
-    """
+    """Returns the rows of an array attribute (count, *components), int32 if ``whole``; or None. Other rows are refused."""
     value = value_of(attribute, time)
     return None if value is None else checked_rows(attribute.GetName(), value, components, whole)
 
@@ -158,11 +138,7 @@ def checked_rows(name, value, components=(), whole=False):
 
 
 def refuse_outside(name, numbers, count, what):
-    """Checks that numbers are indices below ``count``.
-
-    Raises:
-        ValueError: A number is out of range; the message names the first.
-    """
+    """Raises ValueError with the first of some numbers that is not an index below ``count``."""
     wrong = (numbers < 0) | (numbers >= count)
     if wrong.any():
         first = int(np.argmax(wrong))
@@ -170,11 +146,7 @@ def refuse_outside(name, numbers, count, what):
 
 
 def refuse_unknown(name, values, where="", infinite=False):
-    """Checks that numbers are finite, or with ``infinite`` not NaN.
-
-    Raises:
-        ValueError: A number is not; the message names the first.
-    """
+    """Raises ValueError with the first number that is not finite, or with ``infinite`` NaN."""
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     for entry in np.argwhere(wrong)[:1].tolist():
         index = "".join(f"[{i}]" for i in entry)
@@ -182,11 +154,7 @@ def refuse_unknown(name, values, where="", infinite=False):
 
 
 def time_codes_of(attribute):
-    """Lists the time codes of the samples of an attribute.
-
-    Raises:
-        ValueError: A time code is larger than `MOST_TIME_CODE`.
-    """
+    """Lists the time codes of the samples of an attribute, up to `MOST_TIME_CODE`; refuses larger ones."""
     codes = attribute.GetTimeSamples()
     for code in codes:
         if not abs(code) <= MOST_TIME_CODE:
