@@ -37,14 +37,9 @@ class Cloths:
         labels: Frame numbers of the source (F,).
         times: (F,) [s], or None.
         read: Function (index) → points (n, 3) [m], which may be infinite or NaN.
-        precision: Floating-point type of the source.
         missing: Numbers of missing frames.
-        colliders: The colliders, with keyframes at these frames.
-        limits: The declared limits.
         others: Paths of other meshes of a stage.
         stages: The `StageMesh` of each, or empty.
-        files: Paths of the source.
-        up_axis: "Y" or "Z", or None.
     """
 
     names: tuple[str, ...]

@@ -13,10 +13,8 @@ class Measure:
     """A field of numbers of triangles or vertices.
 
     Attributes:
-        name: Its name.
         shape: Shape of one value, () for a number.
         unit: SI unit, or "1".
-        text: Its definition.
         neutral: Undeformed value, the middle of a colour scale, or None if scales start at 0.
         rate: Whether it is a rate from the previous frame.
         needs: "directions" or "material", options of :func:`warpcloth.analyze`, or "".

@@ -22,11 +22,8 @@ class Summary:
         frame: Label of the frame.
         reference: Label of its reference, or None for the rest shape.
         time: Its time [s].
-        name: Name of the scalar.
-        unit: Unit of the scalar.
         measured: Elements with a value.
         excluded: Elements without.
-        mean: Mean over elements.
         area_mean: Σ wᵢvᵢ / Σ wᵢ, w the rest areas.
         percentiles: `PERCENTILES` (9,), interpolated linearly.
         smallest: First element with the smallest value, or -1.

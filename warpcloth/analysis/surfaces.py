@@ -87,12 +87,7 @@ class Triangles(_Elements):
         without: Why a triangle may have no reference.
 
     Args:
-        mesh: Its mesh.
-        measures: List of :class:`warpcloth.analysis.measures.Measure`.
         directions: Columns of :func:`material_directions` (T, 2, 2), or None.
-        material: A membrane term, or None.
-        device: A Warp device.
-        dtype: "float32" or "float64".
     """
 
     without = "has no area"
@@ -152,11 +147,7 @@ class Neighbourhoods(_Elements):
         without: Why a vertex may have no reference.
 
     Args:
-        mesh: A mesh of triangles.
-        measures: List of :class:`warpcloth.analysis.measures.Measure`.
         neighbourhood: As of :func:`warpcloth.analysis.neighbourhoods.neighbourhoods`.
-        device: A Warp device.
-        dtype: "float32" or "float64".
     """
 
     without = "is in no triangle with area, or its neighbours lie on a line"

@@ -199,11 +199,8 @@ class Registration:
     """Moves a template onto one surface after another (:func:`resample`).
 
     Args:
-        mesh: The template.
         held: Vertices that stay where a solve starts (p,).
-        stiffness: α [1].
         within: Maximum distance of points that count [m].
-        device: A Warp device.
     """
 
     def __init__(self, mesh: Mesh, held: np.ndarray, stiffness: float, within: float, device: str) -> None:

@@ -35,10 +35,8 @@ class MeasuredScalar:
     """The values of a scalar on the cloths of a subject.
 
     Args:
-        subject: The :class:`Subject`.
         name: The scalar, such as "stretch_1".
         rest: The rest shape, or None for that of the subject.
-        device: A Warp device.
         options: Options of :class:`warpcloth.Analyzer` by name.
 
     Raises:

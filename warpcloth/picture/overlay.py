@@ -21,8 +21,6 @@ class Overlay:
     Args:
         size: Width and height [px].
         scale: The :class:`Scale` of the bar, or None.
-        title: Name of the coloured scalar.
-        unit: Its unit, or "1".
         names: Names of panels side by side, or empty.
         background: Its sRGB, 0 to 255.
         columns: Panels in a row; None for all.

@@ -37,12 +37,8 @@ class RayCaster:
 
     Args:
         shapes: List of :class:`Shape`.
-        width: Width of the picture [px].
-        height: Height of the picture [px].
         samples: Rays through each pixel.
         ground: Height of a ground that fades into the background [m], or None.
-        device: A Warp device.
-        up_axis: "Y" or "Z".
         threads: Threads of the CPU, by default all cores.
         sun_angle: Angular diameter of the sun [°].
         contrast: Strength of shading on coloured surfaces, 0 to 1.

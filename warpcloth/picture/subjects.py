@@ -45,15 +45,12 @@ class Subject:
     """Everything that is drawn of a source.
 
     Attributes:
-        name: Name of the source.
-        shapes: List of :class:`Shape`.
         labels: Frame numbers (F,).
         times: (F,) [s], or None.
         read: Function (index) → positions (n, 3) [m] of each shape.
         up_axis: "Y" or "Z", or None.
         coloured: Index of the coloured shape.
         sequences: Function that returns the :class:`Sequence` of each of its cloths.
-        files: Paths of the source.
         camera: Function (frame, aspect) of :func:`warpcloth.usd.drawn.camera_of`, or None.
     """
 

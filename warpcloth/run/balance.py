@@ -112,9 +112,6 @@ class Balance:
         free: Whether no pin, attachment or rail holds it.
         gravity: Of each copy, (B, 3) [m/s²].
         loads: Constant loads on cloth that is held, (B, n, 3) [N], or None.
-        elastic: :class:`Elastic` of the model.
-        attached: Whether attachments hold it.
-        sources: The sources of the scene.
         points: Positions of the frame that is checked, (B·n, 3) [m].
         has, given: Energy of each copy, and the energy that its sources can have added, in the last checked frame, (B,) [J].
         driven: Whether the bound of the energy is only an estimate: sources beside the start add energy, or explicit steps have

@@ -25,8 +25,6 @@ class Grades:
     """The grades of the copies of a run.
 
     Attributes:
-        errors: The :class:`warpcloth.run.step_errors.StepErrors` of the stepper.
-        flutter: The :class:`warpcloth.run.flutter.Flutter` of the run, or None.
         distance: The largest distance of a vertex from the solution of a step in a good frame, (B,) [m].
         first: For each reason why a copy is not usable, its first frame from 1, or 0, (4, B).
         figure: The figure of that frame, (4, B).

@@ -90,7 +90,6 @@ class Evaluation:
         pairs: The :class:`warpcloth.contact.self_steps.SelfSteps`, if there is no stepper.
 
     Attributes:
-        names: Names of the energies.
         stored: Last U of all friction springs, (B,) [J].
         hidden: Whether some forces follow from multipliers.
         gradient: Last ∂U/∂x, (N,) [N].
@@ -270,7 +269,6 @@ class History:
         record: Words of :data:`RECORDS`.
 
     Attributes:
-        names: Names of the energies.
         energies: Energies of each kept frame, (F, B, K) [J].
         reactions: Reactions of each kept frame, (F, B, p, 3) [N].
         forces: Total force and friction force on each collider in each kept frame, (F, B, C, 2, 3) [N].

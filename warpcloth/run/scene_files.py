@@ -29,7 +29,6 @@ class SceneSource:
     """The source of a scene: the ``scene`` function of a Python file, a USD stage, or a mesh file.
 
     Attributes:
-        path: The file.
         function: Function that returns a :class:`warpcloth.Scene`, called with ``parameters`` by name.
         parameters: Its parameters, `inspect.Parameter` by name.
         pins: Selection of fixed vertices in place of the pins of the scene, or None.

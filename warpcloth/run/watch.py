@@ -54,10 +54,7 @@ class Watch:
         last: The last checked frame; before the first, the state of the stepper.
         stopped: Whether the run could not go on.
         seconds: Computation time of each frame [s].
-        history: The :class:`warpcloth.run.history.History`, if any.
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
-        grades: The :class:`warpcloth.run.grades.Grades`, or None.
-        pressed: The :class:`warpcloth.run.contact_verdicts.Pressed` with grades and colliders, else None.
         least_gap: The smallest distance of cloth to cloth in the frames before the last checked one, (B,) [m].
     """
 

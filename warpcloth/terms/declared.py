@@ -18,7 +18,6 @@ class Elements:
 
     Attributes:
         label: Name within the scene.
-        term: The energy.
         stencil: Vertices of each element, (E, K) int32.
         stiffness: One value, (E,), or (C,) with cells [unit of the term].
         rest: Rest states (E, P); with sparse cells (C, P).

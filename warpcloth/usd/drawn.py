@@ -35,9 +35,7 @@ class DrawnPrim:
     """A Mesh prim, a solid such as a Sphere, or linear BasisCurves.
 
     Attributes:
-        path: Path of the prim.
         cloth: Whether it is cloth.
-        count: Number of its points n.
         triangles: (T, 3) int32; empty for curves.
         edges: (E, 2) int32, the segments of curves; empty for a mesh.
         radius: Radius of the curves [m].
@@ -64,10 +62,7 @@ class DrawnStage:
     """The drawn prims of a stage, and its time codes.
 
     Attributes:
-        prims: List of `DrawnPrim`.
         codes: Time codes of the frames (F,): of the cloth, else of its surroundings; one if nothing moves.
-        rate: Time codes per second.
-        up_axis: "Y" or "Z".
         stage: The stage, which keeps the prims valid.
     """
 

@@ -40,9 +40,7 @@ class StageSurfaces:
     """The meshes of a stage, read by `read_surfaces`.
 
     Attributes:
-        surfaces: The meshes.
         codes: Time codes of the frames (F,) of all meshes.
-        rate: Time codes per second.
         colliders: The colliders, with a keyframe at each frame.
         others: Paths of other visible meshes.
         files: Real paths of the files of the stage.

@@ -21,7 +21,6 @@ class Target:
     """The prim to animate, with what expresses a frame in its space and units.
 
     Attributes:
-        prim: Path of the prim.
         triangles: (T, 3), for normals; empty for curves.
         transform: (4, 4) from its space to metres; None for the identity.
         point_vertices: Vertex of each point; None if points are vertices.
