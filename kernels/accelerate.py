@@ -159,7 +159,7 @@ def combine(dtype):
 
 @cache
 def accept(dtype):
-    """Kernel over vertices: d = the accelerated candidate if its φ is at most that of the plain one, which NaN is not.
+    """Kernel over vertices: d = the accelerated candidate if its φ is at most that of the plain one, never NaN.
 
     s of the slot is the step, 0 where ``stayed`` (or None) is 1.
     """

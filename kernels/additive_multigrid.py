@@ -174,7 +174,7 @@ def prolong_smoothly(dtype):
 def refine(dtype, block: int):
     """Kernel over (copies, threads): x += P̄ M_c P̄ᵀ r, by all transfers from the ``first`` on.
 
-    A copy has a ``block`` of threads, which synchronise, or one thread on the CPU, where ``block`` is 0.
+    A copy has a ``block`` of threads, or one on the CPU, where ``block`` is 0.
     """
     vec3, mat33 = types(dtype)
     lanes, dense_block, vector = lanes_of_rows(block), load(mat33), load(vec3)

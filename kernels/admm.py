@@ -151,10 +151,7 @@ def admm_forces(term: Term, dtype):
 
 @cache
 def scatter_admm(term: Term, dtype):
-    """Kernel over elements: adds max(1, 1/r) Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N].
-
-    For one thread of the CPU: no addition is atomic.
-    """
+    """Kernel over elements: adds max(1, 1/r) Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N]."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)

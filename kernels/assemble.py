@@ -164,7 +164,6 @@ def scatter_gradient(term: Term, dtype, corrected: bool = False, clearing: bool 
 
 
 def gather_gradient(term: Term, dtype, corrected: bool = False, clearing: bool = False):
-    """Kernel over vertices: the sum of :func:`scatter_gradient`."""
     return gather(term, dtype, forces(term, dtype, corrected, clearing))
 
 
@@ -210,7 +209,7 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
 def scatter_hessian(term: Term, dtype, corrected: bool = False):
     """Kernel over elements: adds block q = K·i + j of :func:`hessian_blocks` to values[slots[K²e + q]] if that slot is ≥ 0.
 
-    For one thread of the CPU; block (j, i) is the transpose of (i, j).
+    Block (j, i) is the transpose of (i, j).
     """
     vec3, mat33 = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)

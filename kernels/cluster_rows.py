@@ -186,5 +186,4 @@ def pull_clusters(dtype):
 
 
 def gather_pulls(term: Term, dtype):
-    """Kernel over vertices: out += the parts of its elements."""
     return gather(term, dtype, stored(term, dtype))

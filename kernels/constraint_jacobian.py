@@ -112,7 +112,6 @@ def scatter_rows(term: Term, dtype, scalar: bool, curved: bool):
 
 
 def gather_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over vertices: the sum of :func:`scatter_rows`."""
     return gather(term, dtype, pulls(term, dtype, scalar, curved))
 
 
@@ -213,7 +212,7 @@ def product_blocks(term: Term, dtype, scalar: bool, curved: bool):
 def scatter_products(term: Term, dtype, scalar: bool, curved: bool):
     """Kernel over elements: adds block q = K·i + j of :func:`product_blocks` to values[slots[K²e + q]] if that slot is ≥ 0.
 
-    For one thread of the CPU; block (j, i) is the transpose of (i, j).
+    Block (j, i) is the transpose of (i, j).
     """
     _, mat33 = types(dtype)
     K, Q = wp.constant(term.vertices), wp.constant(row_count(term, scalar, curved))

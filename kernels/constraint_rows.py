@@ -60,7 +60,6 @@ def row_values(dtype):
 
 
 def row_count(term: Term, scalar: bool, curved: bool):
-    """Number of rows per element."""
     if not scalar:
         return 3 * term.rows
     return 1 + (term.stiffening_rows if curved else 0)

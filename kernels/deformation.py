@@ -3,7 +3,7 @@
 F̂ (3×3) is the deformation gradient in the tangent frame T = [t₁, t₂, N] of the reference: two columns F (3×2) of the surface,
 and the unit normal n of a triangle or the least-squares image of N of a neighbourhood. F̂ Tᵀ maps reference to current vectors.
 It is NaN if the element is degenerate in the reference (flatter than :data:`FLATTEST`), its third column without a current
-normal. No fourth power of a length is computed, against overflow in float32.
+normal.
 
 Outputs may be None.
 """

@@ -55,12 +55,10 @@ def local_steps(term: Term, dtype, scalar: bool, multipliers: bool = False, per_
 
 
 def scatter_moves(term: Term, dtype):
-    """Kernel over elements: total += Dᵀz."""
     return scatter(term, dtype, stored(term, dtype))
 
 
 def gather_moves(term: Term, dtype):
-    """Kernel over vertices: total += Dᵀz."""
     return gather(term, dtype, stored(term, dtype))
 
 

@@ -5,9 +5,8 @@ copy iterates.
 
 Conjugate gradients take vectors with 3×3 preconditioner blocks, or ``numbers``.
 
-An iteration has two launches over (copies, lanes): the direction with its product, and the rest. A lane takes every lanes-th
-unknown of its copy. On CUDA each unknown has a lane, up to a limit, and a ``block`` of threads stores its part of a scalar
-product, which the next launch adds up; the CPU has one lane, and ``block`` 0.
+An iteration has two launches over (copies, lanes): the direction with its product, and the rest. On CUDA a ``block`` of threads
+stores its part of a scalar product, which the next launch adds up; the CPU has one lane, and ``block`` 0.
 """
 
 from functools import cache
@@ -275,8 +274,6 @@ class Solves:
 
     ``rz`` is rᵀz, ``first`` its first value; ``negative`` is 1 after negative curvature; ``iteration`` counts from 1 up to
     ``most``; ``proceed`` (1,) is 1 if a copy is active; the last three are those of :func:`is_enough`, or None.
-
-    A launch that turns directions writes ``next``, and the one that advances takes it over, so no launch reads what it writes.
     """
 
     active: wp.array(dtype=wp.int32)
@@ -297,8 +294,6 @@ class Solves:
 
 @cache
 def scalar_product(numbers: bool):
-    """Device function (a, b) → a·b in float64 of vectors or ``numbers``."""
-
     @wp.func
     def multiplied(a: Any, b: Any):
         if wp.static(numbers):
@@ -448,10 +443,7 @@ def turn(dtype, numbers: bool, block: int):
 
 @cache
 def turn_and_multiply(dtype, block: int, terms: int = 0):
-    """:func:`turn` from ``before`` to p, with q = A p and the parts of pᵀq.
-
-    On CUDA threads compute p of neighbours again; on the CPU ``before`` is p.
-    """
+    """:func:`turn` from ``before`` to p, with q = A p and the parts of pᵀq."""
     vec3, _ = types(dtype)
     store, add_up = block_sums(block)
     multiplied, lanes = scalar_product(False), lanes_of_rows(block)

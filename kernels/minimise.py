@@ -225,8 +225,7 @@ def end_newton(block: int):
 
     Rounding ends it if the gradient is within its rounding, and no step was found or φ fell by no more than its rounding. It is
     stuck without a step or a descent direction. Pairs leave a ``fraction`` (B,), or None, of the direction. A list with
-    ``most`` pairs (B,) in less ``room`` ends the descent: the step is repeated. ``roundings`` has the parts of
-    :func:`.linear.rounding`.
+    ``most`` pairs (B,) in less ``room`` ends the descent: the step is repeated.
     """
     (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
 

@@ -40,7 +40,6 @@ class Rows:
 
 
 def _module(dtype):
-    """A module name in which no two kernels share a name."""
     return f"{MODULE}.{dtype.__name__}"
 
 
@@ -277,7 +276,6 @@ def scale_sweeps(dtype, block: int):
     """Kernel over (block rows, lanes): S[i] = ω LᵀL/Σⱼ‖L[i] A[i, j] L[j]ᵀ‖, L the inverse factors of the diagonal blocks.
 
     So no eigenvalue of S A exceeds ω (Baker et al. 2011, *Multigrid smoothers for ultraparallel computing*, for numbers).
-    ``own`` bounds the norm of the diagonal block; √(‖·‖₁‖·‖∞) and Frobenius norms those of others.
     """
     vec3, mat33 = types(dtype)
     lanes = LANES if block > 1 else 1
@@ -394,8 +392,7 @@ def end_choice():
     """Kernel over copies: chooses the next preconditioner by decades gained for the cost, means over about ``AGED`` solves.
 
     The first solve is by multigrid, the second tries blocks; the other is tried again after ``AGED`` solves, or sooner if it
-    gained more for its cost. A solve that is cut off gained nothing; one that ends at negative curvature does not count. A
-    cycle costs ``cycle`` iterations with blocks.
+    gained more for its cost. A solve that is cut off gained nothing; one that ends at negative curvature does not count.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)

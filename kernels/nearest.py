@@ -37,8 +37,8 @@ def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 def distances():
     """Kernel over points: out[i] = distance of points[i] to the triangles of ``mesh``, faces[i] = the nearest.
 
-    Coordinates are in [−1, 1]³, in float32 in ``mesh``, in float64 in ``x`` and the distance. Queries can miss nearly flat
-    triangles, so those in ``flat`` are tested one by one.
+    Distances are in float64, coordinates in [−1, 1]³. Queries can miss nearly flat triangles, so those in ``flat`` are tested
+    one by one.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -160,7 +160,6 @@ def push_rows(dtype):
 
 @cache
 def clear_pins(dtype):
-    """Kernel over vertices: force = 0 at pins."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
@@ -294,8 +293,6 @@ def end_pass():
 
 @cache
 def add_rows(dtype):
-    """Kernel over rows of open copies: x += z."""
-
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def add(
         # state in

@@ -1,6 +1,6 @@
 """Sums and maxima per copy, in float64 and in a fixed order.
 
-A launch over (copies, lanes) stores parts by block; the next adds them up. On the CPU a copy has one lane.
+A launch over (copies, lanes) stores parts by block; the next adds them up.
 """
 
 from functools import cache

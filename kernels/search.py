@@ -1,7 +1,4 @@
-"""Kernels of the line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d along p in every copy.
-
-A trial launches positions, gradient, inertia, the energy of each term, and the decision.
-"""
+"""Kernels of the line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d along p in every copy."""
 
 from functools import cache
 

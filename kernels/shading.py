@@ -7,8 +7,6 @@ import warp as wp
 
 @cache
 def tube_bounds():
-    """Kernel over tubes: axis-aligned bounding boxes."""
-
     @wp.kernel(module="unique", enable_backward=False)
     def bound_tube(
         # elements

@@ -162,8 +162,6 @@ def move_pins(dtype):
 
 @cache
 def count_step():
-    """Kernel over copies: step += 1."""
-
     @wp.kernel(module="unique", enable_backward=False)
     def count(
         # in and out

@@ -11,7 +11,6 @@ FIRST = wp.constant(wp.int64(2**62))
 
 @cache
 def subtract_positions(dtype):
-    """Kernel over vertices: out = a − b."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"warpcloth.step_doubling.{dtype.__name__}", enable_backward=False)

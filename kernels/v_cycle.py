@@ -11,7 +11,6 @@ from .vectors import types
 
 
 def _module(dtype, terms=0):
-    """A module name in which no two kernels share a name."""
     return f"warpcloth.v_cycle.{dtype.__name__}" + f".{terms}" * (terms > 0)
 
 

@@ -42,13 +42,11 @@ def scatter_multipliers(term: Term, dtype, scalar: bool):
 
 
 def gather_multipliers(term: Term, dtype, scalar: bool):
-    """Kernel over vertices: the sum of :func:`scatter_multipliers`."""
     return gather(term, dtype, multiplier_pull(term, dtype, scalar))
 
 
 @cache
 def add_scaled(dtype):
-    """Kernel over vertices: out += factor·a."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -105,7 +103,6 @@ def past(dtype):
 
 @cache
 def wide_dot(dtype):
-    """Device function (a, b) → a·b in float64."""
     vec3, _ = types(dtype)
 
     @wp.func

@@ -201,7 +201,6 @@ def add_block(part: TermFacts, dtype, corrected: bool = False):
 
 @cache
 def add_block_forces(parts: tuple[TermFacts, ...], dtype, corrected: bool = False):
-    """:func:`add_block` for all terms."""
     vec3, _ = types(dtype)
     chain_type = chain_of(parts, dtype)
     key = dtype, corrected

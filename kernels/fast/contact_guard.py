@@ -52,7 +52,6 @@ class NoGuard:
 
 
 def guard_type(dtype, guarded: bool):
-    """:func:`guard_struct` if ``guarded``, else :class:`NoGuard`."""
     return guard_struct(dtype) if guarded else NoGuard
 
 

@@ -255,7 +255,6 @@ def correct_pairs(of: Projected, dtype):
 
 @cache
 def correct_terms(parts: tuple[Projected, ...], dtype):
-    """:func:`correct_elements` for all terms."""
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     chain_type = chain_of(parts, dtype, constraints_of)
     first, others = (correct_elements(parts[0], dtype), correct_terms(parts[1:], dtype)) if parts else (None, None)

@@ -224,7 +224,6 @@ def gather_matrix_rows(part: TermFacts, dtype, ahead, lanes: int):
 
 @cache
 def gather_terms(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1):
-    """:func:`gather_term` for all terms."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     chain_type = chain_of(parts, dtype)

@@ -97,10 +97,9 @@ def gather_step(
 ):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
-    Without damping v may be ``v_after``. ``fast`` allows errors of two bits in quotients and roots. ``alone`` is for one copy.
-    ``residual_type`` is None, or, in float32 without damping, that of the residual of :func:`..explicit_step.kick_and_drift`:
-    vectors, with a ``unit`` of 1, or int32 of :mod:`.packed_residual` in units of ``unit``. ``guarded`` includes contact with
-    colliders, of which some move if ``moving``.
+    ``fast`` allows errors of two bits in quotients and roots. ``residual_type`` is None, or, in float32 without damping, that
+    of the residual of :func:`..explicit_step.kick_and_drift`: vectors, with a ``unit`` of 1, or int32 of
+    :mod:`.packed_residual` in units of ``unit``. ``guarded`` includes contact with colliders, of which some move if ``moving``.
     """
     vec3, _ = types(dtype)
     stored = residual_type or vec3
@@ -143,7 +142,7 @@ def gather_steps_of_copies(
 ):
     """Kernel over (copies, threads): x, v after several steps, a block of ``threads`` per copy.
 
-    Every other step writes x_other and v_other. Without damping v may be v_other.
+    Every other step writes x_other and v_other.
     """
     vec3, _ = types(dtype)
     gather_one = gather_vertex(parts, dtype, symplectic, guarded=guarded)

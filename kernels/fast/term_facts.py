@@ -44,8 +44,7 @@ class TermFacts(NamedTuple):
 def local_gradient(part: TermFacts, dtype, corrected: bool = False):
     """Device function (k, β, rest, y, dy, h) → kA ∂u/∂y at y plus the force of damping at y + dy, (M, 3).
 
-    Without damping, ``corrected`` evaluates the first at y + dy. No damped term is corrected: explicit steps with damping are
-    not compensated (:func:`warpcloth.fast.compensation.needs_compensation`).
+    Without damping, ``corrected`` evaluates the first at y + dy.
     """
     term, precision = part.term, part.precision(dtype)
     assert not (part.damped and corrected), f"{term.name} is damped, and evaluated with a position residual"
@@ -102,8 +101,6 @@ def elements_struct(part: TermFacts, dtype):
 
 @wp.struct
 class Nothing:
-    """The end of a chain of structs."""
-
     unused: int
 
 

@@ -238,7 +238,6 @@ def bounded_hessian(y: Any, rest: Any, negative: Any):
 
 @cache
 def contact(solid: Solid):
-    """The :class:`..term.Term` of contact with colliders of a shape."""
     local_gap, curvature_of = gap_to(solid), solid.curvature
 
     @wp.func

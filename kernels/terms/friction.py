@@ -56,7 +56,6 @@ def bounded_hessian(y: Any, rest: Any, negative: Any):
 
 @cache
 def friction(law: Law):
-    """The :class:`..term.Term` of friction by a law."""
     energy_of, secant_of, bend_of, prox_of = law.energy, law.secant, law.bend, law.prox
 
     @wp.func
