@@ -36,7 +36,7 @@ def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, *
             returns.
         mesh: The mesh at rest; by default that of the file.
         dt: Time between frames [s], for rates; by default that of the file or animation.
-        options: The options of :class:`Analyzer`.
+        options: Those of :class:`Analyzer`.
 
     Returns:
         :class:`Analysis`.

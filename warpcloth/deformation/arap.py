@@ -72,10 +72,8 @@ class Arap:
     Args:
         mesh: The rest shape, a :class:`warpcloth.Mesh`.
         handles: Moved vertices (h,), or a selection, which is sorted; every component of the mesh needs one.
-        weights: One of those above.
-        energy: One of those above.
-        device: A Warp device, ``"cpu"`` or ``"cuda:0"``.
-        dtype: ``"float32"`` or ``"float64"``.
+        weights, energy: One of those above.
+        device, dtype: A Warp device, and ``"float32"`` or ``"float64"``.
 
     Attributes:
         handles: (h,) int32, in the order of positions in :meth:`solve`.

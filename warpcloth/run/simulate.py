@@ -97,7 +97,7 @@ class Animation(ShownInNotebooks):
             frame: ``"pairs in contact"`` (nearer than the contact distance), ``"pairs listed"``, ``"new lists"`` (of all
             copies), ``"moves kept"`` (the fraction of the moves of free vertices that the filter left whole) and ``"least
             gap"`` [m].
-        cuts: With a record, ``cut`` of each frame, (frames+1,) or (frames+1, B).
+        cuts: With a record, ``cut`` of each frame.
         cut: The fraction of the moves of free vertices that the filter of colliders cut short, plus that of the filter of cloth
             with cloth, or (B,).
         inside: The first vertex inside each collider that contained one, a tuple of :class:`Inside`.

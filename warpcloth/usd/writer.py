@@ -21,7 +21,7 @@ class AnimationWriter(ChunkWriter):
 
     With a source, the result is a layer over the artist's stage, which never changes, with points, velocities, normals, extent
     and subdivisionScheme of one prim, in its space and units. It blocks accelerations and `primvars:normals`. Time codes start
-    at the source's first second, else at 0.
+    at the time of the source's first one, else at 0.
 
     Data are float primvars, `primvars:<name>`; a face gets the mean of its triangles.
 
@@ -61,7 +61,7 @@ class AnimationWriter(ChunkWriter):
             prim: With a source, path or name of the prim; else name under /World, by default "Cloth".
             pins: Vertex indices by name, written as GeomSubsets; without a source.
             up_axis: "Y" or "Z", by default that of the mesh; without a source.
-            chunk: Number of frames in memory, which a killed process loses.
+            chunk: Number of frames written together, which a killed process may lose.
             metadata: Further customLayerData["warpcloth"]: numbers or texts by name.
             primvars: Interpolation of each primvar by name: "vertex", or "uniform" for triangles.
             lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves; without a source.
