@@ -89,11 +89,10 @@ def resample(
     Minimises α·E(x, R) + Σ aₚ dₚ²/Σ aₚ over the vertices p of the capture (after Amberg, Romdhani & Vetter 2007, non-rigid
     iterative closest points), aₚ a third of the area of triangles at p. E is 2 Σ area ‖∇x − R‖² over triangles, with a rotation
     each (Liu, Zhang, Xu, Gotsman & Gortler 2008), plus 0.12 times that of :class:`warpcloth.Arap` with clamped weights, against
-    bending. Edges in the latter are 0.9 times those of the last frame, or ``positions``, plus 0.1 times those at rest, rotated
-    with their cells: folds stay, noise does not grow. dₚ is the distance of p from the tangent plane of the nearest point, on
-    the boundary from that point. Points count within a distance and, unless beyond the outline, if the planes enclose less than
-    60°. An iteration finds nearest points and rotations, and solves a sparse system. Frames start from the last one, moved on
-    by its motion.
+    bending. The latter compares with 0.9 times the edges of the last frame, or ``positions``, plus 0.1 times those at rest. dₚ
+    is the distance of p from the tangent plane of the nearest point, on the boundary from that point. Points count within a
+    distance and, unless beyond the outline, if the planes enclose less than 60°. Frames start from the last one, moved on by
+    its motion.
 
     Args:
         capture: The capture, with times.

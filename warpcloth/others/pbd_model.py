@@ -12,8 +12,7 @@ does, w = Σ ‖∂C/∂xᵢ‖²/mᵢ at rest, so f = 1 − (1 + w k dt²)^(−
 | `CorotatedMembrane` | strain of a triangle, normalised | f, with k = EtA for the stretch along two axes, EtA/2 for the shear |
 
 Bending is constrained by its energy, so that satisfying it halves y; hence the factor 2. As dt falls, moves add up to those of
-the energies, for every n. Triangles are corotated for small strains. The XPBD constraint of bending has no stiffness at rest,
-½k(½‖y‖²)², and PBD divides out that of the FEM constraint; neither is used.
+the energies, for every n.
 
 Gravity is 9.81 m/s² along −y, so scenes are rotated, and time is scaled by √(|g|/9.81).
 """

@@ -1,19 +1,13 @@
-"""Compares the energy of a cloth with the energy that its sources can have added.
+"""Compares the energy of a cloth with the energy that its sources can have added; docs/stability.md has the derivations.
 
-Divergence is judged by kinetic energy and the potential energy of gravity. Positive elastic energy is left out, because
-unconverged sweeps store much ½kx² without diverging.
-
-:meth:`Balance.surplus` is stricter: elastic energy and that of contact count too, but for what unconverged steps leave. After
-such steps elastic energy counts as far as it exceeds that of a uniform strain of 2 %, and that of a single element beyond a
-strain of 5 %, both in the norm √U.
+Divergence is judged by kinetic energy and the potential energy of gravity, with u = v − ½hω²x for v in symplectic Euler.
+:meth:`Balance.surplus` is stricter: elastic energy and that of contact count too. After unconverged steps elastic energy counts
+beyond that of a uniform strain of 2 %, and that of a single element beyond a strain of 5 %, both in the norm √U.
 
 Euler steps with a semi-definite Hessian never raise the sum: E₁ − E₀ = −½‖v₁ − v₀‖²_M + U(x₁) − U(x₀) − ∇U(x₁)·(x₁ − x₀). BDF2
-does not raise ¼(5‖z₁‖² − 4z₁·z₀ + ‖z₀‖²) (Dahlquist 1978), with ‖z‖² twice the energy; this is at least ¼‖z₁‖², and ½‖z₀‖² at
-the start, so the energy stays below twice that at the start. Midpoint conserves the energy of a quadratic U. Contact that
-begins within a step adds energy without a known bound; midpoint is held to the bound of BDF2.
-
-In symplectic Euler, velocities are half a step behind positions. For x″ = −ω²x, with u = v − ½hω²x, it conserves u² + ω²x²(1 −
-ω²h²/4). So u, which never exceeds that below the limit ωh = 2, replaces v.
+does not raise ¼(5‖z₁‖² − 4z₁·z₀ + ‖z₀‖²) (Dahlquist 1978), with ‖z‖² twice the energy, which so stays below twice that at the
+start. Midpoint conserves the energy of a quadratic U; as contact that begins within a step adds energy, it is held to the bound
+of BDF2.
 """
 
 from functools import cached_property

@@ -1,7 +1,7 @@
 """The elastic energy that cloth may gain when a body pulls it from what holds it.
 
-With w the velocity field of a rigid body, its power on elastic cloth is Σ ∇U·w over the elements between held and other
-vertices. For springs it is at most √(2U Σk) ‖w‖, so √U grows by at most √(½Σk) times the body's relative way.
+With w the velocity of a rigid body, the power is Σ ∇U·w over the elements between held and other vertices. For springs √U grows
+by at most √(½Σk) times the body's relative way.
 """
 
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""Sources of energy for a cloth: upper bounds of the energy that the start, pins, loads and colliders add.
+"""Sources of energy for a cloth: upper bounds of what the start, pins, loads and colliders add, as docs/stability.md states.
 
 A part of a scene that adds energy registers a function for its type with ``source_of.register``.
 """
@@ -56,11 +56,10 @@ def source_of(part, balance, stepper):
 
 @source_of.register(Stepper)
 class Start(Source):
-    """Kinetic, elastic and contact energy at the start.
+    """Kinetic, elastic and contact energy at the start, and that of closing the gaps of constraints in one step.
 
-    Hard constraints count with the energy of closing their gaps in one step, soft ones too for solvers whose sweeps may do so
-    (``closes``). A chain of N moves its end by up to Σ gap ≤ √(N Σ gap²); midpoint or a relaxation of 2 doubles the speed. Gaps
-    of rounding have random signs and do not add up, so N is then 1.
+    Soft constraints count for solvers whose sweeps may close them (``closes``). A chain of N moves its end by up to Σ gap ≤ √(N
+    Σ gap²); midpoint or a relaxation of 2 doubles the speed.
     """
 
     name = "the start"
@@ -79,7 +78,7 @@ class Start(Source):
 
     @staticmethod
     def _of_chains(model, elastic, closed):
-        """Returns ½N Σ gap² of constraints at the start (B,) [m²]."""
+        """Returns ½N Σ gap² of constraints at the start (B,) [m²], with N = 1 for gaps of rounding."""
         gaps = elastic.gaps(model.positions, closed)
         points = model.in_scene_order(model.positions.numpy()).astype(np.float64)
         rounding = np.finfo(model.numpy_dtype).eps * points * np.random.default_rng(0).choice([-1.0, 1.0], points.shape)
@@ -91,12 +90,10 @@ class Start(Source):
 
 
 class MovingPins(Source):
-    """Pins that keyframes move.
+    """Pins that keyframes move; those joined by edges form a patch, with which the cloth may move as a rigid body.
 
-    Pins joined by edges form a patch, with which the cloth may move as a rigid body at no cost. A change δ of the speed of a
-    patch, over the whole cloth, adds at most ½δ² + δ·speed per unit mass. Beyond that, only motion against gravity and constant
-    loads adds energy. Patches that move relative to one another store at most the energy of the start deformed by the mean of
-    their motions, with weights 1/distance². Colliders may hold the cloth, so a single patch pulls it, too.
+    A change δ of the speed of a patch adds at most ½δ² + δ·speed per unit mass. Patches that move relative to one another store
+    at most the energy of the start deformed by the mean of their motions, with weights 1/distance².
     """
 
     name = "moving pins"
@@ -188,10 +185,8 @@ class MovingPins(Source):
 
 
 class DrivenLoads(Source):
-    """Loads that change or follow the cloth, and all loads on a free cloth; others count as potential energy.
-
-    Forces f on masses m have the power Σ f·v ≤ (Σ f²/m · Σ m v²)^½. With a² = Σ f²/m / Σ m a frame adds the speed δ = a/fps,
-    and so at most ½δ² + δ·speed per unit mass.
+    """Loads that change or follow the cloth, and all loads on a free cloth: in a frame at most ½δ² + δ·speed per unit mass, δ =
+    (Σ f²/m / Σ m)^½/fps.
     """
 
     name = "loads"
@@ -271,11 +266,8 @@ def moving_collider(collider, balance, stepper):
 
 
 class MovingCollider(Source):
-    """A collider that keyframes move.
-
-    In a frame in which its surface moves at V, it may give each vertex a velocity of up to 2V, and move it against gravity and
-    constant loads by V over the frame rate. A half-space that turns counts as large as the cloth. It also pulls cloth that
-    something else holds.
+    """A collider that keyframes move: at a surface speed V it may give each vertex 2V, move it by V over the frame rate, and
+    pull the cloth.
     """
 
     name = "moving colliders"
@@ -312,10 +304,8 @@ def _blowing(air: Air, balance, _stepper):
 
 
 class Wind(Source):
-    """Wind w on a cloth of area A, which gives at most the power Σ ½ρA(C_n + C_t)(w + |v|)w².
-
-    As the force is c(w − v) with c ≤ ½ρAC(w + |v|), its power is at most cw²/4; the factor 4 allows for growing areas and fast
-    triangles. For free cloth, w is relative to its centre of mass, whose speed is at most that of the start and a free fall.
+    """Wind w on a cloth of area A, of at most the power Σ ½ρA(C_n + C_t)(w + |v|)w²; for free cloth relative to its centre of
+    mass.
     """
 
     name = "wind"

@@ -10,14 +10,7 @@ in SI units and world space, standard ones in the units of the stage; where both
     token warpcloth:terms:bending:type = "QuadraticBending"
     double warpcloth:terms:bending:stiffness = 1e-5
 
-Other data of a stage:
-
-- Rest shape: the default points, transformed as at the first frame. Animated points are the start of the cloth and move its
-  pinned vertices.
-- Pins: the union of `warpcloth:pins`, `primvars:pins`, and the GeomSubsets of :func:`.stage.pinned_points`.
-- Frames per second: the stage's framesPerSecond, else its timeCodesPerSecond. Duration: `warpcloth:duration`, else the
-  whole frames from start to end time code, else 1 s.
-- Gravity: `warpcloth:gravity`, else the PhysicsScene's, else 9.81 m/s² down the stage's up axis.
+docs/usd.md says how rest shape, pins, frame rate, duration and gravity are found.
 """
 
 from dataclasses import dataclass, fields

@@ -38,9 +38,9 @@ class ChunkWriter:
     - `manifest.usda`: the names of the animated attributes.
 
     Files are written under temporary names and renamed; the root is replaced after each chunk. So a killed process leaves a
-    result that opens, without at most one chunk; a power failure may lose more (no fsync). An earlier result stays whole until
-    the first chunk is written, or for .usdz the package. Memory holds one chunk. An output has one writer at a time, in all
-    processes. An interrupt (Ctrl-C) waits for a chunk or `close`; a second one does not.
+    result that opens, without at most one chunk; a power failure may lose more. An earlier result stays whole until the first
+    chunk is written, or for .usdz the package. An output has one writer at a time, in all processes. An interrupt (Ctrl-C)
+    waits for a chunk or `close`; a second one does not.
 
     A run removes the files of earlier runs to the output, except those that it reads and complete frames of a .usdz that was
     not packed; nothing else, and nothing behind a link.

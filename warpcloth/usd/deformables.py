@@ -1,6 +1,6 @@
 """Reads and writes cloth by the names of the AOUSD proposal for deformable bodies and of Newton, the physics engine.
 
-Two laws give the names a meaning. K, G and D are `surfaceStretchStiffness`, `surfaceShearStiffness` [N/m] and
+Two laws, in docs/usd.md, give the names a meaning. K, G and D are `surfaceStretchStiffness`, `surfaceShearStiffness` [N/m] and
 `surfaceBendStiffness` [N·m], t is the thickness; a hinge has the edge e and triangles of areas A₁ and A₂:
 
 | Name | "proposal" | "newton" |
