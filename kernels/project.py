@@ -330,7 +330,7 @@ def correct_in_place(
 
     A thread takes ``each`` elements in order from first + thread·each on; a negative ``each`` reverses it. On a GPU that is one
     element of a colour, whose elements share no free vertex, or all of a copy; on the CPU all. If ``cleared``, it skips
-    elements whose vertex has moved less than ``clear``, until one was not skipped.
+    elements whose vertex has moved less than ``clear``; one that was not skipped once never is again.
     """
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)

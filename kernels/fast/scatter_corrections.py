@@ -60,8 +60,8 @@ def scatter_correction(
 ):
     """Kernel over elements: adds factorₑ Δxᵢ [m] of each element to out, and factorₑ Δλ to λ.
 
-    If ``cleared``, one thread loops over all elements and skips those whose vertex has moved less than ``clear``, until one was
-    not skipped.
+    If ``cleared``, one thread loops over all elements and skips those whose vertex has moved less than ``clear``; one that was
+    not skipped once never is again.
     """
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)

@@ -40,17 +40,7 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
     """Reads fabrics from a file, by name.
 
     A .json file is a material of ARCSim: density [kg/m²], stretching [N/m], bending [N·m], named as the file. A .csv file has a
-    fabric in each row, with a column ``name`` and columns of KES-F or FAST. Names that end with 1 or warp, or 2 or weft, such
-    as ``B1`` or ``E5 warp``, are of that direction, others of both. Other columns are ignored. A number without a value stays
-    None.
-
-    | KES-F | | FAST | |
-    |---|---|---|---|
-    | W | mg/cm² | W | g/m² |
-    | T | mm | T or T2 | mm |
-    | B | gf·cm²/cm | B, or C | µN·m, mm |
-    | G | gf/(cm·degree) | G, or EB5 | N/m, % |
-    | EMT, WT, LT (two of these) | %, gf·cm/cm², 1 | E5 and E20, or E100 | % |
+    fabric in each row, with a column ``name`` and columns of KES-F or FAST, named as in docs/fabrics.md.
 
     ``notes`` says what was derived and ignored.
 

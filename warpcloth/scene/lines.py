@@ -7,7 +7,7 @@ _SPRING, _BODY = 0.05, 0.15
 
 
 def lines_of(scene):
-    """Finds the pairs of vertices (E, 2) that a term joins, one without a triangle, and their thickness [m], by label.
+    """Finds the pairs of vertices (E, 2) that a term joins, at least one without a triangle, and their thickness [m], by label.
 
     Springs give their pairs, rigid bodies the minimum spanning tree of vertices without a triangle, edge meshes none.
     """

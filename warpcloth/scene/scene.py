@@ -105,7 +105,7 @@ class Scene:
         fps: Frames per second.
         name: Name in reports and files.
         stage: The :class:`warpcloth.usd.StageMesh` of ``mesh``, over which animations are layers; or None.
-        free_axes: Axes along which each vertex may move, (n, 3) booleans, by default all, as for planes of symmetry and rails.
+        free_axes: Axes along which each vertex may move, (n, 3) booleans, as for planes of symmetry and rails; by default all.
             Without a free axis a vertex is a fixed pin. Values of pins are ignored.
         loads: :class:`Force`, :class:`Traction`, :class:`Pressure`.
         colliders: The colliders, such as :class:`warpcloth.Sphere`; pins do not collide.

@@ -57,8 +57,8 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
 
 
 def segments(centres, vectors, nowhere):
-    """Returns the ends c ± v/2 (2E, 3) [m] of segments of centres and vectors (E, 3) [m]; of length 0 where NaN, ``nowhere``
-    (3,) without any.
+    """Returns the ends c ± v/2 (2E, 3) [m] of segments of centres c and vectors v (E, 3) [m]: of length 0 where NaN, and at
+    ``nowhere`` (3,) if no centre is finite.
     """
     placed = np.isfinite(centres).all(axis=1)[:, None]
     # In the middle of the others, so that invisible segments do not enlarge the extent.
