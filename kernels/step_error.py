@@ -101,8 +101,8 @@ def energy_above():
 
 @cache
 def unresolved_contact(dtype):
-    """Kernel over vertices: counts frames in a row where half of a contact force f is unbalanced and f h²/m > r, so that it would move
-    the vertex out of contact in a step.
+    """Kernel over vertices: counts frames in a row where half of a contact force f is unbalanced and f h²/m > r, so that it
+    would move the vertex out of contact in a step.
 
     ``forces`` are of colliders, ``forces_of_cloth`` of self-contact or None, ``r`` the contact distances. out = (1, 0, 0) after
     two such frames.

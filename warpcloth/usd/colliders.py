@@ -27,8 +27,8 @@ _SAME = 1e-5
 def read_colliders(stage, cloths, surroundings, codes):
     """Reads the colliders of a stage, in the order of its prims.
 
-    A collider is a shape, visible or not, with PhysicsCollisionAPI or `warpcloth:collider`, on it or on the Xform above;
-    cloth is none. Planes, spheres, capsules and cubes become primitives if their scale allows it; other shapes, and those that change
+    A collider is a shape, visible or not, with PhysicsCollisionAPI or `warpcloth:collider`, on it or on the Xform above; cloth
+    is none. Planes, spheres, capsules and cubes become primitives if their scale allows it; other shapes, and those that change
     in size, meshes. ``codes`` turns time codes of samples into those of frames.
 
     Raises:
