@@ -79,11 +79,11 @@ def sh(*commands):
 
 
 def described(kind, name):
-    """The docstring of a name and of its members, but for old names of fields and for properties that have none."""
+    """The docstring of a name and of its members, except properties that have none."""
     value = getattr(wc, name)
     bare = [each for each, of_class in vars(value).items() if isinstance(of_class, property) and not of_class.__doc__]
     bare += getattr(value, "_fields", ())  # of named tuples, whose docstrings only count them
-    left_out = ", ".join([*getattr(value, "renamed_fields", ()), *bare])
+    left_out = ", ".join(bare)
     path = value.__name__ if kind == "module" else f"warpcloth.{name}"
     options = {"class": ["members:"], "module": ["members:"], "data": ["no-value:"]}.get(kind, [])
     options += [f"exclude-members: {left_out}"] * bool(left_out)

@@ -30,8 +30,6 @@ INSTEAD = {
 }
 # "In place" is the field's.
 ALLOWED = {"in_place", "correct_in_place", "launch_in_place", "refuse_in_place"}
-# Old names that work for one release.
-ALIASES = {"warpcloth/analysis/analysis.py": {"places"}}
 
 
 def words(name):
@@ -66,4 +64,4 @@ def test_docstrings_open_with_a_statement(path):
 def test_names_are_words_of_the_field(path):
     found = {name for name in read(path)[1] if name.lower().strip("_") not in ALLOWED}
     wrong = {name for name in found if INSTEAD.keys() & set(words(name))}
-    assert wrong == ALIASES.get(path, set()), {word: INSTEAD[word] for name in wrong for word in words(name) if word in INSTEAD}
+    assert not wrong, {word: INSTEAD[word] for name in wrong for word in words(name) if word in INSTEAD}

@@ -242,7 +242,7 @@ def warnings_once():
 
     def show(message, category, filename, lineno, file=None, line=None):
         text = printable(" ".join(str(message).split()))
-        if category in (UserWarning, DeprecationWarning) and text not in texts:
+        if category is UserWarning and text not in texts:
             texts.add(text)
             print("warpcloth: warning:", text, file=sys.stderr)
 

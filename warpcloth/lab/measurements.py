@@ -128,7 +128,7 @@ def task(function, **arguments):
 def usable(row):
     """Returns whether the run of a row counts as usable without a reference, see :class:`warpcloth.core.status.Grade`.
 
-    Rows without a grade, as of results that were stored before there were grades, do.
+    Rows without a grade do.
     """
     return row.get("grade") != Grade.NOT_USABLE.value
 

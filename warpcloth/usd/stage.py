@@ -53,8 +53,8 @@ def read_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh) 
 def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh, time: float | None = None) -> StageMesh:
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
-    The points at the default time are the rest shape. If points have only time samples, the first is read, with a warning. This
-    is deprecated, for the first frame need not be at rest. Holes are omitted. Polygons are cut into triangles as
+    The points at the default time are the rest shape. If points have only time samples, the first is read, with a
+    warning, for the first frame need not be at rest. Holes are omitted. Polygons are cut into triangles as
     `polygons.cut` says. Their winding is reversed if the prim is left-handed or its transform mirrors, so that triangle normals
     point to the front. The up axis is kept.
 
@@ -78,8 +78,8 @@ def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = 
     found = stage_mesh(path, prim, kind, time)
     if time is None and not found.rest:
         warnings.warn(
-            f"{path}, prim {found.prim}: points have no default value; their first sample is taken as the rest shape. "
-            "This is deprecated: author the rest shape as the default",
+            f"{path}, prim {found.prim}: points have no default value; their first sample is taken as the rest shape; "
+            "author the rest shape as the default",
             stacklevel=2,
         )
     return found
