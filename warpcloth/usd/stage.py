@@ -183,16 +183,6 @@ def open_stage(path):
     return stage
 
 
-def flattened(path: FilePath) -> str:
-    """A stage as the text of one .usda file, with the contents of the files it refers to, except value clips.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is not a USD stage.
-    """
-    return open_stage(path).ExportToString(addSourceFileComment=False)
-
-
 def find_prim(stage, path, prim=None):
     """Finds the prim of the cloth.
 
