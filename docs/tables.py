@@ -181,14 +181,14 @@ TABLES = {
     "residuals": residuals,
     "attributes": attributes,
     "term attributes": term_attributes,
-    "options": options,
-    "solver options": solver_options,
 }
+# Tables that the site alone has. Their markers in the checkout have nothing between them.
+IN_SITE = {"options": options, "solver options": solver_options}
 
 
-def filled(text):
+def filled(text, tables=TABLES):
     """The text of a page with its tables as the code has them now."""
-    for name, made in TABLES.items():
+    for name, made in tables.items():
         marked = f"<!-- {name} -->\n"
         if marked in text:
             text = re.sub(rf"(?s)({marked}).*?(<!-- end -->)", lambda m, made=made: m[1] + made() + m[2], text)
