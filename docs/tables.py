@@ -48,7 +48,8 @@ def solvers():
             takes += "; finite stiffness only"
         else:
             takes += "; infinite stiffness too" + (f", but not for {listed(hard)}" if hard else "")
-        rows.append([f"`{record.__name__}`", record.facts.method, takes])
+        first = next((row[0] for row in rows if "but not for" in takes and row[2] == takes), None)
+        rows.append([f"`{record.__name__}`", record.facts.method, f"as {first}" if first else takes])
     return table(("Solver", "Method", "Supports"), rows)
 
 
