@@ -1,6 +1,7 @@
 """Makes the pages that follow from the code when the site is built.
 
-There is one for each energy, solver, scene and fabric, one of the failures, the reference of Python, and the changes.
+There is one for each energy, solver, scene and fabric, one of the failures, the reference of Python, and the changes. The
+tables of options are put into the page of the command line.
 """
 
 import inspect
@@ -449,9 +450,10 @@ def write_pages(app):
 
 
 def lead_inside(app, document, source):
-    """Puts the texts of the site into a page."""
+    """Puts the texts and the tables of the site into a page."""
     for outside, inside in OUTSIDE.items():
         source[0] = source[0].replace(outside, inside)
+    source[0] = tables.filled(source[0], tables.IN_SITE)
 
 
 def escape(app, what, name, value, options, lines):
