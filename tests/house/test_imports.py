@@ -10,9 +10,8 @@ import warpcloth
 
 PACKAGE = Path(warpcloth.__file__).parent
 HEAVY = {"warp", "scipy", "trimesh", "matplotlib", "pxr", "tqdm", "PIL", "av"}
-# The command line imports what loads Warp where it is used; the package passes its names on when one is first used; and what a
-# Dask worker is sent by value imports the rest of its module there.
-DEFERRED = ("cli/", "__init__.py", "lab/cluster.py")
+# The command line imports what loads Warp where it is used; the package passes its names on when one is first used.
+DEFERRED = ("cli/", "__init__.py")
 # Answers of the command line in a process that cannot import Warp.
 WITHOUT_WARP = """
 import json, sys

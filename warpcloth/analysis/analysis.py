@@ -1,6 +1,5 @@
 """Measures of an animated cloth: deformation, strain, rotation and their rates."""
 
-import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from os import PathLike
@@ -53,7 +52,6 @@ def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, *
         >>> round(float(measured["area_ratio"][1, 0]), 6)
         2.25
     """
-    frames, mesh = _frames_first("analyze", frames, mesh)
     analyzer = Analyzer(frames, mesh, dt, **options)
     values = {
         measure.name: np.empty((len(analyzer.pairs), analyzer.count, *measure.shape), analyzer.dtype)
@@ -120,7 +118,6 @@ class Analyzer:
         device: str = "cpu",
         dtype: Precision = "float64",
     ) -> None:
-        frames, mesh = _frames_first("Analyzer", frames, mesh)
         self._given = {name: value for name, value in locals().items() if name != "self"}
         choice("rates", rates, tuple(RATES))
         choice("dtype", dtype, tuple(DTYPES))
@@ -186,11 +183,6 @@ class Analyzer:
             return points
         a, b, c = self.mesh.triangles.T
         return (points[a] + points[b] + points[c]) / 3.0
-
-    def places(self, points: np.ndarray) -> np.ndarray:
-        """Old name of :meth:`positions`."""
-        warnings.warn("Analyzer: places is now called positions", DeprecationWarning, stacklevel=2)
-        return self.positions(points)
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -288,14 +280,6 @@ def _missing(labels):
 
 def _frame(label, reason):
     return Exclusion(label, "frame", np.empty(0, dtype=int), reason)
-
-
-def _frames_first(name, frames, mesh):
-    """Returns frames and mesh; if they are given in the old order, mesh first, swaps them with a warning."""
-    if isinstance(frames, Mesh) or (frames is None and mesh is not None and not isinstance(mesh, Mesh)):
-        warnings.warn(f"{name}: frames come first now, {name}(frames, mesh)", DeprecationWarning, stacklevel=3)
-        return mesh, frames
-    return frames, mesh
 
 
 def _sequence(mesh, frames, dt):

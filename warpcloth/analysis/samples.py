@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..base.renamed import renamed
 from ..mesh.mesh import Mesh
 from .measures import Measure
 
@@ -38,7 +37,6 @@ class Exclusion:
         return f"{where}, {count}{kind} {named}: {self.reason}"
 
 
-@renamed(place="index")
 @dataclass(frozen=True, eq=False)
 class Sample:
     """One row of an analysis: a frame measured against its reference.

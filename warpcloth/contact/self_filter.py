@@ -459,10 +459,10 @@ class SelfFilter:
         self.launch_limit(self._direction)
         self._add(before, self._direction, 1.0, d)
 
-    def launch_trial(self, base, d, active=None, part=None):
-        """Lists the pairs at base + d again, in copies that are ``active`` (B,), as :meth:`launch_fresh` does."""
+    def launch_trial(self, base, d, active=None):
+        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if any may be missing there."""
         self._add(base, d, 1.0, self._contact.x_before, active)
-        self.launch_fresh(self._contact.x_before, self._contact.relist, active, part)
+        self.launch_fresh(self._contact.x_before, self._contact.relist, active, 0.5)
 
     def launch_limit(self, direction, whole=False):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
@@ -499,7 +499,7 @@ class SelfFilter:
 
     def launch_near_trial(self, base, d):
         """Launches :meth:`launch_trial` if :meth:`launch_look` found that pairs may be near."""
-        wp.capture_if(self._contact.near.array, self.launch_trial, base=base, d=d, part=0.5)
+        wp.capture_if(self._contact.near.array, self.launch_trial, base=base, d=d)
 
     def launch_follow(self, base, d):
         """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs.

@@ -241,7 +241,7 @@ class PairSystem(CorrectedSystem):
         """Launches U and ∂U/∂x at the trial d + step·p."""
         given = [self._d, self._direction, self.model.per_copy]
         self._launch_on(set_trial, self.model.count, given, [self._state, self._trial, self._pull])
-        self._pairs.filter.launch_trial(self.x, self._trial, part=0.5)
+        self._pairs.filter.launch_trial(self.x, self._trial)
         self._dynamic.launch(self.x, self._trial)
         self._dynamic.add_energy(self._sums, self._state.other)
         self._dynamic.add_gradient(self._pull)

@@ -80,6 +80,25 @@ def find_source(name, pins=None):
         FileNotFoundError: There is no such file or name.
         ValueError: The file cannot be loaded, or has no function ``scene``.
     """
+    path = find_path(name)
+    if path.suffix == ".py":
+        return _python_source(path, pins)
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        animation = path.suffix.lower() in (".abc", ".npz", ".npy", *CACHES)
+        hint = "; 'warpcloth convert' makes a stage of .pc2, .mdd, .npz and numbered .obj files" if animation else ""
+        raise ValueError(f"{path}: is no scene; it must be {_KINDS}{hint}")
+    parameters = parameters_of(read)
+    del parameters["path"]
+    return SceneSource(path, lambda **values: read(str(path), **values), parameters, pins)
+
+
+def find_path(name):
+    """Finds the file of a scene, as :func:`find_source`, and does not read it.
+
+    Raises:
+        FileNotFoundError: There is no such file or name.
+    """
     path = Path(name)
     if not path.suffix and path.name == str(name):
         candidates = [folder / f"{name}.py" for folder in folders()]
@@ -92,16 +111,7 @@ def find_source(name, pins=None):
             )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: {'is a folder, no scene' if path.is_dir() else 'there is no such file'}")
-    if path.suffix == ".py":
-        return _python_source(path, pins)
-    read = _READERS.get(path.suffix.lower())
-    if read is None:
-        animation = path.suffix.lower() in (".abc", ".npz", ".npy", *CACHES)
-        hint = "; 'warpcloth convert' makes a stage of .pc2, .mdd, .npz and numbered .obj files" if animation else ""
-        raise ValueError(f"{path}: is no scene; it must be {_KINDS}{hint}")
-    parameters = parameters_of(read)
-    del parameters["path"]
-    return SceneSource(path, lambda **values: read(str(path), **values), parameters, pins)
+    return path
 
 
 def _python_source(path, pins):

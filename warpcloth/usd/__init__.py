@@ -9,7 +9,7 @@ from ..mesh.sequences import OPENERS
 from .frames import FrameSequence, JoinedFrames, open_sequence
 from .measures import MeasureWriter
 from .scene import read_scene, write_scene
-from .stage import StageMesh, flattened, read_mesh, read_stage_mesh
+from .stage import StageMesh, read_mesh, read_stage_mesh
 from .writer import AnimationWriter
 
 READERS.update(dict.fromkeys(STAGE_ENDINGS, read_mesh))
@@ -21,7 +21,6 @@ __all__ = [
     "JoinedFrames",
     "MeasureWriter",
     "StageMesh",
-    "flattened",
     "read_mesh",
     "read_scene",
     "read_stage_mesh",

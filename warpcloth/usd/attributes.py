@@ -57,9 +57,6 @@ class Attribute:
         return self.field.startswith("terms.") or self.field in _INFINITE
 
 
-# An attribute of earlier versions.
-ELEMENTS = "warpcloth:contact:elements"
-
 _INFINITE = ("(gravity magnitude)", "contact.stiffness", "(attachment stiffness)", "(shell thickness)")
 
 ATTRIBUTES = (
@@ -208,8 +205,6 @@ class Values:
         rows = [row for row in attributes() if row.location in self.locations]
         known = {row.name.replace("<name>", key) for row in rows for key in (*self.terms, *self.loads, "")}
         unknown = sorted(set(names) - known)
-        if ELEMENTS in unknown:
-            raise ValueError(f"{ELEMENTS} is not needed, as meshes always touch vertices, edges and faces of cloth; remove it")
         if unknown:
             for key in self.terms:  # an unknown type of a term may be the reason
                 kind_of(self, key)

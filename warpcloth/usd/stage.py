@@ -53,8 +53,8 @@ def read_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh) 
 def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh, time: float | None = None) -> StageMesh:
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
-    The rest shape is at the default time; without default points, the first sample is read with a warning (deprecated). Holes
-    are omitted, and polygons cut into triangles. Triangle normals point to the front.
+    The rest shape is at the default time; without default points, the first sample is read, with a warning. Holes are omitted,
+    and polygons cut into triangles. Triangle normals point to the front.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
@@ -76,8 +76,8 @@ def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = 
     found = stage_mesh(path, prim, kind, time)
     if time is None and not found.rest:
         warnings.warn(
-            f"{path}, prim {found.prim}: points have no default value; their first sample is taken as the rest shape. "
-            "This is deprecated: author the rest shape as the default",
+            f"{path}, prim {found.prim}: points have no default value; their first sample is taken as the rest shape; "
+            "author the rest shape as the default",
             stacklevel=2,
         )
     return found
@@ -176,16 +176,6 @@ def open_stage(path):
             raise ValueError(f"{path}: is no USD stage ({reason_of(error)})") from None
         check_stage(stage, path)
     return stage
-
-
-def flattened(path: FilePath) -> str:
-    """A stage as text of one .usda file, without value clips.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is not a USD stage.
-    """
-    return open_stage(path).ExportToString(addSourceFileComment=False)
 
 
 def find_prim(stage, path, prim=None):
