@@ -17,6 +17,7 @@ from ..memory import load, store
 from ..rotation import epsilon
 from ..terms.contact import ROUNDED_BOX
 from ..vectors import types
+from .guard import ContactFactories
 
 
 @cache
@@ -42,18 +43,6 @@ def guard_struct(dtype):
         drift: dtype
 
     return Guard
-
-
-@wp.struct
-class NoGuard:
-    """Struct of steps without colliders, which has fewer parameters."""
-
-    per_copy: int
-
-
-def guard_type(dtype, guarded: bool):
-    """:func:`guard_struct` if ``guarded``, else :class:`NoGuard`."""
-    return guard_struct(dtype) if guarded else NoGuard
 
 
 @cache
@@ -130,3 +119,6 @@ def touching_step(dtype, symplectic: bool):
         return end, velocity
 
     return touch
+
+
+CONTACT_GUARD = ContactFactories(guard_struct, in_ball, touching_step)
