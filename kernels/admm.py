@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .contact.clear_elements import is_clear
+from .assemble import is_clear
 from .local import local_coordinate
 from .local_minimiser import local_minimiser
 from .memory import load, load_shared, store

@@ -7,9 +7,8 @@ from functools import cache
 
 import warp as wp
 
-from .contact.pair_sums import pair_blocks, turned_pull
-from .contact.self_pairs import Pairs
 from .memory import add_to, load
+from .pairs import Pairs, pair_blocks, turned_pull
 from .vectors import types
 
 LANES = 4

@@ -1,8 +1,10 @@
-"""Kernels over points: their distance to a surface of triangles."""
+"""Kernels over points: their distance to a surface of triangles, or to a solid."""
 
 from functools import cache
 
 import warp as wp
+
+from .terms.contact import gap_to
 
 # A triangle is flat if its normal, over the square of its longest side, is shorter: its direction is then rounding error.
 FLAT = wp.constant(wp.float64(1e-12))
@@ -92,5 +94,27 @@ def faces():
         query = wp.mesh_query_point_no_sign(mesh, points[i], FAR)
         if query.result:
             out[i] = query.face
+
+    return find
+
+
+@cache
+def find_distances(solid):
+    """Kernel over points in the frame of a shape: their signed distances [m]."""
+    gap = gap_to(solid)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find(
+        # state in
+        points: wp.array(dtype=wp.vec3d),
+        # parameters
+        half: wp.vec3d,
+        radius: wp.float64,
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        d, _n = gap(points[i], half, radius)
+        out[i] = d
 
     return find

@@ -132,3 +132,37 @@ class Term:
         if self.vertices == 0:
             return self.quadratic
         return any(function is not None for function in (self.project, self.constraint, self.prox))
+
+
+@dataclass(frozen=True)
+class PairTerm:
+    """The record of an energy of pairs.
+
+    Attributes:
+        name: Its name in reports.
+        module: Name of the Warp module of its kernels, without the precision.
+        rows: The number of its constraint rows.
+        data: Warp struct of the values of each pair in the step, among them its normal n.
+        near: Function of a precision, which makes the device function (pairs, data, e, x, d, always) → whether pair e may have
+            a force at x + d, v, n and w, for a sweep. v is the y of friction, and the gap along n of contact. With ``always``,
+            w and v are found in any case.
+        push: Device function (data, e, v, n, D, least, h, hard) → λ = −h²∂U/∂y at v + Dλ [kg·m], v without the force of the
+            pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.contact.pair_sweeps`.
+        row: Device function (pairs, data, e, x, d) → :class:`.contact.pair_sums.PairRow`.
+        isotropic: Whether D is that of a vertex without locked axes, because ``push`` needs one D for all directions.
+        turns: Whether w changes with the positions, see :class:`.contact.pair_sums.PairForces`. The data then has a ``normal``.
+    """
+
+    name: str
+    module: str
+    rows: int
+    data: Any
+    near: Callable
+    push: Callable
+    row: Callable
+    isotropic: bool
+    turns: bool = False
+
+    def of(self, dtype, scatters):
+        """Returns the name of the module of its sums. Those that gather are in one of their own, for the CPU needs none."""
+        return f"{self.module}.{dtype.__name__}" + ("" if scatters else ".gather")

@@ -11,7 +11,7 @@ from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..vectors import types
 from .block_forces import add_block_forces
-from .contact_guard import guard_type, in_ball, touching_step
+from .guard import ContactFactories, guard_type
 from .term_facts import TermFacts, chain_of
 
 
@@ -22,18 +22,19 @@ def block_step(
     symplectic: bool,
     flags: str,
     compensated: bool = False,
-    guarded: bool = False,
+    contact: ContactFactories | None = None,
     moving: bool = False,
 ):
     """Kernel over copies, block by block: v, x after a step with a = g − ∇U/m.
 
     ``gradient`` is that of other terms, and is reset. ``flags`` are compiler flags of the CPU, ``compensated`` that of
-    :func:`..explicit_step.kick_and_drift`, ``guarded`` includes contact with colliders, of which some move if ``moving``.
+    :func:`..explicit_step.kick_and_drift`, ``contact`` is that with colliders, of which some move if ``moving``.
     """
     vec3, _ = types(dtype)
     add, step = add_block_forces(parts, dtype, compensated), kick_and_drift(dtype, symplectic, compensated)
     vector, number, whole, put = load(vec3), load(dtype), load(wp.int32), store(vec3)
-    clear, touch = (in_ball(dtype, moving), touching_step(dtype, symplectic)) if guarded else (None, None)
+    clear, touch = contact.functions(dtype, symplectic, moving) if contact else (None, None)
+    guarded = contact is not None
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
     def step_blocks(
@@ -42,7 +43,7 @@ def block_step(
         vertices: wp.array(dtype=wp.int32),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        guard: guard_type(dtype, guarded),
+        guard: guard_type(dtype, contact),
         # parameters
         h: dtype,
         # in and out, the first two scratch

@@ -17,6 +17,7 @@ from ..memory import load, store
 from ..rotation import epsilon
 from ..terms.contact import ROUNDED_BOX
 from ..vectors import types
+from .guard import ContactFactories
 
 
 @cache
@@ -42,17 +43,6 @@ def guard_struct(dtype):
         drift: dtype
 
     return Guard
-
-
-@wp.struct
-class NoGuard:
-    """Struct of steps without colliders."""
-
-    per_copy: int
-
-
-def guard_type(dtype, guarded: bool):
-    return guard_struct(dtype) if guarded else NoGuard
 
 
 @cache
@@ -128,3 +118,6 @@ def touching_step(dtype, symplectic: bool):
         return end, velocity
 
     return touch
+
+
+CONTACT_GUARD = ContactFactories(guard_struct, in_ball, touching_step)

@@ -7,7 +7,7 @@ from functools import cache
 
 import warp as wp
 
-from ..contact.clear_elements import is_clear
+from ..assemble import is_clear
 from ..memory import load, load_shared, store
 from ..project import element_change, multiplier_type
 from ..term import Term

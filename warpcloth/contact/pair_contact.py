@@ -4,7 +4,7 @@ import warp as wp
 
 from ..base.limits import refuse_memory
 from ..core.capture import Mirror
-from ..core.dynamic import DynamicElements
+from ..core.dynamic_elements import DynamicElements
 from ..core.filled import filled
 from ..kernels.block_rows import LANES
 from ..kernels.contact import pair_follow

@@ -3,10 +3,10 @@
 import numpy as np
 import warp as wp
 
-from ..core.dynamic import DynamicElements
+from ..core.dynamic_elements import DynamicElements
 from ..core.filled import filled
 from ..kernels.contact import self_friction as kernels
-from ..kernels.contact.self_pairs import Pairs
+from ..kernels.pairs import Pairs
 
 
 class Slips:
@@ -14,7 +14,7 @@ class Slips:
 
     Attributes:
         room: The number of contacts that fit.
-        pairs: :class:`warpcloth.kernels.contact.self_pairs.Pairs` with ``first``, ``stencils`` and ``corners``.
+        pairs: :class:`warpcloth.kernels.pairs.Pairs` with ``first``, ``stencils`` and ``corners``.
         slips: (room,), see :func:`warpcloth.kernels.contact.self_friction.end_friction`.
         grow: A function that allocates memory for a number of contacts, by default for this object alone.
     """

@@ -17,6 +17,7 @@ from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes
 from ..kernels.contact.pair_potential import Laws
 from ..kernels.contact.piece_motion import add_positions
 from ..kernels.contact.self_filter import HeldPins, copies_with_pairs
+from ..kernels.pairs import Pairs
 from ..kernels.terms.contact import FLOOR
 from .collider_steps import cut_share
 from .pair_contact import PairContact
@@ -194,7 +195,7 @@ class SelfSteps:
 
         lists = {name: getattr(found, name) for name in ("stencils", "counts", "rows", "distances")}
         threads = 1 if device.is_cpu else capacity
-        self.pairs = filled(self_pairs.Pairs, layout=self.surface.layout, threads=threads, **lists)
+        self.pairs = filled(Pairs, layout=self.surface.layout, threads=threads, **lists)
         self.begun = filled(self_pairs.StepPairs, normal=room(wp.vec3d), weights=room(wp.vec4d), gap=room(wp.float64))
         self.contact.hold(self.pairs, self.begun.normal)
 

@@ -6,6 +6,7 @@ import warp as wp
 from ..core.filled import filled
 from ..kernels.contact import obstacles as kernels
 from ..kernels.coulomb import law_of
+from ..kernels.pairs import Layout
 from ..mesh.mesh import Mesh
 from ..scene.mesh_collider import first_extended
 from ..terms.needs import listed
@@ -21,7 +22,8 @@ class ContactSurface:
         meets_itself: Whether cloth meets cloth.
         obstacles: The number m of vertices of meshes in a copy.
         count: The number of vertices of all copies, N + B·m.
-        layout, of_obstacles: Structs of :mod:`warpcloth.kernels.contact.obstacles`.
+        layout: The :class:`warpcloth.kernels.pairs.Layout`.
+        of_obstacles: The :class:`warpcloth.kernels.contact.obstacles.Obstacles`.
         items: Vertices of the triangles, then of the edges, of all copies, each with 2·copy + kind, (items, 4) int32.
         triangles, edges: The numbers of both, over all copies.
         groups: The group of each item, (items,), and ``vertex_groups`` that of each vertex of a copy, (n + m,).
@@ -41,7 +43,7 @@ class ContactSurface:
         self._vertices = np.concatenate([vertices for _, vertices, _, _ in found] or [np.empty(0, np.int64)])
         self.obstacles, self.moves = len(self.colliders), any(scene.colliders[c].moves for c, _, _, _ in found)
         self.count = model.count + model.copies * self.obstacles
-        self.layout = filled(kernels.Layout, cloth=model.count, per_copy=n, obstacles=self.obstacles)
+        self.layout = filled(Layout, cloth=model.count, per_copy=n, obstacles=self.obstacles)
         firsts = np.cumsum([0, *(len(vertices) for _, vertices, _, _ in found)])
         self._of_meshes = [
             (Mesh(points, triangles), first) for (_, _, points, triangles), first in zip(found, firsts, strict=False)

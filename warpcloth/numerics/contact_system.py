@@ -3,10 +3,10 @@
 import numpy as np
 import warp as wp
 
-from ..contact.no_filter import filter_of
 from ..core.capture import Mirror, Segment
 from ..core.dynamic import dynamic_of
 from ..core.hessian import Hessian
+from ..core.no_filter import filter_of
 from ..kernels import linear as kernels
 from ..kernels.accelerate import plain_step
 from ..kernels.contact.clear_elements import add_hessian

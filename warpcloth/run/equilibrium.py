@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+import warpcloth.contact as contact
+
 from ..base.checks import array, choice, number, whole
 from ..base.limits import MOST_FRAMES
 from ..base.turns import in_turn
 from ..base.types import Precision
-from ..contact.collider_steps import ColliderSteps
-from ..contact.self_steps import SelfSteps
 from ..core.state import State
 from ..core.status import Grade, Residual, Result, Status, digits, sentence
 from ..kernels.terms.air import AIR
@@ -134,7 +134,7 @@ def equilibrium(
     record = checked_record(record)
     scene = _with_colliders_at_rest(scene)
     model = scene.build(device=device, dtype=dtype, vary=vary)
-    refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
+    refuse_unmet(model.terms, "equilibrium", (FINITE,), ())
     base = wp.clone(model.positions)
     if start is not None:
         base.assign(_with_held(scene, model, array("start", start, (model.count, 3))))
@@ -142,9 +142,9 @@ def equilibrium(
     if model.has_pairs:
         state, colliders = State(base, model.vectors(), 1), None
         if model.colliders is not None and model.colliders.meshes is not None:  # whose poses the pairs need
-            colliders = ColliderSteps(model, state, 0.0, 1, 1.0)
+            colliders = contact.ColliderSteps(model, state, 0.0, 1, 1.0)
             colliders.launch_move()
-        pairs = SelfSteps(model, state, h=0.0, steps_per_frame=1, bounded=False, colliders=colliders)
+        pairs = contact.SelfSteps(model, state, h=0.0, steps_per_frame=1, bounded=False, colliders=colliders)
         pairs.filter.iterates()
     if linear == "auto":
         linear = "cg" if model.per_copy >= LEAST else "factorised"

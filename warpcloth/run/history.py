@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+import warpcloth.contact as contact
+
 from ..base.checks import shown
 from ..base.limits import MOST_FRAMES
 from ..base.texts import numbered
 from ..base.turns import in_turn
-from ..contact.collider_work import ColliderWork, FilterWork, PairWork
-from ..contact.present import ColliderPulls, PresentContact
 from ..core.capture import Segment
 from ..core.energy import Energy
 from ..core.sums import Sums
@@ -103,7 +103,7 @@ class Evaluation:
         self.model, self._h, self._pull, self.pulls = model, h, None, None
         self._pairs = pairs if stepper is None else stepper.pairs
         shares = [] if stepper is None or model.colliders is None else stepper.shares
-        self._present = PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
+        self._present = contact.PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
         terms = [(present, own) for present, own in zip(self._present.terms, model.terms, strict=True) if own.term is not AIR]
         self._terms = tuple(present for present, _own in terms)
         self._blown = tuple(own for own in model.terms if own.term is AIR)
@@ -121,7 +121,7 @@ class Evaluation:
         if self.hidden:
             self._pull = stepper.constraint_forces()
         if model.colliders is not None:
-            self.pulls = ColliderPulls(model, self._terms, stepper and stepper.constraint_forces, self._pairs)
+            self.pulls = contact.ColliderPulls(model, self._terms, stepper and stepper.constraint_forces, self._pairs)
         soft = tuple(elements for elements in self._terms if not elements.hard and elements.collider is None)
         self._elastic = plan(model).gradient(terms=soft) if soft else None
         self._of_air = plan(model).gradient(terms=self._blown) if self._blown else None
@@ -317,7 +317,7 @@ class History:
         if self._moving or self._driven or self._filtered or self._blown or pushes:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
-            self._of_pairs = PairWork(stepper, self._works[3]) if pushes else None
+            self._of_pairs = contact.PairWork(stepper, self._works[3]) if pushes else None
             self._room = None if stepper.pairs is None else stepper.pairs.capacities
         self._note()
 
@@ -334,9 +334,9 @@ class History:
             vertices = slice(first * model.per_copy, end * model.per_copy)
             sums = [work[vertices] for work in self._works[2:]]
             stepper.follow_contact()
-            cuts, touches, terms = FilterWork(stepper, sums[-1]), None, stepper.model.terms
+            cuts, touches, terms = contact.FilterWork(stepper, sums[-1]), None, stepper.model.terms
             if self._touched or not any(elements.hard and elements.collider is not None for elements in terms):
-                touches = ColliderWork(stepper.colliders, terms, cuts, *sums, stepper.constraint_forces)
+                touches = contact.ColliderWork(stepper.colliders, terms, cuts, *sums, stepper.constraint_forces)
             self._touches.append((cuts, touches, vertices))
         self._of_air = [AirWork(stepper) for stepper, _first, _end in (self._stepper.shares if self._blown else ())]
 

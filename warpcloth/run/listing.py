@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from ..solvers import __all__ as _SOLVERS
+
 _PACKAGE = Path(__file__).parents[1]
 
 
@@ -66,7 +68,7 @@ def list_solvers():
     folder, classes = _PACKAGE / "solvers", {}
     for path in folder.glob("*.py"):
         classes |= {node.name: node for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ClassDef)}
-    records = [classes[name] for name in _assigned(ast.parse((folder / "__init__.py").read_bytes()), "__all__")]
+    records = [classes[name] for name in _SOLVERS]
     return {_assigned(record, "name"): _options(record, classes) for record in records}
 
 

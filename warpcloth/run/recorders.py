@@ -4,8 +4,9 @@ import re
 
 import numpy as np
 
+import warpcloth.usd as usd
+
 from ..scene.lines import lines_of
-from ..usd import AnimationWriter, FrameSequence, JoinedFrames
 from .checkpoint import NAME, Checkpoint
 from .history import PAIRS, collider_names, energy_names
 
@@ -84,7 +85,7 @@ class File:
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
-            self.writer = AnimationWriter(
+            self.writer = usd.AnimationWriter(
                 output,
                 scene.mesh,
                 scene.fps,
@@ -98,7 +99,7 @@ class File:
         else:
             cloths = {name: each.prim for name, each in zip(scene.cloths, stage.cloths, strict=True)}
             given = {"source": stage.path, "prim": stage.prim, "history": history, "cloths": cloths}
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, **given)
+            self.writer = usd.AnimationWriter(output, scene.mesh, scene.fps, **given)
         self.saved = self.writer.saved
         if resume:
             try:
@@ -173,5 +174,5 @@ class File:
     def read(self):
         path = self.writer.path
         if self._prims:
-            return JoinedFrames(path, self._prims), JoinedFrames(path, self._prims, "velocities")
-        return FrameSequence(path), FrameSequence(path, attribute="velocities")
+            return usd.JoinedFrames(path, self._prims), usd.JoinedFrames(path, self._prims, "velocities")
+        return usd.FrameSequence(path), usd.FrameSequence(path, attribute="velocities")

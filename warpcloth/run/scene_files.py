@@ -8,6 +8,8 @@ import typing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import warpcloth.usd as usd
+
 from ..base.checks import did_you_mean
 from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import allowed, convert, kinds_of_parameter, parameters_of
@@ -16,11 +18,9 @@ from ..mesh.loading import ENDINGS
 from ..mesh.selection import some_vertices
 from ..scene.mesh_scene import mesh_scene
 from ..scene.scene import Scene
-from ..usd import read_scene
 from .listing import folders, list_scenes
 
 _number_of_modules = itertools.count()
-_READERS = dict.fromkeys(STAGE_ENDINGS, read_scene) | dict.fromkeys(ENDINGS, mesh_scene)
 _KINDS = f"a .py file, a USD stage or a mesh ({' '.join(ENDINGS)})"
 
 
@@ -83,11 +83,11 @@ def find_source(name, pins=None):
     path = find_path(name)
     if path.suffix == ".py":
         return _python_source(path, pins)
-    read = _READERS.get(path.suffix.lower())
-    if read is None:
-        animation = path.suffix.lower() in (".abc", ".npz", ".npy", *CACHES)
+    if (ending := path.suffix.lower()) not in (*STAGE_ENDINGS, *ENDINGS):
+        animation = ending in (".abc", ".npz", ".npy", *CACHES)
         hint = "; 'warpcloth convert' makes a stage of .pc2, .mdd, .npz and numbered .obj files" if animation else ""
         raise ValueError(f"{path}: is no scene; it must be {_KINDS}{hint}")
+    read = usd.read_scene if ending in STAGE_ENDINGS else mesh_scene
     parameters = parameters_of(read)
     del parameters["path"]
     return SceneSource(path, lambda **values: read(str(path), **values), parameters, pins)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -21,7 +21,6 @@ from ..core.status import Status, Stopped, millimetres
 from ..mesh.ordering import order_of_run
 from ..scene.scene import Scene
 from ..solvers.step import Step
-from ..usd import FrameSequence
 from .checkpoint import facts_of
 from .contact_verdicts import (
     Forced,
@@ -39,6 +38,9 @@ from .frames_ahead import state_of
 from .history import History, checked_record
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
+
+if TYPE_CHECKING:
+    from ..usd import FrameSequence
 
 # Limits on the frames that a CUDA device computes ahead: bytes on the host and on the device, fraction of the free memory of
 # the device, and number.
@@ -105,8 +107,8 @@ class Animation(ShownInNotebooks):
         self_contact: The :class:`SelfContactSummary` of a scene with self-contact or meshes among its colliders, else None.
     """
 
-    points: np.ndarray | FrameSequence
-    velocities: np.ndarray | FrameSequence
+    points: "np.ndarray | FrameSequence"
+    velocities: "np.ndarray | FrameSequence"
     times: np.ndarray
     status: Status
     timings: dict[str, Any]

@@ -11,7 +11,7 @@ from ..base.checks import array, as_array, keep_plain, number, shown
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..base.types import Converted, default
-from ..kernels.contact.colliders import find_distances
+from ..kernels.nearest import find_distances
 from ..kernels.terms.contact import ROUNDED_BOX, Solid
 
 

@@ -1,14 +1,18 @@
 """Fabrics: measured moduli, from which energies follow."""
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import warpcloth.terms as energies
+
 from ..base.checks import keep_plain, number, shown
 from ..terms.declared import Declared
-from ..terms.orthotropic_membrane import OrthotropicMembrane
-from ..terms.plate_bending import PlateBending, isotropic_twist
+from ..terms.woven import isotropic_twist
+
+if TYPE_CHECKING:
+    from ..terms import OrthotropicMembrane, PlateBending
 
 GRAVITY = 9.81  # [m/s²]
 
@@ -66,7 +70,7 @@ class Fabric:
             elif value is not None or field.name == "density":
                 number(f"Fabric.{field.name}", value, above=None if field.name == "poisson_ratio" else 0.0)
 
-    def membrane(self, **given: Any) -> OrthotropicMembrane:
+    def membrane(self, **given: Any) -> "OrthotropicMembrane":
         """The :class:`warpcloth.OrthotropicMembrane` of the fabric, with further fields such as ``warp_angle``.
 
         Raises:
@@ -74,9 +78,9 @@ class Fabric:
         """
         warp, weft, shear, ratio = self._known("a membrane", "warp", "weft", "shear", "poisson_ratio")
         direction = given.pop("warp", None)
-        return OrthotropicMembrane.from_moduli(warp, weft, shear, ratio, direction, **given)
+        return energies.OrthotropicMembrane.from_moduli(warp, weft, shear, ratio, direction, **given)
 
-    def bending(self, **given: Any) -> PlateBending:
+    def bending(self, **given: Any) -> "PlateBending":
         """The :class:`warpcloth.PlateBending` of the fabric, with further fields such as ``warp_angle``.
 
         D₁₂ is √(ν₁₂ν₂₁ D₁D₂), as of one material. D₆₆ is Gt t²/12, without thickness the default of the class.
@@ -84,7 +88,7 @@ class Fabric:
         Raises:
             ValueError: A number is None.
         """
-        return PlateBending(**self._plate(), **given)
+        return energies.PlateBending(**self._plate(), **given)
 
     def _plate(self) -> dict[str, Any]:
         one, two = self._known("bending", "bending_warp", "bending_weft")

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import ATTACHMENT
+from ..kernels.terms.attachment import ATTACHMENT
 from ..mesh.mesh import Mesh
 from .declared import Damped, indices, own_stencil, quantity
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 from ..kernels.term import Term
-from ..kernels.terms import COROTATED_MEMBRANE
+from ..kernels.terms.corotated_membrane import COROTATED_MEMBRANE
 from .membrane import Membrane, membrane_stiffness
 
 Own = TypeVar("Own", bound="CorotatedMembrane")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..kernels.term import Term
-from ..kernels.terms import DIHEDRAL_BENDING
+from ..kernels.terms.dihedral_bending import DIHEDRAL_BENDING
 from .bending import Bending
 
 

@@ -101,7 +101,7 @@ def refuse_unmet(terms, solver, needs, others):
     for elements in terms:
         need = lacks(elements, needs)
         if need is not None:
-            able = [name for name, theirs in others.items() if lacks(elements, theirs) is None]
+            able = [name for name, theirs in others if lacks(elements, theirs) is None]
             # If another solver takes the term as it is, name the remedy only if it is enough: no other need is unmet.
             suffices = need.remedy and (not able or sum(not each.met(elements) for each in needs) == 1)
             instead = [f"{listed(able)} can"] * bool(able) + [need.remedy] * bool(suffices)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..kernels.term import Term
-from ..kernels.terms import NEO_HOOKEAN_MEMBRANE
+from ..kernels.terms.neo_hookean_membrane import NEO_HOOKEAN_MEMBRANE
 from .membrane import IsotropicMembrane
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..base.checks import numeric, refuse
 from ..kernels.term import Term
-from ..kernels.terms import ORTHOTROPIC_MEMBRANE
+from ..kernels.terms.orthotropic_membrane import ORTHOTROPIC_MEMBRANE
 from ..mesh.mesh import Mesh
 from .declared import FINITE
 from .membrane import Membrane

@@ -9,19 +9,14 @@ import numpy as np
 from ..base.checks import numeric, refuse
 from ..kernels.membrane import side_axes
 from ..kernels.term import Term
-from ..kernels.terms import PLATE_BENDING
+from ..kernels.terms.plate_bending import PLATE_BENDING
 from ..mesh.curvature import curvature_operator
 from ..mesh.mesh import Mesh
 from .declared import quantity
 from .sparse import Sparse
-from .woven import ABOVE_0, Woven
+from .woven import ABOVE_0, Woven, isotropic_twist
 
 Own = TypeVar("Own", bound="PlateBending")
-
-
-def isotropic_twist(ratio: Any, weft: Any) -> Any:
-    """Returns the default D₆₆/D₁ = ½(1 − ν)√(D₂/D₁), from ν and D₂/D₁."""
-    return 0.5 * (1.0 - ratio) * np.sqrt(weft)
 
 
 @dataclass(frozen=True, kw_only=True)

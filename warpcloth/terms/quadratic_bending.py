@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..kernels.term import Term
-from ..kernels.terms import QUADRATIC_BENDING
+from ..kernels.terms.quadratic_bending import QUADRATIC_BENDING
 from .bending import Bending
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.checks import shown
 from ..kernels.clusters import fit_targets
 from ..kernels.term import Term
-from ..kernels.terms import RIGID_CLUSTER
+from ..kernels.terms.rigid_cluster import RIGID_CLUSTER
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 from .declared import FROM_0, Declared, Elements, indices, own_indices

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import SHELL_BENDING
+from ..kernels.terms.shell_bending import SHELL_BENDING
 from ..mesh.curvature import covariant_operator
 from ..mesh.mesh import Mesh
 from .plate_bending import PlateBending

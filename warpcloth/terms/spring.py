@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import SPRING
+from ..kernels.terms.spring import SPRING
 from ..mesh.mesh import Mesh
 from .declared import FINITE_FROM_0, Damped, indices, own_stencil
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import SPRING_LIMIT
+from ..kernels.terms.spring_limit import SPRING_LIMIT
 from ..mesh.mesh import Mesh
 from .declared import indices
 from .limit import Limit

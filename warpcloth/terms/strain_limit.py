@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import STRAIN_LIMIT
+from ..kernels.terms.strain_limit import STRAIN_LIMIT
 from ..mesh.mesh import Mesh
 from .limit import Limit
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..kernels.term import Term
-from ..kernels.terms import STVK_MEMBRANE
+from ..kernels.terms.stvk_membrane import STVK_MEMBRANE
 from .membrane import IsotropicMembrane
 
 

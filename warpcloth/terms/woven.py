@@ -73,3 +73,8 @@ def along_s(x: np.ndarray, st: np.ndarray) -> np.ndarray:
     """
     sides, ((s1, t1), (s2, t2)) = x[:, 1:] - x[:, :1], (st[:, 1:] - st[:, :1]).transpose(1, 2, 0)
     return np.sign(s1 * t2 - s2 * t1)[:, None] * (t2[:, None] * sides[:, 0] - t1[:, None] * sides[:, 1])
+
+
+def isotropic_twist(ratio: Any, weft: Any) -> Any:
+    """Returns D₆₆/D₁ = ½(1 − ν)√(D₂/D₁) where it is not declared, from ν and D₂/D₁."""
+    return 0.5 * (1.0 - ratio) * np.sqrt(weft)
