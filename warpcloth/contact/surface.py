@@ -1,4 +1,4 @@
-"""The surface on which contact of cloth with cloth and with meshes is found: the cloth, and mesh colliders as obstacles."""
+"""The surface on which contact is found: the cloth, and mesh colliders as obstacles."""
 
 import numpy as np
 import warp as wp
@@ -32,7 +32,7 @@ class ContactSurface:
         colliders: The index of the collider of each obstacle of a copy, (m,).
         moves: Whether a mesh moves or deforms.
         width: The largest area of an edge of the cloth over its length [m].
-        moves_of_step: Moves of obstacles in the step, (B·m,) vectors [m].
+        moves_of_step: Moves of obstacles in the step, (B·m,) [m].
     """
 
     def __init__(self, model, meets_itself=True):
@@ -59,7 +59,6 @@ class ContactSurface:
             self.width = float(((of_edges[a] + of_edges[b]) / mesh.edge_lengths).max())
 
     def _find_elements(self):
-        """Finds the elements of a copy, and of all copies."""
         model, mesh, n = self.model, self.model.scene.mesh, self.model.per_copy
         held = (model.coordinate_mobility().reshape(-1, 3)[:n] == 0.0).all(axis=1)
         of_cloth = np.where(held, int(kernels.HELD), int(kernels.CLOTH))
@@ -146,11 +145,11 @@ class ContactSurface:
         return np.concatenate([np.tile(values[:n], copies), np.tile(values[n:], copies)])
 
     def vectors(self):
-        """Returns a new array of a zero vector for each vertex of the surface of all copies, (N + B·m,)."""
+        """Returns zero vectors for the vertices of the surface of all copies, (N + B·m,)."""
         return wp.zeros(self.count, dtype=self.model.vec3, device=self.model.device)
 
     def behind(self, whole):
-        """Returns the part (B·m,) of an array (N + B·m,) that belongs to the obstacles."""
+        """Returns the part (B·m,) of an array (N + B·m,) for the obstacles."""
         return whole[self.model.count :]
 
     def launch_positions(self, colliders, ahead, placed):
