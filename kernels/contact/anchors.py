@@ -1,4 +1,4 @@
-"""Factory of the kernels that anchor friction on colliders where a step begins."""
+"""Kernels that anchor friction on colliders where a step begins."""
 
 from functools import cache
 
@@ -12,7 +12,7 @@ from .colliders import filters, gap_of, pose_types, rotated, to_local, to_space
 
 @cache
 def slip_of(dtype, law: Law):
-    """Device function (anchor, X, n) → the way from an anchor to X along the surface, less what it follows; 0 without ε."""
+    """Device function (anchor, X, n) → the tangential vector from an anchor to X, less the part that the anchor follows."""
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
     kept = law.kept
@@ -32,9 +32,9 @@ def slip_of(dtype, law: Law):
 def anchor_vertices(dtype, solids, law: Law, bounded: bool):
     """Kernel over friction elements of one collider at the start of a step: anchors, and the rest states of the step.
 
-    N = −kAφ′(d), or kA(r − d) if ``bounded``; ε = μN/(kA) by Coulomb's law. A vertex that comes into contact has its anchor
-    there. If ‖u‖ is above the ε of the last step, the vertex slid, and its anchor follows to a distance of that ε. Anchors are
-    in the frame of the collider, with ε, which is 0 without contact.
+    ε = μN/(kA) by Coulomb's law, with N = −kAφ′(d), or kA(r − d) if ``bounded``. The anchor is where contact began. If ‖u‖ is
+    above the ε of the last step, the vertex slid, and its anchor follows to the distance ε. Anchors are in the frame of the
+    collider; their ε is 0 without contact.
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)

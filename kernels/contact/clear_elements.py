@@ -1,7 +1,6 @@
-"""Factories of kernels over contact with colliders, which on the CPU skip elements that have no force.
+"""Kernels over contact with colliders that skip elements without force.
 
-``clear`` is the distance that the vertex of an element can move from x̃ without a force [m]. Elements with a shorter correction
-d are skipped before their rest state is read.
+``clear`` is the distance that the vertex of an element can move from x̃ without a force [m].
 """
 
 from functools import cache
@@ -42,7 +41,7 @@ def find_clear(term: Term, dtype):
 
 @cache
 def move_clear(term: Term, dtype):
-    """Kernel over contact elements: x[vertex] += max(r − d, 0) ∇d, for no two elements of a term share a vertex. Pins stay."""
+    """Kernel over contact elements: x[vertex] += max(r − d, 0) ∇d. Pins stay. No two elements of a term share a vertex."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, gap, rest_of = local_coordinate(term, dtype, False), term.gap, load(rest_type)
@@ -74,11 +73,10 @@ LEAP, LIFT = wp.constant(10.0), wp.constant(0.04)
 def add_hessian(term: Term, dtype):
     """Kernel over elements: values[diagonal[vertex]] += kₑ Aₑ ∂²u/∂y² [N/m], semi-definite; of contact kA c nnᵀ.
 
-    c is φ″ or the slope of a secant of φ′, from d outwards. For small d, φ″ is so large that Newton's method at most doubles d.
-    The secant ends at the distance that the vertex would have with its own ``inertia`` m/h² [N/m] and the present force of
-    everything else, or before. At the minimum that distance is d, and c is φ″. A secant is no upper bound, so ``careful``
-    copies have φ″. ``gradient`` is ∇φ of the whole objective [N]. ``diagonal`` is negative for pins. No two elements share a
-    vertex.
+    Newton's method with c = φ″ at most doubles a small d. So c is the slope of a secant of φ′ from d to the distance that the
+    vertex would have with its own ``inertia`` m/h² [N/m] and the other forces in ``gradient`` ∇φ [N], or less. At the minimum
+    this is φ″. A secant is no upper bound, so ``careful`` copies use φ″. ``diagonal`` is negative for pins. No two elements
+    share a vertex.
     """
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)

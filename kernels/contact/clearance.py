@@ -1,4 +1,4 @@
-"""Factory of the kernels that find whether a step may come near a collider, by balls around vertices that contain none."""
+"""Kernels that find whether a step may come near a collider, by balls around vertices that contain none."""
 
 from functools import cache
 
@@ -12,12 +12,11 @@ from .colliders import filters, gap_of, to_local
 
 @cache
 def clearances(dtype):
-    """Struct of what is known of the distances of vertices to colliders that stand.
+    """Struct of the distances of vertices to colliders that stand still.
 
-    ``balls`` has the centre and the radius of a ball about each vertex [m], with no collider within the contact ``distance`` of
-    it. Where a ball contains the motion of its vertex, distances are not computed. ``near`` is 1 for copies with a vertex that
-    may come near in this step, ``before`` for those of the last step (B,); ``some`` is 1 if there is one. If steps are
-    ``followed``, all refresh contact.
+    No collider is within the contact ``distance`` [m] of the ball (centre, radius) of a vertex, so a vertex that stays in its
+    ball needs no distances. ``near`` and ``before`` (B,) are 1 for copies with a vertex that may come near in this and in the
+    last step; ``some`` is 1 if any is. All ``followed`` steps refresh contact.
     """
 
     @wp.struct
@@ -36,9 +35,8 @@ def clearances(dtype):
 def near_colliders(dtype):
     """Kernel over vertices: due = 1 if a vertex may come near a collider in a step.
 
-    At the start of a step the motion is the prediction h v + h² g, and the contact distance further, because what refreshes
-    contact looks so far. due is also 1 if a copy was near before, so that a refresh leaves anchors and half-spaces behind.
-    After a step, a vertex moved from x to ``end``, which is None before.
+    At the start, where ``end`` is None, the bound on the motion is ‖h v + h² g‖ + ``distance``; after a step, ‖end − x‖. due is
+    also 1 if a copy was near before, because a refresh then has to remove its anchors and half-spaces.
     """
     vec3, _ = types(dtype)
     gap, ball_type = gap_of(dtype, (ROUNDED_BOX,)), wp.types.vector(4, dtype)

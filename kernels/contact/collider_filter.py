@@ -1,4 +1,4 @@
-"""Factories of the kernels of the filter of convex colliders, which ends a step, and of its notes."""
+"""Kernels of the filter of convex colliders, which ends a step, and its notes."""
 
 from functools import cache
 from typing import Any
@@ -16,11 +16,10 @@ FIRST = wp.constant(wp.int64(2**62))
 
 @wp.struct
 class FilterNotes:
-    """Notes of the filter after ``steps`` steps: the number of cuts (copies,), and the first vertex inside (copies, colliders).
+    """Notes of the filter after ``steps`` steps: the number of cuts (B,), and the first vertex inside (B, C).
 
-    ``inside`` is 0 if no vertex is inside. Else it is FIRST − ((step·n + vertex)(C + 1) + other) with n vertices and C
-    colliders. other is the last collider that held the vertex back, or C for a vertex that is not free. ``pushed`` and
-    ``kicked``, (N,) or None, are the changes of the positions and velocities of vertices by cuts.
+    ``inside`` is 0, or FIRST − ((step·n + vertex)(C + 1) + other), where other is the last collider that held the vertex back,
+    or C for a vertex that is not free. ``pushed`` and ``kicked``, (N,) or None, are the changes of x and v by cuts.
     """
 
     steps: wp.array(dtype=wp.int32)
@@ -32,7 +31,6 @@ class FilterNotes:
 
 @wp.func
 def note_cut(notes: FilterNotes, copy: int, i: int, pushed: Any, kicked: Any):
-    """Notes that the move of vertex i of a copy was cut, with the changes of its position and velocity."""
     wp.atomic_add(notes.cut, copy, wp.int64(1))
     if notes.pushed.shape[0] > 0:
         notes.pushed[i] = wp.vec3d(pushed)
@@ -41,7 +39,7 @@ def note_cut(notes: FilterNotes, copy: int, i: int, pushed: Any, kicked: Any):
 
 @wp.func
 def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex: int, per_copy: int, other: int):
-    """Notes that a vertex of a copy is inside a collider; the first in time, then by index, remains."""
+    """Notes that a vertex of a copy is inside a collider. The first in time, then by index, remains in any order of threads."""
     count = wp.int64(notes.inside.shape[1])
     key = wp.int64(step) * wp.int64(per_copy) + wp.int64(vertex)
     wp.atomic_max(notes.inside, copy, collider, FIRST - (key * (count + wp.int64(1)) + wp.int64(other)))
@@ -49,20 +47,16 @@ def note_inside(notes: FilterNotes, copy: int, collider: int, step: int, vertex:
 
 @cache
 def outside(dtype, solids):
-    """Device function (x, end, v, …) → final position and velocity of a free vertex that moves from x to ``end``.
+    """Device function (x, end, v, …) → end, velocity, whether a collider stopped a free vertex that moves from x to ``end``.
 
-    In the frame of a collider it moves along a segment, unless that comes too near. The third value is whether a collider
-    stopped it. ``notes`` has the stops, and the vertex if colliders leave no way out.
+    In the frame of a collider the vertex moves along a segment.
     """
     vec3, _ = types(dtype)
     gap, kept, zero = gap_of(dtype, solids), kept_part(dtype, solids), dtype(0.0)
 
     @wp.func
     def along(move: vec3, n: vec3, friction: dtype):
-        """The part of a move along a surface with the normal n, and the push, which removes the part into it.
-
-        Friction reduces the first by up to μ times the push (Coulomb).
-        """
+        """The part of a move along a surface with normal n, less up to μ times the push (Coulomb), and the push out of it."""
         push = wp.max(-wp.dot(move, n), zero) * n
         left = move + push
         l, most = wp.length(left), friction * wp.length(push)
@@ -72,10 +66,9 @@ def outside(dtype, solids):
 
     @wp.func
     def velocity(v: vec3, move: vec3, change: vec3, push: vec3, h: dtype):
-        """The velocity after a step whose ``move`` was changed: v + change/h, but along the push that of the move.
+        """The velocity after a ``move`` was changed: v + change/h, but along the push that of the move.
 
-        For midpoint, v is twice the mean velocity of the step minus that at its start, so that v + change/h would throw the
-        vertex back.
+        The velocity of midpoint is not that of the move, so v + change/h would throw the vertex back.
         """
         size = wp.dot(push, push)
         found = v + (change - push) / h
@@ -87,8 +80,8 @@ def outside(dtype, solids):
     def stopped(shape: shapes(dtype), c: int, X: vec3, move: vec3, least: dtype, landing: dtype, slides: bool):
         """The end of a move from X, its change and push, and whether it would come nearer than ``least``.
 
-        Then it stops before, at a distance of at most ``landing`` more. With ``slides``, it continues along the tangent plane
-        there, raised to twice ``least`` so that rounding does not stop it.
+        Then it ends at most ``landing`` before that distance. With ``slides`` it continues along the tangent plane there,
+        raised to twice ``least`` so that rounding does not stop it.
         """
         end = X + move
         change = vec3()
@@ -169,9 +162,9 @@ def entry(dtype, solids):
 
 @cache
 def filter_step(dtype, solids):
-    """Kernel over vertices at the end of a step: keeps free vertices outside colliders, also on their way.
+    """Kernel over vertices at the end of a step: keeps free vertices and their ``move`` (or None) outside colliders.
 
-    Free vertices, and their ``move``, which may be None, end as in :func:`outside`. :func:`entry` notes others.
+    It notes vertices that are not free and enter a collider.
     """
     vec3, _ = types(dtype)
     end_outside, note_entry = outside(dtype, solids), entry(dtype, solids)
@@ -208,7 +201,6 @@ def filter_step(dtype, solids):
 
 @cache
 def hold_locked(dtype):
-    """Kernel over vertices: undoes the filter along locked axes."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -240,7 +232,7 @@ def hold_locked(dtype):
 
 @cache
 def note_fixed(dtype, solids):
-    """Kernel over the vertices of all copies that are not free: :func:`entry`, from the start of the step."""
+    """Kernel over the vertices of all copies that are not free: notes those that enter a collider in the step."""
     vec3, _ = types(dtype)
     note_entry = entry(dtype, solids)
 

@@ -1,4 +1,4 @@
-"""Factories of the kernels of the work of colliders and of their filter."""
+"""Kernels of the work of colliders and of their filter [J]."""
 
 from functools import cache
 
@@ -28,15 +28,10 @@ def collider_pulls(dtype):
 def add_collider_work(dtype):
     """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
 
-    ∇U is that of contact and friction, ∇H that of friction alone, where the step takes its forces (``now``), at x; δ is the
-    displacement in the step of the collider's material there. With ``before``, the trapezoidal rule takes the mean of the
-    products there and at the start of the step; ∇U and ∇H are then stored for the next step.
-
-    If the gap changes by more than the contact ``distance`` in a step, the two are in contact, and move together, for a part of
-    it alone. The work of contact is then that of the part of Δx that δ shares.
-
-    If the filter shortened the move, Δx is the unshortened move, to ``uncut``, and only the forces of ``now`` count, in this
-    and in the next step. The filter then changed the energy of contact: of_filter −= ∇U·(Δx − δ).
+    ∇U is that of contact and friction, ∇H that of friction alone, where the step evaluates its forces; δ is the displacement of
+    the collider's material there. With ``before``, the trapezoidal rule averages the products there and at the start of the
+    step. If the gap changes by more than the contact ``distance``, only the part of Δx that δ shares does work. If the filter
+    shortened the move, Δx ends at ``uncut``, only ``now`` counts in this step and the next, and of_filter −= ∇U·(Δx − δ).
     """
     vec3, _ = types(dtype)
     product, (pose_type, _anchor) = wide_dot(dtype), pose_types(dtype)
@@ -48,7 +43,6 @@ def add_collider_work(dtype):
 
     @wp.func
     def work_on(pulls: collider_pulls(dtype), i: int, move: vec3, moved: vec3, distance: dtype):
-        """∇U·δ."""
         contact = pulls.all[i]
         rubbed = wp.float64(0.0)
         if pulls.friction.shape[0] > 0:
@@ -108,7 +102,7 @@ def add_collider_work(dtype):
 def add_filter_work(dtype):
     """Kernel over vertices, after a step: work of the filter += ½m(v² − v₋²) − (m g + f)·(x − x₋), x₋ and v₋ without it.
 
-    It sets ``uncut`` to x₋, updates ``cuts``, and resets the notes of the filter to 0.
+    It sets ``uncut`` to x₋, updates ``cuts``, and clears the notes.
     """
     vec3, _ = types(dtype)
 
@@ -160,7 +154,7 @@ def add_stored(
     before: wp.array(dtype=wp.float64),
     of_filter: wp.array(dtype=wp.float64),
 ):
-    """Kernel over elements of contact: work of the filter += the change of their energies in a step that it shortened."""
+    """Kernel over elements of contact: work of the filter += the change of their energy in a step that it shortened."""
     e = wp.tid()
     cut = wp.bool(False)
     for k in range(stencil.shape[1]):
@@ -173,9 +167,9 @@ def add_stored(
 
 @cache
 def limit_pulls(dtype):
-    """Kernel over vertices: scales ∇U of a collider by ‖f‖/‖∇U‖ if that is below ½, with the ∇U of all colliders.
+    """Kernel over vertices: scales ∇U by ‖f‖/‖∇U‖ where that is below ½, f being the contact force of the step.
 
-    f is the contact force of the step. Where the step has not converged to f = −∇U, a vertex deep inside has a far larger ∇U.
+    Deep inside a collider, ∇U is far larger than f if the step has not converged.
     """
     vec3, _ = types(dtype)
 

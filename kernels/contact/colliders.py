@@ -1,6 +1,6 @@
-"""Factories of what contact and the filter know of colliders: shapes, poses, motion, and rest states where a step begins.
+"""Colliders for contact and the filter: shapes, poses, motion, and rest states at the start of a step.
 
-A pose is a position and a quaternion (x, y, z, w), seven numbers.
+A pose is a position and a quaternion (x, y, z, w).
 """
 
 from functools import cache
@@ -24,7 +24,7 @@ def pose_types(dtype):
 
 @cache
 def shapes(dtype):
-    """Struct of C colliders: ``kind``, see :func:`gap_of`, half sizes and radius of the shape, and friction μ."""
+    """Struct of C colliders: ``kind`` of :func:`gap_of`, half sizes and radius [m], friction μ."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -39,7 +39,7 @@ def shapes(dtype):
 
 @cache
 def step_poses(dtype):
-    """Struct of the poses (copies, colliders) at the start, at the end, and ``at`` the time of the forces of a step."""
+    """Struct of the poses (B, C) at the start and end of a step, and ``at`` the time of its forces."""
     pose_type, _anchor = pose_types(dtype)
 
     @wp.struct
@@ -55,7 +55,7 @@ def step_poses(dtype):
 def filters(dtype):
     """Struct of colliders, their ``poses`` in a step, and the numbers of the filter.
 
-    A vertex may end at the distance ``least`` [m]. One that is stopped ends at most ``landing`` farther away [m].
+    A vertex may end at the distance ``least`` [m]. One that is stopped ends at most ``landing`` [m] farther away.
     """
 
     @wp.struct
@@ -71,27 +71,24 @@ def filters(dtype):
 
 @wp.func
 def rotated(pose: Any, v: Any):
-    """A vector v in the frame of a pose, in space."""
     return turned(type(v)(pose[3], pose[4], pose[5]), pose[6], v)
 
 
 @wp.func
 def to_local(pose: Any, x: Any):
-    """The point x in the frame of a pose."""
     return turned(-type(x)(pose[3], pose[4], pose[5]), pose[6], x - type(x)(pose[0], pose[1], pose[2]))
 
 
 @wp.func
 def to_space(pose: Any, X: Any):
-    """The point X in the frame of a pose, in space."""
     return rotated(pose, X) + type(X)(pose[0], pose[1], pose[2])
 
 
 @cache
 def move_colliders(dtype):
-    """Kernel over (copies, colliders): the :func:`step_poses` of a step, with ``at`` after ``halves`` half steps.
+    """Kernel over (copies, colliders): the poses of a step, with ``at`` after ``halves`` half steps.
 
-    Between keyframes, velocities and angular velocities are constant. After the last keyframe colliders are at rest.
+    Between keyframes, velocity and angular velocity are constant. After the last keyframe colliders are at rest.
     """
     pose_type, _anchor = pose_types(dtype)
     quat_type = wp.types.quaternion(dtype=dtype)
@@ -138,10 +135,9 @@ def move_colliders(dtype):
 
 @cache
 def gap_of(dtype, solids):
-    """Device function (shapes, collider, X) → the signed distance and its gradient, in the frame of the collider.
+    """Device function (shapes, collider, X) → the signed distance [m] and its gradient, in the frame of the collider.
 
-    ``solids`` are the :class:`..terms.contact.Solid` of the scene, the convex ones first. The ``kind`` of a collider is the
-    number of those after its own.
+    ``solids`` are the :class:`..terms.contact.Solid` of the scene, convex ones first. ``kind`` counts those after its own.
     """
     vec3, _ = types(dtype)
     kind, first = len(solids) - 1, gap_to(solids[0])
@@ -168,9 +164,9 @@ def kept_part(dtype, solids):
     """Device function (shapes, collider, X, move, least) → the fraction of a move from X that is kept, in the collider's frame.
 
     A convex collider is behind the plane through its nearest point, normal to the distance. The move is kept until it is nearer
-    to that plane than ``least``, or than its start if that is nearer. From there the next plane decides. Any other collider is
-    outside the ball of radius d about a point at the distance d; the move is kept as far as it leads in this ball, less
-    ``least``, or less half of its start if that is nearer (Hart 1996, *Sphere tracing*).
+    to that plane than ``least``, or than its start; from there the next plane decides. Any other collider is outside the ball
+    of radius d about a point. The move is kept within this ball, less ``least`` or half the distance of its start (Hart 1996,
+    *Sphere tracing*).
     """
     vec3, _ = types(dtype)
     gap, concave = gap_of(dtype, solids), sum(not each.convex for each in solids)
@@ -211,8 +207,8 @@ def kept_part(dtype, solids):
 def pose_collider(dtype, solids):
     """Kernel over contact elements of one collider at the start of a step: rest states with its pose, or with a half-space.
 
-    If the prediction x + h v + h² g of a vertex crosses the collider, it has contact with the half-space behind the tangent
-    plane where it meets the collider, for beyond a thin collider no force would lead it back. Explicit steps have h = 0.
+    If x + h v + h² g crosses the collider, contact is with the half-space behind the tangent plane where it meets the collider;
+    beyond a thin collider no force would lead the vertex back. Explicit steps have h = 0.
     """
     vec3, _ = types(dtype)
     gap, kept = gap_of(dtype, solids), kept_part(dtype, solids)
@@ -220,7 +216,6 @@ def pose_collider(dtype, solids):
 
     @wp.func
     def behind(point: vec3, normal: vec3):
-        """The pose of the half-space behind the plane with this point and normal."""
         turn = vec3(normal[2], dtype(0.0), -normal[0])
         w = dtype(1.0) + normal[1]
         size = wp.sqrt(wp.dot(turn, turn) + w * w)

@@ -1,4 +1,4 @@
-"""Factories of the kernels that record the gaps between cloth and cloth at the end of frames."""
+"""Kernels that record the gaps between cloth and cloth at the end of frames."""
 
 from functools import cache
 
@@ -20,12 +20,12 @@ FIRST = wp.constant(wp.int64(2**62))
 
 @wp.struct
 class GapNotes:
-    """The smallest gaps in the frames so far, (copies,), or of one state if there are ``counts``.
+    """The smallest gaps in the frames so far (B,), or in one state if there are ``counts``.
 
-    ``nearest`` is 1/d for the smallest gap d [1/m]. The next are FIRST − (frame·n + vertex), with n vertices, of the first
-    frame and vertex, or 0: of gaps that float32 does not resolve, of pairs nearer than half the distance where contact begins,
-    of cloth with cloth and with meshes (copies, 2), and of pairs that rounding, far from the origin, stops where contact
-    begins. ``counts`` (copies, 2) has the listed pairs and those in contact instead, or is None.
+    ``nearest`` is 1/d for the smallest gap d [1/m]. The others are 0, or FIRST − (frame·n + vertex) of the first frame and
+    vertex where float32 does not resolve a gap, where a pair of cloth with cloth or with meshes (B, 2) is nearer than half the
+    contact distance, and where rounding stops a pair at the contact distance. ``counts`` (B, 2) counts pairs listed and in
+    contact.
     """
 
     nearest: wp.array(dtype=wp.float64)

@@ -1,6 +1,6 @@
-"""Factories of the kernels that bound the moves of all cloth near a vertex, so that a search may leave common motion out.
+"""Kernels that bound the moves of all cloth near a vertex, so that a search may omit common motion.
 
-Two elements can only meet on a way if their distance is at most the difference of their moves. Cloth nearby moves almost alike.
+Two elements can meet only if their distance is at most the difference of their moves, and cloth nearby moves almost alike.
 """
 
 from functools import cache
@@ -19,22 +19,21 @@ MODULE = "warpcloth.local_motion"
 
 @wp.func
 def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
-    """The bucket of a cell, of 2ᵏ; those of cells along x are in sequence."""
+    """The bucket of a cell, of 2ᵏ; cells along x have buckets in sequence."""
     key = wp.uint32(x) + wp.uint32(y) * wp.uint32(73856093) + wp.uint32(z) * wp.uint32(19349663)
     return wp.int32((key + wp.uint32(code) * wp.uint32(83492791)) & wp.uint32(buckets - 1))
 
 
 @cache
 def motions(dtype):
-    """Struct of moves near each vertex, and of the clusters of vertices that are near one another at rest.
+    """Struct of moves near each vertex, and of clusters of vertices that are near one another at rest.
 
-    Cluster c has the vertices ``members`` [i] for i from first[c] to first[c+1], and the ``mean`` of their moves; ``cluster``
-    (N,) is that of each vertex, or −1. A vertex is ``calm`` if its move differs by at most ``size`` from that mean [m].
-    ``lowest`` and ``highest`` (B,) bound the means and the moves of obstacles. Calm vertices are hashed to cells of a length H,
-    such that those that may meet are in adjacent cells. ``tables`` (4, buckets) bound their moves p from x in each cell, and
-    their moves q from the positions ``found`` of the last list. ``low`` and ``high`` (V,) bound p in the cells about a vertex.
-    They are +∞ and −∞ where all q there differ by at most ``alike``, so that only listed pairs may meet [m]. ``some`` is 1 if
-    there are others, else 0.
+    ``members`` of cluster c are those from first[c] to first[c+1]; ``cluster`` (N,) may be −1. A vertex is ``calm`` if its move
+    differs by at most ``size`` [m] from the ``mean`` of its cluster. ``lowest`` and ``highest`` (B,) bound means and moves of
+    obstacles. Calm vertices are hashed to cells so long that those that may meet are in adjacent cells. ``tables`` (4, buckets)
+    bound their moves p from x, and q from the positions ``found`` of the last list. ``low`` and ``high`` (V,) bound p in the
+    cells about a vertex. They are +∞ and −∞ where all q differ by at most ``alike`` [m], so that only listed pairs may meet;
+    ``some`` is 1 if there are others.
     """
     vec3, _ = types(dtype)
 
@@ -60,7 +59,6 @@ def motions(dtype):
 
 @cache
 def _extend(dtype):
-    """Device function (low, high, i, p): extends the range low[i] to high[i] by a finite p."""
     vec3, _ = types(dtype)
 
     @wp.func
@@ -75,7 +73,7 @@ def _extend(dtype):
 
 @cache
 def find_means(dtype):
-    """Kernel over clusters, and then over the obstacles that move: means of moves p, and their range in each copy."""
+    """Kernel over clusters, then over moving obstacles: means of moves p, and their range in each copy."""
     vec3, _ = types(dtype)
     extend = _extend(dtype)
 
@@ -106,10 +104,10 @@ def find_means(dtype):
 
 @cache
 def cells(dtype):
-    """Device functions (motion, copy) → H [m], and (motion, x, H, copy, dx, dy, dz) → the bucket of a cell beside that of x.
+    """Device functions (motion, copy) → the cell length H [m], and (motion, x, H, copy, dx, dy, dz) → a bucket next to x.
 
-    Along each axis the moves of two calm elements differ by at most the range of the means and 2·``size``, and each has an
-    extent of at most 2·``size``.
+    Along each axis the moves of two calm elements differ by at most the range of the means + 2·``size``, and the extent of each
+    is at most 2·``size``. H is the range and 6·``size``, so those that may meet are in adjacent cells.
     """
     vec3, _ = types(dtype)
     farthest = dtype(FARTHEST)
@@ -130,7 +128,7 @@ def cells(dtype):
 
 @cache
 def note_moves(dtype):
-    """Kernel over vertices of the cloth: finds those that are calm, and the range of the moves of these in cells."""
+    """Kernel over vertices of the cloth: which are calm, and the range of their moves in each cell."""
     vec3, _ = types(dtype)
     extend, (cell_length, cell) = _extend(dtype), cells(dtype)
 
@@ -210,10 +208,10 @@ def bound_moves(dtype):
 
 @cache
 def differences(dtype):
-    """Device functions on a box low to high that moves by p_low to p_high, relative to what moves by low to high moves.
+    """Device functions on the motion of a box relative to cloth nearby, and on whether three vertices are calm.
 
-    ``relative_box`` returns the box that it sweeps in the frame of what moves by ``m`` to ``n``, enlarged for rounding of
-    ``ulps``; ``all_calm`` says whether three vertices are calm.
+    ``relative_box`` is the box that low to high sweeps by p_low to p_high, in the frame of what moves by ``m`` to ``n``,
+    enlarged for rounding of ``ulps``.
     """
     vec3, _ = types(dtype)
 

@@ -1,4 +1,4 @@
-"""Factories of the kernels that sum forces between cloth and mesh colliders, for records."""
+"""Kernels that sum forces between cloth and mesh colliders, for records."""
 
 import warp as wp
 
@@ -19,9 +19,9 @@ def keep_forces(
     # in and out
     forces: PairForces,
 ):
-    """Kernel over contacts: forces and energies of contacts with other colliders than ``kept`` become 0.
+    """Kernel over contacts: sets forces and energies of contacts with other colliders than ``kept`` to 0.
 
-    ``colliders`` is the collider of each obstacle of a copy; −1 keeps contact of cloth with cloth.
+    ``colliders`` is the collider of each obstacle of a copy; kept = −1 keeps contact of cloth with cloth.
     """
     e = wp.tid()
     if e >= pairs.number[0]:

@@ -1,9 +1,8 @@
-"""Factories of the kernels that move colliders in a step and carry near cloth along, so that it does not get in their way.
+"""Kernels that move colliders in a step and carry near cloth along.
 
-A vertex listed with a mesh makes the move of the nearest point there, one that a shape would meet that of the shape, and one
-listed with such cloth the move of that. Pairs that would still approach are pushed apart, by :func:`.self_filter.push_pairs`.
-Then continuous collision detection says how far all of a copy may move together. If that is not the whole way, pairs are listed
-anew, and the rest follows.
+A vertex listed with a mesh makes the move of the nearest point there, one that a shape would meet the move of the shape, and
+one listed with such cloth the move of that cloth. Pairs that would still approach are pushed apart. Continuous collision
+detection then bounds the fraction that all of a copy move together; the rest follows with a new list.
 """
 
 from functools import cache
@@ -23,7 +22,7 @@ SMALL = wp.constant(wp.float64(1e-9))  # a weight, so that their sum is not 0
 
 @cache
 def aim_obstacles(dtype):
-    """Kernel over obstacles: their moves p to ``goal``. Those that appear or vanish go there at once."""
+    """Kernel over obstacles: their moves p to ``goal`` [m]. Those that appear or vanish go there at once."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
@@ -47,10 +46,10 @@ def aim_obstacles(dtype):
 
 @cache
 def find_carriers(dtype):
-    """Kernel over pairs: the key of the pair that carries each vertex of the cloth, with a mesh or with cloth that is carried.
+    """Kernel over pairs: the key of the pair that carries each vertex, with a mesh or with cloth that is carried.
 
-    Pairs of the vertex itself with a triangle come first, as their nearest point moves as it should where the mesh turns, then
-    those with the smallest gap.
+    Pairs of the vertex itself with a triangle come first, as their nearest point also follows rotations, then the smallest gap.
+    The maximum of keys does not depend on the order of threads.
     """
 
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)
@@ -95,9 +94,9 @@ def find_carriers(dtype):
 
 @cache
 def carry_with_shapes(dtype, solids):
-    """Kernel over vertices of the cloth: p, the move of a shape to ``at`` that is then nearer than ``distance``; its key is 1.
+    """Kernel over free vertices of the cloth: p, the move of the nearest shape if that is then nearer than ``distance`` [m].
 
-    Pins have none. ``some`` is 1 if a vertex moves.
+    The key of such a vertex is 1.
     """
     vec3, _ = types(dtype)
     gap = gap_of(dtype, solids)
@@ -136,7 +135,7 @@ def carry_with_shapes(dtype, solids):
 
 @cache
 def carry_vertices(dtype):
-    """Kernel over free vertices of the cloth with a new key: p, the move of what carries them on the other side of its pair."""
+    """Kernel over free vertices of the cloth with a new key: p, the move of the carriers on the other side of its pair."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="warpcloth.obstacles." + dtype.__name__, enable_backward=False)

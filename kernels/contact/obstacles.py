@@ -18,7 +18,6 @@ CLOTH, HELD, OBSTACLE = wp.constant(0), wp.constant(1), wp.constant(2)
 
 @wp.func
 def copy_of(layout: Layout, i: int):
-    """The copy of a vertex."""
     if i < layout.cloth:
         return i // layout.per_copy
     return (i - layout.cloth) // layout.obstacles
@@ -34,7 +33,6 @@ def in_copy(layout: Layout, i: int):
 
 @wp.func
 def cloth_vertex(layout: Layout, s: wp.vec4i):
-    """The first vertex of a pair that belongs to the cloth."""
     found = s[0]
     for k in range(1, 4):
         if found >= layout.cloth:
@@ -44,7 +42,6 @@ def cloth_vertex(layout: Layout, s: wp.vec4i):
 
 @wp.func
 def has_obstacle(layout: Layout, s: wp.vec4i):
-    """Whether one side of a pair belongs to a mesh."""
     return s[0] >= layout.cloth or s[3] >= layout.cloth
 
 
@@ -60,7 +57,7 @@ def obstacle_of(layout: Layout, s: wp.vec4i):
 
 @cache
 def vector_within(dtype):
-    """Device function (p, i) → the move of vertex i, which is 0 beyond the array, where p is for the cloth alone."""
+    """Device function (p, i) → p[i], or 0 beyond the array, where p is for the cloth alone."""
     vec3, _ = types(dtype)
     vector = load(vec3)
 
@@ -75,10 +72,7 @@ def vector_within(dtype):
 
 @cache
 def meshes(dtype):
-    """Struct of the meshes of C colliders: the ``points`` of all keyframes of all meshes.
-
-    For each collider: its first point, the points per keyframe, and the number of keyframes, 0 if it is not a mesh.
-    """
+    """Struct of meshes of C colliders: all ``points`` [m]; of each its first point, points per keyframe, and keyframes or 0."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -93,7 +87,7 @@ def meshes(dtype):
 
 @wp.struct
 class Obstacles:
-    """The collider and its vertex of each obstacle of a copy, (m,), and where the frames of colliders begin in ``present``."""
+    """The collider and its vertex of each obstacle of a copy (m,), and where the frames of colliders begin in ``present``."""
 
     collider: wp.array(dtype=wp.int32)
     vertex: wp.array(dtype=wp.int32)
@@ -105,9 +99,8 @@ class Obstacles:
 def find_obstacles(dtype):
     """Kernel over obstacles of all copies: positions at the ``poses`` of a step and, as float64, their ``moves`` in it [m].
 
-    Forces are evaluated after ``ahead`` half steps, of which a frame has ``per_frame``. Points move linearly between keyframes,
-    and stand still after the last. While a collider is absent, that is at one point for a whole step, positions are NaN, and
-    moves 0.
+    Forces are evaluated after ``ahead`` half steps; a frame has ``per_frame``. Points move linearly between keyframes. While a
+    collider is absent, positions are NaN, and moves 0.
     """
     vec3, _ = types(dtype)
     pose_type, _anchor = pose_types(dtype)

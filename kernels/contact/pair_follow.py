@@ -1,7 +1,6 @@
-"""Factories of the kernels by which the contacts of sweeps follow the iterate.
+"""Kernels by which the contacts of sweeps follow the iterate.
 
-Sweeps leave w and n as they were found. Then all forces are removed, contacts are found anew where the iterate is now, and the
-new ones start with the λ of the old ones.
+Sweeps keep w and n. Now and then contacts are found anew at the iterate, and start with the λ of the same contacts before.
 """
 
 import warp as wp
@@ -25,7 +24,7 @@ def carry_forces(
     # in and out
     contacts: Contacts,
 ):
-    """Kernel over contacts: carries over λ along n, before the contacts are found elsewhere."""
+    """Kernel over contacts: keeps λ along n, before contacts are found anew."""
     for e in range(wp.tid(), pairs.number[0], pairs.threads):
         contacts.followed.keys[e] = pairs.keys[e]
         contacts.followed.carried[e] = wp.dot(multipliers[e], contacts.normal[e])
@@ -86,7 +85,7 @@ def count_sweep(
     # out
     due: wp.array(dtype=wp.int32),
 ):
-    """Kernel of one thread: counts a sweep; ``due`` is 1 after ``every`` sweeps, and so on, if any pair is ``listed``."""
+    """Kernel of one thread: counts a sweep; ``due`` is 1 after every ``every`` sweeps if a pair is ``listed``."""
     due[0] = wp.where(turn[0] % every == 0 and turn[0] > 0, listed[0], 0)
     turn[0] = turn[0] + 1
 
@@ -103,8 +102,8 @@ def fix_forces(
 ):
     """Kernel over vertices: the part of the forces of contacts over a valley that sweeps do not compute anew, as λ [kg·m].
 
-    That is −h²(1 − share)kAφ′ along n, and all of negative contacts, in proportion to the λ of the positive ones, because the
-    positions where the contacts were found may be far from the solution.
+    It is −h²(1 − share)kAφ′ along n, and all of negative contacts, in proportion to the λ of the positive ones, because
+    contacts may have been found far from the solution.
     """
     v = wp.tid()
     first = lists.rows[v]
