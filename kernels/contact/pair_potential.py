@@ -1,19 +1,18 @@
-"""Factories of the kernels that find the contacts of a surface at given positions, with a potential of these alone.
+"""Kernels that find the contacts of a surface at given positions. Their potential is a function of positions alone.
 
-U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)). The first sum is over the vertices v, with rest area aᵥ, half
-for each side, and the faces, edges and vertices F near v. The multiplicities m are those of inclusion and exclusion: 1 for a
-face, 1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces that have E edges there. As the nearest
-point of a face may be on its edge, most terms cancel: over a plane or a convex edge one is left, with m = 1, and over a valley
-there are two faces and minus one edge. So a flat sheet has the pressure −kφ′, and the gradient is continuous.
+U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)). The first sum is over vertices v, with rest area aᵥ, half for
+each side, and the faces, edges and vertices F near v. The multiplicities m are those of inclusion and exclusion: 1 for a face,
+1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces with E edges there. Where nearest points coincide,
+terms cancel: over a plane or a convex edge one is left, over a valley two faces minus one edge. So a flat sheet has the
+pressure −kφ′, and the gradient is continuous.
 
-The second sum is over pairs of edges, for vertices do not find where two edges cross. b is the rest area of an edge over its
-length, and D² = min over s and t of ‖y(s, t)‖² (1 + ⅛((2s − 1)² + (2t − 1)²)), strictly convex, so that D has a gradient for
-parallel edges too. Flat sheets do not need it, so edges act below a quarter of the contact distance.
+The second sum is over pairs of edges, because vertices do not find where two edges cross. b is the rest area of an edge over
+its length. D² = min over s and t of ‖y(s, t)‖² (1 + ⅛((2s − 1)² + (2t − 1)²)) is strictly convex, so D has a gradient for
+parallel edges too. Edges act below a quarter of the contact distance.
 
-Elements with a common vertex have no contact, nor have those of one piece whose rest distance is below 2r.
-
-Vertices of cloth have their whole area against meshes, Σᵥ k aᵥ Σ_F m φ(d), and vertices of meshes keep out of the faces of the
-cloth like edges, by k aᵥ φ(4d). Positions of meshes are not unknowns, so y = Σ wᵢxᵢ + o with the vertices of the cloth alone.
+Elements with a common vertex have no contact, nor have those of one piece whose rest distance is below 2r. Against meshes,
+vertices of cloth have their whole area, Σᵥ k aᵥ Σ_F m φ(d), and vertices of meshes act on faces of cloth by k aᵥ φ(4d).
+Positions of meshes are not unknowns, so y = Σ wᵢxᵢ + o with the vertices of the cloth alone.
 """
 
 from functools import cache
@@ -45,7 +44,7 @@ def from_middles(p: wp.vec2d):
 
 @wp.func
 def on_two_edges(u: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """(s, t) of D of the edges 0u and cd, by Newton's method within the square, and D/‖y‖."""
+    """(s, t) of D for the edges 0u and cd, by a projected Newton method with line search, and D/‖y‖."""
     v = c - d
     of_square = TWO * wp.mat22d(wp.dot(u, u), wp.dot(u, v), wp.dot(u, v), wp.dot(v, v))  # ∂²‖y‖²
     p = wp.vec2d(SIDE, SIDE)
@@ -87,8 +86,8 @@ def on_two_edges(u: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 class Followed:
     """The ``start`` of λ where contacts are found anew, and the λ ``carried`` over from the previous contacts.
 
-    ``stencils``, ``rows``, ``number``, ``keys`` and ``slots`` are those of the previous contacts. ``mode`` (1,) is 0 in a
-    sweep, STARTING if it only adds the start, and ENDING if it only removes the forces.
+    The other arrays are those of the previous contacts. ``mode`` (1,) is 0 in a sweep, STARTING if it only adds the start, and
+    ENDING if it only removes the forces.
     """
 
     mode: wp.array(dtype=wp.int32)
@@ -115,12 +114,11 @@ class Laws:
 
 @wp.struct
 class NearFaces:
-    """The near faces of each of V vertices at some positions, for a list with room for C pairs.
+    """The near faces of each of V vertices at some positions, for a list of C pairs.
 
-    ``code`` (C,) says where the nearest point of the face of a pair is; it is NONE if the face is not near. ``near`` (C,) has
-    the pairs of the near faces of vertex i from rows[i] on. ``counts`` (V,) has their number, and the number of contacts of the
-    vertex with keys from C on. ``multiplicities`` (C,) are m of the edges 12, 23 and 31 and of the corners 1 to 3 of a face, 0
-    if another near face counts them.
+    ``code`` (C,) says where the nearest point of a face is; it is NONE if the face is not near. ``near`` (C,) has the pairs of
+    the near faces of vertex i from rows[i] on. ``counts`` (V,) has their number, and that of contacts with keys from C on.
+    ``multiplicities`` (C,) are m of the edges 12, 23 and 31 and of corners 1 to 3, or 0 if another near face counts them.
     """
 
     code: wp.array(dtype=wp.int32)
@@ -133,19 +131,16 @@ class NearFaces:
 class Contacts:
     """The contacts at some positions, by slots: w, n, d, r [m], kA with the sign of m [N/m], ``share``, and ``fixed`` λ [kg·m].
 
-    The list has room for C pairs. The contact of pair e has the key e. Keys of vertex i from C + 3·rows[i] on are for contacts
-    with an edge or a corner of near faces whose nearest points are elsewhere. Three keys for each face suffice, because F faces
-    share at most 1.5 F edges and 1.5 F vertices. ``code`` is TWO_EDGES if a contact is that of two edges.
+    The contact of pair e of a list with C pairs has the key e. Keys of vertex i from C + 3·rows[i] on are for edges or corners
+    of near faces whose nearest points are elsewhere; three a face suffice, as F faces share at most 1.5 F edges and 1.5 F
+    vertices. ``code`` is TWO_EDGES for two edges, with r/c and c²kA where 4D = cd, and the ``ratio`` D/d, else 1.
 
-    ``parts`` has the vertices of the surface of a contact, and bit i of ``touching`` is 1 if wᵢ is not 0. The stencil has the
-    first vertex of the cloth with w = 0 in place of each obstacle. Obstacles give the ``offset`` o = Σ wⱼXⱼ [m] of their
-    positions X, and the ``travel`` Σ wⱼΔXⱼ [m] by their ``moves`` ΔX in the step, (B·m,).
+    ``parts`` are the vertices of the surface; bit i of ``touching`` is 1 if wᵢ is not 0. In the stencil, each obstacle is
+    replaced by the first vertex of the cloth with w = 0. Obstacles give the ``offset`` o = Σ wⱼXⱼ and the ``travel`` Σ wⱼΔXⱼ by
+    their ``moves`` ΔX in the step (B·m,) [m].
 
-    The ``share`` of a contact is the curvature Σ kA φ″ along n of the contacts on its side of the vertex, divided by that of
-    the positive ones. The definite part of the Hessian has this share of its φ″. Sweeps compute this share of its
-    force anew, and leave the rest ``fixed``, see :mod:`.pair_follow`.
-
-    Two edges with 4D = cd have r/c and c²kA, for φ(cd) with r is c²φ(d) with r/c. Their ``ratio`` is D/d, else 1.
+    The ``share`` is the curvature Σ kA φ″ along n of the contacts on its side of the vertex, over that of the positive ones.
+    The definite part of the Hessian, and what sweeps compute anew, have this share; sweeps leave the rest ``fixed``.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -167,7 +162,7 @@ class Contacts:
 
 @wp.struct
 class Areas:
-    """Rest areas of the vertices of the surface, and of each edge at them, (V,) [m²], and rest points of a copy (n + m,)."""
+    """Rest areas of vertices of the surface, and of each edge at them (V,) [m²]; rest positions in a copy (n + m,) [m]."""
 
     of_vertices: wp.array(dtype=wp.float64)
     of_edges: wp.array(dtype=wp.float64)
@@ -176,7 +171,6 @@ class Areas:
 
 @wp.func
 def corner_of(s: wp.vec4i, u: int):
-    """The corner 1 to 3 of a face at which vertex u is, or 0."""
     found = wp.int32(0)
     for i in range(1, 4):
         if s[i] == u:
@@ -186,7 +180,7 @@ def corner_of(s: wp.vec4i, u: int):
 
 @wp.func
 def code_between(i: int, j: int):
-    """The code of the edge between two corners, 1 to 3, or of the corner i = j."""
+    """The code of the edge between the corners i and j, 1 to 3, or of the corner i = j."""
     return wp.where(i == j, CORNER + i - 1, wp.where(i + j == 3, EDGE, EDGE + 6 - i - j))
 
 
@@ -196,10 +190,10 @@ _stencil, _number = load(wp.vec4i), load(wp.int32)
 
 @wp.func  # on the CPU a function that takes a struct copies it
 def count_faces(stencils: STENCILS, codes: NUMBERS, near: NUMBERS, first: int, end: int, p: int, q: int):
-    """Counts the near faces of a vertex at an edge pq, or a vertex p = q; their pairs are ``near`` from ``first`` to ``end``.
+    """Counts the near faces of a vertex at an edge pq, or a vertex p = q. Their pairs are ``near`` from ``first`` to ``end``.
 
-    Returns the face that owns the term, the first whose nearest point is there or else the first; the number of faces; of those
-    whose nearest point is there; and the first face.
+    Returns the owner, which is the first face with its nearest point there or else the first; the number of faces; of those
+    with their nearest point there; and the first face.
     """
     lowest = wp.int32(-1)
     owner = wp.int32(-1)
@@ -275,7 +269,6 @@ def put_contact(
 
 @wp.func
 def slot_of(pairs: Pairs, near: NUMBERS, first: int, count: int, extra: int, i: int):
-    """The slot of contact i of a vertex, or −1. The first ``count`` are of near faces; keys of others begin at ``extra``."""
     key = extra + i - count
     if i < count:
         key = near[first + i]
@@ -286,7 +279,7 @@ def slot_of(pairs: Pairs, near: NUMBERS, first: int, count: int, extra: int, i: 
 def set_shares(
     pairs: Pairs, contacts: Contacts, near: NUMBERS, first: int, count: int, extra: int, extras: int, lane: int, lanes: int
 ):
-    """Sets the shares of every ``lanes``-th contact of a vertex with ``count`` near faces and ``extras`` other terms."""
+    """Sets the shares of every ``lanes``-th contact of a vertex."""
     for i in range(lane, count + extras, lanes):
         one = slot_of(pairs, near, first, count, extra, i)
         if one >= 0 and contacts.stiffness[one] > ZERO:
@@ -312,7 +305,7 @@ def set_shares(
 def lowest_gap(dtype):
     """Device function (of_vertex, stencil, n, b, c, d, goal, move) → a lower bound of the gap, with b, c and d from vertex 0.
 
-    It is the gap along n there or, if less and given, at goal + move, where the pair may have passed through.
+    It is the gap along n there or, if less, at goal + move, where the pair may have passed through.
     """
     vec3, _ = types(dtype)
     at, points = vertex_of(dtype), wp.array(dtype=vec3)
@@ -333,9 +326,9 @@ def lowest_gap(dtype):
 
 @cache
 def find_near_faces(dtype):
-    """Kernel over the listed pairs of a vertex and a face: where the nearest point is at x, or x + correction.
+    """Kernel over listed pairs of a vertex and a face: where the nearest point is, at x or x + correction.
 
-    A face is near if it has a force there, or may have one at goal + move if that is given. Only the first ``vertices`` count.
+    A face is near if it has a force, or may have one at goal + move. Only the first ``vertices`` count.
     """
     vec3, _ = types(dtype)
     at, lowest = vertex_of(dtype), lowest_gap(dtype)
@@ -387,7 +380,7 @@ def list_near_faces(
     # out
     faces: NearFaces,
 ):
-    """Kernel over vertices: lists their ``near`` faces and counts them; 0 if keys of their contacts would reach 2C."""
+    """Kernel over vertices: lists their ``near`` faces; none if keys of their contacts would exceed 2C."""
     for v in range(wp.tid(), vertices, threads):
         first = lists.rows[v]
         end = lists.rows[v + 1]
@@ -402,7 +395,7 @@ def list_near_faces(
 
 @cache
 def count_multiplicities(dtype):
-    """Kernel over the listed pairs of a vertex and a face: the multiplicities of the terms that a near face owns."""
+    """Kernel over listed pairs of a vertex and a face: the multiplicities of the terms that a near face owns."""
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
     points = wp.array(dtype=vec3)
@@ -411,7 +404,7 @@ def count_multiplicities(dtype):
     def edges_at(
         stencils: STENCILS, codes: NUMBERS, near: NUMBERS, first: int, end: int, p: int, a: wp.vec3d, x: points, d: points
     ):
-        """The number of edges of near faces at the vertex p; those with p nearest to a count once for each of their faces."""
+        """The number of edges of near faces at p; those with p nearest to a count once for each of their faces."""
         edges = wp.int32(0)
         P = at(x, d, p) - a
         for k in range(first, end):
@@ -469,10 +462,7 @@ def count_multiplicities(dtype):
 
 @cache
 def find_vertex_contacts(dtype):
-    """Kernel over vertices: their contacts at x, or x + correction, with the faces of :func:`list_near_faces`.
-
-    ``distant`` contacts may have no force.
-    """
+    """Kernel over vertices: their contacts at x or x + correction. ``distant`` contacts may have no force."""
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
 
@@ -566,7 +556,7 @@ def share_contacts(
     # out
     contacts: Contacts,
 ):
-    """Kernel over vertices, each of ``lanes`` threads: the shares of their contacts, see :func:`set_shares`."""
+    """Kernel over vertices, each of ``lanes`` threads: the shares of their contacts."""
     for thread in range(wp.tid(), vertices * lanes, threads):
         v = thread // lanes
         counts = faces.counts[v]
@@ -578,7 +568,7 @@ def share_contacts(
 
 @wp.func
 def width_of(areas: Areas, layout: Layout, laws: Laws, i: int, j: int):
-    """The rest area of an edge over its length; of a mesh, whose triangles may be large, at most the largest of the cloth."""
+    """The rest area of an edge over its length [m]; of a mesh, at most the largest of the cloth."""
     length = wp.length(areas.rest[in_copy(layout, j)] - areas.rest[in_copy(layout, i)])
     found = (areas.of_edges[i] + areas.of_edges[j]) / length
     if i >= layout.cloth:
@@ -588,7 +578,7 @@ def width_of(areas: Areas, layout: Layout, laws: Laws, i: int, j: int):
 
 @cache
 def find_edge_contacts(dtype):
-    """Kernel over pairs of edges: their contacts, as :func:`find_vertex_contacts`."""
+    """Kernel over listed pairs of edges: their contacts at x or x + correction, or which may have a force at goal + move."""
     vec3, _ = types(dtype)
     at, lowest = vertex_of(dtype), lowest_gap(dtype)
 

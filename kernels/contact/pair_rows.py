@@ -1,8 +1,8 @@
-"""Factories of the constraint rows of pairs, for each :class:`..term.PairTerm`.
+"""Constraint rows of pairs.
 
-Each copy has rows for all slots; those of other copies, or without a pair, are inactive, see :mod:`..constraint_rows`. With
-``curved``, pairs of a term with one row have a second one, which adds the stiffness −λC″. λ is found anew, as −C/α and the
-``fixed`` force, for pairs may have other slots than in the last rows.
+Each copy has rows for all slots; those of other copies, or without a pair, are inactive. With ``curved``, pairs of a term with
+one row have a second one, which adds the stiffness −λC″. λ starts as −C/α and the ``fixed`` force, because a pair may have
+another slot than before.
 """
 
 from functools import cache
@@ -21,7 +21,7 @@ FIXED = wp.constant(wp.float64(1e20))  # compliance of a row whose force is give
 
 @wp.struct
 class PairSlopes:
-    """Weights w of pairs, and ∂C/∂y of their first and second rows; 0 for inactive rows."""
+    """Weights w of pairs, and ∂C/∂y of their two rows; 0 if inactive."""
 
     weights: wp.array(dtype=wp.vec4d)
     first: wp.array(dtype=wp.vec3d)
@@ -30,7 +30,7 @@ class PairSlopes:
 
 @wp.func
 def row_of_pair(copy: int, e: int, ranks: wp.array(dtype=wp.int32), layout: RowLayout, rows: int):
-    """The first row of the pair in slot e. Rows are in the order of ``ranks``, or of slots if that is None."""
+    """The first row of the pair in slot e, in the order of ``ranks`` or, if that is None, of slots."""
     rank = e
     if ranks:
         rank = ranks[e]
@@ -44,7 +44,6 @@ def count_first_corners(
     # out
     counts: wp.array(dtype=wp.int32),
 ):
-    """Kernel over vertices: the number of pairs of which the vertex is corner 0."""
     i = wp.tid()
     found = wp.int32(0)
     for k in range(pairs.first[i], pairs.first[i + 1]):
@@ -60,7 +59,7 @@ def rank_pairs(
     # out
     ranks: wp.array(dtype=wp.int32),
 ):
-    """Kernel over vertices: numbers the pairs of which the vertex is corner 0, by their keys, from ``starts`` [i] on."""
+    """Kernel over vertices: numbers the pairs with the vertex as corner 0 from ``starts`` [i] on, by keys, in a fixed order."""
     i = wp.tid()
     rank = starts[i]
     for k in range(pairs.first[i], pairs.first[i + 1]):
@@ -71,7 +70,7 @@ def rank_pairs(
 
 @cache
 def linearise_pair_rows(term: PairTerm, dtype, curved: bool):
-    """Kernel over copies and pairs at x̃ + d: rows as in :func:`..constraint_rows.linearise`."""
+    """Kernel over copies and pairs: rows linearised at x̃ + d."""
     vec3, _ = types(dtype)
     row_of = term.row
     Q = wp.constant(2 if curved else term.rows)

@@ -1,9 +1,8 @@
-"""Factories of the kernels that sum energies, forces and Hessians of pairs: those of contact, and those of friction.
+"""Kernels that sum energies, forces and Hessians of pairs of contact and friction.
 
 The energy of a pair is a function of y = Σ wᵢxᵢ: vertex i gets wᵢ ∂U/∂y, and wᵢwⱼ ∂²U/∂y² joins vertices i and j. Kernels
-gather, with a thread for each vertex, in order and in float64. For the CPU they scatter: one thread takes the pairs with a
-force in order, so that no list of the pairs of a vertex is needed, and products find Σ wⱼpⱼ of each pair once. Both agree up to
-rounding.
+gather with a thread for each vertex, in order and in float64. On the CPU one thread scatters over the pairs with a force, in
+order, so that no list by vertex is needed. Both agree up to rounding.
 """
 
 from functools import cache
@@ -20,14 +19,12 @@ from .self_gaps import ZERO
 class PairForces:
     """Values of each pair at some positions, in float64: w, U [J], ∂U/∂y [N] and ∂²U/∂y² [N/m].
 
-    ∂²U/∂y² is the ``definite`` part, positive semi-definite, and the ``rest``, of which the matrix takes the factor that a
-    :class:`..term.HessianPolicy` gives the negative part; ``block`` is their sum. For kernels that scatter, ``pressing`` lists
-    the ``count`` [0] pairs with a force, in order, and ``joining`` the ``count`` [1] ones that join vertices: those with a mesh
-    may have only one.
+    ``block`` is the ``definite`` part and, by the :class:`..term.HessianPolicy`, a fraction of the ``rest``. For kernels that
+    scatter, ``pressing`` lists the ``count`` [0] pairs with a force, and ``joining`` the ``count`` [1] ones that join vertices.
 
-    If w changes with the positions, the rest has more entries, see :func:`..pairs.turned_pull`: of the ``turns`` t, two numbers
-    [1/m] for each vertex, two vectors e, the ``ways``, the ``normal`` n of the data, and ``twist``, α [N] and β [N·m].
-    ``twisted`` is the share of ``twist`` that the policy gives. Without, these arrays are None.
+    If w changes with the positions, :func:`..pairs.turned_pull` takes ``turns`` t, two numbers [1/m] for each vertex, two
+    vectors e, the ``ways``, the ``normal`` n, and ``twist``, α [N] and β [N·m], of which ``twisted`` is that fraction. Else
+    these arrays are None.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -48,13 +45,12 @@ class PairForces:
 
 @wp.func
 def is_single(s: wp.vec4i):
-    """Whether a pair has only one vertex of the cloth, which is the first; others are obstacles, with w = 0."""
+    """Whether a pair has only one vertex of the cloth; the others are obstacles, with w = 0."""
     return s[1] == s[0] and s[2] == s[0] and s[3] == s[0]
 
 
 @wp.func
 def note_pressing(forces: PairForces, e: int, s: wp.vec4i):
-    """Lists a pair with a force, if kernels scatter."""
     if forces.pressing:
         forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
         if not is_single(s):
@@ -65,8 +61,8 @@ def note_pressing(forces: PairForces, e: int, s: wp.vec4i):
 class PairRow:
     """The constraint rows C of a pair: w, ∂C/∂y of both rows, 0 if inactive, C, and the stiffness k [N/m].
 
-    ``size`` is the length of what cancels in y, without the correction [m]. ``fixed`` is the part of the force of the first row
-    that does not follow from C [N]. A row without stiffness has that alone.
+    ``size`` is the length that cancels in y, without the correction [m]. ``fixed`` is the part of the force of the first row
+    that does not follow from C [N].
     """
 
     weights: wp.vec4d
@@ -137,7 +133,7 @@ def pair_forces(term: PairTerm, dtype, scatters: bool):
 
 @cache
 def pair_energies(term: PairTerm, dtype, scatters: bool):
-    """Kernel over threads: adds the energies [J] of the pairs to those of their first vertices."""
+    """Kernel over threads: adds the energy of each pair to that of its first vertex [J]."""
     range_of, corners_at = taken_by(scatters)
 
     @wp.kernel(module=term.of(dtype, scatters), enable_backward=False)
@@ -161,7 +157,7 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
 
 @cache
 def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
-    """Kernel over pairs: ``block`` with the ``policy`` (B,), and the :func:`..pairs.pair_blocks` if products are gathered."""
+    """Kernel over pairs: ``block`` with the ``policy`` (B,), and the blocks of products if these are gathered."""
     vec3, mat33 = types(dtype)
     vec4, vec2, mat42, mat23 = (
         wp.types.vector(4, dtype),
@@ -211,7 +207,7 @@ def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
 
 @cache
 def pair_diagonal(term: PairTerm, dtype, scatters: bool):
-    """Kernel over threads: adds ∂²U/∂xᵢ² = Σ wᵢ² ∂²U/∂y², with its turns, to the diagonal of a Hessian, except at pins."""
+    """Kernel over threads: adds Σ wᵢ² ∂²U/∂y², with its turns, to the diagonal of a Hessian, except at pins."""
     _, mat33 = types(dtype)
     range_of, corners_at = taken_by(scatters)
 

@@ -1,11 +1,11 @@
-"""Factories of the kernels of Gauss–Seidel and Jacobi sweeps over pairs, for each :class:`..term.PairTerm`.
+"""Kernels of Gauss–Seidel and Jacobi sweeps over pairs.
 
-A sweep removes the λ of a pair and adds that of its prox at what remains: with v̂ without the force of the pair and D = Σ
-wᵢ²/mᵢ along n, λ = −hₑ²∂U/∂y(v̂ + Dλ) in closed form, and Δxᵢ = wᵢλ/mᵢ. Then M(x − x̃) = Σ wᵢλ with w at x, and a fixed point
-minimises the objective of the step. Without multipliers nothing is removed (PBD).
+A sweep replaces the λ of a pair by that of its prox: with v̂ without the force of the pair and D = Σ wᵢ²/mᵢ along n, λ =
+−hₑ²∂U/∂y(v̂ + Dλ) in closed form, and Δxᵢ = wᵢλ/mᵢ. Then M(x − x̃) = Σ wᵢλ with w at x, and a fixed point minimises the
+objective of the step. Without multipliers nothing is removed (PBD).
 
-Where axes of a vertex are locked, a soft pair takes D with all axes free, which does not move the fixed point: by the smaller
-D, a pair that cannot open along its free axes would throw the cloth far along them.
+Where axes are locked, a soft pair takes D with all axes free, which does not move the fixed point. By the smaller D, a pair
+that cannot open along its free axes would throw the cloth far along them.
 """
 
 from functools import cache
@@ -28,8 +28,8 @@ LOCKED = wp.constant(wp.float64(0.01))
 class SweptPairs:
     """Values of each pair in a Jacobi sweep: whether it touches, v, n and w.
 
-    ``slots`` has the index in ``corners`` of each corner 4·pair + i, and ``moves`` the mΔx of each entry of ``corners`` [kg·m].
-    ``touching`` counts the pairs that touch at each vertex; it is 0 between sweeps.
+    ``slots`` has the index in ``corners`` of each corner 4·pair + i, ``moves`` the mΔx of each entry of ``corners`` [kg·m].
+    ``touching`` counts the pairs that touch at a vertex; it is 0 between sweeps.
     """
 
     touches: wp.array(dtype=wp.int32)
@@ -45,7 +45,7 @@ class SweptPairs:
 def mobility(dtype, axes: bool, isotropic: bool):
     """Device functions (inverse masses, i, v) → W v and R v, and (inverse masses, i) → the largest 1/m of the axes of vertex i.
 
-    With ``axes``, inverse masses are vectors. R is that largest 1/m if ``isotropic``, else W.
+    R is that largest 1/m if ``isotropic``, else W.
     """
     vec3, _ = types(dtype)
 
@@ -72,7 +72,7 @@ def mobility(dtype, axes: bool, isotropic: bool):
 
 @cache
 def sweep_pairs(term: PairTerm, dtype, axes: bool):
-    """Kernel of one thread, which takes each pair in turn."""
+    """Kernel of one thread: a Gauss–Seidel sweep."""
     vec3, _ = types(dtype)
     moved, respond, greatest = mobility(dtype, axes, term.isotropic)
     near, push, stencil = term.near(dtype), term.push, load(wp.vec4i)
@@ -146,7 +146,7 @@ def number_corners(
 
 @cache
 def touch_pairs(term: PairTerm, dtype):
-    """Kernel over pairs of a Jacobi sweep: v, n and w of those that touch or have a force, counted at their vertices."""
+    """Kernel over pairs of a Jacobi sweep: v, n and w of those that touch or have a force, counted at vertices."""
     vec3, _ = types(dtype)
     near = term.near(dtype)
 
@@ -190,8 +190,8 @@ def touch_pairs(term: PairTerm, dtype):
 def press_pairs(term: PairTerm, dtype, axes: bool):
     """Kernel over pairs of a Jacobi sweep: λ of the prox, with D = Σ nᵢwᵢ²/mᵢ, nᵢ the touching pairs of vertex i.
 
-    D ⪰ J W Jᵀ, so the sum of the moves does not overshoot; the fixed point is that of :func:`sweep_pairs`. It stores wᵢλ −
-    w′ᵢλ′ for each corner, w′ and λ′ of the last sweep, and then λ and w for the next one.
+    D ⪰ J W Jᵀ, so the sum of the moves does not overshoot, and the fixed point remains. It stores wᵢλ − w′ᵢλ′ for each corner,
+    w′ and λ′ those of the last sweep, and then λ and w.
     """
     _moved, respond, greatest = mobility(dtype, axes, term.isotropic)
     vec3, _ = types(dtype)
@@ -248,7 +248,7 @@ def press_pairs(term: PairTerm, dtype, axes: bool):
 
 @cache
 def move_by_pairs(dtype, axes: bool):
-    """Kernel over vertices of a Jacobi sweep: d += W Σ of the ``moves`` of its corners, in order."""
+    """Kernel over vertices of a Jacobi sweep: d += W Σ ``moves`` of its corners, in order."""
     vec3, _ = types(dtype)
     moved, _respond, _greatest = mobility(dtype, axes, False)
 

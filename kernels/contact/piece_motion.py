@@ -1,4 +1,4 @@
-"""Factories of the kernels that decide whether pairs must be found again, by the motion of the connected pieces of a cloth."""
+"""Kernels that decide, by the motion of connected pieces of cloth, whether pairs must be found again."""
 
 from functools import cache
 
@@ -17,10 +17,9 @@ SAMPLES = wp.constant(9)  # vertices whose median motion is that of a piece
 def pieces(dtype):
     """Struct of the connected pieces of all copies: the piece of each vertex, or −1, and the drift of each piece [m].
 
-    The drift is its motion: along each axis the median of that of its ``samples`` (pieces·SAMPLES,). A part that moves alone,
-    such as a fold that rolls, hardly changes it. If a copy has more than one piece (``per_copy``), each also has a box, and the
-    largest motion of its vertices relative to the drift [m]. The first are those of the ``cloth``, which meet one another if it
-    meets ``itself``, and the others are meshes.
+    The drift is the median motion of its ``samples`` (pieces·SAMPLES,) along each axis, which a part that moves alone hardly
+    changes. If a copy has more than one piece (``per_copy``), each also has a box, and the largest motion of its vertices
+    relative to the drift [m]. Pieces of the ``cloth`` come first, then meshes.
     """
     vec3, _ = types(dtype)
 
@@ -42,7 +41,6 @@ def pieces(dtype):
 
 @cache
 def extend_boxes(dtype):
-    """Kernel over vertices: extends the boxes of their pieces."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -74,7 +72,7 @@ def note_moved(active: NUMBERS, copy: int, moved: NUMBERS, some: NUMBERS, due: N
 
 @cache
 def add_positions(dtype):
-    """Kernel over vertices: out = a + sign·b in the copies that are ``active``, or in all; b may be None, or end before a."""
+    """Kernel over vertices: out = a + sign·b in the ``active`` copies, or all; b may be None, or shorter than a."""
     vec3, _ = types(dtype)
     vector_or_zero = vector_within(dtype)
 
@@ -104,7 +102,7 @@ def add_positions(dtype):
 
 @cache
 def find_drift(dtype):
-    """Kernel over pieces: their drift from ``found`` to x + d, d (N,) or None; 0 if it is not finite."""
+    """Kernel over pieces: their drift from ``found`` to x + d; 0 if it is not finite."""
     vec3, _ = types(dtype)
     vector_or_zero = vector_within(dtype)
     numbers = wp.types.vector(SAMPLES, dtype)
@@ -145,10 +143,9 @@ def find_drift(dtype):
 
 @cache
 def find_motion(dtype):
-    """Kernel over vertices: finds copies in which a vertex at x + d has moved by more than ``most`` since ``found``.
+    """Kernel over vertices: finds copies where a vertex at x + d has moved by more than ``most`` since ``found``.
 
-    The motion is relative to the drift of the piece. moved = 1 for such copies among the ``active`` ones, and some = 1 if there
-    is one; due = 1 then. d is (N,) or None.
+    The motion is relative to the drift of the piece. moved = 1 for such ``active`` copies; some = due = 1 if there is one.
     """
     vec3, _ = types(dtype)
     vector_or_zero = vector_within(dtype)
@@ -187,7 +184,7 @@ def find_motion(dtype):
 
 @cache
 def compare_positions(dtype):
-    """Kernel over vertices: differ = 1 if one is at other positions in a and b, of which both may be NaN."""
+    """Kernel over vertices: differ = 1 if a and b differ at one. Two NaN are equal."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -207,9 +204,9 @@ def compare_positions(dtype):
 
 @cache
 def compare_motions(dtype):
-    """Kernel over pieces: moved, some and due as in :func:`find_motion`, if it and a later one of its copy may be too near.
+    """Kernel over pieces: moved, some and due are 1 if a piece and a later one of its copy may be too near.
 
-    That is, if their approach may exceed ``most`` plus the excess of the distance of their boxes over ``radius``, up to which
+    They may if their approach exceeds ``most`` plus the excess of the distance of their boxes over ``radius``, up to which
     pairs are listed.
     """
     vec3, _ = types(dtype)

@@ -1,4 +1,4 @@
-"""Factories of the kernels that find vertex–triangle pairs and edge–edge pairs near one another, in :mod:`.proximity_grid`."""
+"""Kernels that find vertex–triangle pairs and edge–edge pairs near one another, in a hashed grid."""
 
 from functools import cache
 
@@ -18,7 +18,8 @@ MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 class PairList:
     """The pairs: ``counts`` (2,) of those found, and unordered (row, item) of those within the capacity.
 
-    Rows are vertices, then edges. Row i has the items from ``first`` [i] on, sorted. ``row_counts`` is 0 between launches.
+    Rows are vertices, then edges. Row i has the sorted items from ``first`` [i] on, which makes the order of pairs fixed.
+    ``row_counts`` is 0 between launches.
     """
 
     counts: wp.array(dtype=wp.int32)
@@ -38,12 +39,11 @@ def distance_of(dtype, of_edges: bool):
 
     @wp.func
     def on_segment(along: dtype, squared: dtype):
-        """The parameter of the nearest point of a segment, 0 without length."""
         return wp.where(squared > zero, wp.clamp(along / squared, zero, one), zero)
 
     @wp.func
     def of_two_edges(a: vec3, b: vec3, c: vec3, d: vec3):
-        """Ericson 2004, *Real-time collision detection*, 5.1.9; then s once more, for parallel edges leave it to rounding."""
+        """Ericson 2004, *Real-time collision detection*, 5.1.9; then s again, which is rounding for parallel edges."""
         e = b - a
         f = d - c
         r = a - c
@@ -96,7 +96,7 @@ def cutoffs(dtype, of_edges: bool):
 
 @cache
 def take_near(dtype, of_edges: bool):
-    """The function of :func:`search_pairs` that lists pairs nearer than their contact distance and the skin, and its struct."""
+    """Returns the ``take`` of :func:`search_pairs` that lists pairs nearer than contact distance + skin, and its struct."""
     vec3, _ = types(dtype)
     corner = load(vec3)
     distance, cutoff = distance_of(dtype, of_edges), cutoffs(dtype, of_edges)
@@ -131,15 +131,15 @@ def take_near(dtype, of_edges: bool):
 def search_pairs(dtype, of_edges: bool, take, name: str):
     """Kernel over vertices, or edges: calls ``take`` for pairs with triangles, or with edges, whose boxes meet.
 
-    ``take`` (dtype, of_edges) returns a device function (surface, x, s, i, k, triangles, out) and the struct of ``out``. s is
-    the stencil of a pair, i its vertex or edge, and k its triangle or other edge. The boxes are at x, or along moves ``p`` from
-    there, of the cloth or of all vertices. Of calm cloth they are boxes at x, on level 0, that meet the box that an element
-    sweeps relative to all calm cloth nearby. A box meets those of its own level and those above, but that of a vertex that
-    moves meets those of all levels, for it may be larger. ``shares`` threads share the search of a vertex or edge. Where there
-    are more rows of cells than buckets, as for long moves, it goes through the buckets instead.
+    ``take`` (dtype, of_edges) returns a device function (surface, x, s, i, k, triangles, out) and the struct of ``out``; s is
+    the stencil, i its vertex or edge, and k its triangle or other edge. Boxes are at x, or along moves ``p`` of the cloth or of
+    all vertices. Calm cloth has its boxes at x on level 0, and meets the box that an element sweeps relative to all calm cloth
+    nearby. No pair is missed: a box meets those of its level and above, and that of a vertex that moves, which may be larger,
+    those of all levels. Of two edges of one level only one finds the other, by the order of their cells along z and y, or of
+    their indices.
 
-    Of two edges of one level, only one finds the other, by the order of their cells along z and y, or of their indices, which
-    is also the order in the stencil.
+    ``shares`` threads share the search of a vertex or edge. Where there are more rows of cells than buckets, it visits all
+    buckets.
     """
     vec3, _ = types(dtype)
     box_at, box_along, stored_box, cell_of = boxes(dtype)
@@ -327,7 +327,7 @@ def fill_rows(
 
 @cache
 def write_pairs(dtype):
-    """Kernel over rows: their sorted pairs, with the contact distance of each."""
+    """Kernel over rows: their sorted pairs, with the contact distance of each [m]."""
     vertex_cutoff, edge_cutoff = (cutoffs(dtype, each) for each in (False, True))
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)

@@ -1,9 +1,9 @@
-"""Factories of the hashed grid that finds near pairs, and of the structs of cloths and pairs.
+"""The hashed grid that finds near pairs, and structs of surfaces.
 
 The *items* are the triangles and then the edges of all copies. Their bounding boxes are sorted by centre into the cells of a
 hierarchical grid (count, scan, fill). Level l has boxes with half sizes up to ``size``·2ˡ, so a box meets only boxes whose
 centres are at most this far from it, in its own level and those above. Cells are hashed to buckets such that a row along x is a
-sequence of buckets. So cells are a quarter as long as wide (measured on waves: 0.75 of the time with cubes).
+sequence of buckets; so cells are a quarter as long as wide.
 """
 
 from functools import cache
@@ -27,12 +27,11 @@ MODULE = "warpcloth.proximity"
 def surfaces(dtype):
     """Struct of the cloths: the vertices of each item (the last vertex of an edge twice), with 2·copy + kind.
 
-    ``rest`` is the rest position of each vertex of a copy [m], and ``piece`` its connected piece, −1 without an element.
-    ``groups`` of items and ``vertex_groups`` say which elements meet, and ``itself`` whether cloth meets cloth. ``distance`` is
-    the contact distance of cloth with cloth, ``of_meshes`` that with meshes, and ``max_distance`` the larger one [m]. With
-    meshes, edges and vertices of the meshes act at smaller distances; they are listed up to ``close`` and the skin [m].
-    Elements whose first vertices are more than ``far`` apart at rest are surely at least twice the contact distance apart [m].
-    ``lowest`` and ``highest`` are corners of a box of the cloth of each copy; without obstacles they are empty.
+    ``rest`` are rest positions in a copy [m], and ``piece`` connected pieces, −1 without an element. ``groups`` and
+    ``vertex_groups`` say which elements meet, ``itself`` whether cloth meets cloth. ``distance`` is the contact distance of
+    cloth with cloth, ``of_meshes`` that with meshes, ``max_distance`` the larger one; edges and vertices of meshes are listed
+    up to ``close`` and the skin [m]. Elements whose first vertices are more than ``far`` apart at rest are at least twice the
+    contact distance apart [m]. ``lowest`` and ``highest`` bound the cloth of each copy; without obstacles they are empty.
     """
     vec3, _ = types(dtype)
 
@@ -61,9 +60,9 @@ def surfaces(dtype):
 def grids(dtype):
     """Struct of the grid: ``size``, the half size of the largest boxes of level 0 [m], and 2ᵏ buckets of entries.
 
-    Bucket b has the entries first[b] to first[b+1]. An entry is a box and (item, y, z, code), with y and z of the cell, see
-    :func:`code_of`. ``counts`` and ``keys`` are scratch. ``levels`` (4,) has a bit for each level with items of each
-    :func:`kind_in_grid`, and ``extents`` the largest half sizes of these along each axis [m].
+    Bucket b has the entries first[b] to first[b+1], each a box and (item, y, z, code) with y and z of the cell. ``counts`` and
+    ``keys`` are scratch. ``levels`` (4,) has a bit for each level with items of a kind, ``extents`` their largest half sizes
+    [m].
     """
     vec3, _ = types(dtype)
 
@@ -90,7 +89,7 @@ def boxes(dtype):
 
     @wp.func
     def box_of(radius: dtype, a: vec3, b: vec3, c: vec3):
-        """The box of three points, enlarged by half of ``radius``, and by a margin for rounding."""
+        """The box of three points, enlarged by half of ``radius`` and a margin for rounding."""
         low = wp.min(wp.min(a, b), c)
         high = wp.max(wp.max(a, b), c)
         more = half * radius
@@ -102,7 +101,7 @@ def boxes(dtype):
 
     @wp.func
     def box_at(surface: surfaces(dtype), x: wp.array(dtype=vec3), i: int, j: int, k: int):
-        """The box of three vertices and its radius. Of an edge, j and k are equal."""
+        """The box of three vertices and its radius [m]. Of an edge, j and k are equal."""
         of_mesh = i >= surface.layout.cloth
         is_edge = i != j and j == k
         radius = surface.skin + surface.max_distance
@@ -113,7 +112,7 @@ def boxes(dtype):
 
     @wp.func
     def box_along(surface: surfaces(dtype), x: wp.array(dtype=vec3), p: wp.array(dtype=vec3), i: int, j: int, k: int):
-        """The box of three vertices that move from x to x + p, or that stay, if p is None. Of an edge, j and k are equal."""
+        """The box of three vertices that move from x to x + p, or stay if p is None."""
         a, b, c = corner(x, i), corner(x, j), corner(x, k)
         low, high, radius = box_at(surface, x, i, j, k)
         if p:
@@ -124,7 +123,7 @@ def boxes(dtype):
 
     @wp.func
     def level_of(size: dtype, low: vec3, high: vec3):
-        """The level of a box; −1 if the box is not finite."""
+        """The level of a box; −1 if it is not finite."""
         own = half * wp.max(high - low)
         level = wp.int32(-1)
         if own < dtype(wp.inf):
@@ -147,7 +146,7 @@ def boxes(dtype):
     ):
         """The box of three vertices in the grid, and its level.
 
-        If they move and are calm, it is their box at x, on level 0. Other boxes along moves of the cloth are above it.
+        Of calm vertices that move it is their box at x, on level 0. Other boxes along moves of the cloth are above it.
         """
         low, high = box_along(surface, x, p, i, j, k)
         level = level_of(size, low, high)
@@ -164,7 +163,6 @@ def boxes(dtype):
 
     @wp.func
     def cell_of(size: dtype, level: int, p: vec3):
-        """The cell of a level with the point p."""
         cell = wp.vec3i()
         if level < LEVELS:
             q = vec3(dtype(2.0) * p[0], half * p[1], half * p[2]) / (size * dtype(1 << level))
@@ -182,11 +180,11 @@ def boxes_meet(low: Any, high: Any, l: Any, u: Any):
 
 @cache
 def box_tests(dtype):
-    """Device functions ``ends_of`` (low, high) → a box as it is stored in the grid, and ``next_meeting``.
+    """Device functions ``ends_of`` (low, high) → a box as stored in the grid, and ``next_meeting``.
 
-    ``next_meeting`` returns the first of every ``stride``-th entry from ``at`` to ``end`` whose box meets the given one;
-    ``ends`` is that box with low and high exchanged, and ``more`` entries follow from the first bucket on. It has one branch
-    an entry: a search takes .7 of the time on the CPU.
+    ``next_meeting`` is the first of every ``stride``-th entry from ``at`` to ``end``, then of ``more`` entries from the first
+    bucket on, whose box meets the one with low and high exchanged in ``ends``. One branch an entry takes .7 of the time on the
+    CPU.
     """
     vec3, _ = types(dtype)
     vec8 = wp.types.vector(8, dtype)
@@ -208,7 +206,7 @@ def box_tests(dtype):
 
 @wp.func
 def kind_in_grid(v: wp.vec4i, group: int):
-    """The kind of an item with the vertices v: 0 for triangles, 1 for edges, and 2 more for those of obstacles."""
+    """The kind of an item: 0 for triangles, 1 for edges, and 2 more for obstacles."""
     return (v[3] & 1) + wp.where(group == OBSTACLE, 2, 0)
 
 
@@ -219,7 +217,7 @@ def code_of(copy: int, kind: int, level: int):
 
 @cache
 def bound_cloth(dtype):
-    """Kernel over vertices of the cloth: extends the box of their copy, which holds their boxes along p."""
+    """Kernel over vertices of the cloth: extends the box of their copy by their boxes along p."""
     vec3, _ = types(dtype)
     _box_at, box_along, *_ = boxes(dtype)
 

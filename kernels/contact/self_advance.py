@@ -19,9 +19,9 @@ from .self_planes import KEPT, WIDE, margin_of, needs_no_cut, part_apart, ulp_of
 def advances(dtype):
     """Struct of the moves ``direction`` [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m].
 
-    The direction is that of the cloth (N,), or of all vertices of the surface. ``far`` is 1 for copies that move so far that
-    pairs may meet which are not in the list (B,). Of cloth the list has all pairs that may meet while their sides move by at
-    most ``alike`` relative to one another, from the positions ``found`` of the list to the end of the direction [m].
+    The direction is that of the cloth (N,), or of all vertices. ``far`` (B,) is 1 for copies that move so far that unlisted
+    pairs may meet. Of cloth the list has all pairs that may meet while their sides move by at most ``alike`` relative to one
+    another from the positions ``found`` of the list [m].
     """
     vec3, _ = types(dtype)
 
@@ -41,9 +41,8 @@ def advances(dtype):
 def allowed_fraction(dtype):
     """Device function (of_vertex, stencil, x, advance) → the fraction of its moves that a pair may make.
 
-    A pair keeps a tenth of its gap. Where all vertices move by the same fraction, a plane between the sides may move with them:
-    they stay apart along y while no vertex of one side comes near the height of one of the other. Where this allows less than
-    the direction, as for cloth that slides over an edge, :func:`.self_planes.part_apart` may allow more.
+    A pair keeps a tenth of its gap. Its sides stay apart along y while no vertex of one comes near the height of one of the
+    other. Where this allows less than the direction, :func:`.self_planes.part_apart` may allow more.
     """
     vec3, _ = types(dtype)
     ulp, vector_or_zero, advance = ulp_of(dtype), vector_within(dtype), advances(dtype)
@@ -82,9 +81,9 @@ def allowed_fraction(dtype):
 
 @cache
 def take_advance(dtype, of_edges: bool):
-    """The function of :func:`.proximity.search_pairs` that reduces the ``fraction`` of copies that move ``far``; its struct.
+    """The ``take`` of :func:`.proximity.search_pairs` that reduces the ``fraction`` of copies that move ``far``; its struct.
 
-    It leaves out pairs that the list has, and those whose boxes stay apart while they move relative to one another.
+    It omits listed pairs, and those whose boxes stay apart while they move relative to one another.
     """
     vec3, _ = types(dtype)
     advance, allowed, of_vertex = advances(dtype), allowed_fraction(dtype), wp.constant(not of_edges)
@@ -139,7 +138,7 @@ def take_advance(dtype, of_edges: bool):
 def advance_listed(dtype):
     """Kernel over listed pairs: reduces the ``fraction`` of copies.
 
-    Pairs whose ``gap`` at ``begun`` is too wide for the moves of their sides relative to one another are left out.
+    It omits pairs whose ``gap`` at ``begun`` is too wide for the relative moves of their sides.
     """
     vec3, _ = types(dtype)
     allowed, stencil, vertex, ulp = allowed_fraction(dtype), load(wp.vec4i), load(vec3), ulp_of(dtype)

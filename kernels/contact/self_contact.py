@@ -1,15 +1,13 @@
-"""Factories of the kernels of the energy of self-contact and its derivatives, from the contacts of :mod:`.pair_potential`.
+"""Kernels of the energy of self-contact and its derivatives, from contacts of :mod:`.pair_potential`.
 
-U = Σ kA φ(d) over the contacts, with φ as for colliders (:mod:`..terms.contact`). The nearest points minimise ‖y‖, so their
-motion does not contribute to the gradient ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's theorem). The Hessian of a contact is
+U = Σ kA φ(d). The nearest points minimise ‖y‖, so their motion does not contribute to ∂U/∂xᵢ = kA φ′ wᵢn, n = y/d (Danskin's
+theorem). The Hessian of a contact is
 
     kA (φ″ wᵢwⱼ nnᵀ + φ′/d (wᵢwⱼ (1 − nnᵀ) − VᵢᵀG Vⱼ)),  Vᵢ = cᵢ yᵀ + wᵢ (u, v)ᵀ
 
 for nearest points that move along the edges u and v, with cᵢ = ∂wᵢ/∂θ by their parameters θ, and G⁻¹ = LLᵀ the second
-derivatives of ½‖y‖² by θ. For two edges with D² = γ(θ)‖y‖², cᵢ also has wᵢ ∂γ/∂θ/γ, and G⁻¹ is that of ½D²/γ. The part of φ′
-is negative. Across n it is as large as that of φ″ at small gaps. Its entries that join n with directions across n have the size
-of kA φ′ over the length of an edge. The definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All
-is in float64 for every precision.
+derivatives of ½‖y‖² by θ. For two edges with D² = γ(θ)‖y‖², cᵢ also has wᵢ ∂γ/∂θ/γ, and G⁻¹ is that of ½D²/γ. The part of φ′ is
+negative. The definite part is kA φ″ nnᵀ alone, of contacts over a valley by their share of it. All is in float64.
 """
 
 from functools import cache
@@ -39,7 +37,7 @@ UNITY = wp.constant(wp.mat33d(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
 @cache
 def least_gap(dtype):
-    """Device function (stencil, x, least) → the least gap f [m] that the filter leaves a pair at x: twice its margin."""
+    """Device function (stencil, x, least) → the least gap f [m] that the filter leaves a pair: twice its margin."""
     vec3, _ = types(dtype)
     ulp = ulp_of(dtype)
 
@@ -54,7 +52,7 @@ def least_gap(dtype):
 def slope_of_middles(contacts: Contacts, e: int, own: wp.vec4i, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """∂γ/∂(s, t)/γ of two edges ab and cd, γ that of :func:`.pair_potential.from_middles`.
 
-    The weights of obstacles are not stored: there the other edge and d n give s or t.
+    Weights of obstacles are not stored: there the other edge and d n give s or t.
     """
     w = contacts.weights[e]
     u = b - a
@@ -71,10 +69,10 @@ def slope_of_middles(contacts: Contacts, e: int, own: wp.vec4i, a: wp.vec3d, b: 
 
 @cache
 def nearest_turns(dtype):
-    """Device function (contacts, e, stencil, x, d) → the rows L⁻¹cᵢ and L⁻¹(u, v) of a contact, see the module.
+    """Device function (contacts, e, stencil, x, d) → the rows L⁻¹cᵢ and L⁻¹(u, v) of a contact.
 
-    The nearest points move along u and v, edges of a face or the two edges. Along each one weight grows and one falls. On a
-    flat mesh they may be on an edge by rounding alone, and move along the face.
+    Along each of the edges u and v one weight grows and one falls. On a flat mesh the nearest points may be on an edge by
+    rounding alone, and move along the face.
     """
     vec3, _ = types(dtype)
     at = vertex_of(dtype)
@@ -160,9 +158,9 @@ def nearest_turns(dtype):
 def find_forces(dtype, bounded: bool):
     """Kernel over contacts: their forces; φ = ½(r − d)² if ``bounded``.
 
-    If the least gap f of the filter, ``least`` [m], is above 0, ψ is added to φ, from d = 2f on, where it is C², or from r if
-    that is less: else cloth would be pressed to f, where one pair stops the whole copy. Of a negative contact the definite
-    part lacks what is along n, which is negative, and has half of U′/d across n.
+    If the least gap f of the filter is above 0, ψ is added to φ, from d = 2f or r on, where it is C²; else cloth would be
+    pressed to f, where one pair stops the whole copy. The definite part of a negative contact omits the part along n, and has
+    half of U′/d across n.
     """
     vec3, _ = types(dtype)
     least_gap_of, turns_of = least_gap(dtype), nearest_turns(dtype)
@@ -250,7 +248,7 @@ def push_contact(
 ):
     """The ``push`` of contact: λ = (d* − d)/D of the gap d = v·n, with D at least ``least`` if the contact is ``hard``.
 
-    The prox is that of the share of the contact; the rest of its force, and that of a negative contact, is ``fixed``.
+    The prox is that of its share; the rest of its force, and that of a negative contact, is ``fixed``.
     """
     k = contacts.stiffness[e]
     mode = contacts.followed.mode[0]
@@ -275,10 +273,7 @@ def push_contact(
 
 @wp.func
 def row_of_contact(pairs: Pairs, contacts: Contacts, e: int, x: wp.array(dtype=Any), d: wp.array(dtype=Any)):
-    """The ``row`` of contact: C = −√(2φ(d)), as for contact with colliders. The second has the stiffness −λC″ along n.
-
-    C is that of the share of the contact; the rest is ``fixed``.
-    """
+    """The ``row`` of contact: C = −√(2φ(d)) of its share; the rest is ``fixed``. The second has the stiffness −λC″ along n."""
     found = PairRow()
     k = contacts.stiffness[e]
     r = contacts.distance[e]

@@ -1,6 +1,6 @@
-"""Factories of the kernels of the filter, which moves each vertex only as far as the planes of :mod:`.self_planes` allow.
+"""Kernels of the filter, which moves each vertex only as far as the planes of :mod:`.self_planes` allow.
 
-The filter ends each step. It also shortens the search directions of a minimiser whose iterates must stay apart.
+The filter ends each step, and shortens search directions of a minimiser whose iterates must stay apart.
 """
 
 from functools import cache
@@ -24,8 +24,8 @@ TOGETHER, LAGGING = wp.constant(wp.float64(0.01)), wp.constant(wp.float64(0.5))
 def keep_apart(dtype):
     """Kernel over vertices: x ← x + u + t(δ − u), with the ``common`` move u and t at most the ``share`` that planes allow.
 
-    ``most`` bounds t‖δ − u‖, so that pairs that are not listed cannot cross. ``cuts`` (B,) counts the vertices whose move this
-    bound alone shortened. Copies whose ``walk`` is 0 do not move.
+    ``most`` bounds t‖δ − u‖, so that unlisted pairs cannot cross. ``cuts`` (B,) counts the vertices whose move this bound alone
+    shortened. Copies whose ``walk`` is 0 do not move.
     """
     vec3, _ = types(dtype)
 
@@ -77,10 +77,7 @@ def another_round(
     walk: wp.array(dtype=wp.int32),
     proceed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: ``walk`` is 1 if a copy makes another round, of at most ``most``, and ``proceed`` if any does.
-
-    It does so while the bound of the list cuts the move of a vertex.
-    """
+    """Kernel over copies: ``walk`` and ``proceed`` are 1 while the bound of the list cuts a move, in up to ``most`` rounds."""
     c = wp.tid()
     rounds[c] = rounds[c] + 1
     walk[c] = 0
@@ -107,8 +104,7 @@ def end_move(
 ):
     """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
 
-    After ``most`` rounds pins stop, and meshes go through what is in their way: ``first`` is FIRST − frame for the first such
-    frame.
+    After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame.
     """
     c = wp.tid()
     if fraction[c] == ONE:
@@ -122,10 +118,10 @@ def end_move(
 
 @wp.struct
 class HeldPins:
-    """The prescribed moves that the filter has shortened after ``steps``, (copies,).
+    """The prescribed moves that the filter has shortened after ``steps`` (B,).
 
-    ``first`` is FIRST − (step·n + vertex), with n vertices a copy, for the first step and vertex with a pinned coordinate that
-    was held back, or 0. ``farthest`` is the largest distance by which one was held back [m].
+    ``first`` is FIRST − (step·n + vertex) for the first pinned coordinate that was held back, or 0, and ``farthest`` the
+    largest distance by which one was held back [m].
     """
 
     steps: wp.array(dtype=wp.int32)
@@ -136,7 +132,6 @@ class HeldPins:
 
 @wp.func
 def note_held(held: HeldPins, i: int, back: wp.float64):
-    """Notes that the pin i was held back by the distance ``back`` [m], if that is not 0."""
     if back == ZERO:
         return
     copy = i // held.per_copy
@@ -147,9 +142,9 @@ def note_held(held: HeldPins, i: int, back: wp.float64):
 
 @wp.func
 def turned_gap(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """The gap of a pair at a, b, c and d along its common normal, which was n before it moved, and the sine of the turn of n.
+    """The gap of a pair at a, b, c and d along its common normal, n before it moved, and the sine of the rotation of n.
 
-    The normal is that of the triangle bcd, or of both edges ab and cd. A pair that has none keeps n.
+    The normal is that of the triangle bcd, or of the edges ab and cd. A pair without one keeps n.
     """
     first = wp.where(of_vertex, c - b, b - a)
     second = wp.where(of_vertex, d - b, d - c)
@@ -167,12 +162,11 @@ def turned_gap(of_vertex: bool, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec
 def share_of_pins(dtype):
     """Kernel over pairs: reduces the ``share`` of each pin, the fraction of its move to x that other pins leave it.
 
-    It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. If they would pass
-    through one another, pins stop at the contact distance or, if that is smaller, at the gap at the start of the step. If pairs
-    are ``hard``, so do pins that would come nearer than this by more than a fraction of it: TOGETHER, or LAGGING if a vertex is
-    free, or, if larger, the sine of the turn of their normal. Else free vertices count as if they moved with the pins of their
-    pair, for x has where they would be without contact. Gaps are those of :func:`turned_gap`, which a turn as one body does not
-    change. On the chords of a turn by θ between keyframes they shrink, by up to tan θ/2 times this sine.
+    It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. Pins that would
+    pass through one another stop at the contact distance or, if smaller, the gap at the start. So do pins of ``hard`` pairs
+    that would come nearer by more than a fraction of it: TOGETHER, or LAGGING if a vertex is free, or, if larger, the sine of
+    the rotation of their normal. Else free vertices count as if they moved with the pins, because x omits contact. Rotation as
+    one body keeps gaps; on chords of a rotation by θ between keyframes they shrink by up to tan θ/2 times this sine.
     """
     vec3, _ = types(dtype)
 
@@ -233,7 +227,7 @@ def share_of_pins(dtype):
 
 @cache
 def hold_pins(dtype):
-    """Kernel over vertices: pins make the ``share`` of their moves from x_before in x, and v changes with them."""
+    """Kernel over vertices: pins make the ``share`` of their moves from x_before, and v changes with them."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -263,7 +257,7 @@ def hold_pins(dtype):
 def end_filter(dtype):
     """Kernel over vertices: adds the change of x by the filter to ``move``, which may be None, and the change over h to v.
 
-    ``cut`` counts the free vertices among them, and ``held`` notes pins. These have v of their last move, which took ``pin_h``.
+    ``cut`` counts the free vertices among them, and ``held`` notes pins, whose last move took ``pin_h`` [s].
     """
     vec3, _ = types(dtype)
 
@@ -307,10 +301,7 @@ def end_filter(dtype):
 
 @cache
 def find_short(dtype):
-    """Kernel over vertices: ``walk`` of a copy becomes 1 if it is cut more often than ``before`` and not at its target.
-
-    ``some`` becomes 1 too.
-    """
+    """Kernel over vertices: ``walk`` and ``some`` become 1 for a copy cut more often than ``before`` and not at its target."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -343,7 +334,6 @@ def take_back(
     # in and out
     first: wp.array(dtype=wp.int64),
 ):
-    """Kernel over copies: ``first`` is what it was ``before`` in copies that ``walk`` again."""
     copy = wp.tid()
     if walk[copy] == 1:
         first[copy] = before[copy]
@@ -351,7 +341,7 @@ def take_back(
 
 @cache
 def walk_from_start(dtype):
-    """Kernel over vertices from ``first`` on: x = x_before, the start of the step, in copies that ``walk``."""
+    """Kernel over vertices from ``first`` on: x = x_before in copies that ``walk``."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -377,7 +367,7 @@ def walk_from_start(dtype):
 def find_held(dtype):
     """Kernel over vertices: ``mobile`` is 1/m, or 0 for those not at their position ``outside`` of colliders.
 
-    ``within`` becomes 1 if there is such a vertex and fewer than ``most`` turns were made.
+    ``within`` becomes 1 if there is one and fewer than ``most`` turns were made.
     """
     vec3, _ = types(dtype)
 
@@ -407,10 +397,10 @@ def find_held(dtype):
 
 @cache
 def push_pairs(dtype):
-    """Kernel of one thread: each pair in turn moves the ends of moves p apart along n, to its gap or ``left``, the smaller one.
+    """Kernel of one thread: each pair in turn moves the ends of moves p apart along n, to its gap or ``left`` [m] if smaller.
 
-    If it ``opens``, to twice its gap, so that rounding does not stop pairs at the least gap that should move together.
-    Obstacles move if p has their moves, and cannot be pushed.
+    If it ``opens``, to twice its gap, so that rounding does not stop pairs that should move together. Obstacles cannot be
+    pushed.
     """
     vec3, _ = types(dtype)
     vector_or_zero = vector_within(dtype)
@@ -452,7 +442,7 @@ def push_pairs(dtype):
 
 @cache
 def scale_directions(dtype):
-    """Kernel over vertices: p ← ``fraction``·p, with the fraction of the copy (B,); or 0 if it is below 1 and ``whole``."""
+    """Kernel over vertices: p ← ``fraction``·p of the copy (B,), or 0 if that is below 1 and ``whole``."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -483,9 +473,9 @@ def copies_near_colliders(
     touching: wp.array(dtype=wp.int32),
     some: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: ``touching`` is 1 for ``active`` copies that are ``near`` colliders, else 0; then ``some`` becomes 1.
+    """Kernel over copies: ``touching`` is 1 for ``active`` copies ``near`` colliders, else 0; then ``some`` becomes 1.
 
-    ``near`` (B,) is None if it holds ``always`` or never.
+    ``near`` (B,) is None if that holds ``always`` or never.
     """
     copy = wp.tid()
     is_near = always
@@ -505,7 +495,7 @@ def copies_free(
     # out
     some: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: ``wanted`` becomes 0 where the fraction of the direction is below 1; ``some`` is 1 if one is left."""
+    """Kernel over copies: ``wanted`` becomes 0 where the fraction is below 1; ``some`` is 1 if one is left."""
     copy = wp.tid()
     if fraction[copy] < ONE:
         wanted[copy] = 0
@@ -523,7 +513,7 @@ def copies_in_contact(
     touching: wp.array(dtype=wp.int32),
     some: wp.array(dtype=wp.int32),
 ):
-    """Kernel over contacts: ``touching`` becomes 1 for their copies if these are ``active``, and then ``some``."""
+    """Kernel over contacts: ``touching`` and ``some`` become 1 for ``active`` copies."""
     e = wp.tid()
     if e >= pairs.number[0]:
         return
@@ -540,7 +530,6 @@ def copies_with_pairs(
     # out
     listed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over pairs: ``listed`` becomes 1 for their copies."""
     e = wp.tid()
     if e < pairs.counts[0] + pairs.counts[1]:
         listed[copy_of(pairs.layout, pairs.stencils[e][0])] = 1
@@ -555,7 +544,7 @@ def divide_copies(
     # out
     stand: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: ``walk`` also becomes 1 where ``far`` is; ``stand`` is 1 in the others."""
+    """Kernel over copies: ``walk`` becomes 1 where ``far`` is; ``stand`` is 1 in the others."""
     c = wp.tid()
     walk[c] = wp.max(walk[c], far[c])
     stand[c] = 1 - walk[c]
@@ -563,10 +552,9 @@ def divide_copies(
 
 @cache
 def aim(dtype):
-    """Kernel over vertices: p = goal − x along ``free`` axes, pinned ones, or both, else 0; where ``fraction`` (B,) is below 1.
+    """Kernel over vertices: p = goal − x along ``free`` axes, pinned ones, or both, else 0.
 
-    ``fraction`` may be None.
-    """
+    Copies whose ``fraction`` (B,) is 1 keep p; it may be None."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

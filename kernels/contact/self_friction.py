@@ -1,13 +1,11 @@
-"""Factories of the kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(Σ wᵢxᵢ − a), a = Σ wᵢxᵢⁿ − ξ.
+"""Kernels of friction in self-contact: U = Σ kA H(‖u‖), u = (I − nnᵀ)(Σ wᵢxᵢ − a), a = Σ wᵢxᵢⁿ − ξ.
 
 H is that of :mod:`..coulomb`, with ε = μN/(kA). Contacts, w, n, kA and N = −kAφ′ times their share are those at the start xⁿ of
-the step. A step updates the elongation ξ of the spring, ξ ← u, and the next one shortens it to at most ε: a sticking pair does
-not creep, and the spring of a sliding pair slides along. A pair takes the ξ of the contact between the same vertices, those of
-nonzero w, in the last step; without one, the mean of those that the vertex had with a part of the same face, or else of those
-with a common vertex on each side.
-
-At the end of a step ξ rotates with the cloth or the mesh, and u is without what turns the gap d: R of :func:`turn_of` moves one
-side by d(Rn − n) relative to the other. That of meshes is known, so u is without it in the whole step.
+the step. A step sets the elongation ξ of the spring to u, and the next one shortens it to at most ε: a sticking pair does not
+creep, and the spring of a sliding pair slides along. A pair takes the ξ of the contact between the same vertices of nonzero w
+in the last step, else the mean of those that its vertex had with the face, or else of those with a common vertex on each side.
+At the end of a step ξ rotates with the cloth or mesh, and u omits the displacement d(Rn − n) by the rotation R of the gap. That
+of meshes is known, so u omits it in the whole step.
 """
 
 from functools import cache
@@ -32,8 +30,8 @@ from .self_pairs import take_slot
 class RubbedPairs:
     """Values of contacts at the start of the step: n, w, kA [N/m], ε [m], the anchor a [m], and the vertices on the first side.
 
-    ``parts`` are vertices of the surface, −1 where w is 0. ``travel`` is what obstacles add to y in the step; forces see the
-    fraction ``ahead`` of it.
+    ``parts`` are vertices of the surface, −1 where w is 0. ``travel`` is the motion of obstacles in y; forces see the fraction
+    ``ahead``.
     """
 
     normal: wp.array(dtype=wp.vec3d)
@@ -53,7 +51,6 @@ MODULE = "warpcloth.self_friction"
 
 
 def friction_module(dtype, law=None):
-    """Returns the name of the module of kernels, of those for a law if that is given."""
     return ".".join([MODULE, *([law.name] if law else []), dtype.__name__])
 
 
@@ -67,7 +64,6 @@ def has(s: wp.vec4i, vertex: int, first: int, last: int):
 
 @wp.func
 def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_last: int):
-    """Whether two sides, given by their ranges of corners, have a common vertex."""
     found = wp.bool(False)
     for i in range(s_first, s_last):
         found = found or (s[i] >= 0 and has(q, s[i], q_first, q_last))
@@ -76,7 +72,7 @@ def meet(s: wp.vec4i, s_first: int, s_last: int, q: wp.vec4i, q_first: int, q_la
 
 @wp.func
 def same_vertices(s: wp.vec4i, q: wp.vec4i, sides: int):
-    """Whether two contacts are between the same vertices on each side, in any order."""
+    """Whether two contacts are between equal vertices on each side, in any order."""
     found = wp.bool(True)
     for i in range(4):
         first = wp.where(i < sides, 0, sides)
@@ -109,10 +105,10 @@ def turn_of_edge(layout: Layout, i: int, j: int, start: POINTS, moves: VECTORS, 
 
 @wp.func
 def turn_of(layout: Layout, rings: Rings, s: wp.vec4i, w: wp.vec4d, sides: int, start: POINTS, moves: VECTORS, x: POINTS):
-    """The rotation R of a contact from ``start`` to x.
+    """The rotation R of a contact from ``start`` to x (Kabsch 1976).
 
-    It fits the edges at its vertices s (−1: none) best, each with |w| (Kabsch 1976): of a mesh by the ``moves`` of its
-    vertices, else of the cloth. Vertices without a triangle have the edges of the contact.
+    It fits the edges at its vertices s (−1: none), with weights |w|: of a mesh by the ``moves`` of its vertices, else of the
+    cloth. Vertices without a triangle have the edges of the contact.
     """
     of_mesh = obstacle_of(layout, s) >= 0
     A = wp.mat33d()
@@ -151,7 +147,6 @@ def difference(layout: Layout, s: wp.vec4i, w: wp.vec4d, x: wp.array(dtype=Any))
 
 @wp.func
 def slip_from(layout: Layout, rubbed: RubbedPairs, e: int, y: wp.vec3d, ahead: wp.float64):
-    """Returns u of a pair, after the fraction ``ahead`` of the step."""
     u = y - rubbed.anchor[e]
     if layout.obstacles > 0:
         u += ahead * rubbed.travel[e]
@@ -160,7 +155,7 @@ def slip_from(layout: Layout, rubbed: RubbedPairs, e: int, y: wp.vec3d, ahead: w
 
 @wp.func
 def slip_at(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=Any), d: wp.array(dtype=Any)):
-    """u at x, or at x + d."""
+    """u at x or x + d."""
     s = pairs.stencils[e]
     y = difference(pairs.layout, s, rubbed.weights[e], x)
     if d:
@@ -170,7 +165,7 @@ def slip_at(pairs: Pairs, rubbed: RubbedPairs, e: int, x: wp.array(dtype=Any), d
 
 @cache
 def begin_friction(dtype, law: Law, bounded: bool):
-    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force and friction, for which there is room.
+    """Kernel over contacts at the start of a step: w, n, kA and ε of those with a force and friction.
 
     ``friction`` has μ of cloth with cloth, then that of each obstacle of a copy.
     """
@@ -225,7 +220,7 @@ def begin_friction(dtype, law: Law, bounded: bool):
 
 @cache
 def set_anchors(dtype, law: Law):
-    """Kernel over pairs at the start of a step: a; ξ is from ``kept`` of the last step, if there are ``steps``."""
+    """Kernel over pairs at the start of a step: a, with ξ from ``kept`` of the last step if there are ``steps``."""
     vec3, _ = types(dtype)
     kept_of = law.kept
 
@@ -294,7 +289,7 @@ def set_anchors(dtype, law: Law):
 
 @cache
 def find_friction(dtype, law: Law):
-    """Kernel over pairs: the forces at x, or x + correction."""
+    """Kernel over pairs: the forces at x or x + correction."""
     vec3, _ = types(dtype)
     energy, secant, bend = law.energy, law.secant, law.bend
 
@@ -332,7 +327,7 @@ def find_friction(dtype, law: Law):
 
 @cache
 def end_friction(dtype):
-    """Kernel over pairs at the end x of a step: pairs ``kept`` for the next step, all but ``first``, and their ξ."""
+    """Kernel over pairs at the end x of a step: pairs ``kept`` for the next step, and their ξ."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=friction_module(dtype), enable_backward=False)
@@ -421,6 +416,5 @@ def row_of_friction(law: Law):
 
 @cache
 def friction_of_pairs(law: Law):
-    """Returns the :class:`..term.PairTerm` of friction by a law."""
     push, row = push_friction(law), row_of_friction(law)
     return PairTerm("self-friction", f"{MODULE}.{law.name}", 2, RubbedPairs, near_friction, push, row, isotropic=True)

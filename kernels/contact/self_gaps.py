@@ -1,7 +1,7 @@
 """Nearest points of a vertex and a triangle, or of two edges, and the gap between them, in float64.
 
-y = Σ wᵢxᵢ is the vector between the nearest points of the four vertices of a pair, with w = (1, −β₁, −β₂, −β₃) for a vertex and
-a triangle, and (1 − s, s, −(1 − t), −t) for two edges. The gap is d = ‖y‖.
+y = Σ wᵢxᵢ is the vector between the nearest points, with w = (1, −β₁, −β₂, −β₃) for a vertex and a triangle, and (1 − s, s, −(1
+− t), −t) for two edges. The gap is d = ‖y‖.
 """
 
 from functools import cache
@@ -31,10 +31,7 @@ def on_segment(p: wp.vec3d, ab: wp.vec3d):
 
 @wp.func
 def from_plane(normal: wp.vec3d, a: wp.vec3d):
-    """The vector to the origin from its nearest point in the plane through a.
-
-    For nearly parallel edges and thin triangles, y from the weights would have too few digits.
-    """
+    """The vector to the origin from the plane through a. For thin triangles, y from the weights would have too few digits."""
     return -wp.dot(normal, a) / wp.dot(normal, normal) * normal
 
 
@@ -113,7 +110,7 @@ def nearest(of_vertex: bool, x: CORNERS):
 
 @wp.func
 def gap_along(of_vertex: bool, n: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """The gap along n, |n| ≤ 1, of the sides of a pair with vertex 0 at the origin, which is a lower bound of d."""
+    """The gap along n, |n| ≤ 1, of the sides of a pair with vertex 0 at the origin: a lower bound of d."""
     side = wp.dot(n, b)
     other = wp.max(wp.dot(n, c), wp.dot(n, d))
     if of_vertex:
@@ -123,7 +120,6 @@ def gap_along(of_vertex: bool, n: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3
 
 @wp.func
 def perpendicular(n: wp.vec3d):
-    """A unit vector normal to n."""
     axis = wp.vec3d()
     axis[wp.int32(wp.argmin(wp.abs(n)))] = ONE
     t = wp.cross(n, axis)
@@ -132,7 +128,6 @@ def perpendicular(n: wp.vec3d):
 
 @wp.func
 def corners(x: wp.array(dtype=Any), s: wp.vec4i):
-    """The corners of a pair."""
     return wp.matrix_from_rows(wp.vec3d(x[s[0]]), wp.vec3d(x[s[1]]), wp.vec3d(x[s[2]]), wp.vec3d(x[s[3]]))
 
 

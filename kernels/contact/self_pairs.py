@@ -1,4 +1,4 @@
-"""The structs of the pairs of self-contact, and factories of the kernels that find their gaps and list them by vertex."""
+"""Structs of the pairs of self-contact, and kernels that find their gaps and list them by vertex."""
 
 from functools import cache
 
@@ -25,14 +25,14 @@ MODULE = "warpcloth.self_contact"
 def module_of(dtype):
     """Returns the name of the module of the kernels that every scene with self-contact launches.
 
-    Warp compiles a module as a whole, and again if it has other kernels; so these are in modules of their own.
+    Warp compiles a module again if it has other kernels.
     """
     return f"{MODULE}.{dtype.__name__}"
 
 
 @cache
 def begin_pairs(dtype):
-    """Kernel over pairs: n, d and w at the positions x at the start of a step."""
+    """Kernel over pairs: n, d and w at x."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -85,7 +85,7 @@ def bound_number(
     pairs: Pairs,
     most: wp.array(dtype=wp.int32),
 ):
-    """Kernel of one thread: raises ``most`` (1,) to the number of contacts, and limits that to the number of slots."""
+    """Kernel of one thread: raises ``most`` (1,) to the number of contacts, and limits that to the slots."""
     most[0] = wp.max(most[0], pairs.number[0])
     pairs.number[0] = wp.min(pairs.number[0], pairs.stencils.shape[0])
 
@@ -97,7 +97,6 @@ def forget_forces(
     # out
     multipliers: wp.array(dtype=wp.vec3d),
 ):
-    """Kernel over contacts: their λ become 0."""
     for e in range(wp.tid(), pairs.number[0], pairs.threads):
         multipliers[e] = wp.vec3d()
 
@@ -107,7 +106,7 @@ def fill_corners(
     # in and out
     pairs: Pairs,
 ):
-    """Kernel over contacts: lists 4·key + corner at each vertex, and counts ``corner_counts`` down to 0."""
+    """Kernel over contacts: lists 4·key + corner at each vertex; counts ``corner_counts`` down to 0."""
     for t in range(wp.tid(), pairs.number[0], pairs.threads):
         e = pairs.number[0] - 1 - t
         s = pairs.stencils[e]
@@ -120,7 +119,7 @@ def sort_corners(
     # in and out
     pairs: Pairs,
 ):
-    """Kernel over vertices: sorts the corners of each vertex by key, and then replaces 4·key + corner by 4·slot + corner."""
+    """Kernel over vertices: sorts corners by key, so that sums have a fixed order, then replaces 4·key by 4·slot."""
     i = wp.tid()
     sort(pairs.corners, pairs.first[i], pairs.first[i + 1])
     for k in range(pairs.first[i], pairs.first[i + 1]):
@@ -139,7 +138,7 @@ def note_list(
     # out
     listed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: the most pairs in any list, the number of lists, to which it adds ``made`` (1,), and ``listed``."""
+    """Kernel over copies: ``most`` pairs in any list, the number of ``lists`` with those ``made`` (1,), and ``listed``."""
     c = wp.tid()
     if c == 0:
         listed[0] = wp.min(counts[0] + counts[1], 1)

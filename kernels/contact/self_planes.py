@@ -1,4 +1,4 @@
-"""Factories of the kernels that limit the moves of vertices, by a plane between the two sides of each pair."""
+"""Kernels that limit the moves of vertices by a plane between the two sides of each pair."""
 
 from functools import cache
 from typing import Any
@@ -26,20 +26,19 @@ ROUNDED = wp.constant(wp.float64(1e-9))  # by which a gap may be below its floor
 
 @cache
 def ulp_of(dtype):
-    """The largest relative unit in the last place of a scalar type, as a constant of kernels in double precision."""
+    """The largest relative unit in the last place of a scalar type, a constant of kernels."""
     return wp.constant(wp.float64(np.finfo(wp.dtype_to_numpy(dtype)).eps))
 
 
 @wp.func
 def bounded_share(move: wp.vec3d, most: wp.float64):
-    """Returns min(1, most/‖move‖), the fraction of a move that is at most ``most`` long."""
     size = wp.length(move)
     return wp.where(size > most, most / size, ONE)
 
 
 @wp.func
 def wanted(x: wp.array(dtype=Any), target: wp.array(dtype=Any), i: int):
-    """The wanted move of vertex i, target − x; 0 for obstacles, which have no target."""
+    """The move target − x of vertex i; 0 for obstacles, which have no target."""
     if i < target.shape[0]:
         return wp.vec3d(target[i]) - wp.vec3d(x[i])
     return wp.vec3d()
@@ -47,7 +46,7 @@ def wanted(x: wp.array(dtype=Any), target: wp.array(dtype=Any), i: int):
 
 @cache
 def common_move(dtype):
-    """Kernel over copies: the mean of the wanted moves of all vertices [m]."""
+    """Kernel over copies: the mean of the wanted moves [m]."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)
@@ -75,7 +74,7 @@ def find_ways(dtype):
 
     The ways are a bound of what it adds to the approach of a pair [m], its largest coordinate [m], and its share. The bound is
     the length of that move plus WIDE times that of the motion since ``begun``, where gaps were computed, ``relative`` to the
-    first vertex of the copy where cloth meets nothing but itself. Obstacles have not moved since.
+    first vertex of the copy where cloth meets only itself.
     """
     vec3, _ = types(dtype)
 
@@ -113,7 +112,7 @@ def find_ways(dtype):
 
 @wp.func
 def margin_of(least: wp.float64, ulp: wp.float64):
-    """Half the smallest distance of two sides whose largest coordinate has the unit ``ulp`` in the last place."""
+    """Half the smallest distance of two sides whose largest coordinate has the unit ``ulp`` in the last place [m]."""
     return SIDE * wp.max(least, wp.float64(4.0) * ulp) + ulp
 
 
@@ -122,7 +121,7 @@ _value, _way_of = load(wp.float64), load(wp.vec3d)
 
 @wp.func
 def ways_of_sides(ways: wp.array(dtype=wp.vec3d), s: wp.vec4i, sides: int):
-    """The largest way of each side of a pair, whose first side has ``sides`` vertices, and its largest coordinate."""
+    """The largest way of each side of a pair, and its largest coordinate."""
     way = wp.vec2d()
     far = ZERO
     for i in range(4):
@@ -137,7 +136,7 @@ def ways_of_sides(ways: wp.array(dtype=wp.vec3d), s: wp.vec4i, sides: int):
 
 @wp.func
 def needs_no_cut(e: int, way: wp.float64, margin: wp.float64, gap: wp.array(dtype=wp.float64)):
-    """Whether the ``gap`` of pair e is too wide, however it is divided, for an approach by ``way`` to be shortened."""
+    """Whether the ``gap`` of pair e is too wide for an approach by ``way`` to be shortened, however it is divided."""
     return way <= WIDE * _value(gap, e) - KEPT / CLAMPED * margin
 
 
@@ -147,8 +146,8 @@ def moved_apart(
 ):
     """A fraction up to ``most`` of the moves du, dv and dw for which |w·(u × v)| surely exceeds ``floor`` times |u × v|.
 
-    The quotient is the distance of two lines along u and v that are w apart, or of a point from a plane. KEPT of the excess of
-    the volume, a cubic polynomial, may be used up.
+    The quotient is the distance of two lines along u and v, or of a point from a plane. KEPT of the excess of the volume, a
+    cubic polynomial, may be used up.
     """
     n = wp.cross(u, v)
     turn = wp.cross(du, v) + wp.cross(u, dv)
@@ -177,7 +176,7 @@ def moved_apart(
 
 @wp.func
 def across(of_vertex: bool, x: CORNERS):
-    """Vectors along two edges of a pair, and from a vertex of the first to one of the second, as of :func:`moved_apart`."""
+    """Vectors along two edges of a pair, and from a vertex of the first to one of the second."""
     if of_vertex:
         return x[2] - x[1], x[3] - x[2], x[1] - x[0]
     return x[1] - x[0], x[3] - x[2], x[2] - x[0]
@@ -221,14 +220,13 @@ def part_apart(of_vertex: bool, x: CORNERS, moves: CORNERS, floor: wp.float64):
 def cut_by_planes(dtype):
     """Kernel over pairs: reduces the ``share`` of each vertex, the fraction of its wanted move from x that it may make.
 
-    A pair cuts nothing while its sides stay apart, by a tenth of their gap or more, with the shares that its vertices had
-    before: along y, where a plane may move with them, or by :func:`part_apart`. So cloth that falls or turns together moves
-    freely. Else a plane normal to y divides their gap, minus the smallest distance, in the ratio of their approaches, not
-    counting the ``common`` move of a copy; each side gets at least CLAMPED of it, and shares may fall further. Pairs whose
-    ``gap`` is too wide for the moves that :func:`find_ways` bounds have no plane.
+    A pair cuts nothing while its sides keep a tenth of their gap with the shares of before: along y, or by :func:`part_apart`.
+    So cloth that falls or rotates together moves freely. Else a plane normal to y divides their gap, minus the smallest
+    distance, in the ratio of their approaches without the ``common`` move; each side gets at least CLAMPED of it. Pairs whose
+    ``gap`` is too wide for the moves have no plane.
 
-    A vertex at the smallest distance from a plane that it does not approach moves by at least ``least_share``, or not at all:
-    roundings of shorter moves, which can be equal in many steps, would take it nearer.
+    A vertex at the smallest distance from a plane that it does not approach moves by at least ``least_share``, or not at all;
+    rounding of shorter moves would take it nearer.
     """
     vec3, _ = types(dtype)
     ulp, stencil = ulp_of(dtype), load(wp.vec4i)
@@ -325,7 +323,7 @@ def note_cuts(
     # out
     changed: wp.array(dtype=wp.int32),
 ):
-    """Kernel over vertices: takes the share into ``ways``; changed = 1 if one has fallen."""
+    """Kernel over vertices: stores the share in ``ways``; changed = 1 if one has fallen."""
     i = wp.tid()
     way = ways[i]
     if share[i] < way[2]:

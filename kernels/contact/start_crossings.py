@@ -1,4 +1,4 @@
-"""A factory of the kernel that finds the pairs of edges of which one may cross a triangle at the other."""
+"""A kernel that finds the pairs of edges of which one may cross a triangle at the other."""
 
 from functools import cache
 
