@@ -279,7 +279,6 @@ def slot_of(pairs: Pairs, near: NUMBERS, first: int, count: int, extra: int, i: 
 def set_shares(
     pairs: Pairs, contacts: Contacts, near: NUMBERS, first: int, count: int, extra: int, extras: int, lane: int, lanes: int
 ):
-    """Sets the shares of every ``lanes``-th contact of a vertex."""
     for i in range(lane, count + extras, lanes):
         one = slot_of(pairs, near, first, count, extra, i)
         if one >= 0 and contacts.stiffness[one] > ZERO:

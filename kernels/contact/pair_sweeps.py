@@ -138,7 +138,6 @@ def number_corners(
     # out
     slots: wp.array(dtype=wp.int32),
 ):
-    """Kernel over entries of ``corners``: the index of each corner."""
     k = wp.tid()
     if k < pairs.first[pairs.first.shape[0] - 1]:
         slots[pairs.corners[k]] = k

@@ -133,7 +133,6 @@ def corners(x: wp.array(dtype=Any), s: wp.vec4i):
 
 @wp.func
 def farthest(x: wp.array(dtype=Any), s: wp.vec4i):
-    """The largest coordinate of a pair [m]."""
     far = ZERO
     for i in range(4):
         far = wp.max(far, wp.max(wp.abs(wp.vec3d(x[s[i]]))))

@@ -32,7 +32,6 @@ def module_of(dtype):
 
 @cache
 def begin_pairs(dtype):
-    """Kernel over pairs: n, d and w at x."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=module_of(dtype), enable_backward=False)

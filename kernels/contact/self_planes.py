@@ -26,7 +26,6 @@ ROUNDED = wp.constant(wp.float64(1e-9))  # by which a gap may be below its floor
 
 @cache
 def ulp_of(dtype):
-    """The largest relative unit in the last place of a scalar type, a constant of kernels."""
     return wp.constant(wp.float64(np.finfo(wp.dtype_to_numpy(dtype)).eps))
 
 

@@ -25,14 +25,14 @@ class Trial:
     Attributes:
         kind: Left out: a "term", a "collider", the "friction" of a collider, the "air", the "anisotropy" of a term, or "all"
             that do not matter alone; or changed: "precision", "step" or "resolution".
-        name: The change, such as "without QuadraticBending", "without friction on ball" or "n=64".
+        name: The change, such as "without QuadraticBending" or "n=64".
         change: RMS distance of the results over vertices and frames, over the longest side of the cloth; for another
             resolution, the distance between the surfaces, both ways. NaN without a result.
         cost: Time of a frame over that of the unchanged scene.
         matters: Whether the change is above the tolerance; None without a result.
-        reason: Why there is no result, or it is not usable, or "".
+        reason: Why there is no usable result, or "".
         finer: For another resolution, whether it has more vertices; else None.
-        usable: Whether the run counts as usable, see :class:`warpcloth.core.status.Grade`; None without a run.
+        usable: Whether the run counts as usable; None without a run.
     """
 
     kind: str
@@ -47,15 +47,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Advice:
-    """The result of :func:`advise`.
+    """The result of :func:`advise`: ``trials``, ``tolerance``, and the ``status`` of the unchanged scene.
 
     Attributes:
-        trials: List of :class:`Trial`.
         frames: Number of frames of each run.
         declared: Number of frames of the scene.
         milliseconds: Mean time of a frame of the unchanged scene without the first frame, in its first and its last run [ms].
-        tolerance: Tolerance below which a change does not matter.
-        status: The :class:`warpcloth.core.status.Status` of the unchanged scene.
     """
 
     trials: list
@@ -67,13 +64,12 @@ class Advice:
 
     @property
     def steady(self):
-        """Whether both runs of the unchanged scene took about the same time, so that costs can be compared."""
+        """Whether both runs of the unchanged scene took about as long, so that costs can be compared."""
         first, last = self.milliseconds
         return abs(first - last) <= _STEADY * max(first, last)
 
     @property
     def sentences(self):
-        """Returns the advice in sentences."""
         found = [] if self.status.ok else [f"the scene as it is: {self.status.message}; what follows is of runs like it"]
         step = next(trial for trial in self.trials if trial.kind == "step")
         if step.matters is not False:
@@ -128,13 +124,10 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         solver: The record of a solver, with its step.
         tolerance: Change of the result below which something does not matter, as a fraction of the longest side of the cloth.
         frames: Number of frames; by default those of the scene, but at most 30.
-        resolutions: The same scene with coarser or finer meshes by name, such as {"n=16": scene}; or None.
+        resolutions: The scene with coarser or finer meshes by name, such as {"n=16": scene}.
         device: A Warp device.
-        dtype: "float32" or "float64", by default that of a run; the other one is a trial.
-        progress: Function called with (trials done, trials) after each; or None.
-
-    Returns:
-        :class:`Advice`.
+        dtype: By default that of a run; the other precision is a trial.
+        progress: Function called with (trials done, trials) after each.
 
     Raises:
         ValueError: An option is not allowed, or the unchanged scene diverges.
@@ -186,7 +179,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
 
 
 def _parts(scene):
-    """Returns names of everything that can be left out, by (kind, index); the only term cannot."""
+    """Returns names of all that can be left out, by (kind, index); the only term cannot."""
     terms, colliders = _names(scene.terms), _names(scene.colliders)
     found = {("term", k): name for k, name in enumerate(terms) if len(terms) > 1}
     for k, (collider, name) in enumerate(zip(scene.colliders, colliders, strict=True)):
@@ -206,14 +199,12 @@ def _anisotropy(term):
 
 
 def _names(declared):
-    """Returns the labels of terms or colliders, numbered if equal."""
     labels = [each.label for each in declared]
     counted = [(label, labels[:k].count(label) + 1, labels.count(label)) for k, label in enumerate(labels)]
     return [f"{label} {k} of {count}" if count > 1 else label for label, k, count in counted]
 
 
 def _without(scene, parts):
-    """Returns the scene without some parts, see :func:`_parts`."""
     terms = [
         term.isotropic() if ("anisotropy", k) in parts else term
         for k, term in enumerate(scene.terms)

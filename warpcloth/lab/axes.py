@@ -11,14 +11,7 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of a map.
-
-    Attributes:
-        label: Its label.
-        low, high: Default range.
-        whole: Whether its values are whole numbers.
-        logarithmic: Whether they are spaced logarithmically.
-    """
+    """One axis of a map, with its default range; values may be ``whole`` numbers, or spaced logarithmically."""
 
     label: str
     low: float
@@ -27,7 +20,7 @@ class Axis:
     logarithmic: bool = True
 
     def values(self, low, high, count):
-        """Returns ``count`` values from low to high; fewer if whole numbers coincide.
+        """Returns ``count`` values; fewer if whole numbers coincide.
 
         Raises:
             ValueError: The range is not allowed on this axis.

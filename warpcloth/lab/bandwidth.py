@@ -1,4 +1,4 @@
-"""The memory bandwidth of a device, measured by copying."""
+"""Memory bandwidth of a device, measured by copying."""
 
 import time
 
@@ -16,9 +16,6 @@ def measure(device="cpu"):
 
     Each is the fastest of seven, because delays are no property of the device. The first copy does not count.
 
-    Args:
-        device: A Warp device.
-
     Returns:
         dict: ``copy`` and ``kernel`` [B/s].
     """
@@ -34,7 +31,6 @@ def measure(device="cpu"):
 
 
 def _least(way, device):
-    """Returns the shortest time of several calls [s], without the first."""
     times = []
     for _ in range(1 + _REPEATS):
         wp.synchronize_device(device)

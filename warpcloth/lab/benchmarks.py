@@ -21,9 +21,8 @@ class SolverBenchmark:
     Attributes:
         scene: The scene, of any size.
         setup: The solver; a limited solver without a step takes the fewest stable substeps of each size.
-        sizes: Resolutions of the scene, see :func:`warpcloth.lab.cells.refined`; if empty, the scene as it is.
-        device: A Warp device.
-        dtype: ``"float32"`` or ``"float64"``, by default that of a run with the solver.
+        sizes: Resolutions of the scene; if empty, the scene as it is.
+        dtype: By default that of a run with the solver.
         frames: Maximum number of frames to time.
         copies: Number of copies of the scene in a batch.
         threads: Number of CPU threads.
@@ -51,7 +50,6 @@ class SolverBenchmark:
         return [refined(self.scene, size) for size in self.sizes] or [self.scene]
 
     def setup_of(self, scene):
-        """Returns the :class:`Setup` for one of the scenes."""
         solver = self.setup.solver
         if not SOLVERS[solver].limited or {"dt", "substeps"} & set(self.setup.options):
             return self.setup
@@ -60,11 +58,7 @@ class SolverBenchmark:
 
 
 def standard(**given):
-    """Returns benchmarks of every solver on ``hanging`` of growing size, and the others of their records.
-
-    Args:
-        given: Further fields of each :class:`SolverBenchmark`.
-    """
+    """Returns benchmarks of every solver on ``hanging`` of growing size, and the others of their records."""
     kind = "cuda" if given.get("device", "cpu").startswith("cuda") else "cpu"
     listed = [(name, each) for name, record in SOLVERS.items() for each in record.facts.benchmarks]
     listed.sort(key=lambda one: one[1].scene != "hanging")
@@ -79,11 +73,7 @@ _TOUCHING = {"explicit": {}, "newton": {"substeps": 4}, "xpbd": {"substeps": 4},
 
 
 def contacts(**given):
-    """Returns benchmarks of contact on the scene ``resting``: shapes of colliders, near and far, and meshes of growing size.
-
-    Args:
-        given: Further fields of each :class:`SolverBenchmark`.
-    """
+    """Returns benchmarks of contact on the scene ``resting``: shapes of colliders, near and far, and meshes of growing size."""
     shapes = tuple({"collider": shape, "gap": gap} for shape in _SHAPES for gap in _GAPS)
     few = tuple(each for each in shapes if each["collider"] in ("sphere", "mesh"))
     setups = [(Setup(solver, options), shapes if solver == "explicit" else few) for solver, options in _TOUCHING.items()]
@@ -102,11 +92,7 @@ _FOLDED = (
 
 
 def self_contacts(**given):
-    """Returns benchmarks of self-contact on the scene ``folded_sheet``: a sheet that falls flat, and one folded in two.
-
-    Args:
-        given: Further fields of each :class:`SolverBenchmark`.
-    """
+    """Returns benchmarks of self-contact on ``folded_sheet``: a sheet that falls flat, and one folded in two."""
     return [
         SolverBenchmark(SceneRef("folded_sheet", {"layers": layers}), Setup(solver, options), sizes, **given)
         for solver, options, *of in _FOLDED
@@ -115,17 +101,13 @@ def self_contacts(**given):
 
 
 class Run:
-    """Measures the rows of benchmarks; after an interrupt it has the rows so far.
-
-    Args:
-        benchmarks: :class:`SolverBenchmark`\\s, all on one device.
+    """Measures the rows of benchmarks, all on one device; after an interrupt it has the rows so far.
 
     Attributes:
         total: Total number of rows.
-        rows: The measured rows: the result of :func:`warpcloth.lab.timing.measure`, with ``scene``, ``parameters``,
-            ``solver``, ``options``, ``label``, ``device``, ``dtype``, ``copies``, ``threads``, ``benchmark`` (its index),
-            ``share`` (``bytes_per_s`` over the bandwidth) and, in the first row of each benchmark, ``cold_start_s``, the time
-            to start without compiled kernels.
+        rows: The measured rows: the result of :func:`warpcloth.lab.timing.measure`, with what was measured, ``benchmark``
+            (its index), ``share`` (``bytes_per_s`` over the bandwidth) and, in the first row of each benchmark,
+            ``cold_start_s``, the time to start without compiled kernels.
         bandwidth: The result of :func:`warpcloth.lab.bandwidth.measure`.
     """
 
@@ -164,6 +146,5 @@ class Run:
 
 
 def _alone(asked):
-    """Returns the result of a task in a fresh process."""
     ((_, result),) = sweep([asked], workers=1)
     return result

@@ -22,10 +22,7 @@ class Store:
     """Results by key in a file with a line of JSON for each, to which several processes may append at a time.
 
     A truncated line, after a crash or on a full disk, is ignored, and its result is measured again. The file is never
-    rewritten.
-
-    Args:
-        path: The file, which is made with its folder if it does not exist; None keeps results in memory.
+    rewritten. Without a path, results stay in memory.
 
     Raises:
         ValueError: The path is not such a file.
@@ -60,7 +57,6 @@ class Store:
         return len(self._results)
 
     def machine(self, task):
-        """Returns the name of the machine that measured a task."""
         return self._machines[task.key]
 
     def keep(self, task, result, machine):
@@ -83,17 +79,16 @@ class Store:
 
 
 def sweep(tasks, executor=None, store=None, progress=None, workers=None):
-    """Measures all tasks that are not in the store, and yields (task, result) in order of completion.
+    r"""Measures all tasks that are not in the store, and yields (task, result) in order of completion.
 
     Args:
-        tasks: :class:`warpcloth.lab.measurements.Task`\\s.
+        tasks: :class:`warpcloth.lab.measurements.Task`\s.
         executor: Any `concurrent.futures.Executor`, such as that of a Dask client; by default, processes on this machine, for
             which a script needs ``if __name__ == "__main__":``. Its processes may have another working directory; they read
             scenes, references and extensions from the same absolute paths. Threads of one process measure one after another.
         store: A :class:`Store`; without one nothing is kept.
-        progress: Function called with (finished, tasks, seconds left or None) first and after each; or None.
-        workers: Number of parallel processes without an executor, by default that of cores. Measured times include the load
-            of the others.
+        progress: Function called with (finished, tasks, seconds left or None) first and after each.
+        workers: Number of processes without an executor, by default that of cores. Times include the load of the others.
 
     Raises:
         Exception: The error of a task. Finished results are kept, tasks that have not begun are dropped.
@@ -138,12 +133,9 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
 
 
 def collect(tasks, name, **run):
-    """Measures all tasks and returns the (result, machine) of each in their order; ``run`` is that of :func:`sweep`.
+    """Measures all tasks and returns the (result, machine) of each in their order.
 
-    Args:
-        tasks: As for :func:`sweep`.
-        name: Name of the :func:`kept_store`, if ``run`` has no ``store``.
-        **run: Arguments of :func:`sweep`.
+    ``name`` is that of the :func:`kept_store` if ``run``, arguments of :func:`sweep`, has no ``store``.
     """
     if "store" not in run:
         run["store"] = kept_store(name, run.get("executor"))
@@ -179,7 +171,7 @@ def processes(workers):
 
 
 def kept_store(name, executor=None):
-    """Returns the :class:`Store` of a chart in the cache folder; another one for an executor that may be of other machines."""
+    """Returns the :class:`Store` of a chart in the cache folder; another one for an executor, maybe of other machines."""
     local = executor is None or isinstance(executor, ProcessPoolExecutor | ThreadPoolExecutor)
     return Store(cache_folder() / ("" if local else "elsewhere") / f"{name}.jsonl")
 

@@ -22,11 +22,8 @@ _RESOLUTIONS = ("n", "links", "elements")
 def scene_at(ref, values, steps, duration=None):
     """Returns the scene of a cell, with frames of one step or more and noise in the initial positions.
 
-    Args:
-        ref: :class:`warpcloth.lab.measurements.SceneRef`.
-        values: Values by name of the axis, ``dt`` among them.
-        steps: Minimum number of steps, rounded up to whole frames.
-        duration: Minimum time of motion [s], with about :data:`FRAMES` frames; by default that of ``steps``.
+    It has at least ``steps``, rounded up to whole frames, or lasts a ``duration`` [s] with about :data:`FRAMES` frames. ``dt``
+    is among the values by axis.
 
     Raises:
         ValueError: The scene cannot have such a value.
@@ -88,7 +85,7 @@ def applied(scene, name, value):
 
 
 def vary(scene, name, values):
-    """Returns the ``vary`` of a model whose copies differ in one of :data:`VARIED`, from the scene of :func:`scene_at`."""
+    """Returns the ``vary`` of a model whose copies differ in one of :data:`VARIED`."""
     each = [applied(scene, name, value) for value in values]
     if name == "stiffness":
         stiffness = [[np.asarray(term.stiffness) for term in one.terms] for one in each]
@@ -124,7 +121,6 @@ def record_at(setup, values):
 
 
 def _furthest(scene):
-    """Returns the vertex furthest from the pins, or without pins from the middle."""
     points = scene.mesh.points
     pins = points[scene.pins.vertices] if len(scene.pins.vertices) else points.mean(axis=0)[None]
     return int(np.linalg.norm(points[:, None] - pins, axis=-1).min(axis=1).argmax())

@@ -42,18 +42,18 @@ def cheapest_map(scene, x, y=None, tolerance=0.01, solvers=None, frames=None, de
     Args:
         scene: A :class:`SceneRef`.
         x: (name of a parameter of the scene, its values).
-        y: The same of another parameter, or None for a map of one row.
+        y: Another parameter, or None for a map of one row.
         tolerance: Largest error, relative to the size of the cloth; see :func:`warpcloth.lab.reference.position_error`.
         solvers: Names of solvers, by default all.
-        frames: Number of frames, by default those of the scene.
-        device: A Warp device, also for the reference solutions.
-        dtype: Precision of the runs, by default that of a run with each solver; reference solutions have float64.
+        frames: By default those of the scene.
+        device: Of the runs and the reference solutions.
+        dtype: By default that of a run with each solver; reference solutions have float64.
         limit: Time limit of the search in each cell [s].
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`.
 
     Returns:
-        dict: ``x``, ``y`` (None without), ``tolerance``, ``frames`` and ``limit`` as given, ``scene``, ``device``, ``dtype``,
-        ``machine``, and ``cells``: a list of the results of :func:`measure`, with ``x`` and ``y``, in rows of y.
+        dict: The arguments, ``machine``, and ``cells``: a list of the results of :func:`measure`, with ``x`` and ``y``, in rows
+        of y.
 
     Raises:
         ValueError: An argument is not allowed, or the scene has no such parameter or has it already.
@@ -88,19 +88,9 @@ def measure(scene, digest, frames, tolerance, solvers, device, dtype, limit):
     """Finds the cheapest setting of any solver that meets a tolerance. Arguments and results are JSON values.
 
     The settings of each solver are climbed by :func:`warpcloth.lab.choosing.climb`, one solver after another in the order
-    given, so that those that are named first have been tried if the time runs out. The search goes on up to :data:`BEYOND`
-    times the cheapest setting, so that the second best is known too. Each run ends once it takes longer than that.
-
-    Args:
-        scene: Fields of a :class:`SceneRef`, by name.
-        digest: :func:`scene_digest` of the scene, for the key of the measurement.
-        frames: Number of frames.
-        tolerance: Largest error.
-        solvers: Names, or None for all.
-        device: A Warp device.
-        dtype: ``"float32"``, ``"float64"`` or None, as for :func:`cheapest_map`.
-        limit: Time limit [s] of all runs and what they bind, without the kernels that each solver compiles first and without
-            the reference solution, which may take six times as long.
+    given. The search goes on up to :data:`BEYOND` times the cheapest setting, so that the second best is known too. Each run
+    ends once it takes longer. ``digest`` is in the key of the measurement. ``limit`` [s] bounds all runs and what they bind,
+    without the kernels that each solver compiles first and the reference solution, which may take six times as long.
 
     Returns:
         dict: Unknown values are None.
@@ -109,7 +99,7 @@ def measure(scene, digest, frames, tolerance, solvers, device, dtype, limit):
           not accurate enough to tell; ``reason``: a sentence, "" if found.
         - ``solver``, ``options``, ``label``, ``ms``, ``spread``, ``error``, ``strain_error``, ``grade``: the cheapest setting,
           the time of a frame and its spread [ms], its errors, and the grade of its run.
-        - ``second``: The same of the cheapest setting of another solver, with its ``ratio`` of times, or None.
+        - ``second``: The cheapest setting of another solver, with its ``ratio`` of times, or None.
         - ``complete``: Whether the search ended before the limit.
         - ``reference_error``, ``reference_method``, ``reference_substeps``, ``reference_seconds``: The reference solution.
         - ``seconds``: Time of the search; ``measured``: what was measured, a list.
@@ -143,9 +133,7 @@ def measure(scene, digest, frames, tolerance, solvers, device, dtype, limit):
 class _Search:
     """Measures setups one after another until the time of a cell is over.
 
-    Attributes:
-        left: Time that is left [s].
-        most: :data:`BEYOND` times the cheapest frame that is accurate [ms], or None.
+    It has ``left`` [s], and runs up to ``most``, :data:`BEYOND` times the cheapest frame that is accurate [ms], or None.
     """
 
     def __init__(self, scene, frames, exact, tolerance, device, dtype, limit):
@@ -188,7 +176,6 @@ def _facts(each):
 
 
 def _why(found, tolerance, floor, limit, complete):
-    """Says how near the most accurate setting comes."""
     known = [each for each in found if each.error is not None]
     within = "" if complete else f" within {limit:g} s"
     if not known:
@@ -223,7 +210,6 @@ def write_csv(path, found):
 
 
 def _columns(setting):
-    """Returns the columns of a setting that are made of its lists and dictionaries."""
     if not setting.get("options"):
         return {}
     low, high = setting["spread"]

@@ -38,10 +38,10 @@ class Measured:
     Attributes:
         setup: The :class:`warpcloth.lab.measurements.Setup`.
         error: Error of the trajectory, relative to the size of the cloth, or None.
-        milliseconds: Time of a frame, as :func:`warpcloth.lab.trajectory.measure` gives it [ms], or None.
+        milliseconds: Time of a frame [ms], or None.
         spread: By how much frames differ from their neighbours, as quartiles [ms], (low, high), or None.
         reason: Why there is no error, or "".
-        machine: The machine that measured it, in a few words.
+        machine: The machine that measured it.
         final: Whether finer steps would fail too: it took too long, or its method is refused.
         strain_error: See :func:`warpcloth.lab.reference.strain_error`, or None.
         own_error: Error relative to the motion to which a solver of another simulator itself converges, or None.
@@ -67,7 +67,6 @@ class Measured:
 
     @property
     def usable(self):
-        """Whether its run counts as usable without a reference."""
         return usable({"grade": self.grade})
 
 
@@ -77,11 +76,11 @@ class Choice:
 
     Attributes:
         chosen: The chosen :class:`Measured`, or None.
-        meets: Whether it meets the tolerance and the budget that were given.
+        meets: Whether it meets the tolerance and the budget.
         rivals: Others that are as good within the spread of times, the best first.
         certainty: A sentence about the certainty of the choice.
-        others: By solver of another simulator, the :func:`warpcloth.lab.own_reference.own_facts` of its own motion, if there is
-            one, and ``searched``, how its search ended.
+        others: By solver of another simulator, the :func:`warpcloth.lab.own_reference.own_facts` of its own motion, if any, and
+            ``searched``, how its search ended.
         untried: Number of settings that :func:`climb` left out.
     """
 
@@ -96,10 +95,7 @@ class Choice:
 class Longest(NamedTuple):
     """The longest time that :func:`choose` may take without compilation, if no ``total`` is given.
 
-    Attributes:
-        limit: Time limit of a run [s].
-        settings: Number of settings of warpcloth that may be run.
-        others: Number of solvers of other simulators.
+    ``limit`` is that of a run [s], ``settings`` the number of settings of warpcloth, and ``others`` that of other solvers.
     """
 
     limit: float
@@ -108,7 +104,6 @@ class Longest(NamedTuple):
 
     @property
     def reference(self):
-        """Time of the reference [s]."""
         return _REFERENCE * self.limit
 
     @property
@@ -121,25 +116,21 @@ class Longest(NamedTuple):
 
     @property
     def seconds(self):
-        """Sum of all [s]."""
         return self.reference + self.settings * self.limit + self.others * self.other
 
 
 def pick(measurements, tolerance=None, budget=None, floor=0.0):
-    """Chooses among measurements.
+    r"""Chooses the cheapest setup that meets the tolerance and the budget, if there is one.
 
-    With a tolerance, it chooses the cheapest setup that meets it, and the budget, if there is one. If nothing does, or with a
-    budget alone, it chooses the most accurate setup within the budget, if there is one. A setup whose run is not usable may be
-    chosen, because the reference judges it better; of setups that are as good, the best that is usable is chosen.
+    If nothing does, or with a budget alone, it chooses the most accurate setup within the budget, if there is one. A setup
+    whose run is not usable may be chosen, because the reference judges it better; of setups that are as good, the best usable
+    one is.
 
     Args:
-        measurements: :class:`Measured`\\s.
+        measurements: :class:`Measured`\s.
         tolerance: Largest error allowed, relative to the size of the cloth; or None.
         budget: Longest time of a frame allowed [ms], or None.
         floor: Error of the reference, by which each error may be wrong.
-
-    Returns:
-        :class:`Choice`.
 
     Raises:
         ValueError: Neither tolerance nor budget is given, or one of them is not a number above 0.
@@ -176,17 +167,11 @@ def pick(measurements, tolerance=None, budget=None, floor=0.0):
 
 
 def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=None):
-    """Measures only the setups that :func:`pick` needs: each ladder from its cheapest rung up, all ladders in parallel.
+    r"""Measures only the setups that :func:`pick` needs: each ladder from its cheapest rung up, all ladders in parallel.
 
-    A ladder ends when a rung meets the tolerance, exceeds the budget, or costs more than a setup that meets the tolerance.
-
-    Args:
-        ladders: Lists of :class:`warpcloth.lab.measurements.Setup`, each from cheap and coarse to expensive and accurate.
-        measure: Function that returns a list of :class:`Measured` for a list of setups.
-        tolerance: As for :func:`pick`.
-        budget: As for :func:`pick`.
-        floor: As for :func:`pick`.
-        progress: Function called with all measurements so far after each round, or None.
+    A ladder is a list of setups from cheap and coarse to expensive and accurate. It ends when a rung meets the tolerance,
+    exceeds the budget, or costs more than a setup that meets the tolerance. ``measure`` returns :class:`Measured`\s for setups;
+    ``progress`` is called with all measurements so far after each round.
 
     Returns:
         tuple: The :class:`Choice` and the list of all :class:`Measured`.
@@ -207,15 +192,8 @@ def climb(ladders, measure, tolerance=None, budget=None, floor=0.0, progress=Non
 def climb_others(ladders, measure, tolerance=None, budget=None, floor=0.0, seconds=float("inf")):
     """Measures the ladders of solvers of other simulators: of each until its own cheapest setting is found.
 
-    Other than by :func:`climb` of all ladders, a solver is not given up because another one is cheaper.
-
-    Args:
-        ladders: As for :func:`climb`.
-        measure: As for :func:`climb`.
-        tolerance: As for :func:`pick`.
-        budget: As for :func:`pick`.
-        floor: As for :func:`pick`.
-        seconds: Time of frames [s] after which the search of a solver ends.
+    Unlike in :func:`climb`, a solver is not given up because another one is cheaper. Its search ends after ``seconds`` of
+    frames.
 
     Returns:
         tuple: The list of all :class:`Measured`, and by solver how its search ended, a sentence.
@@ -247,11 +225,7 @@ def climb_others(ladders, measure, tolerance=None, budget=None, floor=0.0, secon
 
 
 def ladders_of_others(setups):
-    """Groups setups of solvers of other simulators by solver and iterations, and doubles substeps and iterations further.
-
-    Args:
-        setups: A list of :class:`warpcloth.lab.measurements.Setup`, sorted by solver.
-    """
+    """Groups sorted setups of other simulators by solver and iterations, and doubles substeps and iterations further."""
     found = []
     for solver, group in itertools.groupby(setups, key=lambda setup: setup.solver):
         same = list(group)
@@ -291,16 +265,16 @@ def choose(
         tolerance: As for :func:`pick`.
         budget: As for :func:`pick`.
         solvers: Names of solvers, by default all.
-        frames: Number of frames, by default those of the scene.
-        device: A Warp device, also for the reference.
-        dtype: Precision of the runs, "float32" or "float64"; by default that of a run with each solver.
+        frames: By default those of the scene.
+        device: Of the runs and the reference.
+        dtype: By default that of a run with each solver.
         limit: Time limit of each run [s].
-        others: Simulators whose solvers are measured too, such as ``["newton"]``, each until its own cheapest setting is
-            found by :func:`climb_others`, within six time limits; its own reference has as much time again.
+        others: Simulators whose solvers are measured too, such as ``["newton"]``, each until its own cheapest setting is found,
+            within six time limits; its own reference has as much time again.
         clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for limits and times.
         total: Time on the wall [s] after which nothing more is measured or computed; of it, the reference may take a third, the
             searches of other simulators a third, and their own references a third.
-        announce: Function called with the :class:`Longest` before anything is measured, or None.
+        announce: Function called with the :class:`Longest` before anything is measured.
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; by default with the
             store in the cache folder.
 
@@ -364,12 +338,8 @@ def choose(
 def run_limit(limit, frames, meeting):
     """Returns the time limit of a run [s]: ``limit`` halved as often as leaves enough for a setting that may be chosen.
 
-    Halves, so that stored measurements are found again where times differ a little.
-
-    Args:
-        limit: The limit that is given [s].
-        frames: Number of frames.
-        meeting: Times of a frame of settings that meet the tolerance [ms].
+    ``meeting`` has the times of a frame of settings that meet the tolerance [ms]. Halves, so that stored measurements are found
+    again where times differ a little.
     """
     if not meeting:
         return limit
@@ -378,11 +348,7 @@ def run_limit(limit, frames, meeting):
 
 
 def ladders(setups):
-    """Groups setups that differ only in substeps, or in the error of steps, from cheap to expensive, and extends each group.
-
-    Args:
-        setups: A list of :class:`warpcloth.lab.measurements.Setup`.
-    """
+    """Groups setups that differ only in substeps, or in the error of steps, from cheap to expensive, and extends each group."""
     found = {}
     for setup in setups:
         fixed = {name: value for name, value in setup.options.items() if name not in ("substeps", "error")}
@@ -398,7 +364,7 @@ def ladders(setups):
 
 
 def measured(setup, result, machine):
-    """Returns the :class:`Measured` of a result of :func:`warpcloth.lab.trajectory.measure` and the name of its machine."""
+    """Returns the :class:`Measured` of a result of :func:`warpcloth.lab.trajectory.measure`."""
     spread = None if result["spread"] is None else tuple(result["spread"])
     # Only a limited solver may accept a finer step after it refused one.
     limited = setup.solver in SOLVERS and SOLVERS[setup.solver].limited
@@ -420,7 +386,6 @@ def as_json(choice, found, exact):
 
 
 def _ends(last, tolerance, floor, most):
-    """Returns whether rungs above this one cannot be chosen."""
     if last.final or (last.milliseconds is not None and last.milliseconds > most):
         return True
     return _meets(last, tolerance, floor)  # after divergence, a finer step may work
@@ -431,7 +396,6 @@ def _meets(each, tolerance, floor):
 
 
 def _as_cheap(chosen, accurate):
-    """Returns others whose times overlap those of the chosen one, the cheapest first."""
     if chosen.spread is None:
         return []
     others = [each for each in accurate if each is not chosen and each.spread and each.spread[0] <= chosen.spread[1]]
@@ -448,19 +412,16 @@ def _certainty(chosen, rivals, tolerance, floor):
 
 
 def _grade(chosen):
-    """Returns what to add to a sentence about a setup whose run is not usable, or ""."""
     return "" if chosen.usable else "; without the reference its run is not usable, so 'warpcloth run' ends with exit code 1"
 
 
 def _unknown(exact, tolerance):
-    """Returns a sentence that says why nothing is known to meet the tolerance."""
     why = "smaller steps make it no less" if exact.limit == math.inf else f"its steps were halved for {exact.limit:g} s"
     known = f"the reference is known to {percent(exact.error)} only ({exact.method}, {exact.substeps} substeps; {why})"
     return f"{known}, so nothing can be said to meet {percent(tolerance)}"
 
 
 def percent(share):
-    """Formats a fraction as a percentage with three significant digits."""
     return f"{100.0 * share:.3g}%"
 
 

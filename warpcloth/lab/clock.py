@@ -17,12 +17,9 @@ class TooSlow(Exception):
 
 
 class Clock:
-    """Ends a run ``limit`` seconds after frame 0 is stored, so that compilation does not count.
+    """Ends a run ``limit`` seconds after frame 0 is stored, so that compilation does not count, as its ``progress``.
 
-    It is passed as ``progress`` to :func:`warpcloth.simulate`. ``clock`` is one of :data:`CLOCKS`.
-
-    Attributes:
-        frames: Time of each frame [s].
+    ``clock`` is one of :data:`CLOCKS`; ``frames`` has the time of each frame [s].
     """
 
     def __init__(self, limit, progress=None, clock="wall"):
@@ -40,7 +37,7 @@ class Clock:
 
 
 def mean_time(times):
-    """Returns the mean of the times of successive frames (F,), which times their number is the time of the motion.
+    """Returns the mean of the times of successive frames (F,).
 
     A frame counts for at most ``MOST`` times as long as the longer of its neighbours, so that an interruption counts little.
     """
@@ -54,8 +51,8 @@ def mean_time(times):
 def time_spread(times):
     """Returns by how much the times of successive frames (F,) differ from those of their neighbours, (low, high).
 
-    The time of each frame but the first and the last is divided by the mean of its neighbours' times. These are the quartiles
-    of the quotients, divided by their median; (1, 1) for less than three frames.
+    These are the quartiles, over the median, of the time of each inner frame divided by the mean of its neighbours' times; (1,
+    1) for less than three frames.
     """
     if len(times) < 3 or not np.min(times) > 0.0:
         return 1.0, 1.0

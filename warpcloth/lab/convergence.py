@@ -30,14 +30,8 @@ SEED = 0  # of the random roundings that give the accuracy of the minimum
 class OneStep:
     """A step of implicit Euler from a state of a scene in motion, and φ(d) = 1/(2h²)‖d‖²_M + U(x̃ + d), d = x − x̃, in float64.
 
-    The state, which Newton computes, is rounded to float32, so that all precisions start at the same positions. Newton also
-    computes the minimiser.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        frame: Number of frames before the state.
-        substeps: Number of steps per frame.
-        device: A Warp device.
+    Newton computes the state and the minimiser. The state is rounded to float32, so that all precisions start at the same
+    positions. It comes ``frame`` frames after the start, with ``substeps`` steps each.
 
     Attributes:
         h: Step [s].
@@ -97,7 +91,6 @@ class OneStep:
 
     @in_turn
     def objective(self, d):
-        """Returns φ(d) [J]."""
         model = self.model
         energy = wp.zeros(1, dtype=wp.float64, device=model.device)
         self._energy_of.add(self.base, energy, model.array(d, model.vec3))
@@ -114,12 +107,11 @@ class OneStep:
         return epsilon * random.uniform(-1.0, 1.0, size=(8, *self.best.shape)) * self.free[:, None]
 
     def _rounding(self):
-        """Returns the largest change of φ at the minimiser by rounding."""
         return max(abs(self.objective(self.best + move) - self.lowest) for move in self.roundings())
 
 
 def one_step(scene, digest, frame, substeps, device):
-    """Returns the :class:`OneStep` of a scene, the fields of a :class:`SceneRef`; all tasks of a process share it.
+    """Returns the :class:`OneStep` of a scene; all tasks of a process share it.
 
     Raises:
         ValueError: The scene has another digest.
@@ -138,23 +130,16 @@ def _one_step(scene, digest, frame, substeps, device):
 def measure(scene, digest, setup, frame, substeps, device="cpu", dtype="float64", limit=20.0, repeats=5):
     """Measures the gap of one step from x̃ after increasing numbers of iterations.
 
-    Args:
-        scene: :class:`SceneRef` as a dictionary.
-        digest: Digest of the scene, see :func:`warpcloth.base.digest.scene_digest`, so that another scene has another key.
-        setup: :class:`Setup` as a dictionary, without step and iterations.
-        frame: Number of frames before the step.
-        substeps: Number of steps per frame.
-        device: A Warp device.
-        dtype: Precision of the method; gaps are computed in float64.
-        limit: Time limit [s], without the state and the minimum.
-        repeats: Number of warm steps, of which the median counts.
+    Arguments and results are JSON values. ``digest`` gives another scene another key, ``setup`` has neither step nor
+    iterations, the step comes after ``frame`` frames, and the median of ``repeats`` warm steps counts. Gaps are computed in
+    float64. ``limit`` [s] bounds the time without the state and the minimum.
 
     Returns:
         dict: ``status``, ``reason``, ``points`` with ``iterations``, ``gap``, ``ms`` and ``spread`` (quartiles) of the step,
         ``floor``, ``message`` (why there are no more points), ``compile_s``, ``factorise_s``.
 
     Raises:
-        ValueError: The scene has no such step, see :class:`OneStep`.
+        ValueError: The scene has no such step.
     """
     step = one_step(scene, digest, frame, substeps, device)
     result = {"status": "ok", "reason": "", "message": "", "points": [], "floor": step.floor}
@@ -190,7 +175,6 @@ def measure(scene, digest, setup, frame, substeps, device="cpu", dtype="float64"
 
 
 def _ended(points):
-    """Returns whether more iterations change or improve nothing."""
     gaps = [point["gap"] for point in points]
     if gaps[-2:] == 2 * gaps[-1:]:
         return True
@@ -198,7 +182,6 @@ def _ended(points):
 
 
 def _milliseconds(step, stepper, repeats):
-    """Returns the quartiles of the time of a warm step [ms]."""
     taken = []
     for _ in range(repeats):
         step.set_state(stepper)

@@ -1,6 +1,6 @@
 """Negative cotangent weights: w = ½(cot α + cot β) of an edge is negative iff the angles opposite it sum to more than 180°.
 
-With "spokes", an edge of negative weight adds a negative energy, so that as-rigid-as-possible deformation pulls the mesh apart.
+With "spokes", an edge of negative weight adds a negative energy, so as-rigid-as-possible deformation pulls the mesh apart.
 "intrinsic" weights are positive inside (Fisher et al. 2007, *An algorithm for the construction of intrinsic Delaunay
 triangulations*), though not on the boundary. "clamped" weights lose linear precision. "spokes_and_rims" has the energy of
 triangles, which is never negative (Chao et al. 2010, *A simple geometric model for elastic deformations*).
@@ -81,7 +81,6 @@ PANELS = (
 
 
 def tasks(device):
-    """One measures all."""
     return [task(measure, device=device, libigl=importlib.util.find_spec("igl") is not None)]
 
 
@@ -113,7 +112,6 @@ def _weights(choices, device):
 
 
 def _kites(choices, device):
-    """Yields points from a start that is perturbed by 1e-3 of an edge."""
     noise = 1e-3 * np.random.default_rng(0).normal(size=(4, 3))
     for apex in np.arange(75.0, 110.1, 2.5):
         mesh = kite(apex)

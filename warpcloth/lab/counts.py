@@ -17,10 +17,6 @@ def compulsory_bytes(model, iterations):
 
     An iteration reads positions, inverse masses and all arrays of the terms, and writes positions, each once. A step also reads
     and writes velocities once. Pins, gravity and arrays of the solver do not count.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        iterations: Number of iterations of a step.
     """
     terms = sum(term["bytes"] for term in model.report()["terms"])
     iteration = 2 * model.positions.capacity + model.inverse_mass.capacity + terms
@@ -30,10 +26,7 @@ def compulsory_bytes(model, iterations):
 def launches_of(run):
     """Counts the launches of ``run()``: kernels, fills and copies within a device, including all repeats of device loops.
 
-    During the call, segments launch their functions directly instead of replaying graphs, so that the host runs loops.
-
-    Args:
-        run: A function that steps.
+    Segments launch their functions directly instead of replaying graphs, so that the host runs loops.
     """
     with _one_by_one() as counted:
         run()

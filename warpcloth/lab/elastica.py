@@ -1,5 +1,5 @@
-"""The heavy elastica: a strip clamped horizontally that bends under its own weight (Romero et al. 2021, *Physical validation
-of simulators in computer graphics*), and a hanging loop.
+"""The heavy elastica: a strip clamped horizontally that bends under its own weight (Romero et al. 2021, *Physical validation of
+simulators in computer graphics*), and a hanging loop.
 
 Γ = ρgL³/D. With the arc length u from the free tip in units of L, and the angle φ from the downward vertical,
 
@@ -7,8 +7,8 @@ of simulators in computer graphics*), and a hanging loop.
 
 H/W tends to Γ/8 for small Γ. Above Γ of about 150 there are several solutions; this module is for smaller Γ.
 
-A loop hangs from one point at which both ends are clamped. With the arc length s from its lowest point in units of L, the
-angle a of the tangent from the horizontal, and an unknown horizontal force h in units of D/L²,
+A loop hangs from one point at which both ends are clamped. With the arc length s from its lowest point in units of L, the angle
+a of the tangent from the horizontal, and an unknown horizontal force h in units of D/L²,
 
     a″ = h sin a − Γ s cos a,   a(0) = 0,   a(½) = nπ,   ∫cos a ds = 0;   depth = ∫sin a ds,
 
@@ -23,11 +23,9 @@ MOST = 100.0
 
 
 def curve(gamma, at=None):
-    """Returns points (k, 2) in units of L, from the clamp at the origin along x, y up.
+    """Returns points (k, 2) in units of L, from the clamp at the origin along x, y up, for Γ up to 100.
 
-    Args:
-        gamma: Γ, up to 100.
-        at: Positions along the strip (k,), from 0 at the clamp to 1 at the tip; by default 101.
+    ``at`` (k,) are positions along the strip, from 0 at the clamp to 1 at the tip; by default 101.
     """
 
     from scipy.integrate import solve_ivp
@@ -69,12 +67,7 @@ def gamma_of(ratio, at, near):
 
 
 def loop_depth(kind, gamma):
-    """Returns the depth of a hanging loop in units of L.
-
-    Args:
-        kind: "pear", "ring" or "heart".
-        gamma: Γ, up to 200.
-    """
+    """Returns the depth of a hanging "pear", "ring" or "heart" in units of L, for Γ up to 200."""
     from scipy.integrate import solve_bvp
 
     turns, closing, _ = KINDS[kind]

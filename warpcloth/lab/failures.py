@@ -25,12 +25,7 @@ COLUMNS = ("panel", "series", "x", "y", "value", "law", "expected", "reason", "m
 
 
 def failure_chart(name, device="cpu", **run):
-    """Measures a failure.
-
-    Args:
-        name: One of `FAILURES`.
-        device: A Warp device.
-        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+    """Measures one of `FAILURES`; ``run`` has arguments of :func:`sweep`.
 
     Returns:
         dict: JSON values; ``rows`` has the points, with the ``law`` of a series and the value ``expected`` from it.

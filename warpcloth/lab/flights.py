@@ -18,8 +18,7 @@ class Flights:
 
     Attributes:
         speed: Label of the speed.
-        fails: The series of flights that fail.
-        holds: The series of the others.
+        fails: The series of flights that fail; ``holds`` is that of the others.
         failed: Label of the fraction that fails [%], which colours maps without the filter.
         cut: Label of the fraction that was cut short [%], which colours maps with the filter; those that fail are crossed out.
     """

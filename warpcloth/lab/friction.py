@@ -108,7 +108,6 @@ PANELS = (
 
 
 def tasks(device):
-    """One for each solver and part of the chart."""
     found = []
     for solver in TAKERS:
         found += [task(mapped, solver=solver, coefficient=float(f"{mu:.6g}"), device=device) for mu in COEFFICIENTS]
@@ -158,8 +157,8 @@ def slide(solver, coefficient, slopes, device, **options):
     """Returns speeds [m/s] and accelerations [m/s²] of sheets down slopes [°], each (S,).
 
     A batch with one plane and different directions of gravity stands for the slopes. The sheets start at rest, with contact in
-    balance with their weight. Speeds and accelerations are differences of mean positions over each third of the time, so that
-    the oscillation of explicit steps about an anchor cancels. They are exact for constant acceleration.
+    balance with their weight. Speeds and accelerations are differences of mean positions over each third of the time, so the
+    oscillation of explicit steps about an anchor cancels; they are exact for constant acceleration.
     """
     grid = Mesh.grid(3, 3, size=0.1)
     scene = Scene(

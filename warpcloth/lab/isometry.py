@@ -49,7 +49,6 @@ PANELS = (
 
 
 def tasks(device):
-    """One measures all."""
     return [task(measure, device=device)]
 
 

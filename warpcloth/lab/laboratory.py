@@ -108,10 +108,7 @@ def check_sample(scene: Scene) -> None:
 def drape_coefficient(points: np.ndarray, flat: np.ndarray, triangles: np.ndarray) -> float:
     """Returns the area of the ring outside the support that has a shadow, over that of the flat sample.
 
-    Args:
-        points: Draped positions (n, 3) [m], with the axis of the support along y through the origin.
-        flat: Positions of the flat sample (n, 3) [m].
-        triangles: (T, 3).
+    ``points`` and ``flat`` (n, 3) are draped and flat positions [m], with the axis of the support along y through the origin.
     """
     support = np.pi * cusick.SUPPORT**2
     return (_shadow(points, triangles) - support) / (_shadow(flat, triangles) - support)
@@ -120,7 +117,7 @@ def drape_coefficient(points: np.ndarray, flat: np.ndarray, triangles: np.ndarra
 def _shadow(points, triangles):
     """Returns the area [m²] of the union of triangles and the support, projected along y.
 
-    Lines along x cross them in intervals, whose unions are measured exactly; the area is their sum by the midpoint rule.
+    It is a sum over lines along x by the midpoint rule; the union on each line is exact.
     """
     x, z = np.moveaxis(points[triangles][..., [0, 2]], 2, 0)
     width = 2.0 * np.abs(z).max() / _LINES
@@ -159,7 +156,6 @@ def _clamps(scene):
 
 
 def _bending(length, gamma, scene):
-    """Returns the bending length [mm] and D [µN·m] of a strip of a length [m] with Γ."""
     bending_length = length * gamma ** (-1 / 3)
     return 1e3 * bending_length, 1e6 * scene.density * np.linalg.norm(scene.gravity) * bending_length**3
 

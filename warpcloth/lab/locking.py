@@ -1,21 +1,18 @@
 """Locking: a net that cannot bend without straining bends too little, and less the stiffer its membrane is.
 
 Chords of a cylinder are shorter than its arcs by κ²h²/24. The energy of this strain exceeds the bending energy per area, ½Dκ²,
-if κ²h⁴K > 576D. A regular net with three edge lengths avoids it at no cost and keeps its curvature. An irregular net keeps some
-of the strain, or loses curvature to wrinkles. Springs k on all edges act as a membrane of K = 2k/√3 on an equilateral net; the
-same is assumed for others.
+if κ²h⁴K > 576D. A regular net with three edge lengths avoids it at no cost. An irregular net keeps some of the strain, or loses
+curvature to wrinkles. Springs k on all edges act as a membrane of K = 2k/√3 on an equilateral net; the same is assumed for
+others.
 
-Apart from locking, each net of hinges has its own bending stiffness, an error of its pattern that refinement does not remove. A
-cantilever with a soft membrane shows it. The stiffness divided by that is due to locking, and falls with h⁴. Regular nets lock
-there too, though less, because their curvature varies and their sides curl. Plate bending locks as well, but its stiffness does
-not depend on the pattern.
+Apart from locking, each net of hinges has its own bending stiffness, which a cantilever with a soft membrane shows. The
+stiffness divided by that is due to locking, and falls with h⁴. Regular nets lock there too, because their curvature varies and
+their sides curl. Plate bending locks as well, but its stiffness does not depend on the pattern.
 
-How well a net can avoid strain depends on the degrees of freedom that its stiff edges leave (:mod:`warpcloth.scene.freedom`).
-Rows and columns alone leave more than one per vertex. All edges of triangles leave 3 plus the number of boundary edges, at any
-resolution. A grid with both diagonals leaves only rigid motion. With so little freedom, a net bends only if it is regular and
-bent along its own lines.
-
-Springs alone reach no rest shape: they leave motion without stiffness, and the net keeps sliding along its wrinkles.
+The freedom to avoid strain is what stiff edges leave (:mod:`warpcloth.scene.freedom`): rows and columns more than one degree
+per vertex, all edges of triangles 3 plus the number of boundary edges, a grid with both diagonals only rigid motion. With so
+little, a net bends only if it is regular and bent along its own lines. Springs alone leave motion without stiffness, and the
+net keeps sliding along its wrinkles.
 """
 
 from dataclasses import replace
@@ -146,7 +143,6 @@ PANELS = (
 
 
 def tasks(device):
-    """One for each net and resolution."""
     found = [task(imposed, device=device)]
     found += [task(relaxed, pattern=pattern, elements=n, moduli=_MODULI, device=device) for pattern, n in _RELAXED]
     found += [task(let_go, pattern=pattern, degrees=turn, device=device) for pattern, turn in _LET_GO]
@@ -176,7 +172,7 @@ def imposed(device):
 
 
 def relaxed(pattern, elements, moduli, device):
-    """Returns points of a sheet whose hinges are at rest on a cylinder and whose springs are at rest when flat, over K/D."""
+    """Returns points of a sheet whose hinges are at rest on a cylinder and springs when flat, over K/D."""
     h = 1.0 / elements
     flat = strip(pattern, np.radians(NETS[pattern]), h).mesh
     area = flat.triangle_areas.sum()
@@ -194,7 +190,6 @@ def relaxed(pattern, elements, moduli, device):
 
 
 def _at_rest(flat, pairs, K, device):
-    """Builds a flat mesh with hinges at rest when rolled up and springs at rest when flat, and its rest shape."""
     rolled = Mesh(rolled_up(flat.points, CURVATURE), flat.triangles)
     lengths = np.linalg.norm(flat.points[pairs[:, 1]] - flat.points[pairs[:, 0]], axis=1)
     terms = [
@@ -206,7 +201,6 @@ def _at_rest(flat, pairs, K, device):
 
 
 def held(holding, mesh):
-    """Returns the pairs of vertices (E, 2) that hold their distance in a net of `_HOLDING`."""
     if holding.startswith("edges"):
         return mesh.edges
     # The longest side of a right triangle is the diagonal of a cell.
@@ -219,7 +213,6 @@ def held(holding, mesh):
 
 
 def counted(holding, n):
-    """Counts the degrees of freedom that the springs of a square or jittered net of about n² vertices leave."""
     pattern = _HOLDING[holding]
     mesh = strip(pattern, 0.0, 1.0 / (n - 1)).mesh if pattern == "jittered" else Mesh.grid(n, n, pattern=pattern)
     return [point("freedom", holding, len(mesh.boundary_edges), _left(mesh, held(holding, mesh)))]

@@ -12,11 +12,7 @@ from ..others.simulators import SIMULATORS
 
 
 def machine(device="cpu"):
-    """Returns the names of processor and device, numbers of cores, and versions, by name.
-
-    Args:
-        device: A Warp device.
-    """
+    """Returns the names of processor and device, numbers of cores, and versions, by name."""
     import numpy
     import scipy
     import warp as wp
@@ -39,18 +35,13 @@ def machine(device="cpu"):
 
 @cache
 def name(device="cpu"):
-    """Returns host, processor and, if it is not the CPU, device in a few words, to be kept with each measurement."""
+    """Returns host, processor and, if it is not the CPU, device in a few words."""
     facts = machine(device)
     return ", ".join([platform.node(), facts["processor"], *([] if facts["device"] == "cpu" else [facts["device"]])])
 
 
 def in_words(facts, others=()):
-    """Formats the versions and the device of :func:`machine`, for a CPU its name and cores, for a chart.
-
-    Args:
-        facts: Those of :func:`machine`.
-        others: Names of simulators whose versions are added.
-    """
+    """Formats the versions, also those of ``others``, and the device of :func:`machine` for a chart."""
     device = facts["device"] if facts["device"] != "cpu" else f"{facts['processor']}, {facts['cores']} cores"
     own = f"warpcloth {facts['warpcloth']} ({facts['source'][:8]})"
     return ", ".join([own, f"Warp {facts['warp']}", *(f"{SIMULATORS[name].title} {facts[name]}" for name in others), device])

@@ -30,7 +30,7 @@ class SceneRef:
     Attributes:
         name: A known name, a .py file or a USD stage.
         parameters: Parameters of its function by name. Strings are converted, so that "inf", which JSON lacks, is a number.
-        pins: A selection that replaces its pins, see :class:`warpcloth.run.scene_files.SceneSource`; or None.
+        pins: A selection that replaces its pins; or None.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Setup:
     """A solver with options, as data.
 
     Attributes:
-        solver: Its name on the command line, such as "projective-dynamics", or of another simulator, such as "newton-vbd".
+        solver: Its name on the command line, such as "projective-dynamics" or "newton-vbd".
         options: Options of its record by name; others have their defaults.
     """
 
@@ -69,7 +69,7 @@ class Setup:
     options: dict = field(default_factory=dict)
 
     def record(self):
-        """Returns the record, such as ``wc.Newton(substeps=4)``, or that of a solver of another simulator.
+        """Returns the record, such as ``wc.Newton(substeps=4)``.
 
         Raises:
             ValueError: There is no such solver, or an option is not allowed.
@@ -94,12 +94,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Task:
-    """One measurement: a function of JSON values that returns JSON values.
-
-    Attributes:
-        function: Module and name, "package.module:function".
-        arguments: Its arguments by name: numbers, texts, lists and dictionaries of such.
-    """
+    """One measurement: the function "package.module:function", and its arguments by name; JSON values, as its result."""
 
     function: str
     arguments: dict
@@ -127,27 +122,18 @@ class Task:
         return replace(self, arguments=found)
 
     def run(self):
-        """Measures in this process, and returns the result."""
         module, name = self.function.split(":")
         return getattr(import_module(module), name)(**self.arguments)
 
 
 def task(function, **arguments):
-    """Returns the :class:`Task` of a function of a module; records such as :class:`SceneRef` become dictionaries.
-
-    Args:
-        function: A function at the top of a module, which another process can import.
-        arguments: Its arguments.
-    """
+    """Returns the :class:`Task` of a function at the top of a module; records such as :class:`SceneRef` become dictionaries."""
     plain = {name: asdict(value) if hasattr(value, "__dataclass_fields__") else value for name, value in arguments.items()}
     return Task(f"{function.__module__}:{function.__qualname__}", plain)
 
 
 def usable(row):
-    """Returns whether the run of a row counts as usable without a reference, see :class:`warpcloth.core.status.Grade`.
-
-    Rows without a grade do.
-    """
+    """Returns whether the run of a row counts as usable without a reference, as do rows without a grade."""
     return row.get("grade") != Grade.NOT_USABLE.value
 
 
@@ -158,11 +144,6 @@ def finite(value):
 
 def run(task, source, modules):
     """Runs a task for an executor: returns its result and the name of the machine that measured it.
-
-    Args:
-        task: The :class:`Task`.
-        source: The :func:`source_digest` of the calling process.
-        modules: Its :func:`warpcloth.base.extensions.extensions`, a tuple of names.
 
     Raises:
         ValueError: This process has other code, so that its results would have other keys, or cannot import a module.
@@ -179,7 +160,7 @@ def run(task, source, modules):
 
 @cache
 def _code(modules):
-    """Loads the extensions of the process that asks, and returns the hash of the code as this process first read it."""
+    """Loads the extensions of the process that asks, and returns the hash of the code as first read."""
     if {*modules} != {*extensions()}:
         load_only(modules)
     return source_digest()

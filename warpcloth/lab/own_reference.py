@@ -32,34 +32,25 @@ def own_reference(
 ):
     """Returns the :class:`warpcloth.lab.reference.Reference` of a solver of another simulator, from its file, or computed.
 
-    It runs the scene with the fewest substeps and the most iterations of its settings, with twice the substeps, and so on. It
-    ends when two successive doublings both move the cloth by at most the tolerance. It also ends when the last two doublings
-    both move it further than an earlier one did; then float32 rounds the motion, or the solver does not converge.
+    It runs the scene with the fewest substeps and the most iterations of ``setups``, with twice the substeps, and so on. It
+    ends when two successive doublings both move the cloth by at most the ``tolerance``, relative to the size of the cloth; or
+    further than an earlier one did, because float32 rounds the motion or the solver does not converge.
 
     Two successive doublings count if the second moves the cloth no further than the first, or both move it by at most the
-    tolerance. A single doubling does not count, nor do moves that grow: a solver far from its limit may hardly move. Of those
-    that count, the two with the smallest moves are taken. The middle run is run with twice the iterations too. The largest of
-    the three moves is the error, which bounds that of the finest run if each doubling at least halves the error. A caller must
-    compare it with a bound of its own before it takes the motion for converged, see :func:`own_facts`.
+    tolerance; a solver far from its limit may hardly move. Of those that count, the two with the smallest moves are taken. The
+    middle run is run with twice the iterations too. The largest of the three moves is the error, which bounds that of the
+    finest run if each doubling at least halves the error. A caller must compare it with a bound of its own, see
+    :func:`own_facts`.
 
-    Args:
-        scene: The :class:`warpcloth.lab.measurements.SceneRef`.
-        setups: The :class:`warpcloth.lab.measurements.Setup`\\s of the solver.
-        frames: Number of frames.
-        device: A Warp device.
-        tolerance: Relative to the size of the cloth.
-        limit: Time limit [s] of the frames of all runs that double the substeps. The run with twice the iterations may take as
-            long again.
-        progress: Function called with (substeps, frame, frames) after each frame, or None.
-        clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for the limit.
-        until: A time of ``time.perf_counter`` [s] at which :class:`UsedUp` is raised.
+    ``limit`` [s] bounds the frames of all runs that double the substeps; the run with twice the iterations may take as long
+    again. ``progress`` is called with (substeps, frame, frames).
 
     Returns:
         The reference, or None if the solver does not take the scene, diverges, or takes too long for two runs. Its error is
         infinite if no two doublings count, or if there was no time for the run with more iterations.
 
     Raises:
-        UsedUp: The time ``until`` has come before the end.
+        UsedUp: The time ``until`` of ``time.perf_counter`` [s] has come before the end.
     """
     records = [setup.record() for setup in setups]
     iterations = max(record.iterations for record in records)
@@ -134,9 +125,9 @@ def own_reference(
 
 
 def _settled(moves, tolerance):
-    """Returns (index of a doubling, error) of the two successive doublings that move the cloth least and count.
+    """Returns (index, error) of the second of the two successive doublings that move the cloth least and count.
 
-    The index is that of the second of them. If no two count, it is that of the smallest move, and the error is infinite.
+    If no two count, the index is that of the smallest move, and the error is infinite.
     """
     pairs = {k: (moves[k - 1], moves[k]) for k in range(1, len(moves))}
     errors = {k: max(pair) for k, pair in pairs.items() if pair[1] <= pair[0] or max(pair) <= tolerance}
@@ -145,18 +136,9 @@ def _settled(moves, tolerance):
 
 
 def own_references(scene, setups, frames, device, tolerance, limit, progress=None, clock="wall", until=math.inf):
-    """Returns the :func:`own_reference` of each solver of another simulator among setups, by its name, or ``CUT``.
+    """Returns the :func:`own_reference` of each solver of another simulator among setups, by its name.
 
-    Args:
-        scene: The :class:`warpcloth.lab.measurements.SceneRef`.
-        setups: :class:`warpcloth.lab.measurements.Setup`\\s.
-        frames: Number of frames.
-        device: A Warp device.
-        tolerance: As for :func:`own_reference`.
-        limit: As for :func:`own_reference`, of each solver.
-        progress: As for :func:`own_reference`.
-        clock: As for :func:`own_reference`.
-        until: A time of ``time.perf_counter`` [s]. Solvers whose reference is not known by then have ``CUT``.
+    Solvers whose reference is not known at the time ``until`` have ``CUT``.
     """
     of_each, found = {}, {}
     for setup in setups:
@@ -173,11 +155,7 @@ def own_references(scene, setups, frames, device, tolerance, limit, progress=Non
 def own_facts(own, exact, mesh, bound):
     """Returns what is known of the motion to which a solver converges, as JSON values, or None if there is none.
 
-    Args:
-        own: The :func:`own_reference`, None or ``CUT``.
-        exact: The :class:`warpcloth.lab.reference.Reference` of warpcloth.
-        mesh: The mesh.
-        bound: Largest error of a motion that counts as converged.
+    ``own`` is the :func:`own_reference`, None or ``CUT``, and ``bound`` the largest error of a motion that counts as converged.
 
     Returns:
         dict: ``substeps``, ``error``, ``converged``, ``bound``, ``seconds``, and ``apart``, the distance from the reference; or

@@ -6,14 +6,9 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Panel:
-    """The contents of one panel.
+    """The contents of one panel: its name in tables, its title, labels with units, and scales, "linear" or "log".
 
     Attributes:
-        key: Its name in tables.
-        title: A sentence that says what fails.
-        x: Label of the axis, with its unit.
-        y: Label of the other axis, with its unit.
-        scales: Scales of x and y, "linear" or "log".
         laws: Functions of x by the label of their line.
         follows: Label of the law of a series, by series; not all have one.
         marks: Labels of vertical lines by their x.

@@ -3,24 +3,22 @@
 | Case | Closed form | Order |
 |---|---|---|
 | cylinder | energy ½Dκ² per area of a sheet rolled to a cylinder with κL = 1 | 2 |
-| cantilever | H/W of the heavy elastica at the tip of a wide strip under its weight | 1.5 to 3, down to the effect of its sides
-| | chain | extension of N springs k by N masses m, (mg/k)·N(N + 1)/2 | none: exact |
+| cantilever | H/W of the heavy elastica at the tip of a wide strip under its weight | 1.5 to 3, down to the effect of sides |
+| chain | extension of N springs k by N masses m, (mg/k)·N(N + 1)/2 | none: exact |
 | catenary | sag of the elastic catenary | 2 |
 | patch | x = Gx̄ inside a membrane whose boundary is moved to Gx̄ | none: exact |
 
-Hinges are calibrated on equilateral nets. On others, refinement does not remove their error (:func:`strips.rolled`). Plates,
-here with ν = 0, have no such error. A cantilever with hinges differs from the elastica in these ways. The last three also
-apply to plates, for which the position of the clamp was not calibrated:
+Hinges are calibrated on equilateral nets; on others, refinement does not remove their error (:func:`strips.rolled`). Plates,
+here with ν = 0, have no such error. A cantilever with hinges differs from the elastica in these ways, the last three also with
+plates, for which the position of the clamp was not calibrated:
 
-- One row of triangles, or any strip much narrower than long, bends with 1 − ν² = 8/9 of D, because the Poisson's ratio ν of
-  both energies is −1/3 (:func:`strips.plate`): it is the elastica of 9Γ/8. This strip is twice as wide as it is long.
-- Its sides curl like those of a narrow strip, as far in as its membrane allows. `sides` is the fraction of D lost by that, and
-  the error cannot be much less. It falls with the stiffness of the membrane.
-- A stiff membrane locks: the mesh cannot bend without stretching, by κ²h²/24 per triangle, most of all if it is irregular. That
-  costs more than bending if h⁴ > 576D/(Kκ²), and vanishes with h.
-- The clamp is half a row before the last pinned one, because a hinge bends if any of its vertices is free. The L of Γ starts
-  there.
-- Quadratic bending is for small Γ or stiff membranes, because unlike dihedral angles it resists non-uniform stretch.
+- A strip much narrower than long bends with 1 − ν² = 8/9 of D, as ν = −1/3 (:func:`strips.plate`): it is the elastica of 9Γ/8.
+  This strip is twice as wide as it is long.
+- Its sides curl as far in as its membrane allows. `sides` is the fraction of D lost by that, and falls with the stiffness of
+  the membrane.
+- A stiff membrane locks, by κ²h²/24 per triangle. That costs more than bending if h⁴ > 576D/(Kκ²), and vanishes with h.
+- The clamp is half a row before the last pinned one, because a hinge bends if any of its vertices is free. L starts there.
+- Quadratic bending is for small Γ or stiff membranes, because it resists non-uniform stretch.
 """
 
 import time
@@ -68,18 +66,9 @@ def measure(
 ):
     """Measures one point of the diagram.
 
-    Args:
-        case: One of `CASES`.
-        resolution: Number of elements along L, 1 m.
-        bending: "dihedral", "quadratic" or "plate", the last with ν = 0.
-        pattern: Pattern of the net, see :func:`strips.strip`; ignored for a chain and a catenary.
-        angle: Rotation of the net [rad].
-        gamma: Γ = ρgL³/D of the cantilever, up to 100.
-        device: A Warp device.
-        dtype: "float32" or "float64".
-        limit: Time limit [s], checked every 200 iterations.
-        stretching: KL²/D of the membrane of the cantilever; EA/wL of the catenary.
-        width: Width of the cantilever over L.
+    ``case`` is one of `CASES`, with ``resolution`` elements along L, 1 m. ``pattern`` is that of :func:`strips.strip`, rotated
+    by ``angle`` [rad]. ``gamma`` is Γ = ρgL³/D of the cantilever, up to 100, and ``width`` its width over L. ``stretching`` is
+    KL²/D of its membrane, or EA/wL of the catenary. ``limit`` [s] is checked every 200 iterations.
 
     Returns:
         dict: ``status`` "ok", "diverged" (or did not settle) or "slow", and ``reason``; relative ``error``; ``stiffness``, the
@@ -117,14 +106,12 @@ def measure(
 
 
 class _Settling:
-    """Finds equilibria within a time limit."""
-
     def __init__(self, device, dtype, limit):
         self.options, self.limit = {"device": device, "dtype": dtype}, limit
         self.status, self.reason, self.ms, self.spread, self.iterations, self.floor = "ok", "", None, None, 0, None
 
     def __call__(self, scene, error, **options):
-        """Returns ``error(points)`` of a scene at rest, or when the time is up: a signed number, or an array."""
+        """Returns ``error(points)`` of a scene at rest, or when the time is up."""
         points = self._rest(scene, options)
         found = error(points)
         if self.status == "ok":
@@ -136,7 +123,6 @@ class _Settling:
         return found
 
     def _rest(self, scene, options):
-        """Returns the points (n, 3) of a scene at rest, or when the time is up."""
         equilibrium(scene, iterations=1, **options, **self.options)  # compiles
         rest, self.iterations, seconds = self._solve(scene, options)
         taken = [seconds]
@@ -151,7 +137,6 @@ class _Settling:
         return rest.points
 
     def _solve(self, scene, options):
-        """Returns the equilibrium, the number of Newton iterations and the time [s]."""
         started, iterations = time.perf_counter(), 0
         while True:
             rest = equilibrium(scene, iterations=_CHUNK, **options, **self.options)
@@ -162,14 +147,13 @@ class _Settling:
 
 
 def _moves(scene, size):
-    """Returns eight random displacements of free coordinates of up to ``size``, equal in every call, (8, n, 3) [m]."""
+    """Returns eight displacements of free coordinates of up to ``size``, equal in every call, (8, n, 3) [m]."""
     moves = size * np.random.default_rng(SEED).uniform(-1.0, 1.0, size=(8, *scene.positions.shape))
     moves[:, scene.pins.vertices] = 0.0
     return moves
 
 
 def _cylinder(settle, bending, pattern, angle, resolution):
-    """Measures a sheet rolled up with κ = 1/m."""
     mesh = strip(pattern, angle, 1.0 / resolution).mesh
     stiffness = bending_density(bending, mesh, rolled_up(mesh.points, 1.0), **settle.options)
     return {"error": abs(stiffness - 1.0), "stiffness": stiffness, "elements": len(mesh.triangles), "h": 1.0 / resolution}
@@ -234,7 +218,6 @@ def side_loss(gamma, stretching, width):
 
 
 def _chain(settle, links):
-    """Measures the extension of a chain of N springs, each with 1/N of the mass of 0.2 kg."""
     mass, stiffness = 0.2 / links, 50.0 * links
     extension = mass * G / stiffness * links * (links + 1) / 2.0
     scene = chain.scene(links=links, mass=mass, stiffness=stiffness)

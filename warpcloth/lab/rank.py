@@ -61,7 +61,6 @@ PANELS = (
 
 
 def tasks(device):
-    """One measures all."""
     return [task(measure, device=device)]
 
 

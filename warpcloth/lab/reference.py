@@ -33,7 +33,7 @@ _SOLVED = (Result.COMPLETED, Result.CONVERGED, Result.ROUNDED)
 
 
 class NoReference(ValueError):
-    """Raised if a scene has no reference solution: no method takes it, or the time was too short for any estimate."""
+    """Raised if a scene has no reference solution: no method takes it, or the time was too short."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Reference:
     Attributes:
         points: (F, n, 3) [m], the start and each frame after it, float64.
         times: (F,) [s].
-        error: Bound of its own :func:`position_error`, see :func:`reference`.
+        error: Bound of its own :func:`position_error`.
         strain_error: Bound of its own :func:`strain_error`.
         substeps: Steps per frame of the finest run.
         seconds: Time of all runs [s].
@@ -123,22 +123,18 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None, de
     by more than 0.75 of what the one before did, e(h) is x(h), which is not extrapolated.
 
     The method is symplectic Euler if some 20 000 steps per frame are stable, on CUDA 65 000, because BDF2 damps high
-    frequencies unless ωh is small. For ``hanging`` with 32 × 32 vertices over 20 frames, 128 BDF2 steps per frame have an error
-    of 4e-5 after 9 s, and 428 explicit ones, extrapolated, less than 4e-6 after 3 s. Stiffer scenes use Newton's method with
-    BDF2, and hard constraints :class:`warpcloth.ConstrainedDynamics`. Scenes with colliders also use Newton's method, because
-    contact in explicit steps is softer: the two motions of ``drape`` with 8 × 8 vertices are 0.6 % apart after half a second.
-    Friction uses the normal forces at the start of a step, which makes BDF2 first order.
-
-    The file is in :func:`warpcloth.lab.campaign.cache_folder`, named by a hash of the scene, the frames and this code.
+    frequencies unless ωh is small. Stiffer scenes use Newton's method with BDF2, and hard constraints
+    :class:`warpcloth.ConstrainedDynamics`. Scenes with colliders also use Newton's method, because contact in explicit steps is
+    softer. Friction uses the normal forces at the start of a step, which makes BDF2 first order.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
-        frames: Number of frames, by default those of the scene.
+        frames: By default those of the scene.
         tolerance: Steps are halved until ``error`` is at most this, or until two halvings did not lower it, a sign of chaotic
             motion or rounding.
         limit: Time limit [s].
-        progress: Function called with (substeps, frame, frames) after each frame, or None.
-        device: A Warp device, which computes it; on CUDA symplectic Euler is the method of stiffer scenes too.
+        progress: Function called with (substeps, frame, frames) after each frame.
+        device: A Warp device.
 
     Warns:
         UserWarning: Its error is above the tolerance, or a term makes it slow.
@@ -169,7 +165,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None, de
 
 
 def kept_reference(path, key):
-    """Returns the reference in a file, or None if there is none, or a broken one."""
+    """Returns the reference in a file, or None if there is none or it is broken."""
     try:
         found = Reference.load(path)
     except (FileNotFoundError, ValueError):
@@ -179,13 +175,7 @@ def kept_reference(path, key):
 
 @dataclass(frozen=True)
 class _Method:
-    """The method of a reference.
-
-    Attributes:
-        record: Function (substeps) → record of the solver.
-        first: Smallest number of substeps.
-        order: Order p.
-    """
+    """The method of a reference: (substeps) → ``record``, the smallest number of substeps, and its order p."""
 
     record: Callable
     first: int
@@ -193,11 +183,6 @@ class _Method:
 
 
 def _method(scene, device):
-    """Returns the :class:`_Method` for a scene on a device.
-
-    Raises:
-        NoReference: No method takes the scene.
-    """
     model = scene.build(device=device, dtype="float64")
     if any(elements.hard for elements in model.terms):
         method = _Method(lambda s: ConstrainedDynamics(substeps=s, iterations=100, tolerance=_TOLERANCE), 4, 1)
@@ -223,7 +208,6 @@ def _method(scene, device):
 
 
 def _solve(scene, frames, tolerance, limit, progress, device):
-    """Computes ``points``, ``error``, ``strain_error``, ``substeps``, ``seconds``, ``method`` and ``limit`` of a reference."""
     method = _method(scene, device)
     started, substeps = time.perf_counter(), method.first
     runs, errors, best, trouble = [], [], None, ""  # points of up to three runs, each with half the step of the one before
@@ -264,5 +248,4 @@ def _solve(scene, frames, tolerance, limit, progress, device):
 
 
 def _idle(errors):
-    """Returns whether the last two halvings lowered the error by less than a tenth."""
     return len(errors) > 2 and errors[-1] > 0.9 * errors[-3]

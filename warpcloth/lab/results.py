@@ -22,14 +22,9 @@ COLUMNS = (
 
 
 def exponent(sizes, values):
-    """Fits values ∝ sizesᵖ by least squares of logarithms, and returns p and its standard error.
+    """Fits values ∝ sizesᵖ, each (m,) above 0, by least squares of logarithms, and returns p and its standard error.
 
-    Args:
-        sizes: (m,), above 0.
-        values: (m,), above 0.
-
-    Returns:
-        (p, error): The error is None for two points; both are None for fewer points or if all sizes are equal.
+    The error is None for two points; both are None for fewer points or if all sizes are equal.
     """
     x, y = (np.log(np.asarray(each, dtype=np.float64)) for each in (sizes, values))
     x = x - x.mean() if len(x) else x
@@ -76,12 +71,8 @@ def growth(rows):
 def ratios(old, new):
     """Returns the ratios new over old of rows that are "ok" in both results.
 
-    The spread of a ratio of times goes from lower quartile over upper quartile to the reverse. So a difference exceeds it if
+    The spread of a ratio of times goes from lower quartile over upper quartile to the reverse, so a difference exceeds it if
     the quartiles do not overlap.
-
-    Args:
-        old: A result, see :func:`read`.
-        new: Another.
 
     Returns:
         list: For each row the columns that identify it, ``label``, ``ms`` (old, new), ``ratio``, ``spread`` (low, high),

@@ -1,7 +1,4 @@
-"""Settings that charts compare: those that minimise one step, and those of runs, which trade speed for accuracy.
-
-Each solver's record has its own, see :class:`warpcloth.solvers.facts.Facts`.
-"""
+"""Settings that charts compare: those that minimise one step, and those of runs, which trade speed for accuracy."""
 
 from ..others.simulators import SIMULATORS, check_installed, shown_name
 from ..solvers import SOLVERS, Explicit
@@ -23,12 +20,10 @@ def setups_of_steps(solvers=None):
 
 
 def setups_of_runs(scene, solvers=None, device="cpu", dtype=None, others=()):
-    """Returns the :class:`Setup`\\s of runs of a :class:`SceneRef`, of all solvers or of those named, each once.
+    r"""Returns the :class:`Setup`\s of runs of a :class:`SceneRef`, of all solvers or of those named, each once.
 
-    Those of ``others``, simulators of :data:`warpcloth.others.simulators.SIMULATORS`, come last.
-
-    Steps do not depend on the frame rate of the scene, unless they would be longer than a frame. The substeps of a limited
-    solver are multiples of its fewest stable substeps on a device.
+    Those of ``others``, simulators, come last. Steps do not depend on the frame rate of the scene, unless they would be longer
+    than a frame. The substeps of a limited solver are multiples of its fewest stable substeps on a device.
 
     Raises:
         ImportError: A simulator is not installed.
@@ -92,7 +87,7 @@ def _checked(names, known):
 
 
 def _fewest(record, scene, device, dtype):
-    """Returns the fewest stable substeps of a limited solver; 1 with hard constraints, which it refuses."""
+    """Returns the fewest stable substeps; 1 with hard constraints, which a limited solver refuses."""
     declared, dtype = scene.load(), record.precision_on(device, dtype)
     try:
         return fewest_substeps(declared.fps, *record.step_limits(declared.build(device=device, dtype=dtype)))

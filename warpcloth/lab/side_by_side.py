@@ -1,8 +1,4 @@
-"""Solvers of warpcloth and of other simulators on one scene: each one's cheapest setting within a tolerance, and the ratios.
-
-The result is a diagram of :func:`warpcloth.lab.work_precision.time_diagram` with more keys, so that
-:mod:`warpcloth.chart.pareto` draws it.
-"""
+"""Solvers of warpcloth and of other simulators on one scene: each one's cheapest setting within a tolerance, and the ratios."""
 
 import numpy as np
 import warp as wp
@@ -29,26 +25,23 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
         others: Names of simulators.
         tolerance: Largest error of the settings whose times are compared, relative to the size of the cloth.
-        frames: Number of frames, by default those of the scene.
-        device: A Warp device. On the CPU times are those of the process, which others do not prolong.
+        frames: By default those of the scene.
+        device: On the CPU times are those of the process, which others do not prolong.
         given: ``solvers``, ``limit``, ``total`` and ``run`` of :func:`warpcloth.lab.choosing.choose`.
 
     Returns:
-        dict: That of :func:`warpcloth.lab.work_precision.time_diagram` with two more keys. ``searched`` has, for each solver of
-        another simulator, how its search ended. ``ratios`` has a dictionary for the cheapest setting of warpcloth, and then for
-        that of each other solver:
+        dict: That of :func:`warpcloth.lab.work_precision.time_diagram` with ``searched``, for each solver of another simulator,
+        how its search ended, and ``ratios``. These have a dictionary for the cheapest setting of warpcloth that meets the
+        tolerance, or else of another solver, and then for that of each other solver; they are empty if none does:
 
         - ``label``, ``solver``, ``options``: The setting.
         - ``error``, ``own_error``: Its errors.
         - ``to``: The one that meets the tolerance, "reference" or "own".
-        - ``ms``: Its time of a frame [ms], :func:`warpcloth.lab.clock.mean_time`.
+        - ``ms``: Its mean time of a frame [ms].
         - ``ratio``: This time divided by that of the first setting.
         - ``spread``: The ratio times :func:`warpcloth.lab.clock.time_spread` of the ratios of frames.
         - ``crossings``, ``inside``: The largest number in a frame of pairs of triangles that cross, and of vertices inside
           colliders; None if libigl is not installed.
-
-        If no setting of warpcloth meets the tolerance, the first setting is another that does. If none does, ``ratios`` is
-        empty.
 
     Raises:
         ImportError: A simulator is not installed.
@@ -98,7 +91,6 @@ def nearest_setting(found):
 
 
 def _row(each, fps):
-    """Returns the row of a :class:`warpcloth.lab.choosing.Measured` in a diagram."""
     status = each.status if each.error is not None or each.status != "ok" else "diverged"
     names = ("error", "strain_error", "own_error", "reason", "machine", "spread", "grade")
     row = {"solver": each.setup.solver, "options": each.setup.options, "label": label(each.setup), "status": status}
@@ -123,11 +115,7 @@ def _best(rows, floor, tolerance):
 
 
 def _alternate(scene, rows, frames, device, now):
-    """Times the frames of settings in turns, one frame of each after the other, and counts crossings.
-
-    Returns:
-        list: A dictionary for each row with ``ms``, ``ratio``, ``spread``, ``crossings`` and ``inside``.
-    """
+    """Times the frames of settings in turns, one frame of each after the other, and counts crossings."""
     if not rows:
         return []
     with wp.ScopedDevice(device):
@@ -172,7 +160,6 @@ def _bound(scene, setup, device):
 
 
 def _checked(scene, points):
-    """Returns the largest numbers of crossings and of vertices inside colliders in frames of points (F, n, 3)."""
     if not len(scene.mesh.triangles):
         return {"crossings": 0, "inside": 0}
     try:

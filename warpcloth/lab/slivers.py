@@ -1,8 +1,8 @@
 """Dihedral bending of slivers, whose stiffness has no bound, and of hinges that fold through, whose angle jumps.
 
-The angle of a hinge changes by 1/height per metre of motion of its apex normal to the triangle. So a sliver has the largest
-forces and the smallest explicit step of a mesh. With a height below 1e-6 of the longest side it has no force. When a hinge is
-folded flat, its angle jumps from π to −π, and the force changes sign.
+The angle of a hinge changes by 1/height per metre of normal motion of its apex, so a sliver has the largest forces and the
+smallest explicit step of a mesh. With a height below 1e-6 of the longest side it has no force. When a hinge is folded flat, its
+angle jumps from π to −π, and the force changes sign.
 """
 
 import numpy as np
@@ -96,7 +96,6 @@ PANELS = (
 
 
 def tasks(device):
-    """One measures all."""
     return [task(measure, device=device)]
 
 
@@ -131,7 +130,6 @@ def _scene(rest, positions, bending):
 
 @in_turn
 def _force(scene, device, dtype):
-    """Returns ∂U/∂x of the first apex (3,)."""
     model = scene.build(device=device, dtype=dtype)
     gradient = model.vectors()
     Gradient(model).add(model.positions, gradient)

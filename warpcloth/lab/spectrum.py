@@ -25,13 +25,7 @@ LINEAR, RESOLVED = 1e-2, 1e-8
 
 
 def relative_spectrum(step):
-    """Returns μ and v of Hv = μAv at the minimiser of a step, VᵀAV = 1.
-
-    Args:
-        step: The :class:`warpcloth.lab.convergence.OneStep`.
-
-    Returns:
-        tuple: (μ (f,) ascending, V (f, f), A (f, f)), f the number of coordinates of free vertices.
+    """Returns μ (f,) ascending, V (f, f) and A (f, f) of Hv = μAv at the minimiser of a step, VᵀAV = 1, for f free coordinates.
 
     Raises:
         ValueError: There are too many unknowns, or projective dynamics does not take a term.
@@ -60,13 +54,7 @@ def relative_spectrum(step):
 def measure(scene, digest, frame, substeps, device="cpu", limit=20.0):
     """Measures errors of plain projective dynamics after increasing iterations of one step, and predicts them.
 
-    Args:
-        scene: :class:`SceneRef` as a dictionary.
-        digest: Digest of the scene, as for :func:`warpcloth.lab.convergence.measure`.
-        frame: Number of frames before the step.
-        substeps: Number of steps per frame.
-        device: A Warp device.
-        limit: Time limit of the iterations [s].
+    Arguments and results are JSON values, as for :func:`warpcloth.lab.convergence.measure`.
 
     Returns:
         dict: ``status`` ("ok", or "refused", also if the scene has no such step), ``reason``, ``eigenvalues`` μ,

@@ -33,7 +33,7 @@ class BatchRun:
         points: (frames+1, B, n, 3) [m].
         good: The last good frame of each copy (B,).
         growth: Largest kinetic and potential energy in a good frame, over what the start, falling and rounding can have added,
-            (B,), see :class:`warpcloth.run.balance.Balance`.
+            (B,).
         reasons: A sentence for each copy, or "".
         results: :class:`warpcloth.core.status.Result` of each copy.
         steps_per_frame: Steps per frame.
@@ -95,31 +95,20 @@ def measure(
 ):
     """Measures cells that differ in one value, for each setup, in one run of several copies if possible.
 
-    Args:
-        scene: A dictionary of :class:`warpcloth.lab.measurements.SceneRef`.
-        setups: Dictionaries of :class:`warpcloth.lab.measurements.Setup`.
-        fixed: Values by axis that all cells share; ``dt`` is among them or ``axis``.
-        axis: The axis along which they differ.
-        values: Values of that axis.
-        steps: Minimum number of steps of a run, so that instabilities have time to grow.
-        accuracy: RMS distance to the reference over vertices and frames, over the size of the cloth, above which a run is
-            inaccurate.
-        device: Device of the run.
-        dtype: Precision of the run; the reference has float64.
-        limit: Time limit of each run [s].
-        reference: Whether to compare with Newton and BDF2 at a quarter of the step, but at most 2000 steps. If Newton refuses
-            the scene, there is no reference.
-        digests: Digests of the scene, see :func:`warpcloth.base.digest.scene_digest`, so that a changed scene has another key.
-        duration: Time of motion that is compared with the reference, the same for all cells [s]; runs last at least as long. By
-            default that of ``steps``.
+    Arguments and results are JSON values. ``values`` are those of ``axis``; ``fixed`` has those of others that all cells share.
+    Runs have at least ``steps`` steps, so that instabilities have time to grow. ``accuracy`` is the RMS distance to the
+    reference over vertices and frames, over the size of the cloth, above which a run is inaccurate. It is compared for a
+    ``duration`` [s], by default that of ``steps``. The reference is Newton with BDF2 in float64 at a quarter of the step, but
+    at most 2000 steps; there is none if Newton refuses the scene. ``limit`` [s] is that of each run. With ``digests`` a changed
+    scene has another key.
 
     Returns:
         list: For each setup a list of cells, dictionaries with ``verdict``, of :data:`VERDICTS` ("stalled": a step ended in
-        no minimum; "unsure": inaccurate or not, the reference does not tell), ``status`` ("ok", "diverged", "slow" or
-        "refused"), ``reason``, ``step`` (that of divergence, or None), ``steps`` (those of the run), ``growth`` (see
-        :class:`BatchRun`), ``error`` (or None), ``floor``, the distance of the reference to a run of twice its step, which
-        bounds its own error if each halving at least halves that (or None), and ``rules`` (see
-        :func:`warpcloth.lab.stability_limits.limit_ratios`), of which :data:`KNOWN` is ``floor`` over ``accuracy``.
+        no minimum; "unsure": the reference does not tell), ``status`` ("ok", "diverged", "slow" or "refused"), ``reason``,
+        ``step`` (that of divergence, or None), ``steps``, ``growth`` of :class:`BatchRun`, ``error`` (or None), ``floor``, the
+        distance of the reference to a run of twice its step, which bounds its own error if each halving at least halves that
+        (or None), and ``rules`` of :func:`warpcloth.lab.stability_limits.limit_ratios`, where :data:`KNOWN` is ``floor`` over
+        ``accuracy``.
     """
     ref, setups = SceneRef(**scene), [Setup(**setup) for setup in setups]
     groups = [values]
@@ -164,7 +153,7 @@ def _attempt(ref, record, fixed, axis, group, length, device, dtype, limit):
 
 
 def _reference(ref, fixed, axis, group, length, device, limit):
-    """Returns a :class:`BatchRun` of the coarser run and of the reference of a group, or why there is none; or None."""
+    """Returns a :class:`BatchRun` of the coarser run and of the reference, or why there is none; or None."""
     dt = {**fixed, axis: group[0]}["dt"]
     steps, duration = length
     steps = steps if duration is None else steps_in(duration, dt)
@@ -180,10 +169,7 @@ def _reference(ref, fixed, axis, group, length, device, limit):
 
 
 def _apart(first, other, copy):
-    """Returns the RMS distance of a copy in two runs, over vertices and frames of the second, divided by the size of the cloth.
-
-    None if one of the runs did not end.
-    """
+    """Returns the RMS distance of a copy in two runs over the size of the cloth; None if one did not end."""
     frames = len(other.points)
     if min(each.good[copy] for each in (first, other)) < frames - 1:
         return None
@@ -192,7 +178,6 @@ def _apart(first, other, copy):
 
 
 def _judge(trial, copy, answer, accuracy):
-    """Returns the cell of one copy; ``answer`` is from :func:`_reference`."""
     growth, reason = finite(trial.growth[copy]), trial.reasons[copy]
     floor = _apart(*answer, copy) if isinstance(answer, list) else None
     if trial.good[copy] < len(trial.points) - 1:
@@ -220,15 +205,9 @@ def _cell(verdict, reason, **more):
 
 @dataclass(frozen=True)
 class Survey:
-    """A map to be measured.
+    """A map to be measured: methods without steps, over two axes with values ``xs`` and ``ys``, and ``fixed`` values of others.
 
-    Attributes:
-        scene: :class:`warpcloth.lab.measurements.SceneRef`.
-        setups: The methods, :class:`warpcloth.lab.measurements.Setup`, without steps.
-        x, y: Names of the two axes, of :data:`warpcloth.lab.axes.AXES`.
-        xs, ys: Their values.
-        fixed: Values of other axes.
-        steps, duration: As for :func:`measure`; the default duration is half of the scene's.
+    ``steps`` and ``duration`` are as for :func:`measure`; the default duration is half of the scene's.
 
     Raises:
         ValueError: The axes are equal or unknown, or a method has a step of its own.
@@ -257,11 +236,7 @@ class Survey:
         number("duration", self.duration, above=0.0)
 
     def tasks(self, **options):
-        """Returns one :class:`warpcloth.lab.measurements.Task` for each row, along an axis in which copies can differ, if any.
-
-        Args:
-            options: Options of :func:`measure`.
-        """
+        """Returns one :class:`warpcloth.lab.measurements.Task` for each row, along an axis in which copies can differ if any."""
         scene = scene_at(self.scene, {**FIXED, **self.fixed} | self._first(), 1)
         along = self.y if together(scene, self.y) and not together(scene, self.x) else self.x
         other, others = (self.x, self.xs) if along == self.y else (self.y, self.ys)
@@ -274,7 +249,6 @@ class Survey:
         return [task(measure, scene=self.scene, fixed={**rest, other: value}, **given) for value in others]
 
     def _digests(self):
-        """Returns the digests of the scene at each of its resolutions."""
         values = {self.x: self.xs, self.y: self.ys}.get("resolution", [])
         refs = [refined(self.scene, value) for value in values] or [self.scene]
         return [scene_digest(ref.load()) for ref in refs]
@@ -283,11 +257,9 @@ class Survey:
         return {self.x: self.xs[0], self.y: self.ys[0]}
 
     def table(self, results, store=None):
-        """Returns cells (setup, y, x) as nested lists, None if missing.
+        """Returns cells (setup, y, x) as nested lists, None if missing, from (task, result) pairs in any order.
 
-        Args:
-            results: (task, result) pairs of :func:`warpcloth.lab.campaign.sweep`, in any order.
-            store: Their :class:`warpcloth.lab.campaign.Store`, which gives the ``machine`` of each cell, or None.
+        A ``store`` gives the ``machine`` of each cell.
         """
         cells = [[[None] * len(self.xs) for _ in self.ys] for _ in self.setups]
         for done, rows in results:
@@ -305,16 +277,7 @@ class Survey:
 def boundary(scene, setup, axis, low, high, steps=200, fixed=None, accuracy=1e-3, **options):
     """Returns the value of an axis at which runs begin or cease to diverge, by bisection of its logarithm.
 
-    Args:
-        scene: :class:`warpcloth.lab.measurements.SceneRef`.
-        setup: :class:`warpcloth.lab.measurements.Setup`.
-        axis: Name of the axis.
-        low: Lower end of the bracket.
-        high: Upper end of the bracket; exactly one of the ends must diverge.
-        steps: Number of steps of each run.
-        fixed: Values of other axes.
-        accuracy: Relative width at which to stop.
-        options: Options of :func:`run`.
+    Exactly one of ``low`` and ``high`` must diverge. ``accuracy`` is the relative width at which to stop.
 
     Raises:
         ValueError: Neither end diverges, or both do.

@@ -25,27 +25,14 @@ _MOST = 1000
 
 
 def limit_ratios(scene, record, steps):
-    """Returns, by name, the ratios of those of :data:`LIMITS` that the record of a solver names, each above 1 beyond its limit.
-
-    Args:
-        scene: The :class:`warpcloth.Scene` of a cell.
-        record: The options of the solver.
-        steps: Length of the run.
-    """
+    """Returns, by name, the ratios of those :data:`LIMITS` that the record of a solver names, each above 1 beyond its limit."""
     cell = _Cell(scene, record, steps)
     found = {name: LIMITS[name](cell) for name in record.facts.limits}
     return {name: ratio for name, ratio in found.items() if ratio is not None}
 
 
 class _Cell:
-    """A scene, a solver and the length of a run, with the quantities that limits need.
-
-    Attributes:
-        h: Step [s].
-        he: Effective step hₑ [s] of the integrator.
-        damped: Whether a term has damping.
-        springs: Whether all terms are springs without damping.
-    """
+    """A scene, a solver and the length of a run, with the quantities that limits need, such as h and hₑ [s]."""
 
     def __init__(self, scene, record, steps):
         self.scene, self.record, self.steps = scene, record, steps
@@ -56,14 +43,12 @@ class _Cell:
 
     @cached_property
     def model(self):
-        """The model in float64; None if a stiffness is infinite."""
         if any(np.isinf(term.stiffness).any() for term in self.scene.terms):
             return None
         return self.scene.build(dtype="float64")
 
     @cached_property
     def step_limits(self):
-        """See :func:`warpcloth.solvers.explicit.step_limits`; None if a stiffness is infinite."""
         return self.model and step_limits(self.model)
 
 
@@ -74,7 +59,7 @@ def _below_rest(cell):
 
 
 def _below_motion(cell):
-    """Returns h over the largest stable step in motion, see :func:`warpcloth.solvers.explicit.step_limits`."""
+    """Returns h over the largest stable step in motion."""
     if cell.record.scheme == "symplectic" and cell.step_limits:
         return cell.h / cell.step_limits[1]
 
@@ -86,20 +71,17 @@ def _forward_growth(cell):
 
 
 def _jacobi_relaxation(cell):
-    """Returns the relaxation of Jacobi sweeps over springs divided by its limit, see :func:`largest_relaxation`."""
     if cell.springs and cell.record.sweep not in IN_PLACE:
         return cell.record.relaxation / largest_relaxation(cell.scene, cell.he, cell.record)
 
 
 def _ordered_relaxation(cell):
-    """Returns the relaxation of Gauss–Seidel sweeps over springs divided by its limit, see :func:`largest_ordered`."""
     if cell.springs and cell.record.sweep in IN_PLACE:
         limit = largest_ordered(cell.scene, cell.he, cell.record, cell.steps)
         return None if limit is None else cell.record.relaxation / limit
 
 
 def _rings(cell):
-    """Returns the number of edges between pins and the furthest vertex over the number of sweeps."""
     if len(cell.scene.pins.vertices):
         return rings(cell.scene) / cell.record.iterations
 
@@ -142,8 +124,7 @@ LIMITS = {
 def concave_rate(model):
     """Returns −λ for the lowest eigenvalue λ of M⁻¹∂²U/∂x² at the start of one copy [1/s²]; 0 if none is negative.
 
-    With more than 100 vertices, the error is up to 1e-4 of the largest row sum. A flat, unstrained cloth has many eigenvalues
-    near 0, which then count as 0.
+    With more than 100 vertices, the error is up to 1e-4 of the largest row sum, and smaller eigenvalues count as 0.
     """
     hessian = Hessian(model, policy=HessianPolicy.RAW)
     hessian.assemble(model.positions, 0.0)
@@ -165,18 +146,13 @@ def concave_rate(model):
 
 
 def largest_relaxation(scene, he, record):
-    """Returns the largest stable relaxation ω of Jacobi sweeps over springs about the rest shape.
+    """Returns the largest stable relaxation ω of Jacobi sweeps over springs without damping, about the rest shape.
 
     A sweep multiplies errors by 1 − ωλ. λ are the eigenvalues of C(D + α̃)⁻¹JVWJᵀ, with D the diagonal of JWJᵀ, α̃ = 1/(khₑ²),
     and C and V the factors of constraints and vertices; for XPBD, with multipliers, those of C(D + α̃)⁻¹(JWJᵀ + α̃). Sweeps
-    converge iff ωλ_max < 2. Velocities are differences of positions. So the factor by which n sweeps multiply x̃,
-    q = 1 − ρ(1 − (1 − ωλ)ⁿ) with ρ the fraction of JWJᵀ in λ, must be below 1 and above the ``least_factor`` of the integrator.
-    For even n that is the same condition, for odd n it is (ωλ_max − 1)ⁿ < (1 − q_min)/ρ − 1.
-
-    Args:
-        scene: A scene of springs alone, without damping.
-        he: Effective step hₑ [s].
-        record: :class:`warpcloth.PBD` or :class:`warpcloth.XPBD` with a Jacobi sweep.
+    converge iff ωλ_max < 2. The factor by which n sweeps multiply x̃, q = 1 − ρ(1 − (1 − ωλ)ⁿ) with ρ the fraction of JWJᵀ in
+    λ, must be below 1 and above the ``least_factor`` of the integrator. For even n that is the same condition, for odd n it is
+    (ωλ_max − 1)ⁿ < (1 − q_min)/ρ − 1.
     """
     from scipy.sparse import diags_array
 
@@ -201,20 +177,13 @@ def largest_relaxation(scene, he, record):
 
 
 def largest_ordered(scene, he, record, steps):
-    """Finds the largest relaxation ω at which Gauss–Seidel sweeps over springs, about the rest shape, are stable for a run.
+    """Finds the largest relaxation ω of Gauss–Seidel sweeps over undamped springs, about the rest shape, that is stable for a run.
 
-    A sweep solves (D/ω + L)Δλ = −(Jx̃ + Aλ). A is JWJᵀ + α̃ for XPBD and JWJᵀ for PBD, D is the diagonal of JWJᵀ + α̃,
-    α̃ = 1/(khₑ²), and L is the part of JWJᵀ that comes before an element in the order of the sweep; x = x̃ + WJᵀλ. The matrix by
-    which n sweeps multiply x̃ has complex eigenvalues q, because the order makes it unsymmetric. Steps multiply by z, see
-    ``growth`` of the integrator. A run is stable while no |z| makes the energy grow by :data:`GROWTH` in all steps. In a net of
-    structural springs the smallest q is (1 − ω)ⁿ, which is −1/3 for ω = 1 + 3^(−1/n); with more springs complex q grow before
-    that.
-
-    Args:
-        scene: A scene of springs alone, without damping.
-        he: Effective step hₑ [s].
-        record: :class:`warpcloth.PBD` or :class:`warpcloth.XPBD` with a Gauss–Seidel sweep.
-        steps: Number of steps of the run.
+    A sweep solves (D/ω + L)Δλ = −(Jx̃ + Aλ). A is JWJᵀ + α̃ for XPBD and JWJᵀ for PBD, D is the diagonal of JWJᵀ + α̃, α̃ =
+    1/(khₑ²), and L is the part of JWJᵀ that comes before an element in the order of the sweep; x = x̃ + WJᵀλ. The matrix by
+    which n sweeps multiply x̃ has complex eigenvalues q, because the order makes it unsymmetric. A run is stable while no |z|,
+    by which steps multiply, makes the energy grow by :data:`GROWTH` in all steps. In a net of structural springs the smallest q
+    is (1 − ω)ⁿ, which is −1/3 for ω = 1 + 3^(−1/n); with more springs complex q grow before that.
 
     Returns:
         float: ω; None if twice 1 + 3^(−1/n) is still stable, if no spring moves anything, or for more than :data:`_MOST`
@@ -295,13 +264,11 @@ def _directions(scene, pairs):
 
 
 def _range(J):
-    """Returns an orthonormal basis of the range of Jᵀ (3N, rank), the moves that change the length of springs."""
     _, values, vectors = np.linalg.svd(J, full_matrices=False)
     return vectors[values > 1e-9 * values[0]].T
 
 
 def _integrator(record):
-    """Returns the class of the integrator of a record; solvers without a choice use the velocities of Euler."""
     return INTEGRATORS[getattr(record, "integrator", "euler")]
 
 
@@ -319,7 +286,6 @@ def _inverse_masses(scene):
 
 
 def _largest(matrix):
-    """Returns the largest eigenvalue of a symmetric matrix, and its eigenvector."""
     if matrix.shape[0] <= 300:
         values, vectors = np.linalg.eigh(matrix.toarray())
     else:

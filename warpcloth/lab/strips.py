@@ -17,14 +17,7 @@ _CLAMP = 3.0
 
 
 class Strip(NamedTuple):
-    """A flat strip along x in the plane y = 0.
-
-    Attributes:
-        mesh: The :class:`warpcloth.Mesh`.
-        pins: Vertices of the clamp.
-        clamp: x at which the bending part begins [m].
-        end: x at which it ends [m].
-    """
+    """A flat strip along x in the plane y = 0, with vertices of the clamp, and x where the bending part begins and ends [m]."""
 
     mesh: Mesh
     pins: np.ndarray
@@ -33,15 +26,14 @@ class Strip(NamedTuple):
 
     @property
     def length(self):
-        """Free length [m]."""
         return self.end - self.clamp
 
 
 def strip(pattern, angle, spacing, length=1.0, width=1.0):
     """Returns a strip whose vertices up to x = 0 are clamped.
 
-    It has all triangles of the net that are inside length and width. Clipped triangles would be slivers, and would make a
-    regular net irregular, which locks. So the sides are jagged, with an error of first order in the spacing.
+    It has all triangles of the net that are inside length and width. Clipped triangles would be slivers and lock. So the sides
+    are jagged, with an error of first order in the spacing.
 
     ``clamp`` is where an equivalent smooth strip would begin to bend. A hinge bends if one of its vertices is free, on average
     half its length before the last pin; ``clamp`` is the mean over hinges, weighted by bending energy. The end is that of the
@@ -56,8 +48,7 @@ def strip(pattern, angle, spacing, length=1.0, width=1.0):
         width: Width [m].
 
     Raises:
-        ValueError: The pattern is unknown, or the spacing is more than a quarter of length or width, so that the strip might
-            be connected by a single vertex.
+        ValueError: The pattern is unknown, or the spacing is more than a quarter of length or width.
     """
     points, triangles = _net(pattern, angle, spacing, length, width)
     near = 1e-9 * length
@@ -77,8 +68,8 @@ def strip(pattern, angle, spacing, length=1.0, width=1.0):
 def rolled(pattern, angle):
     """Computes the stiffness, divided by D, of a net that is rolled to a cylinder, however fine it is.
 
-    With c and s the cosine and sine of the angle, the curvature has the components c², s² and cs in the net's own axes. At rest
-    a sheet may find a softer shape: one that also twists, or in which the two kinds of vertices of "alternating" separate.
+    The curvature has the components c², s² and cs in the net's own axes. At rest a sheet may find a softer shape, which also
+    twists, or in which the two kinds of vertices of "alternating" separate.
     """
     c, s = np.cos(angle), np.sin(angle)
     curvature = np.array([c * c, s * s, c * s])
@@ -117,7 +108,6 @@ def inner_shares(mesh):
 
 
 def _net(pattern, angle, spacing, length, width):
-    """Returns points (n, 2) in x and z, and triangles, of a net that covers the strip, with a vertex at the origin."""
     choice("pattern", pattern, PATTERNS)
     number("angle", angle)
     number("spacing", spacing, above=0.0)
@@ -138,7 +128,6 @@ def _net(pattern, angle, spacing, length, width):
 
 
 def _end(mesh):
-    """Returns the far end of the rectangle along x with the area, centre and second moment of a mesh."""
     x, areas = mesh.points[mesh.triangles, 0], mesh.triangle_areas / mesh.triangle_areas.sum()
     centre = areas @ x.mean(axis=1)
     second = areas @ ((x**2).sum(axis=1) + x.sum(axis=1) ** 2) / 12.0 - centre**2

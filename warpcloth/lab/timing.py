@@ -25,30 +25,22 @@ OF_SELF_CONTACT = ("pairs", "lists", "kept", "least_gap", "list_ns", "find_ns")
 def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
     """Times warm frames of a scene with a setup, and counts the work of a step. Arguments and results are JSON values.
 
-    Args:
-        scene: Fields of a :class:`warpcloth.lab.measurements.SceneRef`, by name.
-        setup: Fields of a :class:`warpcloth.lab.measurements.Setup`, by name.
-        frames: Maximum number of frames to time; after 10 s, three are enough. 0 ends with the first frame.
-        device: A Warp device.
-        dtype: ``"float32"`` or ``"float64"``.
-        started: ``time.time()`` when this process was requested.
-        copies: Number of copies of the scene in a batch.
-        threads: Number of CPU threads.
+    ``frames`` is the maximum number of frames to time; after 10 s, three are enough, and 0 ends with the first frame.
+    ``started`` is ``time.time()`` when this process was requested.
 
     Returns:
         dict: Unknown values are None.
 
         - ``status``: "ok", "diverged" or "refused"; ``reason``: a sentence, "" if ok.
-        - ``grade``, ``distance``: Those of the :class:`warpcloth.core.status.Status` of the frames; of copies the worst [m].
-          They are found when the frames are taken again, so that times and memory are those of steps alone.
+        - ``grade``, ``distance``: Those of the :class:`warpcloth.core.status.Status` of the frames, taken again, so that times
+          and memory are those of steps alone; of copies the worst [m].
         - ``vertices``, ``elements``: Numbers for all copies and terms. ``substeps``: Steps per frame. ``frames``: Timed frames.
         - ``ms``, ``spread``: Median and quartiles of the time of a frame with its points on the host [ms]; ``cloths_per_s``:
           copies over the median [1/s].
         - ``iterations``: Mean number of iterations of a step, over the timed frames.
         - ``ns``: Median time of a frame over elements × iterations × substeps [ns].
-        - ``bytes``: Minimum memory traffic of a step, see :func:`warpcloth.lab.counts.compulsory_bytes`; ``bytes_per_s``: that
-          over the time of a step.
-        - ``launches``: Mean number of launches of a step, see :func:`warpcloth.lab.counts.launches_of`.
+        - ``bytes``: Minimum memory traffic of a step; ``bytes_per_s``: that over the time of a step.
+        - ``launches``: Mean number of launches of a step.
         - ``start_s``: Time from ``started`` to the end of the first frame. ``bind_s``: Time to build the model and bind the
           solver, including compilation, without ``factorise_s``, that of constant matrices [s].
         - ``triangles``: Number of triangles of all mesh colliders.
@@ -124,7 +116,7 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
 
 
 def _graded(model, stepper, solver, frames):
-    """Takes the frames again from the start, and returns their grade and distance; or that they diverged."""
+    """Takes the frames again from the start, and returns their grade and distance, or that they diverged."""
     stepper.reset()
     watch = Watch(model, stepper)
     for _ in watched_frames(stepper, watch, frames):
@@ -135,7 +127,6 @@ def _graded(model, stepper, solver, frames):
 
 
 def _warm(stepper, model, points, frames, elements):
-    """Times the warm frames and counts their work."""
     for _ in range(_WARM_UP - 1):
         _run_frame(stepper, points)
     times, iterations = [], []
@@ -162,7 +153,6 @@ def _warm(stepper, model, points, frames, elements):
 
 
 def _self_contact(stepper):
-    """Returns counts of self-contact in all steps so far, the smallest gap, and the times of a list and of its contacts."""
     pairs = stepper.pairs
     lists, steps = (int(array.numpy().max()) for array in (pairs.lists, pairs.steps))
     gap = float(pairs.least_gap.min())
@@ -179,7 +169,6 @@ def _self_contact(stepper):
 
 
 def _seconds(segment):
-    """Returns the median time of a segment [s]."""
     times = []
     for _ in range(5):
         wp.synchronize_device(segment.device)
@@ -191,7 +180,6 @@ def _seconds(segment):
 
 
 def _run_frame(stepper, points):
-    """Takes a frame, reads its points to a fixed host array, and returns the iterations of its steps."""
     iterations = 0
     if stepper.uniform:
         stepper.frame()

@@ -17,34 +17,25 @@ from .reference import Reference, position_error, strain_error
 def measure(scene, setup, frames=None, reference=None, device="cpu", dtype=None, limit=60.0, repeats=1, own=None, clock="wall"):
     """Runs a scene with a setup. Arguments and results are JSON values.
 
-    Args:
-        scene: Fields of a :class:`warpcloth.lab.measurements.SceneRef`, by name.
-        setup: Fields of a :class:`warpcloth.lab.measurements.Setup`, by name.
-        frames: Number of frames, by default that of the reference, or without one that of the scene.
-        reference: Path of a :class:`warpcloth.lab.reference.Reference` with at least as many frames, or None.
-        device: A Warp device.
-        dtype: ``"float32"`` or ``"float64"``, by default that of a run with the solver.
-        limit: Time limit [s] of the frames of all runs, without compilation and factorisation, checked once per frame.
-        repeats: Number of runs to time; fewer if the limit is reached after the first.
-        own: Path of the :class:`warpcloth.lab.reference.Reference` to which the solver itself converges, or None.
-        clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for the limit and the times of frames.
+    ``reference`` is the path of a :class:`warpcloth.lab.reference.Reference` with at least as many frames, and ``own`` that to
+    which the solver itself converges. ``frames`` is by default that of the reference, or without one that of the scene.
+    ``limit`` [s] bounds the frames of all ``repeats``, without compilation and factorisation; it is checked once per frame.
+    ``clock`` is one of :data:`warpcloth.lab.clock.CLOCKS`.
 
     Returns:
         dict: Unknown values are None.
 
         - ``status``: "ok", "diverged", "slow" or "refused"; ``reason``: a sentence, "" if ok.
-        - ``error``: :func:`warpcloth.lab.reference.position_error` relative to the reference, of the frames after the start.
-        - ``own_error``: With ``own``, the same relative to that.
-        - ``strain_error``: :func:`warpcloth.lab.reference.strain_error` of the same frames.
+        - ``error``: :func:`warpcloth.lab.reference.position_error` relative to the reference, of the frames after the start;
+          ``own_error``: relative to ``own``; ``strain_error``: :func:`warpcloth.lab.reference.strain_error`.
         - ``ms``: Time of a frame [ms], :func:`warpcloth.lab.clock.mean_time` without the first frame of each run, which warms
           up. If there is one frame, a second is run.
         - ``spread``: ``ms`` times the quartiles of :func:`warpcloth.lab.clock.time_spread`, (low, high) [ms].
         - ``ms_per_second``: ``ms`` per second of simulated time.
         - ``compile_s``: Time to build, bind and warm up before the first frame, including compilation, without
           ``factorise_s``, that of constant matrices [s].
-        - ``grade``, ``distance``: Those of the :class:`warpcloth.core.status.Status` [m]. A run that is not usable has an error
-          too, for a reference judges it better.
-        - ``residual``, ``message``: Those of the :class:`warpcloth.core.status.Status`, with warnings of the solver.
+        - ``grade``, ``distance`` [m], ``residual``, ``message``: Those of the :class:`warpcloth.core.status.Status`, with
+          warnings of the solver. A run that is not usable has an error too, for a reference judges it better.
         - ``frames``: Number of good frames.
         - ``dtype``: The precision of the runs.
 
@@ -102,7 +93,7 @@ def measure(scene, setup, frames=None, reference=None, device="cpu", dtype=None,
 
 
 def _run(scene, setup, dtype, **given):
-    """Runs a scene with a solver of warpcloth, or of another simulator, whose one precision must be at least that asked for."""
+    """Runs a scene with a solver of warpcloth or of another simulator, which must have at least the precision asked for."""
     other = simulator_of(setup.solver)
     if other is None:
         return simulate(scene, setup.record(), dtype=dtype, **given)
@@ -112,11 +103,6 @@ def _run(scene, setup, dtype, **given):
 
 
 def _checked_frames(frames, scene, exact):
-    """Returns the number of frames to run.
-
-    Raises:
-        ValueError: The reference is of another scene, or too short.
-    """
     if exact is None:
         frames = scene.frames if frames is None else frames
         whole("frames", frames, 1)

@@ -77,7 +77,6 @@ PANELS = tuple(_panel(solver, wall) for wall, solvers in SHOWN.items() for solve
 
 
 def tasks(device):
-    """One for each panel."""
     given = {"steps": STEPS.tolist(), "speeds": SPEEDS.tolist(), "device": device}
     return [task(measure, solver=solver, wall=wall, **given) for wall, solvers in SHOWN.items() for solver in solvers]
 

@@ -1,7 +1,7 @@
 """Diagrams of accuracy against time: measurements, the Pareto front, and tables.
 
 Each diagram is a function of a :class:`warpcloth.lab.measurements.SceneRef` that returns a dictionary of JSON values, with a
-dictionary for each setting in ``rows``. :mod:`warpcloth.chart.pareto` draws it.
+dictionary for each setting in ``rows``. ``run`` has arguments of :func:`sweep`; ``limit`` [s] is that of each setting.
 """
 
 import json
@@ -64,19 +64,9 @@ FACTS += ("source",)
 
 
 def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float64", limit=20.0, **run):
-    """Measures one implicit Euler step from the same x̃ with every method that minimises it, see :func:`convergence.measure`.
+    """Measures one implicit Euler step from the same x̃ with every method that minimises it.
 
-    Args:
-        scene: A :class:`SceneRef`.
-        solvers: Names as on the command line; None for all that minimise.
-        frames: Number of frames before the step; by default a third of the scene's.
-        device: A Warp device.
-        dtype: Precision of the methods.
-        limit: Time limit of each setting [s].
-        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
-
-    Returns:
-        dict: See the module.
+    The step comes after ``frames`` frames, by default a third of the scene's.
 
     Raises:
         ValueError: A name is not that of a solver that minimises.
@@ -98,24 +88,15 @@ def solver_diagram(scene, solvers=None, frames=None, device="cpu", dtype="float6
 
 
 def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype=None, limit=20.0, watch=None, others=(), **run):
-    """Measures the error of trajectories and their time, over steps and iterations, see :func:`trajectory.measure`.
+    """Measures the error of trajectories and their time, over steps and iterations.
 
     The rows of solvers of other simulators also have ``own_error``, that relative to the motion to which the solver itself
-    converges, if it does, see :func:`warpcloth.lab.own_reference.own_reference`.
-
-    Args:
-        scene: A :class:`SceneRef`.
-        solvers: Names as on the command line; None for all.
-        frames: Number of frames; by default half of the scene's.
-        device: A Warp device, also for the reference solution.
-        dtype: Precision of the runs, by default that of a run with each solver; the reference solution has float64.
-        limit: Time limit of each setting [s]; that of the reference solution is six times this, but at least 120 s.
-        watch: Function called with the progress of the reference solution, see :func:`reference`, or None.
-        others: Simulators whose solvers are measured too, such as ``["newton"]``.
-        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
+    converges, if it does. ``frames`` is by default half of the scene's. The reference solution has float64, and a time limit of
+    six times ``limit``, but at least 120 s; ``watch`` is called with its progress. ``others`` are simulators, such as
+    ``["newton"]``.
 
     Returns:
-        dict: See the module; ``reference`` describes the reference solution. ``others`` has for each solver of another
+        dict: As of the module; ``reference`` describes the reference solution. ``others`` has for each solver of another
         simulator the :func:`warpcloth.lab.own_reference.own_facts` of its own motion, which counts as converged if it is known
         to a tenth of :data:`WITHIN`; or None if it has none.
 
@@ -145,15 +126,7 @@ def time_diagram(scene, solvers=None, frames=None, device="cpu", dtype=None, lim
 def spectrum_diagram(scene, frames=None, device="cpu", limit=20.0, **run):
     """Measures errors of plain projective dynamics within a step, for several step sizes, and predicts them by the spectrum.
 
-    Args:
-        scene: A :class:`SceneRef`, with few vertices.
-        frames: Number of frames before the step; by default a third of the scene's.
-        device: A Warp device.
-        limit: Time limit of each step size [s].
-        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
-
-    Returns:
-        dict: See the module, and for the rows :func:`spectrum.measure`.
+    The step comes after ``frames`` frames, by default a third of the scene's.
 
     Raises:
         ValueError: The mesh is too fine.
@@ -195,17 +168,9 @@ PHYSICS = {
 
 
 def physics_diagram(scene, device="cpu", dtype="float64", limit=20.0, **run):
-    """Measures errors of equilibria relative to closed forms, over mesh size and time, see :func:`physics.measure`.
+    """Measures errors of equilibria relative to closed forms, over mesh size and time, with the ``arguments`` of each.
 
-    Args:
-        scene: A :class:`SceneRef` of "cantilever", "chain" or "catenary", without parameters, because these are varied.
-        device: A Warp device.
-        dtype: "float32" or "float64".
-        limit: Time limit of each point [s].
-        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`sweep`.
-
-    Returns:
-        dict: See the module; a row has the ``arguments`` of `physics.measure`.
+    The scene is "cantilever", "chain" or "catenary", without parameters, because these are varied.
 
     Raises:
         ValueError: The scene has no closed form here, or has parameters.
@@ -224,7 +189,6 @@ def physics_diagram(scene, device="cpu", dtype="float64", limit=20.0, **run):
 
 
 def _label_of(plan):
-    """Returns a point of the diagram "physics" in a few words, such as "cantilever quadratic diagonal 45° 16"."""
     words = [plan["case"], *(plan[name] for name in ("bending", "pattern") if name in plan)]
     words += [f"{math.degrees(plan['angle']):.0f}°"] if "angle" in plan else []
     return " ".join([*words, str(plan["resolution"])])
@@ -233,9 +197,7 @@ def _label_of(plan):
 def cheapest(rows, floor=0.0):
     """Returns the fastest row of each solver with an error of at most :data:`WITHIN`, the fastest solver first.
 
-    Args:
-        rows: Rows of :func:`time_diagram`.
-        floor: Error of the reference, by which each error may be wrong.
+    ``floor`` is the error of the reference, by which each error may be wrong.
     """
     found = {}
     for row in sorted(filter(_has_error, rows), key=lambda row: row["ms_per_second"]):
@@ -247,12 +209,8 @@ def cheapest(rows, floor=0.0):
 def front(rows, floor=0.0, name="error"):
     """Returns the indices of the rows that no other beats in time and error by more than the spread of times, fastest first.
 
-    A row is left out if another has a smaller error and its time is no longer, within the quartiles of both.
-
-    Args:
-        rows: Rows of :func:`time_diagram`.
-        floor: Error of the reference; errors below it count as equal.
-        name: The error, "error" or "strain_error".
+    A row is left out if another has a smaller error and its time is no longer, within the quartiles of both. Errors below
+    ``floor``, that of the reference, are equal; ``name`` is "error" or "strain_error".
     """
     eligible = [i for i, row in enumerate(rows) if row["status"] == "ok" and row[name] is not None]
     levels, spreads = {i: max(rows[i][name], floor) for i in eligible}, {i: quartiles(rows[i]) for i in eligible}
@@ -315,7 +273,6 @@ def _has_error(row):
 
 
 def _measured(function, scene, setups, given, run, more=None):
-    """Measures and returns a row for each setup, in order; ``more`` has further arguments for each."""
     more = more or [{}] * len(setups)
     tasks = [task(function, scene=scene, setup=setup, **given, **each) for setup, each in zip(setups, more, strict=True)]
     return [
@@ -325,5 +282,4 @@ def _measured(function, scene, setups, given, run, more=None):
 
 
 def _results(tasks, run):
-    """Returns the result of each task with its machine, in order."""
     return [{**result, "machine": where} for result, where in collect(tasks, "work-precision", **run)]

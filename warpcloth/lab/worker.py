@@ -14,8 +14,7 @@ from ..base.quiet import initialise_warp
 def begin():
     """Starts a process of a campaign: loads Warp. It shows no warnings, because the parent process has them.
 
-    An interrupt ends the process without a message, because the parent process reports it. It also ends if the parent is
-    killed, because otherwise it would wait forever.
+    An interrupt ends the process without a message. It also ends if the parent is killed.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     warnings.simplefilter("ignore")
