@@ -28,12 +28,11 @@ def bucket_of(x: int, y: int, z: int, code: int, buckets: int):
 def motions(dtype):
     """Struct of moves near each vertex, and of clusters of vertices that are near one another at rest.
 
-    ``members`` of cluster c are those from first[c] to first[c+1]; ``cluster`` (N,) may be −1. A vertex is ``calm`` if its move
-    differs by at most ``size`` [m] from the ``mean`` of its cluster. ``lowest`` and ``highest`` (B,) bound means and moves of
-    obstacles. Calm vertices are hashed to cells so long that those that may meet are in adjacent cells. ``tables`` (4, buckets)
-    bound their moves p from x, and q from the positions ``found`` of the last list. ``low`` and ``high`` (V,) bound p in the
-    cells about a vertex. They are +∞ and −∞ where all q differ by at most ``alike`` [m], so that only listed pairs may meet;
-    ``some`` is 1 if there are others.
+    Cluster c has ``members`` from first[c] to first[c+1] and the ``mean`` of their moves; ``cluster`` (N,) may be −1. A vertex
+    is ``calm`` if its move differs by at most ``size`` [m] from the mean. ``lowest`` and ``highest`` (B,) bound means and moves
+    of obstacles. ``tables`` (4, buckets) bound moves of calm vertices in cells: p from x, and q from the positions ``found`` of
+    the last list. ``low`` and ``high`` (V,) bound p in the cells about a vertex. They are +∞ and −∞ where all q differ by at
+    most ``alike`` [m], so that only listed pairs may meet; ``some`` is 1 if there are others.
     """
     vec3, _ = types(dtype)
 

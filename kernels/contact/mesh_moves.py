@@ -1,8 +1,8 @@
 """Kernels that move colliders in a step and carry near cloth along.
 
 A vertex listed with a mesh makes the move of the nearest point there, one that a shape would meet the move of the shape, and
-one listed with such cloth the move of that cloth. Pairs that would still approach are pushed apart. Continuous collision
-detection then bounds the fraction that all of a copy move together; the rest follows with a new list.
+one listed with such cloth the move of that. Pairs that would still approach are pushed apart. Continuous collision detection
+bounds the fraction that all of a copy move together; the rest follows with a new list.
 """
 
 from functools import cache

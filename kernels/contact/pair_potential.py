@@ -135,12 +135,12 @@ class Contacts:
     of near faces whose nearest points are elsewhere; three a face suffice, as F faces share at most 1.5 F edges and 1.5 F
     vertices. ``code`` is TWO_EDGES for two edges, with r/c and c²kA where 4D = cd, and the ``ratio`` D/d, else 1.
 
-    ``parts`` are the vertices of the surface; bit i of ``touching`` is 1 if wᵢ is not 0. In the stencil, each obstacle is
-    replaced by the first vertex of the cloth with w = 0. Obstacles give the ``offset`` o = Σ wⱼXⱼ and the ``travel`` Σ wⱼΔXⱼ by
-    their ``moves`` ΔX in the step (B·m,) [m].
+    ``parts`` are the vertices of the surface; bit i of ``touching`` is 1 if wᵢ is not 0. The stencil has the first vertex of
+    the cloth with w = 0 for each obstacle. Obstacles give the ``offset`` o = Σ wⱼXⱼ and the ``travel`` Σ wⱼΔXⱼ by their
+    ``moves`` ΔX in the step (B·m,) [m].
 
-    The ``share`` is the curvature Σ kA φ″ along n of the contacts on its side of the vertex, over that of the positive ones.
-    The definite part of the Hessian, and what sweeps compute anew, have this share; sweeps leave the rest ``fixed``.
+    The ``share`` is the curvature Σ kA φ″ along n of contacts on its side of the vertex, over that of positive ones. The
+    definite part of the Hessian, and what sweeps compute anew, have this share.
     """
 
     weights: wp.array(dtype=wp.vec4d)

@@ -164,9 +164,9 @@ def share_of_pins(dtype):
 
     It acts on pairs with pins on both sides whose nearest points are inside a triangle or inside both edges. Pins that would
     pass through one another stop at the contact distance or, if smaller, the gap at the start. So do pins of ``hard`` pairs
-    that would come nearer by more than a fraction of it: TOGETHER, or LAGGING if a vertex is free, or, if larger, the sine of
-    the rotation of their normal. Else free vertices count as if they moved with the pins, because x omits contact. Rotation as
-    one body keeps gaps; on chords of a rotation by θ between keyframes they shrink by up to tan θ/2 times this sine.
+    that would come nearer by more than TOGETHER of it, LAGGING if a vertex is free, or, if larger, the sine of the rotation of
+    their normal, because gaps shrink on chords of a rotation. Else free vertices count as if they moved with the pins, because
+    x omits contact.
     """
     vec3, _ = types(dtype)
 

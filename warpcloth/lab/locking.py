@@ -7,12 +7,12 @@ others.
 
 Apart from locking, each net of hinges has its own bending stiffness, which a cantilever with a soft membrane shows. The
 stiffness divided by that is due to locking, and falls with h⁴. Regular nets lock there too, because their curvature varies and
-their sides curl. Plate bending locks as well, but its stiffness does not depend on the pattern.
+their sides curl. Plate bending locks as well.
 
-The freedom to avoid strain is what stiff edges leave (:mod:`warpcloth.scene.freedom`): rows and columns more than one degree
-per vertex, all edges of triangles 3 plus the number of boundary edges, a grid with both diagonals only rigid motion. With so
-little, a net bends only if it is regular and bent along its own lines. Springs alone leave motion without stiffness, and the
-net keeps sliding along its wrinkles.
+Stiff edges leave a net some freedom to avoid strain (:mod:`warpcloth.scene.freedom`): rows and columns leave more than one
+degree of freedom per vertex, all edges of triangles 3 plus the number of boundary edges, and a grid with both diagonals only
+rigid motion. With so little, a net bends only if it is regular and bent along its own lines. Springs alone leave motion without
+stiffness, and the net keeps sliding along its wrinkles.
 """
 
 from dataclasses import replace

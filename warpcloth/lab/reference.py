@@ -120,12 +120,11 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None, de
     Runs with steps h, h/2, h/4 … in float64 give e(h) = x(h) + (x(h) − x(2h))/(2ᵖ − 1) by Richardson extrapolation, with the
     order p of the method (Hairer, Nørsett and Wanner 1993, *Solving ordinary differential equations I*). The last e(h) is the
     reference. ‖e(h) − e(2h)‖ bounds its error if each halving of h at least halves the error. Where a halving moves the cloth
-    by more than 0.75 of what the one before did, e(h) is x(h), which is not extrapolated.
+    by more than 0.75 of what the one before did, e(h) is x(h).
 
     The method is symplectic Euler if some 20 000 steps per frame are stable, on CUDA 65 000, because BDF2 damps high
-    frequencies unless ωh is small. Stiffer scenes use Newton's method with BDF2, and hard constraints
-    :class:`warpcloth.ConstrainedDynamics`. Scenes with colliders also use Newton's method, because contact in explicit steps is
-    softer. Friction uses the normal forces at the start of a step, which makes BDF2 first order.
+    frequencies unless ωh is small. Stiffer scenes, and scenes with colliders, where contact in explicit steps is softer, use
+    Newton's method with BDF2. Hard constraints use :class:`warpcloth.ConstrainedDynamics`. Friction makes BDF2 first order.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.

@@ -29,17 +29,17 @@ def scan(
 ) -> Capture:
     """Returns a capture of an animation, with a mesh of its own in each frame.
 
-    The vertices of a frame are the boundary vertices of the mesh, and a point at random in each cell of a grid over its flat
-    rest shape. They are joined by a Delaunay triangulation there, moved to the frame on the triangles of the mesh, and then by
-    normal noise along each axis. Discs at random positions are cut out.
+    The vertices of a frame are the boundary vertices of the mesh, and a random point in each cell of a grid over its flat rest
+    shape. A Delaunay triangulation there joins them. They move to the frame on the triangles of the mesh, and then by normal
+    noise along each axis. Discs at random positions are cut out.
 
     Args:
         mesh: The mesh, flat at rest.
         frames: Its positions (F, n, 3) [m].
         dt: Time from each frame to the next [s].
         spacing: Size of a cell of the grid [m].
-        noise: Standard deviation of the error along each axis [m].
-        holes: Share of the area that is cut out, at least.
+        noise: Standard deviation along each axis [m].
+        holes: Minimum share of the area that is cut out.
         hole: Largest radius of a disc [m].
         seed: Seed of the random numbers.
 
@@ -99,10 +99,7 @@ def _frame(mesh, flat, x, spacing, noise, holes, hole, random):
 def write_capture(capture: Capture, folder: FilePath, scale: float = 1.0) -> None:
     """Writes a capture as numbered .ply files into a folder, which is made.
 
-    Args:
-        capture: The capture.
-        folder: The folder.
-        scale: Length of a unit of the files [m].
+    ``scale`` is the length of a unit of the files [m].
     """
     import trimesh
 

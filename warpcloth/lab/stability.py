@@ -97,7 +97,7 @@ def measure(
 
     Arguments and results are JSON values. ``values`` are those of ``axis``; ``fixed`` has those of others that all cells share.
     Runs have at least ``steps`` steps, so that instabilities have time to grow. ``accuracy`` is the RMS distance to the
-    reference over vertices and frames, over the size of the cloth, above which a run is inaccurate. It is compared for a
+    reference over vertices and frames, over the size of the cloth, above which a run is inaccurate. Motion is compared for
     ``duration`` [s], by default that of ``steps``. The reference is Newton with BDF2 in float64 at a quarter of the step, but
     at most 2000 steps; there is none if Newton refuses the scene. ``limit`` [s] is that of each run. With ``digests`` a changed
     scene has another key.
@@ -236,7 +236,7 @@ class Survey:
         number("duration", self.duration, above=0.0)
 
     def tasks(self, **options):
-        """Returns one :class:`warpcloth.lab.measurements.Task` for each row, along an axis in which copies can differ if any."""
+        """Returns one :class:`warpcloth.lab.measurements.Task` for each row, along an axis where copies can differ if any."""
         scene = scene_at(self.scene, {**FIXED, **self.fixed} | self._first(), 1)
         along = self.y if together(scene, self.y) and not together(scene, self.x) else self.x
         other, others = (self.x, self.xs) if along == self.y else (self.y, self.ys)

@@ -177,7 +177,7 @@ def largest_relaxation(scene, he, record):
 
 
 def largest_ordered(scene, he, record, steps):
-    """Finds the largest relaxation ω of Gauss–Seidel sweeps over undamped springs, about the rest shape, that is stable for a run.
+    """Finds the largest relaxation ω of Gauss–Seidel sweeps over undamped springs, about the rest shape, stable for a run.
 
     A sweep solves (D/ω + L)Δλ = −(Jx̃ + Aλ). A is JWJᵀ + α̃ for XPBD and JWJᵀ for PBD, D is the diagonal of JWJᵀ + α̃, α̃ =
     1/(khₑ²), and L is the part of JWJᵀ that comes before an element in the order of the sweep; x = x̃ + WJᵀλ. The matrix by

@@ -32,24 +32,23 @@ def measure(scene, setup, frames, device, dtype, started, copies=1, threads=1):
         dict: Unknown values are None.
 
         - ``status``: "ok", "diverged" or "refused"; ``reason``: a sentence, "" if ok.
-        - ``grade``, ``distance``: Those of the :class:`warpcloth.core.status.Status` of the frames, taken again, so that times
-          and memory are those of steps alone; of copies the worst [m].
+        - ``grade``, ``distance`` [m]: Those of the :class:`warpcloth.core.status.Status`, of copies the worst; from frames
+          taken again, so that times and memory are those of steps alone.
         - ``vertices``, ``elements``: Numbers for all copies and terms. ``substeps``: Steps per frame. ``frames``: Timed frames.
         - ``ms``, ``spread``: Median and quartiles of the time of a frame with its points on the host [ms]; ``cloths_per_s``:
           copies over the median [1/s].
-        - ``iterations``: Mean number of iterations of a step, over the timed frames.
+        - ``iterations``: Mean number of iterations of a step, over the timed frames; ``launches``: that of launches of a step.
         - ``ns``: Median time of a frame over elements × iterations × substeps [ns].
         - ``bytes``: Minimum memory traffic of a step; ``bytes_per_s``: that over the time of a step.
-        - ``launches``: Mean number of launches of a step.
-        - ``start_s``: Time from ``started`` to the end of the first frame. ``bind_s``: Time to build the model and bind the
+        - ``start_s``: Time from ``started`` to the end of the first frame [s]. ``bind_s``: Time to build the model and bind the
           solver, including compilation, without ``factorise_s``, that of constant matrices [s].
         - ``triangles``: Number of triangles of all mesh colliders.
-        - ``ms_without``, ``contact_ns``: With contact, the time of a frame of the same cloth without contact [ms], and the
-          difference over vertices, substeps and colliders, counting self-contact as one [ns].
-        - ``pairs``, ``lists``, ``kept``, ``least_gap``: With self-contact, the largest number of pairs in a list, lists per
-          step, the fraction of moves that the filter kept, and the smallest gap in any frame [m], of all copies.
-        - ``list_ns``, ``find_ns``: With self-contact, the time per vertex to list near pairs, and to find their gaps and
-          contacts, in the last state [ns].
+        - ``ms_without``, ``contact_ns``: The time of a frame of the same cloth without contact [ms], and the difference over
+          vertices, substeps and colliders, counting self-contact as one [ns].
+        - ``pairs``, ``lists``, ``kept``, ``least_gap``: Of self-contact, the largest number of pairs in a list, lists per step,
+          the fraction of moves that the filter kept, and the smallest gap in any frame [m], of all copies.
+        - ``list_ns``, ``find_ns``: Of self-contact, the time per vertex to list pairs, and to find gaps and contacts, in the
+          last state [ns].
         - ``memory``: Peak memory of the process on a CPU, and of Warp's memory pool on CUDA [bytes].
     """
     names = (

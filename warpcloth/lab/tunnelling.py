@@ -1,11 +1,10 @@
 """Sheets that fly against a thin wall, over speed and step, with the filter of contact and with the energy of contact alone.
 
-The wall is a box of 1 µm, or a sheet of triangles without thickness.
-
-A test for contact at the end of each step misses contact during the step. A vertex moves by v h in a step, and a wall has
-contact within the distance r on either side. So a vertex can pass without contact if v h ≥ 2r. If v h ≥ r, it can end beyond
-the wall, where the energy pushes it on. The energy also fails if it is less than that of the motion. Per area it is ½kr² for
-explicit steps and kτ²(2 + ln τ/δ) for the others, with τ = r/2 and δ = r/1000, below which it is a parabola.
+The wall is a box of 1 µm, or a sheet of triangles without thickness. It has contact within the distance r on either side, and a
+vertex moves by v h in a step. A test at the end of each step misses a vertex that passes without contact, if v h ≥ 2r. If v h ≥
+r, it can end beyond the wall, where the energy pushes it on. The energy also fails if it is less than that of the motion. Per
+area it is ½kr² for explicit steps and kτ²(2 + ln τ/δ) for the others, with τ = r/2 and δ = r/1000, below which it is a
+parabola.
 
 Implicit steps, which have contact with the wall ahead, need the filter if their minimiser is nearer than δ. With the prediction
 v h beyond the wall and the pressure kτ²/d, it is at d = kτ²h/(ρv).
