@@ -29,7 +29,7 @@ def add_collider_work(dtype):
     """Kernel over vertices, after a step: work of a collider −= ∇U·δ, work against friction += ∇H·(Δx − δ).
 
     ∇U is that of contact and friction, ∇H that of friction alone, where the step evaluates its forces; δ is the displacement of
-    the collider's material there. With ``before``, the trapezoidal rule averages the products there and at the start of the
+    the collider's material there. With ``before``, the trapezoidal rule averages the products with those at the start of the
     step. If the gap changes by more than the contact ``distance``, only the part of Δx that δ shares does work. If the filter
     shortened the move, Δx ends at ``uncut``, only ``now`` counts in this step and the next, and of_filter −= ∇U·(Δx − δ).
     """

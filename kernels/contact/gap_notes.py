@@ -23,9 +23,8 @@ class GapNotes:
     """The smallest gaps in the frames so far (B,), or in one state if there are ``counts``.
 
     ``nearest`` is 1/d for the smallest gap d [1/m]. The others are 0, or FIRST − (frame·n + vertex) of the first frame and
-    vertex where float32 does not resolve a gap, where a pair of cloth with cloth or with meshes (B, 2) is nearer than half the
-    contact distance, and where rounding stops a pair at the contact distance. ``counts`` (B, 2) counts pairs listed and in
-    contact.
+    vertex where float32 does not resolve a gap, where cloth is nearer to cloth or meshes (B, 2) than half the contact distance,
+    and where rounding stops a pair at that distance. ``counts`` (B, 2) counts pairs listed and in contact.
     """
 
     nearest: wp.array(dtype=wp.float64)

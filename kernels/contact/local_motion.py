@@ -209,8 +209,7 @@ def bound_moves(dtype):
 def differences(dtype):
     """Device functions on the motion of a box relative to cloth nearby, and on whether three vertices are calm.
 
-    ``relative_box`` is the box that low to high sweeps by p_low to p_high, in the frame of what moves by ``m`` to ``n``,
-    enlarged for rounding of ``ulps``.
+    ``relative_box`` is the box that low to high sweeps by p_low to p_high, in the frame of what moves by ``m`` to ``n``.
     """
     vec3, _ = types(dtype)
 

@@ -2,17 +2,17 @@
 
 U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)). The first sum is over vertices v, with rest area aᵥ, half for
 each side, and the faces, edges and vertices F near v. The multiplicities m are those of inclusion and exclusion: 1 for a face,
-1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces with E edges there. Where nearest points coincide,
-terms cancel: over a plane or a convex edge one is left, over a valley two faces minus one edge. So a flat sheet has the
-pressure −kφ′, and the gradient is continuous.
+1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces with E edges there. Terms with one nearest point
+cancel: a plane leaves one, a valley two faces minus one edge. So a flat sheet has the pressure −kφ′, and the gradient is
+continuous.
 
-The second sum is over pairs of edges, because vertices do not find where two edges cross. b is the rest area of an edge over
+The second sum is over pairs of edges, because vertices do not find where two edges cross; b is the rest area of an edge over
 its length. D² = min over s and t of ‖y(s, t)‖² (1 + ⅛((2s − 1)² + (2t − 1)²)) is strictly convex, so D has a gradient for
-parallel edges too. Edges act below a quarter of the contact distance.
+parallel edges too.
 
 Elements with a common vertex have no contact, nor have those of one piece whose rest distance is below 2r. Against meshes,
-vertices of cloth have their whole area, Σᵥ k aᵥ Σ_F m φ(d), and vertices of meshes act on faces of cloth by k aᵥ φ(4d).
-Positions of meshes are not unknowns, so y = Σ wᵢxᵢ + o with the vertices of the cloth alone.
+vertices of cloth have their whole area, and vertices of meshes act on faces of cloth by k aᵥ φ(4d). Positions of meshes are not
+unknowns, so y = Σ wᵢxᵢ + o with the vertices of the cloth alone.
 """
 
 from functools import cache
@@ -116,9 +116,9 @@ class Laws:
 class NearFaces:
     """The near faces of each of V vertices at some positions, for a list of C pairs.
 
-    ``code`` (C,) says where the nearest point of a face is; it is NONE if the face is not near. ``near`` (C,) has the pairs of
-    the near faces of vertex i from rows[i] on. ``counts`` (V,) has their number, and that of contacts with keys from C on.
-    ``multiplicities`` (C,) are m of the edges 12, 23 and 31 and of corners 1 to 3, or 0 if another near face counts them.
+    ``code`` (C,) says where the nearest point of a face is, or NONE. ``near`` (C,) has the pairs of the near faces of vertex i
+    from rows[i] on. ``counts`` (V,) has their number, and that of contacts with keys from C on. ``multiplicities`` (C,) are m
+    of the edges 12, 23 and 31 and of corners 1 to 3, or 0 if another near face counts them.
     """
 
     code: wp.array(dtype=wp.int32)

@@ -19,12 +19,11 @@ from .self_gaps import ZERO
 class PairForces:
     """Values of each pair at some positions, in float64: w, U [J], ∂U/∂y [N] and ∂²U/∂y² [N/m].
 
-    ``block`` is the ``definite`` part and, by the :class:`..term.HessianPolicy`, a fraction of the ``rest``. For kernels that
+    ``block`` is the ``definite`` part and a fraction of the ``rest`` by the :class:`..term.HessianPolicy`. For kernels that
     scatter, ``pressing`` lists the ``count`` [0] pairs with a force, and ``joining`` the ``count`` [1] ones that join vertices.
 
-    If w changes with the positions, :func:`..pairs.turned_pull` takes ``turns`` t, two numbers [1/m] for each vertex, two
-    vectors e, the ``ways``, the ``normal`` n, and ``twist``, α [N] and β [N·m], of which ``twisted`` is that fraction. Else
-    these arrays are None.
+    If w changes with the positions, :func:`..pairs.turned_pull` takes ``turns`` t [1/m], two vectors e, the ``ways``, the
+    ``normal`` n, and ``twist``, α [N] and β [N·m], of which ``twisted`` is that fraction. Else these arrays are None.
     """
 
     weights: wp.array(dtype=wp.vec4d)

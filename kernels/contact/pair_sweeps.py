@@ -2,10 +2,8 @@
 
 A sweep replaces the λ of a pair by that of its prox: with v̂ without the force of the pair and D = Σ wᵢ²/mᵢ along n, λ =
 −hₑ²∂U/∂y(v̂ + Dλ) in closed form, and Δxᵢ = wᵢλ/mᵢ. Then M(x − x̃) = Σ wᵢλ with w at x, and a fixed point minimises the
-objective of the step. Without multipliers nothing is removed (PBD).
-
-Where axes are locked, a soft pair takes D with all axes free, which does not move the fixed point. By the smaller D, a pair
-that cannot open along its free axes would throw the cloth far along them.
+objective of the step. Without multipliers nothing is removed (PBD). Where axes are locked, a soft pair takes D with all axes
+free, which keeps the fixed point; the smaller D would throw the cloth far along the free axes.
 """
 
 from functools import cache

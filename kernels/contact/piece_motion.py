@@ -17,9 +17,9 @@ SAMPLES = wp.constant(9)  # vertices whose median motion is that of a piece
 def pieces(dtype):
     """Struct of the connected pieces of all copies: the piece of each vertex, or −1, and the drift of each piece [m].
 
-    The drift is the median motion of its ``samples`` (pieces·SAMPLES,) along each axis, which a part that moves alone hardly
-    changes. If a copy has more than one piece (``per_copy``), each also has a box, and the largest motion of its vertices
-    relative to the drift [m]. Pieces of the ``cloth`` come first, then meshes.
+    The drift is the median motion of its ``samples`` along each axis, which a part that moves alone hardly changes. If a copy
+    has more than one piece, each also has a box, and the largest motion of its vertices relative to the drift [m]. Pieces of
+    the ``cloth`` come first, then meshes.
     """
     vec3, _ = types(dtype)
 

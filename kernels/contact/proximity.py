@@ -135,11 +135,8 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     the stencil, i its vertex or edge, and k its triangle or other edge. Boxes are at x, or along moves ``p`` of the cloth or of
     all vertices. Calm cloth has its boxes at x on level 0, and meets the box that an element sweeps relative to all calm cloth
     nearby. No pair is missed: a box meets those of its level and above, and that of a vertex that moves, which may be larger,
-    those of all levels. Of two edges of one level only one finds the other, by the order of their cells along z and y, or of
-    their indices.
-
-    ``shares`` threads share the search of a vertex or edge. Where there are more rows of cells than buckets, it visits all
-    buckets.
+    those of all levels. Of two edges of one level only one finds the other, by the order of cells along z and y, or of indices.
+    ``shares`` threads share a search.
     """
     vec3, _ = types(dtype)
     box_at, box_along, stored_box, cell_of = boxes(dtype)

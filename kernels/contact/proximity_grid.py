@@ -1,9 +1,9 @@
 """The hashed grid that finds near pairs, and structs of surfaces.
 
-The *items* are the triangles and then the edges of all copies. Their bounding boxes are sorted by centre into the cells of a
+The *items* are the triangles and then the edges of all copies. Their boxes are sorted by centre into the cells of a
 hierarchical grid (count, scan, fill). Level l has boxes with half sizes up to ``size``·2ˡ, so a box meets only boxes whose
-centres are at most this far from it, in its own level and those above. Cells are hashed to buckets such that a row along x is a
-sequence of buckets; so cells are a quarter as long as wide.
+centres are at most this far from it, in its own level and those above. A row of cells along x is hashed to a sequence of
+buckets; so cells are a quarter as long as wide.
 """
 
 from functools import cache
@@ -30,8 +30,8 @@ def surfaces(dtype):
     ``rest`` are rest positions in a copy [m], and ``piece`` connected pieces, −1 without an element. ``groups`` and
     ``vertex_groups`` say which elements meet, ``itself`` whether cloth meets cloth. ``distance`` is the contact distance of
     cloth with cloth, ``of_meshes`` that with meshes, ``max_distance`` the larger one; edges and vertices of meshes are listed
-    up to ``close`` and the skin [m]. Elements whose first vertices are more than ``far`` apart at rest are at least twice the
-    contact distance apart [m]. ``lowest`` and ``highest`` bound the cloth of each copy; without obstacles they are empty.
+    up to ``close`` and the skin [m]. Elements whose first vertices are more than ``far`` [m] apart at rest are at least twice
+    the contact distance apart. ``lowest`` and ``highest`` bound the cloth of each copy; without obstacles they are empty.
     """
     vec3, _ = types(dtype)
 

@@ -19,9 +19,8 @@ from .self_planes import KEPT, WIDE, margin_of, needs_no_cut, part_apart, ulp_of
 def advances(dtype):
     """Struct of the moves ``direction`` [m], the ``fraction`` that each copy may make (B,), and the ``least`` gap [m].
 
-    The direction is that of the cloth (N,), or of all vertices. ``far`` (B,) is 1 for copies that move so far that unlisted
-    pairs may meet. Of cloth the list has all pairs that may meet while their sides move by at most ``alike`` relative to one
-    another from the positions ``found`` of the list [m].
+    ``far`` (B,) is 1 for copies that move so far that unlisted pairs may meet. Of cloth the list has all pairs that may meet
+    while their sides move by at most ``alike`` [m] relative to one another from the positions ``found`` of the list.
     """
     vec3, _ = types(dtype)
 

@@ -2,10 +2,10 @@
 
 H is that of :mod:`..coulomb`, with ε = μN/(kA). Contacts, w, n, kA and N = −kAφ′ times their share are those at the start xⁿ of
 the step. A step sets the elongation ξ of the spring to u, and the next one shortens it to at most ε: a sticking pair does not
-creep, and the spring of a sliding pair slides along. A pair takes the ξ of the contact between the same vertices of nonzero w
-in the last step, else the mean of those that its vertex had with the face, or else of those with a common vertex on each side.
-At the end of a step ξ rotates with the cloth or mesh, and u omits the displacement d(Rn − n) by the rotation R of the gap. That
-of meshes is known, so u omits it in the whole step.
+creep, and the spring of a sliding pair slides along. A pair takes the ξ of the contact between the same vertices of nonzero w,
+else the mean of those that its vertex had with the face, or else of those with a common vertex on each side. At the end of a
+step ξ rotates with the cloth or mesh, and u omits the displacement d(Rn − n) by the rotation R of the gap; that of meshes is
+known, so u omits it in the whole step.
 """
 
 from functools import cache

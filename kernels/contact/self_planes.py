@@ -72,8 +72,8 @@ def find_ways(dtype):
     """Kernel over vertices: ``share`` with which the wanted move minus the ``common`` move is at most ``most``, and ``ways``.
 
     The ways are a bound of what it adds to the approach of a pair [m], its largest coordinate [m], and its share. The bound is
-    the length of that move plus WIDE times that of the motion since ``begun``, where gaps were computed, ``relative`` to the
-    first vertex of the copy where cloth meets only itself.
+    the length of that move plus WIDE times that of the motion since ``begun``, ``relative`` to the first vertex of the copy
+    where cloth meets only itself.
     """
     vec3, _ = types(dtype)
 
@@ -221,8 +221,7 @@ def cut_by_planes(dtype):
 
     A pair cuts nothing while its sides keep a tenth of their gap with the shares of before: along y, or by :func:`part_apart`.
     So cloth that falls or rotates together moves freely. Else a plane normal to y divides their gap, minus the smallest
-    distance, in the ratio of their approaches without the ``common`` move; each side gets at least CLAMPED of it. Pairs whose
-    ``gap`` is too wide for the moves have no plane.
+    distance, in the ratio of their approaches without the ``common`` move; each side gets at least CLAMPED of it.
 
     A vertex at the smallest distance from a plane that it does not approach moves by at least ``least_share``, or not at all;
     rounding of shorter moves would take it nearer.

@@ -16,7 +16,7 @@ from .timing import measure
 
 @dataclass(frozen=True)
 class SolverBenchmark:
-    """A solver on a scene of several sizes.
+    """A solver on a scene of several sizes, in a batch of ``copies`` with ``threads`` CPU threads.
 
     Attributes:
         scene: The scene, of any size.
@@ -24,8 +24,6 @@ class SolverBenchmark:
         sizes: Resolutions of the scene; if empty, the scene as it is.
         dtype: By default that of a run with the solver.
         frames: Maximum number of frames to time.
-        copies: Number of copies of the scene in a batch.
-        threads: Number of CPU threads.
         variants: Parameters of the scene by name, one dictionary for each variant, in place of sizes.
     """
 

@@ -84,8 +84,8 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
     Args:
         tasks: :class:`warpcloth.lab.measurements.Task`\s.
         executor: Any `concurrent.futures.Executor`, such as that of a Dask client; by default, processes on this machine, for
-            which a script needs ``if __name__ == "__main__":``. Its processes may have another working directory; they read
-            scenes, references and extensions from the same absolute paths. Threads of one process measure one after another.
+            which a script needs ``if __name__ == "__main__":``. Its processes read scenes, references and extensions from the
+            same absolute paths. Threads of one process measure one after another.
         store: A :class:`Store`; without one nothing is kept.
         progress: Function called with (finished, tasks, seconds left or None) first and after each.
         workers: Number of processes without an executor, by default that of cores. Times include the load of the others.

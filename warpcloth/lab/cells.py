@@ -52,7 +52,6 @@ def scene_at(ref, values, steps, duration=None):
 
 
 def steps_in(duration, dt):
-    """Returns the fewest steps that last a duration, at least 1, ignoring rounding."""
     return max(math.ceil(duration / dt * (1.0 - 1e-9)), 1)
 
 
@@ -71,7 +70,6 @@ def refined(ref, value):
 
 
 def applied(scene, name, value):
-    """Returns the scene with a value of one of :data:`VARIED`."""
     if name == "stiffness":
         return replace(scene, terms=[replace(term, stiffness=value * np.asarray(term.stiffness)) for term in scene.terms])
     if name == "compression":

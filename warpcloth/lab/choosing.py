@@ -33,17 +33,15 @@ _DEARER, _START = 3.0, 1.0
 
 @dataclass(frozen=True)
 class Measured:
-    """A setup and its measurements.
+    """A ``setup`` and its measurements, by a ``machine``.
 
     Attributes:
-        setup: The :class:`warpcloth.lab.measurements.Setup`.
         error: Error of the trajectory, relative to the size of the cloth, or None.
         milliseconds: Time of a frame [ms], or None.
         spread: By how much frames differ from their neighbours, as quartiles [ms], (low, high), or None.
         reason: Why there is no error, or "".
-        machine: The machine that measured it.
         final: Whether finer steps would fail too: it took too long, or its method is refused.
-        strain_error: See :func:`warpcloth.lab.reference.strain_error`, or None.
+        strain_error: Strain error of the trajectory, or None.
         own_error: Error relative to the motion to which a solver of another simulator itself converges, or None.
         seconds: Time of its frames [s].
         status: "ok", "diverged", "slow", "refused", or "left" if it was not measured.
@@ -79,8 +77,8 @@ class Choice:
         meets: Whether it meets the tolerance and the budget.
         rivals: Others that are as good within the spread of times, the best first.
         certainty: A sentence about the certainty of the choice.
-        others: By solver of another simulator, the :func:`warpcloth.lab.own_reference.own_facts` of its own motion, if any, and
-            ``searched``, how its search ended.
+        others: By solver of another simulator, the :func:`warpcloth.lab.own_reference.own_facts`, and ``searched``, how its
+            search ended.
         untried: Number of settings that :func:`climb` left out.
     """
 
@@ -257,8 +255,8 @@ def choose(
 ):
     """Measures setups of a scene until the choice is clear, on this machine or, with an executor, on its workers.
 
-    The reference may take five times the limit of one run. If it is not known to the tolerance, nothing is measured, because
-    nothing could be said to meet it. Runs of warpcloth end at three times the time of its cheapest setting that meets it.
+    The reference may take five times the limit of one run. If it is not known to the tolerance, nothing is measured. Runs of
+    warpcloth end at three times the time of its cheapest setting that meets the tolerance.
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
@@ -269,14 +267,13 @@ def choose(
         device: Of the runs and the reference.
         dtype: By default that of a run with each solver.
         limit: Time limit of each run [s].
-        others: Simulators whose solvers are measured too, such as ``["newton"]``, each until its own cheapest setting is found,
-            within six time limits; its own reference has as much time again.
+        others: Simulators whose solvers are measured too, each until its own cheapest setting is found, within six time limits;
+            its own reference has as much time again.
         clock: One of :data:`warpcloth.lab.clock.CLOCKS`, for limits and times.
-        total: Time on the wall [s] after which nothing more is measured or computed; of it, the reference may take a third, the
-            searches of other simulators a third, and their own references a third.
+        total: Time on the wall [s] after which nothing more is measured; the reference, the searches of other simulators, and
+            their own references may take a third each.
         announce: Function called with the :class:`Longest` before anything is measured.
-        run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`; by default with the
-            store in the cache folder.
+        run: Arguments of :func:`warpcloth.lab.campaign.sweep`; by default with the store in the cache folder.
 
     Returns:
         tuple: :class:`Choice`, the list of :class:`Measured`, and the :class:`warpcloth.lab.reference.Reference`.

@@ -17,7 +17,7 @@ class TooSlow(Exception):
 
 
 class Clock:
-    """Ends a run ``limit`` seconds after frame 0 is stored, so that compilation does not count, as its ``progress``.
+    """A ``progress`` that ends a run ``limit`` seconds after frame 0 is stored, so that compilation does not count.
 
     ``clock`` is one of :data:`CLOCKS`; ``frames`` has the time of each frame [s].
     """

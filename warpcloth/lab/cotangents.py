@@ -95,7 +95,6 @@ def measure(device, libigl):
 
 
 def kite(apex):
-    """Returns two triangles with the angle ``apex`` [°] opposite their common edge (0, 1)."""
     height = 0.5 / np.tan(np.radians(0.5 * apex))
     return Mesh([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.0, height], [0.5, 0.0, -height]], [[0, 1, 2], [1, 0, 3]])
 

@@ -3,9 +3,8 @@
 Without the filter, the path during a step is not tested, and the energy of contact does not know the side from which a sheet
 came. For v h ≥ r, a step can end beyond the other sheet, where the energy pushes it on; for v h ≥ 2r it can do so without
 contact. Contact also fails if its energy is less than that of the motion, ½(ρ/2)v² of two free sheets of density ρ. Per area it
-is ½kr² in explicit steps, and kτ²(2 + ln τ/δ) in those of Newton's method, with τ = r/2 and δ = r/1000, below which it is a
-parabola. Pairs of edges add to the latter below r/4. Sweeps take contacts nearer than r plus the skin at the start of the step,
-and know their side.
+is ½kr² in explicit steps, and kτ²(2 + ln τ/δ) in those of Newton's method, with τ = r/2 and δ = r/1000, plus that of pairs of
+edges below r/4. Sweeps take contacts nearer than r plus the skin at the start of the step, and know their side.
 
 Vertices can move along the line of flight only. Otherwise sheets could tip and pass each other.
 """

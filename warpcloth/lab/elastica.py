@@ -5,7 +5,7 @@ simulators in computer graphics*), and a hanging loop.
 
     φ″ = Γ u sin φ,   φ′(0) = 0,   φ(1) = π/2;   H = ∫cos φ du,   W = ∫sin φ du.
 
-H/W tends to Γ/8 for small Γ. Above Γ of about 150 there are several solutions; this module is for smaller Γ.
+H/W tends to Γ/8 for small Γ. Above Γ of about 150 there are several solutions.
 
 A loop hangs from one point at which both ends are clamped. With the arc length s from its lowest point in units of L, the angle
 a of the tangent from the horizontal, and an unknown horizontal force h in units of D/L²,

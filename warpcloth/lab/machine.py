@@ -48,7 +48,7 @@ def in_words(facts, others=()):
 
 
 def processor():
-    """Returns the model name of the processor, which only Linux has in a file."""
+    """Returns the model name of the processor, from a file on Linux."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

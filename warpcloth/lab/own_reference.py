@@ -37,10 +37,8 @@ def own_reference(
     further than an earlier one did, because float32 rounds the motion or the solver does not converge.
 
     Two successive doublings count if the second moves the cloth no further than the first, or both move it by at most the
-    tolerance; a solver far from its limit may hardly move. Of those that count, the two with the smallest moves are taken. The
-    middle run is run with twice the iterations too. The largest of the three moves is the error, which bounds that of the
-    finest run if each doubling at least halves the error. A caller must compare it with a bound of its own, see
-    :func:`own_facts`.
+    tolerance. Of those, the two with the smallest moves are taken, and the middle run is repeated with twice the iterations.
+    The largest of the three moves is the error, which bounds that of the finest run if each doubling at least halves the error.
 
     ``limit`` [s] bounds the frames of all runs that double the substeps; the run with twice the iterations may take as long
     again. ``progress`` is called with (substeps, frame, frames).

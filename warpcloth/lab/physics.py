@@ -176,7 +176,7 @@ def bending_density(bending, mesh, positions, **options):
 
 @in_turn
 def energies(scene, **options):
-    """Returns the energy [J] of each element of each term at the start of a scene, a list of arrays."""
+    """Returns the energy [J] of each element of each term at the start of a scene."""
     model = scene.build(**options)
     energy = Energy(model, Sums(model))
     energy.add(model.positions, wp.zeros(1, dtype=wp.float64, device=model.device))
@@ -238,7 +238,7 @@ def _catenary(settle, links, stretching):
 
 
 def _patch(settle, pattern, angle, resolution):
-    """Measures the largest distance of a vertex to Gx̄ over the length; inner vertices start perturbed by 0.1 edges."""
+    """Measures the largest distance of a vertex to Gx̄ over the length; inner vertices start perturbed."""
     mesh = strip(pattern, angle, 1.0 / resolution).mesh
     affine = mesh.points @ np.array([[1.1, 0.05, 0.02], [0.0, 1.0, 0.0], [0.03, -0.1, 1.2]])
     moved = np.random.default_rng(0).uniform(-0.1, 0.1, affine.shape) / resolution

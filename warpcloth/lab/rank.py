@@ -1,10 +1,10 @@
-"""Best rotations of points in a plane, on a line or at one position (Kabsch 1976, *A solution for the best rotation to relate
-two sets of vectors*).
+"""Best rotations of points in a plane, on a line or at one position (Kabsch 1976, *A solution for the best rotation to
+relate two sets of vectors*).
 
 The covariance of the points has the singular values σ₁² ≥ σ₂² ≥ σ₃². The rotation about their main axis follows from σ₂², which
-has the rounding εσ₁², so that it is accurate to about ε(σ₁/σ₂)². The axis itself is rotated to within a few ε. Points in a
-plane determine the rotation, but UVᵀ is a reflection half of the time once (σ₃/σ₁)² is below ε. For points on a line, the
-smallest rotation is taken, for one point the identity.
+has the rounding εσ₁², so it is accurate to about ε(σ₁/σ₂)²; the axis itself to a few ε. Points in a plane determine the
+rotation, but UVᵀ is a reflection half of the time once (σ₃/σ₁)² is below ε. For points on a line, the smallest rotation is
+taken, for one point the identity.
 """
 
 import numpy as np
@@ -65,7 +65,7 @@ def tasks(device):
 
 
 def sets(ratios, dtype, seed=0):
-    """Returns P and Q = R P (c, n, 3) of a dtype, R (c, 3, 3) and the first axis of P (c, 3); P has given singular values."""
+    """Returns P and Q = R P (c, n, 3), R (c, 3, 3) and the first axis of P (c, 3); P has given singular values."""
     rng = np.random.default_rng(seed)
     centred = rng.normal(size=(_SETS, _POINTS, 3))
     axes, _ = np.linalg.qr(centred - centred.mean(axis=1, keepdims=True))

@@ -38,16 +38,15 @@ class NoReference(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The motion of a scene, with a bound of its error.
+    """The motion of a scene on its mesh, with a bound of its error.
 
     Attributes:
         points: (F, n, 3) [m], the start and each frame after it, float64.
         times: (F,) [s].
-        error: Bound of its own :func:`position_error`.
-        strain_error: Bound of its own :func:`strain_error`.
+        error: Bound of its :func:`position_error`.
+        strain_error: Bound of its :func:`strain_error`.
         substeps: Steps per frame of the finest run.
         seconds: Time of all runs [s].
-        path: The file.
         key: A hash of scene, frames and code.
         scene: :func:`warpcloth.base.digest.scene_digest` of the scene.
         method: The solver.

@@ -3,8 +3,8 @@
 Near the minimiser, an iteration d ← d − A⁻¹∇φ(d) maps the error e to (1 − A⁻¹H)e, with the Hessian H of φ and the constant
 matrix A. Each component of e along an eigenvector v of Hv = μAv is multiplied by 1 − μ, so that ‖e‖²_A = eᵀAe shrinks at worst
 by max |1 − μ| per iteration. As A takes projections as fixed, H ≤ A and 0 ≤ 1 − μ (Liu et al. 2017, *Quasi-Newton methods for
-real-time simulation of hyperelastic materials*, for the view as a descent). With colliders, A includes the semi-definite
-Hessian of contact at the minimiser, as in the iterations.
+real-time simulation of hyperelastic materials*). With colliders, A includes the semi-definite Hessian of contact at the
+minimiser, as in the iterations.
 """
 
 import time

@@ -32,8 +32,8 @@ class Strip(NamedTuple):
 def strip(pattern, angle, spacing, length=1.0, width=1.0):
     """Returns a strip whose vertices up to x = 0 are clamped.
 
-    It has all triangles of the net that are inside length and width. Clipped triangles would be slivers and lock. So the sides
-    are jagged, with an error of first order in the spacing.
+    It has all triangles of the net that are inside length and width, because clipped ones would be slivers and lock. So the
+    sides are jagged, with an error of first order in the spacing.
 
     ``clamp`` is where an equivalent smooth strip would begin to bend. A hinge bends if one of its vertices is free, on average
     half its length before the last pin; ``clamp`` is the mean over hinges, weighted by bending energy. The end is that of the
@@ -42,7 +42,7 @@ def strip(pattern, angle, spacing, length=1.0, width=1.0):
     Args:
         pattern: "equilateral", "diagonal" or "alternating" as for :meth:`warpcloth.Mesh.grid`, or "jittered": a Delaunay
             triangulation of the equilateral net with random displacements, equal in every call.
-        angle: Rotation of the net about +y [rad]; at 45° the diagonals of "diagonal" run along the strip.
+        angle: Rotation of the net about +y [rad].
         spacing: Edge length of the net [m]; for right triangles, that of the shorter edges.
         length: Length of the free part [m].
         width: Width [m].
@@ -80,8 +80,8 @@ def plate(pattern):
     """Returns C (3, 3) of a net on a surface of curvature κ = (κ₁₁, κ₂₂, κ₁₂), with energy ½D κᵀCκ per area, however fine.
 
     C is AᵀA, where each row of A is the curvature that a kind of hinge measures. In an equilateral net the hinge along e
-    measures κₙₙ − ⅓κₑₑ, and the three directions add up to 4/3 tr κ² − 1/3 (tr κ)²: a plate with a Poisson's ratio of −1/3. The
-    other nets are not isotropic plates.
+    measures κₙₙ − ⅓κₑₑ, and the three directions add up to 4/3 tr κ² − 1/3 (tr κ)²: a plate with ν = −1/3. The other nets are
+    not isotropic plates.
     """
     choice("pattern", pattern, PATTERNS[:3])
     rows = {

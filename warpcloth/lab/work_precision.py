@@ -225,7 +225,7 @@ def front(rows, floor=0.0, name="error"):
 
 
 def quartiles(row):
-    """Returns the spread of the time for a second of motion, (low, high) [ms]; both are that time if it is unknown."""
+    """Returns the spread of the time for a second of motion, (low, high) [ms]."""
     if not row.get("spread"):
         return row["ms_per_second"], row["ms_per_second"]
     return tuple(each * row["ms_per_second"] / row["ms"] for each in row["spread"])
