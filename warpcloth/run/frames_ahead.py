@@ -38,17 +38,11 @@ class Frame(NamedTuple):
 
 
 def frames_of(stepper, count, ahead, keeps=None, find=None):
-    """Yields the next frames of a stepper. Close the generator: it then waits for frames in work.
+    """Yields the next ``count`` frames of a stepper, at most ``ahead`` of them computed ahead by a thread, without one if 0.
 
-    While the caller uses one frame, a thread computes the next ones. The first is computed alone: it may capture graphs, during
-    which the device must not do other work.
-
-    Args:
-        stepper: Its state is ahead of the frame that the caller has.
-        count: Number of frames.
-        ahead: Maximum number of frames computed ahead; 0 computes each on demand, without a thread.
-        keeps: Function (number of frames before) → whether the next frame includes the state; or None.
-        find: Function that is called after each frame for ``found``, or None.
+    The first is computed alone: it may capture graphs, during which the device must not do other work. Close the generator: it
+    then waits for frames in work. ``keeps`` is a function (number of frames before) → whether the next frame includes the
+    state, ``find`` one that is called after each frame for ``found``, or None.
     """
     numbers = itertools.count()
     copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
