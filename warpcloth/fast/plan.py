@@ -1,13 +1,15 @@
 """The entry to code that only increases speed. Each backend computes the same as the core, up to rounding.
 
 - ``core``: gradients and corrections term by term, then an update of the vertices.
-- ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices; several threads have a subdomain each. Jacobi
-  sweeps scatter corrections while they compute them. Gradients are those of the core.
+- ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices. Jacobi sweeps scatter corrections while they
+  compute them. Gradients are those of the core.
 - ``gather``, for CUDA: a gradient, a Jacobi sweep or an explicit step is one launch for all terms. One launch may do several
   explicit steps.
 
 Tests compare each backend with the core.
 """
+
+from functools import partial
 
 from ..base.checks import choice
 from ..core.explicit_step import ExplicitStep
@@ -20,7 +22,6 @@ from .gather_corrections import GatherSweeps
 from .gather_gradient import GatherGradient
 from .gather_step import GatherStep
 from .scatter_corrections import ScatterSweeps
-from .subdomains import SubdomainSteps
 from .touching_steps import TouchingSteps
 
 BACKENDS = ("auto", "core", "blocks", "gather")
@@ -47,7 +48,7 @@ class Plan:
         of_backend = {"core": Gradient, "blocks": Gradient, "gather": GatherGradient}
         return of_backend[self.backend](self.model, corrected, terms, dynamic)
 
-    def explicit_step(self, state, h, symplectic, count, pool, colliders=None, pairs=None):
+    def explicit_step(self, state, h, symplectic, count, colliders=None, pairs=None):
         """Returns a :class:`warpcloth.core.explicit_step.ExplicitStep`, or a faster class with the same methods.
 
         Args:
@@ -55,30 +56,24 @@ class Plan:
             h: Step [s].
             symplectic: Whether x is updated with v after the step.
             count: Number of steps of the moved pins (B,) int32, or None.
-            pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that divides the work.
             colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`, with which faster classes handle contact
                 themselves. None: the terms and the end of each step handle it.
             pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact and mesh colliders, or None.
-
-        Raises:
-            ValueError: Threads cannot divide the steps; the message names the term.
         """
-        given = self.model, state, h, symplectic, count, needs_compensation(self.model)
+        core, given = partial(ExplicitStep, count=count), (state, h, symplectic)
         if self.model.dynamic:
             blocks = self.backend == "blocks" and self.model.uniform and colliders is None
-            plain = (BlockStep if blocks else ExplicitStep)(self.model.with_dynamic(()), *given[1:-1])
+            plain = (BlockStep if blocks else core)(self.model.with_dynamic(()), *given)
             steps = TouchingSteps(plain, pairs)
-        elif pool.threads > 1:
-            _refuse_undivided(self.model, self.backend, pool.threads)
-            steps = SubdomainSteps(*given, pool)
         else:
             backend = self.backend if self.model.uniform else "core"
             if colliders is not None and not self.model.colliders.plain:
                 backend = "core"
+            given = *given, needs_compensation(self.model)
             if colliders is not None and backend != "core":
                 self.guard = ContactGuard(self.model, colliders)
                 given = *given, self.guard
-            steps = {"core": ExplicitStep, "blocks": BlockStep, "gather": GatherStep}[backend](*given)
+            steps = {"core": core, "blocks": BlockStep, "gather": GatherStep}[backend](self.model, *given)
         self.record = steps.record
         return steps
 
@@ -105,29 +100,3 @@ def plan(model, backend="auto"):
     if backend == "blocks" and model.device.is_cuda:
         raise ValueError(f"backend is 'blocks' on {model.device}; it is for the CPU")
     return Plan(model, backend)
-
-
-def _refuse_undivided(model, backend, threads):
-    """Checks that the steps of a model can be divided into subdomains.
-
-    Raises:
-        ValueError: A term or the backend does not support subdomains; the message names it.
-    """
-    if backend != "blocks":
-        raise ValueError(f"threads is {threads} with backend {backend!r}; more than 1 is for 'blocks'")
-    if model.mobility is not None:
-        raise ValueError(
-            f"threads is {threads} with one copy, whose vertices that are locked along some axes Explicit cannot divide; "
-            "threads=1 can, and copies are shared out with every solver"
-        )
-    if model.loads is not None:
-        raise ValueError(
-            f"threads is {threads} with one copy that has loads, whose steps Explicit cannot divide; threads=1 can, or PBD and "
-            "XPBD, and copies are shared out with every solver"
-        )
-    for elements in model.terms:
-        if elements.refresh:
-            raise ValueError(
-                f"threads is {threads} with one copy, whose {elements.label} Explicit cannot divide; threads=1 can, or PBD "
-                "and XPBD, and copies are shared out with every solver"
-            )

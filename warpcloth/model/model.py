@@ -25,7 +25,7 @@ from .host_values import keep, repeat
 from .loads import loads_on
 from .precision import DTYPES, cast, refuse_coarse
 from .report import report
-from .threads import threads_on
+from .threads import refuse_one_copy, threads_on
 from .vary import Vary, unlike_copies
 
 
@@ -43,7 +43,7 @@ class Model:
         order: Vertices of the scene in the order of the model, (n,), such as :func:`warpcloth.mesh.ordering.near_order` gives;
             elements are then sorted by their lowest vertices. Arguments and messages use the order of the scene, attributes
             and solvers that of the model, and :meth:`in_scene_order` converts. None keeps the order of vertices and elements.
-        threads: Threads of the CPU that share the steps, see :class:`warpcloth.core.thread_pool.ThreadPool`.
+        threads: Threads of the CPU that share out the copies; 1 if there is one copy.
 
     Attributes:
         positions, velocities: Initial state, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
@@ -81,6 +81,7 @@ class Model:
         copies = int(copies)
         self.scene, self.copies = scene, copies
         self.device = find_device(device)
+        refuse_one_copy(threads, copies)
         self.threads = threads_on(self.device, threads)
         self.dtype, self.numpy_dtype = DTYPES[dtype]
         self.vec3, self.mat33 = types(self.dtype)

@@ -261,7 +261,7 @@ def simulate(
         raise ValueError("resume is given without output, the file of the run to go on with")
 
     def facts():
-        return facts_of(scene, solver, device, dtype, vary, threads, record)
+        return facts_of(scene, solver, device, dtype, vary, record)
 
     # First, so that a wrong output is refused before anything compiles.
     recorder = Memory(frames, copies) if output is None else File(scene, output, single_file, facts, resume, record)

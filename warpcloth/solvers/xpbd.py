@@ -116,10 +116,6 @@ class XPBD(ImplicitStep):
             return self.residual._replace(measure="largest move of a vertex in the last sweep (divided by h²)")
         return self.residual
 
-    @property
-    def divides(self) -> bool:
-        return self.sweep == "coloured"
-
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
@@ -145,10 +141,7 @@ class XPBDStepper(LaunchedStepper):
         model = self.model
         given = model, self.state.x, self.he, options.sweep, options.relaxation
         more = {"scalar": options.form == "scalar", "multipliers": True}
-        if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool)
-        else:
-            self.sweep = JacobiSweep(*given, **more)
+        self.sweep = (GaussSeidelSweep if options.ordered else JacobiSweep)(*given, **more)
         self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
@@ -165,7 +158,8 @@ class XPBDStepper(LaunchedStepper):
         self.integrator.start()
 
     def _launch_start(self):
-        self.pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        self.launch_prediction()
+        self.sweep.launch_start()
 
     def _launch_to_and_fro(self):
         """Launches one sweep forward and one backward."""
@@ -174,16 +168,12 @@ class XPBDStepper(LaunchedStepper):
 
     def _launch_last(self):
         """Launches the end of a step and its residual: the unbalanced force, or with hard constraints the last move."""
-        if self._gradient is None:
-            self.pool.launch_alone(self.model, self._force.zero_, lambda: self._launch_momentum(-1.0))
-            self.sweep.launch()
-        if self.pool.leads:
-            self._launch_end()
-
-    def _launch_end(self):
         model, d = self.model, self.sweep.correction
-        if self._gradient is not None:
-            self._force.zero_()
+        self._force.zero_()
+        if self._gradient is None:
+            self._launch_momentum(-1.0)
+            self.sweep.launch()
+        else:
             self._gradient.add(self.state.x, self._force, d)
         self._launch_momentum(1.0)
         model.lock(self._force)
