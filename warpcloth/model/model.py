@@ -254,7 +254,6 @@ class Model:
         other.terms = tuple(elements.part(first, count) for elements in self.terms)
         return other
 
-    @in_turn
     def array(self, values, dtype):
         """Returns ``values`` as an array on the model's device, in its precision."""
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy_dtype), dtype=dtype, device=self.device)
@@ -280,7 +279,6 @@ class Model:
         words = [] if each is None else [f"{each} {i}"]
         return " of ".join(words + ([f"copy {copy}"] if self.copies > 1 else []))
 
-    @in_turn
     def vectors(self):
         """Returns a new array of a zero vector for each vertex of all copies."""
         return wp.zeros(self.count, dtype=self.vec3, device=self.device)
@@ -289,7 +287,6 @@ class Model:
         """Returns a new array of a zero for each copy."""
         return wp.zeros(self.copies, dtype=dtype, device=self.device)
 
-    @in_turn
     def kernel(self, factory, *key):
         """Returns the kernel of ``factory(*key)``, and notes its name for :meth:`report`, as factory(variant).Term."""
         kernel = factory(*key)
@@ -300,7 +297,6 @@ class Model:
         self.kernels.add(".".join([f"{factory.__name__}{variant}", *terms]))
         return kernel
 
-    @in_turn
     def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
         self.launches[0] += 1
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)

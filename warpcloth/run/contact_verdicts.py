@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.turns import in_turn
 from ..scene.colliders import turned
 from ..terms.needs import NORMAL_FORCE
 from .history import collider_names
@@ -78,7 +77,6 @@ class Pressed:
                 self.first[copy, c] = number
 
 
-@in_turn
 def soft_contact_of(watch, stepper):
     """Returns a sentence each about the first frame in which a gap to a collider, and one between cloth and cloth, falls below
     half the contact distance. That of edges, and of vertices of meshes, is r/4."""
@@ -104,7 +102,6 @@ def _where(found):
     return f"in frame {found.frame}" + (f" of copy {found.copy}" if found.copy else "")
 
 
-@in_turn
 def inside_of(stepper):
     """Returns the :class:`Inside` of each collider and copy in the steps so far, the first frame first."""
     names, found = collider_names(stepper.model.scene), []
@@ -114,7 +111,6 @@ def inside_of(stepper):
     return tuple(sorted(found, key=lambda each: each.frame))
 
 
-@in_turn
 def forced_of(stepper):
     """Returns the :class:`Forced` of each mesh and copy in the steps so far, the first frame first."""
     scene = stepper.model.scene
@@ -144,7 +140,6 @@ class Unresolved(NamedTuple):
         )
 
 
-@in_turn
 def unresolved_of(stepper):
     """Returns the :class:`Unresolved` of each copy in the steps so far, the first frame first."""
     found, name = [] if stepper.pairs is None else stepper.pairs.unresolved, stepper.model.numpy_dtype.__name__
@@ -152,7 +147,6 @@ def unresolved_of(stepper):
     return tuple(sorted(found, key=lambda each: each.frame))
 
 
-@in_turn
 def crossings_at_start(model):
     """Returns a sentence about the triangles of free cloth that cross each mesh at the start of the first copy where some do.
 
@@ -223,7 +217,6 @@ def _passes_through(p, q, a, b, c):
     return within & (volume(a, b, c, p) * volume(a, b, c, q) < 0.0)
 
 
-@in_turn
 def held_pins_of(stepper):
     """Returns the :class:`warpcloth.contact.self_steps.PinHeld` of each copy that holds pins back, with indices in the mesh."""
     held = [] if stepper.pairs is None else stepper.pairs.pins_held

@@ -10,7 +10,6 @@ import warp as wp
 from ..base.checks import shown
 from ..base.limits import MOST_FRAMES
 from ..base.texts import numbered
-from ..base.turns import in_turn
 from ..contact.collider_work import ColliderWork, FilterWork, PairWork
 from ..contact.present import ColliderPulls, PresentContact
 from ..core.capture import Segment
@@ -297,7 +296,6 @@ class History:
 
     energies, reactions, pairs, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
 
-    @in_turn
     def __init__(self, stepper, model, record):
         self._stepper, self.model, self._record, scene = stepper, model, record, model.scene
         changing = model.loads is not None and model.loads.constant is None

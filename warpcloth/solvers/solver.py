@@ -54,7 +54,7 @@ class Stepper:
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        methods_in_turn(cls, "__init__", "step", "frame", "prepare_frame", "reset")
+        methods_in_turn(cls, "step", "frame", "prepare_frame", "reset")
 
     def __init__(self, options, model, integrator=None):
         fps = model.scene.fps
