@@ -64,6 +64,7 @@ class Model:
         order: As given, int32, or None.
         indices: Index in a copy of each vertex of the scene, (n,) int32; None without an order.
         kernels: Names of the kernels that solvers use.
+        motion: x and v (B·n,) of steppers, if they are views of those of a larger batch; else None.
         launches: Number of launches so far, in a list of one that models made from this one share.
         threads: As given.
 
@@ -88,7 +89,7 @@ class Model:
         self.per_copy = len(scene.mesh.points)
         self.count = copies * self.per_copy
         self.kernels, self.launches = set(), [0]
-        self.dynamic = ()
+        self.dynamic, self.motion = (), None
         self.order = self.indices = None
         self.rest_points = scene.mesh.points
         if order is not None:
@@ -240,14 +241,21 @@ class Model:
         """Returns a model of one copy, whose arrays are views of those of this one."""
         return self if self.copies == 1 else self.part(copy, 1)
 
-    def part(self, first, count):
-        """Returns a model of copies ``first`` to ``first + count − 1``, for one thread, whose arrays are views."""
+    def part(self, first, count, motion=None):
+        """Returns a model of copies ``first`` to ``first + count − 1``, for one thread, whose arrays are views.
+
+        Args:
+            first: The first copy.
+            count: Number of copies.
+            motion: x and v of all copies, of which the steppers of the part have views; None for arrays of their own.
+        """
         n = self.per_copy
         other, of_copies, of_vertices = shallow_copy(self), slice(first, first + count), slice(first * n, (first + count) * n)
         other.copies, other.count, other.threads = count, count * n, 1
         for name in ("positions", "velocities", "mass", "inverse_mass", "mobility", "_vertex_gravity"):
             if getattr(self, name) is not None:
                 setattr(other, name, getattr(self, name)[of_vertices])
+        other.motion = motion and tuple(array[of_vertices] for array in motion)
         other.gravity = self.gravity[of_copies]
         if self.loads is not None:
             other.loads = self.loads.part(self, first, count)

@@ -99,11 +99,12 @@ class HierarchicalPBDStepper(LaunchedStepper):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations
         self.levels = levels(model, options.levels)
-        given = self.model, self.state.x, self.h, "coloured", options.relaxation
-        self.sweep = GaussSeidelSweep(*given)
-        self.model = self.model.with_terms(self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
         self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
+
+    def arranged(self, model):
+        self.sweep = GaussSeidelSweep(model, self.state.x, self.h, "coloured", self.options.relaxation)
+        return model.with_terms(self.sweep.elements)
 
     def _on_level(self, level):
         """Returns the sweep over a level, and the arguments of the launch that interpolates to the vertices that it drops."""

@@ -115,7 +115,10 @@ class PBDStepper(LaunchedStepper):
     def __init__(self, options, model):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations
-        model = self.model
+        self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
+
+    def arranged(self, model):
+        options = self.options
         # With one sweep, both kinds of correction are equal.
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         given = model, self.state.x, self.h, options.sweep, options.relaxation
@@ -123,8 +126,7 @@ class PBDStepper(LaunchedStepper):
             self.sweep = GaussSeidelSweep(*given, spread=spread)
         else:
             self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread)
-        self.model = model.with_terms(self.sweep.elements)
-        self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
+        return model.with_terms(self.sweep.elements)
 
     def _launch_start(self):
         self.launch_prediction()

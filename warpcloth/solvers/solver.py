@@ -24,10 +24,10 @@ class Stepper:
     Attributes:
         state: The :class:`warpcloth.core.state.State`.
         h: Step [s].
-        model: The model, whose terms include damping, in the order of the steps.
-        declared: The model as it was bound, without damping and without rest states of its own for contact.
-        elements: The elements of ``model`` copy by copy, in the order of the scene; sweeps sort those of ``model``. They exist
-            with an integrator.
+        declared: The model as it was bound.
+        model: The model of the steps: with damping, with contact that has rest states of its own, and in the order of sweeps.
+            It is made once, by the constructor.
+        elements: The elements of ``model`` copy by copy, in the order of the scene.
         integrator: The integrator, see :mod:`warpcloth.numerics.integrators`, which computes x̃, and the new state from the
             minimiser; None for solvers without x̃.
         he: Effective step hₑ of the integrator [s], else h.
@@ -49,7 +49,6 @@ class Stepper:
     hard_pairs = False  # whether pairs of self-contact keep the contact distance as a constraint
     even = True
     uniform = False  # whether all steps have the same number of iterations
-    _motion = None  # x and v, if they are views of those of another stepper, see `part_of`
     predicted = correction = unfiltered = None
 
     def __init_subclass__(cls, **options):
@@ -58,39 +57,33 @@ class Stepper:
 
     def __init__(self, options, model, integrator=None):
         fps = model.scene.fps
-        self.options, self.model, self.declared = options, model, model
+        self.options, self.declared = options, model
         self.steps_per_frame = options.per_frame(fps)
         self.h = 1.0 / (fps * self.steps_per_frame)
-        motion = self._motion or (wp.clone(model.positions), wp.clone(model.velocities))
-        self.state = State(*motion, model.copies)
+        self.state = State(*(model.motion or (wp.clone(model.positions), wp.clone(model.velocities))), model.copies)
         self.count = self.state.add("steps of keyframes", model.scalars(wp.int32) if model.timed else None, Count())
-        self._reset = None
-        self.integrator, self.he = None, self.h
-        self.colliders = None
+        self._reset = self._kept = self.colliders = self.pairs = self.integrator = None
+        method = None if integrator is None else INTEGRATORS[integrator]
+        self.he = self.h if method is None else method.share * self.h
         if model.colliders is not None:
-            part = 0.0 if integrator is None else 1.0 / INTEGRATORS[integrator].parts
+            part = 0.0 if method is None else 1.0 / method.parts
             self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
-            self.model = model = model.with_terms(self.colliders.terms)
-        self.pairs, self._kept = None, None
+            model = model.with_terms(self.colliders.terms)
         if model.has_pairs:
-            self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
-            self.model = model = model.with_dynamic(self.pairs.forces.terms)
-        if integrator is not None:
-            self.integrator = INTEGRATORS[integrator](self)
-            self.he = self.integrator.he
-            self.model = model.with_terms(damped_terms(model, self.he))
-            self.elements = self.model.terms
+            self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, method is None, self.colliders)
+            model = model.with_dynamic(self.pairs.forces.terms)
+        if method is not None:
+            model = model.with_terms(damped_terms(model, self.he))
+        self.elements, self.model = model.terms, self.arranged(model)
+        if method is not None:
+            self.integrator = method(self)
             self.predicted = model.vectors()
             if self.colliders is not None or self.pairs is not None:
                 self.unfiltered = model.vectors()
 
-    @classmethod
-    def part_of(cls, motion, options, model):
-        """Returns a stepper whose x and v are ``motion``, views of the arrays of a larger batch."""
-        stepper = cls.__new__(cls)
-        stepper._motion = motion
-        stepper.__init__(options, model)
-        return stepper
+    def arranged(self, model):
+        """Returns the model with its elements in the order of the steps, which sweeps determine; called once."""
+        return model
 
     @property
     def filter(self):

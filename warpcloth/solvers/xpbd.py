@@ -139,13 +139,9 @@ class XPBDStepper(LaunchedStepper):
         super().__init__(options, model, options.integrator)
         self.iterations = options.iterations
         model = self.model
-        given = model, self.state.x, self.he, options.sweep, options.relaxation
-        more = {"scalar": options.form == "scalar", "multipliers": True}
-        self.sweep = (GaussSeidelSweep if options.ordered else JacobiSweep)(*given, **more)
-        self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
-        self._gradient = plan(self.model).gradient(corrected=True) if soft else None
+        self._gradient = plan(model).gradient(corrected=True) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
         self._acceleration = model.scalars()
         self._largest = Mirror(self.state.add("largest acceleration", model.scalars()))
@@ -156,6 +152,13 @@ class XPBDStepper(LaunchedStepper):
             sweeps = [(self._launch_to_and_fro, options.iterations // 2)]
         self.record((self._launch_start, 1), *sweeps, (self._launch_last, 1))
         self.integrator.start()
+
+    def arranged(self, model):
+        options = self.options
+        kind = GaussSeidelSweep if options.ordered else JacobiSweep
+        more = {"scalar": options.form == "scalar", "multipliers": True}
+        self.sweep = kind(model, self.state.x, self.he, options.sweep, options.relaxation, **more)
+        return model.with_terms(self.sweep.elements)
 
     def _launch_start(self):
         self.launch_prediction()
