@@ -10,7 +10,7 @@ import warp as wp
 from ..memory import load
 from ..rotation import epsilon
 from ..vectors import types
-from .obstacles import Layout, copy_of
+from .obstacles import Layout, copy_of, vector_within
 
 FARTHEST = 1e9  # largest cell coordinate; the outermost cells contain everything beyond
 MODULE = "warpcloth.local_motion"
@@ -74,9 +74,9 @@ def _extend(dtype):
 
 @cache
 def find_means(dtype):
-    """Kernel over clusters, and then over the obstacles that move: means of moves p, and their range in each copy."""
+    """Kernel over clusters, and then over obstacles, which stand where p ends before them: means of moves p, and their range."""
     vec3, _ = types(dtype)
-    extend = _extend(dtype)
+    extend, vector_or_zero = _extend(dtype), vector_within(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def find_each_mean(
@@ -89,7 +89,7 @@ def find_means(dtype):
         clusters = motion.mean.shape[0]
         if c >= clusters:
             i = motion.layout.cloth + c - clusters
-            extend(motion.lowest, motion.highest, copy_of(motion.layout, i), p[i])
+            extend(motion.lowest, motion.highest, copy_of(motion.layout, i), vector_or_zero(p, i))
             return
         total = vec3()
         first = motion.first[c]

@@ -248,8 +248,7 @@ class Proximity:
         for k, start in enumerate((np.inf, -np.inf) * 2):
             motion.tables[k].fill_(start)
         motion.some.zero_()
-        moving = len(motion.mean) + len(p) - model.count
-        self._launch(local_motion.find_means, moving, [p], [motion])
+        self._launch(local_motion.find_means, len(motion.mean) + self._vertices - model.count, [p], [motion])
         self._launch(local_motion.note_moves, model.count, [x, p, self.found], [motion])
         self._launch(local_motion.bound_moves, self._vertices, [x], [motion])
         wp.capture_if(motion.some, lambda: self._launch_grid(self._along, x, p, searches, out))
