@@ -142,7 +142,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     is also the order in the stencil.
     """
     vec3, _ = types(dtype)
-    box_at, box_along, stored_box, cell_of = boxes(dtype)
+    box_at, box_along, stored_box, cell_of, _level_of = boxes(dtype)
     relative_box, _all_calm = differences(dtype)
     vector, vector_or_zero = load(vec3), vector_within(dtype)
     number, four = load(wp.int32), load(wp.vec4i)
