@@ -90,6 +90,7 @@ class Proximity:
         self._near = self.searches(kernels.take_near, "near")
         self._launch = model.launcher(
             ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
+            ((proximity_grid.note_large,), model.dtype),
             ((kernels.write_pairs,), model.dtype),
             ((piece_motion.extend_boxes, piece_motion.find_drift, piece_motion.compare_positions), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.add_positions), model.dtype),
@@ -243,10 +244,11 @@ class Proximity:
         for k, start in enumerate((np.inf, -np.inf) * 2):
             motion.tables[k].fill_(start)
         motion.some.zero_()
-        moving = len(motion.mean) + len(p) - model.count
-        self._launch(local_motion.find_means, moving, [p], [motion])
+        self._launch(local_motion.find_means, len(motion.mean) + self._vertices - model.count, [p], [motion])
         self._launch(local_motion.note_moves, model.count, [x, p, self.found], [motion])
         self._launch(local_motion.bound_moves, self._vertices, [x], [motion])
+        given = [self._along, x, self._grid.size, self._triangles]
+        self._launch(proximity_grid.note_large, self._edges, given, [motion])
         wp.capture_if(motion.some, lambda: self._launch_grid(self._along, x, p, searches, out))
 
     def _launch_grid(self, surface, x, p, searches, out):
