@@ -29,7 +29,7 @@ def info(arguments):
         setup = solver_setup(arguments, scene, device, limits=True)
     else:  # in the precision of a run by default
         setup = Chosen(SOLVERS[DEFAULT].precision_on(device, arguments.dtype))
-    model = setup.model or scene.build(device=device, dtype=setup.dtype)
+    model = scene.build(device=device, dtype=setup.dtype)
     facts = {
         "scene": {
             "name": scene.name,

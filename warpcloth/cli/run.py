@@ -11,7 +11,7 @@ from .history_files import record_of, write_history
 from .options import values_of
 from .render import check_drawing, draw_film
 from .setup import EPILOG as OF_STEPS
-from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup, warn_of_seams
+from .setup import hint_of, named_scene, solver_facts, solver_line, solver_setup, warn_of_seams
 from .terminal import Progress, check_writable, frames_folder_of, location, own_output, say
 
 EPILOG = f"""\
@@ -41,7 +41,7 @@ def run(arguments):
     progress = Progress(frames, hint_of(arguments, setup, scene))
     with progress.of(arguments.output):
         animation = simulate(
-            scene if setup.model is None else Built(scene, setup.model),
+            scene,
             setup.checked,
             device=device,
             frames=frames,
