@@ -7,13 +7,12 @@ import argparse
 import contextlib
 import os
 import sys
-import warnings
 from dataclasses import fields
 from functools import partial
 
 from ..base.extensions import load_extension, load_installed
 from ..base.outputs import STAGE_ENDINGS
-from ..base.texts import WORDS, json_text, kinds_of_parameter, parameters_of, words_of
+from ..base.texts import WORDS, json_text, kinds_of_parameter, parameters_of, words_in, words_of
 from ..run.listing import folders, list_scenes, list_solvers
 from .terminal import aligned
 
@@ -44,16 +43,19 @@ def _of_solver(name):
 
     name = name or DEFAULT
     record = SOLVERS[name]
-    found = _listed(f"-s of {name}", record.__doc__, record, parameters_of(record))
+    rules = {field.name: str(field.metadata["range"]) for field in fields(record) if "range" in field.metadata}
     error = " or error (tolerance [m])" if "error" in record.step_options else ""
-    return found | {"note": f"give dt (the step [s]) or substeps (steps per frame){error}, or none, for which a step is chosen"}
+    note = f"give dt (the step [s]) or substeps (steps per frame){error}, or none, for which a step is chosen"
+    return _listed(f"-s of {name}", record.__doc__, parameters_of(record), rules) | {"note": note}
 
 
 def _of_scene(name):
     from ..run.scene_files import find_source
+    from ..scene.measured_fabrics import fabrics
 
     source = find_source(name)
-    return _listed(f"-p of {source.path}", source.function.__doc__, source.function, source.parameters)
+    rules = {"fabric": f"one of {', '.join(fabrics)}"}
+    return _listed(f"-p of {source.path}", source.function.__doc__, source.parameters, rules)
 
 
 def _scene_name(arguments):
@@ -63,13 +65,14 @@ def _scene_name(arguments):
     return name
 
 
-def _listed(title, doc, call, parameters):
+def _listed(title, doc, parameters, rules):
+    """Returns the options of a solver or a scene as JSON values; ``rules`` are the allowed values, by name, of some."""
     rows = [
         {
             "name": name,
             "default": None if parameter.default is parameter.empty else parameter.default,
             "needed": parameter.default is parameter.empty,
-            "allowed": _allowed(call, name, parameter),
+            "allowed": _allowed(parameter, rules.get(name)),
         }
         for name, parameter in parameters.items()
     ]
@@ -94,23 +97,12 @@ def _values(row):
     return row["allowed"].removesuffix(", or none" if row["default"] is None and not row["needed"] else "")
 
 
-class _Refused:
-    """A value that no option takes, whose error lists the allowed values."""
-
-
-def _allowed(call, name, parameter):
-    """Returns the allowed values: from the error for a value that is refused, or else from the type."""
-    kinds = kinds_of_parameter(parameter)
-    refused = "?" if str in kinds else _Refused()
-    rule = ""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            call(**{name: refused})
-    except Exception as error:
-        said, _, rule = str(error).partition("; it must be ")
-        rule = rule if said.startswith(f"{name} is ") else ""
-    if not rule:
+def _allowed(parameter, rule):
+    """Returns the allowed values: the rule of the option if it has one, else the words or the types of its annotation."""
+    kinds, words = kinds_of_parameter(parameter), words_in(parameter.annotation)
+    if rule is None and words:
+        rule = f"one of {', '.join(map(str, words))}"
+    if rule is None:
         rule = " or ".join(words for kind, words in WORDS.items() if kind in kinds) or "nothing written as text"
     return rule.replace("'", "") + (", or none" if type(None) in kinds else "")
 
