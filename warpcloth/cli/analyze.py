@@ -8,9 +8,10 @@ from ..base.checks import choice
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import convert, json_text
-from .options import values_of
+from .options import DOUBLE, add_shared, values_of
 from .terminal import Progress, aligned, check_writable, frames_folder_of, location
 
+TEXT = "Measure how an animated cloth deforms."
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays in .npz or .npy.
 --measure help lists the measures. --colour takes a scalar measure, such as area_ratio, or a component of a vector, such as
@@ -25,7 +26,7 @@ _SENTENCES = 8
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add(
         "input",
@@ -69,6 +70,7 @@ def add_arguments(parser):
     add("--elevation", type=float, metavar="DEGREES", help="elevation of the camera of --still (default: 24)")
     add("--both-sides", action="store_true", help="also show the opposite side of the cloth in each still")
     add("--still-frames", type=float, nargs="+", metavar="FRAME", help="frames to show with --still (default: the last)")
+    add_shared(parser, "device", "json", "dtype", "single_file", dtype=DOUBLE)
 
 
 def add_measuring(parser):

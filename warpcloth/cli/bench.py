@@ -6,10 +6,11 @@ from ..base.checks import whole
 from ..base.outputs import check_apart, check_replaceable
 from ..base.quiet import find_device
 from ..base.texts import assignments, json_text, options
-from .options import CLOTH, DEFAULT, add_cloth, add_scene, add_solver, add_values, values_of
+from .options import CLOTH, DEFAULT, add_cloth, add_scene, add_shared, add_solver, add_values, values_of
 from .setup import named_scene, solver_setup
 from .terminal import Bar, Interrupted, aligned, check_writable, say
 
+TEXT = "Measure the time and memory of frames, or compare two results."
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
 scene net. The scene resting then shows what contact costs, for colliders of each shape, touched and far away, and for meshes of
@@ -48,7 +49,7 @@ _OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": 
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add_scene(parser, nargs="?")
     add_cloth(parser)
@@ -72,6 +73,7 @@ def add_arguments(parser):
     add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="number of cloths in a batch (default: 1)")
     add("--csv", metavar="FILE", help="write the measurements as a table")
     add("--compare", nargs=2, metavar=("OLD", "NEW"), help="compare two files saved from --json, and print the ratios")
+    add_shared(parser, "device", "json", "threads", "dtype")
 
 
 def bench(arguments):

@@ -9,9 +9,9 @@ from ..base.texts import assignments, fraction, json_text
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
-from .options import HelpFormatter, add_cloth, add_import, add_scene, add_with, solvers, values_of
+from .options import HelpFormatter, add_cloth, add_import, add_scene, add_shared, add_with, solvers, values_of
 from .setup import named_scene, scene_ref
-from .terminal import DTYPES, add_dask, check_outputs, measuring
+from .terminal import add_dask, check_outputs, measuring
 
 TEXT = "Draw charts of accuracy against time, of stability, and of failures."
 NOT_USABLE = ", not usable"
@@ -80,13 +80,12 @@ def add(charts, name, command, text, epilog):
     form = {"formatter_class": HelpFormatter, "allow_abbrev": False}
     sub = charts.add_parser(name, help=text, description=text, epilog=epilog, **form)
     sub.set_defaults(command=command)
-    sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+    add_shared(sub, "device")
     sub.add_argument("--workers", type=int, metavar="N", help="number of processes (default: one per core, or one on a GPU)")
     add_dask(sub)
     sub.add_argument("-o", "--output", metavar="FILE", help=f"draw the chart ({', '.join(PICTURES)})")
     sub.add_argument("--csv", metavar="FILE", help="write the measurements as a table")
-    sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_shared(sub, "json", "debug")
     add_import(sub)
     return sub
 
@@ -108,7 +107,7 @@ def _add_work_precision(charts):
         "before the step that is measured (default: a third)",
     )
     text = "precision (default: by device and solver for the diagram time, else float64)"
-    sub.add_argument("--dtype", choices=DTYPES, help=text)
+    add_shared(sub, "dtype", dtype={"help": text})
     sub.add_argument(
         "--limit",
         type=float,
@@ -136,7 +135,7 @@ def _add_cheapest(charts):
     sub.add_argument(
         "--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)"
     )
-    sub.add_argument("--dtype", choices=DTYPES, help="precision (default: by device and solver)")
+    add_shared(sub, "dtype")
     sub.add_argument(
         "--limit",
         type=float,

@@ -9,10 +9,11 @@ import numpy as np
 from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart, write_table
 from ..base.texts import assignments, json_text
-from .options import add_values, values_of
+from .options import add_shared, add_values, values_of
 from .render import SIZE, check_drawing, draw_film
 from .terminal import Progress, aligned, check_writable, frames_folder_of, location
 
+TEXT = "Find what intersects in an animation, exactly."
 EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. Of a result of warpcloth the
 cloth is checked, of other stages all meshes whose points move, or else all meshes, but no colliders; --prim names others. Pairs
@@ -35,7 +36,7 @@ _SENTENCES = 8
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation, mesh or scene to check")
     add_values(parser, "-p", "parameter", "parameters of a scene")
@@ -52,6 +53,7 @@ def add_arguments(parser):
     )
     add("--still", metavar="FILE", help="draw the frame with the most intersections (.png)")
     add("--up-axis", choices=("Y", "Z"), help="up axis of -o and --still, if the input does not say (default: Y)")
+    add_shared(parser, "json", "single_file")
 
 
 def check(arguments):

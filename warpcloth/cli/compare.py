@@ -10,9 +10,10 @@ from ..base.quiet import find_device
 from ..base.texts import json_text
 from ..picture.figures import PICTURES, check_path
 from .compare_surfaces import compare_by_surface, left_out, metres, over_frames, shown_at, shown_frame, worst_of, write_csv
-from .options import values_of
+from .options import add_shared, values_of
 from .terminal import Progress, check_writable
 
+TEXT = "Measure the distance between two animations."
 EPILOG = """\
 A and B are USD stages, folders of .obj, .ply or .off files, patterns such as "frames/*.obj", .npz or .npy files. Frames are
 matched by their time; those without a match are listed. Distances between the surfaces are always measured. If A and B have the
@@ -30,7 +31,7 @@ which leaves out what faces a hole.
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     for name, of in (("a", "A"), ("b", "B")):
         parser.add_argument(name, metavar=of, help="the first animation" if of == "A" else "the second animation")
     for name, of in (("a", "A"), ("b", "B")):
@@ -58,6 +59,7 @@ def add_arguments(parser):
     parser.add_argument("--frames", type=int, metavar="N", help="compare the first frame and N frames after it (default: all)")
     parser.add_argument("--csv", metavar="FILE", help="write a table with one row per frame")
     parser.add_argument("--plot", metavar="FILE", help=f"plot the distances over time ({', '.join(PICTURES)})")
+    add_shared(parser, "device", "json")
 
 
 def compare(arguments):

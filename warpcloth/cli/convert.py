@@ -1,8 +1,10 @@
 """The command ``convert``: writes an animation in another format."""
 
 from ..base.texts import json_text
+from .options import add_shared
 from .terminal import Bar, check_writable
 
+TEXT = "Write an animation in another format."
 EPILOG = """\
 FILE is a USD stage, a folder or pattern of .obj, .ply or .off files, or arrays in .npz, .npy, .pc2 or .mdd. It must have
 triangles, the same in all frames. The ending of OUTPUT sets the format:
@@ -19,13 +21,13 @@ Vertices keep their order, and coordinates their axes; lengths are metres.
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     parser.add_argument("file", metavar="FILE", help="the animation to convert")
     parser.add_argument("output", metavar="OUTPUT", help="the file to write; its ending sets the format")
     parser.add_argument("--prim", help="path or name of the prim, or name of the geometry in each file, if there are several")
     parser.add_argument("--fps", type=float, help="frames per second (default: those of FILE, if it has them)")
     parser.add_argument("--rest", metavar="FILE", help="mesh with the triangles of an .npy, .pc2 or .mdd file")
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    add_shared(parser, "json")
 
 
 def convert(arguments):

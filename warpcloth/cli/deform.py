@@ -13,12 +13,13 @@ from ..base.limits import refuse_memory
 from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
 from ..base.texts import convert, json_text
-from .options import add_values, values_of
+from .options import DOUBLE, add_shared, add_stage, add_values, values_of
 from .setup import named_scene, warn_of_seams
 from .terminal import Progress, check_writable, frames_folder_of, location
 
 _FRAMES, _FPS = 24, 24.0
 
+TEXT = "Deform a mesh by handles, as rigidly as possible (ARAP)."
 EPILOG = """\
 --fix holds vertices where they are. --move moves vertices by the --rotate and --translate that follow it, before the next
 --move. --rotate turns them by DEGREES about AXIS, which passes through (CX, CY, CZ), or through their centroid if that is not
@@ -47,7 +48,7 @@ class _Move:
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     text = "a mesh file, a USD stage, or a scene with moving pins (a name or a .py file)"
     parser.add_argument("mesh", metavar="MESH", help=text)
     hold = "vertices to hold in place; may be repeated"
@@ -88,6 +89,9 @@ def add_arguments(parser):
         default=1e-6,
         help="stop when an iteration lowers the energy by less than this fraction (default: 1e-6)",
     )
+    add_shared(parser, "device", "json", "dtype", dtype=DOUBLE)
+    add_stage(parser)
+    add_shared(parser, "single_file")
 
 
 class _AddMove(argparse.Action):

@@ -117,6 +117,34 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         super().add_usage(usage, [action for action in actions if action not in first], groups, prefix)
 
 
+# The options that several commands have, by the names of their values, as arguments of `add_argument`. The words of dtype are
+# those of :data:`warpcloth.model.precision.DTYPES`, which loads Warp.
+_SHARED = {
+    "debug": {"action": "store_true", "help": "show the traceback of an error"},
+    "device": {"default": "cpu", "help": "cpu (default), cuda:0, …"},
+    "json": {"action": "store_true", "help": "print the result as one JSON object"},
+    "threads": {"type": int, "default": 1, "metavar": "N", "help": "number of CPU threads (default: 1)"},
+    "dtype": {"choices": ("float32", "float64"), "help": "precision (default: by device and solver)"},
+    "single_file": {"action": "store_true", "help": "write one file instead of a file and a folder of frames"},
+}
+
+
+def add_shared(parser, *names, **changes):
+    """Adds options that several commands have; ``changes`` are changed arguments of `add_argument` by name of the option."""
+    for name in names:
+        parser.add_argument(f"--{name.replace('_', '-')}", **_SHARED[name] | changes.get(name, {}))
+
+
+# The changes to ``dtype`` of commands that compute in float64 by default.
+DOUBLE = {"default": "float64", "help": "precision (default: float64)"}
+
+
+def add_stage(parser):
+    """Adds the option that names a stage to write, which the command needs."""
+    text = "the .usd, .usda, .usdc or .usdz file to write"
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
+
+
 def values_of(arguments, *names):
     """Returns the options of these names as keyword arguments."""
     return {name: getattr(arguments, name) for name in names}

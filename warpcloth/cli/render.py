@@ -9,10 +9,11 @@ from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
 from .analyze import add_measuring, measuring_of
-from .options import values_of
+from .options import add_shared, values_of
 from .terminal import Bar, check_writable, own_output
 
 SIZE = (1280, 720)
+TEXT = "Draw a picture or a film of an animation."
 EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. All meshes and linear curves of
 a stage are drawn. Several FILEs are drawn side by side. The extension of -o selects the format: .png for one frame, .gif, .webp
@@ -26,7 +27,7 @@ or .mp4 for a film in real time (.mp4 needs PyAV: pip install -e '.[video]' in t
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to draw")
     add("beside", metavar="FILE", nargs="*", help="others to draw beside it")
@@ -43,6 +44,7 @@ def add_arguments(parser):
     add("--camera", metavar="PRIM", help="look from this Camera of the stage, a path or a name (default: the whole motion)")
     add("--time", action="store_true", help="write the time into a corner")
     add_measuring(parser)
+    add_shared(parser, "device", "json")
 
 
 def add_camera(parser):

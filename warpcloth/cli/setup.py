@@ -6,7 +6,7 @@ import warnings
 from dataclasses import asdict, dataclass, replace
 
 from ..base.texts import assignments, options
-from .options import DEFAULT
+from .options import DEFAULT, add_cloth, add_scene, add_solver, add_values
 
 # With more substeps per frame than this, print a hint at the implicit solver.
 _MANY_SUBSTEPS = 1000
@@ -17,6 +17,14 @@ explicit, take the fewest substeps that respect two limits. The first, with a ma
 rest shape. The second is for large motion. It is a strict bound for springs and quadratic bending, but only an estimate for
 dihedral bending and membranes, because it uses their stiffness at rest.
 """
+
+
+def add_scene_and_solver(parser, text):
+    """Adds the scene and the solver of a command; ``text`` says what the solver is for."""
+    add_scene(parser)
+    add_solver(parser, text)
+    add_values(parser, "-s", "option", "options of the solver")
+    add_cloth(parser)
 
 
 def named_scene(arguments):

@@ -6,9 +6,9 @@ from ..base.checks import did_you_mean, number, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, json_text, options
 from ..lab.axes import ACCURACY, AXES, FIXED, SEED
-from .options import add_cloth, add_scene, values_of
+from .options import DOUBLE, add_cloth, add_scene, add_shared, values_of
 from .setup import scene_ref
-from .terminal import DTYPES, check_outputs, measuring
+from .terminal import check_outputs, measuring
 
 _COUNT = 9
 
@@ -84,7 +84,7 @@ def add_arguments(parser):
         help=f"runs with a larger error are inaccurate (default: {ACCURACY:g}); 0 measures no errors",
     )
     parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
-    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default: float64)")
+    add_shared(parser, "dtype", dtype=DOUBLE)
 
 
 def chart(arguments):

@@ -14,8 +14,6 @@ from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart, check_replaceable
 from ..picture.figures import PICTURES, check_path
 
-# The same as :data:`warpcloth.model.precision.DTYPES`, which loads Warp.
-DTYPES = ("float32", "float64")
 _STREAMS = {1: "stdout", 2: "stderr"}
 # Unicode categories to escape: control, format (which can reverse text), surrogates, line ends.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")

@@ -8,10 +8,11 @@ from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
 from .analyze import add_measuring, measuring_of
-from .options import values_of
+from .options import add_shared, values_of
 from .render import add_camera, frames
 from .terminal import Bar, check_writable, own_output
 
+TEXT = "Write a page that shows an animation in a browser."
 EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. The page is one file of HTML
 that loads nothing else: open it in a browser. It plays in real time and turns by the mouse. Positions are stored with 16 bits,
@@ -24,7 +25,7 @@ values with 8: the page is for looking, not for measuring. Colours need matplotl
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to show")
     text = "the .html file to write (default: named after FILE; no file is then replaced)"
@@ -41,6 +42,7 @@ def add_arguments(parser):
     add("--plain", action="store_true", help="measure nothing, so that the page is smaller")
     add_camera(parser)
     add_measuring(parser)
+    add_shared(parser, "device", "json")
 
 
 def view(arguments):
