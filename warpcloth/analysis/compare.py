@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import choice, number, shown, whole
 from ..base.types import FilePath, Progress, UpAxis
 from ..mesh.distances import surface_distances
-from ..mesh.mesh import UP_AXES, Mesh, areas_of, same_topology
+from ..mesh.mesh import UP_AXES, Mesh, Surface, areas_of, same_topology
 from ..mesh.sequences import HasPoints, Sequence, as_sequence, open_sequence
 from .measures import MEASURES
 from .samples import Exclusion
@@ -20,16 +20,13 @@ Compared = FilePath | Sequence | tuple[Mesh, FilePath | ArrayLike | HasPoints]
 _SAME_TIME = 1e-6  # tolerance of times, relative to the shortest frame
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """The comparison of two sequences, a and b. On axes of length 2, a comes first.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ComparedFrames:
+    """The frames of two animations, a and b, that were compared. On axes of length 2, a comes first.
 
-    A frame is a pair of frames at one time. If it could not be compared, its numbers are NaN, and ``excluded`` says why. If the
-    topologies differ, vertices and triangles cannot be compared: these arrays are None, and only distances of surfaces are
-    left.
+    A frame is a pair of frames at one time. If it could not be compared, its numbers are NaN, and ``excluded`` says why.
 
     Attributes:
-        same_topology: Whether both have the same number of vertices and the same triangles, in the same order.
         up_axes: The up axes of a and b, "Y" or "Z", or None if the input does not say. If they differ, b was turned to the axis
             of a.
         times: Times of the frames (F,) [s].
@@ -37,25 +34,13 @@ class Comparison:
         labels: Their numbers in the files (F, 2).
         unmatched: Indices of the frames of a, and of b, without a partner at their time: two arrays.
         excluded: What could not be compared, in a and in b: two lists of `analysis.Exclusion`, with frame numbers of the files.
-            Triangles without area in one of the rest shapes do not count for stretches.
         sizes: Diagonal of the bounding box of a (F,) [m].
-        rms: Root mean square over vertices of ‖aᵢ − bᵢ‖ (F,) [m], or None.
-        largest: The largest of these distances (F,) [m], or None.
-        largest_vertex: The vertex with the largest distance (F,), −1 in excluded frames, or None.
-        surface_mean: Mean distance of a's vertices to the surface of b, and of b's to that of a (F, 2) [m]. Vertices are
-            weighted by a third of the area of their triangles in the frame; vertices without triangles do not count.
-        surface_rms: Root mean square of the same distances (F, 2) [m].
-        surface_largest: The largest of the same distances (F, 2) [m].
-        hausdorff: The larger of the two (F,) [m], the Hausdorff distance of the vertices. That of the surfaces is no less,
-            apart from the rounding of `surface_distances`, but may be more, because they may be further apart between vertices.
-        hausdorff_bound: Upper bound of the Hausdorff distance of the surfaces (F,) [m]: hausdorff + l/√3 with the longest side
-            l, as a point of a triangle is within l/√3 of a vertex; or ``largest`` if that is less.
-        stretch_rms: Root mean square over triangles of the differences of the principal stretches λ₁ ≥ λ₂, the singular values
-            of the deformation gradient from each one's rest shape (F, 2: λ₁, λ₂) [1], or None.
-        stretch_largest: The largest of these differences (F, 2: λ₁, λ₂) [1], or None.
+        hausdorff: The largest distance of a point of one surface, as far as they are sampled, to the other (F,) [m]. The
+            Hausdorff distance of the surfaces is no less, apart from rounding.
+        hausdorff_bound: Upper bound of that distance (F,) [m]: hausdorff + l/√3 with the longest side l, as a point of a
+            triangle is within l/√3 of a vertex.
     """
 
-    same_topology: bool
     up_axes: tuple[UpAxis | None, UpAxis | None]
     times: np.ndarray
     frames: np.ndarray
@@ -63,11 +48,36 @@ class Comparison:
     unmatched: tuple[np.ndarray, ...]
     excluded: tuple[list[Exclusion], ...]
     sizes: np.ndarray
+    hausdorff: np.ndarray
+    hausdorff_bound: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison(ComparedFrames):
+    """The comparison of two sequences, a and b.
+
+    If the topologies differ, vertices and triangles cannot be compared: these arrays are None, and only distances of surfaces
+    are left. Triangles without area in one of the rest shapes do not count for stretches.
+
+    Attributes:
+        up_axes, times, frames, labels, unmatched, excluded, sizes, hausdorff, hausdorff_bound: See :class:`ComparedFrames`.
+        same_topology: Whether both have the same number of vertices and the same triangles, in the same order.
+        rms: Root mean square over vertices of ‖aᵢ − bᵢ‖ (F,) [m], or None.
+        largest: The largest of these distances (F,) [m], or None. It bounds ``hausdorff_bound``.
+        largest_vertex: The vertex with the largest distance (F,), −1 in excluded frames, or None.
+        surface_mean: Mean distance of a's vertices to the surface of b, and of b's to that of a (F, 2) [m]. Vertices are
+            weighted by a third of the area of their triangles in the frame; vertices without triangles do not count.
+        surface_rms: Root mean square of the same distances (F, 2) [m].
+        surface_largest: The largest of the same distances (F, 2) [m]; ``hausdorff`` is the larger of the two.
+        stretch_rms: Root mean square over triangles of the differences of the principal stretches λ₁ ≥ λ₂, the singular values
+            of the deformation gradient from each one's rest shape (F, 2: λ₁, λ₂) [1], or None.
+        stretch_largest: The largest of these differences (F, 2: λ₁, λ₂) [1], or None.
+    """
+
+    same_topology: bool
     surface_mean: np.ndarray
     surface_rms: np.ndarray
     surface_largest: np.ndarray
-    hausdorff: np.ndarray
-    hausdorff_bound: np.ndarray
     rms: np.ndarray | None = None
     largest: np.ndarray | None = None
     largest_vertex: np.ndarray | None = None
@@ -138,22 +148,10 @@ def compare(
         whole("frames", frames, least=0)
     one = opened("a", a, prim_a, fps if fps_a is None else fps_a)
     other = opened("b", b, prim_b, fps if fps_b is None else fps_b)
-    up_axes = up_axis_of("up_axis_a", one, up_axis_a or up_axis), up_axis_of("up_axis_b", other, up_axis_b or up_axis)
-    other = to_up_axis(other, *up_axes)
-    pairs, unmatched = matching(one, other, frames)
+    one, other, up_axes = in_one_axis(one, other, up_axis_a or up_axis, up_axis_b or up_axis)
     pair = _Pair(one, other, device)
-    rows = []
-    for frame, (i, j) in enumerate(pairs):
-        rows.append(pair.measure(i, j))
-        if progress is not None:
-            progress(frame, len(pairs) - 1)
-    if not any(rows):
-        why = next(first for excluded in pair.excluded for first in excluded if first.kind == "vertex")
-        raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
-    labels = np.column_stack([one.labels[pairs[:, 0]], other.labels[pairs[:, 1]]])
-    return Comparison(
-        pair.same, up_axes, np.asarray(one.times)[pairs[:, 0]], pairs, labels, unmatched, tuple(pair.excluded), **_columns(rows)
-    )
+    found = measured_frames(one, other, pair.measure, pair.excluded, frames, progress)
+    return Comparison(same_topology=pair.same, up_axes=up_axes, **found)
 
 
 def opened(name: str, source: Any, prim: str | None = None, fps: float | None = None) -> Sequence:
@@ -175,18 +173,30 @@ def opened(name: str, source: Any, prim: str | None = None, fps: float | None = 
     return replace(sequence, mesh=mesh, declared=True, up_axis=sequence.up_axis or mesh.up_axis)
 
 
-def up_axis_of(name, sequence, given):
-    """Returns the given up axis, or by default that of the sequence."""
-    if given is not None:
-        choice(name, given, UP_AXES)
-    return given or sequence.up_axis
+def in_one_axis(a, b, up_axis_a, up_axis_b):
+    """Returns a, b with its frames rotated to the up axis of a, and the two axes: those that are given, or their own."""
+    for name, given in (("up_axis_a", up_axis_a), ("up_axis_b", up_axis_b)):
+        if given is not None:
+            choice(name, given, UP_AXES)
+    axes = up_axis_a or a.up_axis, up_axis_b or b.up_axis
+    return a, to_up_axis(b, *axes), axes
 
 
-def to_up_axis(b: Sequence, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Sequence:
-    """Returns b with its frames rotated to the up axis of a, without rounding; b itself if the axes agree or one is unknown."""
+def to_up_axis(b: Any, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Any:
+    """Returns b, a `Sequence` or a `Capture`, with its frames rotated to the up axis of a without rounding.
+
+    If the axes agree or one is unknown, b itself.
+    """
     if axis_a is None or axis_b is None or axis_a == axis_b:
         return b
-    return replace(b, read=lambda frame: turned_up(b[frame], axis_a))
+
+    def read(frame):
+        found = b[frame]
+        if isinstance(found, Surface):
+            return Surface(turned_up(found.points, axis_a), found.triangles)
+        return turned_up(found, axis_a)
+
+    return replace(b, read=read)
 
 
 def turned_up(points: np.ndarray, axis: UpAxis) -> np.ndarray:
@@ -194,19 +204,23 @@ def turned_up(points: np.ndarray, axis: UpAxis) -> np.ndarray:
     return points[:, [0, 2, 1]] * ([1.0, 1.0, -1.0] if axis == "Y" else [1.0, -1.0, 1.0])
 
 
-def matching(a, b, frames=None):
-    """Returns the indices of frames of a and b at the same time, and those without a partner.
+def measured_frames(a, b, measure, excluded, frames, progress):
+    """Measures the frames of a and b at the same time.
 
     Args:
         a: A `Sequence` or a `Capture`.
         b: A `Sequence` or a `Capture`.
-        frames: Number of frames to keep after the first; None keeps all.
+        measure: Function of the indices of a frame of a and of b; returns its numbers by name, or {} after it has appended the
+            reason to ``excluded``.
+        excluded: What could not be compared, in a and in b: two lists of `Exclusion`.
+        frames: Number of frames to compare after the first; None for all.
+        progress: Function called with (frame, frames), or None.
 
     Returns:
-        tuple: Pairs (F, 2), F at least 1, and two arrays of the indices of a and of b that have no partner.
+        dict: Fields of `ComparedFrames` but ``up_axes``, and arrays of the other numbers, by name.
 
     Raises:
-        ValueError: One of them has no times, or no two frames have the same time.
+        ValueError: One of them has no times, no two frames have the same time, or no pair of frames can be compared.
     """
     for name, each in (("a", a), ("b", b)):
         if each.times is None:
@@ -214,7 +228,20 @@ def matching(a, b, frames=None):
             raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
     pairs = _at_one_time(a, b)
     unmatched = tuple(np.setdiff1d(np.arange(len(s)), partners) for s, partners in zip((a, b), pairs.T, strict=True))
-    return pairs if frames is None else pairs[: frames + 1], unmatched
+    pairs = pairs if frames is None else pairs[: frames + 1]
+    labels = np.column_stack([a.labels[pairs[:, 0]], b.labels[pairs[:, 1]]])
+    rows = []
+    for frame, (i, j) in enumerate(pairs):
+        rows.append(measure(i, j))
+        if progress is not None:
+            progress(frame, len(pairs) - 1)
+    if not any(rows):
+        reasons = [one for k in (0, 1) for one in excluded[k] if one.kind != "triangle" and one.frame in labels[:, k]]
+        why = next((one for one in reasons if one.kind == "frame"), reasons[0])
+        raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
+    times = np.asarray(a.times)[pairs[:, 0]]
+    about = {"times": times, "frames": pairs, "labels": labels, "unmatched": unmatched, "excluded": tuple(excluded)}
+    return about | _columns(rows)
 
 
 def _at_one_time(a, b):

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,9 +13,9 @@ from ..base.checks import number, shown, whole
 from ..base.types import FilePath, Progress, UpAxis
 from ..mesh.captures import Capture, as_capture, open_capture, solid_triangles
 from ..mesh.distances import Boundary, nearest_on_surface, surface_samples
-from ..mesh.mesh import Mesh, Surface, areas_of
+from ..mesh.mesh import Mesh, areas_of
 from ..mesh.sequences import HasPoints, Sequence, as_sequence
-from .compare import longest_side, matching, turned_up, up_axis_of, whole_frame
+from .compare import ComparedFrames, in_one_axis, longest_side, measured_frames, whole_frame
 from .samples import Exclusion
 
 Captured = FilePath | Capture | Sequence | tuple[Mesh, ArrayLike | HasPoints] | Iterable[Mesh]
@@ -41,45 +40,26 @@ class SurfaceDistances:
     largest: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceComparison:
-    """The comparison of the surfaces of two captures, a and b. On axes of length 2, a comes first.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SurfaceComparison(ComparedFrames):
+    """The comparison of the surfaces of two captures, a and b.
 
-    A frame is a pair of frames at one time. If it could not be compared, its numbers are NaN, and ``excluded`` says why.
+    Triangles with a corner that is not finite count as holes.
 
     Attributes:
-        up_axes: The up axes of a and b, "Y" or "Z", or None if the input does not say. If they differ, b was turned to the axis
-            of a.
-        times: Times of the frames (F,) [s].
-        frames: Their indices in a and in b (F, 2).
-        labels: Their numbers in the files (F, 2).
-        unmatched: Indices of the frames of a, and of b, without a partner at their time: two arrays.
-        excluded: What could not be compared, in a and in b: two lists of `analysis.Exclusion`. Triangles with a corner that is
-            not finite count as holes.
-        sizes: Diagonal of the bounding box of a (F,) [m].
+        up_axes, times, frames, labels, unmatched, excluded, sizes, hausdorff, hausdorff_bound: see
+            :class:`warpcloth.analysis.compare.ComparedFrames`.
         vertices: Number of vertices of a and of b (F, 2).
         all: Distances of all points. If b has holes, points of a that face them are as far as their rims.
         inner: Distances of those points only whose nearest point is not on the boundary of the other surface. So what faces a
             hole, or lies beyond the outline, does not count.
         inner_area: Share of the area of each that these stand for (F, 2) [1].
-        hausdorff: The larger of the two largest distances (F,) [m]. That of the surfaces is no less, apart from rounding.
-        hausdorff_bound: Upper bound of the Hausdorff distance of the surfaces (F,) [m]: hausdorff + l/√3 with the longest side
-            l, as a point of a triangle is within l/√3 of a vertex.
     """
 
-    up_axes: tuple[UpAxis | None, UpAxis | None]
-    times: np.ndarray
-    frames: np.ndarray
-    labels: np.ndarray
-    unmatched: tuple[np.ndarray, ...]
-    excluded: tuple[list[Exclusion], ...]
-    sizes: np.ndarray
     vertices: np.ndarray
     all: SurfaceDistances
     inner: SurfaceDistances
     inner_area: np.ndarray
-    hausdorff: np.ndarray
-    hausdorff_bound: np.ndarray
 
 
 def compare_surfaces(
@@ -143,26 +123,15 @@ def compare_surfaces(
         whole("frames", frames, least=0)
     one = opened_capture("a", a, prim_a, fps if fps_a is None else fps_a, scale_a)
     other = opened_capture("b", b, prim_b, fps if fps_b is None else fps_b, scale_b)
-    up_axes = up_axis_of("up_axis_a", one, up_axis_a or up_axis), up_axis_of("up_axis_b", other, up_axis_b or up_axis)
-    other = capture_to_up_axis(other, *up_axes)
-    pairs, unmatched = matching(one, other, frames)
+    one, other, up_axes = in_one_axis(one, other, up_axis_a or up_axis, up_axis_b or up_axis)
     excluded = tuple([whole_frame(label, "is missing") for label in each.missing] for each in (one, other))
-    rows = []
-    for frame, (i, j) in enumerate(pairs):
-        rows.append(_measured(one[i], other[j], (one.labels[i], other.labels[j]), excluded, samples, device))
-        if progress is not None:
-            progress(frame, len(pairs) - 1)
-    first = next(filter(None, rows), None)
-    if first is None:
-        why = next(last for each in excluded for last in reversed(each))
-        raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
-    columns: dict[str, Any] = {
-        name: np.array([row.get(name, np.full(np.shape(value), np.nan)) for row in rows]) for name, value in first.items()
-    }
-    both: dict[str, Any] = {kind: SurfaceDistances(*np.moveaxis(columns.pop(kind), 2, 0)) for kind in ("all", "inner")}
-    labels = np.column_stack([one.labels[pairs[:, 0]], other.labels[pairs[:, 1]]])
-    times = np.asarray(one.times)[pairs[:, 0]]
-    return SurfaceComparison(up_axes, times, pairs, labels, unmatched, excluded, **columns, **both)
+
+    def measure(i, j):
+        return _measured(one[i], other[j], (one.labels[i], other.labels[j]), excluded, samples, device)
+
+    found = measured_frames(one, other, measure, excluded, frames, progress)
+    both = {kind: SurfaceDistances(*np.moveaxis(found.pop(kind), 2, 0)) for kind in ("all", "inner")}
+    return SurfaceComparison(up_axes=up_axes, **found, **both)
 
 
 def opened_capture(
@@ -183,18 +152,6 @@ def opened_capture(
     if not isinstance(source, (list, tuple)):
         raise ValueError(f"{name} is {shown(source)}; it must be a path, a Capture, a Sequence, (mesh, frames) or meshes")
     return as_capture(source, dt=dt)
-
-
-def capture_to_up_axis(b: Capture, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Capture:
-    """Returns b with its frames rotated to the up axis of a; b itself if the axes agree or one is unknown."""
-    if axis_a is None or axis_b is None or axis_a == axis_b:
-        return b
-
-    def read(frame):
-        surface = b[frame]
-        return Surface(turned_up(surface.points, axis_a), surface.triangles)
-
-    return replace(b, read=read)
 
 
 def _measured(a, b, labels, excluded, samples, device):

@@ -43,10 +43,10 @@ def _of_solver(name):
 
     name = name or DEFAULT
     record = SOLVERS[name]
-    rules = {field.name: str(field.metadata["range"]) for field in fields(record) if "range" in field.metadata}
+    known = {field.name: str(field.metadata["range"]) for field in fields(record) if "range" in field.metadata}
     error = " or error (tolerance [m])" if "error" in record.step_options else ""
     note = f"give dt (the step [s]) or substeps (steps per frame){error}, or none, for which a step is chosen"
-    return _listed(f"-s of {name}", record.__doc__, parameters_of(record), rules) | {"note": note}
+    return _listed(f"-s of {name}", record.__doc__, parameters_of(record), known) | {"note": note}
 
 
 def _of_scene(name):
@@ -54,8 +54,8 @@ def _of_scene(name):
     from ..scene.measured_fabrics import fabrics
 
     source = find_source(name)
-    rules = {"fabric": f"one of {', '.join(fabrics)}"}
-    return _listed(f"-p of {source.path}", source.function.__doc__, source.parameters, rules)
+    known = {"fabric": f"one of {', '.join(fabrics)}"}
+    return _listed(f"-p of {source.path}", source.function.__doc__, source.parameters, known)
 
 
 def _scene_name(arguments):
@@ -65,14 +65,14 @@ def _scene_name(arguments):
     return name
 
 
-def _listed(title, doc, parameters, rules):
-    """Returns the options of a solver or a scene as JSON values; ``rules`` are the allowed values, by name, of some."""
+def _listed(title, doc, parameters, known):
+    """Returns the options of a solver or a scene as JSON values; ``known`` are the allowed values, by name, of some."""
     rows = [
         {
             "name": name,
             "default": None if parameter.default is parameter.empty else parameter.default,
             "needed": parameter.default is parameter.empty,
-            "allowed": _allowed(parameter, rules.get(name)),
+            "allowed": _allowed(parameter, known.get(name)),
         }
         for name, parameter in parameters.items()
     ]
@@ -97,14 +97,14 @@ def _values(row):
     return row["allowed"].removesuffix(", or none" if row["default"] is None and not row["needed"] else "")
 
 
-def _allowed(parameter, rule):
-    """Returns the allowed values: the rule of the option if it has one, else the words or the types of its annotation."""
+def _allowed(parameter, text):
+    """Returns the allowed values: ``text`` if it is not None, else the words or the types of its annotation."""
     kinds, words = kinds_of_parameter(parameter), words_in(parameter.annotation)
-    if rule is None and words:
-        rule = f"one of {', '.join(map(str, words))}"
-    if rule is None:
-        rule = " or ".join(words for kind, words in WORDS.items() if kind in kinds) or "nothing written as text"
-    return rule.replace("'", "") + (", or none" if type(None) in kinds else "")
+    if text is None and words:
+        text = f"one of {', '.join(map(str, words))}"
+    if text is None:
+        text = " or ".join(words for kind, words in WORDS.items() if kind in kinds) or "nothing written as text"
+    return text.replace("'", "") + (", or none" if type(None) in kinds else "")
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -283,8 +283,8 @@ def _scene_words(prefix, parsed_args, **_):
     name, sign, _value = prefix.partition("=")
     scene = _scene_name(parsed_args)
     if sign:
-        (rule,) = [row["allowed"] for row in _of_scene(scene)["rows"] if row["name"] == name] or [""]
-        words = rule.removeprefix("one of ").split(", ") if rule.startswith("one of ") else []
+        (text,) = [row["allowed"] for row in _of_scene(scene)["rows"] if row["name"] == name] or [""]
+        words = text.removeprefix("one of ").split(", ") if text.startswith("one of ") else []
         return _words(prefix, {name: [word.removeprefix("or ") for word in words]})
     listed = {listed.name: listed for folder in folders()[::-1] for listed in list_scenes(folder)}
     known = listed[scene].parameters if scene in listed else [row["name"] for row in _of_scene(scene)["rows"]]
