@@ -127,7 +127,7 @@ def add_measuring(parser):
 
 def analyze(arguments):
     from ..analysis.measures import MEASURES
-    from .reports import write_report
+    from .reports import ReportFiles, ReportLooks, write_report
 
     if arguments.measure == ["help"]:
         print(_listed(MEASURES))
@@ -142,16 +142,10 @@ def analyze(arguments):
     analyzer = _analyzer(arguments)
     stills = _stills(arguments, analyzer)
     with closing(Progress(len(analyzer), first="measuring")) as progress:
-        found = write_report(
-            analyzer,
-            usd=arguments.output,
-            json=arguments.report,
-            stills=stills,
-            view=view,
-            progress=progress,
-            **values_of(arguments, "csv", "npz", "plot", "colour", "colour_range", "colormap", "curves", "both_sides"),
-            **values_of(arguments, "single_file", "up_axis"),
-        )
+        others = values_of(arguments, "csv", "npz", "plot", "single_file", "up_axis")
+        written = ReportFiles(usd=arguments.output, json=arguments.report, stills=stills, **others)
+        looks = ReportLooks(view=view, **values_of(arguments, "colour", "colour_range", "colormap", "curves", "both_sides"))
+        found = write_report(analyzer, written, looks, progress)
     facts = {
         "input": arguments.input,
         "vertices": len(analyzer.mesh.points),
