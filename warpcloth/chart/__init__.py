@@ -1,4 +1,8 @@
-"""Plots of measured cloth and of solvers, with matplotlib, the extra "chart"."""
+"""Plots of measured cloth and of solvers, with matplotlib, the extra "chart".
+
+Each function that plots writes a .png, .svg or .pdf file. It raises ``FileNotFoundError`` if the folder does not exist,
+``ImportError`` if matplotlib is not installed, and ``ValueError`` if the path has another ending.
+"""
 
 from ..picture.colour import Scale, range_over
 from ..picture.picture import draw

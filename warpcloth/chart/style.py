@@ -5,6 +5,7 @@ simulated by Machado, Oliveira and Fernandes (2009). No two solvers have the sam
 """
 
 import math
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from ..lab.machine import in_words, machine
 from ..others.simulators import other_solvers, shown_name
-from ..picture.figures import GREY
+from ..picture.figures import GREY, PICTURES, check_path, save
 from ..solvers import SOLVERS
 from ..solvers import __all__ as _INCLUDED
 
@@ -110,6 +111,28 @@ def dress(axes, grid=True):
     if grid:
         axes.grid(True, **_GRID)
         axes.set_axisbelow(True)
+
+
+@contextmanager
+def drawn(path, width, height):
+    """Yields an empty figure with a constrained layout, and writes it when the block ends.
+
+    Args:
+        path: The file, .png, .svg or .pdf.
+        width: Width of the figure [in].
+        height: Height of the figure [in].
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ImportError: matplotlib is not installed.
+        ValueError: The path has another ending.
+    """
+    check_path(path, PICTURES)
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    yield figure
+    save(figure, path)
 
 
 def headline(figure, text):
