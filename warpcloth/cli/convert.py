@@ -1,8 +1,10 @@
 """The command ``convert``: writes an animation in another format."""
 
+from contextlib import closing
+
 from ..base.texts import json_text
 from .options import add_shared
-from .terminal import Bar, check_writable
+from .terminal import Counter, check_writable
 
 TEXT = "Write an animation in another format."
 EPILOG = """\
@@ -36,11 +38,8 @@ def convert(arguments):
 
     check_writable(arguments.output)
     rest = None if arguments.rest is None else Surface.load(arguments.rest)
-    progress = _Writing()
-    try:
+    with closing(Counter("writing", "frames")) as progress:
         sequence, paths = write(arguments.file, arguments.output, arguments.prim, arguments.fps, rest, progress)
-    finally:
-        progress.close()
     facts = {
         "input": arguments.file,
         "frames": len(sequence),
@@ -51,18 +50,6 @@ def convert(arguments):
     }
     print(json_text(facts) if arguments.json else _summary(facts))
     return 0
-
-
-class _Writing(Bar):
-    """Shows the frames written on a terminal."""
-
-    def __init__(self):
-        self.open(None, "reading", "")
-
-    def __call__(self, done, total):
-        if done == 1:
-            self.open(total, "writing", "{n_fmt} of {total_fmt} frames, {remaining} left")
-        self.move(done)
 
 
 def _summary(facts):

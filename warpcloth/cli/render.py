@@ -2,6 +2,7 @@
 
 import argparse
 import time
+from contextlib import closing
 from pathlib import Path
 
 from ..base.limits import shown_bytes
@@ -10,7 +11,7 @@ from ..base.quiet import find_device
 from ..base.texts import json_text
 from .analyze import add_measuring, measuring_of
 from .options import add_shared, values_of
-from .terminal import Bar, check_writable, own_output
+from .terminal import Counter, check_writable, own_output
 
 SIZE = (1280, 720)
 TEXT = "Draw a picture or a film of an animation."
@@ -63,6 +64,21 @@ def add_camera(parser):
     add("--no-ground", action="store_true", help="draw no ground")
 
 
+def drawing_of(arguments):
+    """Returns the ground, a height or whether there is one, and the options of what is measured for colours.
+
+    Raises:
+        ValueError: Two options exclude one another, or one needs another.
+    """
+    if arguments.no_ground and arguments.ground is not None:
+        raise ValueError("--ground and --no-ground are given; give one of them")
+    measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
+    if arguments.colour is None:
+        for name in (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else [])):
+            raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    return not arguments.no_ground if arguments.ground is None else arguments.ground, measuring
+
+
 def size(text):
     """Returns width and height from a text such as 640x360."""
     parts = text.lower().split("x")
@@ -88,12 +104,7 @@ def render(arguments):
 
     files = [arguments.file, *arguments.beside]
     arguments.output = own_output(Path(arguments.file).stem, ".png") if arguments.output is None else arguments.output
-    if arguments.no_ground and arguments.ground is not None:
-        raise ValueError("--ground and --no-ground are given; give one of them")
-    measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
-    if arguments.colour is None:
-        for name in (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else [])):
-            raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    ground, measuring = drawing_of(arguments)
     check_drawing(arguments.output, files, arguments.size)
     device = find_device(arguments.device)
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
@@ -103,7 +114,7 @@ def render(arguments):
         arguments.output,
         mesh=rest,
         measuring=measuring,
-        ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
+        ground=ground,
         device=device.alias,
         **values_of(arguments, "prim", "fps", "up_axis", "frame", "frames", "every", "speed", "size", "samples", "time"),
         **values_of(arguments, "colour", "colour_range", "colormap", "azimuth", "elevation", "zoom", "camera"),
@@ -136,26 +147,9 @@ def draw_film(source, output, **options):
     """Draws by :func:`warpcloth.render` with a progress bar on a terminal; returns the number of pictures."""
     from ..picture.render import render
 
-    progress = _Drawing()
-    try:
+    with closing(Counter("drawing", "pictures")) as progress:
         render(source, output, progress=progress, **options)
-    finally:
-        progress.close()
-    return progress.pictures
-
-
-class _Drawing(Bar):
-    """Counts the pictures of a film, and shows them on a terminal."""
-
-    def __init__(self):
-        self.pictures = 0
-        self.open(None, "reading", "")
-
-    def __call__(self, done, total):
-        self.pictures = done
-        if done == 0:
-            self.open(total, "drawing", "{n_fmt} of {total_fmt} pictures, {remaining} left")
-        self.move(done)
+    return progress.done
 
 
 def _summary(facts):

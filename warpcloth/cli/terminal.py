@@ -151,6 +151,20 @@ def measuring(arguments, device):
         progress.close()
 
 
+class Counter(Bar):
+    """Counts what a command makes, such as frames that it writes, and shows it on a terminal, after its input is read."""
+
+    def __init__(self, text, of):
+        self.text, self.of, self.done, self.total = text, of, 0, None
+        self.open(None, "reading", "")
+
+    def __call__(self, done, total):
+        if self.total is None:
+            self.open(total, self.text, f"{{n_fmt}} of {{total_fmt}} {self.of}, {{remaining}} left")
+        self.done, self.total = done, total
+        self.move(done)
+
+
 class Settings(Bar):
     """Shows the progress of the reference, and then of the settings of a sweep with the time left, on a terminal."""
 

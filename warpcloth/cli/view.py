@@ -1,16 +1,17 @@
 """The command ``view``: writes a page that shows an animation in a browser."""
 
 import time
+from contextlib import closing
 from pathlib import Path
 
 from ..base.limits import shown_bytes
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
-from .analyze import add_measuring, measuring_of
+from .analyze import add_measuring
 from .options import add_shared, values_of
-from .render import add_camera, frames
-from .terminal import Bar, check_writable, own_output
+from .render import add_camera, drawing_of, frames
+from .terminal import Counter, check_writable, own_output
 
 TEXT = "Write a page that shows an animation in a browser."
 EPILOG = """\
@@ -50,15 +51,9 @@ def view(arguments):
     from ..picture.pages import check_page
     from ..picture.pages import view as write_page
 
-    if arguments.no_ground and arguments.ground is not None:
-        raise ValueError("--ground and --no-ground are given; give one of them")
     if arguments.plain and arguments.colour:
         raise ValueError("--plain and --colour are given; give one of them")
-    measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
-    if arguments.colour is None:
-        given = (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else []))
-        for name in given:
-            raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    ground, measuring = drawing_of(arguments)
     arguments.output = own_output(Path(arguments.file).stem, ".html") if arguments.output is None else arguments.output
     check_page(arguments.output)
     check_apart([arguments.output], [arguments.file, arguments.rest])
@@ -66,46 +61,29 @@ def view(arguments):
     device = find_device(arguments.device)
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
     started = time.perf_counter()
-    progress = _Coding()
-    try:
+    with closing(Counter("coding", "frames")) as progress:
         write_page(
             arguments.file,
             arguments.output,
             mesh=rest,
             colours=() if arguments.plain else arguments.colour,
             measuring=measuring or None,
-            ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
+            ground=ground,
             device=device.alias,
             progress=progress,
             **values_of(arguments, "prim", "fps", "up_axis", "frames", "every", "colour_range", "colormap"),
             **values_of(arguments, "azimuth", "elevation", "zoom"),
         )
-    finally:
-        progress.close()
     facts = {
         "input": arguments.file,
         "file": arguments.output,
-        "frames": progress.frames,
+        "frames": progress.done,
         "bytes": Path(arguments.output).stat().st_size,
         "seconds": time.perf_counter() - started,
         "device": device.alias,
     }
     print(json_text(facts) if arguments.json else _summary(facts))
     return 0
-
-
-class _Coding(Bar):
-    """Counts the frames of a page, and shows them on a terminal."""
-
-    def __init__(self):
-        self.frames = 0
-        self.open(None, "reading", "")
-
-    def __call__(self, done, total):
-        self.frames = done
-        if done == 0:
-            self.open(total, "coding", "{n_fmt} of {total_fmt} frames, {remaining} left")
-        self.move(done)
 
 
 def _summary(facts):
