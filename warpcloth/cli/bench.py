@@ -55,21 +55,10 @@ def add_arguments(parser):
     add_cloth(parser)
     add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
-    add(
-        "--sizes",
-        nargs="+",
-        type=int,
-        default=[],
-        metavar="N",
-        help="resolutions to measure: values of the parameter of the scene that sets it (n, links or elements)",
-    )
-    add(
-        "--frames",
-        type=int,
-        default=_OF_A_RUN["frames"],
-        metavar="N",
-        help="frames to time (default: 20); fewer if they take over 10 s, but at least 3",
-    )
+    text = "resolutions to measure: values of the parameter of the scene that sets it (n, links or elements)"
+    add("--sizes", nargs="+", type=int, default=[], metavar="N", help=text)
+    text = "frames to time (default: 20); fewer if they take over 10 s, but at least 3"
+    add("--frames", type=int, default=_OF_A_RUN["frames"], metavar="N", help=text)
     add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="number of cloths in a batch (default: 1)")
     add("--csv", metavar="FILE", help="write the measurements as a table")
     add("--compare", nargs=2, metavar=("OLD", "NEW"), help="compare two files saved from --json, and print the ratios")

@@ -99,22 +99,15 @@ def _add_work_precision(charts):
         "--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure only these solvers (default: all)"
     )
     add_with(sub)
-    sub.add_argument(
-        "--frames",
-        type=int,
-        metavar="N",
-        help="frames to simulate (default: half of the scene's); for the diagrams solver and spectrum, frames to simulate "
-        "before the step that is measured (default: a third)",
+    text = (
+        "frames to simulate (default: half of the scene's); for the diagrams solver and spectrum, frames to simulate "
+        "before the step that is measured (default: a third)"
     )
+    sub.add_argument("--frames", type=int, metavar="N", help=text)
     text = "precision (default: by device and solver for the diagram time, else float64)"
     add_shared(sub, "dtype", dtype={"help": text})
-    sub.add_argument(
-        "--limit",
-        type=float,
-        default=20.0,
-        metavar="SECONDS",
-        help="time limit of each setting (default: 20); a reference may take six times as long",
-    )
+    text = "time limit of each setting (default: 20); a reference may take six times as long"
+    sub.add_argument("--limit", type=float, default=20.0, metavar="SECONDS", help=text)
 
 
 def _add_cheapest(charts):
@@ -125,24 +118,15 @@ def _add_cheapest(charts):
     for of, needed in (("x", True), ("y", False)):
         text = f"parameter of the scene on the {of} axis and its values" + ("" if needed else " (default: a map of one row)")
         sub.add_argument(f"--{of}", nargs="+", required=needed, metavar=("PARAMETER", "VALUE"), help=text)
-    sub.add_argument(
-        "--tolerance",
-        default="1%",
-        metavar="SHARE",
-        help="largest error allowed, as a share of the size of the cloth (default: 1%%)",
-    )
+    text = "largest error allowed, as a share of the size of the cloth (default: 1%%)"
+    sub.add_argument("--tolerance", default="1%", metavar="SHARE", help=text)
     sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="solvers to choose among (default: all)")
     sub.add_argument(
         "--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)"
     )
     add_shared(sub, "dtype")
-    sub.add_argument(
-        "--limit",
-        type=float,
-        default=60.0,
-        metavar="SECONDS",
-        help="time limit of the search in each cell (default: 60); a reference may take six times as long",
-    )
+    text = "time limit of the search in each cell (default: 60); a reference may take six times as long"
+    sub.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help=text)
 
 
 def _add_failure(charts):

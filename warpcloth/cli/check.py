@@ -46,11 +46,8 @@ def add_arguments(parser):
     add("--stretch", type=float, metavar="RATIO", help="also report edges longer than this many times their rest length")
     add("--every", type=int, default=1, metavar="K", help="check only every K-th frame")
     add("-o", "--output", metavar="FILE", help="write a .usd, .usda, .usdc or .usdz file with what intersects in red")
-    add(
-        "--csv",
-        metavar="FILE",
-        help="write a table: a row for each pair, each vertex inside a collider and each stretch beyond a limit",
-    )
+    text = "write a table: a row for each pair, each vertex inside a collider and each stretch beyond a limit"
+    add("--csv", metavar="FILE", help=text)
     add("--still", metavar="FILE", help="draw the frame with the most intersections (.png)")
     add("--up-axis", choices=("Y", "Z"), help="up axis of -o and --still, if the input does not say (default: Y)")
     add_shared(parser, "json", "single_file")

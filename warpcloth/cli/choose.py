@@ -27,11 +27,8 @@ def add_arguments(parser):
     add = parser.add_argument
     add_scene(parser)
     add_cloth(parser)
-    add(
-        "--tolerance",
-        metavar="SHARE",
-        help="largest error allowed, as a share of the size of the cloth, such as 1%%; needed unless --budget is given",
-    )
+    text = "largest error allowed, as a share of the size of the cloth, such as 1%%; needed unless --budget is given"
+    add("--tolerance", metavar="SHARE", help=text)
     add("--budget", metavar="TIME", help="longest time per frame allowed, such as 16ms; needed unless --tolerance is given")
     add("--solvers", nargs="+", metavar="SOLVER", help="solvers to choose among (default: all)")
     add_with(parser)

@@ -45,18 +45,10 @@ def add_arguments(parser):
         parser.add_argument(f"--rest-{name}", metavar="MESH", help=f"mesh file with the rest shape of {of}")
         parser.add_argument(f"--fps-{name}", type=float, metavar="FPS", help=f"frames per second of {of}; overrides its own")
         parser.add_argument(f"--up-axis-{name}", choices=("Y", "Z"), help=f"up axis of {of}; overrides its own")
-        parser.add_argument(
-            f"--scale-{name}",
-            type=float,
-            metavar="M",
-            help=f"with --by surface: length of a unit of the mesh files of {of} [m]",
-        )
-    parser.add_argument(
-        "--by",
-        choices=("vertices", "surface"),
-        default="vertices",
-        help="compare meshes that keep their triangles (vertices, default), or surfaces that may change them (surface)",
-    )
+        text = f"with --by surface: length of a unit of the mesh files of {of} [m]"
+        parser.add_argument(f"--scale-{name}", type=float, metavar="M", help=text)
+    text = "compare meshes that keep their triangles (vertices, default), or surfaces that may change them (surface)"
+    parser.add_argument("--by", choices=("vertices", "surface"), default="vertices", help=text)
     parser.add_argument(
         "--samples", type=int, metavar="N", help="with --by surface: number of points on each surface (default: 10000)"
     )

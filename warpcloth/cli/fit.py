@@ -48,22 +48,10 @@ def add_arguments(parser):
     parser.add_argument(
         "--points", type=int, metavar="N", help="use at most N vertices of each frame of --capture (default: all)"
     )
-    parser.add_argument(
-        "--reading",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME=VALUE",
-        help='fit what a laboratory\'s device reads from SCENE at rest, such as "drape coefficient=52+-1"',
-    )
-    parser.add_argument(
-        "--start",
-        nargs="+",
-        action="extend",
-        required=True,
-        metavar="NAME=VALUE",
-        help="parameters, such as Spring.stiffness=100, and values above 0 to start from",
-    )
+    text = 'fit what a laboratory\'s device reads from SCENE at rest, such as "drape coefficient=52+-1"'
+    parser.add_argument("--reading", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=text)
+    text = "parameters, such as Spring.stiffness=100, and values above 0 to start from"
+    parser.add_argument("--start", nargs="+", action="extend", required=True, metavar="NAME=VALUE", help=text)
     add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
     parser.add_argument(

@@ -158,14 +158,8 @@ def add_solver(parser, text):
 
 def add_with(parser):
     """Adds the option that names other simulators."""
-    parser.add_argument(
-        "--with",
-        dest="others",
-        nargs="+",
-        metavar="SIMULATOR",
-        choices=_SIMULATORS,
-        help="measure other simulators too: newton (the physics engine), pbd (pyPBD), uipc (libuipc); extras install them",
-    )
+    text = "measure other simulators too: newton (the physics engine), pbd (pyPBD), uipc (libuipc); extras install them"
+    parser.add_argument("--with", dest="others", nargs="+", metavar="SIMULATOR", choices=_SIMULATORS, help=text)
 
 
 def add_scene(parser, **more):

@@ -52,13 +52,8 @@ def add_camera(parser):
     """Adds the options of the camera and the ground."""
     add = parser.add_argument
     add("--azimuth", type=float, default=-38.0, metavar="DEGREES", help="angle of the camera about the vertical (default: -38)")
-    add(
-        "--elevation",
-        type=float,
-        default=24.0,
-        metavar="DEGREES",
-        help="angle of the camera above the horizontal (default: 24)",
-    )
+    text = "angle of the camera above the horizontal (default: 24)"
+    add("--elevation", type=float, default=24.0, metavar="DEGREES", help=text)
     add("--zoom", type=float, default=1.0, metavar="FACTOR", help="zoom in by this factor (default: 1, the whole motion)")
     add("--ground", type=float, metavar="HEIGHT", help="height of the ground [m] (default: the lowest point of the motion)")
     add("--no-ground", action="store_true", help="draw no ground")

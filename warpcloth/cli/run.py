@@ -38,13 +38,11 @@ def add_arguments(parser):
     text = "number of frames after the start (default: those of the scene's duration)"
     add("--frames", type=int, metavar="N", help=text)
     add_shared(parser, "device", "json", "threads", "dtype")
-    add(
-        "-o",
-        "--output",
-        metavar="FILE",
-        help="the .usd, .usda, .usdc or .usdz file to write (default: named after the scene, such as hanging.usdc; an existing "
-        "file is then not replaced)",
+    text = (
+        "the .usd, .usda, .usdc or .usdz file to write (default: named after the scene, such as hanging.usdc; an existing "
+        "file is then not replaced)"
     )
+    add("-o", "--output", metavar="FILE", help=text)
     add("--film", metavar="FILE", help="also draw the run as a film, .mp4, .webp or .gif; see 'warpcloth render'")
     add("--csv", metavar="FILE", help="also write a table of energies and forces, one row per frame")
     add("--report", metavar="FILE", help="also write energies, forces and the reaction of each pin as JSON")

@@ -33,13 +33,11 @@ def add_arguments(parser):
     add("-o", "--output", metavar="FILE", help=text)
     add("--frames", type=frames, metavar="A:B", help="the first and the last frame (default: all)")
     add("--every", type=int, default=1, metavar="K", help="show only every K-th frame")
-    add(
-        "--colour",
-        metavar="NAME",
-        action="append",
-        help="a measured value that the page can show as colour, such as area_ratio; may be given more than once "
-        "(default: stretch_1 and stretch_2, and the page opens with plain cloth)",
+    text = (
+        "a measured value that the page can show as colour, such as area_ratio; may be given more than once "
+        "(default: stretch_1 and stretch_2, and the page opens with plain cloth)"
     )
+    add("--colour", metavar="NAME", action="append", help=text)
     add("--plain", action="store_true", help="measure nothing, so that the page is smaller")
     add_camera(parser)
     add_measuring(parser)
