@@ -2,6 +2,7 @@
 
 import sys
 from collections import Counter
+from functools import partial
 
 from ..base.checks import number, whole
 from ..base.quiet import find_device
@@ -142,6 +143,7 @@ def _add_failure(charts):
 
 
 def map_cheapest(arguments):
+    from ..chart.cheapest import plot_cheapest
     from ..lab.cheapest import cheapest_map, write_csv
 
     if arguments.frames is not None:
@@ -160,14 +162,7 @@ def map_cheapest(arguments):
             **values_of(arguments, "solvers", "frames", "dtype", "limit"),
             **run,
         )
-    if arguments.output:
-        from ..chart.cheapest import plot_cheapest
-
-        plot_cheapest(arguments.output, found)
-    if arguments.csv:
-        write_csv(arguments.csv, found)
-    print(json_text(found) if arguments.json else _cheapest_summary(found))
-    return 0
+    return _write(arguments, found, plot_cheapest, write_csv, _cheapest_summary)
 
 
 def _axis(of, words):
@@ -213,11 +208,16 @@ def failure(arguments):
     device = find_device(arguments.device)
     with measuring(arguments, device) as run:
         found = failure_chart(arguments.failure, device=str(device), **run)
+    return _write(arguments, found, plot_failure, write_csv, _failure_summary)
+
+
+def _write(arguments, found, plot, write_csv, summary):
+    """Draws and writes a chart as the arguments ask for, and prints it; returns the exit code."""
     if arguments.output:
-        plot_failure(arguments.output, found)
+        plot(arguments.output, found)
     if arguments.csv:
         write_csv(arguments.csv, found)
-    print(json_text(found) if arguments.json else _failure_summary(found))
+    print(json_text(found) if arguments.json else summary(found))
     return 0
 
 
@@ -263,12 +263,7 @@ def work_precision(arguments):
         watch = {"watch": run["progress"].watch} if arguments.diagram == "time" else {}
         scene = SceneRef(arguments.scene, given, arguments.pins)
         found = measure(scene, device=str(device), limit=arguments.limit, **watch, **run, **options)
-    if arguments.output:
-        plot(arguments.output, found)
-    if arguments.csv:
-        write_csv(arguments.csv, found)
-    print(json_text(found) if arguments.json else _summary(found, lines))
-    return 0
+    return _write(arguments, found, plot, write_csv, partial(_summary, lines_of=lines))
 
 
 def _parts(diagram):
