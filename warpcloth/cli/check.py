@@ -116,16 +116,15 @@ def _writer(arguments, cloths):
     if arguments.output is None:
         return nullcontext()
     from ..usd import MeasureWriter
+    from .reports import rate_of
 
-    times = cloths.times
-    rate = 24.0 if times is None or len(times) < 2 else float((cloths.labels[-1] - cloths.labels[0]) / (times[-1] - times[0]))
     return MeasureWriter(
         arguments.output,
         cloths.mesh,
         {"intersections": "uniform", "inside": "uniform"},
         coloured="intersections",
         source=cloths.stages or None,
-        fps=rate,
+        fps=rate_of(cloths),
         up_axis=cloths.up_axis or arguments.up_axis or "Y",
     )
 
