@@ -48,7 +48,8 @@ def solvers():
             takes += "; finite stiffness only"
         else:
             takes += "; infinite stiffness too" + (f", but not for {listed(hard)}" if hard else "")
-        rows.append([f"`{record.__name__}`", record.facts.method, takes])
+        first = next((row[0] for row in rows if "but not for" in takes and row[2] == takes), None)
+        rows.append([f"`{record.__name__}`", record.facts.method, f"as {first}" if first else takes])
     return table(("Solver", "Method", "Supports"), rows)
 
 
@@ -181,14 +182,14 @@ TABLES = {
     "residuals": residuals,
     "attributes": attributes,
     "term attributes": term_attributes,
-    "options": options,
-    "solver options": solver_options,
 }
+# Tables that the site alone has. Their markers in the checkout have nothing between them.
+IN_SITE = {"options": options, "solver options": solver_options}
 
 
-def filled(text):
+def filled(text, tables=TABLES):
     """The text of a page with its tables as the code has them now."""
-    for name, made in TABLES.items():
+    for name, made in tables.items():
         marked = f"<!-- {name} -->\n"
         if marked in text:
             text = re.sub(rf"(?s)({marked}).*?(<!-- end -->)", lambda m, made=made: m[1] + made() + m[2], text)

@@ -1,7 +1,5 @@
-"""Factories of the kernels of quasi-Newton iterations with a constant matrix A: histories, their products and candidates.
-
-With w = A⁻¹∇φ(d), the plain step is d − w. A history has m slots. Slot j holds a step sⱼ of d, the change yⱼ of ∇φ, and
-zⱼ = A⁻¹yⱼ. zⱼ is the change of w, so acceleration needs no further solve.
+"""Kernels of quasi-Newton iterations with a constant matrix A. With w = A⁻¹∇φ(d), the plain step is d − w. Slot j of m holds a
+step sⱼ of d, the change yⱼ of ∇φ, and zⱼ = A⁻¹yⱼ, the change of w.
 """
 
 from functools import cache
@@ -14,7 +12,7 @@ from .vectors import types
 
 @cache
 def plain_step(dtype):
-    """Kernel over vertices: out = d − w in active copies, and d in the others; out may be d."""
+    """Kernel over vertices: out = d − w in active copies, else d; out may be d."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -39,7 +37,7 @@ def plain_step(dtype):
 
 @cache
 def note_change(dtype):
-    """Kernel over vertices: y and z of the slot = changes of ∇φ and w; stores their present values for the next call."""
+    """Kernel over vertices: y and z of the slot = changes of ∇φ and w, whose values it stores."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -67,10 +65,7 @@ def note_change(dtype):
 
 @cache
 def partial_products(dtype, block: int):
-    """Kernel over (copies, 4m, lanes): the parts of sⱼ·∇φ, zⱼ·∇φ, sⱼ·y and zⱼ·y for j < m, with the y of the current slot.
-
-    See :func:`.reduce.block_sums`.
-    """
+    """Kernel over (copies, 4m, lanes): parts of sⱼ·∇φ, zⱼ·∇φ, sⱼ·y and zⱼ·y for j < m, y of the current slot."""
     vec3, _ = types(dtype)
     store, _add_up = block_sums(block)
 
@@ -107,7 +102,7 @@ def partial_products(dtype, block: int):
 
 @cache
 def finish_products(block: int):
-    """Kernel over (copies, 4m, lanes of one block): out = the sum of the parts."""
+    """Kernel over (copies, 4m, lanes of one block): out = the sums of the parts."""
     _store, add_up = block_sums(block)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -127,9 +122,9 @@ def finish_products(block: int):
 
 @cache
 def combine(dtype):
-    """Kernel over vertices: out = d − c₀ w + Σⱼ aⱼ sⱼ + bⱼ zⱼ with the coefficients (c₀, a, b) of the copy, (B, 1 + 2m).
+    """Kernel over vertices: out = d − c₀ w + Σⱼ aⱼ sⱼ + bⱼ zⱼ with coefficients (c₀, a, b), (B, 1 + 2m).
 
-    Products with a coefficient of 0 are skipped, so their slots may hold NaN.
+    Slots with a coefficient of 0 may hold NaN.
     """
     vec3, _ = types(dtype)
 
@@ -164,10 +159,9 @@ def combine(dtype):
 
 @cache
 def accept(dtype):
-    """Kernel over vertices: d = the accelerated candidate if its φ is at most that of the plain one, else the plain one.
+    """Kernel over vertices: d = the accelerated candidate if its φ is at most that of the plain one, never NaN.
 
-    A candidate with φ = NaN is never chosen. s of the slot is the step, 0 in copies with ``stayed`` = 1. ``stayed`` may be
-    None.
+    s of the slot is the step, 0 where ``stayed`` (or None) is 1.
     """
     vec3, _ = types(dtype)
 
@@ -201,9 +195,8 @@ def accept(dtype):
 
 @cache
 def note_lowest():
-    """Kernel over copies: stayed = 1 if both candidates raise φ by more than the fraction ``noise``; updates the lowest φ.
-
-    A φ of NaN does not count as a rise, so NaN reaches the result and is reported.
+    """Kernel over copies: stayed = 1 if both candidates raise φ by more than the fraction ``noise``, NaN excepted; updates the
+    lowest φ.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,7 +1,4 @@
-"""Factories of the kernels of additive multigrid, see :mod:`warpcloth.numerics.additive_multigrid`.
-
-``active[copy]`` is 1 while a copy iterates.
-"""
+"""Kernels of additive multigrid; ``active[copy]`` is 1 while a copy iterates."""
 
 from functools import cache
 
@@ -22,9 +19,8 @@ def _module(dtype):
 
 @cache
 def smooth_interpolation(dtype):
-    """Kernel over (copies, blocks of AP): P̄ = P − S A P instead of AP, and again ``by_column``, at the ``slots``.
-
-    Rows of locked coordinates are 0.
+    """Kernel over (copies, blocks of AP): P̄ = P − S A P in place of AP, and again ``by_column``, at the ``slots``; 0 in locked
+    rows.
     """
     vec3, mat33 = types(dtype)
 
@@ -63,10 +59,10 @@ def smooth_interpolation(dtype):
 
 @cache
 def transfer(dtype):
-    """Struct of P̄ from a coarser level, by rows and by columns, and of that level, in every copy.
+    """Struct of P̄ from a coarser level, by rows and by columns, and of that level.
 
-    Column i has the ``entries`` from ``starts`` [i] on, its rows. ``values`` are the blocks of P̄ by rows, ``sweep`` is S of the
-    coarser level, and ``dense`` its inverse, with all blocks, or None.
+    Column i has the ``entries`` from ``starts`` [i] on; ``values`` are the blocks of P̄ by rows, ``sweep`` is S of the coarser
+    level, ``dense`` its inverse, or None.
     """
     vec3, mat33 = types(dtype)
 
@@ -132,7 +128,7 @@ def prolonged(dtype, lanes: int):
 
 @cache
 def restrict_smoothly(dtype):
-    """Kernel over (copies, COLUMN_LANES · coarse rows): r_c = P̄ᵀr, x_c = S r_c, on CUDA."""
+    """CUDA kernel over (copies, COLUMN_LANES · coarse rows): r_c = P̄ᵀr, x_c = S r_c."""
     vec3, _ = types(dtype)
     restrict_row = restricted(dtype, COLUMN_LANES)
 
@@ -154,7 +150,7 @@ def restrict_smoothly(dtype):
 
 @cache
 def prolong_smoothly(dtype):
-    """Kernel over (copies, LANES · rows): x += P̄ x_c, on CUDA."""
+    """CUDA kernel over (copies, LANES · rows): x += P̄ x_c."""
     vec3, _ = types(dtype)
     prolong_row = prolonged(dtype, LANES)
 
@@ -176,9 +172,9 @@ def prolong_smoothly(dtype):
 
 @cache
 def refine(dtype, block: int):
-    """Kernel over (copies, threads): x += P̄ M_c P̄ᵀ r, with all transfers from the ``first`` on.
+    """Kernel over (copies, threads): x += P̄ M_c P̄ᵀ r, by all transfers from the ``first`` on.
 
-    A ``block`` of threads, which synchronise, takes a copy. The CPU has one thread, and ``block`` is 0.
+    A copy has a ``block`` of threads, or one on the CPU, where ``block`` is 0.
     """
     vec3, mat33 = types(dtype)
     lanes, dense_block, vector = lanes_of_rows(block), load(mat33), load(vec3)

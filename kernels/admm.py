@@ -1,10 +1,10 @@
-"""Factories of the kernels of ADMM: implicit Euler, split into elements, each with its own copy z of y, and vertices."""
+"""Kernels of ADMM: implicit Euler, split into vertices and elements, which have a copy z of y."""
 
 from functools import cache
 
 import warp as wp
 
-from .contact.clear_elements import is_clear
+from .assemble import is_clear
 from .local import local_coordinate
 from .local_minimiser import local_minimiser
 from .memory import load, load_shared, store
@@ -15,7 +15,7 @@ from .vectors import types
 
 @cache
 def stiffness_scale(term: Term, dtype):
-    """Kernel over elements: out = ‖∂²u/∂y²‖, by which W² is scaled to the energy and to the unit of y."""
+    """Kernel over elements: out = ‖∂²u/∂y²‖, the scale of W²."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     y_of, hessian = local_coordinate(term, dtype, False), term.hessian
@@ -40,9 +40,8 @@ def stiffness_scale(term: Term, dtype):
 
 @cache
 def admm_elements(term: Term, dtype):
-    """Struct of the elements of a term: ratio r, scale s, W² = r s k A, z, u, gap = W²(y − z), and the change of W²z [N].
-
-    ``clear`` is that of :mod:`.contact.clear_elements`, or empty.
+    """Struct of the elements of a term: ratio r, scale s, W² = r s k A, z, u, gap = W²(y − z), change of W²z [N], and ``clear``
+    or an empty array.
     """
     y_type = wp.types.matrix((term.rows, 3), dtype)
 
@@ -88,9 +87,9 @@ def start_admm(term: Term, dtype):
 
 @cache
 def split(term: Term, dtype):
-    """Kernel over elements, the local step of ADMM: z = argmin U(z) + ½‖W(y + u − z)‖², u += y − z; writes gap and change.
+    """Kernel over elements: z = argmin U(z) + ½‖W(y + u − z)‖², u += y − z; writes gap and change.
 
-    An element whose vertex is still within its ``clear`` is skipped: its u, gap and change are 0.
+    Elements whose vertex is within ``clear`` have u, gap and change 0.
     """
     vec3, _ = types(dtype)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -133,7 +132,7 @@ def split(term: Term, dtype):
 
 @cache
 def admm_forces(term: Term, dtype):
-    """Device functions (elements, e) → max(1, 1/r) and (elements, e, rest) → gap + W²u, see :func:`scatter_admm`."""
+    """Device functions (elements, e) → max(1, 1/r) and (elements, e, rest) → gap + W²u."""
     rest_type = wp.types.vector(term.parameters, dtype)
     measure, shared, take = term.measure, load_shared(dtype), load(wp.types.matrix((term.rows, 3), dtype))
 
@@ -152,10 +151,7 @@ def admm_forces(term: Term, dtype):
 
 @cache
 def scatter_admm(term: Term, dtype):
-    """Kernel over elements: adds max(1, 1/r) Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N].
-
-    For the CPU, where one thread takes the elements in order: no addition is atomic.
-    """
+    """Kernel over elements: adds max(1, 1/r) Gᵀgap to primal, Gᵀchange to dual, Gᵀ(gap + W²u) to force [N]."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -194,7 +190,7 @@ def scatter_admm(term: Term, dtype):
 
 @cache
 def gather_admm(term: Term, dtype):
-    """Kernel over vertices: the sums of :func:`scatter_admm` in a fixed order, see :func:`.transpose.gather`."""
+    """Kernel over vertices: the sums of :func:`scatter_admm` in a fixed order."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     (weight_of, pull_of), share_of = admm_forces(term, dtype), to_corner(term, dtype)

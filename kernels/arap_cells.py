@@ -1,9 +1,8 @@
-"""Factories of kernels over cells. A cell has any number of vertices and one rotation.
+"""Kernels over cells: sets of vertices with one rotation.
 
-Cells are compressed rows: entries offsets[c] to offsets[c+1] of ``members`` are the vertices of cell c, at least one. Each
-entry has a constant moment gᵢ with Σᵢ gᵢ = 0 over the cell. The covariance of the cell is S_c = Σᵢ (xᵢ − x_o) gᵢᵀ for any
-reference x_o. For a point set with weights wᵢ and weighted centroid X̄, gᵢ = wᵢ(Xᵢ − X̄) (Kabsch 1976). For edges with weights
-w_ij, gᵢ = Σⱼ w_ij (Xᵢ − Xⱼ).
+The vertices of cell c are ``members`` offsets[c] to offsets[c+1], at least one. Their constant moments gᵢ have Σᵢ gᵢ = 0. The
+covariance of the cell is S_c = Σᵢ (xᵢ − x_o) gᵢᵀ for any reference x_o. Points with weights wᵢ and centroid X̄ have gᵢ = wᵢ(Xᵢ
+− X̄) (Kabsch 1976), edges gᵢ = Σⱼ w_ij (Xᵢ − Xⱼ).
 """
 
 from functools import cache
@@ -16,10 +15,7 @@ from .vectors import types
 
 @cache
 def set_moments(dtype):
-    """Kernel over cells: moments gᵢ = wᵢ(Xᵢ − X̄), X̄ = Σ wᵢ Xᵢ / Σ wᵢ, scaled so that the longest of a cell has length 1.
-
-    The scale does not change the rotation; without it, squares of small moments would underflow.
-    """
+    """Kernel over cells: moments gᵢ = wᵢ(Xᵢ − X̄), X̄ = Σ wᵢ Xᵢ / Σ wᵢ, scaled to a maximum length of 1 against underflow."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -61,7 +57,7 @@ def set_moments(dtype):
 def fit_rotations(dtype):
     """Kernel over cells: R_c = the rotation with the largest tr(RᵀS_c), S_c = Σᵢ (xᵢ − x_o) gᵢᵀ.
 
-    x_o is the position of the first member with a nonzero moment; members without one may be far away.
+    x_o is the first member with a nonzero moment.
     """
     vec3, mat33 = types(dtype)
 
@@ -94,7 +90,7 @@ def fit_rotations(dtype):
 def gather_moments(dtype):
     """Kernel over vertices: b_i = start_i + Σ_{c∋i} R_c g_ic, the transpose of the sums in :func:`fit_rotations`.
 
-    Entries offsets[i] to offsets[i+1] of ``cells`` and ``moments`` are the cells of vertex i, and its moments in them.
+    Entries offsets[i] to offsets[i+1] of ``cells`` and ``moments`` are those of vertex i.
     """
     vec3, mat33 = types(dtype)
 
@@ -121,10 +117,7 @@ def gather_moments(dtype):
 
 @cache
 def edge_energy(dtype):
-    """Kernel over edges: out[e] = w_ij (‖d − R_i D‖² + ‖d − R_j D‖²), d = xⱼ − xᵢ, D = Xⱼ − Xᵢ, for the cells of both ends.
-
-    It is a sum of squares, so no digits cancel when the motion is nearly rigid.
-    """
+    """Kernel over edges: out[e] = w_ij (‖d − R_i D‖² + ‖d − R_j D‖²), d = xⱼ − xᵢ, D = Xⱼ − Xᵢ."""
     vec3, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -151,7 +144,7 @@ def edge_energy(dtype):
 def triangle_energy(dtype):
     """Kernel over triangles: out[t] = Σᵥ Σₑ w_e ‖dₑ − Rᵥ Dₑ‖² over its vertices v and edges e.
 
-    d and D are the edge vectors of x and of the rest shape. Edge k is opposite vertex k.
+    d and D are edge vectors of x and at rest; edge k is opposite vertex k.
     """
     vec3, mat33 = types(dtype)
 

@@ -1,7 +1,4 @@
-"""Factories of the kernels that assemble a term: energy, gradient and Hessian blocks.
-
-They work for every term. Each is compiled only when a solver asks for it.
-"""
+"""Kernels that assemble any term: energy, gradient and Hessian blocks."""
 
 from functools import cache
 from typing import Any
@@ -20,19 +17,17 @@ AHEAD = wp.constant(4)  # elements for whose blocks memory is asked ahead
 
 @wp.func
 def is_clear(radius: Any, d: Any):
-    """Whether ‖d‖ is below the radius; False if d is not finite or the radius is NaN."""
+    """Whether ‖d‖ is below the radius; False for NaN and infinity."""
     return radius > type(radius)(0.0) and wp.dot(d, d) < radius * radius
 
 
 @cache
 def of_element(term: Term, dtype, corrected: bool):
-    """Device functions (stencil, stiffness, e, rest, x, d) → kₑ Aₑ u(yₑ) [J] in double precision, and kₑ Aₑ ∂u/∂y.
+    """Device functions (stencil, stiffness, e, rest, x, d) → kₑ Aₑ u(yₑ) [J] in float64, and kₑ Aₑ ∂u/∂y.
 
-    A third one, which also takes the factor of the negative part, gives kₑ Aₑ ∂²u/∂y².
+    A third, with the factor of the negative part, gives kₑ Aₑ ∂²u/∂y².
 
-    If ``corrected``, the energy and its gradient are computed in double precision, also from x and d in float32. Else the force
-    of a spring would have a rounding error of ε k L, in stiff cloth more than its weight, and the rounding of the energy would
-    hide a slow descent.
+    If ``corrected``, energy and gradient are computed in float64, also from float32.
     """
     vec3, _ = types(dtype)
     indices, numbers, vectors = wp.array2d(dtype=wp.int32), wp.array(dtype=dtype), wp.array(dtype=vec3)
@@ -63,9 +58,8 @@ def of_element(term: Term, dtype, corrected: bool):
 
 @cache
 def energy(term: Term, dtype, corrected: bool = False, clearing: bool = False):
-    """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in double precision, to be summed.
-
-    If ``clearing``, elements of one vertex whose d is below their ``clear`` have no energy, see :mod:`.contact.clear_elements`.
+    """Kernel over elements: out[e] = kₑ Aₑ u(yₑ) [J], in float64; 0, if ``clearing``, where d of a vertex is below its
+    ``clear``.
     """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
@@ -96,7 +90,7 @@ def energy(term: Term, dtype, corrected: bool = False, clearing: bool = False):
 
 @cache
 def energy_parts(term: Term, dtype, block: int, clearing: bool = False):
-    """Kernel over (copies, lanes): the parts of Σ kₑ Aₑ u(yₑ) [J] at x + d, see :func:`.reduce.block_sums`, :func:`energy`."""
+    """Kernel over (copies, lanes): parts of Σ kₑ Aₑ u(yₑ) [J] at x + d."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)
     (energy_of, _gradient, _hessian), rest_of = of_element(term, dtype, True), load(rest_type)
@@ -133,7 +127,7 @@ def energy_parts(term: Term, dtype, block: int, clearing: bool = False):
 
 @cache
 def elastic(term: Term, dtype):
-    """Struct of the inputs of the forces of a term: its elements, the state x, d, and ``clear`` of elements to skip."""
+    """Struct of a term's forces: elements, x, d, and ``clear``."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -149,7 +143,7 @@ def elastic(term: Term, dtype):
 
 @cache
 def forces(term: Term, dtype, corrected: bool = False, clearing: bool = False):
-    """The :class:`.transpose.LocalSource` of kₑ Aₑ ∂u/∂y; if ``clearing``, it leaves out as :func:`energy` does."""
+    """The :class:`.transpose.LocalSource` of kₑ Aₑ ∂u/∂y, with ``clearing`` as in :func:`energy`."""
     data, rest_type = elastic(term, dtype), wp.types.vector(term.parameters, dtype)
     _energy, gradient_of, _hessian = of_element(term, dtype, corrected)
 
@@ -165,18 +159,17 @@ def forces(term: Term, dtype, corrected: bool = False, clearing: bool = False):
 
 
 def scatter_gradient(term: Term, dtype, corrected: bool = False, clearing: bool = False):
-    """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i], see :func:`.transpose.scatter`."""
+    """Kernel over elements: adds kₑ Aₑ wᵢ·∂u/∂y [N] to out[vertex i]."""
     return scatter(term, dtype, forces(term, dtype, corrected, clearing))
 
 
 def gather_gradient(term: Term, dtype, corrected: bool = False, clearing: bool = False):
-    """Kernel over vertices: the same sum as :func:`scatter_gradient`, see :func:`.transpose.gather`."""
     return gather(term, dtype, forces(term, dtype, corrected, clearing))
 
 
 @cache
 def hessian_blocks(term: Term, dtype, corrected: bool = False):
-    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], with the ``policy`` of the element's copy."""
+    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ ∂²u/∂xᵢ∂xⱼ [N/m], with the ``policy`` of the copy."""
     vec3, mat33 = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     weight, block_of, (_energy, _gradient, hessian_of) = (
@@ -214,9 +207,9 @@ def hessian_blocks(term: Term, dtype, corrected: bool = False):
 
 @cache
 def scatter_hessian(term: Term, dtype, corrected: bool = False):
-    """Kernel over elements: adds block q = K·i + j of :func:`hessian_blocks` to values[slots[K²e + q]], if it is not below 0.
+    """Kernel over elements: adds block q = K·i + j of :func:`hessian_blocks` to values[slots[K²e + q]] if that slot is ≥ 0.
 
-    For the CPU, where one thread takes the elements in order: no addition is atomic. Block (j, i) is the transpose of (i, j).
+    Block (j, i) is the transpose of (i, j).
     """
     vec3, mat33 = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
@@ -262,10 +255,7 @@ def scatter_hessian(term: Term, dtype, corrected: bool = False):
 
 @cache
 def row_norms(dtype):
-    """Kernel over rows of blocks: out = Σ √(‖·‖₁‖·‖∞) of the blocks of the row, in double precision.
-
-    √(‖·‖₁‖·‖∞) is a cheap upper bound of the spectral norm, equal to it along the axes and diagonals of a grid.
-    """
+    """Kernel over rows of blocks: out = Σ √(‖·‖₁‖·‖∞), in float64, a bound of the spectral norms."""
     _, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -295,7 +285,7 @@ def row_norms(dtype):
 
 @cache
 def constant_blocks(term: Term, dtype):
-    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ wᵢ·wⱼ [N/m], the blocks of kAGᵀG, in double precision."""
+    """Kernel over elements: out[e, K·i + j] = kₑ Aₑ wᵢ·wⱼ [N/m], in float64."""
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type = wp.types.vector(term.parameters, dtype)
     weight, measure = term.weight, term.measure
@@ -330,10 +320,9 @@ ZERO = 1e-12
 
 @cache
 def sum_entries():
-    """Kernel over (copies, entries of a matrix): sums of the entries of elements, and of the sizes of these.
+    """Kernel over (copies, entries of a matrix): sums of the entries of :func:`constant_blocks` and of their sizes.
 
-    They are those of :func:`constant_blocks`. Entries of weights that are 0 up to rounding, such as those of vertices on one
-    line, count as 0.
+    Entries that are 0 up to rounding count as 0.
     """
     threshold = wp.constant(ZERO * ZERO)
 

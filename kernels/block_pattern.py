@@ -1,8 +1,7 @@
-"""Kernels that find the pattern of a sparse matrix of blocks which is a sum of element matrices, or a product.
+"""Kernels that find the pattern of a sparse matrix of blocks: a sum of element matrices, or a product.
 
-A corner q is an index into the vertices of all elements, one element after another. In the matrix row of its vertex, it has one
-block for each vertex of its element. Elements have K vertices each, or are cells with different numbers of vertices. Rows and
-columns of fixed vertices have no such blocks. Each row has its diagonal block.
+A corner q is an index into the vertices of all elements, which have K vertices or are cells. Its matrix row has one block for
+each vertex of its element, and a diagonal block; rows and columns of fixed vertices have only that.
 """
 
 from functools import cache
@@ -17,12 +16,12 @@ class Corners:
     """The corners of the elements of one term.
 
     Attributes:
-        vertices: Vertices of all elements, in one row.
+        vertices: Vertices of all elements.
         offsets, codes: The corners of each vertex, ascending.
         K: Number of vertices of an element, or 0 for cells.
-        firsts: For cells, the first corner of the cell of each corner.
+        firsts: For cells, the first corner of each corner's cell.
         sizes: For cells, the number of vertices of that cell.
-        starts: For cells, the first block of each corner in the array of all blocks. For elements it is K·q.
+        starts: For cells, the first block of each corner among all; K·q for elements.
     """
 
     vertices: wp.array(dtype=wp.int32)
@@ -36,7 +35,7 @@ class Corners:
 
 @wp.func
 def element_of(corners: Corners, q: int):
-    """The first corner of the element of corner q, the number of its vertices, and the first block of q."""
+    """The first corner of q's element, its number of vertices, and the first block of q."""
     size = int(corners.K)
     if size > 0:
         return q // size * size, size, size * q
@@ -45,7 +44,7 @@ def element_of(corners: Corners, q: int):
 
 @wp.func
 def find_column(columns: wp.array(dtype=wp.int32), first: int, last: int, column: int):
-    """The index of the first of the ascending columns[first : last] that is not below ``column``."""
+    """Index of the first of ascending columns[first : last] that is not below ``column``."""
     low, high = int(first), int(last)
     while low < high:
         middle = (low + high) // 2
@@ -58,7 +57,7 @@ def find_column(columns: wp.array(dtype=wp.int32), first: int, last: int, column
 
 @wp.func
 def insert_column(columns: wp.array(dtype=wp.int32), start: int, count: int, column: int):
-    """Inserts a column into the ascending columns[start : start + count], if it is not there; returns their number."""
+    """Inserts a column into the ascending columns[start : start + count] if it is missing; returns their number."""
     last = start + count
     index = find_column(columns, start, last, column)
     if index < last and columns[index] == column:
@@ -71,7 +70,7 @@ def insert_column(columns: wp.array(dtype=wp.int32), start: int, count: int, col
 
 @cache
 def add_diagonal():
-    """Kernel over vertices: the first of the columns, from ``firsts`` on, is the vertex itself."""
+    """Kernel over vertices: the first column, at ``firsts``, is the vertex itself."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def add_each_diagonal(
@@ -90,7 +89,7 @@ def add_diagonal():
 
 @cache
 def add_columns():
-    """Kernel over vertices: adds the columns of a term to its ascending ones, from ``firsts`` on; how many blocks they have."""
+    """Kernel over vertices: adds the columns of a term to the ascending ones from ``firsts`` on, and counts its blocks."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def add_each_column(
@@ -123,7 +122,7 @@ def add_columns():
 
 @cache
 def add_product_columns():
-    """Kernel over rows: the ascending columns of a product of two sparse matrices, from ``firsts`` on, and their number."""
+    """Kernel over rows: the ascending columns of a product of two sparse matrices from ``firsts`` on, and their number."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def add_columns_of_product(
@@ -151,7 +150,7 @@ def add_product_columns():
 
 @cache
 def pack_columns():
-    """Kernel over vertices: the columns from ``firsts`` on, without gaps between rows; their row; and the diagonal block."""
+    """Kernel over vertices: columns without gaps between rows, their row, and the diagonal block."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def pack_each_column(
@@ -178,7 +177,7 @@ def pack_columns():
 
 @cache
 def list_blocks():
-    """Kernel over vertices: the blocks of a term, ascending, of which each block of the row is the sum, and where they end."""
+    """Kernel over vertices: the blocks of a term, ascending, that add up to each block of the row, and where they end."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def list_each_block(
@@ -225,7 +224,7 @@ def list_blocks():
 
 @cache
 def set_slots():
-    """Kernel over the blocks of the matrix: slots[q] = s for each block q of a term of which block s is the sum."""
+    """Kernel over blocks s of the matrix: slots[q] = s for each block q of a term in its sum."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def set_each_slot(

@@ -1,31 +1,28 @@
-"""Products of a matrix of 3×3 blocks with vectors, row by row: its block compressed rows, and pairs that are not in them.
+"""Products of a matrix of 3×3 blocks with vectors: block compressed rows, and pairs outside them.
 
-On CUDA LANES threads share a row and add up what each found, for the blocks of a row lie one after another in memory. Of 4, 8
-and 16, a product in contact is fastest with 4 (``drape``, 128² vertices, one H200).
+On CUDA LANES threads share a row.
 """
 
 from functools import cache
 
 import warp as wp
 
-from .contact.pair_sums import pair_blocks, turned_pull
-from .contact.self_pairs import Pairs
 from .memory import add_to, load
+from .pairs import Pairs, pair_blocks, turned_pull
 from .vectors import types
 
 LANES = 4
 
 
 def lanes_of_rows(block: int):
-    """The number of threads that share a row, given the threads of a block: 1 for blocks of one, and for the CPU, with 0."""
+    """The number of threads that share a row: 1 for blocks of one thread and for the CPU, with 0."""
     return LANES if block > 1 else 1
 
 
 @cache
 def block_rows(dtype):
-    """Struct of a matrix: its rows, and the pairs of up to two energies, of which the rows have the diagonal blocks.
-
-    ``mobility`` is None without locked coordinates.
+    """Struct of a matrix: its rows, and the pairs of up to two energies, whose diagonal blocks the rows have; ``mobility`` is
+    None without locks.
     """
     vec3, mat33 = types(dtype)
 
@@ -62,10 +59,7 @@ def operand_at(dtype, turned: bool):
 
 @cache
 def product_of_pairs(dtype, lanes: int, turned: bool):
-    """Device function (pairs, blocks, i, lane, x, p, ratio) → Σ ∂²U/∂xᵢ∂xⱼ vⱼ over the other vertices j of each pair.
-
-    It takes every ``lanes``-th pair of vertex i.
-    """
+    """Device function (pairs, blocks, i, lane, x, p, ratio) → Σ ∂²U/∂xᵢ∂xⱼ vⱼ over every ``lanes``-th pair of vertex i."""
     vec3, _ = types(dtype)
     vec2 = wp.types.vector(2, dtype)
     vector, whole, stencil = operand_at(dtype, turned), load(wp.int32), load(wp.vec4i)
@@ -105,9 +99,8 @@ def product_of_pairs(dtype, lanes: int, turned: bool):
 
 @cache
 def product_of_row(dtype, lanes: int, terms: int = 0, turned: bool = False):
-    """Device function (matrix, i, lane, x, p, ratio) → what a lane finds of row i of A v, v as in :func:`operand_at`.
-
-    ``terms`` is the number of energies of pairs, at most 2.
+    """Device function (matrix, i, lane, x, p, ratio) → a lane's part of row i of A v, v as in :func:`operand_at`, with
+    ``terms`` ≤ 2 energies of pairs.
     """
     vec3, mat33 = types(dtype)
     column, block = load(wp.int32), load(mat33)
@@ -143,7 +136,7 @@ def product_of_row(dtype, lanes: int, terms: int = 0, turned: bool = False):
 def symmetric_product(dtype):
     """Device function (matrix, first, end, p, q) of one thread: q = A p in the rows of a copy.
 
-    It reads only the blocks on the diagonal and right of it, where columns ascend: on the CPU in 0.76 of the time (64²).
+    It reads only the diagonal and what is right of it.
     """
     vec3, mat33 = types(dtype)
     column, block, vector, add = load(wp.int32), load(mat33), load(vec3), add_to(vec3)

@@ -1,11 +1,10 @@
-"""Factories of the constraint rows of rigid clusters: C = √mᵢ(xᵢ − c − R qᵢ), 3 rows per vertex, with U = (κ/2)‖C‖².
+"""Constraint rows of rigid clusters: C = √mᵢ(xᵢ − c − R qᵢ), 3 rows per vertex, with U = (κ/2)‖C‖².
 
 (c, R) is the best rigid motion, so J removes the rigid part of a change of x,
 
     J = (I − Q)√M,    Q v = √mᵢ(V + Ω × rᵢ),    V = Σ √mᵢ vᵢ/Σ mᵢ,    Ω = (Σ mᵢ(rᵢ²I − rᵢrᵢᵀ))⁻¹ Σ √mᵢ rᵢ × vᵢ,    rᵢ = R qᵢ,
 
-where Q projects onto translations and rotations. The inverse is a pseudo-inverse: a cluster on a line has no rotation about it.
-Six rows are redundant. See :mod:`.constraint_rows` for rows. Each cluster has one thread.
+where Q projects onto translations and rotations; the inverse is a pseudo-inverse. Six rows are redundant.
 """
 
 from functools import cache
@@ -22,7 +21,7 @@ from .vectors import types
 
 @cache
 def linearise_clusters(dtype):
-    """Kernel over clusters: as :func:`.constraint_rows.linearise`; also the rotation R, which is 0 without stiffness."""
+    """Kernel over clusters: as :func:`.constraint_rows.linearise`, and the rotation R, 0 without stiffness."""
     vec3, mat33 = types(dtype)
     rest_type = wp.types.vector(4, dtype)
     fit_cluster = cluster_fit(dtype, True)
@@ -141,7 +140,7 @@ def apply_cluster_rows(dtype):
 
 @cache
 def pull_clusters(dtype):
-    """Kernel over clusters: pulls (B·E,), the part of each element in Jᵀλ, as matrices of one row."""
+    """Kernel over clusters: pulls (B·E,), each element's part in Jᵀλ, as matrices of one row."""
     vec3, mat33 = types(dtype)
     y_type = wp.types.matrix((1, 3), dtype)
     rest_type = wp.types.vector(4, dtype)
@@ -187,5 +186,4 @@ def pull_clusters(dtype):
 
 
 def gather_pulls(term: Term, dtype):
-    """Kernel over vertices: out += the parts of the elements at the vertex, see :func:`.transpose.gather`."""
     return gather(term, dtype, stored(term, dtype))

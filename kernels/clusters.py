@@ -1,7 +1,7 @@
-"""Factories of kernels over rigid clusters: target positions of their vertices, and Gauss–Seidel sweeps over clusters.
+"""Kernels over rigid clusters: target positions of their vertices, and Gauss–Seidel sweeps.
 
-Cluster c has the elements offsets[c] to offsets[c+1], one for each vertex. An element has a rest position ``shape`` relative to
-the centre of mass, and a rest state (t, m), see :mod:`.terms.rigid_cluster`.
+Cluster c has the elements offsets[c] to offsets[c+1], one per vertex, with a rest position ``shape`` relative to the centre of
+mass and a rest state (t, m).
 """
 
 from functools import cache
@@ -15,10 +15,9 @@ from .vectors import types
 
 @cache
 def cluster_fit(dtype, corrected: bool, precision=None):
-    """Device function that sets t = c + R q − (x + d) of the elements first to last − 1 and returns R.
+    """Device function that sets t = c + R q − (x + d) of elements first to last − 1 and returns R; d counts if ``corrected``.
 
-    d counts only if ``corrected``. Positions are relative to the first vertex, so that no digits are lost far from the origin.
-    It is computed in the ``precision``, by default that of x and d.
+    Positions are relative to the first vertex, in the ``precision``, by default that of x and d.
     """
     vec3, _ = types(dtype)
     number = precision or dtype
@@ -62,7 +61,7 @@ def cluster_fit(dtype, corrected: bool, precision=None):
 
 @cache
 def fit_targets(dtype, corrected: bool):
-    """Kernel over clusters: targets t of their elements at x, or at x + d if ``corrected``, then in double precision."""
+    """Kernel over clusters: targets t of their elements at x, or if ``corrected`` at x + d in float64."""
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(4, dtype)
     fit_cluster = cluster_fit(dtype, corrected, wp.float64 if corrected else dtype)
@@ -87,10 +86,10 @@ def fit_targets(dtype, corrected: bool):
 
 @cache
 def correct_clusters(dtype, multipliers: bool, per_step: bool, axes: bool = False):
-    """Kernel of a Gauss–Seidel sweep over clusters, see :func:`.project.correct_in_place`. The vertices of one move at once.
+    """Kernel of a Gauss–Seidel sweep over clusters, of which the vertices move at once.
 
-    Δxᵢ = (tᵢ − α̃λᵢ/mᵢ)/(1 + α̃), α̃ = 1/(κh²), λᵢ += mᵢΔxᵢ. A thread takes ``each`` clusters. With ``axes``, vertices move
-    only along their free axes.
+    Δxᵢ = (tᵢ − α̃λᵢ/mᵢ)/(1 + α̃), α̃ = 1/(κh²), λᵢ += mᵢΔxᵢ; a thread takes ``each`` clusters. With ``axes``, vertices move
+    along free axes only.
     """
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(4, dtype), wp.types.matrix((1, 3), dtype)

@@ -1,10 +1,10 @@
-"""Vectors of NumPy as three columns, (3, m), which take a fraction of the time of rows. Sums have the order of NumPy's own."""
+"""Vectors as three columns, (3, m), which take a fraction of the time of rows, summed in the order of NumPy."""
 
 import numpy as np
 
 
 def columns_of(points, *indices):
-    """Returns the columns (3, m) of points (n, 3) for each of the arrays of indices (m,)."""
+    """Returns the columns (3, m) of points (n, 3) for each array of indices (m,)."""
     columns = np.ascontiguousarray(points.T)
     return [columns[:, each] for each in indices]
 

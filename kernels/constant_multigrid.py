@@ -1,6 +1,6 @@
-"""Factories of the kernels of a multigrid cycle with constant matrices of numbers, in every copy.
+"""Kernels of a multigrid cycle with constant matrices of numbers, in every copy.
 
-All copies have one pattern. Copies with equal matrices share their values: those of copy b are ``values[of_copy[b]]``.
+Copies share a pattern; the values of copy b are ``values[of_copy[b]]``.
 """
 
 from functools import cache
@@ -14,7 +14,7 @@ MODULE = "warpcloth.constant_multigrid"
 
 @cache
 def constant_rows(dtype):
-    """Struct of compressed rows of numbers: offsets (n + 1,), columns (m,), values (matrices, m)."""
+    """Struct of compressed rows: offsets (n + 1,), columns (m,), values (matrices, m)."""
 
     @wp.struct
     class ConstantRows:
@@ -67,7 +67,7 @@ def multiply_constant(dtype):
 
 @cache
 def subtract_constant(dtype):
-    """Kernel over (copies, rows): out = b − A x, or 0 if the matrix of a copy needs only ``cycle`` cycles."""
+    """Kernel over (copies, rows): out = b − A x, or 0 for a matrix that needs only ``cycle`` cycles."""
     vec3, _ = types(dtype)
     product = row_product(dtype)
 
@@ -98,7 +98,7 @@ def subtract_constant(dtype):
 
 @cache
 def multiply_dense(dtype):
-    """Kernel over (copies, m): out = A x with dense symmetric A; threads side by side read values side by side."""
+    """Kernel over (copies, m): out = A x with dense symmetric A."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -125,7 +125,7 @@ def multiply_dense(dtype):
 
 @cache
 def add_levels(dtype):
-    """Kernel over (copies, rows): out = Q x_c + T r, or out += that if ``accumulate`` is 1."""
+    """Kernel over (copies, rows): out = Q x_c + T r, or += if ``accumulate`` is 1."""
     vec3, _ = types(dtype)
     product = row_product(dtype)
 

@@ -1,6 +1,6 @@
-"""Factories of the kernels of J and Jᵀ, J the Jacobian of the constraint rows of a term, see :mod:`.constraint_rows`.
+"""Kernels of J and Jᵀ, the Jacobian of constraint rows (:mod:`.constraint_rows`).
 
-They share the key (term, dtype, scalar, curved).
+Their key is (term, dtype, scalar, curved).
 """
 
 from functools import cache
@@ -18,7 +18,7 @@ from .vectors import types
 
 @cache
 def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: rows += J v in active copies, see :func:`.reduce.stands_aside`."""
+    """Kernel over elements: rows += J v in active copies."""
     vec3, _ = types(dtype)
     M, Q = wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
@@ -60,7 +60,7 @@ def apply_rows(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def held_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Struct of the inputs of the forces of the rows of a term: slopes, λ of all rows, and the active copies."""
+    """Struct of the forces of rows: slopes, λ, and the active copies."""
     slope = slope_type(term, dtype, scalar, curved)
 
     @wp.struct
@@ -75,7 +75,7 @@ def held_rows(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def pulls(term: Term, dtype, scalar: bool, curved: bool):
-    """:class:`.transpose.LocalSource` of the force of the rows of an element, as it acts on y (M, 3)."""
+    """:class:`.transpose.LocalSource` of the force of an element's rows on y (M, 3)."""
     M, Q = wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     data = held_rows(term, dtype, scalar, curved)
@@ -107,18 +107,17 @@ def pulls(term: Term, dtype, scalar: bool, curved: bool):
 
 
 def scatter_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: out += Jᵀλ in active copies, see :func:`.transpose.scatter`."""
+    """Kernel over elements: out += Jᵀλ in active copies."""
     return scatter(term, dtype, pulls(term, dtype, scalar, curved))
 
 
 def gather_rows(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over vertices: the same sum as :func:`scatter_rows`, see :func:`.transpose.gather`."""
     return gather(term, dtype, pulls(term, dtype, scalar, curved))
 
 
 @cache
 def rows_in_full(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: out[e, rows·i + j] = ∂(row j)/∂xᵢ, in double precision, for assembly on the host."""
+    """Kernel over elements: out[e, rows·i + j] = ∂(row j)/∂xᵢ, in float64, for the host."""
     K, M, Q = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
     weight = term.weight
@@ -150,9 +149,8 @@ def rows_in_full(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def product_of_corners(term: Term, dtype, scalar: bool, curved: bool):
-    """Device function (i, j, rest, slopes, penalties, s) → the block of corners i and j of JᵀDJ, D the ``penalties``.
-
-    J has the rows of one element, of which the first is s.
+    """Device function (i, j, rest, slopes, penalties, s) → block (i, j) of JᵀDJ, D the ``penalties``, J the rows from s on of
+    an element.
     """
     _, mat33 = types(dtype)
     M, Q = wp.constant(term.rows), wp.constant(row_count(term, scalar, curved))
@@ -182,7 +180,7 @@ def product_of_corners(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def product_blocks(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: out[e, K·i + j] = the block of corners i and j of JᵀDJ, see :func:`product_of_corners`."""
+    """Kernel over elements: out[e, K·i + j] = block (i, j) of JᵀDJ."""
     _, mat33 = types(dtype)
     K, Q = wp.constant(term.vertices), wp.constant(row_count(term, scalar, curved))
     rest_type, slope = wp.types.vector(term.parameters, dtype), slope_type(term, dtype, scalar, curved)
@@ -212,9 +210,9 @@ def product_blocks(term: Term, dtype, scalar: bool, curved: bool):
 
 @cache
 def scatter_products(term: Term, dtype, scalar: bool, curved: bool):
-    """Kernel over elements: adds block q = K·i + j of :func:`product_blocks` to values[slots[K²e + q]], if it is not below 0.
+    """Kernel over elements: adds block q = K·i + j of :func:`product_blocks` to values[slots[K²e + q]] if that slot is ≥ 0.
 
-    For the CPU, where one thread takes the elements in order: no addition is atomic. Block (j, i) is the transpose of (i, j).
+    Block (j, i) is the transpose of (i, j).
     """
     _, mat33 = types(dtype)
     K, Q = wp.constant(term.vertices), wp.constant(row_count(term, scalar, curved))

@@ -1,14 +1,12 @@
-"""Factories of the constraint rows of a term: their values and slopes, one element after another.
+"""Kernels of the constraint rows of a term: values and slopes, element by element.
 
-An element of a term with a scalar constraint C has one row with the covector ∂C/∂y. If ``curved``, it also has the rows of
-``stiffening``, with value 0 and compliance 1: with tension −λ they add BᵀB ⪰ −λ∂²C to the masses. An element of another term
-has the 3M rows y − p(y) with p fixed, so their Jacobian is the constant matrix G of weights. The rows of all terms are in one
-array, by copy, then by term, see :class:`RowLayout`.
+A scalar constraint C has one row, with the covector ∂C/∂y. If ``curved``, it also has the rows of ``stiffening``, with value 0
+and compliance 1: at tension −λ they add BᵀB ⪰ −λ∂²C to the masses. Other elements have 3M rows y − p(y) with p held, so their
+Jacobian is the constant G of weights. Rows are ordered by copy, then by term.
 
-A row is inactive without stiffness, without gradient, or within the range of a limit. Its covector, value and λ are 0, and its
-compliance is 1.
+A row is inactive without stiffness or gradient or within a limit: its covector, value and λ are 0, its compliance 1.
 
-The factories share the key (term, dtype, scalar, curved). See :mod:`.constraint_jacobian` for J and Jᵀ.
+The key is (term, dtype, scalar, curved).
 """
 
 from functools import cache
@@ -28,9 +26,8 @@ ROUNDINGS = wp.constant(4.0)
 
 @wp.struct
 class RowLayout:
-    """Where the rows of a term are. A copy has ``rows_per_copy`` rows of all terms; those of this term begin at ``first``.
-
-    ``per_copy`` is the number of elements per copy.
+    """Where the rows of a term are: a copy has ``rows_per_copy`` rows, those of the term begin at ``first``, for ``per_copy``
+    elements.
     """
 
     per_copy: int
@@ -63,20 +60,19 @@ def row_values(dtype):
 
 
 def row_count(term: Term, scalar: bool, curved: bool):
-    """Number of rows per element."""
     if not scalar:
         return 3 * term.rows
     return 1 + (term.stiffening_rows if curved else 0)
 
 
 def slope_type(term: Term, dtype, scalar: bool, curved: bool):
-    """Type of the Jacobian of an element: covectors (rows, 3M), or for constant ones a number, 1 if active, else 0."""
+    """Type of an element's Jacobian: covectors (rows, 3M), or a number (1 if active) if constant."""
     return wp.types.matrix((row_count(term, scalar, curved), 3 * term.rows), dtype) if scalar else dtype
 
 
 @cache
 def covector_row(term: Term, dtype, scalar: bool, curved: bool):
-    """Device function (covectors, j) → covector j with the shape of y (M, 3); None if the covectors are constant."""
+    """Device function (covectors, j) → covector j as y (M, 3), or None if constant."""
     M, y_type, slope = wp.constant(term.rows), wp.types.matrix((term.rows, 3), dtype), slope_type(term, dtype, scalar, curved)
 
     @wp.func
@@ -92,15 +88,15 @@ def covector_row(term: Term, dtype, scalar: bool, curved: bool):
 
 @wp.func
 def lowest_compliance(alpha: Any, least: Any):
-    """The smallest α̃, as a fraction of the diagonal of J W Jᵀ: ``least`` for hard rows (α̃ = 0), ε for soft rows."""
+    """The smallest α̃ over the diagonal of J W Jᵀ: ``least`` for hard rows (α̃ = 0), ε for soft ones."""
     return wp.where(alpha == type(alpha)(0.0), least, epsilon(least))
 
 
 @cache
 def set_projected_row(dtype):
-    """Device function that sets the three values from j on of a row c = y − p(y) of G, a vector, see :func:`linearise`.
+    """Device function that sets the values of a vector c = y − p(y) from row j on, as :func:`linearise`.
 
-    ``total`` is the diagonal of G W Gᵀ, and ``most`` the largest |w|/m of its vertices. ``size`` bounds the summands of y.
+    ``total`` is the diagonal of G W Gᵀ, ``most`` the largest |w|/m, and ``size`` bounds the summands of y.
     """
     vec3, _ = types(dtype)
 
@@ -141,10 +137,9 @@ def set_projected_row(dtype):
 def linearise(term: Term, dtype, scalar: bool, curved: bool):
     """Kernel over elements at x̃ + d: gap = C + α̃λ, the Jacobian, α̃ = 1/(kAh²), the inverse diagonal of J W Jᵀ + α̃.
 
-    For hard rows α̃ is the fraction ``least`` of the diagonal of J W Jᵀ; without it redundant rows would leave λ undetermined.
-    ``carried`` [m] is the vertex displacement by which this α̃ leaves them open; it is small unless rows contradict one
-    another. ``residual`` [m] is the vertex displacement that would close the gap of this row alone; for a hard row without
-    gradient it is |C|. ``rounding`` [m] is the part of it, and of the force, that precision cannot resolve.
+    Hard rows have the fraction ``least`` of the diagonal of J W Jᵀ for α̃, as redundant rows leave λ undetermined. ``carried``
+    [m] is the vertex displacement by which this leaves them open. ``residual`` [m] is the vertex displacement that closes this
+    row's gap; |C| for a hard row without gradient. ``rounding`` [m] is the part of it that rounding explains.
     """
     vec3, _ = types(dtype)
     K, M, N = wp.constant(term.vertices), wp.constant(term.rows), wp.constant(term.stiffening_rows)
@@ -158,7 +153,7 @@ def linearise(term: Term, dtype, scalar: bool, curved: bool):
 
     @wp.func
     def size_of(stencil: wp.array2d(dtype=wp.int32), e: int, r: rest_type, x: wp.array(dtype=vec3), d: wp.array(dtype=vec3)):
-        """Sum of the norms of the summands of y; y is rounded by ε of it."""
+        """Sum of the norms of the summands of y, of which rounding is ε."""
         size = dtype(0.0)
         for i in range(K):
             away = x[stencil[e, i]]

@@ -1,4 +1,4 @@
-"""Copies between arrays: rows, to measure the memory bandwidth, chosen vertices, and indices of a copy for all copies."""
+"""Copies between arrays."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from .vectors import types
 
 @cache
 def copy_rows():
-    """Kernel over rows of four numbers, which a thread reads at once: out = source."""
+    """Kernel over rows of four numbers: out = source; it measures the bandwidth."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def copy_each_row(
@@ -68,7 +68,7 @@ def copy_chosen(dtype):
 
 @cache
 def repeat_indices():
-    """Kernel over (copies · m): out = the indices of the first copy (m,), plus ``step`` for each copy before."""
+    """Kernel over (copies · m): out = the first copy's indices (m,), plus ``step`` per copy."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def repeat_each_index(

@@ -1,11 +1,11 @@
-"""Coulomb's law of friction, for colliders and self-contact: a spring to an anchor that yields at the force μN.
+"""Coulomb's law of friction: a spring to an anchor that yields at the force μN.
 
-Per stiffness k [N/m], its energy is the Huber function H of the length l of its stretch u, with ε = μN/k:
+Per stiffness k [N/m], its energy is the Huber function H of the length l of its stretch u, ε = μN/k:
 
     H = ½l²  for l ≤ ε,   εl − ½ε²  beyond;     force kH′u/l;     second derivatives kH″ along u and kH′/l across
 
-The anchor follows to a distance of ε where a step begins, so that a spring at rest keeps its stretch and does not creep
-(Cundall and Strack 1979, *A discrete numerical model for granular assemblies*). N and the normal are constant in a step.
+Where a step begins, the anchor follows to a distance of ε, so a spring at rest does not creep (Cundall and Strack 1979, *A
+discrete numerical model for granular assemblies*). N and the normal are constant in a step.
 """
 
 from dataclasses import dataclass
@@ -41,14 +41,14 @@ def huber_bend(l: Any, limit: Any):
 
 @wp.func
 def huber_prox(l: Any, limit: Any, compliance: Any):
-    """The fraction f of u by which u* = (1 − f) u, of the length l* that minimises H(l*) + (l* − l)²/2c. l is above 0."""
+    """The fraction f of u by which u* = (1 − f) u minimises H(l*) + (l* − l)²/2c, l > 0."""
     one = type(l)(1.0)
     return wp.min(one / (one + one / compliance), compliance * limit / l)
 
 
 @dataclass(frozen=True)
 class Law:
-    """A law of friction: how far a spring stretches before it yields, and its energy per stiffness, by these device functions.
+    """A law of friction, as device functions.
 
     Attributes:
         name: Its name in the modules of kernels.
@@ -56,8 +56,8 @@ class Law:
         energy: (l, ε) → H.
         secant: (l, ε) → H′/l, at most 1.
         bend: (l, ε) → H″, at most 1.
-        prox: (l, ε, c) → the fraction of u that the prox of compliance c takes away.
-        kept: (l, ε) → the fraction of u that remains when the anchor follows; 1 for a spring that has not yielded.
+        prox: (l, ε, c) → the fraction of u that the prox takes away.
+        kept: (l, ε) → the fraction of u that remains when the anchor follows, 1 before it yields.
     """
 
     name: str
@@ -73,7 +73,7 @@ COULOMB = Law("coulomb")
 
 
 class Friction(float):
-    """A coefficient μ of friction with a law. Another law is a subclass; a plain number has that of Coulomb."""
+    """A coefficient μ of friction with a law. Another law is a subclass; a plain number is Coulomb's."""
 
     law: ClassVar[Law] = COULOMB
 

@@ -1,4 +1,4 @@
-"""Factory of the kernel of damping, which sets the rest states of damped elements at the start of a step."""
+"""The kernel that sets rest states of damped elements at the start of a step."""
 
 from functools import cache
 
@@ -11,12 +11,10 @@ from .vectors import types
 
 @cache
 def set_damped_rest(term: Term, dtype, parts: int, both: bool):
-    """Kernel over elements: out[e] = the rest state of damping for s̃ = s(x) plus a change, see :class:`.term.Dissipation`.
+    """Kernel over elements: out[e] = the rest state of damping for s̃ = s(x) plus a change.
 
     With d = scale·move, the change is (s(x) − s(x − d))/parts, or, with ``both``, (2s(x) − s(x + d) − s(x − d))/parts. With 0
-    parts it is 0, and move may be None, as for Euler. For BDF2 d is the last move, with 3 parts. For midpoint d is hₑ v, with
-    both and 2 parts: the change is about −½ddᵀ∂²s. Without it, s at the mean of two states would stand for the mean of s. That
-    is of first order, and damps rotations.
+    parts it is 0, as for Euler. For BDF2 d is the last move, with 3 parts; for midpoint hₑ v, with both and 2 parts.
     """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(term.parameters, dtype)

@@ -1,7 +1,6 @@
-"""Kernels that apply a device function of :mod:`.rotation` to every matrix of an array.
+"""Kernels that apply a function of :mod:`.rotation` to every matrix of an array.
 
-On CUDA, blocks of threads load and store matrices through shared memory, for a thread that accesses its own matrix makes
-strided accesses. On an H200 this triples the bandwidth of writing U, S and V, and the SVD is twice as fast.
+On CUDA, blocks load and store matrices through shared memory.
 """
 
 from functools import cache
@@ -13,9 +12,9 @@ BLOCK = 32  # threads of a CUDA block; 64 and 96 are 3 and 10 % slower
 
 @cache
 def access(dtype, block):
-    """Device functions load(array, i) and store(array, i, value) for ``dtype``. All threads of a block must call them.
+    """Device functions load(array, i) and store(array, i, value); all threads of a block must call them.
 
-    The number of threads must be a multiple of ``block``. Nothing beyond the end of the array is read or written.
+    The number of threads must be a multiple of ``block``.
     """
 
     @wp.func
@@ -73,7 +72,7 @@ def into_three(function, matrix, types, block):
 
 @cache
 def into_two(function, matrix, types, block):
-    """Kernel over matrices: (a[i], b[i]) = function(A[i]); arguments as in :func:`into_three`."""
+    """Kernel over matrices: (a[i], b[i]) = function(A[i]), as :func:`into_three`."""
     a_type, b_type = types
     load, _ = access(matrix, block)
     (_, store_a), (_, store_b) = (access(dtype, block) for dtype in types)
@@ -95,7 +94,7 @@ def into_two(function, matrix, types, block):
 
 
 def launch(factory, function, A, out):
-    """Launches the kernel of a factory over the matrices A (n,); the results go to the arrays ``out`` (n,)."""
+    """Launches a factory's kernel over the matrices A (n,), into the arrays ``out`` (n,)."""
     block = BLOCK if A.device.is_cuda else 1
     kernel = factory(function, A.dtype, tuple(array.dtype for array in out), block)
     threads = -(-len(A) // block) * block

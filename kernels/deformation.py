@@ -1,12 +1,11 @@
-"""Factories of kernels that measure the deformation of triangles. For neighbourhoods of points see :mod:`.neighbourhood_fit`.
+"""Kernels that measure the deformation of triangles.
 
-F̂ (3×3) is the deformation gradient in the tangent frame T = [t₁, t₂, N] of an element in the reference. Its first two columns
-are the deformation gradient F (3×2) of the surface. F̂ Tᵀ maps reference vectors to current vectors. The third column is the
-unit normal n of a triangle, which makes F̂ invertible, or the least-squares image of N of a neighbourhood. F̂ is NaN if the
-element is degenerate in the reference, such as a triangle flatter than :data:`FLATTEST`. Its third column is NaN without a
-current normal. No kernel computes the fourth power of a length: for 1e10 m or 1e-12 m it is outside float32.
+F̂ (3×3) is the deformation gradient in the tangent frame T = [t₁, t₂, N] of the reference: two columns F (3×2) of the surface,
+and the unit normal n of a triangle or the least-squares image of N of a neighbourhood. F̂ Tᵀ maps reference to current vectors.
+It is NaN if the element is degenerate in the reference (flatter than :data:`FLATTEST`), its third column without a current
+normal.
 
-Outputs that are None are not computed.
+Outputs may be None.
 """
 
 from functools import cache
@@ -52,7 +51,7 @@ def angle_between(a: Any, b: Any):
 
 @wp.func
 def angle_of_threads(F: Any, A: Any):
-    """Angle between the columns of A = F a (3×2); NaN if one is only rounding error of F."""
+    """Angle of the columns of A = F a (3×2); NaN if one is rounding error of F."""
     a = column(A, 0)
     b = column(A, 1)
     found = angle_between(a, b)
@@ -63,7 +62,7 @@ def angle_of_threads(F: Any, A: Any):
 
 @wp.func
 def inverse_beside(A: Any, size: Any):
-    """A⁻¹; NaN if det A is only rounding error for columns of the lengths ``size``."""
+    """A⁻¹; NaN if det A is rounding error for columns of lengths ``size``."""
     a = column(A, 0)
     b = column(A, 1)
     c = column(A, 2)
@@ -84,8 +83,8 @@ def lengths(A: Any):
 def frame_triangles(dtype):
     """Kernel over triangles: frames T in the reference X, Dm⁻¹ = [[r₀, r₁], [0, r₂]] [1/m] and the shortest altitude [m].
 
-    Dm are the edges [X₁ − X₀, X₂ − X₀] in t₁, t₂, with t₁ along the first. All outputs are NaN if the altitude may be only
-    rounding error of points, which is ``rounding`` [m] each.
+    Dm are the edges [X₁ − X₀, X₂ − X₀] in t₁, t₂, with t₁ along the first. All are NaN if the altitude may be rounding of
+    points, ``rounding`` [m].
     """
     vec3, mat33 = types(dtype)
 
@@ -181,7 +180,7 @@ def unit_directions(dtype):
 
 @cache
 def triangle_measures(dtype):
-    """Struct of the outputs of :func:`measure_triangles`, (E,) each, named as the measures."""
+    """Struct of the outputs of :func:`measure_triangles`, (E,), named as the measures."""
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)
     mat32, mat23 = wp.types.matrix((3, 2), dtype), wp.types.matrix((2, 3), dtype)
 
@@ -278,7 +277,7 @@ def measure_triangles(dtype):
 
 @cache
 def stress_measures(dtype):
-    """Struct of the outputs of :func:`measure_stress`, (T,) each, named as the measures."""
+    """Struct of the outputs of :func:`measure_stress`, (T,), named as the measures."""
     _, mat33 = types(dtype)
     mat32 = wp.types.matrix((3, 2), dtype)
 

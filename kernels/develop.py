@@ -1,4 +1,4 @@
-"""Pictures from the layers that rays found: smoothing, and colours in sRGB."""
+"""Pictures from layers of rays: smoothing, and colours in sRGB."""
 
 from functools import cache
 
@@ -12,11 +12,11 @@ SIMILAR = wp.constant(wp.float32(0.08))
 
 @cache
 def smooth():
-    """Kernel over pixels from ``first`` on: weighted means of ``visible`` over seven pixels of one surface in a row or column.
+    """Kernel over pixels from ``first`` on: means of ``visible`` over seven pixels of one surface in a row or column, weights
+    1, 2, 3, 4, 3, 2, 1.
 
-    Four neighbours have the four parts of one even sample sequence; the weights 1, 2, 3, 4, 3, 2, 1 give each part the same
-    sum. Weights decrease where the normal differs, and with the distance from the tangent plane. With ``step`` > 1, only the
-    visibility of the sky is smoothed, and only between pixels where it is similar.
+    Weights decrease with the angle of normals and the distance from the tangent plane. With ``step`` > 1, only similar
+    visibility of the sky is smoothed.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,7 +1,6 @@
-"""Factories of elementwise kernels: negation, scaling, differences, steps.
+"""Elementwise kernels: negation, scaling, differences, steps.
 
-Entries are vectors, or with ``numbers`` scalars. The two variants are in different modules, for Warp would take them for the
-same kernel in one. Each is in the module of the kernels that it runs with.
+Entries are vectors, or with ``numbers`` scalars, in another module, as Warp would take both for one kernel.
 """
 
 from functools import cache
@@ -51,7 +50,7 @@ def scale(dtype, numbers: bool = False):
 
 @cache
 def mismatch(dtype):
-    """Kernel over vertices: out = d − v; for v = W Jᵀλ, the residual of the equation of motion [m]."""
+    """Kernel over vertices: out = d − v; with v = W Jᵀλ the residual of motion [m]."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"warpcloth.constraint_step.{dtype.__name__}", enable_backward=False)
@@ -70,7 +69,7 @@ def mismatch(dtype):
 
 @cache
 def add_step(dtype, numbers: bool = False):
-    """Kernel over entries: a += step·change, with the step of the copy."""
+    """Kernel over entries: a += step·change, step of the copy."""
     value = dtype if numbers else types(dtype)[0]
 
     @wp.kernel(module="unique", enable_backward=False)

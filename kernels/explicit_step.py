@@ -1,4 +1,4 @@
-"""Factories of the kernels of an explicit step, v += h(g − M⁻¹∇U), x += h v, with a given gradient ∇U."""
+"""Kernels of an explicit step, v += h(g − M⁻¹∇U), x += h v, with a given ∇U."""
 
 from functools import cache
 
@@ -11,8 +11,8 @@ from .vectors import types
 def kick_and_drift(dtype, symplectic: bool, compensated: bool = False):
     """Device function (x, residual, v, a, h) → x, residual, v after a step.
 
-    If ``symplectic``, x moves with the new v, else with the old one. ``compensated`` adds to x by compensated summation (Dekker
-    1971, *A floating-point technique for extending the available precision*): the position is x + residual.
+    If ``symplectic``, x moves with the new v. ``compensated`` sums x + residual by compensation (Dekker 1971, *A floating-point
+    technique for extending the available precision*).
     """
     vec3, _ = types(dtype)
 
@@ -35,7 +35,7 @@ def kick_and_drift(dtype, symplectic: bool, compensated: bool = False):
 
 @cache
 def explicit_step(dtype, symplectic: bool, compensated: bool = False):
-    """Kernel over vertices: x, v after a step with a = g − ∇U/m; resets the gradient to 0. Pins keep their x and v."""
+    """Kernel over vertices: x, v after a step with a = g − ∇U/m, but for pins; resets the gradient."""
     vec3, _ = types(dtype)
     step = kick_and_drift(dtype, symplectic, compensated)
 
@@ -71,7 +71,7 @@ def explicit_step(dtype, symplectic: bool, compensated: bool = False):
 
 @cache
 def move_ahead(dtype):
-    """Kernel over vertices: d = h v, the displacement at which damping is computed."""
+    """Kernel over vertices: d = h v, where damping is computed."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

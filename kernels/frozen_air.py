@@ -1,4 +1,4 @@
-"""Factory of the kernel that freezes the forces of air where a step begins, see :mod:`.terms.air`."""
+"""The kernel that freezes the forces of air where a step begins (:mod:`.terms.air`)."""
 
 from functools import cache
 
@@ -18,10 +18,9 @@ def calm(_position: wp.vec3, _time: wp.float32):
 def set_air(dtype, parts: int, explicit: bool, blow: wp.Function = calm):
     """Kernel over triangles: a, n, κ_n and κ_t of rest, from x, v and the wind.
 
-    a is the centre after hₑ with the wind; the step takes velocities from x, or, with ``parts``, from x + move/parts, as
-    BDF2 with 3. Where ``explicit``, y stays at x while the force is taken, and a is that much farther back. A triangle without
-    an area has no force. Wind is that of the rest state or, if there are keyframes (F,), theirs ``ahead`` of the step. A
-    function ``blow`` gives that at the centre; where it is faster than the wind of the rest state, it is slowed to that.
+    a is the centre after hₑ with the wind; velocities are those from x, or, with ``parts``, from x + move/parts (BDF2: 3). If
+    ``explicit``, y stays at x, and a is that much farther back. A triangle without area has no force. Wind is that of the rest
+    state, of keyframes (F,) ``ahead`` of the step, or ``blow`` at the centre, at most as fast as that of the rest state.
     """
     vec3, _ = types(dtype)
     rest_type = wp.types.vector(AIR.parameters, dtype)

@@ -1,6 +1,6 @@
-"""Factories of the kernels of a Jacobi sweep: local steps of elements at the positions before the sweep, then vertex moves.
+"""Kernels of a Jacobi sweep: local steps of elements at the old positions, then, after Dᵀz, vertex moves.
 
-Between the two, :mod:`.transpose` sums Dᵀz. Both have the key of :mod:`.project`.
+The key is that of :mod:`.project`.
 """
 
 from functools import cache
@@ -16,7 +16,7 @@ from .vectors import types
 
 @cache
 def local_steps(term: Term, dtype, scalar: bool, multipliers: bool = False, per_step: bool = False, axes: bool = False):
-    """Kernel over elements at x̃ + d: z = factorₑ times the rows of :func:`.project.multiplier`, λ += factorₑ Δλ."""
+    """Kernel over elements at x̃ + d: z = factorₑ · rows of :func:`.project.multiplier`, λ += factorₑ Δλ."""
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
     y_type, change = wp.types.matrix((term.rows, 3), dtype), element_change(term, dtype, scalar, per_step, axes)
@@ -55,12 +55,10 @@ def local_steps(term: Term, dtype, scalar: bool, multipliers: bool = False, per_
 
 
 def scatter_moves(term: Term, dtype):
-    """Kernel over elements: total += Dᵀz, see :func:`.transpose.scatter`."""
     return scatter(term, dtype, stored(term, dtype))
 
 
 def gather_moves(term: Term, dtype):
-    """Kernel over vertices: total += Dᵀz, see :func:`.transpose.gather`."""
     return gather(term, dtype, stored(term, dtype))
 
 
@@ -68,7 +66,7 @@ def gather_moves(term: Term, dtype):
 def move_vertices(dtype):
     """Kernel over vertices: d += scaleᵢ/mᵢ Σ Dᵀz; resets the sum to 0.
 
-    scaleᵢ is 1, or 1/(nᵢ + α) to average over the nᵢ constraints of the vertex.
+    scaleᵢ is 1, or 1/(nᵢ + α) for nᵢ constraints of the vertex.
     """
     vec3, _ = types(dtype)
 

@@ -1,15 +1,12 @@
-"""Factories of the kernels of a sparse matrix of 3×3 blocks and of conjugate gradients in every copy.
+"""Kernels of a sparse matrix of 3×3 blocks and of conjugate gradients in every copy.
 
-The matrix has block compressed rows (offsets, columns, values). Every copy is a diagonal block of it, so only sums depend on
-copies. ``active[copy]`` is 1 while that copy iterates.
+The matrix has block compressed rows (offsets, columns, values), and a diagonal block per copy; ``active[copy]`` is 1 while a
+copy iterates.
 
-Kernels that always run together share a module, which compiles faster. Conjugate gradients take vector unknowns with 3×3
-preconditioner blocks, or with ``numbers`` scalar ones.
+Conjugate gradients take vectors with 3×3 preconditioner blocks, or ``numbers``.
 
-An iteration of conjugate gradients has two launches over (copies, lanes), one for the direction and its product, one for the
-rest. A lane takes every lanes-th unknown of its copy. On CUDA each unknown has a lane, up to a limit, and blocks of ``block``
-threads store their part of a scalar product. The next launch adds the parts of a copy, in each of its blocks. The CPU has one
-lane, and ``block`` is 0. So sums have a fixed order.
+An iteration has two launches over (copies, lanes): the direction with its product, and the rest. On CUDA a ``block`` of threads
+stores its part of a scalar product, which the next launch adds up; the CPU has one lane, and ``block`` 0.
 """
 
 from functools import cache
@@ -57,7 +54,7 @@ def add_masses(dtype):
 
 @cache
 def add_blocks(dtype):
-    """Kernel over the blocks of the matrix: values[s] += Σ blocks[sources[offsets[s] : offsets[s+1]]], in a fixed order."""
+    """Kernel over blocks s of the matrix: values[s] += Σ blocks[sources[offsets[s] : offsets[s+1]]], in a fixed order."""
     _, mat33 = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -84,10 +81,9 @@ def add_blocks(dtype):
 
 @cache
 def lock_blocks(dtype):
-    """Kernel over the blocks of the matrix: sets rows and columns of locked coordinates to 0, except the diagonal.
+    """Kernel over blocks of the matrix: sets rows and columns of locked coordinates to 0, and diagonal entries ≤ 0 there to 1.
 
-    A diagonal entry of 0 or less becomes 1. Others stay, for they have the scale of the matrix; so do entries that are not
-    finite.
+    Positive ones keep the scale of the matrix; NaN stays.
     """
     vec3, mat33 = types(dtype)
 
@@ -118,7 +114,7 @@ def lock_blocks(dtype):
 
 @cache
 def take_axes(dtype):
-    """Kernel over vertices: out = a along the axes where ``taken`` is 1; the others stay."""
+    """Kernel over vertices: out = a along axes where ``taken`` is 1."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -170,14 +166,13 @@ def multiply(dtype):
 
 @cache
 def rounding(dtype, block: int):
-    """Kernel over (copies, lanes): b = −∇φ, and the parts of estimates of the rounding errors of the force and of the energy.
+    """Kernel over (copies, lanes): b = −∇φ, and parts of estimates of rounding errors of force and energy.
 
-    They are Σ(ρ + ε‖A[i, i]‖ edge)² [N²] and Σ½ρ²/‖A[i, i]‖ [J] with ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖). The typical edge
-    length stands for pinned neighbours, which are not in the matrix. In float32 the parts with ‖xⱼ − xᵢ‖ and with the edge are
-    0, because elements are evaluated in double precision, see :func:`.assemble.of_element`.
+    They are Σ(ρ + ε‖A[i, i]‖ edge)² [N²] and Σ½ρ²/‖A[i, i]‖ [J], ρ = ε Σⱼ ‖A[i, j]‖(‖xⱼ − xᵢ‖ + ‖dⱼ‖), where the typical
+    ``edge`` stands for pinned neighbours. In float32 the parts with ‖xⱼ − xᵢ‖ and the edge are 0: elements are evaluated in
+    float64.
 
-    The third part is max 2ε²‖A[i, i]‖ [N/m]. Times φ it is an estimate of Σ(εF)² for the forces F of elements, of which the
-    sum is rounded: F² ≤ 2‖A‖u for an energy u ≥ 0 of curvature ‖A‖.
+    The third is max 2ε²‖A[i, i]‖ [N/m]; times φ it estimates Σ(εF)² of the elements' forces, as F² ≤ 2‖A‖u.
     """
     vec3, mat33 = types(dtype)
     column, block_at, vector = load(wp.int32), load(mat33), load(vec3)
@@ -228,11 +223,9 @@ def rounding(dtype, block: int):
 
 @cache
 def invert_diagonal(dtype):
-    """Kernel over block rows: inverse[i] = A[i, i]⁻¹, the block Jacobi preconditioner; I/‖A[i, i]‖ if A[i, i] is indefinite.
+    """Kernel over block rows: inverse[i] = A[i, i]⁻¹, or I/‖A[i, i]‖ if indefinite, by leading minors (Sylvester).
 
-    Conjugate gradients need a definite preconditioner even for an indefinite matrix; leading minors decide (Sylvester). The
-    block of a vertex deep in contact has a condition number of 1e5 and more, and its minors cancel. If the determinant of
-    A[i, i]/‖A[i, i]‖ is below ``lost``, the inverse is computed in float64; else conjugate gradients would find no direction.
+    If the determinant of A[i, i]/‖A[i, i]‖ is below ``lost``, as deep in contact, the inverse is computed in float64.
     """
     _, mat33 = types(dtype)
 
@@ -270,7 +263,6 @@ def invert_diagonal(dtype):
 
 
 def _unknowns(dtype, numbers):
-    """Type of an unknown, type of a diagonal block, name of the module."""
     vec3, mat33 = types(dtype)
     name = f"{MODULE}.{dtype.__name__}"
     return (dtype, dtype, f"{name}.numbers") if numbers else (vec3, mat33, name)
@@ -280,12 +272,8 @@ def _unknowns(dtype, numbers):
 class Solves:
     """The conjugate gradients of each copy, (B,) arrays.
 
-    ``rz`` is rᵀz, ``first`` its first value; ``negative`` is 1 after a direction of negative curvature. ``iteration`` counts
-    iterations from 1, up to ``most``; ``proceed`` (1,) is 1 if a copy is active. The last three are those of :func:`is_enough`,
-    or None.
-
-    A launch that turns directions writes the values ``next``, from which the launch that advances takes them over. So no
-    thread reads what another one of the same launch writes.
+    ``rz`` is rᵀz, ``first`` its first value; ``negative`` is 1 after negative curvature; ``iteration`` counts from 1 up to
+    ``most``; ``proceed`` (1,) is 1 if a copy is active; the last three are those of :func:`is_enough`, or None.
     """
 
     active: wp.array(dtype=wp.int32)
@@ -306,8 +294,6 @@ class Solves:
 
 @cache
 def scalar_product(numbers: bool):
-    """Device function (a, b) → a·b in float64 of vectors or ``numbers``."""
-
     @wp.func
     def multiplied(a: Any, b: Any):
         if wp.static(numbers):
@@ -320,10 +306,9 @@ def scalar_product(numbers: bool):
 
 @wp.func
 def begin_iteration(solves: Solves, copy: int, lane: int, rz: wp.float64):
-    """Begins an iteration of an active copy, or ends the copy: returns the ratio of rᵀz to that before, or −1 if it has ended.
+    """Begins an iteration of an active copy: returns the ratio of rᵀz to that before, or −1 if the copy has ended.
 
-    A copy ends if √(rᵀz) has fallen to its tolerance, or after ``most`` iterations. NaN ends it too; the caller finds it in the
-    result.
+    It ends if √(rᵀz) is at its tolerance or NaN, or after ``most`` iterations.
     """
     if copy == 0 and lane == 0:
         solves.proceed[0] = 0
@@ -349,7 +334,7 @@ def begin_iteration(solves: Solves, copy: int, lane: int, rz: wp.float64):
 
 @cache
 def start_solves(dtype, numbers: bool, block: int):
-    """Kernel over (copies, lanes): x = 0, r = b, z = P r, p = 0 in the copies that are ``wanted``; the parts of rᵀz."""
+    """Kernel over (copies, lanes): x = 0, r = b, z = P r, p = 0 in ``wanted`` copies; parts of rᵀz."""
     vector, matrix, module = _unknowns(dtype, numbers)
     store, _add_up = block_sums(block)
     multiplied = scalar_product(numbers)
@@ -400,7 +385,7 @@ def start_solves(dtype, numbers: bool, block: int):
 
 @cache
 def dot_parts(dtype, numbers: bool, block: int):
-    """Kernel over (copies, lanes): the parts of aᵀb in active copies."""
+    """Kernel over (copies, lanes): parts of aᵀb in active copies."""
     vector, _matrix, module = _unknowns(dtype, numbers)
     store, _add_up = block_sums(block)
     multiplied = scalar_product(numbers)
@@ -430,7 +415,7 @@ def dot_parts(dtype, numbers: bool, block: int):
 
 @cache
 def turn(dtype, numbers: bool, block: int):
-    """Kernel over (copies, lanes): p = z + ratio·p in the copies of which an iteration begins, see :func:`begin_iteration`."""
+    """Kernel over (copies, lanes): p = z + ratio·p in copies that begin an iteration."""
     vector, _matrix, module = _unknowns(dtype, numbers)
     _store, add_up = block_sums(block)
 
@@ -458,10 +443,7 @@ def turn(dtype, numbers: bool, block: int):
 
 @cache
 def turn_and_multiply(dtype, block: int, terms: int = 0):
-    """As :func:`turn`, from ``before`` to p, also q = A p and the parts of pᵀq.
-
-    On CUDA threads compute p of the neighbours of a vertex again, so that one launch does both. On the CPU ``before`` is p.
-    """
+    """:func:`turn` from ``before`` to p, with q = A p and the parts of pᵀq."""
     vec3, _ = types(dtype)
     store, add_up = block_sums(block)
     multiplied, lanes = scalar_product(False), lanes_of_rows(block)
@@ -515,7 +497,8 @@ def turn_and_multiply(dtype, block: int, terms: int = 0):
 
 @wp.func
 def is_enough(solves: Solves, copy: int, pq: wp.float64):
-    """Whether the first iteration found x = P b, as A − P⁻¹ has no part in P b; or a solve that is not ``accurate`` is done.
+    """Whether x = P b of the first iteration suffices, as A − P⁻¹ has no part in P b, or a solve that is not ``accurate`` is
+    done.
 
     ``decrease`` is twice the decrease of ½xᵀAx − bᵀx, at most bᵀPb if A ≥ P⁻¹; ``largest`` is the largest bᵀPb of solves.
     """
@@ -534,10 +517,9 @@ def is_enough(solves: Solves, copy: int, pq: wp.float64):
 
 @cache
 def advance(dtype, numbers: bool, block: int):
-    """Kernel over (copies, lanes): x += a p, r −= a q, z = P r with a = rᵀz/pᵀq of the copy; the parts of rᵀz.
+    """Kernel over (copies, lanes): x += a p, r −= a q, z = P r with a = rᵀz/pᵀq; parts of rᵀz.
 
-    A copy with pᵀq ≤ 0 ends. Its first iteration sets x = p, and a later one leaves x. Both give a descent direction
-    (Steihaug 1983).
+    If pᵀq ≤ 0, the copy ends, with x = p in its first iteration, else with x: descent directions (Steihaug 1983).
     """
     vector, matrix, module = _unknowns(dtype, numbers)
     store, add_up = block_sums(block)

@@ -1,4 +1,4 @@
-"""Factories of the kernels of loads, which add forces, tractions and pressures to gravity as accelerations once per step."""
+"""Kernels that add loads to gravity as accelerations, once per step."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from .vectors import types
 
 @cache
 def dead_forces(dtype):
-    """Struct of dead forces [N], of constant direction: keyframes[frame, copy, k] acts on the k-th loaded vertex of a copy."""
+    """Struct of dead forces [N]: keyframes[frame, copy, k] acts on the k-th loaded vertex of a copy."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -23,7 +23,7 @@ def dead_forces(dtype):
 
 @cache
 def pressures(dtype):
-    """Struct of pressures on triangles [Pa], and the triangles of the loaded vertices as offsets and 3·triangle + corner."""
+    """Struct of pressures on triangles [Pa], and offsets and 3·triangle + corner of the loaded vertices."""
 
     @wp.struct
     class Pressures:
@@ -39,9 +39,8 @@ def pressures(dtype):
 def set_loads(dtype, moved: bool):
     """Kernel over (copies, loaded vertices): force = f(t) + Σ p(t)/6 (x₁ − x₀)×(x₂ − x₀), and a = g + force/m.
 
-    The sum is over the triangles at the vertex, which each give p A n/3, at x, or if ``moved`` at x + scale·move. Values are
-    those of the keyframes at step ``step + ahead``, with ``steps_per_frame`` steps per frame. They are linear between keyframes
-    and constant after the last.
+    The sum is over triangles at the vertex, a third of p A n each, at x, or if ``moved`` at x + scale·move. Values are of the
+    keyframes at ``step + ahead``, ``steps_per_frame`` apart, linear between, constant after.
     """
     vec3, _ = types(dtype)
 

@@ -1,4 +1,4 @@
-"""Local coordinates y = Dx = Σᵢ wᵢ ⊗ xᵢ of an element, over its stencil; :mod:`.transpose` applies Dᵀ."""
+"""Local coordinates y = Dx = Σᵢ wᵢ ⊗ xᵢ of an element."""
 
 from functools import cache
 
@@ -29,10 +29,10 @@ def from_corner(term: Term, dtype):
 
 @cache
 def local_coordinate(term: Term, dtype, corrected: bool, precision=None):
-    """Device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ of a term, or if ``corrected`` Σᵢ wᵢ ⊗ (xᵢ + dᵢ).
+    """Device function (stencil, element, rest, x, d) → y = Σᵢ wᵢ ⊗ xᵢ, or if ``corrected`` Σᵢ wᵢ ⊗ (xᵢ + dᵢ) without loss of
+    digits of d.
 
-    In float32 the sum x + d would lose digits of d. The difference of neighbouring x is nearly exact. The rest state and y have
-    the ``precision``, by default that of x and d.
+    Rest state and y have the ``precision``, by default that of x and d.
     """
     vec3, _ = types(dtype)
     wide = types(precision or dtype)[0]

@@ -1,4 +1,4 @@
-"""The local problem of an element, argmin u(z) + ½r‖v − z‖², which ADMM solves and XPBD for energies without another step."""
+"""The local problem of an element, argmin u(z) + ½r‖v − z‖², of ADMM and of XPBD."""
 
 from functools import cache
 from typing import Any
@@ -14,7 +14,7 @@ HALVINGS = wp.constant(30)
 
 @wp.func
 def solve_definite(H: Any, b: Any, n: int):
-    """H⁻¹ b for a symmetric positive definite H, by Cholesky; n is an argument so that loops are not unrolled."""
+    """H⁻¹ b for a symmetric positive definite H of n rows, by Cholesky."""
     L = H
     x = b
     for j in range(n):
@@ -44,12 +44,10 @@ def solve_definite(H: Any, b: Any, n: int):
 
 @cache
 def local_minimiser(term: Term, dtype):
-    """Device function (v, z, rest, r, steps) → argmin u(z) + ½r‖v − z‖², r > 0, from the initial guess z.
+    """Device function (v, z, rest, r, steps) → argmin u(z) + ½r‖v − z‖², r > 0, from the guess z.
 
-    A term with a prox uses it. A term with a projection p uses (p(v) + r v)/(1 + r). Other terms use Newton's method with their
-    semi-definite Hessian and a line search. The result is NaN if a force or the energy is not finite: CUDA's fused products
-    overflow to infinity where others give NaN, and infinity could pass for a minimum. It is NaN too if r is so small that
-    rounding leaves the Hessian not definite.
+    It is a term's prox, or (p(v) + r v)/(1 + r) of its projection, else Newton's method with a semi-definite Hessian and a line
+    search. It is NaN if a force or energy is not finite, or r is so small that the Hessian is not definite.
     """
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     flat = wp.types.vector(3 * term.rows, dtype)

@@ -1,4 +1,4 @@
-"""Factory of the kernel that counts the passes left of a loop on the device."""
+"""Factory of the kernel that counts down a loop on the device."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ import warp as wp
 
 @cache
 def count_down():
-    """Kernel of one thread: left −= 1, the number of passes left."""
+    """Kernel of one thread: left −= 1."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def count_left(

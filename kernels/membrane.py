@@ -1,8 +1,8 @@
-"""Functions of the deformation gradient F of a triangle that membrane energies share: F, and Hessians from singular values.
+"""Functions of the deformation gradient F of a triangle that membrane energies share.
 
-Stencil: a triangle (x₀, x₁, x₂). F (3×2) = [x₁ − x₀, x₂ − x₀] Dm⁻¹ with Dm the rest edges in the triangle's own tangent frame,
-the first along an axis; the rows of y are the columns of F. The first numbers of a rest state are Dm⁻¹, which is upper
-triangular: r₀ = Dm⁻¹₀₀, r₁ = Dm⁻¹₀₁, r₂ = Dm⁻¹₁₁ [1/m]. The measure is the rest area ½ det Dm [m²].
+Stencil: a triangle (x₀, x₁, x₂). F (3×2) = [x₁ − x₀, x₂ − x₀] Dm⁻¹, Dm the rest edges in the triangle's tangent frame, the
+first along an axis; rows of y are columns of F. A rest state begins with Dm⁻¹: r₀ = Dm⁻¹₀₀, r₁ = Dm⁻¹₀₁, r₂ = Dm⁻¹₁₁ [1/m]. The
+measure is the area ½ det Dm [m²].
 
 An isotropic energy ψ(σ₁, σ₂) of the singular values of F = U diag(σ) Vᵀ, u₃ = u₁×u₂, has ∂ψ/∂F = Σ ψᵢ uᵢvᵢᵀ, and its Hessian
 the eigenmatrices (Smith, De Goes and Kim 2019, *Analytic eigensystems for isotropic distortion energies*; here of 3×2)
@@ -40,14 +40,15 @@ def inverse_edges(points, stencil):
 
 
 def material_state(points, stencil, poisson_ratio=0.0):
-    """:func:`inverse_edges` of the triangles ``stencil`` (E, 3), and μ/k = 1/(2(1 + ν)) and λ/k = ν/(1 − ν²) [1] of Poisson's
-    ratio ν (one or E), as an array (E, 5)."""
+    """:func:`inverse_edges` of triangles (E, 3), μ/k = 1/(2(1 + ν)) and λ/k = ν/(1 − ν²) of Poisson's ratio ν (one or E), (E,
+    5).
+    """
     nu = np.broadcast_to(poisson_ratio, len(stencil))
     return np.column_stack([inverse_edges(points, stencil), 0.5 / (1.0 + nu), nu / (1.0 - nu**2)])
 
 
 def edge_max_lengths(points, stencil, stretch):
-    """``max_lengths`` of triangles (E, 3) of stretches up to ``stretch`` (E,): their edges, each with a third of Σ kL² = 2A."""
+    """``max_lengths`` of triangles (E, 3) with stretches up to ``stretch`` (E,): edges, each with a third of Σ kL² = 2A."""
     pairs = stencil[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     sides = points[pairs[:, 1]] - points[pairs[:, 0]]
     squares = np.einsum("ij,ij->i", sides, sides)
@@ -119,7 +120,7 @@ def scaled_if_negative(value: Any, negative: Any):
 
 @wp.func
 def scaled_negative_part(B: Any, negative: Any):
-    """A symmetric 2×2 matrix with its negative eigenvalues times ``negative``, computed without eigenvectors."""
+    """A symmetric 2×2 matrix with its negative eigenvalues times ``negative``, without eigenvectors."""
     half = B.dtype(0.5)
     mean = half * (B[0, 0] + B[1, 1])
     difference = half * (B[0, 0] - B[1, 1])
@@ -136,7 +137,7 @@ def scaled_negative_part(B: Any, negative: Any):
 
 @wp.func
 def isotropic_hessian(U: Any, V: Any, stretch: Any, twist: Any, flip: Any, out1: Any, out2: Any, negative: Any):
-    """∂²ψ/∂y² (6×6) of the 2×2 matrix and the four eigenvalues of the module's table."""
+    """∂²ψ/∂y² (6×6) from the 2×2 matrix and the four eigenvalues of the table."""
     u1 = wp.vector(U[0, 0], U[1, 0], U[2, 0])
     u2 = wp.vector(U[0, 1], U[1, 1], U[2, 1])
     u3 = wp.cross(u1, u2)
@@ -174,7 +175,7 @@ def range_energy(y: Any, sigma_min: Any, sigma_max: Any):
 
 @wp.func
 def range_gradient(y: Any, sigma_min: Any, sigma_max: Any):
-    """F − p, exactly 0 inside the range. For σ = 0, where the direction is not unique, it is that of U."""
+    """F − p, exactly 0 inside the range. For σ = 0 the direction is that of U."""
     U, S, V = decompose(y)
     excess = S - clamped(S, sigma_min, sigma_max)
     return wp.transpose(U * wp.diag(excess) * wp.transpose(V))
@@ -202,7 +203,7 @@ def tangent(size: Any, sigma_min: Any, sigma_max: Any):
 
 @wp.func
 def range_hessian(y: Any, sigma_min: Any, sigma_max: Any, negative: Any):
-    """∂²u/∂y²; at a bound of the range, its limit from outside. Only twist and the last two eigenvalues can be negative."""
+    """∂²u/∂y², at a bound of the range from outside; only twist and the last two eigenvalues can be negative."""
     U, S, V = decompose(y)
     c = clamped(S, sigma_min, sigma_max)
     excess = S - c

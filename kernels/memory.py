@@ -7,9 +7,8 @@ import warp as wp
 
 
 def _copied(dtype):
-    """The C type of a number, how many there are, the type of the whole value, and C code that copies ``from`` to ``to``.
-
-    The code copies number by number: copies of whole vectors or matrices keep the compiler from vectorising a loop.
+    """C type of a number, their count, type of the value, and C code that copies ``from`` to ``to``, number by number so that
+    loops vectorise.
     """
     number = f"wp::{getattr(dtype, '_wp_scalar_type_', dtype).__name__}"
     shape = getattr(dtype, "_shape_", ())
@@ -20,9 +19,8 @@ def _copied(dtype):
 
 @cache
 def load(dtype, ndim=1, stored=None):
-    """Device function (a, i) → entry i of contiguous memory, without the arithmetic of strides and negative indices.
-
-    A sweep over springs then takes 0.8 of the time. ``stored`` is the dtype of the array, if it differs from ``dtype``.
+    """Device function (a, i) → entry i of contiguous memory, without strides and negative indices; ``stored`` is the dtype of
+    the array, if another.
     """
     number, numbers, kind, copy = _copied(dtype)
 
@@ -37,7 +35,7 @@ def load(dtype, ndim=1, stored=None):
 
 @cache
 def load_shared(dtype):
-    """Device function (array, i) → entry i, for any stride, such as 0 if elements share a value."""
+    """Device function (array, i) → entry i, for any stride, such as 0."""
 
     @wp.func_native("return *(decltype(a.data))((char*)a.data + size_t(i) * size_t(a.strides[0]));")
     def load_strided(a: wp.array(dtype=dtype), i: int) -> dtype: ...
@@ -47,7 +45,7 @@ def load_shared(dtype):
 
 @cache
 def store(dtype, stored=None):
-    """Device function (a, i, value) that sets a[i] = value; arguments as in :func:`load`."""
+    """Device function (a, i, value) that sets a[i] of contiguous memory."""
     number, numbers, _kind, copy = _copied(dtype)
 
     @wp.func_native(
@@ -75,10 +73,7 @@ def add_to(dtype, transposed=False):
 
 @cache
 def prefetch(dtype):
-    """Device function (a, indices, first, last) that asks the memory of a CPU for a[indices[n]], first ≤ n < last.
-
-    Indices beyond the last are left out; those below 0 fetch something of no use.
-    """
+    """Device function (a, indices, first, last) that prefetches a[indices[n]], first ≤ n < last, on a CPU."""
     number, numbers, _kind, _copy = _copied(dtype)
 
     @wp.func_native(

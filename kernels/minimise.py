@@ -1,7 +1,6 @@
-"""Factories of the kernels that minimise φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d over the free vertices of each copy.
+"""Kernels that minimise φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d over free vertices of each copy.
 
-φ is the objective of implicit Euler for base = x̃, s = 1/h² and load = 0. It is the potential energy under gravity for base =
-the start, s = 0 and load = 1.
+Implicit Euler has base = x̃, s = 1/h², load = 0; equilibria have base = the start, s = 0, load = 1.
 """
 
 from enum import IntEnum
@@ -31,7 +30,7 @@ FALL = wp.constant(wp.float64(0.25))
 
 
 class End(IntEnum):
-    """How the minimisation of a copy ended; each is the result of this name in :class:`warpcloth.core.status.Result`."""
+    """How the minimisation of a copy ended, named as in :class:`warpcloth.core.status.Result`."""
 
     ITERATIONS_USED_UP = 0
     CONVERGED = 1
@@ -46,11 +45,11 @@ STALLED, DIVERGED = wp.constant(int(End.STALLED)), wp.constant(int(End.DIVERGED)
 
 @wp.struct
 class DescentState:
-    """The minimisation of each copy, (B,) arrays, and flags of all, (1,).
+    """The minimisation of each copy, (B,), and flags of all, (1,).
 
-    ``residual`` is the largest unbalanced acceleration over the scale of :class:`Limits`, ``previous`` its value an iteration
-    before, or 0; ``end`` is an :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it also iterates before the host
-    looks. ``stays`` is 1 where d is that of the start of the step.
+    ``residual`` is the largest unbalanced acceleration over the scale, ``previous`` that before, or 0; ``end`` is an
+    :class:`End`. ``proceed`` is 1 if a copy is active, ``more`` if it iterates before the host looks, ``stays`` where d is that
+    of the start of the step.
     """
 
     active: wp.array(dtype=wp.int32)
@@ -65,7 +64,7 @@ class DescentState:
 
 @wp.struct
 class Limits:
-    """The tolerance of the residual, the maximum number of iterations, (1,), and the scale of each copy [m/s²], (B,)."""
+    """Tolerance of the residual, maximum iterations, (1,), and scale of each copy [m/s²], (B,)."""
 
     tolerance: wp.array(dtype=wp.float64)
     iterations: wp.array(dtype=wp.int32)
@@ -74,7 +73,7 @@ class Limits:
 
 @wp.func
 def look(progress: DescentState, limits: Limits, copy: int, acceleration: wp.float64, end: int):
-    """Notes the residual of an active copy and whether it has ended; ``end`` holds if the residual is finite and too large."""
+    """Notes residual and end of an active copy; ``end`` holds if the residual is finite and too large."""
     residual = acceleration / limits.scale[copy]
     found = end
     if not wp.isfinite(residual):
@@ -95,10 +94,9 @@ def look(progress: DescentState, limits: Limits, copy: int, acceleration: wp.flo
 
 @cache
 def begin_descent():
-    """Kernel over copies: the state of :class:`DescentState` where the descent begins; ``proceed`` and ``more`` are 0 before.
+    """Kernel over copies: the :class:`DescentState` at the start; ``proceed`` and ``more`` are 0 before.
 
-    Cloth that stays where the step began takes an iteration even if its residual is below the tolerance: without, all motion
-    and loads below it would be lost in each step. The iteration is as accurate as the residual must be, ``previous`` is −1.
+    Cloth that stays iterates once even below the tolerance, or small motion and loads would be lost; ``previous`` is then −1.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -125,7 +123,7 @@ def begin_descent():
 
 @cache
 def note_stay():
-    """Kernel over copies: ``stays`` = ``value`` where the search moved d; or 1 where a ``fraction`` (B,) is below 1, else 0."""
+    """Kernel over copies: ``stays`` = ``value`` where the search moved d, 1 where a ``fraction`` (B,) is below 1, else 0."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def note(
@@ -150,12 +148,10 @@ def note_stay():
 def begin_newton():
     """Kernel over copies: sets the tolerance of the linear system, and if ``adaptive`` is 1 the factor of the negative part.
 
-    The factor is that of the raw Hessian in the first iteration of a descent. Later it is FALL above that of the last matrix,
-    which saves a quarter of the solves: a matrix is often about as indefinite as the one before. ``proceed`` and ``more``
-    become 0, ``unsolved`` 1. Active copies are to be solved.
+    That is RAW at first, later FALL above that of the last matrix.
 
-    The tolerance is 0.9 (residual/previous)², choice 2 of Eisenstat and Walker (1996), at most LOOSEST. It is not below LEFT
-    times limit/residual, because a more accurate solution would not save an iteration.
+    The tolerance is 0.9 (residual/previous)², choice 2 of Eisenstat and Walker (1996), at most LOOSEST, at least LEFT times
+    limit/residual.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -194,10 +190,10 @@ def begin_newton():
 
 @cache
 def find_indefinite():
-    """Kernel over copies: those whose matrix is indefinite are to be solved again, with a lower factor in ``policy``.
+    """Kernel over copies: those with an indefinite matrix are solved again, with a lower factor in ``policy``, down to 0, which
+    is definite.
 
-    ``unsolved`` is 0 before, and then 1 if there are any. With the factor 0 a matrix is definite. Coarse matrices of the one
-    that was not are ``outdated`` (B,), which may be None: for the next matrix they are poor preconditioners.
+    ``unsolved`` becomes 1 if there are any, and their coarse matrices ``outdated`` (B,), which may be None.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -225,12 +221,11 @@ def find_indefinite():
 
 @cache
 def end_newton(block: int):
-    """Kernel over (copies, lanes of one block): finds whether an active copy has ended after an iteration.
+    """Kernel over (copies, lanes of one block): finds whether an active copy has ended.
 
-    Rounding allows no further progress if the gradient is within its rounding, and no step was found or φ fell by no more than
-    its rounding. A copy is stuck if no step was found or the direction does not descend. Pairs leave a ``fraction`` (B,) of the
-    direction, which may be None. A list with the ``most`` pairs (B,) has lost some if it has less ``room``: the step will be
-    repeated, so its descent ends. ``roundings`` has the parts of :func:`.linear.rounding`.
+    Rounding ends it if the gradient is within its rounding, and no step was found or φ fell by no more than its rounding. It is
+    stuck without a step or a descent direction. Pairs leave a ``fraction`` (B,), or None, of the direction. A list with
+    ``most`` pairs (B,) in less ``room`` ends the descent: the step is repeated.
     """
     (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
 
@@ -279,7 +274,7 @@ def end_newton(block: int):
 
 @cache
 def mean_parts(dtype, block: int):
-    """Kernel over (copies, lanes): the parts of Σ mᵢ(dᵢ + pᵢ) along each axis [kg·m]."""
+    """Kernel over (copies, lanes): parts of Σ mᵢ(dᵢ + pᵢ) by axis [kg·m]."""
     vec3, _ = types(dtype)
     store, _add_up = block_sums(block)
 
@@ -309,9 +304,8 @@ def mean_parts(dtype, block: int):
 
 @cache
 def take_mean(dtype, block: int):
-    """Kernel over (copies, lanes): p −= Σ m(d + p)/Σ m along the axes of ``inverse``, (B,) vectors 1/Σ m, else 0 [1/kg].
-
-    Copies that may be ``near`` a collider, (B,) int32 or None, keep p.
+    """Kernel over (copies, lanes): p −= Σ m(d + p)/Σ m along axes of ``inverse``, (B,) vectors 1/Σ m or 0 [1/kg], unless a
+    collider may be ``near`` (B,).
     """
     vec3, _ = types(dtype)
     _store, add_up = block_sums(block)
@@ -343,7 +337,7 @@ def take_mean(dtype, block: int):
 
 @cache
 def add_inertia(dtype):
-    """Kernel over vertices: gradient += s m d − load m g, or = 0 for pins; work[i] = s/2 m d·d − load m g·d [J]."""
+    """Kernel over vertices: gradient += s m d − load m g, 0 at pins; work[i] = s/2 m d·d − load m g·d [J]."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)

@@ -1,8 +1,8 @@
-"""Factories of the kernels of the levels of multigrid, in every copy, and of the choice of a preconditioner.
+"""Kernels of multigrid levels in every copy, and of the choice of a preconditioner.
 
-A level has block compressed rows A of a symmetric matrix of 3×3 blocks, and the diagonal blocks S of its Jacobi sweeps. P
-interpolates vectors of the next coarser level. It has one weight for all coordinates, and all copies have the same.
-``due[copy]`` is 1 where matrices are computed; None means all copies.
+A level has a symmetric matrix A of 3×3 blocks in compressed rows, and the diagonal blocks S of its Jacobi sweeps. P
+interpolates from the next coarser level, with one weight for all coordinates and copies. ``due[copy]``, or None for all, is 1
+where matrices are computed.
 """
 
 from functools import cache
@@ -32,7 +32,7 @@ FADE = wp.constant(wp.float64(1.0 - 1.0 / AGED))
 
 @wp.struct
 class Rows:
-    """A sparse matrix of one copy in compressed rows: where each starts, and its ascending columns; P has weights."""
+    """Compressed rows of one copy: starts, and ascending columns; P has weights."""
 
     offsets: wp.array(dtype=wp.int32)
     columns: wp.array(dtype=wp.int32)
@@ -40,17 +40,15 @@ class Rows:
 
 
 def _module(dtype):
-    """The name of a module, in which no two kernels have one name."""
     return f"{MODULE}.{dtype.__name__}"
 
 
 @cache
 def find_slots():
-    """Kernel over rows: the block of a product L R to which each multiple of a block is added.
+    """Kernel over rows: the block of a product L R to which each multiple of a block is added, in the order of L, then R.
 
-    The multiples come in the order of the entries of a row of L, and of those of R in the row of its column. If the product is
-    ``symmetric``, 1, multiples of blocks left of the diagonal are left out, with slot −1. ``mirrors`` then has the transpose
-    of each block, else −1. ``counts`` is the number of multiples of each row that are not left out.
+    If ``symmetric``, blocks left of the diagonal have slot −1, and ``mirrors`` has the transpose of each block, or −1.
+    ``counts`` is the number of multiples kept in each row.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -91,9 +89,9 @@ def find_slots():
 
 @cache
 def list_multiples(dtype):
-    """Kernel over rows: the multiples weight·block of which each block of L R is the sum, and where they end.
+    """Kernel over rows: the multiples weight·block of each block of L R, and where they end.
 
-    One of L and R has weights, the other blocks. ``slots`` and ``firsts`` are those of :func:`find_slots`, ``starts`` the first
+    One of L and R has weights, the other blocks; ``slots`` and ``firsts`` are of :func:`find_slots`, ``starts`` the first
     multiple of each row.
     """
 
@@ -147,7 +145,7 @@ def list_multiples(dtype):
 
 @cache
 def add_multiples(dtype):
-    """Kernel over (copies, threads), which share the blocks of a product: out = Σ weight·value, and its transpose, if any."""
+    """Kernel over (copies, threads): blocks of a product, out = Σ weight·value, and its transpose, if any."""
     _, mat33 = types(dtype)
     index, weight, value, put = load(wp.int32), load(dtype), load(mat33), store(mat33)
 
@@ -186,10 +184,9 @@ def add_multiples(dtype):
 
 @cache
 def eliminate(dtype):
-    """Kernel over (copies, m, m) blocks: a step of the inversion of dense matrices by Gauss and Jordan, with pivot block p.
+    """Kernel over (copies, m, m) blocks: a step of Gauss–Jordan inversion with pivot block p.
 
-    A pivot that is not positive definite is left out: its row and column of the inverse are 0. So the inverse is always
-    semi-definite.
+    A pivot that is not positive definite gives 0, so the inverse is semi-definite.
     """
     _, mat33 = types(dtype)
 
@@ -228,10 +225,7 @@ def eliminate(dtype):
 
 @cache
 def factorise_diagonal(dtype):
-    """Kernel over block rows: factor[i] = L⁻¹ with A[i, i] = LLᵀ, or I/√‖A[i, i]‖ if that block is indefinite, or 0 if it is 0.
-
-    The factors are computed in float64, because the blocks of vertices in contact have condition numbers of 1e5 and more.
-    """
+    """Kernel over block rows: factor[i] = L⁻¹ with A[i, i] = LLᵀ, I/√‖A[i, i]‖ if indefinite, or 0 for 0, in float64."""
     _, mat33 = types(dtype)
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
@@ -281,9 +275,7 @@ def factorise_diagonal(dtype):
 def scale_sweeps(dtype, block: int):
     """Kernel over (block rows, lanes): S[i] = ω LᵀL/Σⱼ‖L[i] A[i, j] L[j]ᵀ‖, L the inverse factors of the diagonal blocks.
 
-    So no eigenvalue of S A is above ω, whatever A is: a symmetric matrix is at most the diagonal matrix of the sums of norms in
-    its block rows (Baker et al. 2011, *Multigrid smoothers for ultraparallel computing*, have numbers instead of blocks).
-    ``own`` bounds the norm of the diagonal block. Those of the others are bounded by √(‖·‖₁‖·‖∞) and by the Frobenius norm.
+    So no eigenvalue of S A exceeds ω (Baker et al. 2011, *Multigrid smoothers for ultraparallel computing*, for numbers).
     """
     vec3, mat33 = types(dtype)
     lanes = LANES if block > 1 else 1
@@ -333,13 +325,12 @@ GAINED, COSTS = wp.constant(0), wp.constant(2)
 
 @wp.struct
 class ChoiceState:
-    """Which preconditioner solves use, of each copy (B,).
+    """Which preconditioner solves use, (B,).
 
-    ``present`` has BLOCKS, 1 if the next solve uses diagonal blocks and 0 for multigrid; TRIAL, 1 if it tries that one, with up
-    to LIMIT iterations; and WAIT, the number of solves before the next trial. ``past`` has the decades of √(rᵀPr) that diagonal
-    blocks and multigrid GAINED, and their COSTS in iterations with diagonal blocks, sums over past solves of which those count
-    less that are longer ago. ``by_blocks`` and ``by_cycles`` are the copies of a solve by preconditioner; ``any_blocks`` and
-    ``any_cycles``, (1,), say whether there are any. Coarse matrices that are ``outdated`` are ``due`` where a solve uses them.
+    ``present`` has BLOCKS, 1 for diagonal blocks, 0 for multigrid; TRIAL, 1 for a trial of up to LIMIT iterations; and WAIT,
+    the solves before the next trial. ``past`` has the decades of √(rᵀPr) that each GAINED and their COSTS in iterations with
+    blocks, fading sums. ``by_blocks`` and ``by_cycles`` are the copies of a solve, ``any_blocks`` and ``any_cycles`` (1,)
+    whether there are any. ``outdated`` coarse matrices are ``due`` where used.
     """
 
     present: wp.array(dtype=wp.vec4i)
@@ -355,10 +346,9 @@ class ChoiceState:
 
 @cache
 def begin_choice():
-    """Kernel over copies: divides those that are ``wanted`` by preconditioner, and sets their largest number of iterations.
+    """Kernel over copies: divides those ``wanted`` by preconditioner, and sets their maximum of iterations.
 
-    A solve with diagonal blocks has at most the iterations of ``PATIENCE`` times the cost of multigrid, which follows from the
-    decades that this gained for its cost, and from the tolerance. Trials have their own limit.
+    With blocks, that is ``PATIENCE`` times the cost of multigrid for the tolerance; trials have their own.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -399,14 +389,10 @@ def begin_choice():
 
 @cache
 def end_choice():
-    """Kernel over copies: chooses the preconditioner of the next solve by the decades that each gained for its cost.
+    """Kernel over copies: chooses the next preconditioner by decades gained for the cost, means over about ``AGED`` solves.
 
-    The first solve is by multigrid. The other preconditioner is tried in the second one. It is tried again ``AGED`` solves
-    after the last trial, or sooner if it has gained more for its cost than this one. Solves of different matrices differ, so
-    both are means, in which a solve counts 1/e after ``AGED`` others. A solve that is cut off, as a trial that costs twice as
-    much as the solve before, has gained nothing. The better one stays. A solve that ends at a negative curvature does not
-    count: its few iterations say nothing of the many that others take. An iteration with a cycle costs as much as ``cycle``
-    with diagonal blocks.
+    The first solve is by multigrid, the second tries blocks; the other is tried again after ``AGED`` solves, or sooner if it
+    gained more for its cost. A solve that is cut off gained nothing; one that ends at negative curvature does not count.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)

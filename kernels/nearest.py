@@ -1,8 +1,10 @@
-"""Kernels over points: their distance to a surface of triangles."""
+"""Kernels over points: their distance to a surface of triangles, or to a solid."""
 
 from functools import cache
 
 import warp as wp
+
+from .terms.contact import gap_to
 
 # A triangle is flat if its normal, over the square of its longest side, is shorter: its direction is then rounding error.
 FLAT = wp.constant(wp.float64(1e-12))
@@ -21,7 +23,7 @@ def from_segment(a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Squared distance of the origin to a triangle, which may be flat: to its plane, or else to its sides."""
+    """Squared distance of the origin to a triangle, which may be flat."""
     nearest = wp.min(from_segment(a, b), wp.min(from_segment(b, c), from_segment(c, a)))
     n = wp.cross(b - a, c - a)
     longest_sq = wp.max(wp.length_sq(b - a), wp.max(wp.length_sq(c - b), wp.length_sq(a - c)))
@@ -37,9 +39,8 @@ def from_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 def distances():
     """Kernel over points: out[i] = distance of points[i] to the triangles of ``mesh``, faces[i] = the nearest.
 
-    All coordinates are in [−1, 1]³, in float32 in ``mesh`` and in float64 in ``x``. A query of the mesh finds the nearest
-    triangle; its distance is computed in float64. Queries omit flat triangles and can be wrong about nearly flat ones, so those
-    in ``flat`` are tested one by one.
+    Distances are in float64, coordinates in [−1, 1]³. Queries can miss nearly flat triangles, so those in ``flat`` are tested
+    one by one.
     """
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -93,5 +94,27 @@ def faces():
         query = wp.mesh_query_point_no_sign(mesh, points[i], FAR)
         if query.result:
             out[i] = query.face
+
+    return find
+
+
+@cache
+def find_distances(solid):
+    """Kernel over points in the frame of a shape: their signed distances [m]."""
+    gap = gap_to(solid)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find(
+        # state in
+        points: wp.array(dtype=wp.vec3d),
+        # parameters
+        half: wp.vec3d,
+        radius: wp.float64,
+        # out
+        out: wp.array(dtype=wp.float64),
+    ):
+        i = wp.tid()
+        d, _n = gap(points[i], half, radius)
+        out[i] = d
 
     return find

@@ -1,4 +1,4 @@
-"""Factories of kernels that fit linear maps to neighbourhoods of vertices; see :mod:`.deformation` for F̂ and T."""
+"""Kernels that fit linear maps to neighbourhoods of vertices, with F̂ and T of :mod:`.deformation`."""
 
 from functools import cache
 from typing import Any
@@ -12,7 +12,7 @@ from .vectors import types
 
 @cache
 def vertex_normals(dtype):
-    """Kernel over vertices: unit normals, area-weighted means over triangles; NaN without a triangle, or if they cancel."""
+    """Kernel over vertices: unit normals, area-weighted means over triangles; NaN if they cancel."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -49,10 +49,7 @@ def vertex_normals(dtype):
 
 @wp.func
 def only_rotation(R: Any, B: Any):
-    """R, or NaN if the rotation nearest to B is not unique: the two smallest signed singular values of B then add to 0.
-
-    The eigenvalues of tr(RᵀB) − RᵀB are the sums of two signed singular values.
-    """
+    """R, or NaN if the rotation nearest to B is not unique: its two smallest signed singular values then add to 0."""
     C, size = scaled3(B)
     P = wp.transpose(R) * C
     least = wp.determinant(wp.trace(P) * wp.identity(n=3, dtype=B.dtype) - P)
@@ -67,8 +64,8 @@ def neighbourhood_gradients(dtype):
     """Kernel over vertices: fits F to p = X − X̄ and q = x − x̄ of a set of points, X̄ and x̄ the centroids.
 
     F = (Σ q pᵀ + l̄² n Nᵀ)(Σ p pᵀ + l̄² N Nᵀ)⁻¹, l̄² the mean of ‖p‖², minimises Σ‖q − Fp‖² (Müller et al. 2005, *Meshless
-    deformations based on shape matching*) with the additional pair (l̄N, l̄n). The pair makes the fit unique for a planar set:
-    its stretch along the normal is 1. F is NaN if p may lie on a line within the rounding of points, ``rounding`` [m].
+    deformations based on shape matching*) with the pair (l̄N, l̄n), which makes a planar set unique. It is NaN if p may lie on
+    a line within ``rounding`` [m].
 
     Outputs: F̂ = F T; T = [t₁, t₂, N]; the rotation R with the largest tr(RᵀΣqpᵀ) (Kabsch 1976), NaN if it is not unique; the
     residual √(mean ‖q − Rp‖²) [m]; and H = Σ p qᵀ [m²].
@@ -142,7 +139,7 @@ def neighbourhood_gradients(dtype):
 
 @cache
 def neighbourhood_measures(dtype):
-    """Struct of the outputs of :func:`measure_neighbourhoods`, (N,) each, named as the measures."""
+    """Struct of the outputs of :func:`measure_neighbourhoods`, (N,), named as the measures."""
     vec3, mat33 = types(dtype)
 
     @wp.struct
@@ -157,8 +154,7 @@ def neighbourhood_measures(dtype):
 
 @cache
 def measure_neighbourhoods(dtype):
-    """Kernel over vertices: F = F̂ Tᵀ (3×3), its singular values, their directions in the current frame as rows (3×3), and the
-    angle of R."""
+    """Kernel over vertices: F = F̂ Tᵀ (3×3), singular values, their current directions as rows (3×3), and the angle of R."""
     _, mat33 = types(dtype)
     outputs = neighbourhood_measures(dtype)
 

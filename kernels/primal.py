@@ -1,7 +1,7 @@
-"""Factories of the kernels that solve for multipliers through positions, see :mod:`warpcloth.numerics.primal`.
+"""Kernels that solve for multipliers through positions.
 
-Rows are those of :mod:`.constraint_rows`, ``per_copy`` for each copy. D is their ``inverse``, the inverse diagonal of
-J W Jᵀ + α̃. ``active[copy]`` is 1 while a copy iterates. All in one module, which compiles faster.
+Rows are those of :mod:`.constraint_rows`, ``per_copy`` each; D is the inverse diagonal of J W Jᵀ + α̃; ``active[copy]`` is 1
+while a copy iterates.
 """
 
 from functools import cache
@@ -22,12 +22,11 @@ PASSES, LEAST_GAIN = 12, 0.2
 
 @wp.struct
 class Passes:
-    """The passes of each copy, (B,) arrays, and of all, (1,).
+    """The passes of each copy, (B,), and of all, (1,).
 
-    ``left`` is rᵀDr, ``first`` its first value, ``tolerance`` that of √(rᵀDr), relative to its first value; ``inner`` that of
-    the conjugate gradients of a pass. ``along`` is rᵀDq, ``length`` qᵀDq, q = (J W Jᵀ + α̃)z for the change z. ``softened``
-    is 1 if the penalty of a row is below 1/α̃. Then passes may leave copies ``open``, with ``rest`` the tolerance relative to
-    what they left; ``finish`` is 1 if there are any.
+    ``left`` is rᵀDr, ``first`` its first value, ``tolerance`` relative to √first, ``inner`` that of the conjugate gradients of
+    a pass. ``along`` is rᵀDq, ``length`` qᵀDq, q = (J W Jᵀ + α̃)z for the change z. ``softened`` is 1 if a row's penalty is
+    below 1/α̃; passes may then leave copies ``open``, ``rest`` the tolerance relative to what they left.
     """
 
     active: wp.array(dtype=wp.int32)
@@ -52,7 +51,7 @@ def _module(dtype):
 
 @cache
 def set_penalties(dtype):
-    """Kernel over rows: penalty = 1/α̃, at most ``STIFFEST`` times 1/(J W Jᵀ) of the row, and 0 for a row that moves nothing."""
+    """Kernel over rows: penalty = 1/α̃, at most ``STIFFEST``/(J W Jᵀ), and 0 for a row that moves nothing."""
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def penalise(
@@ -77,7 +76,7 @@ def set_penalties(dtype):
 
 @cache
 def begin_rows(dtype):
-    """Kernel over rows: x = 0, r = b in the copies that are ``wanted``, and square = D r²."""
+    """Kernel over rows: x = 0, r = b in ``wanted`` copies, square = D r²."""
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def begin(
@@ -108,7 +107,7 @@ def begin_rows(dtype):
 
 @cache
 def begin_copies():
-    """Kernel over copies: activates the copies that are ``wanted`` and have a residual."""
+    """Kernel over copies: activates ``wanted`` ones with a residual."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def begin(
@@ -133,7 +132,7 @@ def begin_copies():
 
 @cache
 def push_rows(dtype):
-    """Kernel over rows of active copies: force = penalty·r, opposite = −r. Counts the pass."""
+    """Kernel over rows of active copies: force = penalty·r, opposite = −r; counts the pass."""
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def push(
@@ -161,7 +160,6 @@ def push_rows(dtype):
 
 @cache
 def clear_pins(dtype):
-    """Kernel over vertices: force = 0 at pins."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
@@ -180,7 +178,7 @@ def clear_pins(dtype):
 
 @cache
 def pull_rows(dtype):
-    """Kernel over rows of active copies: z = penalty·(r − J y), from ``opposite`` = J y − r."""
+    """Kernel over rows of active copies: z = penalty·(r − J y), ``opposite`` = J y − r."""
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def pull(
@@ -228,7 +226,7 @@ def weigh_rows(dtype):
 
 @cache
 def advance_rows(dtype):
-    """Kernel over rows of active copies: x += a z, r −= a q with a = rᵀDq/qᵀDq, which minimises rᵀDr; square = D r²."""
+    """Kernel over rows of active copies: x += a z, r −= a q with a = rᵀDq/qᵀDq, square = D r²."""
 
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def advance(
@@ -261,9 +259,8 @@ def advance_rows(dtype):
 
 @cache
 def end_pass():
-    """Kernel over copies: ends those that are solved, and those that a pass with the smallest inner tolerance did not help.
-
-    NaN ends a copy too; the caller finds it in the result.
+    """Kernel over copies: ends those that are solved or NaN, and those that a pass with the smallest inner tolerance did not
+    help.
     """
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -296,8 +293,6 @@ def end_pass():
 
 @cache
 def add_rows(dtype):
-    """Kernel over rows of open copies: x += z."""
-
     @wp.kernel(module=_module(dtype), enable_backward=False)
     def add(
         # state in

@@ -1,29 +1,28 @@
-"""Factories of the local steps of elements, and of the Gauss–Seidel sweep over the elements of a term.
+"""Local steps of elements of any term, and Gauss–Seidel sweeps over them.
 
-They work for every term. The step of one element is
+The step of one element is
 
     Δλ = (G W Gᵀ + α̃ I)⁻¹ (p(y) − y − α̃ λ),   Δxᵢ = wᵢ-weighted rows of Δλ / mᵢ,   α̃ = 1/(k A h²)
 
-with G the weights of y and W the inverse masses; or for the scalar constraint of a term (Macklin et al. 2016, *XPBD*)
+with G the weights of y and W the inverse masses; for a scalar constraint (Macklin et al. 2016, *XPBD*)
 
     Δλ = −(C + α̃ λ)/(Σ wᵢ‖∇C‖² + α̃),   Δxᵢ = ∇ᵢC Δλ / mᵢ.
 
-or for a term with a prox, with s at least the largest eigenvalue of G W Gᵀ (equal for M = 1),
+or with a prox, s at least the largest eigenvalue of G W Gᵀ (equal for M = 1),
 
     Δλ = (prox(y − s λ, s/α̃) − y)/s,   prox(v, c) = argmin u(y) + ‖y − v‖²/2c,
 
-or by ``prox_from`` instead of the prox, if the term has it. For a term with none of these functions and a finite stiffness, one
-Newton step of :mod:`.local_minimiser` replaces the prox. Its fixed point is the same.
+or ``prox_from`` if there is one. Else, with finite stiffness, a Newton step of :mod:`.local_minimiser` replaces the prox, with
+the same fixed point.
 
-XPBD accumulates Δλ in λ; for PBD λ is 0. With infinite stiffness α̃ = 0; for springs this is the projection of Müller et al.
-2006 (*Position based dynamics*). Δx is 0 if all vertices are pinned, or without stiffness. If so few vertices are free that the
-matrix is singular, the pseudo-inverse moves y as near to p(y) as possible.
+XPBD accumulates Δλ in λ; for PBD λ is 0. With infinite stiffness α̃ = 0; for springs this is Müller et al. 2006 (*Position
+based dynamics*). Δx is 0 without free vertices or stiffness. If the matrix is singular, its pseudo-inverse moves y as near to
+p(y) as possible.
 
-If coordinates are locked, W has an inverse mass for each axis, and the first step is computed for each column of y.
+With locked coordinates, W has a mass per axis, and the first step is computed column by column of y.
 
-The factories share the key (term, dtype, scalar, multipliers, per_step, axes). ``scalar``: the scalar constraint of the term is
-used. ``multipliers``: there is λ, else its array may be None. ``per_step``: finite stiffness is spread over the sweeps of a
-step. ``axes``: inverse masses are vectors with one entry for each axis.
+The key is (term, dtype, scalar, multipliers, per_step, axes). ``scalar``: the scalar constraint is used. ``multipliers``: there
+is λ. ``per_step``: finite stiffness is spread over the sweeps of a step. ``axes``: inverse masses are vectors.
 """
 
 from functools import cache
@@ -51,7 +50,7 @@ def multiplier_type(term: Term, dtype, scalar: bool):
 
 @wp.func
 def pseudo_inverse2(A: Any):
-    """A⁻¹ for a symmetric semi-definite 2×2 A; the pseudo-inverse if the smaller eigenvalue is below 4ε of the larger one."""
+    """A⁻¹ of a symmetric semi-definite 2×2 A; the pseudo-inverse if the smaller eigenvalue is below 4ε of the larger."""
     trace = wp.trace(A)
     B = A / trace
     determinant = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
@@ -64,7 +63,7 @@ def pseudo_inverse2(A: Any):
 def spread_compliance(dtype):
     """Device function (w, α̃, n) → α̃′ with which n sweeps move a single constraint as far as one sweep with α̃.
 
-    For s = w/(w + α̃), w/(w + α̃′) = 1 − (1 − s)^(1/n) (Müller et al. 2006), in double precision since 1 − s may be near 1.
+    For s = w/(w + α̃), w/(w + α̃′) = 1 − (1 − s)^(1/n) (Müller et al. 2006), in float64.
     """
 
     @wp.func
@@ -78,7 +77,7 @@ def spread_compliance(dtype):
 
 @cache
 def prox_step(term: Term, dtype):
-    """Device functions A (M, M) → s, the largest row sum, a bound of the eigenvalues, and (y, rest, s, α̃, λ, sweeps) → rows."""
+    """Device functions A (M, M) → s, the largest row sum, and (y, rest, s, α̃, λ, sweeps) → rows."""
     M, y_type = wp.constant(term.rows), wp.types.matrix((term.rows, 3), dtype)
     rest_type, square = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, term.rows), dtype)
     prox, prox_from, minimise = term.prox, term.prox_from, local_minimiser(term, dtype)
@@ -114,8 +113,8 @@ def prox_step(term: Term, dtype):
 def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: bool = True):
     """Device function (y, rest, inverse masses w of the corners, α̃, λ, sweeps) → (Δλ, rows (M, 3)).
 
-    Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]. Without ``multipliers`` λ is 0. If G W Gᵀ is not a multiple of I, the mean of its diagonal
-    is the w of :func:`spread_compliance`.
+    Δxᵢ = wᵢ Σ_m weightᵢ[m] rows[m]. Without ``multipliers`` λ is 0. :func:`spread_compliance` takes the mean diagonal of G W Gᵀ
+    for w.
     """
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
@@ -186,7 +185,7 @@ def multiplier(term: Term, dtype, scalar: bool, per_step: bool, multipliers: boo
 
 @cache
 def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
-    """As :func:`multiplier`, with inverse masses (K, 3) of the corners along each axis."""
+    """:func:`multiplier` with inverse masses (K, 3) by axis."""
     K, M = wp.constant(term.vertices), wp.constant(term.rows)
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
     corners, system_type = wp.types.matrix((term.vertices, 3), dtype), wp.types.matrix((term.rows, term.rows), dtype)
@@ -257,7 +256,7 @@ def multiplier_by_axis(term: Term, dtype, scalar: bool, per_step: bool):
 
 @cache
 def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool = False):
-    """Device function (element data, x̃, d, h, λ, sweeps) → (Δλ, rows) of :func:`multiplier` for one element at x̃ + d."""
+    """Device function (element data, x̃, d, h, λ, sweeps) → (Δλ, rows) of one element at x̃ + d."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, mobility = wp.types.vector(term.parameters, dtype), vec3 if axes else dtype
@@ -295,7 +294,7 @@ def element_change(term: Term, dtype, scalar: bool, per_step: bool, axes: bool =
 
 @cache
 def sweep_turn(dtype):
-    """Struct of one launch of a Gauss–Seidel sweep: elements from ``first`` on, ``each`` per thread; h, sweeps and ω."""
+    """Struct of a launch of a sweep: elements from ``first`` on, ``each`` per thread; h, sweeps and ω."""
 
     @wp.struct
     class SweepTurn:
@@ -310,7 +309,7 @@ def sweep_turn(dtype):
 
 @wp.func
 def nth_of_thread(first: int, each: int, thread: int, k: int):
-    """Index of the k-th element of a thread in a sweep, see :func:`correct_in_place`."""
+    """Index of the k-th element of a thread in a sweep."""
     e = first + thread * wp.abs(each) + k
     if each < 0:
         e = first - (thread + 1) * each - 1 - k
@@ -329,10 +328,9 @@ def correct_in_place(
 ):
     """Kernel of a Gauss–Seidel sweep: d += ω Δx, λ += ω Δλ, each element after the moves of those before it.
 
-    A thread takes ``each`` elements in order, from first + thread·each on; a negative ``each`` reverses the order. On a GPU a
-    thread takes one element of a colour, whose elements share no free vertex, or all of a copy. On the CPU one takes all. Pins
-    are never written, so elements of a colour may share them. If ``cleared``, it skips elements whose vertex has moved less
-    than their ``clear``; an element that was not skipped once is never skipped again.
+    A thread takes ``each`` elements in order from first + thread·each on; a negative ``each`` reverses it. On a GPU that is one
+    element of a colour, whose elements share no free vertex, or all of a copy; on the CPU all. If ``cleared``, it skips
+    elements whose vertex has moved less than ``clear``; one that was not skipped once never is again.
     """
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
@@ -386,7 +384,7 @@ def correct_in_place(
 
 @cache
 def add_momentum(dtype):
-    """Kernel over vertices: out += s mᵢ dᵢ; with s = 1/h² the inertial force [N] of a correction d [m]."""
+    """Kernel over vertices: out += s mᵢ dᵢ, with s = 1/h² the inertial force [N]."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,4 +1,4 @@
-"""Rates between two deformation gradients F̂, see :mod:`.deformation`: the velocity gradient, and rates of measures."""
+"""Rates between two deformation gradients F̂: the velocity gradient, and rates of measures."""
 
 from functools import cache
 from typing import Any
@@ -20,7 +20,7 @@ NODES, WEIGHTS = (wp.constant(wp.types.vector(7, wp.float64)(v)) for v in (0.5 *
 
 @wp.func
 def square_root(A: Any):
-    """Principal square root, by the scaled product form of the Denman–Beavers iteration (Higham 2008, §6.3)."""
+    """Principal square root, by the scaled Denman–Beavers iteration (Higham 2008, §6.3)."""
     one = A.dtype(1.0)
     half = A.dtype(0.5)
     I = wp.identity(n=3, dtype=A.dtype)
@@ -45,7 +45,7 @@ def square_root(A: Any):
 
 @wp.func
 def logarithm(A: Any):
-    """Principal logarithm, by inverse scaling and squaring (Higham 2008, §11.5); NaN if it does not exist."""
+    """Principal logarithm, by inverse scaling and squaring (Higham 2008, §11.5), or NaN."""
     I = wp.identity(n=3, dtype=A.dtype)
     X = A
     factor = A.dtype(1.0)
@@ -77,7 +77,7 @@ def rate_of(before: Any, after: Any, dt: Any, method: int):
 
 @cache
 def rate_measures(dtype):
-    """Struct of the outputs of :func:`measure_rates`, (E,) each, named as the measures."""
+    """Struct of the outputs of :func:`measure_rates`, (E,), named as the measures."""
     vec3, mat33 = types(dtype)
     vec2 = wp.types.vector(2, dtype)
 
@@ -97,12 +97,11 @@ def rate_measures(dtype):
 
 @cache
 def measure_rates(dtype):
-    """Kernel over elements: the velocity gradient L = ḞF⁻¹ = D + Ω and other rates between the gradients F̂₀ and F̂₁.
+    """Kernel over elements: the velocity gradient L = ḞF⁻¹ = D + Ω and other rates between F̂₀ and F̂₁.
 
     Methods: midpoint, L = 2(F̂₁ − F̂₀)(F̂₁ + F̂₀)⁻¹/dt; forward, L = (F̂₁ − F̂₀)F̂₀⁻¹/dt; logarithm, L = log(F̂₁F̂₀⁻¹)/dt. D =
-    P ½(L + Lᵀ) P, where P projects to the plane of F̂₁ + F̂₀ (forward: of F̂₀), for the stretch along the normal is not
-    measured. Ω = ½(L − Lᵀ). Rates of stretches and lengths use the same method on the numbers; rates of angles are differences.
-    ``rounding`` [m] is the rounding of points, ``sizes`` [m] the widths of elements in the reference.
+    P ½(L + Lᵀ) P, P the projection to the plane of F̂₁ + F̂₀ (forward: of F̂₀). Ω = ½(L − Lᵀ). Stretches and lengths use the
+    same method, angles differences. ``rounding`` [m] is that of points, ``sizes`` [m] the widths at rest.
     """
     vec3, mat33 = types(dtype)
     vec2, mat22 = wp.types.vector(2, dtype), wp.types.matrix((2, 2), dtype)

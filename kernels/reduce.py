@@ -1,7 +1,6 @@
-"""Sums and maxima per copy, in double precision and in a fixed order, so that results are bitwise reproducible.
+"""Sums and maxima per copy, in float64 and in a fixed order.
 
-Two launches: one over (copies, lanes), whose blocks store parts of sums, and the next, which adds these up, see
-:func:`block_sums`. On the CPU a copy has one lane.
+A launch over (copies, lanes) stores parts by block; the next adds them up.
 """
 
 from functools import cache
@@ -27,7 +26,7 @@ def larger(most: wp.float64, value: wp.float64):
 
 @cache
 def block_sums(block: int):
-    """The device functions (lane, value, parts, copy), which stores the part of a block, and (lane, parts, copy) → Σ."""
+    """Device functions (lane, value, parts, copy), which stores a block's part, and (lane, parts, copy) → Σ."""
     threads = max(block, 1)
 
     @wp.func
@@ -60,7 +59,7 @@ def block_sums(block: int):
 
 @cache
 def block_largest(block: int):
-    """The functions of :func:`block_sums` for the largest of numbers of 0 or more; NaN if one is NaN."""
+    """:func:`block_sums` for the largest of numbers ≥ 0; NaN if one is NaN."""
     threads = max(block, 1)
 
     @wp.func
@@ -93,7 +92,7 @@ def block_largest(block: int):
 
 @cache
 def sum_of_lanes(dtype, lanes: int):
-    """Device function (value) → sum over the ``lanes`` neighbouring threads of a warp that take one vertex or row."""
+    """Device function (value) → sum over the ``lanes`` neighbouring threads of a vertex or row."""
     vec3, _ = types(dtype)
     if lanes == 1:
 
@@ -118,9 +117,10 @@ def sum_of_lanes(dtype, lanes: int):
 
 @cache
 def largest_of_warp(dtype):
-    """Device function (value, key) → the value; but if all threads of a warp have one key, their largest value, by components.
+    """Device function (value, key) → the value; if a warp has one key, their largest by components in its first thread, 0 in
+    others.
 
-    Only the first thread gets that, the others get 0. All threads must call it.
+    All threads must call it.
     """
     vec3, _ = types(dtype)
 
@@ -148,7 +148,7 @@ def wait_for_block(): ...
 
 @cache
 def partial_sum(block: int):
-    """Kernel over (copies, lanes): the parts of Σ values."""
+    """Kernel over (copies, lanes): parts of Σ values."""
     store, _add_up = block_sums(block)
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
@@ -172,7 +172,7 @@ def partial_sum(block: int):
 
 @cache
 def partial_dot(dtype, numbers: bool, block: int):
-    """Kernel over (copies, lanes): the parts of Σ a·b of vectors or ``numbers``, 0 in copies that are not active."""
+    """Kernel over (copies, lanes): parts of Σ a·b of vectors or ``numbers`` in active copies."""
     value = dtype if numbers else types(dtype)[0]
     store, _add_up = block_sums(block)
 
@@ -204,7 +204,7 @@ def partial_dot(dtype, numbers: bool, block: int):
 
 @cache
 def finish_sum(block: int):
-    """Kernel over (copies, lanes of one block): out[copy] = the sum of the parts, or += if ``accumulate`` is 1."""
+    """Kernel over (copies, lanes of one block): out[copy] = the sum of parts, or += if ``accumulate`` is 1."""
     _store, add_up = block_sums(block)
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
@@ -228,7 +228,7 @@ def finish_sum(block: int):
 
 @cache
 def partial_largest(dtype, block: int):
-    """Kernel over (copies, lanes): the parts of max wᵢ‖aᵢ‖ over vertices; NaN if one is NaN."""
+    """Kernel over (copies, lanes): parts of max wᵢ‖aᵢ‖ over vertices, or NaN."""
     vec3, _ = types(dtype)
     store, _find = block_largest(block)
 
@@ -256,7 +256,7 @@ def partial_largest(dtype, block: int):
 
 @cache
 def partial_largest_number(block: int):
-    """Kernel over (copies, lanes): the parts of the maximum of nonnegative numbers; NaN if one is NaN."""
+    """Kernel over (copies, lanes): parts of the maximum of numbers ≥ 0, or NaN."""
     store, _find = block_largest(block)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -280,7 +280,7 @@ def partial_largest_number(block: int):
 
 @cache
 def finish_largest(block: int):
-    """Kernel over (copies, lanes of one block): out[copy] = the largest of the parts; NaN if one is NaN."""
+    """Kernel over (copies, lanes of one block): out[copy] = the largest part, or NaN."""
     _store, find = block_largest(block)
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
@@ -300,7 +300,7 @@ def finish_largest(block: int):
 
 @cache
 def keep_largest():
-    """Kernel over copies: out[copy] = max(out[copy], value[copy]) of nonnegative numbers; NaN if either is NaN."""
+    """Kernel over copies: out[copy] = max(out[copy], value[copy]) of numbers ≥ 0, or NaN."""
 
     @wp.kernel(module="warpcloth.reduce", enable_backward=False)
     def keep(

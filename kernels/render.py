@@ -1,4 +1,4 @@
-"""Ray casting: rays from a camera through each pixel, and from the points they meet to the sun and the sky."""
+"""Ray casting: rays from a camera through each pixel, and on to the sun and the sky."""
 
 from functools import cache
 
@@ -104,7 +104,7 @@ def meet_ball(o: wp.vec3, d: wp.vec3, r: float):
 
 @wp.func
 def meet_tube(o: wp.vec3, d: wp.vec3, a: wp.vec3, b: wp.vec3, r: float):
-    """(distance, parameter from a to b) at which a ray enters a capsule from outside; the distance is FAR if it misses."""
+    """(distance, parameter from a to b) where a ray enters a capsule from outside; FAR if it misses."""
     start = wp.dot(0.5 * (a + b) - o, d)
     oa = o + start * d - a
     ba = b - a
@@ -140,7 +140,7 @@ def meet_tube(o: wp.vec3, d: wp.vec3, a: wp.vec3, b: wp.vec3, r: float):
 
 @wp.func
 def nearest_tube(g: Geometry, o: wp.vec3, d: wp.vec3, most: float):
-    """(distance, tube, parameter along it) of the first tube within the distance ``most``; the tube is −1 if there is none."""
+    """(distance, tube, parameter along it) of the first tube within ``most``; tube −1 if none."""
     nearest = most
     tube = wp.int32(-1)
     s = wp.float32(0.0)
@@ -192,7 +192,7 @@ def size_of(p: wp.vec3):
 
 @wp.func
 def find_ground(light: Light, o: wp.vec3, d: wp.vec3):
-    """(distance, opacity) of the ground where a ray from above meets it; the distance is FAR if it does not."""
+    """(distance, opacity) of the ground where a ray from above meets it; FAR if it misses."""
     t = FAR
     share = wp.float32(0.0)
     if light.has_ground != 0:
@@ -208,7 +208,7 @@ def find_ground(light: Light, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: float):
-    """The point where a ray meets a tube, from the parameter along the tube."""
+    """The point where a ray meets a tube, at a parameter along it."""
     ends = g.ends[tube]
     colours = g.end_colours[tube]
     axis = (1.0 - along) * g.points[ends[0]] + along * g.points[ends[1]]
@@ -225,7 +225,7 @@ def see_tube(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, tube: int, along: fl
 
 @wp.func
 def see_triangle(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, face: int, u: float, v: float):
-    """The point where a ray meets a triangle, from the barycentric coordinates of the first two corners."""
+    """The point where a ray meets a triangle, at barycentric coordinates."""
     w = 1.0 - u - v
     a = g.points[g.triangles[3 * face]]
     b = g.points[g.triangles[3 * face + 1]]
@@ -261,7 +261,7 @@ def see_triangle(g: Geometry, o: wp.vec3, d: wp.vec3, t: float, face: int, u: fl
 
 @wp.func
 def see(g: Geometry, light: Light, o: wp.vec3, d: wp.vec3):
-    """The first point that a ray meets; the distance is FAR if there is none."""
+    """The first point that a ray meets, or distance FAR."""
     t, share = find_ground(light, o, d)
     face = wp.int32(-1)
     u = wp.float32(0.0)
@@ -295,7 +295,7 @@ def see(g: Geometry, light: Light, o: wp.vec3, d: wp.vec3):
 def light_at(
     g: Geometry, light: Light, p: wp.vec3, n: wp.vec3, across: wp.vec3, offset: float, sun_sample: int, sky_sample: int
 ):
-    """(light of the sky, of the sun, visibility of each) at a point with shading normal n and geometric normal ``across``."""
+    """(light of the sky, of the sun, visibilities) at a point with shading normal n and geometric normal ``across``."""
     sky = light.sky_share * (1.0 + light.sky_tilt * (wp.dot(n, light.up) - 1.0))
     facing = wp.dot(n, light.sun)
     sun = wp.float32(0.0)
@@ -322,7 +322,7 @@ def light_at(
 
 @cache
 def trace():
-    """Kernel over pixels from ``first`` on: layers, as means over the samples of the pixel."""
+    """Kernel over pixels from ``first`` on: layers, means over samples."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def trace_pixel(

@@ -1,26 +1,25 @@
-"""Rotations and singular values of 3×3, 3×2 and 2×2 matrices: device functions for float32 and float64, without iteration.
+"""Rotations and singular values of 3×3, 3×2 and 2×2 matrices, in float32 and float64, without iteration.
 
-A = U diag(S) Vᵀ, S descending. One singular pair is split off. The remaining 2×2 block has a closed form:
+A = U diag(S) Vᵀ, S descending. One singular pair is split off; the remaining 2×2 block has a closed form:
 
 1. The eigenvalues of AᵀA, shifted by their mean and scaled, are the roots of x³ − 3x = 2r with |r| ≤ 1 (Smith 1961,
 *Eigenvalues
-   of a symmetric 3×3 matrix*). The largest for r ≥ 0, and the smallest for r < 0, is at least √3 from both others. So it and
-   its eigenvector v, a column of an adjugate, are well conditioned for every A (the choice of Eberly 2014, *A robust
-   eigensolver for 3×3 symmetric matrices*).
+   of a symmetric 3×3 matrix*). The largest for r ≥ 0, and the smallest for r < 0, is at least √3 from both others. It and its
+   eigenvector v, a column of an adjugate, are well conditioned for every A (Eberly 2014, *A robust eigensolver for 3×3
+   symmetric matrices*).
 2. For the largest, u = Av/‖Av‖. For the smallest, u = cof(A)v/‖cof(A)v‖, which avoids division by a small singular value and
 has
    the orientation of UVᵀ.
 3. In the right-handed frames (v, v₁, v₂) and (u, u₁, u₂) (Duff et al. 2017, *Building an orthonormal basis, revisited*), A is
    σ ⊕ B up to rounding. B is a multiple of a rotation by atan2(B₁₀ − B₀₁, B₀₀ + B₁₁), plus a multiple of a reflection.
 
-The error is a few ε of the largest singular value. A is first divided by its largest entry, so results do not depend on its
-scale. If A has a NaN or an infinity, all results are NaN.
+The error is a few ε of the largest singular value, at any scale of A. NaN or infinity in A makes all results NaN.
 
 The "rotation" convention has det U = det V = 1, and S[2] < 0 if det A < 0. UVᵀ is then the rotation R nearest to A, which
 maximises tr(RᵀA); for A = Σ w q pᵀ it is that of Kabsch 1976, which rotates p to q. The plain convention has S ≥ 0, det U = ±1.
 
-If S[1] + S[2] is below 3ε S[0], such as for rank 1, the nearest rotation is not unique. The result is then the smallest
-rotation that takes v to u, or the identity for A = 0.
+If S[1] + S[2] is below 3ε S[0], as for rank 1, the result is the smallest rotation that takes v to u, or the identity for A =
+0.
 """
 
 from typing import Any
@@ -30,7 +29,7 @@ import warp as wp
 
 @wp.func
 def epsilon(x: wp.float32):
-    """Machine epsilon: the difference between 1 and the next larger number of this precision."""
+    """Machine epsilon of this precision."""
     return wp.float32(wp.static(2.0**-23))
 
 
@@ -41,7 +40,7 @@ def epsilon(x: wp.float64):  # noqa: F811 - Warp chooses by type
 
 @wp.func
 def smallest(x: wp.float32):
-    """The smallest positive normal number of this precision."""
+    """The smallest positive normal number."""
     return wp.float32(wp.static(2.0**-126))
 
 
@@ -52,10 +51,7 @@ def smallest(x: wp.float64):  # noqa: F811 - likewise
 
 @wp.func
 def unit(c: Any, s: Any, least: Any, c_else: Any, s_else: Any):
-    """(c, s) normalised if longer than ``least``; else (c_else, s_else) normalised; (1, 0) if that is below ε² too.
-
-    The bounds keep squares from underflow.
-    """
+    """(c, s) normalised if longer than ``least``; else (c_else, s_else), or (1, 0) if that is below ε² too."""
     length = wp.sqrt(c * c + s * s)
     if length <= least:
         c = c_else
@@ -71,7 +67,7 @@ def unit(c: Any, s: Any, least: Any, c_else: Any, s_else: Any):
 
 @wp.func
 def half_angle(c: Any, s: Any, length: Any, least: Any):
-    """The unit vector at half the angle of (c, s), a vector of length ``length``; (1, 0) if that is not above ``least``."""
+    """The unit vector at half the angle of (c, s), of length ``length``; (1, 0) if that is not above ``least``."""
     # tan(φ/2) has two forms; this takes the one without cancellation.
     x = length + c
     y = s
@@ -83,7 +79,7 @@ def half_angle(c: Any, s: Any, length: Any, least: Any):
 
 @wp.func
 def complement(n: Any):
-    """Unit vectors t₁, t₂ such that (n, t₁, t₂) is a right-handed frame; for n = the first axis, the other two axes."""
+    """Unit vectors t₁, t₂ such that (n, t₁, t₂) is right-handed; the other axes for n = the first."""
     one = n.dtype(1.0)
     sign = wp.where(n[0] < n.dtype(0.0), -one, one)
     a = -one / (sign + n[0])
@@ -96,10 +92,8 @@ def complement(n: Any):
 
 @wp.func
 def separated_eigenvector(C: Any):
-    """Unit eigenvector of a symmetric 3×3 C with small entries, for the eigenvalue farthest from the others.
-
-    Returns:
-        The eigenvector, and 1 if that eigenvalue is the largest, −1 if it is the smallest.
+    """Unit eigenvector of a symmetric 3×3 C for the eigenvalue farthest from the others, and 1 if that is the largest, −1 if
+    the smallest.
     """
     one = C.dtype(1.0)
     mean = C.dtype(0.3333333333333333) * wp.trace(C)
@@ -161,7 +155,7 @@ def scaled3(A: Any):
 
 @wp.func
 def separated_pair(A: Any):
-    """The singular pair u, v of a scaled 3×3 A to split off, its side (see above), and ‖Av‖ or ‖cof(A)v‖, never small."""
+    """The singular pair u, v of a scaled 3×3 A to split off, its side, and ‖Av‖ or ‖cof(A)v‖."""
     v, side = separated_eigenvector(wp.transpose(A) * A)
     u = A * v
     if side < A.dtype(0.0):
@@ -175,7 +169,7 @@ def separated_pair(A: Any):
 
 @wp.func
 def frame(n: Any, a: Any, b: Any, side: Any):
-    """The matrix with the right-handed columns (n, a, b), or (a, b, n) if the value of n is the smallest."""
+    """The matrix with right-handed columns (n, a, b), or (a, b, n) if n has the smallest value."""
     columns = wp.matrix_from_cols(n, a, b)
     if side < type(side)(0.0):
         columns = wp.matrix_from_cols(a, b, n)
@@ -184,14 +178,14 @@ def frame(n: Any, a: Any, b: Any, side: Any):
 
 @wp.func
 def plane_rotation(c: Any, s: Any, size: Any, u1: Any, u2: Any, v1: Any, v2: Any):
-    """Cosine and sine of the rotation in the plane, from (c, s), or else of the smallest rotation between the frames."""
+    """Cosine and sine of the rotation in the plane from (c, s), else of the smallest one between the frames."""
     least = type(c)(3.0) * epsilon(c) * size
     return unit(c, s, least, wp.dot(u1, v1) + wp.dot(u2, v2), wp.dot(u2, v1) - wp.dot(u1, v2))
 
 
 @wp.func
 def descending(s0: Any, s1: Any, s2: Any):
-    """Three values in descending order, which rounding may have changed, with the smallest |s₂|; the last keeps its sign."""
+    """Three values in descending order despite rounding; the last keeps its sign."""
     high = wp.max(s0, s1)
     low = wp.min(s0, s1)
     last = wp.min(low, wp.abs(s2))
@@ -201,7 +195,7 @@ def descending(s0: Any, s1: Any, s2: Any):
 
 @wp.func
 def nearest_rotation(A: Any):
-    """The rotation R nearest to a 3×3 A, which maximises tr(RᵀA); for A = Σ w q pᵀ that of Kabsch 1976."""
+    """The rotation R nearest to a 3×3 A, which maximises tr(RᵀA)."""
     B, _size = scaled3(A)
     u, v, _side, size = separated_pair(B)
     v1, v2 = complement(v)
@@ -269,7 +263,7 @@ def polar3(A: Any):
 
 @wp.func
 def scaled2(A: Any):
-    """As :func:`scaled3`, for a 2×2 A."""
+    """:func:`scaled3` for a 2×2 A."""
     size = wp.max(wp.max(wp.abs(A[0]), wp.abs(A[1])))
     scale = wp.max(size, smallest(size))
     B = (A.dtype(1.0) / scale) * A
@@ -281,7 +275,7 @@ def scaled2(A: Any):
 
 @wp.func
 def nearest_rotation2(A: Any):
-    """The rotation R nearest to a 2×2 A; the identity if it is not unique, that is, A is a multiple of a reflection."""
+    """The rotation R nearest to a 2×2 A; the identity if not unique."""
     one = A.dtype(1.0)
     B, _scale = scaled2(A)
     f = B[0, 0] - B[1, 1]
@@ -333,8 +327,7 @@ def polar2(A: Any):
 def svd3x2(A: Any):
     """U (3×2), S, V (2×2) of a 3×2 A with S ≥ 0, UᵀU = I and det V = 1.
 
-    For rank 1, U Vᵀ is the first two columns of the smallest rotation in space that takes v to u; for A = 0, the first two
-    axes.
+    For rank 1, U Vᵀ has the first columns of the smallest rotation that takes v to u; for A = 0 the first axes.
     """
     zero = A.dtype(0.0)
     one = A.dtype(1.0)
@@ -366,7 +359,7 @@ def svd3x2(A: Any):
 
 @wp.func
 def polar3x2(A: Any):
-    """R (3×2), P (2×2) of a 3×2 A = R P: R the nearest matrix with RᵀR = I, P symmetric and semi-definite."""
+    """R (3×2), P (2×2) of a 3×2 A = R P with RᵀR = I, P symmetric and semi-definite."""
     U, _S, V = svd3x2(A)
     R = U * wp.transpose(V)
     P = wp.transpose(R) * A

@@ -1,4 +1,4 @@
-"""Kernels of a prefix sum: sums of chunks, prefix sums of these, prefix sums within chunks."""
+"""Kernels of a prefix sum: sums of chunks, their prefix sums, prefix sums within."""
 
 from functools import cache
 
@@ -31,10 +31,7 @@ def sum_chunks():
 
 @cache
 def add_chunks(block: int):
-    """Kernel over the threads of a block: replaces the sum of each chunk by the sum of the chunks before it.
-
-    ``block`` is their number, 0 on the CPU, which has one.
-    """
+    """Kernel over the threads of a ``block`` (0: one thread of the CPU): replaces sums of chunks by sums of those before."""
     threads = max(block, 1)
 
     @wp.kernel(module=f"{MODULE}.{block}", enable_backward=False)
@@ -61,7 +58,7 @@ def add_chunks(block: int):
 
 @cache
 def write_sums():
-    """Kernel over chunks: out (n+1,) = the sums of the values before each entry, and the total."""
+    """Kernel over chunks: out (n+1,) = sums of the values before each entry, and the total."""
 
     @wp.kernel(module=MODULE, enable_backward=False)
     def write_each(

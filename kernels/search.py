@@ -1,8 +1,4 @@
-"""Factories of the kernels of the line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d along p in every copy.
-
-A trial takes a launch for its positions, those of the gradient, one for inertia, one for the energy of each term, and one that
-adds up the parts of all sums, see :func:`.reduce.block_sums`, and decides.
-"""
+"""Kernels of the line search on φ(d) = s/2‖d‖²_M + U(base + d) − load·Σ m g·d along p in every copy."""
 
 from functools import cache
 
@@ -23,12 +19,12 @@ WORK, SLOPE, SQUARE, LARGEST, ROWS = 0, 1, 2, 3, 4
 
 @wp.struct
 class LineSearch:
-    """The line search of each copy, (B,) arrays, and of all, (1,).
+    """The line search of each copy, (B,), and of all, (1,).
 
-    ``energy`` is φ at d [J], ``before`` its value where the search began, ``slope`` its derivative along p and ``step`` the
-    length of the trial step. At the trial they are ``trial_energy`` and ``trial_slope``, with ``square``, ‖∇φ‖² [N²], and
-    ``acceleration``, max ‖∇φᵢ‖/mᵢ [m/s²]. ``other`` is an energy that is not in the parts. ``searching`` is 1 until a step is
-    found. ``trials`` counts, and ``proceed`` is 1 if another is needed. ``moved`` is 1 where the last search changed d.
+    ``energy`` is φ at d [J], ``before`` that at the start, ``slope`` its derivative along p, ``step`` the trial length. At the
+    trial they are ``trial_energy`` and ``trial_slope``, with ``square``, ‖∇φ‖² [N²], and ``acceleration``, max ‖∇φᵢ‖/mᵢ [m/s²].
+    ``other`` is an energy outside the parts. ``searching`` is 1 until a step is found, ``proceed`` if another trial is needed,
+    ``moved`` where the last search changed d; ``trials`` counts.
     """
 
     energy: wp.array(dtype=wp.float64)
@@ -66,7 +62,7 @@ def inertia_struct(dtype):
 
 @cache
 def begin_search(dtype, block: int):
-    """Kernel over (copies, lanes): the first trial d + p of active copies, d of others; the parts of φ′; the gradient is 0."""
+    """Kernel over (copies, lanes): the first trial d + p of active copies, else d; parts of φ′; the gradient is 0."""
     vec3, _ = types(dtype)
     store, _add_up = block_sums(block)
 
@@ -109,7 +105,7 @@ def begin_search(dtype, block: int):
 
 @cache
 def set_trial(dtype):
-    """Kernel over vertices: trial = d + step·p, with the step length of the copy; the gradient becomes 0; counts the trial."""
+    """Kernel over vertices: trial = d + step·p, the gradient becomes 0; counts the trial."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
@@ -140,7 +136,7 @@ def set_trial(dtype):
 
 @cache
 def finish_gradient(dtype, block: int):
-    """Kernel over (copies, lanes): gradient += s m d − load m g, 0 at pins and along locks; the parts of ``ROWS`` sums.
+    """Kernel over (copies, lanes): gradient += s m d − load m g, 0 at pins and along locks; parts of ``ROWS`` sums.
 
     ``WORK`` is Σ s/2 m d·d − load m g·d [J], ``SLOPE`` ∇φ·p, ``SQUARE`` ‖∇φ‖², and ``LARGEST`` max ‖∇φᵢ‖/mᵢ.
     """
@@ -191,7 +187,7 @@ def finish_gradient(dtype, block: int):
 
 @cache
 def add_trial(block: int):
-    """Device function (copy, lane, of vertices, of terms, search), which adds up the parts of a trial."""
+    """Device function (copy, lane, of vertices, of terms, search) that adds up a trial."""
     (_store, add_up), (_store_largest, find) = block_sums(block), block_largest(block)
 
     @wp.func
@@ -219,7 +215,7 @@ def add_trial(block: int):
 
 @cache
 def measure_start(block: int):
-    """Kernel over (copies, lanes of one block): φ and the sums of :class:`LineSearch` at d, which is the trial."""
+    """Kernel over (copies, lanes of one block): φ and the sums of :class:`LineSearch` at d."""
     add = add_trial(block)
 
     @wp.kernel(module=MODULE, enable_backward=False)
@@ -240,10 +236,7 @@ def measure_start(block: int):
 
 @cache
 def work_of_guess(dtype, block: int):
-    """Kernel over (copies, lanes): trial = d + p, and the parts of two sums.
-
-    The row ``WORK`` has that of :func:`finish_gradient` at the trial, ``SQUARE`` that of ‖p‖².
-    """
+    """Kernel over (copies, lanes): trial = d + p, parts of ``WORK`` there and ``SQUARE`` of p."""
     vec3, _ = types(dtype)
     store, _add_up = block_sums(block)
 
@@ -279,10 +272,10 @@ def work_of_guess(dtype, block: int):
 
 @cache
 def bound_guess(block: int):
-    """Kernel over (copies, lanes of one block): ``hopeful`` is 1 for ``active`` copies where a guess may lower φ, else 0.
+    """Kernel over (copies, lanes of one block): ``hopeful`` is 1 in ``active`` copies where a guess may lower φ, else 0;
+    ``some`` if any.
 
-    Pairs have no negative energy. So φ is not lower at the guess if it is as high there without pairs as φ is at d; nor if the
-    guess is d. ``some`` becomes 1 if a copy is hopeful.
+    As pairs have no negative energy, it may not if φ without them is as high there as φ at d.
     """
     _store, add_up = block_sums(block)
 
@@ -314,9 +307,8 @@ def bound_guess(block: int):
 
 @cache
 def check_guess(block: int):
-    """Kernel over (copies, lanes of one block): keeps the step to a guess if φ is lower there, else sets it to 0.
-
-    ``proceed`` is 1 if the trial has to be set again.
+    """Kernel over (copies, lanes of one block): the step to a guess becomes 0 unless φ is lower there; ``proceed`` if a trial
+    is set again.
     """
     add = add_trial(block)
 
@@ -341,12 +333,11 @@ def check_guess(block: int):
 
 @cache
 def check_trial(block: int):
-    """Kernel over (copies, lanes of one block): accepts a trial step or halves it; after ``most`` trials the step is 0, and one
-    last trial measures that.
+    """Kernel over (copies, lanes of one block): accepts a trial step or halves it; after ``most`` trials it is 0, which one
+    last trial measures.
 
-    A step is accepted if φ(α) ≤ φ(0) + α φ'(0)/4 (Armijo), and φ(α) < φ(0) if φ'(0) ≥ 0, as with a raw Hessian. It is also
-    accepted if φ(α) ≤ φ(0) + noise and φ'(α) ≤ −(1 − 2e-4)·φ'(0), where rounding hides the decrease of φ (approximate Wolfe,
-    Hager and Zhang 2005). NaN is never accepted.
+    A step is accepted if φ(α) ≤ φ(0) + α φ'(0)/4 (Armijo), and φ(α) < φ(0) if φ'(0) ≥ 0; or, under rounding, if φ(α) ≤ φ(0) +
+    noise and φ'(α) ≤ −(1 − 2e-4)·φ'(0) (approximate Wolfe, Hager and Zhang 2005). NaN is never accepted.
     """
     (_store, add_up), add = block_sums(block), add_trial(block)
 
@@ -419,12 +410,11 @@ def check_quadratic(
     # in and out
     search: LineSearch,
 ):
-    """Kernel over copies: as :func:`check_trial`, for φ(d) = ½dᵀAd − cᵀd + U(d) of which U at d and at the trial is measured.
+    """Kernel over copies: :func:`check_trial` for φ(d) = ½dᵀAd − cᵀd + U(d), U measured at d and at the trial.
 
-    U is ``energy`` and ``other``, p·∂U/∂x is ``pull`` and ``trial_slope``, φ′(0) is ``slope``, and pᵀAp ``square`` before p was
-    shortened to a ``fraction``. A step is accepted if φ falls by 1e-4 of what the slope says, or if the
-    change is rounding and the slope has fallen to 0.8. A copy with a slope that is not below 0 keeps its step; and the last one
-    after ``most`` trials.
+    U is ``energy`` plus ``other``, p·∂U/∂x ``pull`` and ``trial_slope``, φ′(0) ``slope``, and pᵀAp ``square`` before p was
+    shortened to a ``fraction``. A step is accepted if φ falls by 1e-4 of the slope's prediction, or if the change is rounding
+    and the slope has fallen to 0.8. A copy without descent keeps its step, as does the last trial.
     """
     copy = wp.tid()
     if search.searching[copy] == 0:

@@ -7,8 +7,6 @@ import warp as wp
 
 @cache
 def tube_bounds():
-    """Kernel over tubes: axis-aligned bounding boxes."""
-
     @wp.kernel(module="unique", enable_backward=False)
     def bound_tube(
         # elements
@@ -32,7 +30,7 @@ def tube_bounds():
 
 @cache
 def face_normals():
-    """Kernel over triangles: unit normals (0 for a triangle without area), and the angles at the corners."""
+    """Kernel over triangles: unit normals (0 without area), and angles at the corners."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def find_face_normal(
@@ -60,10 +58,9 @@ def face_normals():
 
 @cache
 def corner_normals():
-    """Kernel over corners of triangles: mean of the normals around the vertex, weighted by angles (Thürmer & Wüthrich 1998).
+    """Kernel over corners: mean of normals around the vertex, weighted by angles (Thürmer & Wüthrich 1998).
 
-    Only normals within about 75° of that of the triangle count, so boxes keep their edges. Their signs do not matter, so
-    triangles can have either winding.
+    Only normals within about 75° count, in either winding.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,7 +1,7 @@
-"""Factories of the kernels of terms whose elements are cells with any number of vertices, in compressed rows with weights.
+"""Kernels of terms whose elements are cells with any number of vertices, in compressed rows with weights.
 
-Cell c has the vertices stencil[e], e from offsets[c] to offsets[c+1], with the weights w[e] (M,): y = Σₑ w[e] ⊗ x[stencil[e]].
-u and ∂u/∂y are evaluated once per cell. Each vertex of a cell is then an element of one vertex, see :func:`share`.
+Cell c has the vertices stencil[e], e from offsets[c] to offsets[c+1], with weights w[e] (M,): y = Σₑ w[e] ⊗ x[stencil[e]]. It
+is evaluated once; each of its vertices is an element of one vertex.
 """
 
 from functools import cache
@@ -42,10 +42,9 @@ def share_hessian(y: Any, rest: Any, negative: Any):
 
 @cache
 def share(term: Term):
-    """The :class:`.term.Term` of one vertex of a cell. Its rest state is A∂u/∂x (3) and Au, which the cell computes.
+    """The :class:`.term.Term` of one vertex of a cell, with A∂u/∂x (3) and Au as rest state.
 
-    The first vertex of a cell has the energy, the next ones what its rounding left. The Hessian couples vertices;
-    :func:`blocks` gives it.
+    The first vertex has the energy, the others its rounding; :func:`blocks` has the Hessian.
     """
     given = _rest_state, weight, measure, share_energy, share_gradient, share_hessian
     return Term(term.name, 1, 1, 4, *given, cells=True, cell=term)
@@ -53,10 +52,7 @@ def share(term: Term):
 
 @cache
 def cell_coordinate(term: Term, dtype, corrected: bool, precision=None):
-    """Device function (first, last, stencil, weights, x, d) → y of a cell at x, or at x + d if ``corrected``.
-
-    y has the ``precision``, by default that of x and d.
-    """
+    """Device function (first, last, stencil, weights, x, d) → y of a cell at x (``corrected``: x + d), in the ``precision``."""
     vec3, _ = types(dtype)
     number = precision or dtype
     wide, y_type = types(number)[0], wp.types.matrix((term.rows, 3), number)
@@ -86,10 +82,7 @@ def cell_coordinate(term: Term, dtype, corrected: bool, precision=None):
 
 @cache
 def evaluate(term: Term, dtype, corrected: bool):
-    """Kernel over cells: rest states of the elements of their vertices, see :func:`share`.
-
-    If ``corrected``, a cell is evaluated in double precision, see :func:`.assemble.of_element`.
-    """
+    """Kernel over cells: rest states of their vertices' elements; in float64 if ``corrected``."""
     vec3, _ = types(dtype)
     precision = wp.float64 if corrected else dtype
     M, weights_type, wide = wp.constant(term.rows), wp.types.vector(term.rows, dtype), types(precision)[0]
@@ -189,7 +182,7 @@ def blocks(term: Term, dtype, corrected: bool):
 
 @cache
 def scatter_blocks(term: Term, dtype, corrected: bool):
-    """Kernel over cells: adds block q of :func:`blocks` to values[slots[q]], see :func:`.assemble.scatter_hessian`."""
+    """Kernel over cells: adds block q of :func:`blocks` to values[slots[q]]."""
     vec3, mat33 = types(dtype)
     weights_type, rest_type = wp.types.vector(term.rows, dtype), wp.types.vector(term.parameters, dtype)
     hessian_of, put = _hessian_of_cell(term, dtype, corrected), add_outer(term.rows, dtype)
@@ -227,7 +220,7 @@ def scatter_blocks(term: Term, dtype, corrected: bool):
 
 @cache
 def constant_blocks(term: Term, dtype):
-    """Kernel over cells of n vertices: out[starts[c] + n·i + j] = k A wᵢ·wⱼ [N/m], in double precision."""
+    """Kernel over cells of n vertices: out[starts[c] + n·i + j] = k A wᵢ·wⱼ [N/m], in float64."""
     M, weights_type, rest_type = (
         wp.constant(term.rows),
         wp.types.vector(term.rows, dtype),
@@ -261,9 +254,9 @@ def constant_blocks(term: Term, dtype):
 
 @cache
 def correct_cells(term: Term, dtype, multipliers: bool, per_step: bool, axes: bool = False):
-    """Kernel of a Gauss–Seidel sweep over cells of a quadratic energy, see :func:`.project.correct_in_place`.
+    """Kernel of a Gauss–Seidel sweep over cells of a quadratic energy.
 
-    Each row of y is a constraint: Δλ = −(y + α̃λ)/(Σ wᵢ²/mᵢ + α̃). The rows are solved in order.
+    Each row of y is a constraint, in order: Δλ = −(y + α̃λ)/(Σ wᵢ²/mᵢ + α̃).
     """
     vec3, _ = types(dtype)
     M, weights_type = wp.constant(term.rows), wp.types.vector(term.rows, dtype)

@@ -1,7 +1,6 @@
-"""Factories of the constraint rows of cells with a quadratic energy ½‖y‖²: the 3M rows y = Σ wₑ ⊗ xₑ of each cell, linear in x.
+"""Constraint rows of cells with an energy ½‖y‖²: the 3M rows y = Σ wₑ ⊗ xₑ, linear in x.
 
-A cell without stiffness is inactive: its rows, values and λ are 0, and its compliance is 1. See :mod:`.constraint_rows` for
-rows, and :mod:`.sparse` for cells.
+A cell without stiffness is inactive: rows, values and λ are 0, the compliance 1.
 """
 
 from functools import cache

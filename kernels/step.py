@@ -1,7 +1,6 @@
-"""Factories of the kernels of time integration: prediction, end of step, pins.
+"""Kernels of time integration: prediction, end of step, pins.
 
-A pinned vertex has inverse mass 0. Fixed pins stay; moved pins follow their keyframes. hₑ is the effective step of an implicit
-integrator, see :mod:`warpcloth.numerics.integrators`.
+A pin has inverse mass 0; moved ones follow their keyframes. hₑ is the effective step of the integrator.
 """
 
 from functools import cache
@@ -13,7 +12,7 @@ from .vectors import types
 
 @cache
 def predict(dtype):
-    """Kernel over vertices: v += hₑ g, x += hₑ v, which gives x̃, the position from inertia and gravity alone."""
+    """Kernel over vertices: v += hₑ g, x += hₑ v, which gives x̃."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -39,9 +38,8 @@ def predict(dtype):
 
 @cache
 def start_bdf2(dtype):
-    """Kernel over vertices: move ← x₀ − x₋₁ = h(v₁ − 7/4(v₂ − v₁)), v₋₁ ← v₀ − 3/2(v₁ − v₀), where v₋₁ has v₁ before.
-
-    v₁ and v₂ are from two steps of implicit Euler with hₑ = 2h/3, see :class:`warpcloth.numerics.integrators.BDF2`.
+    """Kernel over vertices: move ← x₀ − x₋₁ = h(v₁ − 7/4(v₂ − v₁)), v₋₁ ← v₀ − 3/2(v₁ − v₀), from two Euler steps with hₑ =
+    2h/3; v₋₁ has v₁ before.
     """
     vec3, _ = types(dtype)
 
@@ -71,8 +69,7 @@ def start_bdf2(dtype):
 def predict_bdf2(dtype):
     """Kernel over vertices: v ← (4v₀ − v₋₁)/3 + hₑ g, move ← (x₀ − x₋₁)/3 + hₑ v, x += move, v₋₁ ← v₀.
 
-    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v. Displacements are stored instead of x₋₁, for they keep digits that large coordinates
-    lose.
+    That is x̃ = (4x₀ − x₋₁)/3 + hₑ v.
     """
     vec3, _ = types(dtype)
 
@@ -125,8 +122,8 @@ def keyframed_position(dtype):
 def move_pins(dtype):
     """Kernel over (copies, pins): sets x of pinned vertices to their keyframes one step later, and v = (x − x before)/h.
 
-    Each copy counts its steps; a keyframe has ``steps_per_frame``. Pins that hold only some ``axes`` are moved along these.
-    Their x before is then also that of the keyframes, because the step may have moved x.
+    Each copy counts its steps, ``steps_per_frame`` per keyframe. Pins on some ``axes`` move along these, with x before from
+    keyframes too.
     """
     vec3, _ = types(dtype)
     position = keyframed_position(dtype)
@@ -165,8 +162,6 @@ def move_pins(dtype):
 
 @cache
 def count_step():
-    """Kernel over copies: step += 1."""
-
     @wp.kernel(module="unique", enable_backward=False)
     def count(
         # in and out
@@ -182,7 +177,7 @@ def count_step():
 def finish(dtype):
     """Kernel over vertices, after a prediction and a correction d: x += d, v += d/hₑ.
 
-    For Euler this is v = (x − x before)/h, but d keeps digits that large coordinates lose. Pins keep their x and v.
+    Pins keep x and v.
     """
     vec3, _ = types(dtype)
 
@@ -210,7 +205,7 @@ def finish(dtype):
 def finish_midpoint(dtype):
     """Kernel over vertices, after a prediction to the midpoint and a correction d: x₁ = 2(x̃ + d) − x₀, v₁ = 2(ṽ + d/hₑ) − v₀.
 
-    With ṽ = v₀ + hₑ g from the prediction: x += 2d + hₑ ṽ, v += 2d/hₑ + hₑ g. Pins keep their x and v.
+    With ṽ = v₀ + hₑ g from the prediction: x += 2d + hₑ ṽ, v += 2d/hₑ + hₑ g. Pins keep x and v.
     """
     vec3, _ = types(dtype)
 
@@ -292,11 +287,10 @@ def lock(dtype):
 
 @cache
 def reset(dtype, led: bool):
-    """Kernel over vertices: resets the state of the copies where the mask (B,) is true.
+    """Kernel over vertices: resets copies where the mask (B,) is true; pins get v = 0.
 
-    A pinned vertex gets v = 0. If keyframes move it (``led``), it starts at its position in the model, not at ``x_start``.
-    Other state is given by addresses of arrays; its bits are set to those of another array, or to 0. Each array has a number of
-    32-bit words per vertex, or, if the number is negative, per copy.
+    Pins with keyframes (``led``) start where the model has them, not at ``x_start``. Other state is given by addresses of
+    arrays and of those to copy, or 0; with 32-bit words per vertex, or, if negative, per copy.
     """
     vec3, _ = types(dtype)
 

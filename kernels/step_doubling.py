@@ -1,4 +1,4 @@
-"""Factories of the kernels of steps by error: differences of two results, and counts of steps in another unit."""
+"""Kernels of steps by error: differences of two results, and counts of steps in another unit."""
 
 from functools import cache
 
@@ -11,7 +11,6 @@ FIRST = wp.constant(wp.int64(2**62))
 
 @cache
 def subtract_positions(dtype):
-    """Kernel over vertices: out = a − b."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module=f"warpcloth.step_doubling.{dtype.__name__}", enable_backward=False)
@@ -66,7 +65,7 @@ def add_to_sums(
     # out
     sums: wp.array(dtype=wp.int64),
 ):
-    """Kernel over sums over steps: adds what has come to those of `divide_sums`, each step ``parts`` times."""
+    """Kernel over sums over steps: adds what is new to those of `divide_sums`, ``parts`` times."""
     i = wp.tid()
     sums[i] += (found[i] - sums[i] / wp.int64(parts)) * wp.int64(parts)
 
@@ -83,7 +82,7 @@ def scale_notes(
     # out
     out: wp.array(dtype=wp.int64),
 ):
-    """Kernel over notes FIRST − (step·rest + other): writes them with step·times/parts, or keeps one that is there."""
+    """Kernel over notes FIRST − (step·rest + other): writes them with step·times/parts, or keeps present ones."""
     i = wp.tid()
     note = notes[i]
     if keep != 0 and out[i] != wp.int64(0):

@@ -1,4 +1,4 @@
-"""Factories of the kernels that find how far the end of a step is from the minimiser of the step."""
+"""Kernels that find how far a step ended from its minimiser."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from .vectors import types
 
 @cache
 def add_moves(dtype):
-    """Kernel over vertices: out = d + part (x − unfiltered), the correction after contact moved vertices at the end."""
+    """Kernel over vertices: out = d + part (x − unfiltered), after contact moved vertices."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -60,7 +60,7 @@ def finish_residual(dtype):
 
 @cache
 def normal_moves(dtype):
-    """Kernel over vertices: out = n·move n/r, with n the direction of the contact force, or 0 where there is none."""
+    """Kernel over vertices: out = n·move n/r, n the direction of the contact force, or 0."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -101,10 +101,11 @@ def energy_above():
 
 @cache
 def unresolved_contact(dtype):
-    """Kernel over vertices: counts frames in a row where half of a contact force f is unbalanced and f h²/m > r.
+    """Kernel over vertices: counts frames in a row where half of a contact force f is unbalanced and f h²/m > r, so that it
+    would move the vertex out of contact in a step.
 
-    Such a force would move the vertex out of contact in a single step. ``forces`` are those of colliders, ``forces_of_cloth``
-    those of self-contact or None, with the contact distances ``r``. out = (1, 0, 0) where there are two such frames or more.
+    ``forces`` are of colliders, ``forces_of_cloth`` of self-contact or None, ``r`` the contact distances. out = (1, 0, 0) after
+    two such frames.
     """
     vec3, _ = types(dtype)
 

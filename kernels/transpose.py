@@ -1,7 +1,7 @@
-"""The transpose of local coordinates, out += Dᵀz: vertex i of an element gets Σₘ wᵢ[m] z[m].
+"""The transpose of local coordinates, out += Dᵀz: vertex i gets Σₘ wᵢ[m] z[m].
 
-A :class:`LocalSource` computes z, such as forces kA∂u/∂y or multipliers of constraints. One kernel sums over elements in order,
-for the CPU. The other has a thread per vertex, which sums over its elements in order, for a GPU.
+A :class:`LocalSource` computes z, such as kA∂u/∂y or multipliers. One kernel sums over elements, for the CPU, the other over
+the elements of each vertex, for a GPU.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from .vectors import types
 
 @cache
 def to_corner(term: Term, dtype):
-    """Device function (rest, i, z) → Σₘ wᵢ[m] z[m], the part of z (M, 3) at vertex i of an element."""
+    """Device function (rest, i, z) → Σₘ wᵢ[m] z[m], z (M, 3)."""
     M, weight = wp.constant(term.rows), term.weight
     rest_type, y_type = wp.types.vector(term.parameters, dtype), wp.types.matrix((term.rows, 3), dtype)
 
@@ -34,7 +34,7 @@ def to_corner(term: Term, dtype):
 
 @cache
 def to_block(rows: int, dtype):
-    """Device function (wᵢ, wⱼ, h) → Σₘₙ wᵢ[m] wⱼ[n] h[m, n], the block of vertices i and j of DᵀhD, h of 3×3 parts h[m, n]."""
+    """Device function (wᵢ, wⱼ, h) → Σₘₙ wᵢ[m] wⱼ[n] h[m, n], the block (i, j) of DᵀhD."""
     M, weights_type = wp.constant(rows), wp.types.vector(rows, dtype)
     mat33, h_type = types(dtype)[1], wp.types.matrix((3 * rows, 3 * rows), dtype)
 
@@ -54,9 +54,8 @@ def to_block(rows: int, dtype):
 
 @cache
 def add_outer(rows: int, dtype):
-    """Device function (wᵢ, wⱼ, h, s, t, values) that adds :func:`to_block` to values[s], and its transpose to values[t].
-
-    It adds no transpose if t is below 0, and nothing if s is below 0.
+    """Device function (wᵢ, wⱼ, h, s, t, values) that adds :func:`to_block` to values[s] and its transpose to values[t], if s, t
+    ≥ 0.
     """
     weights_type, h_type, mat33 = wp.types.vector(rows, dtype), wp.types.matrix((3 * rows, 3 * rows), dtype), types(dtype)[1]
     block_of, put, put_transposed = to_block(rows, dtype), add_to(mat33), add_to(mat33, transposed=True)
@@ -78,7 +77,7 @@ class LocalSource(NamedTuple):
     Attributes:
         data: Warp struct of the input arrays.
         z_of: Device function (data, element, rest) → z (M, 3).
-        left_out: Device function (data, element) → whether to skip the element; or None.
+        left_out: Device function (data, element) → whether to skip it; or None.
     """
 
     data: Any
@@ -104,7 +103,7 @@ def stored(term: Term, dtype):
 
 @cache
 def scatter(term: Term, dtype, source: LocalSource):
-    """Kernel over elements: out += Dᵀz. For the CPU, where one thread takes the elements in order: no addition is atomic."""
+    """Kernel over elements: out += Dᵀz. For one thread of the CPU: no addition is atomic."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     share_of, z_of, left_out = to_corner(term, dtype), source.z_of, source.left_out
@@ -135,7 +134,7 @@ def scatter(term: Term, dtype, source: LocalSource):
 
 @cache
 def gather(term: Term, dtype, source: LocalSource):
-    """Kernel over vertices: out += Dᵀz in a fixed order, that of :func:`warpcloth.model.elements.incidences_of`."""
+    """Kernel over vertices: out += Dᵀz in a fixed order."""
     vec3, _ = types(dtype)
     K, rest_type = wp.constant(term.vertices), wp.types.vector(term.parameters, dtype)
     share_of, z_of, left_out = to_corner(term, dtype), source.z_of, source.left_out

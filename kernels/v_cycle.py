@@ -1,4 +1,4 @@
-"""Factories of the kernels of a V-cycle, see :mod:`warpcloth.numerics.v_cycle`. ``active[copy]`` is 1 while a copy iterates."""
+"""Kernels of a V-cycle; ``active[copy]`` is 1 while a copy iterates."""
 
 from functools import cache
 
@@ -11,7 +11,6 @@ from .vectors import types
 
 
 def _module(dtype, terms=0):
-    """The name of a module, in which no two kernels have one name."""
     return f"warpcloth.v_cycle.{dtype.__name__}" + f".{terms}" * (terms > 0)
 
 
@@ -44,9 +43,9 @@ def residual(dtype, block: int, terms: int):
 
 @cache
 def subtract_product(dtype, block: int, terms: int = 0):
-    """Kernel over (copies, threads): out = r − A x, minus a ``further`` product with x if that is not None.
+    """Kernel over (copies, threads): out = r − A x, minus a ``further`` product with x if not None; out may be r.
 
-    ``out`` may be r. On CUDA threads share rows; on the CPU a copy has one, for each would copy the structs.
+    On CUDA threads share rows; on the CPU a copy has one.
     """
     vec3, _ = types(dtype)
     remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
@@ -83,7 +82,7 @@ def subtract_product(dtype, block: int, terms: int = 0):
 
 @cache
 def restrict(dtype):
-    """Kernel over (copies, threads), which share the coarse rows: r_c = Pᵀr, x_c = S r_c."""
+    """Kernel over (copies, threads): r_c = Pᵀr, x_c = S r_c."""
     vec3, mat33 = types(dtype)
     index, weight, vector = load(wp.int32), load(dtype), load(vec3)
 
@@ -121,7 +120,7 @@ def restrict(dtype):
 
 @cache
 def prolong(dtype):
-    """Kernel over (copies, threads), which share the rows: d = P x_c."""
+    """Kernel over (copies, threads): d = P x_c."""
     vec3, _ = types(dtype)
     index, weight, vector = load(wp.int32), load(dtype), load(vec3)
 
@@ -155,10 +154,7 @@ def prolong(dtype):
 
 @cache
 def sweep_after(dtype, block: int, terms: int = 0):
-    """Kernel over (copies, threads): x += d + S(r − A d), minus a ``further`` product with d if that is not None.
-
-    Threads are those of :func:`subtract_product`.
-    """
+    """Kernel over (copies, threads): x += d + S(r − A d), minus a ``further`` product with d if not None."""
     vec3, mat33 = types(dtype)
     remaining, lanes = residual(dtype, block, terms), lanes_of_rows(block)
 

@@ -7,5 +7,5 @@ import warp as wp
 
 @cache
 def types(dtype):
-    """The vector and 3×3 matrix types of a scalar type: (vec3, mat33)."""
+    """The types (vec3, mat33) of a scalar type."""
     return wp.types.vector(3, dtype), wp.types.matrix((3, 3), dtype)

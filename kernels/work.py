@@ -1,4 +1,4 @@
-"""Factories of kernels for the forces of multipliers and for the work of pins and loads."""
+"""Kernels of the forces of multipliers and of the work of pins and loads."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from .vectors import types
 
 @cache
 def multiplier_pull(term: Term, dtype, scalar: bool):
-    """:class:`.transpose.LocalSource` of factor·λ of a term, or with ``scalar`` of factor·λ ∂C/∂y."""
+    """:class:`.transpose.LocalSource` of factor·λ, or with ``scalar`` of factor·λ ∂C/∂y."""
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
     y_of, slope = local_coordinate(term, dtype, False), term.constraint_gradient
@@ -37,18 +37,16 @@ def multiplier_pull(term: Term, dtype, scalar: bool):
 
 
 def scatter_multipliers(term: Term, dtype, scalar: bool):
-    """Kernel over elements: out += factor·Gᵀλ, see :func:`.transpose.scatter`."""
+    """Kernel over elements: out += factor·Gᵀλ."""
     return scatter(term, dtype, multiplier_pull(term, dtype, scalar))
 
 
 def gather_multipliers(term: Term, dtype, scalar: bool):
-    """Kernel over vertices: the same sum as :func:`scatter_multipliers`, see :func:`.transpose.gather`."""
     return gather(term, dtype, multiplier_pull(term, dtype, scalar))
 
 
 @cache
 def add_scaled(dtype):
-    """Kernel over vertices: out += factor·a."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -68,7 +66,7 @@ def add_scaled(dtype):
 
 @cache
 def step_back(dtype):
-    """Kernel over vertices: d = h v, before = x − d, the position from which a step at the present velocity leads to x."""
+    """Kernel over vertices: d = h v, before = x − d."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -91,7 +89,7 @@ def step_back(dtype):
 
 @cache
 def past(dtype):
-    """Struct of the state before a step: positions, ∂U/∂x and the forces of loads."""
+    """Struct of positions, ∂U/∂x and forces of loads before a step."""
     vec3, _ = types(dtype)
 
     @wp.struct
@@ -105,7 +103,6 @@ def past(dtype):
 
 @cache
 def wide_dot(dtype):
-    """Device function (a, b) → a·b in double precision."""
     vec3, _ = types(dtype)
 
     @wp.func
@@ -119,9 +116,8 @@ def wide_dot(dtype):
 def add_work(dtype):
     """Kernel over vertices, after a step: work of loads += f·Δx, of pins += (½(∇U₀ + ∇U₁) − m g − f)·Δx along held axes.
 
-    −∇U is the force of the cloth on a pin. For quadratic energies, the mean of both ∇U is that at the middle of the step, where
-    midpoint evaluates it, so its energy balance is exact. f is the force of loads in the step. If ``share`` is ½, for steps
-    that evaluate it at their end, f is the mean of it and of that before.
+    −∇U is the force of the cloth on a pin. The mean of both ∇U is exact for quadratic energies in midpoint. f is the force of
+    loads, or with ``share`` ½ its mean over the step.
     """
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
@@ -162,7 +158,7 @@ def add_work(dtype):
 
 @cache
 def add_rubbing_work(dtype):
-    """Kernel over vertices, after a step: work against friction += ∇H·Δx, with ∇H where the step evaluates its forces."""
+    """Kernel over vertices, after a step: work against friction += ∇H·Δx."""
     vec3, _ = types(dtype)
     product = wide_dot(dtype)
 

@@ -1,6 +1,6 @@
 """A bunny, a closed surface from a stage. Keyframes move pins at its feet, head and ears: it turns its head.
 
-The mesh is one of Warp's example assets, 1.6 m high; the animation is a layer over the file.
+The mesh, 1.6 m high, is one of Warp's example assets; the animation is a layer over the file.
 """
 
 import os

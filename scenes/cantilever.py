@@ -1,12 +1,12 @@
 """A strip clamped at one end that bends under its own weight, Γ = ρgL³/D (Romero et al. 2021), on an equilateral mesh.
 
-The strip extends along x. With a width of 0 it is one row of triangles, which bends with 1 − ν² = 8/9 of D, because both
-bending energies of hinges have the Poisson's ratio ν = −1/3. Otherwise it has rows of edges across its width. A plate, with
-ν = 0, needs a width. L is measured from the middle of the pins, half an element from x = 0, to the free end (of a single row,
-its mean); for a plate from the clamp, 0.18 elements behind the second row of pins.
+With a width of 0 it is one row of triangles along x, which bends with 1 − ν² = 8/9 of D, as both bending energies of hinges
+have ν = −1/3. Otherwise it has rows of edges across; a plate, with ν = 0, needs a width. L is measured from the middle of the
+pins, half an element from x = 0, to the free end (of a single row, its mean); for a plate from 0.18 elements behind the second
+row of pins.
 
-With a fabric, it is the sample of a Shirley tester: a strip 25 mm wide, if no width is given, cut at an angle to the warp. L
-follows from Γ, with the fabric's own ρ and D; for Γ = 8, twice the bending length, the tip hangs 41.5° below the clamp.
+With a fabric, it is the sample of a Shirley tester: 25 mm wide by default, cut at an angle to the warp. L follows from Γ, ρ and
+D; for Γ = 8, twice the bending length, the tip hangs 41.5° below the clamp.
 """
 
 from typing import Literal, get_args

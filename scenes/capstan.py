@@ -1,8 +1,8 @@
 """A belt that is pulled over a fixed drum against a load: it slides when the pull is exp(μφ) times the load.
 
-At a vertex where the belt turns by Δ, the tension ahead is at most (1 + μ tan Δ/2)/(1 − μ tan Δ/2) times the tension behind.
-With ``turns`` edges around the drum, the pull is at most the load times that ratio to the power ``turns``. A tension T presses
-the belt on the drum with T over the radius of its mid-surface. The belt has no weight, and starts at rest under the load.
+Where the belt turns by Δ, the tension ahead is at most (1 + μ tan Δ/2)/(1 − μ tan Δ/2) times that behind; the pull is at most
+the load times that to the power ``turns``, the edges around the drum. A tension T presses with T over the radius of the
+mid-surface. The belt has no weight, and starts at rest under the load.
 """
 
 import numpy as np

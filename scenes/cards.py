@@ -1,8 +1,7 @@
-"""Two cards that lean on each other on a floor. Friction between them and on the floor keeps them upright.
+"""Two cards that lean on each other on a floor, upright by friction.
 
-The top of the first card rests on the face of the second, at ρ = 0.97 of its length; the first is shorter by the same ratio. By
-the balance of moments about the floor, they stand at an angle θ to the vertical if the coefficient of friction between them is
-above (ρ² − cos 2θ)/sin 2θ.
+The top of the first, shorter one rests on the face of the second, at ρ = 0.97 of its length. They stand at an angle θ to the
+vertical if the friction between them is above (ρ² − cos 2θ)/sin 2θ.
 """
 
 import numpy as np

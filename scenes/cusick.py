@@ -1,7 +1,7 @@
 """Cusick's drape test: a disc of 30 cm hangs over the edge of a disc of 18 cm, which holds it, with warp along x.
 
-The device clamps the sample between two discs, so vertices up to the edge of the support are pinned. They are two rows, and the
-mesh has no cloth further in. `start` is the number of the small random waves of the overhanging ring from which it falls.
+Vertices up to the edge of the support, two rows, are pinned; there is no cloth further in. `start` numbers the small random
+waves from which it falls.
 """
 
 import numpy as np

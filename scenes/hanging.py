@@ -1,7 +1,7 @@
 """A square cloth of 1 m, initially horizontal, pinned at two corners of one side; it swings like a pendulum.
 
-It has structural and shear springs, and equal masses. For an odd number of vertices per side it is mirror symmetric. The side
-with the pins lies along x at z = 0.
+It has structural and shear springs, equal masses, and for an odd n mirror symmetry. The side with the pins lies along x at z =
+0.
 """
 
 import numpy as np

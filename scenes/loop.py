@@ -1,10 +1,11 @@
-"""A strip bent into a hanging loop. Both ends are clamped at one point, and point down (pear), sideways (ring) or up (heart).
+"""A strip bent into a hanging loop. Both ends, the contact distance apart, are clamped at one point, and point down (pear),
+sideways (ring) or up (heart).
 
-Without weight, its depth from that point to the lowest one is .424308, .318310 and .133860 of its length L. For a heart with
-Γ = ρgL³/D of 10, 100 and 400 it is .139540, .184043 and .275445. The two ends are the contact distance apart.
+Without weight, its depth below that point is .424308, .318310 and .133860 of its length L. For a heart with Γ = ρgL³/D of 10,
+100 and 400 it is .139540, .184043 and .275445.
 
-With a fabric, a heart is the heart loop test. L follows from Γ, with the fabric's own ρ and D at an angle to the warp. Its
-clamps are 0.18 edges behind the second row of pins, see the scene `cantilever`.
+With a fabric, a heart is the heart loop test. L follows from Γ, ρ and D at an angle to the warp; its clamps are 0.18 edges
+behind the second row of pins, as in `cantilever`.
 """
 
 from typing import Literal

@@ -1,7 +1,6 @@
 """A mobile: two rigid bars, the second hung from the first, carry three cloths sewn to rigid battens. A push makes it rotate.
 
-A bar has three vertices: its two ends, and slightly above them its suspension, where its loads balance, so that bars stay
-level.
+A bar has two ends, and slightly above them its suspension, where its loads balance.
 """
 
 import numpy as np

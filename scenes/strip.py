@@ -1,7 +1,6 @@
 """A strip cut at an angle to the warp is pulled by its ends: E(θ), 1/E = c⁴/E₁ + s⁴/E₂ + (1/G − 2ν₁₂/E₁)s²c².
 
-Strips that are cut at an angle shear when they are pulled. The grips of this one hold its ends along x only, so that their
-vertices slide sideways and the strip is stretched uniformly.
+The grips hold its ends along x only, so strips at an angle shear and stretch uniformly.
 """
 
 import numpy as np

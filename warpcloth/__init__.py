@@ -65,11 +65,30 @@ if TYPE_CHECKING:  # the table below, for type checkers
     from .scene.scene import Pins as Pins
     from .scene.scene import Scene as Scene
     from .scene.self_contact import SelfContact as SelfContact
-    from .solvers import *  # noqa: F403
-    from .terms import *  # noqa: F403
+    from .solvers.admm import ADMM as ADMM
+    from .solvers.constrained_dynamics import ConstrainedDynamics as ConstrainedDynamics
+    from .solvers.explicit import Explicit as Explicit
+    from .solvers.hierarchical_pbd import HierarchicalPBD as HierarchicalPBD
+    from .solvers.newton import Newton as Newton
+    from .solvers.pbd import PBD as PBD
+    from .solvers.projective_dynamics import ProjectiveDynamics as ProjectiveDynamics
+    from .solvers.xpbd import XPBD as XPBD
+    from .terms.attachment import Attachment as Attachment
+    from .terms.corotated_membrane import CorotatedMembrane as CorotatedMembrane
+    from .terms.dihedral_bending import DihedralBending as DihedralBending
     from .terms.loads import Force as Force
     from .terms.loads import Pressure as Pressure
     from .terms.loads import Traction as Traction
+    from .terms.neo_hookean_membrane import NeoHookeanMembrane as NeoHookeanMembrane
+    from .terms.orthotropic_membrane import OrthotropicMembrane as OrthotropicMembrane
+    from .terms.plate_bending import PlateBending as PlateBending
+    from .terms.quadratic_bending import QuadraticBending as QuadraticBending
+    from .terms.rigid_cluster import RigidCluster as RigidCluster
+    from .terms.shell_bending import ShellBending as ShellBending
+    from .terms.spring import Spring as Spring
+    from .terms.spring_limit import SpringLimit as SpringLimit
+    from .terms.strain_limit import StrainLimit as StrainLimit
+    from .terms.stvk_membrane import StVKMembrane as StVKMembrane
 
 # The module of each public name. The names of the two catalogues are added.
 _MODULES = {

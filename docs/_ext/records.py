@@ -1,6 +1,7 @@
 """Makes the pages that follow from the code when the site is built.
 
-There is one for each energy, solver, scene and fabric, one of the failures, the reference of Python, and the changes.
+There is one for each energy, solver, scene and fabric, one of the failures, the reference of Python, and the changes. The
+tables of options are put into the page of the command line.
 """
 
 import inspect
@@ -79,11 +80,11 @@ def sh(*commands):
 
 
 def described(kind, name):
-    """The docstring of a name and of its members, but for old names of fields and for properties that have none."""
+    """The docstring of a name and of its members, except properties that have none."""
     value = getattr(wc, name)
     bare = [each for each, of_class in vars(value).items() if isinstance(of_class, property) and not of_class.__doc__]
     bare += getattr(value, "_fields", ())  # of named tuples, whose docstrings only count them
-    left_out = ", ".join([*getattr(value, "renamed_fields", ()), *bare])
+    left_out = ", ".join(bare)
     path = value.__name__ if kind == "module" else f"warpcloth.{name}"
     options = {"class": ["members:"], "module": ["members:"], "data": ["no-value:"]}.get(kind, [])
     options += [f"exclude-members: {left_out}"] * bool(left_out)
@@ -449,9 +450,10 @@ def write_pages(app):
 
 
 def lead_inside(app, document, source):
-    """Puts the texts of the site into a page."""
+    """Puts the texts and the tables of the site into a page."""
     for outside, inside in OUTSIDE.items():
         source[0] = source[0].replace(outside, inside)
+    source[0] = tables.filled(source[0], tables.IN_SITE)
 
 
 def escape(app, what, name, value, options, lines):

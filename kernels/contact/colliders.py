@@ -164,28 +164,6 @@ def gap_of(dtype, solids):
 
 
 @cache
-def find_distances(solid):
-    """Kernel over points in the frame of a shape: their signed distances [m]."""
-    gap = gap_to(solid)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def find(
-        # state in
-        points: wp.array(dtype=wp.vec3d),
-        # parameters
-        half: wp.vec3d,
-        radius: wp.float64,
-        # out
-        out: wp.array(dtype=wp.float64),
-    ):
-        i = wp.tid()
-        d, _n = gap(points[i], half, radius)
-        out[i] = d
-
-    return find
-
-
-@cache
 def kept_part(dtype, solids):
     """Device function (shapes, collider, X, move, least) → the fraction of a move from X that is kept, in the collider's frame.
 

@@ -4,12 +4,13 @@ from functools import cache
 
 import warp as wp
 
+from ..pairs import Pairs
 from ..vectors import types
 from .obstacles import cloth_vertex, copy_of, has_obstacle
 from .pair_potential import CLOSE, Laws
 from .self_contact import least_gap
 from .self_gaps import ONE, SIDE, ZERO, farthest
-from .self_pairs import Pairs, StepPairs, module_of
+from .self_pairs import StepPairs, module_of
 
 # The least gap that coarse positions leave is 6 units in the last place. Rounding changes gaps by two of them.
 ROUNDED = wp.constant(wp.float64(4.0 / 3.0))

@@ -8,9 +8,10 @@ from functools import cache
 import warp as wp
 
 from ..memory import load
+from ..pairs import Layout
 from ..rotation import epsilon
 from ..vectors import types
-from .obstacles import Layout, copy_of
+from .obstacles import copy_of
 
 FARTHEST = 1e9  # largest cell coordinate; the outermost cells contain everything beyond
 MODULE = "warpcloth.local_motion"

@@ -2,10 +2,10 @@
 
 import warp as wp
 
+from ..pairs import Pairs
 from .obstacles import copy_of, obstacle_of
 from .pair_sums import PairForces
 from .self_gaps import ZERO
-from .self_pairs import Pairs
 
 
 @wp.kernel(module="warpcloth.mesh_forces", enable_backward=False)

@@ -10,11 +10,12 @@ from functools import cache
 
 import warp as wp
 
+from ..pairs import Pairs
 from ..vectors import types
 from .colliders import filters, gap_of, to_local, to_space
 from .obstacles import has_obstacle
 from .self_gaps import ONE, ZERO
-from .self_pairs import Pairs, StepPairs
+from .self_pairs import StepPairs
 
 PARTS = wp.constant(wp.float64(2.0**20))  # of the contact distance and the skin, in which gaps are compared
 SMALL = wp.constant(wp.float64(1e-9))  # a weight, so that their sum is not 0

@@ -8,20 +8,12 @@ from functools import cache
 import warp as wp
 
 from ..memory import load
+from ..pairs import Layout
 from ..vectors import types
 from .colliders import pose_types, step_poses, to_space
 
 # Groups of elements: cloth, cloth with a vertex that cannot move, and obstacles.
 CLOTH, HELD, OBSTACLE = wp.constant(0), wp.constant(1), wp.constant(2)
-
-
-@wp.struct
-class Layout:
-    """The numbers of vertices: N of all cloth, n of that of a copy, and m obstacles of a copy."""
-
-    cloth: wp.int32
-    per_copy: wp.int32
-    obstacles: wp.int32
 
 
 @wp.func

@@ -7,10 +7,11 @@ new ones start with the λ of the old ones.
 import warp as wp
 
 from ..memory import load
+from ..pairs import Pairs
 from ..terms import contact
 from .pair_potential import Contacts
 from .self_gaps import ONE, SIDE, ZERO
-from .self_pairs import Pairs, slot_with
+from .self_pairs import slot_with
 
 slope, _number = contact.slope, load(wp.int32)
 

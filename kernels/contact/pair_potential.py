@@ -22,11 +22,12 @@ from typing import Any
 import warp as wp
 
 from ..memory import load
+from ..pairs import Layout, Pairs
 from ..terms.contact import bend
 from ..vectors import types
-from .obstacles import Layout, cloth_vertex, has_obstacle, in_copy
+from .obstacles import cloth_vertex, has_obstacle, in_copy
 from .self_gaps import CORNER, EDGE, INSIDE, ONE, SIDE, ZERO, along, gap_along, nearest_of_face, vertex_of, vertex_triangle
-from .self_pairs import Pairs, module_of, slot_with, take_slot
+from .self_pairs import module_of, slot_with, take_slot
 
 MIDDLE = wp.constant(wp.float64(0.125))  # weight of the distance from the middles of edges; below 1/6 D is strictly convex
 CLOSE = wp.constant(wp.float64(0.25))  # contact distance of edges over that of vertices

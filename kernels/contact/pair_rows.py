@@ -1,4 +1,4 @@
-"""Factories of the constraint rows of pairs, for each :class:`.pair_sums.PairTerm`.
+"""Factories of the constraint rows of pairs, for each :class:`..term.PairTerm`.
 
 Each copy has rows for all slots; those of other copies, or without a pair, are inactive, see :mod:`..constraint_rows`. With
 ``curved``, pairs of a term with one row have a second one, which adds the stiffness −λC″. λ is found anew, as −C/α and the
@@ -10,11 +10,11 @@ from functools import cache
 import warp as wp
 
 from ..constraint_rows import ROUNDINGS, RowLayout, lowest_compliance, row_values
+from ..pairs import Pairs
 from ..rotation import epsilon
+from ..term import PairTerm
 from ..vectors import types
-from .pair_sums import PairTerm
 from .self_gaps import ONE, ZERO
-from .self_pairs import Pairs
 
 FIXED = wp.constant(wp.float64(1e20))  # compliance of a row whose force is given
 

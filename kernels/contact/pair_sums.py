@@ -6,16 +6,14 @@ force in order, so that no list of the pairs of a vertex is needed, and products
 rounding.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import warp as wp
 
+from ..pairs import Pairs, pair_blocks, turned_pull
+from ..term import PairTerm
 from ..vectors import types
 from .self_gaps import ZERO
-from .self_pairs import Pairs
 
 
 @wp.struct
@@ -27,9 +25,9 @@ class PairForces:
     the ``count`` [0] pairs with a force, in order, and ``joining`` the ``count`` [1] ones that join vertices: those with a mesh
     may have only one.
 
-    If w changes with the positions, the rest has more entries, see :func:`turned_pull`: of the ``turns`` t, two numbers [1/m]
-    for each vertex, two vectors e, the ``ways``, the ``normal`` n of the data, and ``twist``, α [N] and β [N·m]. ``twisted`` is
-    the share of ``twist`` that the policy gives. Without, these arrays are None.
+    If w changes with the positions, the rest has more entries, see :func:`..pairs.turned_pull`: of the ``turns`` t, two numbers
+    [1/m] for each vertex, two vectors e, the ``ways``, the ``normal`` n of the data, and ``twist``, α [N] and β [N·m].
+    ``twisted`` is the share of ``twist`` that the policy gives. Without, these arrays are None.
     """
 
     weights: wp.array(dtype=wp.vec4d)
@@ -61,63 +59,6 @@ def note_pressing(forces: PairForces, e: int, s: wp.vec4i):
         forces.pressing[wp.atomic_add(forces.count, 0, 1)] = e
         if not is_single(s):
             forces.joining[wp.atomic_add(forces.count, 1, 1)] = e
-
-
-@cache
-def pair_blocks(dtype):
-    """Struct of what products of each pair read, in the precision of the matrix: w, 0 at pins, ∂²U/∂y² [N/m], and its turns."""
-    vec3, mat33 = types(dtype)
-
-    @wp.struct
-    class PairBlocks:
-        weights: wp.array(dtype=wp.types.vector(4, dtype))
-        blocks: wp.array(dtype=mat33)
-        turns: wp.array(dtype=wp.types.matrix((4, 2), dtype))
-        ways: wp.array(dtype=wp.types.matrix((2, 3), dtype))
-        normal: wp.array(dtype=vec3)
-        twisted: wp.array(dtype=wp.types.vector(2, dtype))
-
-    return PairBlocks
-
-
-@wp.func
-def turned_pull(w: Any, t: Any, ways: Any, n: Any, twisted: Any, y: Any, z: Any):
-    """wᵢα eᵀz + n tᵢ·(α e y + β z), what turns add to wᵢ ∂²U/∂y² y for y = Σ wⱼpⱼ and z = Σ tⱼ n·pⱼ."""
-    return (w * twisted[0]) * (wp.transpose(ways) * z) + wp.dot(t, twisted[0] * (ways * y) + twisted[1] * z) * n
-
-
-@dataclass(frozen=True)
-class PairTerm:
-    """The record of an energy of pairs.
-
-    Attributes:
-        name: Its name in reports.
-        module: Name of the Warp module of its kernels, without the precision.
-        rows: The number of its constraint rows.
-        data: Warp struct of the values of each pair in the step, among them its normal n.
-        near: Function of a precision, which makes the device function (pairs, data, e, x, d, always) → whether pair e may have
-            a force at x + d, v, n and w, for a sweep. v is the y of friction, and the gap along n of contact. With ``always``,
-            w and v are found in any case.
-        push: Device function (data, e, v, n, D, least, h, hard) → λ = −h²∂U/∂y at v + Dλ [kg·m], v without the force of the
-            pair. D is Σ wᵢ²/mᵢ along n, and ``least`` its bound for ``hard`` pairs, see :mod:`.pair_sweeps`.
-        row: Device function (pairs, data, e, x, d) → :class:`PairRow`.
-        isotropic: Whether D is that of a vertex without locked axes, because ``push`` needs one D for all directions.
-        turns: Whether w changes with the positions, see :class:`PairForces`. The data then has a ``normal``.
-    """
-
-    name: str
-    module: str
-    rows: int
-    data: Any
-    near: Callable
-    push: Callable
-    row: Callable
-    isotropic: bool
-    turns: bool = False
-
-    def of(self, dtype, scatters):
-        """Returns the name of the module of its sums. Those that gather are in one of their own, for the CPU needs none."""
-        return f"{self.module}.{dtype.__name__}" + ("" if scatters else ".gather")
 
 
 @wp.struct
@@ -220,7 +161,7 @@ def pair_energies(term: PairTerm, dtype, scatters: bool):
 
 @cache
 def set_pair_blocks(term: PairTerm, dtype, scatters: bool):
-    """Kernel over pairs: ``block`` with the ``policy`` (B,), and the :func:`pair_blocks` if products are gathered."""
+    """Kernel over pairs: ``block`` with the ``policy`` (B,), and the :func:`..pairs.pair_blocks` if products are gathered."""
     vec3, mat33 = types(dtype)
     vec4, vec2, mat42, mat23 = (
         wp.types.vector(4, dtype),

@@ -1,4 +1,4 @@
-"""Factories of the kernels of Gauss–Seidel and Jacobi sweeps over pairs, for each :class:`.pair_sums.PairTerm`.
+"""Factories of the kernels of Gauss–Seidel and Jacobi sweeps over pairs, for each :class:`..term.PairTerm`.
 
 A sweep removes the λ of a pair and adds that of its prox at what remains: with v̂ without the force of the pair and D = Σ
 wᵢ²/mᵢ along n, λ = −hₑ²∂U/∂y(v̂ + Dλ) in closed form, and Δxᵢ = wᵢλ/mᵢ. Then M(x − x̃) = Σ wᵢλ with w at x, and a fixed point
@@ -13,10 +13,11 @@ from functools import cache
 import warp as wp
 
 from ..memory import load
+from ..pairs import Pairs
+from ..term import PairTerm
 from ..vectors import types
-from .pair_sums import PairForces, PairTerm, is_single
+from .pair_sums import PairForces, is_single
 from .self_gaps import ONE, ZERO
-from .self_pairs import Pairs
 
 # Smallest D of a hard pair, over its D with all axes free. If n is at an angle ε to the free axes, its vertices would move by
 # (r − d)/sin ε. This bounds their moves by (r − d)/√LOCKED, and takes them to 0 where sin ε does.

@@ -4,8 +4,9 @@ from functools import cache
 
 import warp as wp
 
+from ..pairs import Layout
 from ..vectors import types
-from .obstacles import Layout, copy_of, vector_within
+from .obstacles import copy_of, vector_within
 from .proximity_grid import MODULE
 
 NUMBERS = wp.array(dtype=wp.int32)

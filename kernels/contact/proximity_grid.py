@@ -12,11 +12,12 @@ from typing import Any
 import warp as wp
 
 from ..memory import load
+from ..pairs import Layout
 from ..reduce import largest_of_warp
 from ..rotation import epsilon
 from ..vectors import types
 from .local_motion import FARTHEST, bucket_of, differences, motions
-from .obstacles import OBSTACLE, Layout, vector_within
+from .obstacles import OBSTACLE, vector_within
 
 LEVELS = wp.constant(30)  # levels of the grid; the last has one cell
 MODULE = "warpcloth.proximity"

@@ -5,12 +5,13 @@ from functools import cache
 import warp as wp
 
 from ..memory import load
+from ..pairs import Pairs
 from ..vectors import types
 from .local_motion import differences
 from .obstacles import copy_of, has_obstacle, vector_within
 from .proximity_grid import boxes, boxes_meet, surfaces
 from .self_gaps import CORNERS, ONE, ZERO, corners, nearest
-from .self_pairs import Pairs, module_of
+from .self_pairs import module_of
 from .self_planes import KEPT, WIDE, margin_of, needs_no_cut, part_apart, ulp_of
 
 

@@ -18,13 +18,15 @@ from typing import Any
 import warp as wp
 
 from ..memory import load
+from ..pairs import Pairs
 from ..rotation import epsilon
+from ..term import PairTerm
 from ..terms import contact
 from ..vectors import types
 from .pair_potential import ENDING, MIDDLE, STARTING, TWO, TWO_EDGES, Contacts
-from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
+from .pair_sums import PairForces, PairRow, note_pressing
 from .self_gaps import ON_EDGE, ONE, SIDE, ZERO, farthest, vertex_of
-from .self_pairs import MODULE, Pairs, module_of
+from .self_pairs import MODULE, module_of
 from .self_planes import margin_of, ulp_of
 
 potential, slope, bend, gap_after = contact.potential, contact.slope, contact.bend, contact.gap_after

@@ -7,11 +7,12 @@ from functools import cache
 
 import warp as wp
 
+from ..pairs import Layout, Pairs
 from ..vectors import types
 from .gap_notes import FIRST
-from .obstacles import Layout, copy_of, has_obstacle, vector_within
+from .obstacles import copy_of, has_obstacle, vector_within
 from .self_gaps import ONE, PLANAR, ZERO
-from .self_pairs import Pairs, StepPairs, module_of
+from .self_pairs import StepPairs, module_of
 from .self_planes import bounded_share
 
 # Pins of hard pairs may approach by this fraction of their gap in a step. The second is for pairs with a free vertex, which

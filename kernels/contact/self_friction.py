@@ -16,14 +16,16 @@ from typing import Any
 import warp as wp
 
 from ..coulomb import Law
+from ..pairs import Layout, Pairs
 from ..rotation import nearest_rotation
+from ..term import PairTerm
 from ..terms import contact
 from ..vectors import types
-from .obstacles import Layout, copy_of, in_copy, obstacle_of
+from .obstacles import copy_of, in_copy, obstacle_of
 from .pair_potential import TWO_EDGES, Contacts
-from .pair_sums import PairForces, PairRow, PairTerm, note_pressing
+from .pair_sums import PairForces, PairRow, note_pressing
 from .self_gaps import ONE, ZERO, perpendicular
-from .self_pairs import Pairs, take_slot
+from .self_pairs import take_slot
 
 
 @wp.struct
@@ -419,6 +421,6 @@ def row_of_friction(law: Law):
 
 @cache
 def friction_of_pairs(law: Law):
-    """Returns the :class:`.pair_sums.PairTerm` of friction by a law."""
+    """Returns the :class:`..term.PairTerm` of friction by a law."""
     push, row = push_friction(law), row_of_friction(law)
     return PairTerm("self-friction", f"{MODULE}.{law.name}", 2, RubbedPairs, near_friction, push, row, isotropic=True)

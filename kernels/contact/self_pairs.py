@@ -4,39 +4,10 @@ from functools import cache
 
 import warp as wp
 
+from ..pairs import Pairs
 from ..vectors import types
-from .obstacles import Layout
 from .proximity import sort
 from .self_gaps import corners, nearest
-
-
-@wp.struct
-class Pairs:
-    """The near pairs of :class:`warpcloth.contact.proximity.Proximity`, or the contacts of an energy.
-
-    Near pairs have the fields up to ``distances``: ``counts`` of vertex–triangle pairs, which come first, and of edge–edge
-    pairs; those of vertex i in rows ``rows`` [i] to rows[i+1]; and r or, if less, half the rest distance [m], in the precision
-    of the model. Kernels over pairs have so many ``threads``: on the CPU one, for each there copies structs.
-
-    An energy has ``stencils``, of cloth alone, and the others. Its contacts are in the first ``number`` (1,) slots, on a
-    GPU in any order. ``keys`` number contacts by their pairs, so that they do not depend on that order. ``slots`` [key] is
-    the slot of a key, if a contact has it, see :func:`slot_with`. ``corners`` lists 4·slot + corner of contacts at vertex
-    i, from ``first`` [i] to first[i+1], sorted by key. ``corner_counts`` is scratch, 0 between launches. The last three are
-    empty if no kernel sums over vertices.
-    """
-
-    layout: Layout
-    threads: wp.int32
-    stencils: wp.array(dtype=wp.vec4i)
-    counts: wp.array(dtype=wp.int32)
-    rows: wp.array(dtype=wp.int32)
-    distances: wp.array(dtype=wp.float64)
-    number: wp.array(dtype=wp.int32)
-    keys: wp.array(dtype=wp.int32)
-    slots: wp.array(dtype=wp.int32)
-    corner_counts: wp.array(dtype=wp.int32)
-    first: wp.array(dtype=wp.int32)
-    corners: wp.array(dtype=wp.int32)
 
 
 @wp.struct

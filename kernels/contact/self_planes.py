@@ -7,10 +7,11 @@ import numpy as np
 import warp as wp
 
 from ..memory import load
+from ..pairs import Pairs
 from ..vectors import types
 from .obstacles import copy_of
 from .self_gaps import CORNERS, ONE, SIDE, ZERO, corners, nearest
-from .self_pairs import Pairs, module_of
+from .self_pairs import module_of
 
 KEPT = wp.constant(wp.float64(0.9))  # fraction of its distance to a plane that a vertex may move in one round of the filter
 CLAMPED = wp.constant(wp.float64(0.05))  # smallest distance of each side from the plane, as a fraction of the gap

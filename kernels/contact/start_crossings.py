@@ -4,10 +4,11 @@ from functools import cache
 
 import warp as wp
 
+from ..pairs import Pairs
 from ..vectors import types
 from .obstacles import in_copy
 from .self_gaps import ZERO
-from .self_pairs import Pairs, module_of
+from .self_pairs import module_of
 
 # Rounding of the distances from a plane, over the length of an edge.
 ROUNDED = wp.constant(wp.float64(1e-9))

@@ -1,8 +1,7 @@
-"""Factories of functions that add the forces of a block of elements in stages, as loops that the compiler can vectorise.
+"""Functions that add the forces of a block of elements in stages, as loops that vectorise.
 
-Local coordinates are gathered into scratch, forces are computed there, then scattered. A block has two kinds of pieces. In a
-run, the vertices of each element are one higher than those of the last, so memory is accessed in order. For others, stencils
-are read.
+Local coordinates are gathered into scratch, forces are computed there, then scattered. In a piece of a block that is a run, the
+vertices of each element are one higher than the last; others read stencils.
 """
 
 from functools import cache
@@ -18,10 +17,11 @@ from .term_facts import TermFacts, chain_of, elements_struct, local_gradient
 
 @cache
 def gather_piece(part: TermFacts, dtype, corrected: bool = False):
-    """Device function (elements, first, count, base, x, v, h, y, dy) that sets y of a piece.
+    """Device function (elements, first, count, base, x, v, h, y, dy) that sets y of a piece, and dy = h Σ wᵢ ⊗ vᵢ if the term
+    is damped or ``corrected``.
 
-    If the term is damped, or ``corrected``, it also sets dy = h Σ wᵢ ⊗ vᵢ. The piece is a run of ``count`` elements from
-    ``first`` on if ``count`` is positive, else −count other elements. The scratch begins with the element ``base``.
+    A positive ``count`` is a run from ``first`` on, a negative one −count other elements; scratch begins with the element
+    ``base``.
     """
     vec3, _ = types(dtype)
     term = part.term
@@ -78,9 +78,9 @@ def gather_piece(part: TermFacts, dtype, corrected: bool = False):
 
 @cache
 def compute_forces(part: TermFacts, dtype, corrected: bool = False):
-    """Device function (elements, first, last, h, y, dy) that replaces y by kA ∂u/∂y plus the force of damping.
+    """Device function (elements, first, last, h, y, dy) that replaces y of elements first to last − 1 by kA ∂u/∂y plus damping.
 
-    It takes the elements from ``first`` to ``last`` − 1 of a block. With ``corrected``, forces are those at y + dy.
+    With ``corrected``, forces are those at y + dy.
     """
     term = part.term
     damped, shared = part.damped, part.shared
@@ -118,7 +118,7 @@ def compute_forces(part: TermFacts, dtype, corrected: bool = False):
 
 @cache
 def scatter_piece(part: TermFacts, dtype):
-    """Device function (elements, first, count, base, forces, out): out += wᵢ·force for a piece, see :func:`gather_piece`."""
+    """Device function (elements, first, count, base, forces, out): out += wᵢ·force for a piece."""
     vec3, _ = types(dtype)
     term = part.term
     K = wp.constant(term.vertices)
@@ -201,7 +201,6 @@ def add_block(part: TermFacts, dtype, corrected: bool = False):
 
 @cache
 def add_block_forces(parts: tuple[TermFacts, ...], dtype, corrected: bool = False):
-    """As :func:`add_block`, for all terms."""
     vec3, _ = types(dtype)
     chain_type = chain_of(parts, dtype)
     key = dtype, corrected

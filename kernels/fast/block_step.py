@@ -1,7 +1,6 @@
-"""Factories of the explicit step by blocks: one thread per copy computes the forces of all terms and the update in one pass.
+"""The explicit step by blocks: one thread per copy computes all forces and the update in one pass.
 
-Each element is in the block of its lowest vertex. After a block, no element adds to the forces on its vertices or reads their
-positions, so x and v are updated in place.
+Each element is in the block of its lowest vertex. After a block, its vertices are complete, so x and v are updated in place.
 """
 
 from functools import cache
@@ -12,7 +11,7 @@ from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..vectors import types
 from .block_forces import add_block_forces
-from .contact_guard import guard_type, in_ball, touching_step
+from .guard import ContactFactories, guard_type
 from .term_facts import TermFacts, chain_of
 
 
@@ -23,19 +22,19 @@ def block_step(
     symplectic: bool,
     flags: str,
     compensated: bool = False,
-    guarded: bool = False,
+    contact: ContactFactories | None = None,
     moving: bool = False,
 ):
     """Kernel over copies, block by block: v, x after a step with a = g − ∇U/m.
 
-    ``gradient`` is that of the other terms, and is reset to 0. ``flags`` are compiler flags for the CPU. ``compensated`` is as
-    in :func:`..explicit_step.kick_and_drift`, for terms without damping, and evaluates forces at x + residual. ``guarded``
-    includes contact with colliders, see :mod:`.contact_guard`; ``moving``: some colliders move.
+    ``gradient`` is that of other terms, and is reset. ``flags`` are compiler flags of the CPU, ``compensated`` that of
+    :func:`..explicit_step.kick_and_drift`, ``contact`` is that with colliders, of which some move if ``moving``.
     """
     vec3, _ = types(dtype)
     add, step = add_block_forces(parts, dtype, compensated), kick_and_drift(dtype, symplectic, compensated)
     vector, number, whole, put = load(vec3), load(dtype), load(wp.int32), store(vec3)
-    clear, touch = (in_ball(dtype, moving), touching_step(dtype, symplectic)) if guarded else (None, None)
+    clear, touch = contact.functions(dtype, symplectic, moving) if contact else (None, None)
+    guarded = contact is not None
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"cpu_compiler_flags": flags})
     def step_blocks(
@@ -44,7 +43,7 @@ def block_step(
         vertices: wp.array(dtype=wp.int32),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        guard: guard_type(dtype, guarded),
+        guard: guard_type(dtype, contact),
         # parameters
         h: dtype,
         # in and out, the first two scratch

@@ -1,7 +1,7 @@
-"""Factories of contact with colliders inside an explicit step, with a ball around each vertex that contains no collider.
+"""Contact with colliders inside an explicit step, with a ball around each vertex that contains no collider.
 
-If a step of a vertex begins and ends in its ball, there is no contact. Else contact, friction and the filter are computed as in
-the core, and the ball anew. Balls are not part of the state: they remain valid when vertices are set.
+A step within the ball has no contact; others compute contact, friction, filter and the ball. Balls are not part of the state;
+they stay valid when vertices are set.
 """
 
 from functools import cache
@@ -17,14 +17,15 @@ from ..memory import load, store
 from ..rotation import epsilon
 from ..terms.contact import ROUNDED_BOX
 from ..vectors import types
+from .guard import ContactFactories
 
 
 @cache
 def guard_struct(dtype):
     """Struct of contact of vertices with C colliders.
 
-    ``stiffness`` is kA (C, N) [N/m]. ``balls`` are the center and the radius [m] at the start of step ``found`` (N,); the
-    radius is infinite for pins. Surfaces of colliders move by at most ``drift`` per step [m].
+    ``stiffness`` is kA (C, N) [N/m]. ``balls`` are centre and radius [m] at the start of step ``found`` (N,), infinite for
+    pins. Surfaces move by at most ``drift`` per step [m].
     """
     _pose, anchor_type = pose_types(dtype)
 
@@ -42,18 +43,6 @@ def guard_struct(dtype):
         drift: dtype
 
     return Guard
-
-
-@wp.struct
-class NoGuard:
-    """Struct of steps without colliders, which has fewer parameters."""
-
-    per_copy: int
-
-
-def guard_type(dtype, guarded: bool):
-    """:func:`guard_struct` if ``guarded``, else :class:`NoGuard`."""
-    return guard_struct(dtype) if guarded else NoGuard
 
 
 @cache
@@ -81,8 +70,7 @@ def in_ball(dtype, moving: bool):
 def touching_step(dtype, symplectic: bool):
     """Device function (guard, i, w, x, v, a, h) → x, v of vertex i after a step, with a = g − ∇U/m without contact.
 
-    It computes the same as :func:`..contact.anchors.anchor_vertices` (``bounded``) and
-    :func:`..contact.collider_filter.outside`.
+    It is :func:`..contact.anchors.anchor_vertices` (``bounded``) and :func:`..contact.collider_filter.outside` in one.
     """
     vec3, _ = types(dtype)
     _pose, anchor_type = pose_types(dtype)
@@ -130,3 +118,6 @@ def touching_step(dtype, symplectic: bool):
         return end, velocity
 
     return touch
+
+
+CONTACT_GUARD = ContactFactories(guard_struct, in_ball, touching_step)

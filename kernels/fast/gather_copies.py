@@ -1,4 +1,4 @@
-"""Kernels that repeat the layout of one copy for all copies: slots of the vertices of each copy, slot by slot."""
+"""Kernels that repeat the layout of one copy for all copies."""
 
 from functools import cache
 
@@ -7,9 +7,8 @@ import warp as wp
 
 @cache
 def codes_of_copies():
-    """Kernel over (slots, copies, vertices): out = the code in the first copy, ``step`` more for each copy before.
-
-    Where the code is negative, it is −1, or with ``own`` = 1 the vertex itself.
+    """Kernel over (slots, copies, vertices): out = the first copy's code, ``step`` more per copy; −1 if negative, or with
+    ``own`` = 1 the vertex itself.
     """
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -36,9 +35,8 @@ def codes_of_copies():
 
 @cache
 def values_of_copies(dtype):
-    """Kernel over (slots, copies, vertices): out = the values of the source in the first copy, or ``step`` more for each copy.
-
-    Where the source is negative, out has the first values of all.
+    """Kernel over (slots, copies, vertices): out = the values of the first copy's source, or ``step`` more per copy; the first
+    values if negative.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,7 +1,7 @@
-"""Factories of a Jacobi sweep in one launch: each vertex gathers the corrections of its elements, and moves by their sum.
+"""A Jacobi sweep in one launch: each vertex gathers the corrections of its elements.
 
-x̃ and the inverse mass of a vertex are a row of four numbers, which a thread reads at once. d and λ are read from one array and
-written to another, for neighbours still read them. The thread of the first corner of an element updates its λ.
+x̃ and 1/m of a vertex are a row of four numbers. d and λ are read from one array and written to another; the first corner's
+thread updates λ.
 """
 
 from functools import cache
@@ -18,11 +18,7 @@ from .term_facts import TermFacts, chain_of, elements_struct
 
 
 def slot_rows(slots):
-    """The number of rows of pairs of a vertex, and of slots per row: 2 or 4, which a thread reads at once; some are empty.
-
-    Numbers are ordered by row, then vertex, then slot. A sweep over springs takes 0.8 of the time that it takes with the order
-    by slot (H200, 1024² vertices).
-    """
+    """Numbers of rows of pairs of a vertex, and of slots per row, 2 or 4, some empty, ordered by row, vertex, slot."""
     slots += slots % 2
     width = 2 if slots % 4 else 4
     return slots // width, width
@@ -30,10 +26,7 @@ def slot_rows(slots):
 
 @cache
 def load_row(dtype, scalar, width):
-    """Device function (a, i) → the i-th ``width`` scalars of contiguous memory of any type; on CUDA 16 bytes at once.
-
-    The compiler does not combine loads if it is short of registers.
-    """
+    """Device function (a, i) → the i-th ``width`` scalars of contiguous memory, on CUDA 16 bytes at once."""
     row, number = f"wp::vec_t<{width}, wp::{scalar.__name__}>", {wp.float64: "double", wp.float32: "float"}.get(scalar, "int")
     each = min(width, 16 // wp.types.type_size_in_bytes(scalar))
     parts = range(width // each)
@@ -75,10 +68,10 @@ def row_functions(part: TermFacts, dtype):
 
 
 class Projected(NamedTuple):
-    """Facts about the elements of one term, for which the kernel of a sweep is compiled.
+    """Facts about the elements of one term, for which a sweep is compiled.
 
     Attributes:
-        part: Their :class:`.term_facts.TermFacts`. For pairs, everything that is not shared is in rows, see :func:`slot_rows`.
+        part: Their :class:`.term_facts.TermFacts`; pairs are in rows.
         scalar, multipliers, per_step: As in :mod:`..project`.
         even: Whether all elements share one factor.
     """
@@ -202,7 +195,7 @@ def correct_elements(of: Projected, dtype):
 
 @cache
 def correct_pairs(of: Projected, dtype):
-    """As :func:`correct_elements`, for pairs as in :func:`.gather_forces.gather_pairs`, without λ."""
+    """:func:`correct_elements` for pairs as in :func:`.gather_forces.gather_pairs`, without λ."""
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     term, (firsts, seconds) = of.term, of.part.pairs
     (rows_each, width), firsts = map(wp.constant, slot_rows(firsts + seconds)), wp.constant(firsts)
@@ -262,7 +255,6 @@ def correct_pairs(of: Projected, dtype):
 
 @cache
 def correct_terms(parts: tuple[Projected, ...], dtype):
-    """As :func:`correct_elements`, for all terms."""
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     chain_type = chain_of(parts, dtype, constraints_of)
     first, others = (correct_elements(parts[0], dtype), correct_terms(parts[1:], dtype)) if parts else (None, None)
@@ -287,9 +279,8 @@ def correct_terms(parts: tuple[Projected, ...], dtype):
 
 @cache
 def gather_corrections(parts: tuple[Projected, ...], dtype, fast: bool):
-    """Kernel over vertices: d_after = d + scaleᵢ Σ Δx, with scaleᵢ as in :func:`.jacobi.move_vertices`.
-
-    ``fast`` as in :func:`.gather_step.gather_step`.
+    """Kernel over vertices: d_after = d + scaleᵢ Σ Δx, scaleᵢ of :func:`.jacobi.move_vertices`, ``fast`` of
+    :func:`.gather_step.gather_step`.
     """
     (vec3, _), vec4 = types(dtype), wp.types.vector(4, dtype)
     total_of = correct_terms(parts, dtype)

@@ -1,4 +1,4 @@
-"""Factories of sums over the elements of a vertex for all terms in one launch, in a fixed order, so deterministic on a GPU."""
+"""Sums over the elements of a vertex for all terms in one launch, in a fixed order."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ from .term_facts import TermFacts, chain_of, elements_struct, local_gradient
 
 @cache
 def move_of(dtype, ahead):
-    """Device function (v, i, h) → displacement of xᵢ: h vᵢ, or if v is int32, the residual packed in vᵢ in units of h."""
+    """Device function (v, i, h) → displacement of xᵢ: h vᵢ, or, for int32 v, the packed residual in units of h."""
     vec3, _ = types(dtype)
     if ahead is wp.int32:
         whole = load(wp.int32)
@@ -38,8 +38,8 @@ def move_of(dtype, ahead):
 def gather_term(part: TermFacts, dtype, ahead=None, lanes: int = 1):
     """Device function (elements, i, lane, N, x, v, h) → ∂U/∂xᵢ + ∂D/∂xᵢ [N] of one term.
 
-    ∂U/∂x is that at x, or, if ``ahead`` is the type of v, at x moved by :func:`move_of`. Each of the ``lanes`` threads of a
-    vertex takes every ``lanes``-th element.
+    ∂U/∂x is at x, or, if ``ahead`` is the type of v, at x moved by :func:`move_of`. Each of the ``lanes`` threads takes every
+    ``lanes``-th element.
     """
     if part.rows:
         return gather_matrix_rows(part, dtype, ahead, lanes)
@@ -109,10 +109,7 @@ def gather_term(part: TermFacts, dtype, ahead=None, lanes: int = 1):
 
 @cache
 def gather_pairs(part: TermFacts, dtype, ahead, lanes: int):
-    """As :func:`gather_term`, for pairs, without branches: an empty slot pairs the vertex with itself, so its force is 0.
-
-    All slots can then be read at once. One after another they take 1.2 times as long (H200, 64² vertices).
-    """
+    """:func:`gather_term` for pairs, without branches: an empty slot pairs the vertex with itself, without force."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     term = part.term
@@ -175,7 +172,7 @@ def gather_pairs(part: TermFacts, dtype, ahead, lanes: int):
 
 @cache
 def gather_matrix_rows(part: TermFacts, dtype, ahead, lanes: int):
-    """As :func:`gather_term`, from the rows of the matrix Q of a quadratic energy, whose sums are 0: Σⱼ Qᵢⱼ (xⱼ − xᵢ)."""
+    """:func:`gather_term` from rows of the matrix Q of a quadratic energy, Σⱼ Qᵢⱼ (xⱼ − xᵢ)."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     vector, whole, number, moves = load(vec3), load(wp.int32), load(dtype), move_of(dtype, ahead)
@@ -227,7 +224,6 @@ def gather_matrix_rows(part: TermFacts, dtype, ahead, lanes: int):
 
 @cache
 def gather_terms(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1):
-    """As :func:`gather_term`, for all terms."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     chain_type = chain_of(parts, dtype)
@@ -248,7 +244,7 @@ def gather_terms(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1
 
 @cache
 def sum_at_vertices(parts: tuple[TermFacts, ...], dtype, ahead=None, lanes: int = 1):
-    """Device function (thread, chain, N, x, v, h) → the sum at vertex ``thread // lanes``, in all its threads."""
+    """Device function (thread, chain, N, x, v, h) → the sum at vertex ``thread // lanes``."""
     vec3, _ = types(dtype)
     v_type = ahead or vec3
     total_of = gather_terms(parts, dtype, ahead, lanes)

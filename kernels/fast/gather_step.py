@@ -1,4 +1,4 @@
-"""Factories of the explicit step that gathers: each vertex sums over its elements; x is read and written in two arrays."""
+"""The explicit step that gathers: each vertex sums over its elements, from two arrays into two others."""
 
 from functools import cache
 
@@ -8,27 +8,25 @@ from ..explicit_step import kick_and_drift
 from ..memory import load, store
 from ..reduce import wait_for_block
 from ..vectors import types
-from .contact_guard import guard_type, in_ball, touching_step
 from .gather_forces import move_of, sum_at_vertices
+from .guard import ContactFactories, guard_type
 from .packed_residual import pack_residual
 from .term_facts import TermFacts, chain_of
 
 
 @cache
 def gather_vertex(
-    parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: int = 1, residual_type=None, guarded=False, moving=False
+    parts: tuple[TermFacts, ...], dtype, symplectic: bool, lanes: int = 1, residual_type=None, contact=None, moving=False
 ):
-    """Device function with which ``lanes`` threads set x, v of a vertex after a step, with a = g − ∇U/m, in other arrays.
-
-    ``residual_type``, ``guarded`` and ``moving`` are as in :func:`gather_step`.
-    """
+    """Device function with which ``lanes`` threads set x, v of a vertex after a step, with a = g − ∇U/m."""
     vec3, _ = types(dtype)
     compensated, packed, stored = residual_type is not None, residual_type is wp.int32, residual_type or vec3
     total_of = sum_at_vertices(parts, dtype, residual_type, lanes)
     step = kick_and_drift(dtype, symplectic, compensated)
     vector, number, put = load(vec3), load(dtype), store(vec3)
     residual_of, put_residual = move_of(dtype, stored), store(stored)
-    clear, touch = (in_ball(dtype, moving), touching_step(dtype, symplectic)) if guarded else (None, None)
+    clear, touch = contact.functions(dtype, symplectic, moving) if contact else (None, None)
+    guarded = contact is not None
 
     @wp.func
     def gather_one(
@@ -36,7 +34,7 @@ def gather_vertex(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         g: vec3,
-        guard: guard_type(dtype, guarded),
+        guard: guard_type(dtype, contact),
         h: dtype,
         unit: dtype,
         x: wp.array(dtype=vec3),
@@ -95,20 +93,18 @@ def gather_step(
     alone: bool,
     lanes: int = 1,
     residual_type=None,
-    guarded: bool = False,
+    contact: ContactFactories | None = None,
     moving: bool = False,
 ):
     """Kernel over vertices, ``lanes`` threads each: x, v after a step.
 
-    Without damping v may be ``v_after``. ``fast`` allows errors of the last one or two bits in quotients and roots; NaN stays
-    NaN. ``alone`` is for one copy. ``residual_type`` is None, or, for terms without damping in float32, the type of the
-    residual of :func:`..explicit_step.kick_and_drift`: vectors, with a ``unit`` of 1, or int32, packed by
-    :mod:`.packed_residual` in units of ``unit``. ``guarded`` includes contact with colliders, see :mod:`.contact_guard`;
-    ``moving``: some colliders move.
+    ``fast`` allows errors of two bits in quotients and roots. ``residual_type`` is None, or, in float32 without damping, that
+    of the residual of :func:`..explicit_step.kick_and_drift`: vectors, with a ``unit`` of 1, or int32 of
+    :mod:`.packed_residual` in units of ``unit``. ``contact`` is that with colliders, of which some move if ``moving``.
     """
     vec3, _ = types(dtype)
     stored = residual_type or vec3
-    gather_one = gather_vertex(parts, dtype, symplectic, lanes, residual_type, guarded, moving)
+    gather_one = gather_vertex(parts, dtype, symplectic, lanes, residual_type, contact, moving)
     # A loop over the rows of bending that is not unrolled takes 1.3 times as long with compensation, else the same (H200,
     # 512²).
     options = {"fast_math": fast, "max_unroll": 32 if residual_type else 16}
@@ -119,7 +115,7 @@ def gather_step(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        guard: guard_type(dtype, guarded),
+        guard: guard_type(dtype, contact),
         # state in
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -143,14 +139,14 @@ def gather_step(
 
 @cache
 def gather_steps_of_copies(
-    parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, threads: int, guarded: bool = False
+    parts: tuple[TermFacts, ...], dtype, symplectic: bool, fast: bool, threads: int, contact: ContactFactories | None = None
 ):
-    """Kernel over (copies, threads): x, v after several steps. A block of ``threads``, which synchronise, takes a copy.
+    """Kernel over (copies, threads): x, v after several steps, a block of ``threads`` per copy.
 
-    Every other step writes x_other and v_other. Without damping v may be v_other.
+    Every other step writes x_other and v_other.
     """
     vec3, _ = types(dtype)
-    gather_one = gather_vertex(parts, dtype, symplectic, guarded=guarded)
+    gather_one = gather_vertex(parts, dtype, symplectic, contact=contact)
     vector, put = load(vec3), store(vec3)
     threads = wp.constant(threads)
 
@@ -160,7 +156,7 @@ def gather_steps_of_copies(
         chain: chain_of(parts, dtype),
         inverse_mass: wp.array(dtype=dtype),
         gravity: wp.array(dtype=vec3),
-        guard: guard_type(dtype, guarded),
+        guard: guard_type(dtype, contact),
         # parameters
         h: dtype,
         steps: int,

@@ -1,8 +1,6 @@
-"""Packed position residuals of compensated summation: three 10-bit integers in an int32, from −512 to 511 units each.
+"""Residuals of compensated summation in an int32: three 10-bit integers, −512 to 511 units, a power of two [m].
 
-They take a third of the memory traffic of a vector, which limits large cloth on a GPU. A unit is a power of two [m]. Numbers
-are converted through the last bits of floats whose last bit is a unit, for a GPU converts integers four times as slowly as it
-adds.
+Numbers are converted through the last bits of floats, as a GPU converts integers slowly.
 """
 
 import warp as wp
@@ -32,5 +30,5 @@ def pack_one(value: float, unit: float):
 
 @wp.func
 def pack_residual(value: wp.vec3, unit: float):
-    """The integers nearest to value [m], at most 511 units; NaN becomes any number, since x is NaN too."""
+    """The integers nearest to value [m], at most 511 units; any for NaN, as x is NaN too."""
     return pack_one(value[0], unit) | (pack_one(value[1], unit) << 10) | (pack_one(value[2], unit) << 20)

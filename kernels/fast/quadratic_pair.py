@@ -1,7 +1,7 @@
 """Pairs of a quadratic energy: U = Σ ½k‖x₁ − x₀‖², k in N/m of either sign.
 
-Stencil (x₀, x₁), y = x₁ − x₀, measure 1; the one number of the rest state is not read. If the weights of elements sum to 0, so
-do the rows of their matrix Q. Then ½xᵀQx is the sum over pairs i < j with k = −Qᵢⱼ. Scenes cannot declare this term.
+Stencil (x₀, x₁), y = x₁ − x₀, measure 1; the one number of the rest state is not read. If weights of elements sum to 0, so do
+rows of the matrix Q, and ½xᵀQx is the sum over pairs i < j with k = −Qᵢⱼ. Scenes cannot declare this term.
 """
 
 from dataclasses import replace

@@ -1,13 +1,13 @@
-"""Factories of a Jacobi sweep that adds each correction to the vertices as soon as it is computed, in one thread of the CPU.
+"""A Jacobi sweep in one thread of the CPU that adds each correction at once.
 
-The factories take (term, dtype, scalar, multipliers, per_step), as those of :mod:`..project` do.
+The key is (term, dtype, scalar, multipliers, per_step), as of :mod:`..project`.
 """
 
 from functools import cache
 
 import warp as wp
 
-from ..contact.clear_elements import is_clear
+from ..assemble import is_clear
 from ..memory import load, load_shared, store
 from ..project import element_change, multiplier_type
 from ..term import Term
@@ -17,7 +17,7 @@ from ..vectors import types
 
 @cache
 def add_correction(term: Term, dtype, scalar: bool, multipliers: bool, per_step: bool):
-    """Returns the device function that adds factorₑ Δxᵢ [m] of an element to out, and factorₑ Δλ to λ."""
+    """Device function that adds factorₑ Δxᵢ [m] of an element to out, and factorₑ Δλ to λ."""
     vec3, _ = types(dtype)
     K = wp.constant(term.vertices)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
@@ -60,10 +60,8 @@ def scatter_correction(
 ):
     """Kernel over elements: adds factorₑ Δxᵢ [m] of each element to out, and factorₑ Δλ to λ.
 
-    If ``cleared``, one thread loops over all elements, as starting a thread takes longer than testing an element. It skips
-    those whose vertex has moved less than its ``clear``; an element that was not skipped once is never skipped again.
-    It is for the CPU, which takes the elements in order, so nothing is atomic. One factor for all vertices of an element
-    conserves linear momentum and M d = Gᵀλ.
+    If ``cleared``, one thread loops over all elements and skips those whose vertex has moved less than ``clear``; one that was
+    not skipped once never is again.
     """
     vec3, _ = types(dtype)
     rest_type, lambda_type = wp.types.vector(term.parameters, dtype), multiplier_type(term, dtype, scalar)
@@ -102,10 +100,7 @@ def scatter_correction(
 
 @cache
 def apply_correction(dtype):
-    """Kernel over vertices: d += scaleᵢ Σ Δx, then sets the sum to 0.
-
-    scaleᵢ is 1, or 1/(nᵢ + α) if corrections are averaged over the nᵢ constraints of the vertex.
-    """
+    """Kernel over vertices: d += scaleᵢ Σ Δx, then resets the sum; scaleᵢ is 1, or 1/(nᵢ + α) for nᵢ constraints."""
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -1,6 +1,6 @@
-"""Functions of one element, and structs of the arrays of several terms, for kernels that take all terms in one pass.
+"""Functions of one element, and structs of arrays of several terms, for kernels over all terms.
 
-Such a kernel has one function and one struct of arrays per term, each of which contains those of the following terms.
+Each struct of a term contains that of the next.
 """
 
 from functools import cache
@@ -16,15 +16,15 @@ class TermFacts(NamedTuple):
 
     Attributes:
         term: The :class:`.term.Term`.
-        damped: Whether it has damping, evaluated at x + h v relative to the state x, see :class:`..term.Dissipation`.
-        shared: Whether all elements share one stiffness. For gathered pairs without damping, whether all pairs of a vertex do;
-            ``stiffness`` then has one value per vertex.
-        pairs: For gathered pairs, the numbers of slots of a vertex as first and as second of a pair. Incidences then store the
-            other vertex and a rest state, slot by slot. None if they store elements.
-        rows: For the rows of the matrix of a quadratic energy, the number of slots of a vertex. Incidences then store the other
-            vertices of the row, slot by slot, and ``stiffness`` its numbers. 0 otherwise.
-        padded: Whether incidences that store elements have the same number of slots for each vertex, slot by slot.
-        exact: Whether elements are evaluated in double precision, see :func:`..assemble.of_element`.
+        damped: Whether it has damping, at x + h v relative to x.
+        shared: Whether all elements share one stiffness; for gathered pairs without damping all of a vertex, with one
+            ``stiffness`` per vertex.
+        pairs: For gathered pairs, the slots of a vertex as first and as second of a pair; incidences store the other vertex and
+            a rest state, slot by slot. None if they store elements.
+        rows: For rows of the matrix of a quadratic energy, the slots of a vertex; incidences store the other vertices,
+            ``stiffness`` the numbers. Else 0.
+        padded: Whether incidences that store elements have equally many slots per vertex, slot by slot.
+        exact: Whether elements are evaluated in float64.
     """
 
     term: Term
@@ -36,7 +36,7 @@ class TermFacts(NamedTuple):
     exact: bool = False
 
     def precision(self, dtype):
-        """The type of y, and of the rest state from which it is computed."""
+        """The type of y and of its rest state."""
         return wp.float64 if self.exact else dtype
 
 
@@ -44,9 +44,7 @@ class TermFacts(NamedTuple):
 def local_gradient(part: TermFacts, dtype, corrected: bool = False):
     """Device function (k, β, rest, y, dy, h) → kA ∂u/∂y at y plus the force of damping at y + dy, (M, 3).
 
-    Without damping, ``corrected`` evaluates the first at y + dy. A damped term has one dy, so it cannot be corrected too: no
-    explicit step with damping is compensated (:func:`warpcloth.fast.compensation.needs_compensation`), and in the gradients of
-    other solvers damping is an energy.
+    Without damping, ``corrected`` evaluates the first at y + dy.
     """
     term, precision = part.term, part.precision(dtype)
     assert not (part.damped and corrected), f"{term.name} is damped, and evaluated with a position residual"
@@ -84,9 +82,9 @@ def local_gradient(part: TermFacts, dtype, corrected: bool = False):
 def elements_struct(part: TermFacts, dtype):
     """Struct of the arrays of one term.
 
-    Swept: block b has the pieces offsets[b] to offsets[b+1]; ``codes`` are the first element and the count of each, see
-    :mod:`.block_forces`. Gathered: ``codes`` are K·element + corner of the incidences of vertex i from offsets[i] on. They
-    are stored slot by slot if padded. For pairs, they are the other vertex, or the vertex itself in an empty slot.
+    Swept: block b has the pieces offsets[b] to offsets[b+1]; ``codes`` are first element and count of each
+    (:mod:`.block_forces`). Gathered: ``codes`` are K·element + corner of the incidences of vertex i from offsets[i] on, or slot
+    by slot if padded; for pairs the other vertex, or the vertex itself if empty.
     """
 
     @wp.struct
@@ -103,19 +101,11 @@ def elements_struct(part: TermFacts, dtype):
 
 @wp.struct
 class Nothing:
-    """The end of a chain of structs."""
-
     unused: int
 
 
 def chain_of(parts: tuple[TermFacts, ...], dtype, struct_of=elements_struct):
-    """Struct of the arrays of all terms: that of the first, and the chain of the others.
-
-    Args:
-        parts: The facts of each term.
-        dtype: A Warp scalar type.
-        struct_of: Function (part, dtype) → the struct of one term.
-    """
+    """Struct of the arrays of all terms: ``struct_of`` (part, dtype) of the first, and the chain of the others."""
     return _chain(tuple(struct_of(part, dtype) for part in parts))
 
 

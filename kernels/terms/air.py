@@ -1,12 +1,12 @@
-"""Drag and lift of air on a triangle as a dissipation whose coefficients and normal are frozen where a step begins.
+"""Drag and lift of air on a triangle as a dissipation, frozen where a step begins.
 
 The force is F = ½ρA(C_n|u_n|u_n n + C_t|u_t|u_t), u the wind less the velocity of the triangle, u_n and u_t its parts along the
 normal n and across. Within a step it is
 
     F = ρκ_n n(n·(a − y)) + ρκ_t (I − n nᵀ)(a − y),   κ_n = AC_n|u_n|/2hₑ, κ_t = AC_t|u_t|/2hₑ,
 
-the force of U = ½ρ(κ_n(n·(y − a))² + κ_t‖(I − n nᵀ)(y − a)‖²), with y the centre of the triangle and a where it would be if it
-moved with the wind: (a − y)/hₑ is the wind less the velocity.
+the force of U = ½ρ(κ_n(n·(y − a))² + κ_t‖(I − n nᵀ)(y − a)‖²), y the centre of the triangle and a where the wind would take it:
+(a − y)/hₑ is the wind less the velocity.
 
 Stencil: a triangle, y = (x₀ + x₁ + x₂)/3, measure 1. The stiffness is the density ρ of air [kg/m³]. Rest state: a, n, κ_n, κ_t
 [m²/s], which :func:`..frozen_air.set_air` writes, the wind [m/s], C_n and C_t.

@@ -48,7 +48,7 @@ def hessian(y: Any, rest: Any, negative: Any):
 
 @wp.func
 def change(y: Any, other: Any, rest: Any):
-    """The invariant is s = y itself, because the target does not move with the cloth."""
+    """The invariant is s = y: the target does not move with the cloth."""
     return other[0] - y[0]
 
 

@@ -4,12 +4,12 @@ With the contact distance r and τ = r/2 (the two stages of Chen et al. 2025, *O
 
     φ = ½(r − d)²  for τ ≤ d < r,   ½τ² + τ² ln(τ/d)  for d < τ,   0  for d ≥ r
 
-φ is C² at τ and C¹ at r. The force is a pressure: under a load p the gap is r − p/k, or τ²k/p if that is below τ. Below δ =
-r/1000 φ is its Taylor polynomial of second degree, so that a vertex that starts inside a collider is pushed out.
+φ is C² at τ and C¹ at r. The force is a pressure: a load p leaves a gap of r − p/k, or τ²k/p if that is below τ. Below δ =
+r/1000 φ is its Taylor polynomial of second degree, which pushes a vertex inside out.
 
 Stencil (x₀), y = x₀, measure A. Rest state: the pose of the collider (position, quaternion x, y, z, w), the half sizes and the
-radius of its :class:`Solid`, r and A. Infinite half sizes are the half-space below y = 0. If the shape is convex, ∂²d ⪰ 0 and
-φ′∂²d ⪯ 0; clamping drops this part, also of other shapes.
+radius of its :class:`Solid`, r and A. Infinite half sizes are the half-space below y = 0. Clamping drops φ′∂²d, which is ⪯ 0 if
+the shape is convex.
 """
 
 from functools import cache
@@ -88,8 +88,8 @@ class Solid(NamedTuple):
     """A shape of colliders: all points with d ≤ 0.
 
     Attributes:
-        gap: Device function (X, half, radius) → the signed distance d of a point X and ∇d, in the frame of the collider. half
-            and radius are the ``core`` of the collider: the shape is within ``radius`` of the box with half sizes ``half``.
+        gap: Device function (X, half, radius) → the signed distance d of a point X and ∇d, in the frame of the collider; the
+            shape is within ``radius`` of the box with half sizes ``half``.
         convex: Whether the shape is convex.
         curvature: Device function (X, half, radius) → ∂²d; None to find it by differences of ∇d.
     """
@@ -232,18 +232,16 @@ def constraint_bend(d: Any, r: Any):
 
 @wp.func
 def bounded_hessian(y: Any, rest: Any, negative: Any):
-    """I: the Hessian of contact with friction at any distance, and a bound of that of contact alone."""
+    """I: the Hessian of contact with friction, and a bound of that of contact."""
     return wp.identity(n=3, dtype=y.dtype)
 
 
 @cache
 def contact(solid: Solid):
-    """The :class:`..term.Term` of contact with colliders of a shape."""
     local_gap, curvature_of = gap_to(solid), solid.curvature
 
     @wp.func
     def gap(y: Any, rest: Any):
-        """Signed distance of a vertex, and the outward normal, in world space."""
         u = wp.vector(rest[3], rest[4], rest[5])
         X = turned(-u, rest[6], y[0] - wp.vector(rest[0], rest[1], rest[2]))
         d, n = local_gap(X, wp.vector(rest[7], rest[8], rest[9]), rest[10])
@@ -251,7 +249,6 @@ def contact(solid: Solid):
 
     @wp.func
     def curvature(y: Any, rest: Any):
-        """∂²d, by central differences of ∇d if the shape has no function for it."""
         u = wp.vector(rest[3], rest[4], rest[5])
         half = wp.vector(rest[7], rest[8], rest[9])
         H = wp.matrix(shape=(3, 3), dtype=y.dtype)
@@ -275,7 +272,6 @@ def contact(solid: Solid):
 
     @wp.func
     def clearance(y: Any, rest: Any):
-        """d − r, minus a bound of rounding."""
         d, _n = gap(y, rest)
         return y.dtype(0.999) * (d - rest[11])
 
@@ -308,7 +304,6 @@ def contact(solid: Solid):
 
     @wp.func
     def prox_from(y: Any, v: Any, rest: Any, compliance: Any):
-        """The prox of the half-space tangent to the collider nearest to y, for v may be nearer to another side."""
         d, n = gap(y, rest)
         d += wp.dot(n, v[0] - y[0])
         p = v
@@ -317,7 +312,6 @@ def contact(solid: Solid):
 
     @wp.func
     def prox(v: Any, rest: Any, compliance: Any):
-        """The prox, along n."""
         return prox_from(v, v, rest, compliance)
 
     @wp.func
@@ -338,7 +332,7 @@ def contact(solid: Solid):
 
     @wp.func
     def stiffening(y: Any, rest: Any, tension: Any):
-        """For tension < 0, a pressure, the stiffness along n. The part from the curvature of the collider is omitted."""
+        """For tension < 0 (pressure) the stiffness along n, without the collider's curvature."""
         d, n = gap(y, rest)
         return wp.matrix_from_rows(wp.sqrt(wp.max(tension * constraint_bend(d, rest[11]), y.dtype(0.0))) * n)
 

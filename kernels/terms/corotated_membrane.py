@@ -1,10 +1,8 @@
 """Corotated membrane: U = Σ ½kA‖F − R‖², k = 2μ = Et in N/m, Poisson's ratio 0 (Sorkine and Alexa 2007; Chao et al. 2010, *A
 simple geometric model for elastic deformation*).
 
-F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, R its polar factor, the nearest matrix with RᵀR = I,
-and A the rest area. The energy per area is μΣ(σᵢ − 1)². A term ½λ(tr(RᵀF) − 2)² would give Poisson's effect, but no projection.
-
-Where R is not unique, it is the smallest rotation, see :mod:`..rotation`, so that a collapsed triangle still has a force.
+F (3×2) is the deformation gradient of a triangle (:mod:`..membrane`), A its rest area, R the nearest matrix with RᵀR = I; where
+not unique, the smallest rotation, so that a collapsed triangle has a force. The energy per area is μΣ(σᵢ − 1)².
 """
 
 from typing import Any

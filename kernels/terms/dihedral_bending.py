@@ -2,21 +2,20 @@
 *Discrete shells*; Bridson et al. 2003).
 
 Stencil: a hinge (x₀, x₁ the edge, x₂ and x₃ the opposite vertices). y = (e, a, b) = (x₁, x₂, x₃) − x₀. θ is the signed angle
-about e from the normal e×a to the normal b×e, 0 when flat; θ̄, the edge |e| and the areas Aᵢ come from the rest shape.
-The papers have a factor 3 where this has 1: with 1, an equilateral sheet rolled to curvature κ has the energy ½Dκ² per area.
+about e from the normal e×a to the normal b×e, 0 when flat; θ̄, the edge |e| and the areas Aᵢ come from the rest shape. The
+papers have a factor 3 where this has 1, with which an equilateral sheet of curvature κ has the energy ½Dκ² per area.
 
-Derivatives are in closed form (Tamstorf and Grinspun 2013, *Discrete bending forces and their Jacobians*), here as a sum of
-products of two orthogonal covectors, each of which has a positive and a negative half in closed form. Write the vector to the
-apex of a triangle as a = s e + h m, with m ⟂ e, normal n and t = e/|e|. A variation (δe, δa) moves the apex relative to its
-foot by d = δa − s δe and turns the edge by ε = δe/|e|:
+Derivatives (Tamstorf and Grinspun 2013, *Discrete bending forces and their Jacobians*) are a sum of products of two orthogonal
+covectors, whose positive and negative halves have closed forms. The vector to the apex of a triangle is a = s e + h m, with m ⟂
+e, normal n and t = e/|e|. A variation (δe, δa) moves the apex relative to its foot by d = δa − s δe and turns the edge by ε =
+δe/|e|:
 
     δθ = −Σ n·d/h,        ½δ²θ = Σ (n·d/h)(m·d/h) + (n·ε)(t·d/h + ½m·ε)        over both triangles.
 
-This follows from parallel transport of both normals along the edge, as only their difference counts.
 ∂²u = ∂θ∂θᵀ + (θ − θ̄)∂²θ is semi-definite only for θ = θ̄.
 
-If the height of a triangle is at most 1e-6 of its longest side, C = 0 and there is no force.
-θ − θ̄ is wrapped into (−π, π]. It jumps when a hinge passes through the fully folded state.
+A triangle of a height up to 1e-6 of its longest side has C = 0 and no force. θ − θ̄ is wrapped into (−π, π]. It jumps in the
+fully folded state.
 """
 
 from typing import Any
@@ -132,7 +131,7 @@ def flatten(g: Any):
 
 @wp.func
 def positive_half(g: Any, h: Any, ratio: Any, scale: Any):
-    """Returns w, with w wᵀ the positive half of scale·(g hᵀ + h gᵀ); g ⟂ h, and ratio is |h|/|g|."""
+    """Returns w, w wᵀ the positive half of scale·(g hᵀ + h gᵀ); g ⟂ h, ratio = |h|/|g|."""
     u = flatten(g) * wp.sqrt(ratio)
     v = flatten(h) / wp.sqrt(ratio)
     return wp.sqrt(wp.abs(scale) * scale.dtype(0.5)) * (u + wp.sign(scale) * v)
@@ -140,7 +139,7 @@ def positive_half(g: Any, h: Any, ratio: Any, scale: Any):
 
 @wp.func
 def product(g: Any, h: Any, ratio: Any, scale: Any, negative: Any):
-    """Returns scale·(g hᵀ + h gᵀ) with its negative half times ``negative``; g ⟂ h, and ratio is |h|/|g|."""
+    """Returns scale·(g hᵀ + h gᵀ), negative half times ``negative``; g ⟂ h, ratio = |h|/|g|."""
     w = positive_half(g, h, ratio, scale)
     half = (scale.dtype(1.0) - negative) * wp.outer(w, w)
     if negative == scale.dtype(0.0):
@@ -178,7 +177,7 @@ def factors(y: Any, corner: int):
 
 @wp.func
 def curvature(y: Any, scale: Any, negative: Any):
-    """Returns scale·∂²θ, with the negative half of each of its four products times ``negative``."""
+    """Returns scale·∂²θ, the negative halves of its products times ``negative``."""
     h = wp.matrix(shape=(9, 9), dtype=y.dtype)
     if has_no_angle(y):
         return h

@@ -50,13 +50,12 @@ def slip(y: Any, rest: Any):
 
 @wp.func
 def bounded_hessian(y: Any, rest: Any, negative: Any):
-    """0, as the bounded Hessian of contact includes that of friction."""
+    """0: the bounded Hessian of contact includes friction."""
     return wp.matrix(shape=(3, 3), dtype=y.dtype)
 
 
 @cache
 def friction(law: Law):
-    """The :class:`..term.Term` of friction by a law."""
     energy_of, secant_of, bend_of, prox_of = law.energy, law.secant, law.bend, law.prox
 
     @wp.func
@@ -94,12 +93,10 @@ def friction(law: Law):
 
     @wp.func
     def project(y: Any, rest: Any):
-        """y minus the gradient of the energy."""
         return y - gradient(y, rest)
 
     @wp.func
     def prox(v: Any, rest: Any, compliance: Any):
-        """v moved towards the anchor."""
         u = slip(v, rest)
         l = wp.length(u)
         p = v

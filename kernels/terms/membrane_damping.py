@@ -1,8 +1,8 @@
 """Damping of all membranes: D = Σ (Aβ/2hₑ)‖E − Ẽ‖², E = ½(FᵀF − I) the Green strain, β in N·s/m.
 
-F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area, Ẽ the strain at the start of a step.
-The stress βĖ is that of a Kelvin–Voigt solid, zero in rigid motion (Baraff and Witkin 1998, *Large steps in cloth
-simulation*, damp their conditions in the same way).
+F (3×2) is the deformation gradient of a triangle (:mod:`..membrane`), A its rest area, Ẽ the strain at the start of a step. βĖ
+is the stress of a Kelvin–Voigt solid, zero in rigid motion (Baraff and Witkin 1998, *Large steps in cloth simulation*,
+likewise).
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from ..term import Dissipation, Term
 
 
 def rest_state(points, stencil):
-    """Returns inverse rest edges [1/m] of the triangles ``stencil`` (E, 3) and Ẽ₀₀ = Ẽ₁₁ = Ẽ₀₁ = 0, as an array (E, 6)."""
+    """Returns inverse rest edges [1/m] of triangles ``stencil`` (E, 3) and Ẽ = 0, (E, 6)."""
     return np.column_stack([inverse_edges(points, stencil), np.zeros((len(stencil), 3))])
 
 

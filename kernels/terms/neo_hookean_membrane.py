@@ -1,12 +1,11 @@
 """Stable Neo-Hookean membrane: U = Σ A(½μ(‖F‖² − 2) − μ(J − 1) + ½(λ + μ)(J − 1)²), J = ‖f₁×f₂‖ (Smith, De Goes and Kim 2018,
 *Stable Neo-Hookean flesh simulation*, here in two dimensions and without the logarithm).
 
-F (3×2) = [f₁, f₂] is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area. The stiffness is k = Et in
-N/m, Young's modulus times thickness. μ = k/(2(1 + ν)) and λ = kν/(1 − ν²) are the moduli at small strain, ν Poisson's ratio.
-The energy is computed as ½μ(σ₁ − σ₂)² + ½(λ + μ)(J − 1)², which has no cancellation near rest.
+F (3×2) = [f₁, f₂] is the deformation gradient of a triangle (:mod:`..membrane`), A its rest area. The stiffness is k = Et in
+N/m, μ = k/(2(1 + ν)) and λ = kν/(1 − ν²) with Poisson's ratio ν. It is computed as ½μ(σ₁ − σ₂)² + ½(λ + μ)(J − 1)², without
+cancellation near rest.
 
-The rest shape is its only minimum, up to rigid motion. A triangle crushed to a line, f₁×f₂ = 0, has no unique ∂J, which is set
-to 0. It counts as crushed if J ≤ 4ε‖F‖², with ε of the precision.
+The rest shape is its only minimum, up to rigid motion. A crushed triangle, J ≤ 4ε‖F‖², has ∂J = 0.
 """
 
 from typing import Any

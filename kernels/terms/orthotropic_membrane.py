@@ -1,10 +1,10 @@
 """Orthotropic St. Venant–Kirchhoff membrane: U = Σ ½A εᵀCε, ε = (E₁₁, E₂₂, 2E₁₂), E = ½(FᵀF − I) the Green strain.
 
-F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area. The stiffness is E₁t in N/m, Young's
-modulus along the warp times thickness. The rest state holds C/E₁t in the axes of the triangle, in which F is given too.
+F (3×2) is the deformation gradient of a triangle (:mod:`..membrane`), A its rest area. The stiffness is E₁t in N/m, Young's
+modulus along the warp times thickness. The rest state holds C/E₁t in the axes of F.
 
-A polynomial, which gives way when it is crushed, as :mod:`.stvk_membrane` does. Of its Hessian BᵀCB + S⊗I only the stress S can
-be negative. Across the plane of the triangle the Hessian is S alone, so it is semi-definite if and only if S is.
+A polynomial that gives way when crushed, as :mod:`.stvk_membrane`. Its Hessian BᵀCB + S⊗I is semi-definite if and only if the
+stress S is.
 """
 
 from typing import Any
@@ -18,9 +18,9 @@ from .membrane_damping import DISSIPATION
 
 
 def rest_state(points, stencil, warp=(1.0, 0.0, 0.0), weft_ratio=1.0, poisson_ratio=0.0, shear_ratio=0.5):
-    """Inverse rest edges [1/m] of the triangles ``stencil`` (E, 3), and C₀₀, C₁₁, C₂₂, C₀₁, C₀₂, C₁₂ over E₁t [1], (E, 9).
+    """Inverse rest edges [1/m] of triangles ``stencil`` (E, 3), and C₀₀, C₁₁, C₂₂, C₀₁, C₀₂, C₁₂ over E₁t [1], (E, 9).
 
-    Of the vector ``warp`` (3,) or (E, 3) the part in the plane of the triangle counts. E₂/E₁, ν₁₂ and G/E₁ are one or (E,).
+    Of ``warp`` (3,) or (E, 3) the part in the triangle's plane counts. E₂/E₁, ν₁₂ and G/E₁ are one or (E,).
     """
     weft, ratio, shear = (np.broadcast_to(values, len(stencil)) for values in (weft_ratio, poisson_ratio, shear_ratio))
     C = np.zeros((len(stencil), 3, 3))  # along warp and weft

@@ -1,7 +1,7 @@
 """Bending of a plate: U = Σ ½A κᵀCκ over triangles, κ the second derivatives κ₁₁, κ₂₂, κ₁₂ of the positions, vectors [1/m].
 
 The stiffness is D₁ in N·m. A cell has the vertices of a triangle and those around it, see :mod:`warpcloth.mesh.curvature`. The
-weights include a square root of C/D₁, so that κᵀCκ = D₁‖y‖². The Hessian is constant.
+weights include a square root of C/D₁, so that κᵀCκ = D₁‖y‖².
 """
 
 from typing import Any

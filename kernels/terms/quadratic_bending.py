@@ -1,12 +1,12 @@
 """Quadratic bending: U = Σ ½D‖y‖²/(A₁ + A₂), D the plate's bending stiffness in N·m (Bergou et al. 2006, *A quadratic
 bending model for inextensible surfaces*).
 
-Stencil: a hinge (x₀, x₁ the edge, x₂ and x₃ the opposite vertices). y = Σ cᵢxᵢ [m] with cotangent weights taken from the
-rest shape, so that ‖y‖ = |e|·θ for a small angle θ; Aᵢ are the rest areas of the two triangles. The Hessian is constant.
-The paper has a factor 3 where this has 1: with 1, an equilateral sheet rolled to curvature κ has the energy ½Dκ² per area.
+Stencil: a hinge (x₀, x₁ the edge, x₂ and x₃ the opposite vertices). y = Σ cᵢxᵢ [m] with cotangent weights taken from the rest
+shape, so that ‖y‖ = |e|·θ for a small angle θ; Aᵢ are the rest areas of the two triangles. The Hessian is constant. The paper
+has a factor 3 where this has 1, with which an equilateral sheet of curvature κ has the energy ½Dκ² per area.
 
-The sheet is flat at rest: of a curved rest shape, only the edge lengths are used. The energy is exact for isometric motion.
-Stretch in the plane by x → x + εx² costs ½D(2ε)² per area here, and nothing with dihedral angles.
+The sheet is flat at rest: a curved rest shape gives edge lengths only. The energy is exact for isometric motion. Stretch in the
+plane by x → x + εx² costs ½D(2ε)² per area, and nothing with dihedral angles.
 """
 
 from typing import Any
@@ -24,7 +24,6 @@ def rest_state(points, stencil):
     x0, x1, x2, x3 = columns_of(points, *stencil.T)
 
     def cotangent(apex, b, c):
-        """The cotangent, and twice the area."""
         sides = b - apex, c - apex
         double = cross_length(*sides)
         return dot(*sides) / double, double

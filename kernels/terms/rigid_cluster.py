@@ -1,13 +1,12 @@
 """Rigid cluster: U = Σ_cells (κ/2) Σᵢ mᵢ‖xᵢ − (c + R qᵢ)‖², κ in 1/s² (Müller et al. 2005, *Meshless deformations based on
 shape matching*; Chao et al. 2010 for the energy).
 
-A cell is a rigid body of any number of vertices. c is the centre of mass of its vertices, and R the rotation nearest to
-Σ mᵢ(xᵢ − c)qᵢᵀ (Kabsch 1976), qᵢ the rest positions about their centre of mass. c and R minimise U, so their derivatives drop
-out: ∂U/∂xᵢ = κmᵢ(xᵢ − c − R qᵢ). So each vertex of each cell is an element of its own, (x₀), y = x₀. Its rest state is the
-displacement to its target, t = c + R q − x₀ [m], and mᵢ [kg]; the measure is mᵢ. :mod:`..clusters` sets t before each
-evaluation of a gradient, an energy or a projection, and it holds for that evaluation only.
+A cell is a rigid body. c is the centre of mass of its vertices, qᵢ their rest positions about it, and R the rotation nearest to
+Σ mᵢ(xᵢ − c)qᵢᵀ (Kabsch 1976). They minimise U, so ∂U/∂xᵢ = κmᵢ(xᵢ − c − R qᵢ). Each vertex of a cell is an element, (x₀), y =
+x₀. Its rest state is the displacement to its target, t = c + R q − x₀ [m], and mᵢ [kg], the measure; :mod:`..clusters` sets t
+before each evaluation.
 
-The Hessian is at most κM, which is used here. It overestimates the resistance to rigid motion of a cell.
+The Hessian is bounded by κM, which is used here.
 """
 
 from typing import Any

@@ -1,9 +1,8 @@
 """Bending of a shell: U = Σ ½A(κ − κ̄n)ᵀC(κ − κ̄n), κ the second derivatives of the positions, κ̄ the curvature at rest [1/m].
 
-κ are three vectors κ₁₁, κ₂₂, κ₁₂, as in :mod:`.plate_bending`, less the part along the surface that they have at rest. The
-normal is n = f₁×f₂, with the columns f₁ and f₂ of the deformation gradient. Its length is 1 if the area of the triangle does
-not change. In motion without stretch κ = Ln with the curvature L, so that U is that of L − κ̄. Garg et al. 2007, *Cubic shells*,
-have such an energy of hinges.
+κ are three vectors κ₁₁, κ₂₂, κ₁₂ (:mod:`.plate_bending`), less their part along the surface at rest. n = f₁×f₂, of the columns
+of the deformation gradient, is the normal, of length 1 at constant area. Without stretch κ = Ln with the curvature L, and U is
+that of L − κ̄. Garg et al. 2007, *Cubic shells*, has it for hinges.
 
 The stiffness is D₁ in N·m. The rows of y are κ, multiplied by a square root of C/D₁ as κ̄ is, and bf₁ and bf₂ with b = ‖κ̄‖. The
 rest state is A and κ̄/b², or 0 where b is 0. U is a polynomial. Of its Hessian JᵀJ + ∂²(g·n), g = −Σ κ̄(κ − κ̄n), only the

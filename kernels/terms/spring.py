@@ -3,7 +3,7 @@
 Stencil (x₀, x₁), y = x₁ − x₀, l = ‖y‖, rest state L [m], measure 1. The Hessian k[ŷŷᵀ + (1 − L/l)(I − ŷŷᵀ)] has the eigenvalue
 k(1 − L/l) < 0 in compression (Choi and Ko 2002, *Stable but responsive cloth*), which clamping sets to 0.
 
-A collapsed spring, l ≤ 1e-12 L, has no direction: its gradient is 0, its Hessian I, and its projection y.
+A collapsed spring, l ≤ 1e-12 L, has the gradient 0, the Hessian I and the projection y.
 """
 
 from typing import Any

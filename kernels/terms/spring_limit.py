@@ -1,8 +1,8 @@
 """Spring limit: U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L], k in N/m (Provot 1995, *Deformation constraints in a
 mass-spring model*).
 
-Stencil (x₀, x₁), y = x₁ − x₀, l = ‖y‖, measure 1. Within the limits there is neither energy nor force. Beyond them it is a
-spring whose rest length is the limit, see :mod:`.spring`. An infinite k makes it a hard constraint.
+Stencil (x₀, x₁), y = x₁ − x₀, l = ‖y‖, measure 1. Within the limits there is no energy; beyond them a :mod:`.spring` of that
+length; an infinite k makes it a hard constraint.
 """
 
 from typing import Any
@@ -42,7 +42,7 @@ def gradient(y: Any, rest: Any):
 
 @wp.func
 def hessian(y: Any, rest: Any, negative: Any):
-    """Exactly on a limit, this is the Hessian beyond it."""
+    """On a limit, this is the Hessian beyond it."""
     h = spring_hessian(y, nearest_length(y, rest), negative)
     length = wp.length(y[0])
     if length > rest[0] and length < rest[1]:

@@ -1,9 +1,8 @@
 """Strain limit of triangles: U = Σ ½kA‖F − p(F)‖², k in N/m, p(F) the nearest F with σ_min ≤ σᵢ ≤ σ_max (Thomaszewski,
 Pabst and Straßer 2009, *Continuum-based strain limiting*).
 
-F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, with singular values σᵢ, which p clamps. The set with
-σᵢ ≤ σ_max is convex, so its nearest point is unique. That with σᵢ ≥ σ_min is not: a collapsed F takes the smallest rotation.
-Inside the range there is neither energy nor force. An infinite k makes it a hard constraint.
+F (3×2) is the deformation gradient of a triangle (:mod:`..membrane`), with singular values σᵢ, which p clamps; a collapsed F
+takes the smallest rotation. Inside the range there is no energy; an infinite k makes it a hard constraint.
 """
 
 from typing import Any

@@ -1,10 +1,9 @@
 """St. Venant–Kirchhoff membrane: U = Σ A(μ‖E‖² + ½λ(tr E)²), E = ½(FᵀF − I) the Green strain, in plane stress.
 
-F (3×2) is the deformation gradient of a triangle, see :mod:`..membrane`, A its rest area. The stiffness is k = Et in N/m,
-Young's modulus times thickness, and with Poisson's ratio ν: μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
+F (3×2) is the deformation gradient of a triangle (:mod:`..membrane`), A its rest area. The stiffness is k = Et in N/m, and with
+Poisson's ratio ν μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
 
-The energy is a polynomial, without singularities, but does not resist collapse: in compression the force has its maximum at
-σ = 1/√3 and vanishes at σ = 0, where the triangle inverts.
+The energy does not resist collapse: in compression the force is largest at σ = 1/√3 and 0 at σ = 0, where the triangle inverts.
 """
 
 from typing import Any

@@ -74,6 +74,19 @@ def test_generated_tables_are_those_of_the_code(page):
     assert tables.filled(PAGES[page]) == PAGES[page], "run python docs/tables.py"
 
 
+def test_tables_of_the_site_are_not_in_the_checkout():
+    """They have every command, and a row for each of its options; the checkout has their markers."""
+    page = PAGES["docs/command-line.md"]
+    for name in tables.IN_SITE:
+        assert f"<!-- {name} -->\n<!-- end -->\n" in page
+    built = tables.filled(page, tables.IN_SITE)
+    for name, parser in tables.commands(_parser()):
+        part = built.partition(f"\n### {name}\n")[2].partition("\n### ")[0]
+        flags = {flag for action in parser._actions for flag in action.option_strings} - {"-h", "--help", "--debug", "--import"}
+        assert flags <= set(re.findall(r"--?[\w-]+", part)), name
+    assert all(f"`{record.__name__}`" in built.partition("<!-- solver options -->")[2] for record in SOLVERS.values())
+
+
 def slug(heading):
     """The anchor of a heading."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
@@ -81,13 +94,14 @@ def slug(heading):
 
 @pytest.mark.parametrize("page", ALL)
 def test_links_lead_somewhere(page):
-    """To a file of the checkout, and to a heading in it."""
+    """To a file of the checkout, and to a heading that it has in the site."""
     for link in re.findall(r"\]\((?!https?:)([^)]+)\)", ALL[page]):
         path, _, anchor = link.partition("#")
         target = (ROOT / page).parent / path if path else ROOT / page
         assert target.is_file(), link
         if anchor:
-            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+            text = tables.filled(target.read_text(encoding="utf-8"), tables.IN_SITE)
+            headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
             assert anchor in map(slug, headings), link
 
 
@@ -185,7 +199,7 @@ def test_extras_that_refusals_name_exist():
         assert re.match(r"pip install -e (['\"])\.\[(\w+)\]\1(``)? in the checkout", line)[2] in EXTRAS, line
 
 
-@pytest.mark.parametrize("name", tables.TABLES)
+@pytest.mark.parametrize("name", tables.TABLES | tables.IN_SITE)
 def test_every_generated_table_is_on_one_page(name):
     assert "".join(PAGES.values()).count(f"<!-- {name} -->\n") == 1
 

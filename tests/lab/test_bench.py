@@ -274,7 +274,7 @@ def test_the_command_compares(folder, capsys):
     (folder / "other.json").write_text(json.dumps({**NEW, "machine": {"processor": "q", "device": "cpu"}}), encoding="utf-8")
     assert main(["bench", "--compare", "old.json", "other.json"]) == 0
     assert capsys.readouterr().out.startswith("processor: p and q, so that times say little of the code\n")
-    for old in ("old.json", "before.json"):  # results of before there were copies have one of each
+    for old in ("old.json", "before.json"):  # a row without these columns has one of each
         assert main(["bench", "--compare", old, "new.json", "--json"]) == 0
         assert [each["verdict"] for each in json.loads(capsys.readouterr().out)["rows"]] == ["faster", "slower", ""]
 

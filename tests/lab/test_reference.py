@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 import warpcloth as wc
 from support.rows import slow_but
 from warpcloth.base.digest import scene_digest
-from warpcloth.kernels.terms import SPRING
+from warpcloth.kernels.terms.spring import SPRING
 from warpcloth.lab import own_reference as own_reference_module
 from warpcloth.lab import reference as module
 from warpcloth.lab import trajectory

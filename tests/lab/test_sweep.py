@@ -1,6 +1,7 @@
 """Sweeps: every task once, what is finished is kept, any executor."""
 
 import json
+import multiprocessing
 import os
 import platform
 import select
@@ -8,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +18,14 @@ import pytest
 
 import warpcloth as wc
 from support.rows import slow_but
+from warpcloth.base import extensions
 from warpcloth.base.digest import source_digest
 from warpcloth.lab import measurements as listed
-from warpcloth.lab.campaign import Store, cache_folder, sweep
+from warpcloth.lab.campaign import Store, cache_folder, kept_store, sweep
 from warpcloth.lab.machine import machine, name
 from warpcloth.lab.measurements import SceneRef, Setup, Task, run, task
+from warpcloth.lab.work_precision import time_diagram
+from warpcloth.solvers import SOLVERS
 
 
 def square(x, folder=None):
@@ -195,10 +199,98 @@ def test_other_code_is_refused_and_the_machine_kept(tmp_path):
     """In another process, for here both are the same."""
     each = task(square, x=2)
     with pytest.raises(ValueError, match=r"the process that asks another; install the same"):
-        run(each, "another")
+        run(each, "another", tuple(extensions.extensions()))
     path = tmp_path / "store.jsonl"
     list(sweep([each], AtOnce(), Store(path)))
     assert Store(path).machine(each) == name() and platform.node() in name()
+
+
+CLOTH = """
+import warpcloth as wc
+
+
+def scene(n: int = 4):
+    springs = wc.Spring(pairs="structural", stiffness=100.0)
+    return wc.Scene(wc.Mesh.grid(n, n), density=0.1, terms=[springs], pins="corners and z == 0", duration=0.1)
+"""
+OWN = """
+import warpcloth as wc
+
+
+@wc.solvers.register
+class Own(wc.Explicit):
+    name = "own"
+"""
+
+
+def found(name):
+    """The working directory of a process, and its file of a solver."""
+    return [os.getcwd(), sys.modules[SOLVERS[name].__module__].__file__]
+
+
+@pytest.fixture
+def pool(tmp_path):
+    """A process that starts in another folder, with nothing of this one."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context, initializer=os.chdir, initargs=(elsewhere,)) as made:
+        yield made
+
+
+def test_a_process_elsewhere_measures_scenes_and_solvers_of_files(pool, tmp_path, monkeypatch):
+    """Errors and residuals are those of this process. The scenes are a path and a name here, and so is the cache."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WARPCLOTH_CACHE", "cache")
+    monkeypatch.setattr(extensions, "_names", set())
+    Path("scenes").mkdir()
+    for path in ("cloth.py", "scenes/sheet.py"):
+        Path(path).write_text(CLOTH, encoding="utf-8")
+    Path("own_solver.py").write_text(OWN, encoding="utf-8")
+    extensions.load_extension("own_solver.py")
+    try:
+        ((_, (folder, file)),) = sweep([task(found, name="own")], pool)
+        assert folder == str(tmp_path / "elsewhere") and file == str(tmp_path / "own_solver.py")
+        for name in ("cloth.py", "sheet"):
+            given = {"scene": SceneRef(name, {"n": 3}), "solvers": ["own"], "frames": 3}
+            with ThreadPoolExecutor(1) as executor:
+                here = time_diagram(**given, executor=executor, store=Store())
+            there = time_diagram(**given, executor=pool)
+            assert len(here["rows"]) == len(there["rows"]) > 0
+            for one, other in zip(here["rows"], there["rows"], strict=True):
+                assert one["status"] == "ok" and one["error"] is not None
+                for column in ("label", "status", "error", "strain_error", "residual", "machine"):
+                    assert one[column] == other[column], column
+    finally:
+        del SOLVERS["own"], sys.modules["own_solver"]
+
+
+def test_a_process_measures_for_several_others_in_turn(pool, tmp_path, monkeypatch):
+    """Each with a solver of its own; one whose file has changed since it was loaded is refused."""
+
+    def measured(name, text):
+        path = tmp_path / f"{name}_solver.py"
+        path.write_text(text, encoding="utf-8")
+        monkeypatch.setattr(extensions, "_names", set())
+        extensions.load_extension(str(path))
+        try:
+            ((_, (_, file)),) = sweep([task(found, name=name)], pool)
+            assert file == str(path)
+        finally:
+            del SOLVERS[name], sys.modules[path.stem]
+
+    measured("own", OWN)
+    measured("other", OWN.replace('"own"', '"other"'))
+    measured("own", OWN)
+    with pytest.raises(ValueError, match="install the same on all machines and start the workers again"):
+        measured("own", OWN + "# changed\n")
+
+
+def test_times_of_other_machines_are_kept_apart(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPCLOTH_CACHE", str(tmp_path))
+    with ThreadPoolExecutor(1) as threads:
+        here = {kept_store("a", executor).path for executor in (None, threads)}
+    assert len(here | {kept_store("a", AtOnce()).path}) == 2 and len(here) == 1
 
 
 SCRIPT = """

@@ -291,7 +291,7 @@ def test_what_is_refused_alike_is_said_once(tmp_path, drawn):
 
 
 def test_settings_that_are_not_usable_are_marked(tmp_path, drawn, monkeypatch, capsys):
-    """By a cross over each of their points, and in texts; those of before there were grades are not."""
+    """By a cross over each of their points, and in texts; those without a grade are not."""
     rows = [
         {"solver": "xpbd", "options": {}, "label": f"xpbd {n}", "status": "ok", "reason": "", "error": error, "ms": n,
          "strain_error": error, "spread": [n, n], "ms_per_second": 60.0 * n, "machine": "m", **grade}

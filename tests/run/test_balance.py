@@ -16,7 +16,7 @@ from warpcloth.core.energy import Energy
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
 from warpcloth.kernels.term import Term
-from warpcloth.kernels.terms import ATTACHMENT
+from warpcloth.kernels.terms.attachment import ATTACHMENT
 from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.stability import measure
 from warpcloth.run import balance

@@ -13,7 +13,8 @@ from support.scenes import scene
 from support.steps import HANGING_PAIR, hanging_mass, swinging
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
-from warpcloth.kernels.terms import DIHEDRAL_BENDING, SPRING
+from warpcloth.kernels.terms.dihedral_bending import DIHEDRAL_BENDING
+from warpcloth.kernels.terms.spring import SPRING
 from warpcloth.terms import TERMS
 
 EPS = np.finfo(np.float64).eps

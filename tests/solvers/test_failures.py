@@ -29,7 +29,7 @@ from warpcloth.core.energy import Energy
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
 from warpcloth.core.sums import Sums
-from warpcloth.kernels.terms import SPRING
+from warpcloth.kernels.terms.spring import SPRING
 from warpcloth.numerics.sweeps import SWEEPS, GaussSeidelSweep
 from warpcloth.solvers.explicit import step_limits
 

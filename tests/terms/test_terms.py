@@ -1395,7 +1395,7 @@ def test_a_cylinder_costs_its_curvature(name, pattern, degrees, least, most, dev
 def test_a_solver_refuses_a_term_that_lacks_what_it_needs(name, changes, wanted, sentence):
     term = TERMS[name].term
     elements = SimpleNamespace(**{"term": term, "label": name, "hard": False, "damping": None} | changes)
-    others = {"A": wanted, "B": [needs.LOCAL_STEP], "C": [needs.LOCAL_STEP, needs.FINITE]}
+    others = [("A", wanted), ("B", [needs.LOCAL_STEP]), ("C", [needs.LOCAL_STEP, needs.FINITE])]
     if sentence is None:
         needs.refuse_unmet([elements], "A", wanted, others)
         return

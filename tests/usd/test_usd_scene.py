@@ -633,7 +633,6 @@ def own(name, type_name, value):
         (own("loads:a:strength", "Double", 1.0), "warpcloth:loads:a:strength is no attribute of a cloth, must be one of"),
         (own("freeAxes", "Int3Array", [(1, 1, 2)] * 9), r"warpcloth:freeAxes\[0\] has 2, must be 0 or 1 for each axis"),
         (own("freeAxes", "Int3Array", [(1, 1, 1)]), r"free_axes has shape \(1, 3\); it must be an array"),
-        (own("contact:elements", "Token", "triangles"), "warpcloth:contact:elements is not needed, as meshes always touch"),
         (own("mass", "Double", 1.0), "warpcloth:mass is no attribute of a cloth, must be one of .*density"),
         (
             {**OWN, "warpcloth:terms:threads:stiffness": ("Double", -1.0)},

@@ -1,6 +1,5 @@
-"""Measures of an animated cloth: deformation, strain, rotation and their rates, frame by frame or for all frames."""
+"""Measures of an animated cloth: deformation, strain, rotation and their rates."""
 
-import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from os import PathLike
@@ -28,15 +27,15 @@ _MOST = 100  # missing frames that get a message each
 def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, **options: Any) -> Analysis:
     """Measures an animation: each vertex if a ``neighbourhood`` is given, else each triangle.
 
-    :data:`warpcloth.analysis.measures.MEASURES` and docs/measuring.md list the measures. Results of all frames are kept in
-    memory; :class:`Analyzer` gives one frame at a time.
+    docs/measuring.md lists the :data:`warpcloth.analysis.measures.MEASURES`. Results of all frames are in memory;
+    :class:`Analyzer` gives one at a time.
 
     Args:
         frames: Points (F, n, 3) [m], an :class:`warpcloth.Animation`, or anything that :func:`warpcloth.open_sequence` opens or
             returns.
-        mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape; by default that of the file.
-        dt: Time between frames [s], which rates need; a file or an animation has its own.
-        options: The options of :class:`Analyzer`.
+        mesh: The mesh at rest; by default that of the file.
+        dt: Time between frames [s], for rates; by default that of the file or animation.
+        options: Those of :class:`Analyzer`.
 
     Returns:
         :class:`Analysis`.
@@ -53,7 +52,6 @@ def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, *
         >>> round(float(measured["area_ratio"][1, 0]), 6)
         2.25
     """
-    frames, mesh = _frames_first("analyze", frames, mesh)
     analyzer = Analyzer(frames, mesh, dt, **options)
     values = {
         measure.name: np.empty((len(analyzer.pairs), analyzer.count, *measure.shape), analyzer.dtype)
@@ -72,28 +70,24 @@ def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, *
 
 
 class Analyzer:
-    """Measures an animation row by row: ``for sample in Analyzer(frames, mesh): …`` yields a :class:`Sample` for each row.
+    """Measures an animation row by row: ``for sample in Analyzer(frames, mesh): …``.
 
-    A row compares a frame with its reference. Memory holds three frames.
+    A row, a :class:`Sample`, compares a frame with its reference; three frames are in memory.
 
     Args:
-        frames: As for :func:`analyze`.
-        mesh: As for :func:`analyze`.
-        dt: As for :func:`analyze`.
-        measures: Names, or "all" for those that the other arguments allow. Only these are computed.
-        reference: "rest", "first", "previous" or the number of a frame, see :func:`warpcloth.analysis.frame_pairs.pairs_of`.
-            Give ``pairs`` or ``lag`` in its place.
-        pairs: Pairs of reference and frame, such as "1:2,1:3".
-        lag: Number of frames from reference to frame.
-        every: Measure only every k-th frame.
-        neighbourhood: None to measure triangles. To measure vertices, "1-ring", "2-ring", "nearest:k=12",
-            "nearest:radius=0.05" [m], "nearest:2%" of all vertices, or a set of vertices for each. Fixed by the rest shape.
-        rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt for rigid motion; or
-            "logarithm", exact for a constant L. All need rotations below 180° between frames. D is accurate for small
-            rotations: if a frame rotates by θ, midpoint makes a strain 1/cos²(θ/2) times too large, and logarithm up to
-            θ/sin θ times. The first frame has no rates, because no frame precedes it.
-        directions: Directions of warp and weft: "st" for the texture coordinates, or a vector (3,) in the rest shape.
-        material: A membrane term for energy and stress, such as :class:`warpcloth.NeoHookeanMembrane`.
+        frames, mesh, dt: As for :func:`analyze`.
+        measures: Names of those to compute, or "all" that the other arguments allow.
+        reference: "rest", "first", "previous" or the number of a frame.
+        pairs: Instead, pairs of reference and frame, such as "1:2,1:3".
+        lag: Instead, the number of frames from reference to frame.
+        every: Measure every k-th frame.
+        neighbourhood: None for triangles; for vertices "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m],
+            "nearest:2%" of all vertices, or a set of vertices for each, by the rest shape.
+        rates: "midpoint", exact for rigid motion; "forward", whose D is wrong by (cos ωΔt − 1)/Δt there; or "logarithm", exact
+            for a constant L. Frames must rotate by less than 180°; at θ, midpoint makes a strain 1/cos²(θ/2) times too large,
+            logarithm up to θ/sin θ times. The first frame has none.
+        directions: Warp and weft: "st" for texture coordinates, or a vector (3,) at rest.
+        material: A membrane for energy and stress, such as :class:`warpcloth.NeoHookeanMembrane`.
         device: A Warp device.
         dtype: "float32" or "float64".
 
@@ -124,7 +118,6 @@ class Analyzer:
         device: str = "cpu",
         dtype: Precision = "float64",
     ) -> None:
-        frames, mesh = _frames_first("Analyzer", frames, mesh)
         self._given = {name: value for name, value in locals().items() if name != "self"}
         choice("rates", rates, tuple(RATES))
         choice("dtype", dtype, tuple(DTYPES))
@@ -167,7 +160,6 @@ class Analyzer:
         return found
 
     def _check_times(self):
-        """Raises ValueError if the reciprocal of a time between frames overflows or underflows in this precision."""
         if any(measure.rate for measure in self.measures):
             times, least = self.sequence.times, np.finfo(self.dtype).tiny
             rule = f"must be from {least:g} to {1.0 / least:g}, of which {np.dtype(self.dtype)} has the reciprocal"
@@ -177,7 +169,7 @@ class Analyzer:
                     raise ValueError(f"dt: {dt:g} s to frame {self._label(pair.frame):g}, {rule}")
 
     def of(self, *measures: str) -> "Analyzer":
-        """Returns an analyzer of other measures with the same options."""
+        """Returns an analyzer of other measures with its options."""
         return Analyzer(**(self._given | {"frames": self.sequence, "dt": None, "measures": measures}))
 
     @property
@@ -186,16 +178,11 @@ class Analyzer:
         return self.mesh.triangle_areas if self.on == "triangle" else self.mesh.vertex_areas
 
     def positions(self, points: np.ndarray) -> np.ndarray:
-        """Returns the positions of the elements, (E, 3) [m]: centroids of triangles, or vertices, of points (n, 3) [m]."""
+        """Returns the positions of elements, (E, 3) [m], centroids or vertices, of points (n, 3) [m]."""
         if self.on == "vertex":
             return points
         a, b, c = self.mesh.triangles.T
         return (points[a] + points[b] + points[c]) / 3.0
-
-    def places(self, points: np.ndarray) -> np.ndarray:
-        """Old name of :meth:`positions`."""
-        warnings.warn("Analyzer: places is now called positions", DeprecationWarning, stacklevel=2)
-        return self.positions(points)
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -246,13 +233,12 @@ class Analyzer:
             excluded = []
 
     def _refer(self, held):
-        """Sets the reference frame of the elements, unless it is set already; returns which elements have none there."""
         if self._reference is not held:
             self._without, self._reference = self._elements.refer(held.points, held.rounding), held
         return self._without
 
     def _exclude(self, measure, pair, values, known, held):
-        """Sets all numbers of elements that could not be measured to NaN; returns those that are not ``known`` yet."""
+        """Sets elements that could not be measured to NaN; returns those not ``known`` yet."""
         if measure.rate:
             if pair.before is None:
                 values[:] = np.nan
@@ -278,7 +264,7 @@ class Analyzer:
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """Points of a frame, their rounding [m], which are not finite (n,), and which elements have such points (E,)."""
+    """Points of a frame, rounding [m], infinite ones (n,), and elements that have these (E,)."""
 
     points: np.ndarray
     rounding: float
@@ -287,7 +273,6 @@ class _Held:
 
 
 def _missing(labels):
-    """Returns exclusions of missing frames; a single one if there are very many, as after one stray file."""
     if len(labels) <= _MOST:
         return [_frame(label, "is missing") for label in labels]
     return [_frame(labels[0], f"is missing, and so are {len(labels) - 1} more, the last of them {labels[-1]:g}")]
@@ -295,14 +280,6 @@ def _missing(labels):
 
 def _frame(label, reason):
     return Exclusion(label, "frame", np.empty(0, dtype=int), reason)
-
-
-def _frames_first(name, frames, mesh):
-    """Returns frames and mesh; if they are given in the old order, mesh first, swaps them with a warning."""
-    if isinstance(frames, Mesh) or (frames is None and mesh is not None and not isinstance(mesh, Mesh)):
-        warnings.warn(f"{name}: frames come first now, {name}(frames, mesh)", DeprecationWarning, stacklevel=3)
-        return mesh, frames
-    return frames, mesh
 
 
 def _sequence(mesh, frames, dt):

@@ -1,4 +1,4 @@
-"""All meshes of a source that may intersect, joined, with the colliders and limits that the source declares."""
+"""All meshes of a source that may intersect, with its colliders and limits."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -29,23 +29,17 @@ class Cloths:
     """The meshes of a source, one after another.
 
     Attributes:
-        names: Names of the meshes: paths of prims, or parts of a mesh that :meth:`warpcloth.Mesh.join` made; "" if there is one
-            mesh.
-        mesh: All meshes as one `Surface`; its points are the rest shape.
+        names: Paths of prims or parts of a mesh; "" if there is one.
+        mesh: All meshes as one `Surface`, at rest.
         first: First vertex of each mesh (M,).
         owner: Index of the mesh of each triangle (T,).
         faces: Face of each triangle in its mesh (T,).
-        labels: Numbers of the frames in the source (F,).
-        times: Times of the frames (F,) [s], or None.
-        read: Function that returns the points (n, 3) [m] of a frame from its index; they may be infinite or NaN.
-        precision: Floating-point type of the source.
-        missing: Numbers of frames that are missing in the source.
-        colliders: The colliders, with keyframes at these frames.
-        limits: The declared limits.
-        others: Paths of meshes of a stage that are neither among these nor colliders.
-        stages: The `StageMesh` of each mesh of a stage, else empty.
-        files: Paths of the files of the source.
-        up_axis: "Y" or "Z"; None if the source has none.
+        labels: Frame numbers of the source (F,).
+        times: (F,) [s], or None.
+        read: Function (index) → points (n, 3) [m], which may be infinite or NaN.
+        missing: Numbers of missing frames.
+        others: Paths of other meshes of a stage.
+        stages: The `StageMesh` of each, or empty.
     """
 
     names: tuple[str, ...]
@@ -66,11 +60,11 @@ class Cloths:
     up_axis: UpAxis | None = None
 
     def face(self, triangle: int) -> tuple[str, int]:
-        """Returns the name of the mesh of a triangle, and its face there."""
+        """Returns the mesh of a triangle, and its face there."""
         return self.names[self.owner[triangle]], int(self.faces[triangle])
 
     def vertex(self, vertex: int) -> tuple[str, int]:
-        """Returns the name of the mesh of a vertex, and its index there."""
+        """Returns the mesh of a vertex, and its index there."""
         owner = int(np.searchsorted(self.first, vertex, side="right")) - 1
         return self.names[owner], int(vertex - self.first[owner])
 
@@ -81,12 +75,7 @@ def cloths_of(
     prim: str | Iterable[str] | None = None,
     fps: float | None = None,
 ) -> Cloths:
-    """Returns the :class:`Cloths` of a source; for the arguments see :func:`warpcloth.intersections`.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The source is not supported, or has no triangles.
-    """
+    """Returns the :class:`Cloths` of a source, by the arguments of :func:`warpcloth.intersections`."""
     if fps is not None:
         number("fps", fps, above=0.0)
     prims = [prim] if isinstance(prim, str) else prim if prim is None else list(prim) if isinstance(prim, Iterable) else []
@@ -124,7 +113,6 @@ def _of_path(path, mesh, prims, fps):
 
 
 def _of_points(source, mesh):
-    """Returns the cloths of arrays (n, 3) or (F, n, 3), a mesh, a scene, or a result with ``points``."""
     scene = source if isinstance(source, Scene) else getattr(source, "scene", None)
     points = source.positions if isinstance(source, Scene) else getattr(source, "points", source)
     if mesh is None:
@@ -151,7 +139,6 @@ def _of_points(source, mesh):
 
 
 def _of_sequence(sequence, files=None):
-    """Returns the mesh of a sequence, or its parts."""
     mesh = sequence.mesh
     parts = mesh.parts or {"": None}
     first = np.array([0 if part is None else part.first for part in parts.values()])
@@ -175,7 +162,6 @@ def _of_sequence(sequence, files=None):
 
 
 def _of_stage(path, prims, fps):
-    """Returns the meshes of a stage."""
     stage = read_surfaces(path, prims)
     surfaces = stage.surfaces
     rests = [each.stage.mesh for each in surfaces]

@@ -1,4 +1,4 @@
-"""Compares two animated cloths, frame by frame: distances of positions and surfaces, and differences of stretches."""
+"""Compares two animated cloths: distances of positions and surfaces, and differences of stretches."""
 
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -22,23 +22,22 @@ _SAME_TIME = 1e-6  # tolerance of times, relative to the shortest frame
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComparedFrames:
-    """The frames of two animations, a and b, that were compared. On axes of length 2, a comes first.
+    """The frames of two animations, a and b, that were compared, in this order on axes of length 2.
 
-    A frame is a pair of frames at one time. If it could not be compared, its numbers are NaN, and ``excluded`` says why.
+    A frame is a pair at one time, or NaN where ``excluded`` says why it could not be compared.
 
     Attributes:
-        up_axes: The up axes of a and b, "Y" or "Z", or None if the input does not say. If they differ, b was turned to the axis
-            of a.
+        up_axes: "Y" or "Z" of a and b, or None; b was turned to a's.
         times: Times of the frames (F,) [s].
-        frames: Their indices in a and in b (F, 2).
-        labels: Their numbers in the files (F, 2).
-        unmatched: Indices of the frames of a, and of b, without a partner at their time: two arrays.
-        excluded: What could not be compared, in a and in b: two lists of `analysis.Exclusion`, with frame numbers of the files.
+        frames: Indices in a and in b (F, 2).
+        labels: Numbers in the files (F, 2).
+        unmatched: Indices of frames of a, and of b, without a partner.
+        excluded: Two lists of `analysis.Exclusion`, of a and b, with the frame numbers of the files.
         sizes: Diagonal of the bounding box of a (F,) [m].
-        hausdorff: The largest distance of a point of one surface, as far as they are sampled, to the other (F,) [m]. The
-            Hausdorff distance of the surfaces is no less, apart from rounding.
-        hausdorff_bound: Upper bound of that distance (F,) [m]: hausdorff + l/√3 with the longest side l, as a point of a
-            triangle is within l/√3 of a vertex.
+        hausdorff: The largest distance of a sampled point of either surface to the other (F,) [m], a lower bound, but for
+            rounding, of that of the surfaces.
+        hausdorff_bound: Upper bound of the Hausdorff distance of the surfaces (F,) [m]: hausdorff + l/√3 with the longest side
+            l.
     """
 
     up_axes: tuple[UpAxis | None, UpAxis | None]
@@ -56,22 +55,22 @@ class ComparedFrames:
 class Comparison(ComparedFrames):
     """The comparison of two sequences, a and b.
 
-    If the topologies differ, vertices and triangles cannot be compared: these arrays are None, and only distances of surfaces
-    are left. Triangles without area in one of the rest shapes do not count for stretches.
+    With different topologies arrays of vertices and triangles are None. Triangles without area at rest do not count for
+    stretches.
 
     Attributes:
         up_axes, times, frames, labels, unmatched, excluded, sizes, hausdorff, hausdorff_bound: See :class:`ComparedFrames`.
-        same_topology: Whether both have the same number of vertices and the same triangles, in the same order.
-        rms: Root mean square over vertices of ‖aᵢ − bᵢ‖ (F,) [m], or None.
-        largest: The largest of these distances (F,) [m], or None. It bounds ``hausdorff_bound``.
-        largest_vertex: The vertex with the largest distance (F,), −1 in excluded frames, or None.
-        surface_mean: Mean distance of a's vertices to the surface of b, and of b's to that of a (F, 2) [m]. Vertices are
-            weighted by a third of the area of their triangles in the frame; vertices without triangles do not count.
-        surface_rms: Root mean square of the same distances (F, 2) [m].
-        surface_largest: The largest of the same distances (F, 2) [m]; ``hausdorff`` is the larger of the two.
-        stretch_rms: Root mean square over triangles of the differences of the principal stretches λ₁ ≥ λ₂, the singular values
-            of the deformation gradient from each one's rest shape (F, 2: λ₁, λ₂) [1], or None.
-        stretch_largest: The largest of these differences (F, 2: λ₁, λ₂) [1], or None.
+        same_topology: Whether both have equally many vertices and the same triangles.
+        rms: Root mean square of ‖aᵢ − bᵢ‖ over vertices (F,) [m], or None.
+        largest: The largest of these (F,) [m], or None; ``hausdorff_bound`` is no more.
+        largest_vertex: Its vertex (F,), −1 in excluded frames, or None.
+        surface_mean: Mean distance of a's vertices to the surface of b, and vice versa (F, 2) [m], weighted by thirds of
+            triangle areas in the frame.
+        surface_rms: Root mean square of these (F, 2) [m].
+        surface_largest: The largest of these (F, 2) [m]; ``hausdorff`` is the larger of the two.
+        stretch_rms: Root mean square over triangles of the differences of principal stretches λ₁ ≥ λ₂ from each rest shape (F,
+            2) [1], or None.
+        stretch_largest: The largest of these differences (F, 2) [1], or None.
     """
 
     same_topology: bool
@@ -107,35 +106,33 @@ def compare(
     up_axis_a: UpAxis | None = None,
     up_axis_b: UpAxis | None = None,
 ) -> Comparison:
-    """Compares two animations, frame by frame, at the times that both have.
+    """Compares two animations at the times that both have.
 
-    One frame of each is in memory at a time. Two frames are compared if their times differ by no more than 1e-6 of the shortest
-    frame. Identical frames of the same triangles have distance 0.
+    Times match within 1e-6 of the shortest frame; one frame of each is in memory. Identical frames of the same triangles have
+    distance 0.
 
     Args:
         a: Anything that `open_sequence` takes or returns, or (mesh, frames): a rest shape, and a path or anything that
             `as_sequence` takes.
-        b: The same.
+        b: As a.
         prim_a: Prim of a stage with several.
-        prim_b: The same of b.
-        fps: Frames per second of both, if they give none or to override theirs.
-        fps_a: The same of a alone.
-        fps_b: The same of b alone.
-        frames: Compare only that many frames after the first that both have.
+        prim_b: That of b.
+        fps: Frames per second of both, instead of their own.
+        fps_a: That of a.
+        fps_b: That of b.
+        frames: Number of frames to compare after the first common one.
         device: A Warp device.
-        progress: Function called with (frame, frames) once each frame is compared, ``frames`` being those after the first.
-        up_axis: "Y" or "Z", the up axis of both, which overrides their own. If one is Y up and the other Z up, b is rotated
-            about x by 90° to the axis of a: (x, y, z) of Z up is (x, z, −y) of Y up. An animation without an up axis takes that
-            of the other.
-        up_axis_a: The up axis of a alone.
-        up_axis_b: The up axis of b alone.
+        progress: Function called with (frame, frames), ``frames`` being those after the first.
+        up_axis: "Y" or "Z", instead of their own, an unknown one being the other's; b is rotated to the axis of a: (x, y, z) of
+            Z up is (x, z, −y) of Y up.
+        up_axis_a: That of a.
+        up_axis_b: That of b.
 
     Returns:
         :class:`Comparison`.
 
     Raises:
-        ValueError: An input is not allowed or has no times, a frame cannot be read, no two frames have the same time, or no
-            pair of frames can be compared.
+        ValueError: An input is not allowed or has no times, a frame cannot be read, or no frames match or can be compared.
 
     Examples:
         >>> import warpcloth as wc
@@ -155,7 +152,7 @@ def compare(
 
 
 def opened(name: str, source: Any, prim: str | None = None, fps: float | None = None) -> Sequence:
-    """Returns the `Sequence` of an input of `compare`; ``name`` is for error messages."""
+    """Returns the `Sequence` of an input, called ``name`` in messages."""
     if isinstance(source, Sequence):
         return source
     if isinstance(source, (str, PathLike)):
@@ -174,7 +171,7 @@ def opened(name: str, source: Any, prim: str | None = None, fps: float | None = 
 
 
 def in_one_axis(a, b, up_axis_a, up_axis_b):
-    """Returns a, b with its frames rotated to the up axis of a, and the two axes: those that are given, or their own."""
+    """Returns a, b rotated to the up axis of a, and the two axes, given or their own."""
     for name, given in (("up_axis_a", up_axis_a), ("up_axis_b", up_axis_b)):
         if given is not None:
             choice(name, given, UP_AXES)
@@ -183,10 +180,7 @@ def in_one_axis(a, b, up_axis_a, up_axis_b):
 
 
 def to_up_axis(b: Any, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Any:
-    """Returns b, a `Sequence` or a `Capture`, with its frames rotated to the up axis of a without rounding.
-
-    If the axes agree or one is unknown, b itself.
-    """
+    """Returns a sequence or capture rotated to the up axis of a, without rounding; b itself if they agree or one is unknown."""
     if axis_a is None or axis_b is None or axis_a == axis_b:
         return b
 
@@ -200,27 +194,26 @@ def to_up_axis(b: Any, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Any:
 
 
 def turned_up(points: np.ndarray, axis: UpAxis) -> np.ndarray:
-    """Returns points (n, 3) of the other up axis, rotated to this one without rounding."""
+    """Returns points (n, 3) rotated to this up axis from the other, without rounding."""
     return points[:, [0, 2, 1]] * ([1.0, 1.0, -1.0] if axis == "Y" else [1.0, -1.0, 1.0])
 
 
 def measured_frames(a, b, measure, excluded, frames, progress):
-    """Measures the frames of a and b at the same time.
+    """Measures the frames of two sequences or captures, a and b, at one time.
 
     Args:
-        a: A `Sequence` or a `Capture`.
-        b: A `Sequence` or a `Capture`.
-        measure: Function of the indices of a frame of a and of b; returns its numbers by name, or {} after it has appended the
-            reason to ``excluded``.
-        excluded: What could not be compared, in a and in b: two lists of `Exclusion`.
-        frames: Number of frames to compare after the first; None for all.
-        progress: Function called with (frame, frames), or None.
+        a: Read by index.
+        b: The same.
+        measure: (i, j) of a frame of a and of b → its numbers by name, or {} once ``excluded`` has the reason.
+        excluded: Two lists of `Exclusion`, of a and b.
+        frames: Number of frames after the first; None for all.
+        progress: (frame, frames) → None, or None.
 
     Returns:
-        dict: Fields of `ComparedFrames` but ``up_axes``, and arrays of the other numbers, by name.
+        dict: Fields of `ComparedFrames` but ``up_axes``, and arrays of the other numbers.
 
     Raises:
-        ValueError: One of them has no times, no two frames have the same time, or no pair of frames can be compared.
+        ValueError: One has no times, no frames match, or none can be compared.
     """
     for name, each in (("a", a), ("b", b)):
         if each.times is None:
@@ -245,7 +238,6 @@ def measured_frames(a, b, measure, excluded, frames, progress):
 
 
 def _at_one_time(a, b):
-    """Returns the indices of frames at the same time (F, 2), F at least 1."""
     steps = np.concatenate([np.diff(a.times), np.diff(b.times)])
     near = _SAME_TIME * (steps.min() if len(steps) else 1.0)
     after = np.searchsorted(b.times, a.times - near).clip(max=len(b) - 1)
@@ -257,15 +249,12 @@ def _at_one_time(a, b):
 
 
 def _columns(rows):
-    """Returns arrays by name from one dict per frame, which is empty for an excluded frame."""
     first = next(row for row in rows if row)
     missing = {name: -1 if name == "largest_vertex" else np.full(np.shape(value), np.nan) for name, value in first.items()}
     return {name: np.array([row.get(name, missing[name]) for row in rows]) for name in first}
 
 
 class _Pair:
-    """Compares frames of two sequences, and collects what is ``excluded`` in each."""
-
     def __init__(self, a, b, device):
         self.sequences, self.device = (a, b), device
         self.triangles = a.mesh.triangles, b.mesh.triangles
@@ -285,7 +274,6 @@ class _Pair:
             self.kept = ~(without[0] | without[1])
 
     def measure(self, i, j):
-        """Returns the numbers by name for frame i of a and j of b; empty if a point is not finite."""
         points = [sequence[index] for sequence, index in zip(self.sequences, (i, j), strict=True)]
         labels = [sequence.labels[index] for sequence, index in zip(self.sequences, (i, j), strict=True)]
         lost = [np.flatnonzero(~np.isfinite(x).all(axis=1)) for x in points]
@@ -312,7 +300,6 @@ class _Pair:
         return {"stretch_rms": _rms(apart), "stretch_largest": apart.max(axis=0)}
 
     def _surfaces(self, points, labels, apart):
-        """Returns the distances both ways; ``apart`` are the distances of corresponding vertices, or None."""
         mean, rms, largest = np.full((3, 2), np.nan)
         for k, used in enumerate(self.used):
             found = surface_distances(points[k][used], points[1 - k], self.triangles[1 - k], self.device)
@@ -348,5 +335,5 @@ def _rms(values):
 
 
 def longest_side(x: np.ndarray, triangles: np.ndarray) -> float:
-    """Returns the length [m] of the longest side of triangles (T, 3) with corners among x (n, 3)."""
+    """Returns the longest side [m] of triangles (T, 3) of x (n, 3)."""
     return np.linalg.norm(x[triangles] - x[np.roll(triangles, 1, axis=1)], axis=2).max()

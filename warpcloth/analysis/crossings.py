@@ -1,4 +1,4 @@
-"""Finds intersecting triangles by exact predicates: signs of determinants, unaffected by rounding."""
+"""Finds intersecting triangles by exact predicates."""
 
 from importlib.util import find_spec
 
@@ -6,14 +6,14 @@ import numpy as np
 
 
 class Crossings:
-    """Finds the pairs of triangles of a mesh that intersect, frame by frame.
+    """Finds the pairs of triangles of a mesh that intersect.
 
-    Triangles are closed sets: those without a common vertex also intersect if they touch. Those with a common vertex or edge
-    intersect only if they have more in common than that. Both tests use the exact orientation predicates of libigl (Shewchuk
-    1997, *Adaptive precision floating-point arithmetic and fast robust geometric predicates*).
+    Triangles intersect if they touch, or, with a common vertex or edge, if they have more in common. Tests use the exact
+    orientation predicates of libigl (Shewchuk 1997, *Adaptive precision floating-point arithmetic and fast robust geometric
+    predicates*).
 
     Args:
-        triangles: (T, 3), with one index for each vertex.
+        triangles: (T, 3), one index per vertex.
 
     Raises:
         ImportError: libigl is not installed.
@@ -28,12 +28,7 @@ class Crossings:
         self._fans, self._hinges, self._twins = _neighbours(self._triangles, np.flatnonzero(self._proper))
 
     def pairs(self, points: np.ndarray, judged: np.ndarray) -> np.ndarray:
-        """Returns the pairs that intersect, (P, 2), the smaller index first, sorted.
-
-        Args:
-            points: (n, 3) [m], finite at the judged triangles.
-            judged: Which triangles to test, (T,); they must have an area.
-        """
+        """Returns the pairs that intersect, (P, 2), sorted, of ``judged`` triangles (T,), with area, at points (n, 3) [m]."""
         from igl.predicates import find_self_intersections
 
         judged = judged & self._proper
@@ -54,7 +49,7 @@ class Crossings:
 
 
 def have_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Returns which triangles (T, 3) of finite points (n, 3) have an area, exactly, (T,)."""
+    """Returns which triangles (T, 3) of points (n, 3) have an area, exactly, (T,)."""
     corners = points[triangles]
     found = np.zeros(len(triangles), dtype=bool)
     for axis in range(3):
@@ -66,7 +61,7 @@ def have_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _side(a, b, c, d):
-    """Returns the side of the plane through a, b, c on which d is, each (k, 3): 1, −1 or 0, exactly, (k,)."""
+    """Returns the side of the plane abc of d, each (k, 3), exactly: 1, −1 or 0, (k,)."""
     from igl.predicates import orient3d
 
     return orient3d(*(np.ascontiguousarray(each) for each in (a, b, c, d))) if len(a) else np.zeros(0, np.int32)
@@ -75,8 +70,7 @@ def _side(a, b, c, d):
 def _fans_cross(corners):
     """Returns which triangles (v, a, b) and (v, c, d) have more than v in common, (k,), from corners (k, 5, 3).
 
-    Near v they are sectors. A sector meets the plane of the other in a ray if its two corners are on different sides of that
-    plane. The signs tell whether the two rays coincide.
+    Near v they are sectors, which meet the plane of the other in rays that may coincide.
     """
     v, a, b, c, d = corners.transpose(1, 0, 2)
     of_first = [_side(v, c, d, each) for each in (a, b)]
@@ -89,7 +83,6 @@ def _fans_cross(corners):
 
 
 def _sectors_overlap(v, a, b, c, d):
-    """Like :func:`_fans_cross`, for triangles in one plane."""
     above = _above(v, a, b)
 
     def holds(left, right, ray):
@@ -100,7 +93,7 @@ def _sectors_overlap(v, a, b, c, d):
 
 
 def _hinges_overlap(corners):
-    """Returns which triangles (u, v, a) and (u, v, b) are folded flat onto one another, (k,), from corners (k, 4, 3)."""
+    """Returns which triangles (u, v, a) and (u, v, b) are folded flat, (k,), from corners (k, 4, 3)."""
     u, v, a, b = corners.transpose(1, 0, 2)
     found = _side(u, v, a, b) == 0
     u, v, a, b = (each[found] for each in (u, v, a, b))
@@ -110,7 +103,7 @@ def _hinges_overlap(corners):
 
 
 def _above(a, b, c):
-    """Returns points (k, 3) off the planes through a, b, c: steps from a along the axis nearest to the normal."""
+    """Returns points (k, 3) off the planes abc: steps from a along the axis nearest to the normal."""
     normal = np.cross(b - a, c - a)
     rows, axis = np.arange(len(a)), np.abs(normal).argmax(axis=1) if len(a) else np.zeros(0, int)
     found = a.copy()
@@ -119,12 +112,7 @@ def _above(a, b, c):
 
 
 def _neighbours(triangles, own):
-    """Finds the pairs of triangles (T, 3), with indices ``own``, that have one, two and three vertices in common.
-
-    Returns:
-        The pairs (k, 2) with one and those with two, each with the common vertices followed by the others, (k, 5) and (k, 4);
-        and the pairs with three.
-    """
+    """Finds the pairs of triangles with one common vertex (k, 5) and with two (k, 4), those vertices first, and with three."""
     count = len(triangles)
     corners = triangles[own].ravel()
     order = np.argsort(corners, kind="stable")

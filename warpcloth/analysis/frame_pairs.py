@@ -10,12 +10,12 @@ from ..base.checks import shown, whole
 
 @dataclass(frozen=True)
 class Pair:
-    """One row of an analysis, as indices of frames in the sequence.
+    """One row of an analysis, by indices of frames.
 
     Attributes:
-        reference: The frame that counts as undeformed; None for the rest shape.
+        reference: The undeformed frame; None for the rest shape.
         frame: The measured frame.
-        before: The frame from which rates are computed, or None.
+        before: The frame before, for rates, or None.
     """
 
     reference: int | None
@@ -24,23 +24,17 @@ class Pair:
 
 
 def pairs_of(labels, reference=None, pairs=None, lag=None, every=1):
-    """Returns the rows of an analysis.
+    """Returns the rows of an analysis, :class:`Pair` records, and (number, reason) of frames left out.
 
     Args:
         labels: Numbers of the frames (F,), ascending.
-        reference: Reference of every frame: "rest", the default, "first", "previous" or the number of a frame. Rates are
-            computed from the frame before, with "previous" from the reference.
-        pairs: Instead, a text such as "1:2,1:3,72:75" or pairs of numbers: reference and frame, also for rates.
-        lag: Instead, a whole number K: each frame is the reference of the one K later, also for rates; 3 gives 1:4, 2:5 and so
-            on.
-        every: Use only every k-th frame, from the first.
-
-    Returns:
-        tuple: A list of :class:`Pair`, and a list of (number, reason) of frames that are left out.
+        reference: "rest" (default), "first", "previous" or the number of a frame; rates are from the frame before.
+        pairs: Instead, "1:2,1:3,72:75" or pairs of numbers, reference and frame, also for rates.
+        lag: Instead, the distance from reference to frame, also for rates.
+        every: Use every k-th frame.
 
     Raises:
-        ValueError: More than one of the three is given, a number has no frame, a frame is paired with itself, or there is no
-            row.
+        ValueError: More than one of the three is given, a number has no frame or is paired with itself, or there is no row.
     """
     given = [name for name, value in (("reference", reference), ("pairs", pairs), ("lag", lag)) if value is not None]
     if len(given) > 1:

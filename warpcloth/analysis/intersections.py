@@ -1,4 +1,4 @@
-"""Finds intersections in an animation, exactly, vertices inside colliders, and exceeded limits of stretch."""
+"""Finds intersections in an animation, exactly, vertices in colliders, and exceeded limits of stretch."""
 
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Several
@@ -30,11 +30,11 @@ class FrameCheck:
     Attributes:
         index: Index of the frame in the source.
         frame: Its number in the source.
-        time: Its time [s]; NaN if the source has no times.
-        pairs: The triangles that intersect (P, 2), the smaller index first.
-        inside: Vertices (k,) in each collider, by its name; colliders without any are left out.
-        exceeded: Elements (k,) that exceed a limit of stretch and their stretches (k,), by the name of the limit.
-        excluded: List of :class:`warpcloth.analysis.samples.Exclusion`: what could not be judged.
+        time: Its time [s], or NaN.
+        pairs: Triangles that intersect (P, 2), the smaller index first.
+        inside: Vertices (k,) in colliders, by name.
+        exceeded: Elements (k,) beyond a limit of stretch and their stretches (k,), by its name.
+        excluded: List of :class:`warpcloth.analysis.samples.Exclusion`.
     """
 
     index: int
@@ -47,12 +47,12 @@ class FrameCheck:
 
     @property
     def clean(self) -> bool:
-        """Whether all elements could be judged, and nothing was found."""
+        """Whether all elements could be judged and nothing was found."""
         return not (len(self.pairs) or self.inside or self.exceeded or self.excluded)
 
     @property
     def vertices_inside(self) -> int:
-        """Number of vertices in colliders; a vertex counts once for each collider."""
+        """Number of vertices in colliders, once for each."""
         return sum(map(len, self.inside.values()))
 
 
@@ -61,7 +61,7 @@ class Intersections:
     """The result of :func:`intersections`.
 
     Attributes:
-        cloths: The :class:`warpcloth.analysis.cloths.Cloths`; its ``face`` names the mesh and the face of a triangle.
+        cloths: The :class:`warpcloth.analysis.cloths.Cloths`.
         frames: List of :class:`FrameCheck`.
     """
 
@@ -95,25 +95,23 @@ def intersections(
     every: int = 1,
     progress: Progress | None = None,
 ) -> Intersections:
-    """Finds the triangles that intersect in each frame of one or several cloths, by exact predicates.
+    """Finds triangles that intersect in each frame of one or several cloths, by exact predicates, vertices in colliders, and
+    exceeded limits of stretch.
 
-    Triangles without a common vertex intersect if they touch or cross. Triangles with a common vertex or edge intersect if they
-    have more than that in common. Boundary vertices that are at the same position in all frames count as one vertex, as in
-    panels that are sewn together. Vertices inside colliders and limits of stretch that are exceeded are found too.
+    Triangles intersect if they touch, or, with a common vertex or edge, if they have more in common. Boundary vertices at one
+    position in all frames count as one, as in sewn panels.
 
     Args:
-        frames: Points of one frame (n, 3) or of several (F, n, 3) [m]; an :class:`warpcloth.Animation`, or the start of a
-            :class:`warpcloth.Scene`, with their colliders and limits; a :class:`warpcloth.Mesh`; a :class:`warpcloth.Sequence`;
-            or a path: a mesh file, anything that :func:`warpcloth.open_sequence` opens, or a stage. In a stage that warpcloth
-            wrote, the cloth is checked. In other stages, all meshes whose points move are checked, or all meshes if none moves,
+        frames: Points (n, 3) or (F, n, 3) [m]; an :class:`warpcloth.Animation`, or a :class:`warpcloth.Scene` at its start,
+            with colliders and limits; a :class:`warpcloth.Mesh` or :class:`warpcloth.Sequence`; or a path to a mesh, a sequence
+            or a stage. In a stage of warpcloth, the cloth is checked; in others all meshes whose points move, else all meshes,
             but no colliders.
-        mesh: The :class:`warpcloth.Mesh`, whose points are the rest shape, or triangles (T, 3), if the frames have none.
-        prim: Paths or names of the meshes of a stage; only these are checked. In other files, the name of the geometry.
-        fps: Frames per second, if the source does not say it or says it wrong.
-        colliders: Colliders in place of those of the source. Vertices can be inside a half-space, a solid, or a
-            :class:`warpcloth.MeshCollider` that is closed.
-        stretch: Largest l/L of an edge that is allowed, in addition to the limits that the source declares.
-        every: Check only every k-th frame.
+        mesh: The rest shape, or triangles (T, 3), if the frames have none.
+        prim: Meshes of a stage to check, or the geometry of other files.
+        fps: Frames per second, instead of that of the source.
+        colliders: Colliders in place of those of the source; meshes must be closed.
+        stretch: Maximum l/L of edges, beside the limits of the source.
+        every: Check every k-th frame.
         progress: Function called with (frames checked, frames), or None.
 
     Returns:
@@ -122,7 +120,7 @@ def intersections(
     Raises:
         FileNotFoundError: There is no such file.
         ImportError: libigl is not installed.
-        ValueError: An argument breaks a rule, or the source cannot be read.
+        ValueError: An argument is not allowed, or the source cannot be read.
 
     Examples:
         >>> import warpcloth as wc
@@ -140,18 +138,16 @@ def intersections(
 
 
 class Checker:
-    """Checks the frames of :func:`intersections` one after another, in constant memory.
+    """Checks frames of :func:`intersections` in constant memory.
 
     Args:
-        cloths: The :class:`warpcloth.analysis.cloths.Cloths`.
-        colliders, stretch, every: As there.
+        cloths, colliders, stretch, every: As there.
 
     Attributes:
-        cloths: As given.
         indices: Indices of the checked frames.
         limits: The :class:`warpcloth.analysis.stretch_limits.StretchLimit` of each limit.
         colliders: The colliders by name.
-        sewn: Number of vertices that are merged with others at the same position.
+        sewn: Number of vertices merged with others.
     """
 
     def __init__(
@@ -218,9 +214,9 @@ class Checker:
 
     @cached_property
     def _index(self):
-        """For each vertex, the first vertex that has its position in all frames (n,), if both are on a boundary.
+        """The first boundary vertex at the position of each boundary vertex in all frames, (n,).
 
-        A vertex that is not finite in a frame that has finite points is merged with none.
+        Vertices not finite in a frame with finite points are not merged.
         """
         cloths = self.cloths
         found, own, together = np.arange(len(cloths.mesh.points)), cloths.mesh.boundary, None

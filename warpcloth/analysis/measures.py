@@ -10,18 +10,16 @@ from ..base.checks import did_you_mean, shown
 
 @dataclass(frozen=True)
 class Measure:
-    """A field of numbers, one set for each triangle or each vertex.
+    """A field of numbers of triangles or vertices.
 
     Attributes:
-        name: Its name.
-        shape: Shape of the value of one element, () for a number.
-        unit: SI unit, "1" if it has none.
-        text: Its definition.
-        neutral: Its value without deformation, the middle of a colour scale; None if scales start at 0.
-        rate: Whether it is a rate, from the previous frame to this one.
-        needs: "directions" or "material", options of :func:`warpcloth.analyze`; "" for neither.
-        summed: Whether :func:`scalars` uses it; scalars of rotations and unit vectors would be constant.
-        undefined: Why an element with a reference and finite points may have no value.
+        shape: Shape of one value, () for a number.
+        unit: SI unit, or "1".
+        neutral: Undeformed value, the middle of a colour scale, or None if scales start at 0.
+        rate: Whether it is a rate from the previous frame.
+        needs: "directions" or "material", options of :func:`warpcloth.analyze`, or "".
+        summed: Whether :func:`scalars` uses it, unlike rotations and unit vectors.
+        undefined: Why an element may have no value.
     """
 
     name: str
@@ -86,16 +84,7 @@ MEASURES = {on: {measure.name: measure for measure in listed} for on, listed in 
 
 
 def chosen(names, on, given=("directions", "material", "rate")):
-    """Returns the measures of a list of names, each once.
-
-    Args:
-        names: Names, or "all" for those whose needs are met.
-        on: "triangle" or "vertex".
-        given: The needs that are met.
-
-    Raises:
-        ValueError: There is no name, or no such measure.
-    """
+    """Returns the measures of a list of names, or "all" whose needs are ``given``; raises ValueError without any."""
     known = MEASURES[on]
     if isinstance(names, str):
         names = (names,)
@@ -118,14 +107,10 @@ def chosen(names, on, given=("directions", "material", "rate")):
 
 
 def scalars(measure, values):
-    """Returns the scalars of a field, for colours and summaries, as arrays (E,) by name.
+    """Returns the scalars of a field (E, *shape), arrays (E,) by name.
 
-    A number gives itself, a vector each component, such as ``stretch_1``, and a matrix its Frobenius norm, such as
-    ``spin_norm``. Rotations and unit vectors give none.
-
-    Args:
-        measure: The :class:`Measure`.
-        values: (E, *shape).
+    Vectors give components, such as ``stretch_1``, matrices the Frobenius norm, such as ``spin_norm``, rotations and unit
+    vectors none.
     """
     if not measure.summed:
         return {}

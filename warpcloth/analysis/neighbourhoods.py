@@ -1,4 +1,4 @@
-"""Neighbourhoods of vertices: rings of neighbours, or the nearest points."""
+"""Neighbourhoods of vertices: rings or nearest points."""
 
 import re
 import warnings
@@ -18,19 +18,17 @@ _FEW = 8
 
 
 def neighbourhoods(mesh, chosen):
-    """Returns the neighbourhood of each vertex, which includes the vertex itself.
+    """Returns the neighbourhood of each vertex, itself included: those of vertex i are members[offsets[i]:offsets[i + 1]],
+    int32.
 
-    Rings follow edges. Nearest points are measured in the rest shape, in space, so that they may belong to another layer of a
-    garment; a vertex without a finite position has none. A vertex without a triangle has no neighbourhood, and is in none.
+    Rings follow edges; nearest points are in space at rest, maybe of another layer. A vertex without a triangle has none and is
+    in none; without a finite position it has no nearest points. A percentage that determines no rotation takes more vertices,
+    with a warning.
 
     Args:
-        mesh: The :class:`warpcloth.Mesh`.
-        chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices, which is the
-            default of "nearest"; or sets of vertices, (n, k) or n lists. If a percentage gives fewer than three vertices, or
-            all on one line, the fewest nearest vertices that determine a rotation are used, with a warning.
-
-    Returns:
-        tuple: offsets (n + 1,) and members, int32: those of vertex i are members[offsets[i]:offsets[i + 1]].
+        mesh: The mesh.
+        chosen: "1-ring", "2-ring", "nearest:k=12", "nearest:radius=0.05" [m], "nearest:2%" of the vertices (the default of
+            "nearest"); or sets of vertices, (n, k) or n lists.
 
     Raises:
         ValueError: ``chosen`` is none of these.
@@ -101,11 +99,7 @@ def _nearest(mesh, used, chosen):
 
 
 def _sets(tree, k, widen):
-    """Finds the k nearest points of each point of a tree; with ``widen``, as many as it takes to determine a rotation.
-
-    Returns:
-        tuple: The size of each set (n,), and all sets one after another, each in order of index.
-    """
+    """Finds sizes (n,) and members of the sets of k nearest points; ``widen`` adds points until they determine a rotation."""
     points, n = tree.data, tree.n
     most = min(max(k, _FEW), n) if widen else k
     todo = [(np.arange(start, min(start + 4096, n)), 3, most) for start in range(0, n, 4096)]
@@ -134,6 +128,5 @@ def _sets(tree, k, widen):
 
 
 def _on_a_line(sets):
-    """Returns whether the points of each set (m, k, 3) lie on a line, (m,)."""
     spread = np.linalg.svd(sets - sets.mean(axis=1, keepdims=True), compute_uv=False)
     return ~(spread[:, 1] > _LINE * spread[:, 0])

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..base.renamed import renamed
 from ..mesh.mesh import Mesh
 from .measures import Measure
 
@@ -17,10 +16,10 @@ class Exclusion:
     """Elements or a frame that could not be measured.
 
     Attributes:
-        frame: Number of the frame; None for the rest shape.
-        kind: "triangle" or "vertex"; "frame" for a whole frame, without elements.
+        frame: Frame number, or None for the rest shape.
+        kind: "triangle", "vertex", or "frame" without elements.
         elements: Indices (k,).
-        reason: The reason, as the end of a sentence.
+        reason: The end of a sentence.
     """
 
     frame: float | None
@@ -38,20 +37,19 @@ class Exclusion:
         return f"{where}, {count}{kind} {named}: {self.reason}"
 
 
-@renamed(place="index")
 @dataclass(frozen=True, eq=False)
 class Sample:
     """One row of an analysis: a frame measured against its reference.
 
     Attributes:
         row: Index of the row.
-        reference: Number of the reference frame; None for the rest shape.
-        frame: Number of the frame.
-        index: Index of the frame in its sequence.
-        time: Time of the frame [s]; NaN if the sequence has no times.
+        reference: Reference frame, or None for the rest shape.
+        frame: Frame number.
+        index: Its index in the sequence.
+        time: Its time [s], or NaN.
         points: (n, 3) [m], read-only.
-        values: Arrays (E, *shape) by name of measure, NaN for excluded elements; the next sample overwrites them.
-        excluded: List of :class:`Exclusion` that occur first in this row.
+        values: Arrays (E, *shape) by measure, NaN where excluded, overwritten by the next sample.
+        excluded: :class:`Exclusion` that occur first here.
     """
 
     row: int
@@ -71,11 +69,11 @@ class Analysis(Mapping[str, np.ndarray]):
     Attributes:
         mesh: The mesh, with E triangles or vertices.
         on: "triangle" or "vertex".
-        measures: The :class:`warpcloth.analysis.measures.Measure` of each array, by name.
-        references: Number of each row's reference frame; None for the rest shape.
-        frames: Numbers of the frames (rows,).
-        times: Times of the frames (rows,) [s].
-        excluded: List of :class:`Exclusion`, elements that could not be measured; their values are NaN.
+        measures: :class:`warpcloth.analysis.measures.Measure` by name.
+        references: Reference frame of each row, or None for the rest shape.
+        frames: Frame numbers (rows,).
+        times: (rows,) [s].
+        excluded: List of :class:`Exclusion`, whose values are NaN.
         arrays: The arrays by name.
     """
 

@@ -1,4 +1,4 @@
-"""Writes fields of many rows as arrays of one NPZ file."""
+"""Writes fields of many rows as arrays of an NPZ file."""
 
 import math
 import shutil
@@ -11,27 +11,18 @@ from ..base.outputs import Output
 
 
 class NpzWriter(Output):
-    """Writes fields of all rows, (rows, E, *shape) by name, and ``frames``, ``references`` and ``times``, for ``numpy.load``.
+    """Writes fields of all rows, (rows, E, *shape), and ``frames``, ``references`` (NaN: rest) and ``times`` [s], (rows,)
+    float64.
 
-    The last three are (rows,) float64: frame labels, labels of references, NaN for the rest shape, and times [s]. Memory holds
-    them and one row of the fields. Fields are written to files beside the output, and `close` copies them into one file,
-    without compression. Missing rows are left out.
+    Memory holds one row. Fields go to files beside the output, which `close` copies into one.
 
     Attributes:
         rows: Number of rows appended.
     """
 
     def __init__(self, path, rows, fields):
-        """Starts the files.
-
-        Args:
-            path: File to write.
-            rows: Largest number of rows.
-            fields: (shape of a row, dtype) of each field, by name.
-
-        Raises:
-            FileNotFoundError: The folder does not exist.
-            ValueError: The path is a folder or a device, or a field has the name of an array above.
+        """Starts the files for at most ``rows`` rows of fields, (shape of a row, dtype) by name; raises ValueError for a
+        reserved name.
         """
         self._heads = {name: np.empty(rows) for name in ("frames", "references", "times")}
         self._fields = {name: (tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in fields.items()}
@@ -43,17 +34,7 @@ class NpzWriter(Output):
         self._parts = {name: tempfile.TemporaryFile(dir=self.folder) for name in self._fields}
 
     def append(self, frame, reference, time, values):
-        """Adds a row.
-
-        Args:
-            frame: Label of the frame.
-            reference: Label of the frame that it is measured against; None is the rest shape.
-            time: Time of the frame [s].
-            values: The fields by name, each (E, *shape), of the declared dtype; others are ignored.
-
-        Raises:
-            ValueError: A field has another shape or dtype than declared, or there are too many rows.
-        """
+        """Adds a row: labels of the frame and its reference (None: rest), time [s], and fields (E, *shape) by name."""
         if self.rows == self._promised:
             raise ValueError(f"{self.path}: {self._promised} rows were promised, and this is one more")
         arrays = {name: np.asarray(values[name]) for name in self._fields}
@@ -81,7 +62,6 @@ class NpzWriter(Output):
 
 
 def _copy(part, member, shape, dtype):
-    """Copies the complete rows, after the header of an array."""
     header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(member, header)
     part.truncate(math.prod(shape) * dtype.itemsize)
@@ -90,6 +70,6 @@ def _copy(part, member, shape, dtype):
 
 
 def _member(archive, name):
-    """Opens a member of an archive, which may exceed 4 GiB, without a date, so that equal arrays give equal files."""
+    """Opens a member of an archive, above 4 GiB too, without a date, so equal arrays give equal files."""
     info = zipfile.ZipInfo(f"{name}.npy")
     return archive.open(info, "w", force_zip64=True)

@@ -1,4 +1,4 @@
-"""Limits of stretch, and the elements of a cloth that exceed them."""
+"""Limits of stretch, and elements that exceed them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,13 +14,13 @@ _ROUNDINGS = 4.0
 
 @dataclass(frozen=True, eq=False)
 class StretchLimit:
-    """Bounds of the stretches of pairs of vertices, l/L, or of triangles, the singular values of F.
+    """Bounds of stretches: l/L of pairs, or the singular values of F of triangles.
 
     Attributes:
         name: Name of the limit.
         stencil: Vertices of each element, (E, 2) or (E, 3).
         rest: Rest positions of all vertices (n, 3) [m].
-        least, most: The bounds (E,); 0 and infinity stand for no bound.
+        least, most: Bounds (E,); 0 and infinity are none.
     """
 
     name: str
@@ -40,11 +40,10 @@ class StretchLimit:
         return length, *along, *across
 
     def _edges(self, points):
-        """Returns the vectors from the first vertex of each element to the others, (E, 3) each."""
         return [points[vertices] - points[self.stencil[:, 0]] for vertices in self.stencil.T[1:]]
 
     def stretches(self, points: np.ndarray) -> np.ndarray:
-        """Returns the smallest and largest stretch of each element at points (n, 3) [m], (E, 2); NaN if undefined."""
+        """Returns the smallest and largest stretch at points (n, 3) [m], (E, 2), or NaN."""
         length, *others = self._sides
         first, *second = self._edges(points)
         with np.errstate(all="ignore"):
@@ -58,7 +57,7 @@ class StretchLimit:
             return np.sqrt(np.maximum(np.stack([middle - apart, middle + apart], axis=1), 0.0))
 
     def exceeded(self, points: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the elements that exceed the limit by more than ``rounding`` [m] explains, and their stretches, (k,) each."""
+        """Returns elements beyond the limit by more than ``rounding`` [m], and their stretches, (k,) each."""
         low, high = self.stretches(points).T
         length, *others = self._sides
         with np.errstate(all="ignore"):
@@ -79,14 +78,7 @@ def edge_limit(mesh: Mesh, most: float) -> StretchLimit:
 
 
 def declared_limits(terms: list[Limit], mesh: Mesh, first: int = 0, where: str = "") -> list[StretchLimit]:
-    """Returns the limits that terms declare.
-
-    Args:
-        terms: The terms.
-        mesh: Their mesh.
-        first: Index of its first vertex among those of all meshes.
-        where: Name of the mesh, or "".
-    """
+    """Returns the limits that terms declare on a mesh whose first vertex is ``first``, named ``where`` or ""."""
     found = []
     for term in terms:
         stencil = term.elements(mesh, mesh.points).stencil

@@ -1,4 +1,4 @@
-"""Summaries of the fields of an analysis, and their CSV and JSON files."""
+"""Summaries of fields, and their CSV and JSON files."""
 
 import csv
 import math
@@ -16,23 +16,20 @@ PERCENTILES = (0, 1, 5, 25, 50, 75, 95, 99, 100)
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of a scalar field of one row, over elements with a value. NaN means no value; infinity is a value.
+    """Statistics of a scalar field of one row, over elements with a value (not NaN).
 
     Attributes:
         frame: Label of the frame.
-        reference: Label of the frame that it is measured against; None is the rest shape.
-        time: Time of the frame [s].
-        name: Name of the scalar.
-        unit: Unit of the scalar.
-        measured: Number of elements with a value.
-        excluded: Number of elements without a value.
-        mean: Mean over elements.
+        reference: Label of its reference, or None for the rest shape.
+        time: Its time [s].
+        measured: Elements with a value.
+        excluded: Elements without.
         area_mean: Σ wᵢvᵢ / Σ wᵢ, w the rest areas.
-        percentiles: Percentiles `PERCENTILES` (9,), interpolated linearly.
-        smallest: The first element with the smallest value, -1 if none has a value.
-        smallest_at: Its position (x, y, z) in this frame [m].
-        largest: The first element with the largest value, -1 if none has a value.
-        largest_at: Its position (x, y, z) in this frame [m].
+        percentiles: `PERCENTILES` (9,), interpolated linearly.
+        smallest: First element with the smallest value, or -1.
+        smallest_at: Its position in this frame (3,) [m].
+        largest: First element with the largest value, or -1.
+        largest_at: Its position in this frame (3,) [m].
     """
 
     frame: float
@@ -52,21 +49,7 @@ class Summary:
 
 
 def summarise(name, unit, values, positions, weights, *, frame, reference, time):
-    """Returns the `Summary` of a scalar field.
-
-    Args:
-        name: Name of the scalar.
-        unit: Unit of the scalar.
-        values: (E,), NaN for excluded elements.
-        positions: Centroids of triangles, or vertices, in this frame (E, 3) [m].
-        weights: Rest areas of triangles, or lumped areas of vertices (E,) [m²]; those of excluded elements are not read.
-        frame: Label of the frame.
-        reference: Label of the reference frame; None for the rest shape.
-        time: Time of the frame [s].
-
-    Raises:
-        ValueError: An array has another shape, or the weight of a measured element is negative or not finite.
-    """
+    """Returns the `Summary` of values (E,), NaN where excluded, at positions (E, 3) [m], weighted by rest areas (E,) [m²]."""
     values, weights, positions = np.asarray(values, dtype=np.float64), np.asarray(weights), np.asarray(positions)
     if values.ndim != 1 or weights.shape != values.shape or positions.shape != (*values.shape, 3):
         shapes = f"values {values.shape}, weights {weights.shape} and positions {positions.shape}"
@@ -109,7 +92,7 @@ def _weighted_mean(values, weights):
 
 
 def percentiles(values):
-    """Returns `PERCENTILES` of values without NaN, interpolated like NumPy's; beside an infinite value, that value."""
+    """Returns `PERCENTILES` of values without NaN, like NumPy's; beside infinity, infinity."""
     if not len(values):
         return (math.nan,) * len(PERCENTILES)
     ordered = np.sort(values)  # vectorised, and so several times as fast as a partition
@@ -127,10 +110,9 @@ def _label(reference):
 
 
 class CsvWriter(Output):
-    """Writes a CSV table with a line for each frame and scalar: the columns of `COLUMNS`, in UTF-8.
+    """Writes a CSV table, a line per frame and scalar, with `COLUMNS`, in UTF-8.
 
-    Numbers have all digits of float64; a missing value is an empty cell. The scalar is in its ``unit``, ``time`` in s, and the
-    positions ``min_x`` to ``max_z`` in m.
+    Numbers have all digits of float64; missing ones are empty.
     """
 
     COLUMNS = (
@@ -140,12 +122,7 @@ class CsvWriter(Output):
     )
 
     def __init__(self, path):
-        """Starts the table.
-
-        Raises:
-            FileNotFoundError: The folder does not exist.
-            ValueError: The path is a folder or a device.
-        """
+        """Starts the table; raises FileNotFoundError without the folder, ValueError for a folder or a device."""
         super().__init__(path, "x", **TEXT)
         self._table = csv.writer(self.file, lineterminator="\n")
         self._table.writerow(self.COLUMNS)
@@ -161,25 +138,17 @@ class CsvWriter(Output):
 
 
 class JsonWriter(Output):
-    """Writes one strict JSON object as a stream: ``input``, ``measures``, ``rows``, ``exclusions``, ``facts``.
+    """Writes a strict JSON object as a stream: ``input``, ``measures``, ``rows``, ``exclusions``, ``facts``.
 
-    A missing value is null; infinite numbers are the strings "inf" and "-inf".
+    Missing values are null, infinities "inf" and "-inf".
 
     Attributes:
-        facts: Further facts about the analysis by name, written by `close`.
+        facts: Further facts by name, written by `close`.
     """
 
     def __init__(self, path, input, measures):
-        """Starts the document.
-
-        Args:
-            path: File to write.
-            input: Description of the input: texts and numbers by name.
-            measures: The measures by name, each with ``shape``, ``unit`` and ``neutral``.
-
-        Raises:
-            FileNotFoundError: The folder does not exist.
-            ValueError: The path is a folder or a device.
+        """Starts the document with texts and numbers about the input, and the measures by name with ``shape``, ``unit`` and
+        ``neutral``.
         """
         self.facts = {}
         shown = {name: {key: getattr(each, key) for key in ("shape", "unit", "neutral")} for name, each in measures.items()}
@@ -200,7 +169,7 @@ class JsonWriter(Output):
         self._rows_begun = True
 
     def exclude(self, exclusion, frame):
-        """Adds an exclusion, of the frame with the label ``frame``; None is the rest shape."""
+        """Adds an exclusion of a frame, or of the rest shape (None)."""
         elements = np.asarray(exclusion.elements)
         entry = {"frame": _label(frame), "kind": exclusion.kind, "reason": exclusion.reason}
         entry |= {"count": len(elements), "elements": elements}

@@ -1,4 +1,4 @@
-"""Compares the surfaces of two animations, frame by frame, whose triangles may change: distances of samples by area."""
+"""Compares the surfaces of two animations, whose triangles may change, by samples of their areas."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHARE = 0.95  # the share of the area that is nearer than ``percentile``
 
 @dataclass(frozen=True, eq=False)
 class SurfaceDistances:
-    """Distances of points of each of two surfaces to the other, (F, 2) [m]: from a, and from b. NaN without any points.
+    """Distances of points of a to b, and of b to a, (F, 2) [m]; NaN without points.
 
     Attributes:
         mean: Mean over the area.
@@ -42,18 +42,15 @@ class SurfaceDistances:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SurfaceComparison(ComparedFrames):
-    """The comparison of the surfaces of two captures, a and b.
-
-    Triangles with a corner that is not finite count as holes.
+    """The comparison of two captures, a and b; triangles that are not finite are holes.
 
     Attributes:
-        up_axes, times, frames, labels, unmatched, excluded, sizes, hausdorff, hausdorff_bound: see
+        up_axes, times, frames, labels, unmatched, excluded, sizes, hausdorff, hausdorff_bound: See
             :class:`warpcloth.analysis.compare.ComparedFrames`.
-        vertices: Number of vertices of a and of b (F, 2).
-        all: Distances of all points. If b has holes, points of a that face them are as far as their rims.
-        inner: Distances of those points only whose nearest point is not on the boundary of the other surface. So what faces a
-            hole, or lies beyond the outline, does not count.
-        inner_area: Share of the area of each that these stand for (F, 2) [1].
+        vertices: Numbers of vertices (F, 2).
+        all: Distances of all points; those that face a hole are as far as its rim.
+        inner: Distances of points whose nearest point is not on the boundary of the other.
+        inner_area: Share of the area that these stand for (F, 2) [1].
     """
 
     vertices: np.ndarray
@@ -80,36 +77,35 @@ def compare_surfaces(
     up_axis_a: UpAxis | None = None,
     up_axis_b: UpAxis | None = None,
 ) -> SurfaceComparison:
-    """Compares the surfaces of two animations at the times that both have; the triangles of each may change.
+    """Compares the surfaces of two animations at the times that both have; triangles may change.
 
-    Means are over the area, by `mesh.distances.surface_samples`. If the vertices of a have independent errors with
-    the standard deviation σ along the normal, the RMS from a, over its area, is σ/√2, as errors partly cancel within triangles.
+    Means are over area. If the vertices of a have independent errors of standard deviation σ along the normal, the RMS from a
+    is σ/√2.
 
     Args:
-        a: A path that `open_capture` takes, a :class:`warpcloth.Capture`, a :class:`warpcloth.Sequence`, (mesh, frames) as for
+        a: A path for `open_capture`, a :class:`warpcloth.Capture`, a :class:`warpcloth.Sequence`, (mesh, frames) for
             `as_sequence`, or a list of meshes.
-        b: The same.
+        b: As a.
         prim_a: Prim of a stage with several.
-        prim_b: The same of b.
-        fps: Frames per second of both, if they give none or to override theirs.
-        fps_a: The same of a alone.
-        fps_b: The same of b alone.
-        scale_a: Length of a unit of the mesh files of a [m].
-        scale_b: The same of b.
-        samples: Number of samples of each surface, at least; no triangle has fewer than three.
-        frames: Compare only that many frames after the first that both have.
+        prim_b: That of b.
+        fps: Frames per second of both, instead of their own.
+        fps_a: That of a.
+        fps_b: That of b.
+        scale_a: Unit of the mesh files of a [m].
+        scale_b: That of b.
+        samples: Minimum number of samples of each; a triangle has three or more.
+        frames: Number of frames to compare after the first common one.
         device: A Warp device.
-        progress: Function called with (frame, frames) once each frame is compared, ``frames`` being those after the first.
-        up_axis: "Y" or "Z", the up axis of both; see :func:`warpcloth.compare`.
-        up_axis_a: The up axis of a alone.
-        up_axis_b: The up axis of b alone.
+        progress: Function called with (frame, frames), ``frames`` being those after the first.
+        up_axis: "Y" or "Z", as in :func:`warpcloth.compare`.
+        up_axis_a: That of a.
+        up_axis_b: That of b.
 
     Returns:
         :class:`SurfaceComparison`.
 
     Raises:
-        ValueError: An input is not allowed or has no times, a frame cannot be read, no two frames have the same time, or no
-            pair of frames can be compared.
+        ValueError: An input is not allowed or has no times, a frame cannot be read, or no frames match or can be compared.
 
     Examples:
         >>> import warpcloth as wc
@@ -137,7 +133,7 @@ def compare_surfaces(
 def opened_capture(
     name: str, source: Captured, prim: str | None = None, fps: float | None = None, scale: float = 1.0
 ) -> Capture:
-    """Returns the `Capture` of an input of `compare_surfaces`; ``name`` is for error messages."""
+    """Returns the `Capture` of an input, called ``name`` in messages."""
     if isinstance(source, (str, PathLike)):
         return open_capture(source, prim, fps, scale)
     if fps is not None:
@@ -155,7 +151,6 @@ def opened_capture(
 
 
 def _measured(a, b, labels, excluded, samples, device):
-    """Returns the numbers of a frame by name; empty if a surface cannot be measured. Notes in ``excluded`` what is left out."""
     surfaces, lost = [], False
     for surface, label, notes in zip((a, b), labels, excluded, strict=True):
         bad = np.flatnonzero(~np.isfinite(surface.points).all(axis=1))
@@ -195,7 +190,6 @@ def _measured(a, b, labels, excluded, samples, device):
 
 
 def _distances(x, triangles, y, others, samples, device):
-    """Returns the four numbers of all and of inner points of (x, triangles), and the share of the area of the latter."""
     faces, weights, areas = surface_samples(x, triangles, samples)
     points = np.concatenate([np.einsum("kc,kci->ki", weights, x[triangles[faces]]), x])
     areas = np.concatenate([areas, np.zeros(len(x))])  # vertices count for the largest distance alone
@@ -206,7 +200,6 @@ def _distances(x, triangles, y, others, samples, device):
 
 
 def _numbers(distances, areas):
-    """Returns mean, RMS, percentile and largest of distances (k,) with areas (k,); NaN without area."""
     if not areas.sum() > 0.0:
         return np.full(4, np.nan)
     shares = areas / areas.sum()

@@ -1,4 +1,4 @@
-"""Measures one frame against another on a device: the triangles of a mesh, or the neighbourhood of each vertex."""
+"""Measures one frame against another on a device: triangles, or neighbourhoods of vertices."""
 
 import numpy as np
 import warp as wp
@@ -18,10 +18,10 @@ RATES = {"midpoint": rates.MIDPOINT, "forward": rates.FORWARD, "logarithm": rate
 
 
 class _Elements:
-    """The base class of triangles and neighbourhoods: results, which are allocated once, and rates between gradients.
+    """Results, which are allocated once, and rates between gradients.
 
     Attributes:
-        values: Results (E, *shape) by name of measure, overwritten by each call.
+        values: Results (E, *shape) by measure, overwritten by each call.
     """
 
     def __init__(self, count, measures, device, dtype):
@@ -42,7 +42,7 @@ class _Elements:
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy), dtype=kind, device=self.device)
 
     def centred(self, points):
-        """Returns points (n, 3) on the device; in float32 relative to one of them, to keep digits far from the origin."""
+        """Returns points (n, 3) on the device; in float32 relative to one of them."""
         if self.numpy is np.float32:
             finite = np.isfinite(points).all(axis=1)
             points = points - points[finite.argmax()] if finite.any() else points
@@ -50,12 +50,11 @@ class _Elements:
 
     @in_turn
     def launch(self, kernel, inputs, outputs, count=None):
-        """Launches a kernel; outputs are arrays, or names of measures, which are left out if they are not chosen."""
+        """Launches a kernel; outputs are arrays, or measures, which may not be chosen."""
         outputs = [self.results.get(out) if isinstance(out, str) else out for out in outputs]
         wp.launch(kernel, self.count if count is None else count, inputs=inputs, outputs=outputs, device=self.device)
 
     def chosen(self, struct):
-        """Returns a struct of measures with the arrays of the chosen results."""
         found = struct()
         for name in struct.vars:
             if name in self.results:
@@ -66,14 +65,13 @@ class _Elements:
         return any(name in self.results for name in names)
 
     def rates(self, dt, method, rounding):
-        """Computes rates from the gradients ``before`` and ``gradients``, dt [s] later, of points with ``rounding`` [m]."""
+        """Computes rates from ``before`` to ``gradients``, dt [s] later, of points with ``rounding`` [m]."""
         inputs = [self.materials, self.sizes, self.before, self.gradients]
         inputs += [self.scalar(dt), int(RATES[method]), self.scalar(rounding)]
         self.launch(rates.measure_rates(self.scalar), inputs, [self.chosen(rates.rate_measures(self.scalar))])
 
     @in_turn
     def read(self):
-        """Returns the results by name, NumPy arrays (E, *shape)."""
         return {name: found.numpy() for name, found in self.results.items()}
 
     def _kind(self, shape):
@@ -89,13 +87,7 @@ class Triangles(_Elements):
         without: Why a triangle may have no reference.
 
     Args:
-        mesh: A mesh of triangles.
-        measures: List of :class:`warpcloth.analysis.measures.Measure`.
-        directions: Edge coefficients of two material directions in columns (T, 2, 2), or None; see
-            :func:`material_directions`.
-        material: A membrane term, or None.
-        device: A Warp device.
-        dtype: "float32" or "float64".
+        directions: Columns of :func:`material_directions` (T, 2, 2), or None.
     """
 
     without = "has no area"
@@ -115,7 +107,7 @@ class Triangles(_Elements):
             self.rest = self.upload(elements.rest, wp.types.vector(self.term.parameters, self.scalar))
 
     def refer(self, X, rounding):
-        """Sets the reference X (n, 3), with ``rounding`` [m]; returns which triangles have no reference in it, (T,)."""
+        """Sets the reference X (n, 3), with ``rounding`` [m]; returns which have none in it, (T,)."""
         outputs = (self.frames, self.inverse_edges, self.sizes)
         self.launch(deformation.frame_triangles(self.scalar), [self.triangles, self.centred(X), self.scalar(rounding)], outputs)
         if self.materials is not None:
@@ -144,7 +136,7 @@ class Triangles(_Elements):
         self.launch(deformation.triangle_gradients(self.scalar), inputs, [out])
 
     def touched(self, vertices):
-        """Returns which triangles have one of the vertices (n,) bool, (T,) bool."""
+        """Returns which triangles (T,) have one of the vertices (n,)."""
         return vertices[self.triangles.numpy()].any(axis=1)
 
 
@@ -155,11 +147,7 @@ class Neighbourhoods(_Elements):
         without: Why a vertex may have no reference.
 
     Args:
-        mesh: A mesh of triangles.
-        measures: List of :class:`warpcloth.analysis.measures.Measure`.
-        neighbourhood: See :func:`warpcloth.analysis.neighbourhoods.neighbourhoods`.
-        device: A Warp device.
-        dtype: "float32" or "float64".
+        neighbourhood: As of :func:`warpcloth.analysis.neighbourhoods.neighbourhoods`.
     """
 
     without = "is in no triangle with area, or its neighbours lie on a line"
@@ -182,7 +170,7 @@ class Neighbourhoods(_Elements):
         self.sizes = self.upload(np.sqrt(mesh.vertex_areas), self.scalar)
 
     def refer(self, X, rounding):
-        """Sets the reference X (n, 3), with ``rounding`` [m]; returns which vertices have no reference in it, (n,)."""
+        """Sets the reference X (n, 3), with ``rounding`` [m]; returns which have none in it, (n,)."""
         self.X, self.rounding = self.centred(X), self.scalar(rounding)
         self._find_normals(self.X, self.reference_normals)
         self._fit(X, [self.gradients, self.frames, None, None, None])
@@ -202,7 +190,7 @@ class Neighbourhoods(_Elements):
             self.launch(neighbourhood_fit.measure_neighbourhoods(self.scalar), inputs, [self.chosen(outputs)])
 
     def touched(self, vertices):
-        """Returns which neighbourhoods have one of the vertices (n,) bool, (n,) bool."""
+        """Returns which neighbourhoods (n,) have one of the vertices (n,)."""
         offsets, members = self.host
         return np.bincount(np.repeat(np.arange(self.count), np.diff(offsets)), vertices[members], self.count) > 0.0
 
@@ -219,19 +207,13 @@ class Neighbourhoods(_Elements):
 
 
 def material_directions(mesh, chosen):
-    """Returns two material directions of each triangle, as coefficients α of its edges: α₁(X₁ − X₀) + α₂(X₂ − X₀).
+    """Returns two material directions of each triangle as coefficients α of α₁(X₁ − X₀) + α₂(X₂ − X₀), (T, 2, 2), in columns.
 
-    Args:
-        mesh: A mesh of triangles.
-        chosen: "st", the directions along which one texture coordinate grows and the other is constant; or a vector (3,), whose
-            component in the plane of each triangle at rest is the first direction, with the second perpendicular to it.
-
-    Returns:
-        np.ndarray: (T, 2, 2), warp and weft in columns; NaN if the texture is degenerate or the vector is perpendicular to the
-        triangle.
+    They are those along which one texture coordinate grows and the other is constant, for "st", or a vector (3,), projected to
+    the triangle at rest, and the perpendicular; NaN if undefined.
 
     Raises:
-        ValueError: ``chosen`` is none of these, the mesh has no texture coordinates, or no triangle has directions.
+        ValueError: ``chosen`` is neither, there are no texture coordinates, or no triangle has directions.
     """
     rule = 'be "st" or a vector (3,)'
     X = mesh.points[mesh.triangles]
@@ -269,7 +251,7 @@ def material_directions(mesh, chosen):
 
 
 def check_material(material):
-    """Raises ValueError if ``material`` is neither None nor a membrane."""
+    """Raises ValueError unless ``material`` is None or a membrane."""
     if not isinstance(material, Membrane):
         names = ", ".join(name for name, kind in TERMS.items() if issubclass(kind, Membrane))
         raise ValueError(

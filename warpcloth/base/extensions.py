@@ -1,7 +1,7 @@
 """Extensions: modules outside this package that register energies and solvers, loaded by entry point, name or file.
 
 On import, a module calls :func:`warpcloth.terms.register` or :func:`warpcloth.solvers.register`. Its code is part of the hash
-under which measurements are kept, and is sent to other processes and machines that measure.
+under which measurements are kept, and other processes that measure load it.
 """
 
 import importlib
@@ -52,7 +52,7 @@ def load_extension(name):
 
 
 def load_only(names):
-    """Imports modules and forgets extensions loaded before: a worker of a cluster measures for several clients."""
+    """Imports modules and forgets extensions loaded before, because a process may measure for several others in turn."""
     _names.clear()
     for name in names:
         load_extension(name)

@@ -11,7 +11,6 @@ from functools import cache
 import numpy as np
 
 from .checks import did_you_mean, number
-from .renamed import new_name
 
 WORDS = {bool: "true or false", int: "a whole number", float: "a number, or a fraction such as 1/240", str: "a text"}
 _TRUTH = dict.fromkeys(("true", "yes", "on", "1"), True) | dict.fromkeys(("false", "no", "off", "0"), False)
@@ -83,7 +82,6 @@ def options(record, texts):
     """
     hints = typing.get_type_hints(record)
     kinds = {field.name: hints[field.name] for field in fields(record)}
-    texts = {new_name(record, name, stacklevel=1): text for name, text in texts.items()}
     for name in texts:
         if name not in kinds:
             raise ValueError(f"{record.__name__} has no option {name!r}; {allowed(kinds, name)}")

@@ -1,7 +1,6 @@
-"""Plots of measured cloth and of solvers, with matplotlib, the extra "chart".
+"""Plots of measured cloth and of solvers, with the extra "chart".
 
-Each function that plots writes a .png, .svg or .pdf file. It raises ``FileNotFoundError`` if the folder does not exist,
-``ImportError`` if matplotlib is not installed, and ``ValueError`` if the path has another ending.
+Paths end with .png, .svg or .pdf; functions raise what :func:`warpcloth.picture.figures.check_path` does.
 """
 
 from ..picture.colour import Scale, range_over

@@ -1,4 +1,4 @@
-"""Draws maps of the cheapest solver: a cell for each pair of values, in the colour of the solver."""
+"""Draws maps of the cheapest solver for pairs of values."""
 
 import textwrap
 
@@ -12,11 +12,11 @@ _FADED, _BAR = 0.25, 0.035  # opacity of the colour of a solver behind texts, an
 
 
 def plot_cheapest(path, found):
-    """Draws a cell for each pair of values, with the first value of y in the lowest row.
+    """Draws a cell for each pair of values, the first value of y lowest.
 
-    A cell has the colour and the marker of the cheapest solver. It shows its settings, the time of a frame, its error, the
-    second best with its ratio of times, and the error of the reference. Cells without an accurate setting are hatched and say
-    why. "not usable" is the grade of a run. A question mark after the time means that the search was not complete.
+    A cell has the cheapest solver's colour, marker and settings, the time of a frame, its error, the second best by ratio of
+    times, and the error of the reference. Cells without an accurate setting are hatched and say why; "not usable" is the grade
+    of a run. A question mark is an incomplete search.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -57,7 +57,7 @@ def plot_cheapest(path, found):
 
 
 def text_of_cell(cell):
-    """Returns the lines of text of a cell."""
+    """Returns the lines of a cell."""
     if cell["status"] != "found":
         return textwrap.wrap(cell["reason"], _CHARACTERS)
     second = cell["second"]

@@ -1,4 +1,4 @@
-"""The physics diagram: errors to closed forms against mesh size and cost."""
+"""The physics diagram: errors to closed forms by mesh size and cost."""
 
 import math
 
@@ -7,10 +7,10 @@ from .style import LABEL, LEGEND, SMALL, drawn, dress, series_style, small_print
 
 
 def plot_physics(path, results, facts=None):
-    """Plots the error against h and against the time, with two panels for each case, pattern and angle.
+    """Plots the error over h and over time, two panels for each case, pattern and angle.
 
-    Dashed lines show the effect of the free sides of a cantilever, which no mesh can avoid, and the accuracy of the equilibria,
-    below which errors mean nothing; if that is below the picture, it is written. Points that failed are named beside it.
+    Dashed lines are the effect of a cantilever's free sides and the accuracy of equilibria, below which errors mean nothing.
+    Points that failed are named.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -51,7 +51,6 @@ def plot_physics(path, results, facts=None):
 
 
 def _floor(left, right, floors):
-    """Draws a line at the largest of the floors, but errors alone set the range of the picture."""
     if not floors:
         return
     (low, high), floor = left.get_ylim(), max(floors)
@@ -89,7 +88,6 @@ def _title(arguments):
 
 
 def _label(arguments):
-    """Returns the settings of a line that are not in the title."""
     words = [] if arguments["case"] in ("chain", "catenary", "patch") else [arguments.get("bending", "quadratic")]
     if arguments["case"] == "cantilever":
         words.append(f"Γ = {arguments.get('gamma', 1.0):g}")

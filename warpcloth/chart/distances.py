@@ -11,14 +11,7 @@ _FAR = 30.0  # from a line to its name [pt]; beyond, a legend is easier to read
 
 
 def plot_distances(path, found, names, device="cpu"):
-    """Plots the distances of two animations over time and, if they have the same triangles, differences of stretches below.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: The :class:`warpcloth.Comparison`.
-        names: Names of the two files.
-        device: The Warp device that compared them.
-    """
+    """Plots the distances of a :class:`warpcloth.Comparison` over time, and below differences of stretches, if any."""
     if not found.same_topology:
         lines = {"RMS from A": found.surface_rms[:, 0], "RMS from B": found.surface_rms[:, 1], "Hausdorff": found.hausdorff}
         _plot(path, found, names, device, {_DISTANCE: lines}, 3.2)
@@ -30,13 +23,8 @@ def plot_distances(path, found, names, device="cpu"):
 
 
 def plot_surface_distances(path, found, names, device="cpu"):
-    """Plots the RMS distances of two surfaces over time from each, of all points and of inner ones, and the 95 % of the latter.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: The :class:`warpcloth.SurfaceComparison`.
-        names: Names of the two files.
-        device: The Warp device that compared them.
+    """Plots RMS distances of a :class:`warpcloth.SurfaceComparison` over time from each, of all and of inner points, and the 95
+    % of the latter.
     """
     lines = {f"RMS from {of}": found.all.rms[:, k] for k, of in enumerate("AB")}
     lines |= {f"RMS from {of} without holes": found.inner.rms[:, k] for k, of in enumerate("AB")}
@@ -62,7 +50,6 @@ def _plot(path, found, names, device, panels, height, named=True):
 
 
 def _draw(axes, times, lines):
-    """Draws values over time; returns (x, y, label, colour) of the last value of each line."""
     ends = []
     for k, (label, values) in enumerate(lines.items()):
         style = series_style(k)

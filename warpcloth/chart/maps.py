@@ -1,4 +1,4 @@
-"""Draws maps of stability, a panel for each method with its theoretical limits, and writes them as a table."""
+"""Draws maps of stability, a panel for each method, and writes them as a table."""
 
 import math
 
@@ -41,15 +41,10 @@ _TICKS = 4
 
 
 def plot_maps(path, survey, cells, accuracy=None, facts=None):
-    """Draws the verdict of each cell, a panel for each method, with lines where limits of
-    :mod:`warpcloth.lab.stability_limits` are 1.
+    """Draws the verdict of each cell of :meth:`warpcloth.lab.stability.Survey.table`, (setup, y, x), a panel for each method.
 
-    Args:
-        path: The file, .png, .svg or .pdf.
-        survey: The :class:`warpcloth.lab.stability.Survey`.
-        cells: (setup, y, x), from :meth:`warpcloth.lab.stability.Survey.table`.
-        accuracy: The error above which cells are inaccurate, for the legend, or None.
-        facts: The machine, as of :func:`warpcloth.lab.machine.machine`; None for this one.
+    Lines are where :mod:`warpcloth.lab.stability_limits` are 1; ``accuracy`` is the error above which cells are inaccurate, or
+    None.
     """
     count = len(survey.setups)
     columns = min(count, 4)
@@ -82,12 +77,10 @@ def plot_maps(path, survey, cells, accuracy=None, facts=None):
 
 
 def _coordinates(name, values):
-    """Returns the coordinates of values along an axis."""
     return np.log10(values) if AXES[name].logarithmic else np.asarray(values, dtype=np.float64)
 
 
 def _ticks(name, values, at):
-    """Returns the ticks of an axis and their labels: powers of ten if there are some, else a few of the values."""
     if AXES[name].logarithmic and at[-1] - at[0] >= 1.0:
         powers = np.arange(math.ceil(at[0] - 1e-6), at[-1] + 1e-6)
         powers = powers[:: math.ceil(len(powers) / _TICKS)]
@@ -105,7 +98,6 @@ def edges(at):
 
 
 def _colours(rows):
-    """Returns the sRGB colours of cells (y, x, 3)."""
     return np.array([[_colour(cell) for cell in row] for row in rows])
 
 
@@ -117,7 +109,6 @@ def _colour(cell):
 
 
 def _hatch(axes, coordinates, rows):
-    """Hatches the cells that are stable or inaccurate, in the colours of both."""
     from matplotlib.patches import Rectangle
 
     across, up = map(edges, coordinates)
@@ -128,7 +119,6 @@ def _hatch(axes, coordinates, rows):
 
 
 def _line(axes, coordinates, rows, name, style):
-    """Draws the line between cells where a limit is 1; returns whether there is one."""
     ratios = np.array([[cell["rules"].get(name) or np.nan for cell in row] for row in rows], dtype=float)
     if min(ratios.shape) < 2:
         return False
@@ -166,8 +156,8 @@ def _legend(figure, shown, verdicts, accuracy):
 def write_csv(path, survey, cells):
     """Writes a line for each cell of the maps.
 
-    Its columns are method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules and reason, and
-    last the machine, if known.
+    Columns: method, axes, verdict, step of divergence, steps of the run, growth, error, floor, rules, reason, and the machine,
+    if known.
 
     Raises:
         FileNotFoundError: The folder does not exist.

@@ -1,4 +1,4 @@
-"""Draws maps in charts of failures: cells coloured by value or by series, with laws as lines."""
+"""Draws maps in charts of failures: cells by value or series, laws as lines."""
 
 import numpy as np
 
@@ -12,16 +12,8 @@ _REFUSED = {"facecolor": "white", "edgecolor": "0.8", "hatch": "////"}
 
 
 def draw_map(axes, panel, rows, lines):
-    """Draws the cells and laws of a :class:`warpcloth.lab.panels.Map`.
-
-    Args:
-        axes: Axes of matplotlib.
-        panel: The map.
-        rows: Its points.
-        lines: Line styles by label of the law, shared by all maps of a figure.
-
-    Returns:
-        The cells, for a colour bar; None if they are coloured by series.
+    """Draws the cells and laws of a :class:`warpcloth.lab.panels.Map`; returns cells for a colour bar, or None if coloured by
+    series.
     """
     xs, ys = (sorted({row[name] for row in rows}) for name in "xy")
     values, crossed = np.full((len(ys), len(xs)), np.nan), []
@@ -56,13 +48,7 @@ def _edges(values, scale):
 
 
 def add_keys(figure, maps, lines):
-    """Adds colour bars to a figure, one for all maps with the same colours, and a legend of lines, kinds and crosses.
-
-    Args:
-        figure: Figure of matplotlib.
-        maps: (axes, panel, cells) of each map, with the cells of :func:`draw_map`.
-        lines: Line styles by label.
-    """
+    """Adds colour bars, one for maps (axes, panel, cells) of the same colours, and a legend of lines, kinds and crosses."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -1,4 +1,4 @@
-"""Draws panels of measured points with laws as lines, for charts of failures."""
+"""Draws measured points with laws as lines, for charts of failures."""
 
 import math
 
@@ -27,15 +27,7 @@ _FAR = 16.0  # from a line to its name [pt]; beyond, a legend is easier to read
 
 
 def plot_panels(path, panels, rows, title, facts):
-    """Draws points as markers or cells, and laws as lines.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        panels: :class:`warpcloth.lab.panels.Panel` records.
-        rows: Points, see :func:`warpcloth.lab.panels.point`.
-        title: Title of the figure.
-        facts: The machine, as of :func:`warpcloth.lab.machine.machine`.
-    """
+    """Draws :class:`warpcloth.lab.panels.Panel` records: points as markers or cells, and laws as lines."""
     across = 4 if len(panels) > 9 else 2 if len(panels) == 4 else min(len(panels), 3)
     down = math.ceil(len(panels) / across)
     width, height = (3.8, 3.2) if any(isinstance(panel, Map) for panel in panels) else (5.0, 4.1)
@@ -63,7 +55,6 @@ def plot_panels(path, panels, rows, title, facts):
 
 
 def _draw(axes, panel, rows):
-    """Draws points and laws; returns (x, y, label, colour) of the end of each line."""
     from matplotlib.ticker import LogLocator
 
     axes.set(xscale=panel.scales[0], yscale=panel.scales[1])
@@ -102,5 +93,4 @@ def _draw(axes, panel, rows):
 
 
 def _between(low, high, scale):
-    """Returns points of a line, equidistant on the axis."""
     return np.geomspace(low, high, 400) if scale == "log" else np.linspace(low, high, 721)

@@ -1,4 +1,4 @@
-"""Draws speed against accuracy: settings with their Pareto front, and the convergence of methods."""
+"""Draws speed against accuracy with the Pareto front, and the convergence of methods."""
 
 import textwrap
 from contextlib import contextmanager
@@ -20,13 +20,12 @@ _ERRORS = {
 
 
 def plot_time(path, found):
-    """Draws the error of each setting over its time, with the scatter of the times, and names each line at its end.
+    """Draws the error of each setting over its time, with the scatter of times, and names each line.
 
-    Two panels show the error of positions and the 99th percentile of the error of strains. In each panel the settings that no
-    other beats by more than the spread of times are joined and numbered, with their names beside the panel. Settings without an
-    error are named with the reason. Runs that are not usable are crossed. The error of the reference solution is a line; points
-    below it mean nothing. For solvers of other simulators, dots show the error relative to the motion to which the solver
-    itself converges.
+    Panels show errors of positions and the 99th percentile of errors of strains. Settings that no other beats beyond the spread
+    are joined, numbered and named. Settings without an error are named with the reason; runs that are not usable are crossed. A
+    line is the error of the reference, below which points mean nothing. For other simulators, dots are errors relative to the
+    motion to which they converge.
 
     Args:
         path: The file, .png, .svg or .pdf.
@@ -79,12 +78,7 @@ def plot_time(path, found):
 
 
 def plot_solver(path, found):
-    """Draws the gap of the objective within a step over iterations and over time, down to the rounding of float64.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: As :func:`warpcloth.lab.work_precision.solver_diagram` returns it.
-    """
+    """Draws the gap of a step's objective, of :func:`warpcloth.lab.work_precision.solver_diagram`, over iterations and time."""
     texts = _missing("ended early:", found)
     step = f"a step of 1/{found['rate']:g} s after {found['frame']} frames"
     with _panels(path, found, f"{found['scene']}, {step}, {found['dtype']}", texts) as (panels, _ends):
@@ -106,12 +100,7 @@ def plot_solver(path, found):
 
 
 def plot_spectrum(path, found):
-    """Draws μ over its rank, and beside it measured errors on lines predicted by the spectrum, down to their rounding.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: As :func:`warpcloth.lab.work_precision.spectrum_diagram` returns it.
-    """
+    """Draws μ over its rank, and measured errors on lines predicted by the spectrum."""
     texts = _missing("not drawn:", found)
     title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
     with _panels(path, found, title, texts) as (panels, _ends):
@@ -137,12 +126,10 @@ def _doubt(row):
 
 
 def _floor(axes, value, label, colour=GREY):
-    """Draws a line below which errors mean nothing."""
     axes.axhline(value, color=colour, linestyle="--", linewidth=0.8, label=label)
 
 
 def _missing(head, found):
-    """Returns lines of text that name settings without a point, with the reason."""
     lines = [line for each in without_point(found) for line in textwrap.wrap(": ".join(each), _WIDTH, subsequent_indent="  ")]
     return ["", head, *lines] if lines else []
 

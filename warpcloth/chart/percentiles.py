@@ -15,16 +15,16 @@ _NOTE = {"ha": "right", "fontsize": SMALL, "color": GREY, "bbox": {"facecolor": 
 
 
 def plot_percentiles(path, summaries, along="time", neutrals=None, device="cpu"):
-    """Plots each scalar in a panel: its median, bands from 25 to 75, 5 to 95 and 1 to 99 %, and its extremes as thin lines.
+    """Plots each scalar in a panel: median, bands from 25 to 75, 5 to 95 and 1 to 99 %, and extremes.
 
-    Rows without values leave gaps. Extremes far outside the bands leave the panel, which then gives their values.
+    Rows without values leave gaps; extremes far outside the bands are given as numbers.
 
     Args:
         path: The file, .png, .svg or .pdf.
-        summaries: Summaries in the order of the rows, each with ``name``, ``unit``, ``time`` [s], ``frame`` and
-            ``percentiles``: of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %.
+        summaries: Summaries by row, with ``name``, ``unit``, ``time`` [s], ``frame`` and ``percentiles`` of 0, 1, 5, 25, 50,
+            75, 95, 99 and 100 %.
         along: "time" or "frame".
-        neutrals: Values of an undeformed element by name, drawn as a line; None for no line.
+        neutrals: Undeformed values by name, or None.
         device: The Warp device that measured them.
 
     Raises:
@@ -58,7 +58,6 @@ def plot_percentiles(path, summaries, along="time", neutrals=None, device="cpu")
 
 
 def _panel(axes, at, percentiles, neutral):
-    """Plots one scalar: percentiles (F, 9) over ``at`` (F,)."""
     _frame(axes, percentiles, neutral)
     percentiles = np.where(np.isfinite(percentiles), percentiles, np.nan)
     alone = _alone(~np.isnan(percentiles[:, _MEDIAN]))
@@ -76,13 +75,12 @@ def _panel(axes, at, percentiles, neutral):
 
 
 def _alone(known):
-    """Returns which rows have no neighbour with values, so that neither lines nor bands show them."""
     padded = np.pad(known, 1)
     return known & ~padded[:-2] & ~padded[2:]
 
 
 def _frame(axes, percentiles, neutral):
-    """Limits the panel to the bands and as much again on either side, and labels extremes beyond that with their values."""
+    """Limits the panel to the bands and as much on either side, and labels extremes beyond."""
     known = percentiles[~np.isnan(percentiles)]
     finite = known[np.isfinite(known)]
     if not len(finite):

@@ -7,14 +7,7 @@ from .style import drawn, dress, headline, name_ends, series_style, small_print
 
 
 def plot_residuals(path, found, fps, device="cpu"):
-    """Plots the RMS residual of each frame of a fit over time.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: The :class:`warpcloth.Fit`.
-        fps: Frames per second of the scene.
-        device: The Warp device of the fit.
-    """
+    """Plots the RMS residual of each frame of a :class:`warpcloth.Fit`."""
     with drawn(path, 7.0, 3.2) as figure:
         axes = figure.subplots()
         times, style = np.arange(1, len(found.residuals) + 1) / fps, series_style(1)

@@ -1,7 +1,7 @@
-"""The look of all charts: colours and markers by solver, sizes of letters, grids, names at the ends of lines, and small print.
+"""The look of all charts: colours and markers by solver, letters, grids, names at the ends of lines, small print.
 
-Colours of any two solvers differ by 24 or more in CIELAB, and so do the colours that people without red or green cones see, as
-simulated by Machado, Oliveira and Fernandes (2009). No two solvers have the same marker.
+Colours of two solvers differ by 24 or more in CIELAB, also without red or green cones (Machado, Oliveira and Fernandes 2009);
+markers differ too.
 """
 
 import math
@@ -40,12 +40,12 @@ _COVERED = 2.0  # distance that a name goes to cover one point less of other lin
 
 @dataclass(frozen=True)
 class Style:
-    """The colour and marker of a solver, or of a series of points that belongs to none.
+    """Colour and marker of a solver, or of another series.
 
     Attributes:
-        colour: Colour as matplotlib takes it.
-        marker: Marker as matplotlib takes it.
-        hollow: Whether markers are drawn as outlines: those of other simulators are.
+        colour: As matplotlib takes it.
+        marker: As matplotlib takes it.
+        hollow: Whether markers are outlines, for other simulators.
     """
 
     colour: str
@@ -59,10 +59,10 @@ class Style:
 
 
 def style_of(solver):
-    """Returns the :class:`Style` of a solver by its name, the same in all charts.
+    """Returns the :class:`Style` of a solver by its name.
 
-    Included solvers have the first colours, in the order of the catalogue. Registered ones have the next, in the order of their
-    names. Solvers of other simulators are grey, with hollow markers.
+    Included solvers have the first colours in the order of the catalogue, registered ones the next by name, those of other
+    simulators greys and hollow markers.
     """
     if solver in (others := list(other_solvers())):
         k = others.index(solver)
@@ -72,29 +72,28 @@ def style_of(solver):
 
 
 def series_style(k):
-    """Returns the :class:`Style` of series k of those that belong to no solver, of which neighbours have different hues."""
+    """Returns the :class:`Style` of series k without a solver; neighbours differ in hue."""
     return _style(_SERIES[k % len(COLOURS)] + k // len(COLOURS) * len(COLOURS))
 
 
 def _style(k):
-    """Returns the :class:`Style` k; all with k < 144 differ."""
     return Style(COLOURS[k % len(COLOURS)], MARKERS[(k + k // len(COLOURS)) % len(MARKERS)])
 
 
 def solver_in(label):
-    """Returns the name of the solver with which a label begins, as of "xpbd" in "xpbd, filter", or None."""
+    """Returns the solver with which a label begins, or None."""
     shown = {name: shown_name(name) for name in (*other_solvers(), *SOLVERS)}
     return next((name for name, text in shown.items() if label == text or label.startswith((f"{text} ", f"{text},"))), None)
 
 
 def title_style(label):
-    """Returns arguments of ``Axes.set_title``, with the colour of the solver with which a title begins."""
+    """Returns arguments of ``Axes.set_title`` in the colour of the solver that begins a title."""
     solver = solver_in(label)
     return {"fontsize": LABEL, "color": readable(style_of(solver).colour) if solver else GREY, "parse_math": False}
 
 
 def readable(colour):
-    """Returns a colour for letters: the given one, or a darker one if that is light."""
+    """Returns a colour for letters, darker if it is light."""
     from matplotlib.colors import to_rgb
 
     rgb = np.array(to_rgb(colour))
@@ -102,7 +101,7 @@ def readable(colour):
 
 
 def dress(axes, grid=True):
-    """Gives a panel its spines, ticks, letters and grid; called last, when its labels are known."""
+    """Gives a panel spines, ticks, letters and grid; called last."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("0.7")
     axes.tick_params(which="both", colors=GREY, labelsize=TICK)
@@ -115,17 +114,10 @@ def dress(axes, grid=True):
 
 @contextmanager
 def drawn(path, width, height):
-    """Yields an empty figure with a constrained layout, and writes it when the block ends.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        width: Width of the figure [in].
-        height: Height of the figure [in].
+    """Yields an empty figure of a size [in] with a constrained layout, and writes it when the block ends.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: The path has another ending.
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     check_path(path, PICTURES)
     from matplotlib.figure import Figure
@@ -141,13 +133,8 @@ def headline(figure, text):
 
 
 def small_print(figure, facts=None, device="cpu", others=()):
-    """Writes versions and the machine below a figure.
-
-    Args:
-        figure: Figure of matplotlib with a constrained layout.
-        facts: The machine of measurements, as of :func:`warpcloth.lab.machine.machine`; None for this one.
-        device: The Warp device, if ``facts`` is None.
-        others: Names of other simulators in the chart.
+    """Writes versions and the machine below a figure with a constrained layout: that of ``facts``, or this one and its Warp
+    device.
     """
     text = in_words(machine(device) if facts is None else facts, others)
     low = _bottom(figure)
@@ -159,38 +146,28 @@ def small_print(figure, facts=None, device="cpu", others=()):
 
 
 def add_legend(figure, handles, columns):
-    """Adds a legend below all panels of a figure, above its small print."""
+    """Adds a legend between the panels and the small print."""
     low = _bottom(figure)
     at = {"loc": "outside lower center", "bbox_to_anchor": (0.0, low, 1.0, 1.0 - low)}
     figure.legend(handles=handles, ncols=columns, **at, **LEGEND)
 
 
 def _bottom(figure):
-    """Returns the height of the small print, as a part of that of a figure."""
     return 2.0 * PRINT / 72.0 / figure.get_size_inches()[1]
 
 
 def name_ends(figure, axes, ends, far=math.inf):
-    """Writes the name of each line beside its end, in its colour, near to it, without overlaps and inside the panel.
+    """Writes the name of each line (x, y, text, colour) beside its end, in its colour, inside the panel, which is widened.
 
-    Names cover no other text and as little of the lines as possible. The panel is made wider for them.
-
-    Args:
-        figure: Figure of the axes, which are otherwise finished.
-        axes: A panel.
-        ends: (x, y, text, colour) of each line.
-        far: The largest distance between the height of a name and of the end of its line [pt].
-
-    Returns:
-        Whether the names are legible. If a name would be farther away, would cover another line, or needs more than 40 % of
-        the width, none is written; then the chart needs a legend.
+    Names cover no text and little of the lines, within ``far`` [pt] in height. Returns whether they are legible; else (too far,
+    over another line, above 40 % of the width) none is written, and the chart needs a legend.
     """
     (legible,) = name_all_ends(figure, [(axes, ends)], far)
     return legible
 
 
 def name_all_ends(figure, panels, far=math.inf):
-    """Does what :func:`name_ends` does for each of several panels (axes, ends) that share no axis, and lays them out once."""
+    """:func:`name_ends` for several panels (axes, ends) without common axes."""
     if not panels:
         return []
     figure.draw_without_rendering()  # so that sizes are known
@@ -212,12 +189,7 @@ def name_all_ends(figure, panels, far=math.inf):
 
 
 def _begin_names(figure, axes, ends, far):
-    """Writes names at the ends of lines, and makes the panel wider if they can be legible.
-
-    Returns:
-        The limits of x before; the other texts of the panel; the names; their widths and heights [pt]; whether they can be
-        legible.
-    """
+    """Writes names at the ends of lines, and widens the panel if they can be legible."""
     from matplotlib.patheffects import withStroke
 
     before, others = axes.get_xlim(), list(axes.texts)
@@ -239,7 +211,7 @@ def _begin_names(figure, axes, ends, far):
 
 
 def _widen(axes, share):
-    """Adds room for names right of the lines, a share of the new width. The axis and its ticks end where they ended before."""
+    """Adds room right of the lines, a share of the new width, without axis."""
     low, high = axes.get_xlim()
     more = share / (1.0 - share)
     ticks = {minor: [tick for tick in axes.get_xticks(minor=minor) if low <= tick <= high] for minor in (False, True)}
@@ -250,7 +222,7 @@ def _widen(axes, share):
 
 
 def _drawn(axes):
-    """Returns points along all lines of a panel [pixels], (p, 2), about three pixels apart, and at markers several."""
+    """Returns points along all lines [pixels], (p, 2), about three pixels apart, several at markers."""
     parts = []
     for line in axes.lines:
         at = line.get_transform().transform(line.get_xydata())
@@ -264,15 +236,8 @@ def _drawn(axes):
 
 
 def _put(axes, note, size, drawn, taken, far):
-    """Moves a name to its best position; returns whether it is legible there.
-
-    Args:
-        axes: The panel.
-        note: The name, an annotation.
-        size: Width and height of the name [pt].
-        drawn: Points of lines [pixels].
-        taken: Corners (low, high) of names that have a position [pixels]; that of this one is added.
-        far: See :func:`name_ends`.
+    """Moves a name to its best position, away from ``drawn`` points and ``taken`` boxes [pixels]; returns whether it is legible
+    there.
     """
     point = axes.figure.dpi / 72.0
     anchor, best = axes.transData.transform(note.xy), None

@@ -62,7 +62,6 @@ def main(argv=None):
 def _run(argv):
     with warnings.catch_warnings(), Interrupts() as interrupts:
         warnings.showwarning = warnings_once()
-        warnings.filterwarnings("default", category=DeprecationWarning, module=r"warpcloth\.")  # an option has another name now
         debug = False
         try:
             options.load_extensions(sys.argv[1:] if argv is None else argv)

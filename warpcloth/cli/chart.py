@@ -12,7 +12,7 @@ from ..run.listing import list_failures
 from . import stability
 from .options import HelpFormatter, add_cloth, add_import, add_scene, add_shared, add_with, solvers, values_of
 from .setup import named_scene, scene_ref
-from .terminal import add_dask, check_outputs, measuring
+from .terminal import check_outputs, measuring
 
 TEXT = "Draw charts of accuracy against time, of stability, and of failures."
 NOT_USABLE = ", not usable"
@@ -83,7 +83,6 @@ def add(charts, name, command, text, epilog):
     sub.set_defaults(command=command)
     add_shared(sub, "device")
     sub.add_argument("--workers", type=int, metavar="N", help="number of processes (default: one per core, or one on a GPU)")
-    add_dask(sub)
     sub.add_argument("-o", "--output", metavar="FILE", help=f"draw the chart ({', '.join(PICTURES)})")
     sub.add_argument("--csv", metavar="FILE", help="write the measurements as a table")
     add_shared(sub, "json", "debug")

@@ -7,7 +7,7 @@ from ..base.quiet import find_device
 from ..base.texts import assignments, fraction, json_text, milliseconds
 from .options import add_cloth, add_scene, add_shared, add_with, values_of
 from .setup import named_scene, scene_ref
-from .terminal import Interrupted, Settings, add_dask, executing
+from .terminal import Interrupted, Settings
 
 TEXT = "Choose the cheapest solver and settings for a scene."
 EPILOG = """\
@@ -34,7 +34,6 @@ def add_arguments(parser):
     add_with(parser)
     add("--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)")
     add("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
-    add_dask(parser)
     add_shared(parser, "device", "json", "dtype")
 
 
@@ -61,18 +60,16 @@ def choice_for(arguments, device):
     budget = None if arguments.budget is None else milliseconds("budget", arguments.budget)
     progress = Settings()
     try:
-        with executing(arguments) as executor:
-            choice, found, exact = choose(
-                scene_ref(arguments),
-                tolerance,
-                budget,
-                device=str(device),
-                progress=progress,
-                **values_of(arguments, "solvers", "frames", "dtype", "limit"),
-                others=getattr(arguments, "others", None) or (),
-                announce=_announce,
-                **executor,
-            )
+        choice, found, exact = choose(
+            scene_ref(arguments),
+            tolerance,
+            budget,
+            device=str(device),
+            progress=progress,
+            **values_of(arguments, "solvers", "frames", "dtype", "limit"),
+            others=getattr(arguments, "others", None) or (),
+            announce=_announce,
+        )
     except KeyboardInterrupt:
         raise Interrupted(
             "interrupted; the settings that are measured are kept, and the same command goes on from there"
@@ -103,7 +100,7 @@ def take_choice(arguments, device):
     for name, given in (("--solver", arguments.solver), ("-s", arguments.s)):
         if given:
             raise ValueError(f"{name} is given, and --tolerance or --budget chooses it; leave one out")
-    arguments.solvers, arguments.limit, arguments.dask = None, 60.0, None
+    arguments.solvers, arguments.limit = None, 60.0
     choice, _found, _exact, _values = choice_for(arguments, device)
     if not choice.meets:
         raise ValueError(f"nothing meets --tolerance and --budget: {choice.certainty}")

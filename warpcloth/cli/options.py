@@ -6,7 +6,6 @@ Completion parses source files, so that it need not load Warp. Only for the allo
 import argparse
 import contextlib
 import os
-import sys
 from dataclasses import fields
 from functools import partial
 
@@ -14,6 +13,7 @@ from ..base.extensions import load_extension, load_installed
 from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import WORDS, json_text, kinds_of_parameter, parameters_of, words_in, words_of
 from ..run.listing import folders, list_scenes, list_solvers
+from ..solvers import SOLVERS
 from .terminal import aligned
 
 _HELP = "help"
@@ -39,8 +39,6 @@ def show_help(arguments):
 
 
 def _of_solver(name):
-    from ..solvers import SOLVERS
-
     name = name or DEFAULT
     record = SOLVERS[name]
     known = {field.name: str(field.metadata["range"]) for field in fields(record) if "range" in field.metadata}
@@ -258,9 +256,9 @@ def _add_completers(parser, files):
 
 def solvers():
     """Returns a dict of solvers: by name a dict from options to the words that they take, or ()."""
-    found, loaded = dict(list_solvers()), sys.modules.get("warpcloth.solvers")
-    for name, record in loaded.SOLVERS.items() if loaded else ():  # includes extensions
-        found.setdefault(name, dict.fromkeys((field.name for field in fields(record)), ()) | words_of(record))
+    found = dict(list_solvers())
+    for record in [SOLVERS[name] for name in SOLVERS if name not in found]:  # those of extensions
+        found[record.name] = dict.fromkeys((field.name for field in fields(record)), ()) | words_of(record)
     return found
 
 

@@ -83,7 +83,7 @@ def chart(arguments):
     given = {"device": str(device), **values_of(arguments, "dtype", "limit", "accuracy")}
     tasks = survey.tasks(reference=arguments.accuracy > 0.0, **given)
     with measuring(arguments, device) as run:
-        store = kept_store("stability", run.get("executor"))
+        store = kept_store("stability")
         cells = survey.table(sweep(tasks, store=store, **run), store)
     if arguments.output or arguments.csv:
         from ..chart.maps import plot_maps, write_csv

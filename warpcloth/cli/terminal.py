@@ -109,42 +109,16 @@ class Bar:
             self.bar.close()
 
 
-def add_dask(parser):
-    """Adds the option that runs measurements on a cluster."""
-    text = "measure on a Dask cluster: the address of its scheduler, such as tcp://host:8786, or its scheduler file"
-    parser.add_argument("--dask", metavar="ADDRESS", help=text)
-
-
-@contextlib.contextmanager
-def executing(arguments):
-    """Yields keyword arguments of a sweep: the executor of a Dask cluster, or none for processes on this machine.
-
-    Raises:
-        ValueError: A number of processes is given with a cluster.
-    """
-    if arguments.dask is None:
-        yield {}
-        return
-    if getattr(arguments, "workers", None) is not None:
-        raise ValueError("--workers is of processes of this machine, and --dask of a cluster, which has its own; leave one out")
-    from ..lab.cluster import connect
-
-    with connect(arguments.dask) as cluster:
-        yield {"executor": cluster}
-
-
 @contextlib.contextmanager
 def measuring(arguments, device):
-    """Yields keyword arguments of a sweep: where it runs, on a GPU with one process, and its progress.
+    """Yields keyword arguments of a sweep: the number of processes, by default one on a GPU, and its progress.
 
     Raises:
         Interrupted: The user interrupts; the message says what is kept.
-        ValueError: A number of processes is given with a cluster.
     """
     progress = Settings()
     try:
-        with executing(arguments) as executor:
-            yield {"workers": arguments.workers or (1 if device.is_cuda else None), "progress": progress, **executor}
+        yield {"workers": arguments.workers or (1 if device.is_cuda else None), "progress": progress}
     except KeyboardInterrupt:
         raise Interrupted(progress.interrupted()) from None
     finally:
@@ -254,7 +228,7 @@ def warnings_once():
 
     def show(message, category, filename, lineno, file=None, line=None):
         text = printable(" ".join(str(message).split()))
-        if category in (UserWarning, DeprecationWarning) and text not in texts:
+        if category is UserWarning and text not in texts:
             texts.add(text)
             print("warpcloth: warning:", text, file=sys.stderr)
 

@@ -14,7 +14,7 @@ class Clearance:
     A step after one that came near also refreshes contact, which leaves anchors and half-spaces behind.
 
     Attributes:
-        near: 1 for copies in which a vertex may come near a collider in this step, else 0, (B,) int32.
+        near: 1 for copies in which a vertex may come near a collider in this step, (B,) int32.
     """
 
     def __init__(self, colliders, state):

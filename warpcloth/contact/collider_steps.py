@@ -43,15 +43,15 @@ def launch_anchors(kernel, colliders, anchors, x, model, elements):
 
 
 class ColliderSteps:
-    """The motion of colliders, and the anchors of friction and the filter of those that are not meshes, in one solver's steps.
+    """The motion of colliders in one solver's steps, and the friction and filter of those that are not meshes.
 
-    At the start of a step, a ``Refresh`` of the terms moves the colliders, stores positions, and sets the anchors of friction.
-    At its end, :meth:`launch_end` moves vertices out of colliders. Meshes have no terms, see :mod:`.self_steps`; without any,
-    the solver calls :meth:`launch_start` itself.
+    At the start of a step, a ``Refresh`` of the terms moves colliders, stores positions and sets anchors of friction. At its
+    end, :meth:`launch_end` moves vertices out of colliders. Meshes have no terms, see :mod:`.self_steps`; without any, the
+    solver calls :meth:`launch_start` itself.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model` of a scene with colliders.
-        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds arrays.
+        model: The model of a scene with colliders.
+        state: The state of the solver, to which arrays are added.
         h: Time step [s].
         steps_per_frame: Steps per frame.
         part: The time within a step at which forces are evaluated, from 0 to 1. It is 0 for explicit steps, whose contact is
@@ -61,14 +61,14 @@ class ColliderSteps:
         terms: The elements of the model. Those of contact have rest states of their own.
         x_before: Positions at the start of the step, (N,) [m].
         poses, shapes, filter, notes: Structs of :mod:`warpcloth.kernels.contact.colliders` and ``collider_filter``.
-        anchors: The anchors of friction, by the index of each collider with friction; rows of ``anchor_rows`` (C, N).
+        anchors: The anchors of friction by the index of each collider with friction; rows of ``anchor_rows`` (C, N).
         least: The smallest distance from a collider at which a vertex may end a step [m].
-        moved_by_terms: Whether the refresh of a term moves the colliders at the start of a step.
-        near: See :class:`warpcloth.contact.clearance.Clearance`; None if all steps refresh contact.
+        moved_by_terms: Whether the refresh of a term moves the colliders.
+        near: See :class:`.Clearance`; None if all steps refresh contact.
         steps: The number of steps so far, (B,) int32.
         correction: x − x̃ of steps with contact (N,) [m], None if explicit. ``he`` is their effective step [s].
-        pushed, kicked: What the filter changed in positions [m] and velocities [m/s] since both were last set to 0, (N,)
-            float64, after :meth:`note_pushes`.
+        pushed, kicked: What the filter changed in positions [m] and velocities [m/s] since both were last 0, (N,) float64,
+            after :meth:`note_pushes`.
     """
 
     def __init__(self, model, state, h, steps_per_frame, part):
@@ -119,7 +119,7 @@ class ColliderSteps:
         return [elements for elements in self.terms if elements.term.gap]
 
     def _bound(self, elements, c, state):
-        """Returns the elements of contact or friction with collider c, with rest states of their own."""
+        """Returns elements of contact or friction with collider c that have rest states of their own."""
         model, declared = self.model, self.model.colliders
         first = all(each.refresh is None or each.collider is None for each in self.terms)
         term = elements.term.bounded if self.bounded else elements.term
@@ -172,12 +172,12 @@ class ColliderSteps:
             self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
 
     def launch_start(self, x):
-        """Launches :meth:`launch_move` at the start of a step, and a copy of x (N,) to ``x_before``."""
+        """Launches :meth:`launch_move`, and a copy of x (N,) to ``x_before``."""
         self.launch_move()
         wp.copy(self.x_before, x)
 
     def launch_move(self):
-        """Launches the poses of colliders in a step, at its start."""
+        """Launches the poses of colliders in a step."""
         self.model.launch(self._move, self._dim, self._given, [self.poses])
 
     def launch_clear(self, terms, x):
@@ -188,7 +188,7 @@ class ColliderSteps:
                 self.model.launch(kernel, elements.count, [elements.stencil, elements.rest, x], [elements.clear])
 
     def launch_count(self):
-        """Launches an increment of the number of steps."""
+        """Launches an increment of ``steps``."""
         self.model.launch(self._count, self.model.copies, [], [self.steps])
 
     @property
@@ -240,7 +240,7 @@ class ColliderSteps:
         self._launch_filter(self.model.inverse_mass, x, v, None, self._unread)
 
     def launch_inside(self, x, v):
-        """Notes vertices that are inside colliders at the end of the step, and counts the step. It does not move them."""
+        """Notes vertices that end the step inside colliders, without moving them, and counts the step."""
         self._launch_filter(self._fixed, x, v, None, self.notes)
         self.launch_count()
 
@@ -265,6 +265,6 @@ class ColliderSteps:
         return found
 
     def start_again(self):
-        """Clears counts and anchors after the steps that an integrator makes to find its past state."""
+        """Clears counts and anchors."""
         for array in (self.steps, self.notes.cut, self.notes.inside, *self.anchors.values()):
             array.zero_()

@@ -20,14 +20,14 @@ def launch_mean(model, a, b, out):
 
 
 class ColliderWork:
-    """Sums the work of colliders but meshes over the steps of one stepper, from the forces that its steps used.
+    """Sums the work of colliders but meshes over steps, from the forces that the steps used.
 
     Args:
-        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the stepper.
+        colliders: The :class:`.ColliderSteps` of the stepper.
         terms: The elements as its steps take them.
         cuts: The :class:`FilterWork` of the stepper, which must be launched before.
         of_colliders, against_friction, of_filter: Sums per vertex, (N,) float64 [J].
-        hard: See :class:`warpcloth.contact.present.ColliderPulls`.
+        hard: See :class:`.ColliderPulls`.
     """
 
     def __init__(self, colliders, terms, cuts, of_colliders, against_friction, of_filter, hard=None):
@@ -82,9 +82,9 @@ class ColliderWork:
 
 
 class PairWork:
-    """Sums the work of meshes on cloth, and the work against friction of pairs, over the steps of one stepper.
+    """Sums the work of meshes on cloth, and the work against friction of pairs, over steps.
 
-    Work is ∂U/∂y times the travel of the meshes in a step, with y = Σ wᵢxᵢ of each pair where the step evaluates its forces.
+    Work is ∂U/∂y times the travel of the meshes in a step, with y = Σ wᵢxᵢ of each pair where the step evaluates forces.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
@@ -115,7 +115,7 @@ class PairWork:
                 pairs.launch_work(self.against_meshes, [friction])
 
     def _positions(self, x):
-        """Returns the positions at which the last step, which ended at x (N,), evaluated its forces [m]."""
+        """Returns the positions at which the last step, which ended at x (N,), evaluated forces [m]."""
         stepper, model, integrator = self._stepper, self._stepper.model, self._stepper.integrator
         if (integrator is not None and integrator.parts == 1) or not (self._moves or stepper.pairs.friction):
             return x
@@ -135,7 +135,7 @@ class PairWork:
 
 
 class FilterWork:
-    """Sums the energy that the collider filter adds to the cloth of one stepper, see :meth:`launch`.
+    """Sums the energy that the collider filter adds to the cloth, see :meth:`launch`.
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`, with contact.

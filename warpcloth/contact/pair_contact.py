@@ -4,7 +4,7 @@ import warp as wp
 
 from ..base.limits import refuse_memory
 from ..core.capture import Mirror
-from ..core.dynamic import DynamicElements
+from ..core.dynamic_elements import DynamicElements
 from ..core.filled import filled
 from ..kernels.block_rows import LANES
 from ..kernels.contact import pair_follow
@@ -23,17 +23,17 @@ class PairContact(DynamicElements):
     """Contact of cloth with itself: the potential of :mod:`warpcloth.kernels.contact.pair_potential`.
 
     Args:
-        surface: The :class:`warpcloth.contact.surface.ContactSurface`.
+        surface: The :class:`.ContactSurface`.
         bounded: Whether contact is that of explicit steps, without the logarithm.
         laws: :class:`warpcloth.kernels.contact.pair_potential.Laws`.
         listed: Whether there are listed pairs, (1,) int32.
 
     Attributes:
         obstacles: Positions (V,) [m] with the obstacles where forces are evaluated.
-        least: The least gap [m] of the filter if it keeps all pairs apart wherever forces are computed, otherwise 0.
+        least: The least gap [m] of a filter that keeps all pairs apart wherever forces are computed, otherwise 0.
         lists: The listed pairs.
         slots: Number of slots that the next :meth:`hold` allocates.
-        most: The largest number of contacts so far, including those that did not fit, :class:`.Mirror` of (1,) int32.
+        most: The largest number of contacts so far, including those that did not fit, a mirror of (1,) int32.
         turn: The number of sweeps of the step that count towards EVERY, (1,) int32.
     """
 

@@ -15,14 +15,11 @@ from .collider_steps import launch_anchors, launch_pose
 
 
 class PresentContact:
-    """The elements of a model for the current poses of colliders, and the anchors that the next step would use.
-
-    Those of a step may be at its middle or its start.
+    """The elements of a model for the current poses of colliders, and the anchors of the next step.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        parts: Tuples (:class:`warpcloth.contact.collider_steps.ColliderSteps`, first copy, last copy + 1), for all copies.
-            Empty for colliders at their start.
+        model: The model.
+        parts: Tuples (:class:`.ColliderSteps`, first copy, last copy + 1), for all copies; empty for colliders at their start.
 
     Attributes:
         terms: The elements of all terms; contact and friction have their own rest states.
@@ -82,14 +79,12 @@ class ColliderPulls:
 
     Args:
         terms: Elements; those of soft contact and of friction are used.
-        hard: Function (index) → launcher that adds ∂U/∂x of hard contact with that collider to an array (N,), from its
-            multipliers; or None.
-        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` with the pairs of cloth and meshes; None leaves the pulls of
-            meshes 0.
+        hard: Function (index) → launcher that adds ∂U/∂x of hard contact with that collider to an array (N,), or None.
+        pairs: The :class:`.SelfSteps` with the pairs of cloth and meshes; None leaves the pulls of meshes 0.
 
     Attributes:
         found: A :func:`warpcloth.kernels.contact.collider_work.collider_pulls` for each collider.
-        solid: The indices of the colliders that are not meshes, whose contact is terms.
+        solid: The indices of the colliders that are not meshes.
         hard: Whether their contact is hard.
     """
 

@@ -28,30 +28,27 @@ class Proximity:
     """The vertex–triangle pairs and edge–edge pairs that are near one another in each copy of a surface.
 
     A pair is listed if its distance is below r_c + skin. r_c is the contact distance, but at most half the rest distance of two
-    elements of one connected piece. With meshes, edges and vertices of the meshes act below CLOSE r, so it is CLOSE r for them,
-    or more: the sides of a pair approach by at most twice ``kept`` times the skin until :meth:`launch_kept` makes a new list,
-    so that gaps up to r are known. Pairs with a common vertex or with coordinates that are not finite are not listed.
-    Positions (V,) are those of all vertices of the surface.
+    elements of one piece; for edges and vertices of meshes it is CLOSE r or, if more, such that gaps up to r are known until
+    :meth:`launch_kept` lists again. Pairs with a common vertex or with coordinates that are not finite are not listed.
 
     Args:
-        surface: The :class:`warpcloth.contact.surface.ContactSurface`.
+        surface: The :class:`.ContactSurface`, with V vertices.
         distance: The contact distance r [m].
         skin: The list is complete until two vertices have approached one another by it [m].
         of_meshes: The contact distance of cloth with meshes [m].
 
     Attributes:
-        capacity: Number of pairs that the arrays can hold.
-        stencils: (capacity,) vertices (v, a, b, c) of vertex–triangle pairs, sorted, then (a, b, c, d) of pairs of edges ab and
-            cd.
+        capacity: Number of pairs that fit.
+        stencils: (capacity,) vertices (v, a, b, c) of vertex–triangle pairs, sorted, then (a, b, c, d) of edges ab and cd.
         distances: (capacity,) r_c of each pair [m].
-        counts: (2,) int32, numbers of pairs found of each kind, which may exceed the capacity.
-        rows: Pairs rows[i] to rows[i+1] are the vertex–triangle pairs of vertex i. Those of edges follow, by their first edge.
+        counts: (2,) int32, numbers of pairs of each kind, which may exceed the capacity.
+        rows: Pairs rows[i] to rows[i+1] are the vertex–triangle pairs of vertex i; those of edges follow, by their first edge.
         found: Positions of the last list, (V,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
         flag, copies: (1,) and (B,) int32, see :meth:`moved`.
         kept: The ``part`` of :meth:`moved` up to which a list serves for another round of the filter.
         listed: Positions (V,) [m] of the list that is in the arrays.
-        pieces: The connected piece of each vertex of the cloth of a copy, −1 without an element, (n,).
-        drift: Motion of each connected piece of all copies since ``found`` [m].
+        pieces: The connected piece of each vertex of a copy of the cloth, −1 without an element, (n,).
+        drift: Motion of each piece of all copies since ``found`` [m].
         alike: See :meth:`launch_along` [m].
     """
 
@@ -105,7 +102,7 @@ class Proximity:
         self._allocate(max(1024, 4 * model.count))
 
     def _connected(self, edges):
-        """The connected piece of each vertex (−1 without an element), and rest points relative to the middle of their piece."""
+        """The piece of each vertex (−1 without an element), and rest points relative to the middle of their piece."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -206,7 +203,7 @@ class Proximity:
         )
 
     def set_skin(self, skin):
-        """Sets another skin [m]; the next :meth:`launch_kept` makes a new list."""
+        """Sets another skin [m]; the next :meth:`launch_kept` lists again."""
         self._surface.skin = skin
         self.listed.fill_(np.nan)
 
@@ -286,10 +283,9 @@ class Proximity:
     def moved(self, x, part=0.5, active=None):
         """Launches flag = 1 if pairs may be missing at x (V,), else 0, and returns it; ``copies`` is 1 for copies with such.
 
-        The flag is 0 while each vertex has moved by at most the fraction ``part`` of the skin since the last detection,
-        relative to the drift of its connected piece, the median motion of some of its vertices. Two pieces may also have
-        approached one another by twice that, plus the excess of the distance of their boxes over the contact distance and the
-        skin.
+        The flag is 0 while each vertex has moved by at most ``part`` of the skin since the last list, relative to the drift of
+        its piece, the median motion of some of its vertices, and two pieces have approached one another by at most twice that
+        and the excess of the distance of their boxes over the contact distance and the skin.
 
         Args:
             x: Positions (V,) [m].
@@ -323,7 +319,7 @@ class Proximity:
 
     @property
     def overflowed(self):
-        """Whether the last detection found more pairs than the capacity; waits for the device."""
+        """Whether more pairs were found than fit; waits for the device."""
         return self._mirror.read().sum(dtype=np.int64) > self.capacity
 
     @in_turn

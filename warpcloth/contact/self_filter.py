@@ -19,13 +19,12 @@ OUT_ROUNDS, SWEEPS, LEFT = 128, 4, 0.1
 
 
 class SelfFilter:
-    """Moves cloth only as far as the pairs of a :class:`warpcloth.contact.self_steps.SelfSteps` stay apart.
+    """Moves cloth only as far as the pairs of :class:`.SelfSteps` stay apart.
 
     Attributes:
-        back: d of the start of the step (N,) [m], after :meth:`launch_start`; only if iterates stay apart.
-        fraction: The fraction of the last direction that pairs left each copy, (B,); only if iterates stay apart.
-        moves_together: Whether the filter measures moves relative to their mean, as no vertex is pinned or locked along an axis
-            and there are no colliders.
+        back: d of the start of the step (N,) [m], after :meth:`launch_start`.
+        fraction: The fraction of the last direction that pairs left each copy, (B,).
+        moves_together: Whether moves are measured relative to their mean, as nothing is pinned, locked or a collider.
     """
 
     def __init__(self, contact, colliders):
@@ -69,16 +68,16 @@ class SelfFilter:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self):
-        """Stores, at the start of a step, how many moves colliders have cut so far."""
+        """Stores how many moves colliders have cut before the step."""
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
     def launch_end(self, x, v, move=None, parts=1):
-        """Moves the cloth from its start of the step towards x, as far as pairs stay apart; corrects x, v and ``move``, (N,).
+        """Moves the cloth from the start of the step towards x, as far as pairs stay apart; corrects x, v and ``move``, (N,).
 
-        If iterates stay apart, the move starts at the last one. That may be inside a collider. So a copy of which vertices were
-        moved out of colliders, and which does not arrive at x, moves again from the start of the step, which is outside. Pins
-        have moved in ``parts`` equal parts of the step.
+        If iterates stay apart, the move starts at the last one, which may be inside a collider. So a copy of which vertices
+        left a collider, and which does not arrive at x, moves again from the start of the step. Pins have moved in ``parts``
+        equal parts of the step.
         """
         model = self.model
         if self._cut_before is not None and self._surface.moves:
@@ -112,7 +111,7 @@ class SelfFilter:
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
 
     def _launch_from_start(self, x):
-        """Moves copies again, from the start of the step, of which a vertex left a collider and which are not at the target.
+        """Moves copies again of which a vertex left a collider and which are not at the target.
 
         Meshes move again too, and what their first move noted of these copies is taken back.
         """
@@ -157,20 +156,19 @@ class SelfFilter:
         self._launch(self_filter.hold_pins, model.count, given, [x, v, contact.held])
 
     def launch_fresh(self, x, launch, active=None, part=None):
-        """Calls ``launch`` with x if ``active`` copies (B,), or any if None, have moved by ``part`` of the skin.
+        """Calls ``launch`` with x if ``active`` copies (B,), or any, have moved by ``part`` of the skin.
 
-        By default the next round can miss no pair, with ½ none is missing at x.
+        By default the next round can miss no pair; with ½ none is missing at x.
         """
         proximity = self._contact.proximity
         wp.capture_if(proximity.moved(x, part or proximity.kept, active), launch, x=x)
 
     def _launch_sides(self, x, active=None):
-        """Lists pairs at x for the next round, and computes their sides there."""
         self.launch_fresh(x, self._contact.launch_list, active)
         self._contact.launch_sides(x)
 
     def _launch_rounds(self, x):
-        """Moves x towards the target, as far as pairs stay apart, in copies that are ``_walking``."""
+        """Moves x towards the target in copies that are ``_walking``."""
         self._rounds.zero_()
         self._cuts.zero_()
         self._proceed.fill_(1)
@@ -193,7 +191,7 @@ class SelfFilter:
         self._launch(self_filter.keep_apart, model.count, given, [x, self._cuts])
 
     def _launch_held(self, x):
-        """Finds the vertices that cloth holds back inside a collider, and the positions outside to which they must move."""
+        """Finds vertices that cloth holds back inside a collider, and positions outside for them."""
         model, out = self.model, self._outside
         wp.copy(out, x, count=model.count)
         self._colliders.launch_out(out, self._from)
@@ -214,13 +212,11 @@ class SelfFilter:
         self._launch_held(x)
 
     def _launch_pushes(self, mobile, p, opens):
-        """Pushes the ends of moves p apart, where pairs would come nearer than they may."""
         for _ in range(SWEEPS):
             given = [self._contact.pairs, mobile, self._contact.begun, LEFT * self._contact.distance, opens]
             self._launch(self_filter.push_pairs, 1, given, [p])
 
     def _launch_ways(self, x, target):
-        """Finds how far vertices move from x to ``target`` at most, relative to their common move."""
         model = self.model
         if self.moves_together:
             self._launch(self_planes.common_move, model.copies, [x, target, model.per_copy], [self._common])
@@ -229,7 +225,6 @@ class SelfFilter:
         self._launch(self_planes.find_ways, model.count, given, [self._ways, self._share, self._least_share])
 
     def _launch_planes(self, x, target):
-        """Finds the fraction of each move to ``target`` that planes allow."""
         self._launch_ways(x, target)
         given = [self._contact.pairs, self._contact.begun.gap, x, target, self._common, self._ways]
         self._changed.fill_(1)
@@ -243,7 +238,6 @@ class SelfFilter:
         model.launch(self_planes.note_cuts, model.count, [self._share], [self._ways, self._changed])
 
     def _prepare_advance(self):
-        """Prepares :meth:`launch_limit`."""
         model = self.model
         self._make(self_filter.scale_directions, advance_listed)
         self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
@@ -459,10 +453,10 @@ class SelfFilter:
         self.launch_limit(self._direction)
         self._add(before, self._direction, 1.0, d)
 
-    def launch_trial(self, base, d, active=None, part=None):
-        """Lists the pairs at base + d again, in copies that are ``active`` (B,), as :meth:`launch_fresh` does."""
+    def launch_trial(self, base, d, active=None):
+        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if any may be missing there."""
         self._add(base, d, 1.0, self._contact.x_before, active)
-        self.launch_fresh(self._contact.x_before, self._contact.relist, active, part)
+        self.launch_fresh(self._contact.x_before, self._contact.relist, active, 0.5)
 
     def launch_limit(self, direction, whole=False):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
@@ -499,7 +493,7 @@ class SelfFilter:
 
     def launch_near_trial(self, base, d):
         """Launches :meth:`launch_trial` if :meth:`launch_look` found that pairs may be near."""
-        wp.capture_if(self._contact.near.array, self.launch_trial, base=base, d=d, part=0.5)
+        wp.capture_if(self._contact.near.array, self.launch_trial, base=base, d=d)
 
     def launch_follow(self, base, d):
         """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs.
@@ -514,7 +508,6 @@ class SelfFilter:
         self.launch_fresh(x, self._contact.relist, listed)
 
     def _put(self, out, x):
-        """Sets positions (V,) to x (N,), with the obstacles where they are now."""
         wp.copy(out, x, count=self.model.count)
         if self._surface.obstacles:
             wp.copy(self._surface.behind(out), self._surface.behind(self._contact.x_before))

@@ -3,10 +3,10 @@
 import numpy as np
 import warp as wp
 
-from ..core.dynamic import DynamicElements
+from ..core.dynamic_elements import DynamicElements
 from ..core.filled import filled
 from ..kernels.contact import self_friction as kernels
-from ..kernels.contact.self_pairs import Pairs
+from ..kernels.pairs import Pairs
 
 
 class Slips:
@@ -14,9 +14,9 @@ class Slips:
 
     Attributes:
         room: The number of contacts that fit.
-        pairs: :class:`warpcloth.kernels.contact.self_pairs.Pairs` with ``first``, ``stencils`` and ``corners``.
+        pairs: :class:`warpcloth.kernels.pairs.Pairs` with ``first``, ``stencils`` and ``corners``.
         slips: (room,), see :func:`warpcloth.kernels.contact.self_friction.end_friction`.
-        grow: A function that allocates memory for a number of contacts, by default for this object alone.
+        grow: A function that allocates memory for a number of contacts.
     """
 
     def __init__(self, model, room):
@@ -71,10 +71,10 @@ class Slips:
 
 
 class SelfFriction(DynamicElements):
-    """Friction between parts of cloth in contact, and the stretch of its springs, in the steps of one solver.
+    """Friction between parts of cloth in contact, and the stretch of its springs.
 
     Args:
-        surface: The :class:`warpcloth.contact.surface.ContactSurface`.
+        surface: The :class:`.ContactSurface`.
         slips: :class:`Slips`, a part of the state of the solver.
         keys: Number of keys that contacts may have.
         steps: Steps since the start of each copy, (B,) int32.
@@ -108,7 +108,7 @@ class SelfFriction(DynamicElements):
         self.hold(slips.room, keys)
 
     def hold(self, room, keys):
-        """Allocates arrays for ``room`` pairs, whose keys are below ``keys``. The slips of the last step are kept."""
+        """Allocates arrays for ``room`` pairs, whose keys are below ``keys``. Slips are kept."""
         self._kept.hold(room)
         kinds = {"parts": wp.vec4i, "weights": wp.vec4d, "sides": wp.int32, "normal": wp.vec3d, "anchor": wp.vec3d}
         kinds |= {"stiffness": wp.float64, "limit": wp.float64} | ({"travel": wp.vec3d} if self.surface.obstacles else {})
@@ -129,7 +129,7 @@ class SelfFriction(DynamicElements):
         self._launch(kernels.set_anchors, self.pairs.threads, given, [self.data])
 
     def launch_none(self):
-        """Empties the lists of this step and of the last one, at the start of a step without pairs."""
+        """Empties the lists of this step and of the last one."""
         super().launch_none()
         self.present.zero_()
         self._kept.pairs.first.zero_()

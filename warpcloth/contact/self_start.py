@@ -13,10 +13,10 @@ from .start_layers import apart
 
 
 def check_start(contact, state):
-    """Checks that cloth does not start with intersections, or with gaps below the smallest gap of the filter.
+    """Checks that cloth does not start with intersections, or with gaps below the least gap of the filter.
 
-    Pieces of cloth that only touch or coincide are moved apart, in the :class:`warpcloth.core.state.State` and in the model of
-    the :class:`warpcloth.contact.self_steps.SelfSteps`, see :func:`warpcloth.contact.start_layers.apart`.
+    Pieces that only touch or coincide are moved apart in the state and in the model of :class:`.SelfSteps`, see
+    :func:`.start_layers.apart`.
 
     Raises:
         ValueError: Cloth intersects cloth, or touches it and cannot be moved apart; the message names the first pair.
@@ -182,9 +182,9 @@ def _triangles_of(model, edges):
 def crossings(points, edges, triangles):
     """Returns the edges (E, 2) that intersect one of the ``triangles`` (E, m, 3) of each, with that: [(edge, triangle), …].
 
-    An edge that crosses the plane of a triangle does so at a point of its own, which must be inside the triangle. In a straight
-    row of triangles, where it is rounding that decides whether the edge crosses the plane, that point is therefore outside of
-    others in the row. If an edge that lies in the plane touches the triangle, the gap to one of its sides or corners is 0.
+    An edge that crosses the plane of a triangle does so at a point of its own, which must be inside the triangle; so rounding
+    does not count it in several triangles of a row. If an edge in the plane touches the triangle, the gap to a side or corner
+    is 0.
     """
     edges = np.repeat(edges, triangles.shape[1], axis=0)
     triangles = triangles.reshape(-1, 3)

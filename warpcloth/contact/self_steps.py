@@ -17,6 +17,7 @@ from ..kernels.contact.mesh_forces import keep_forces, work_of_meshes
 from ..kernels.contact.pair_potential import Laws
 from ..kernels.contact.piece_motion import add_positions
 from ..kernels.contact.self_filter import HeldPins, copies_with_pairs
+from ..kernels.pairs import Pairs
 from ..kernels.terms.contact import FLOOR
 from .collider_steps import cut_share
 from .pair_contact import PairContact
@@ -34,7 +35,7 @@ THICK = 0.5  # the smallest skin, over the contact distance; see ``kept`` of :cl
 
 
 class FirstGap(NamedTuple):
-    """The first frame with a small gap in a copy, and a vertex of the pair, in the order of the model within the copy."""
+    """The first frame with a small gap in a copy, and a vertex of the pair in the order of the model."""
 
     copy: int
     frame: int
@@ -42,10 +43,7 @@ class FirstGap(NamedTuple):
 
 
 class PinHeld(NamedTuple):
-    """The first frame and vertex, in the order of the model within the copy, of a pin that the filter stopped on its way.
-
-    ``farthest`` is the largest distance of a pin from its prescribed position at the end of a step [m].
-    """
+    """The first pin that the filter stopped, and its frame; ``farthest`` is the largest distance from its target [m]."""
 
     copy: int
     frame: int
@@ -56,32 +54,32 @@ class PinHeld(NamedTuple):
 class SelfSteps:
     """Pairs of near parts of cloth in the steps of one solver, with their forces and the filter.
 
-    At the start of a step, :meth:`launch_begin` lists the near pairs. Contacts are found wherever forces are computed. At the
-    end, the filter keeps the pairs apart.
+    :meth:`launch_begin` lists near pairs at the start of a step. Contacts are found wherever forces are computed. At the end,
+    the filter keeps pairs apart.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model` of a scene with self-contact.
-        state: The :class:`warpcloth.core.state.State` of the solver, to which it adds arrays.
+        model: The model of a scene with self-contact.
+        state: The state of the solver, to which arrays are added.
         h: Time step [s].
         steps_per_frame: Steps per frame.
         bounded: Whether contact has no logarithm, as in explicit steps.
-        colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps` of the solver, or None.
+        colliders: The :class:`.ColliderSteps` of the solver, or None.
 
     Attributes:
-        surface: The :class:`warpcloth.contact.surface.ContactSurface`.
-        distance, max_distance: The smaller and the larger of the contact distances of cloth with itself and with meshes [m].
+        surface: The :class:`.ContactSurface`.
+        distance, max_distance: The smaller and the larger contact distance of cloth with itself and with meshes [m].
         least: The least gap of the filter [m].
-        placed: Positions of the meshes at the start of the step, where it evaluates forces, and at its end, (B·m,) [m].
-        forces: The :class:`warpcloth.core.dynamic.Dynamic` of ``contact`` and ``friction``, which is None without.
-        pairs, begun: The listed pairs, and their gaps at ``begun_at`` (V,), of :mod:`warpcloth.kernels.contact.self_pairs`.
-        x_before: Positions at the start of the step, or of an iterate, and of obstacles behind them, (V,) [m].
+        placed: Positions of meshes at the start of the step, where it evaluates forces, and at its end, (B·m,) [m].
+        forces: The :class:`.Dynamic` of ``contact`` and ``friction``, which may be None.
+        pairs, begun: The listed pairs, and their gaps at ``begun_at`` (V,).
+        x_before: Positions at the start of the step, or of an iterate, with the obstacles behind them, (V,) [m].
         held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
-        near: The :class:`warpcloth.core.capture.Mirror` of what :meth:`.SelfFilter.launch_look` found, (1,) int32.
-        lists: The number of lists of pairs made so far, (B,) int32, equal for all copies.
+        near: What :meth:`.SelfFilter.launch_look` found, a mirror of (1,) int32.
+        lists: The number of lists made so far, (B,) int32.
         most_listed: The largest number of pairs in a list so far, (B,) int32.
-        listed, with_pairs: 1 if the last list has pairs, else 0, (1,) int32; and for each copy at the start of the step (B,).
-        far: 1 if pairs that are not listed may meet on the way of the last :meth:`launch_near`, else 0, (1,) int32.
-        stale: Whether the capacity of lists has grown outside of steps, so that graphs must be recorded again.
+        listed, with_pairs: 1 if the last list has pairs, (1,) int32; and for each copy at the start of the step, (B,).
+        far: 1 if unlisted pairs may meet on the way of the last :meth:`launch_near`, (1,) int32.
+        stale: Whether lists have grown outside of steps, so that graphs must be recorded again.
     """
 
     def __init__(self, model, state, h, steps_per_frame, bounded, colliders):
@@ -142,7 +140,7 @@ class SelfSteps:
         self.start_again()
 
     def refuse_reset(self, mask, x):
-        """Makes :func:`.self_start.check_reset`; returns whether lists have grown, so that graphs must be recorded again.
+        """Makes :func:`.self_start.check_reset`; returns whether graphs must be recorded again.
 
         Raises:
             ValueError: Cloth crosses or nearly touches cloth at the positions x (B·n, 3) of copies in ``mask`` (B,).
@@ -185,7 +183,6 @@ class SelfSteps:
         self.proximity.set_skin(self.skin)  # so that the first step makes a list
 
     def _hold(self):
-        """Allocates arrays for the pairs that the list can hold."""
         found, device = self.proximity, self.model.device
         capacity = len(found.stencils)
 
@@ -194,22 +191,21 @@ class SelfSteps:
 
         lists = {name: getattr(found, name) for name in ("stencils", "counts", "rows", "distances")}
         threads = 1 if device.is_cpu else capacity
-        self.pairs = filled(self_pairs.Pairs, layout=self.surface.layout, threads=threads, **lists)
+        self.pairs = filled(Pairs, layout=self.surface.layout, threads=threads, **lists)
         self.begun = filled(self_pairs.StepPairs, normal=room(wp.vec3d), weights=room(wp.vec4d), gap=room(wp.float64))
         self.contact.hold(self.pairs, self.begun.normal)
 
     @property
     def _keys(self):
-        """Number of keys that contacts may have."""
         return 2 * len(self.pairs.stencils)
 
     @property
     def capacities(self):
-        """The numbers of pairs and of contacts for which there is room."""
+        """The numbers of pairs and contacts that fit."""
         return len(self.pairs.stencils), self.contact.capacity
 
     def grow(self):
-        """Makes room for the pairs and contacts that did not fit. Graphs must then be recorded again.
+        """Makes room for pairs and contacts that did not fit. Graphs must then be recorded again.
 
         Raises:
             Stopped: There is no memory for them.
@@ -220,7 +216,7 @@ class SelfSteps:
             raise Stopped(str(error)) from None
 
     def grow_to(self, pairs, contacts=0):
-        """Makes room for 1.5 times ``pairs`` if these do not fit, and for 1.5 times ``contacts`` if these do not."""
+        """Makes room for 1.5 times the ``pairs`` and ``contacts`` that do not fit."""
         if pairs > len(self.pairs.stencils):
             self.proximity.grow(pairs)
         if contacts > self.contact.capacity:
@@ -235,7 +231,7 @@ class SelfSteps:
 
     @property
     def overflowed(self):
-        """Whether there have been more pairs or contacts than fit. The host reads the device."""
+        """Whether more pairs or contacts were found than fit; waits for the device."""
         most = self.most, int(self.contact.most.read()[0])
         if any(found > room for found, room in zip(most, self.capacities, strict=True)):
             self._wanted = most  # the state, with the first number, may be put back before the lists grow
@@ -249,7 +245,7 @@ class SelfSteps:
 
     @property
     def most(self):
-        """The largest number of pairs in a list so far, over all copies."""
+        """The largest number of pairs in a list so far."""
         return int(self._most.read().max())
 
     @property
@@ -259,12 +255,12 @@ class SelfSteps:
 
     @property
     def too_near(self):
-        """A :class:`FirstGap` for each copy with a gap below 4 units in the last place of float32 coordinates."""
+        """A :class:`FirstGap` for each copy with a gap below 4 units in the last place of float32."""
         return self._first(self._notes.too_near.numpy())
 
     @property
     def pressed(self):
-        """Lists of :class:`FirstGap` of cloth nearer to cloth, and to meshes, than half the distance where contact begins.
+        """:class:`FirstGap` of cloth nearer to cloth, and to meshes, than half the distance where contact begins.
 
         Explicit steps note none of meshes.
         """
@@ -298,12 +294,12 @@ class SelfSteps:
         return *counts.numpy().T, _gaps(notes.nearest)
 
     def start_again(self):
-        """Clears counts and the list, after a reset and after the steps in which an integrator finds its past state."""
+        """Clears counts and the list."""
         for array in (self.cut, self.steps, self.held.first, self.held.farthest, self.first_forced, *self._carried):
             array.zero_()
 
     def launch_begin(self, x):
-        """Lists the pairs near x, (N,), at the start of a step, unless its filter can miss none with the last list."""
+        """Lists the pairs near x (N,) at the start of a step, unless the filter can miss none with the last list."""
         wp.copy(self.x_before, x, count=self.model.count)
         if self.surface.moves:
             if not self._colliders.moved_by_terms:
@@ -317,7 +313,6 @@ class SelfSteps:
         wp.capture_if(self.listed, self._launch_begin, self._launch_none, x=x)
 
     def _launch_none(self, x):
-        """Begins a step without pairs."""
         wp.copy(self.begun_at, x)
         for each in self.forces.terms:
             each.launch_none()
@@ -340,7 +335,6 @@ class SelfSteps:
     # Obstacles.
 
     def _prepare_obstacles(self):
-        """Allocates positions of obstacles, and sets those that stand."""
         surface, model = self.surface, self.model
         self.placed = [wp.zeros(surface.count - model.count, dtype=model.vec3, device=model.device) for _ in range(3)]
         self._kept_poses = [wp.zeros_like(self._colliders.poses.before) for _ in range(3)]
@@ -354,7 +348,7 @@ class SelfSteps:
         self.contact.launch_obstacles(self.placed[1])
 
     def keep(self, collider):
-        """Leaves only forces and energies of contact with the mesh of this index, or −1 for cloth, after ``forces.launch``."""
+        """Leaves only forces and energies of contact with the mesh of this index, or −1 for cloth."""
         surface = self.surface
         if not surface.obstacles:
             return
@@ -382,14 +376,14 @@ class SelfSteps:
             wp.copy(array, spare)
 
     def launch_work(self, out, terms):
-        """Launches out (B, C) += the work of meshes on the cloth in the last step [J], by the last forces of ``terms``."""
+        """Launches out (B, C) += the work of meshes on the cloth in the last step [J]."""
         for each in terms if self.surface.obstacles else ():
             given = [each.pairs, each.data.parts, self.surface.of_obstacles.collider, each.data.travel, each.forces]
             self.model.launch(work_of_meshes, 1, given, [out])
 
     @property
     def forced(self):
-        """The copies in which a mesh went through cloth without a way out: (copy, first frame, mesh, None if several move)."""
+        """The copies in which a mesh went through cloth: (copy, first frame, mesh, or None if several move)."""
         moving = [c for c, each in enumerate(self.model.scene.colliders) if each.is_mesh and each.moves]
         mesh = moving[0] if len(moving) == 1 else None
         return [(c, int(gap_notes.FIRST) - int(note), mesh) for c, note in enumerate(self.first_forced.numpy()) if note]
@@ -427,7 +421,7 @@ class SelfSteps:
         self._launch(self_pairs.begin_pairs, self.pairs.threads, [self.pairs, self.begun_at], [self.begun])
 
     def relist(self, x):
-        """Lists the pairs again at x, in copies that have moved, and computes their sides and gaps."""
+        """Lists the pairs again at x, and computes their sides and gaps."""
         self.launch_list(x)
         self.launch_sides(x, self.proximity.copies)
 

@@ -9,17 +9,16 @@ def apart(points, triangles, sides, gaps, piece, fixed, r):
     """Returns positions at which pieces that touched are apart, or None if they cannot be moved so.
 
     Touching pieces become layers, r apart or, if there are more than three, as far as moves of at most r allow. A piece lies
-    above another one where its touching vertices are, or the vertices beside them, if these are farther than r from the other.
+    above another where its touching vertices are, or the vertices beside them, if these are farther than r from the other.
     Pieces that coincide with opposite normals move to the sides that they face; of those with equal normals the later one lies
     above. Vertices of touching elements move along their normals; those of pieces with a fixed one stay.
 
     Args:
         points: (N, 3) [m].
         triangles: (T, 3).
-        sides: The vertices of the two sides of each touching pair, (m, 2, 3), with one vertex of an edge twice, and a single
-            one three times.
+        sides: Vertices of the two sides of each touching pair, (m, 2, 3); that of an edge or vertex repeats one.
         gaps: Vectors from the second side to the first, (m, 3) [m].
-        piece: The connected piece of each vertex, (N,).
+        piece: The piece of each vertex, (N,).
         fixed: Whether a vertex must stay, (N,).
         r: The contact distance [m].
 
@@ -92,7 +91,6 @@ def _offsets(turns, above, stay):
 
 
 def _normals(points, triangles):
-    """Returns the normals of vertices, weighted by areas, (N, 3); 0 without triangles."""
     a, b, c = points[triangles].swapaxes(0, 1)
     found = _sums(np.cross(b - a, c - a), triangles, len(points))
     return found / np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None]

@@ -1,4 +1,4 @@
-"""The surface on which contact of cloth with cloth and with meshes is found: the cloth, and mesh colliders as obstacles."""
+"""The surface on which contact is found: the cloth, and mesh colliders as obstacles."""
 
 import numpy as np
 import warp as wp
@@ -6,6 +6,7 @@ import warp as wp
 from ..core.filled import filled
 from ..kernels.contact import obstacles as kernels
 from ..kernels.coulomb import law_of
+from ..kernels.pairs import Layout
 from ..mesh.mesh import Mesh
 from ..scene.mesh_collider import first_extended
 from ..terms.needs import listed
@@ -21,7 +22,8 @@ class ContactSurface:
         meets_itself: Whether cloth meets cloth.
         obstacles: The number m of vertices of meshes in a copy.
         count: The number of vertices of all copies, N + B·m.
-        layout, of_obstacles: Structs of :mod:`warpcloth.kernels.contact.obstacles`.
+        layout: The :class:`warpcloth.kernels.pairs.Layout`.
+        of_obstacles: The :class:`warpcloth.kernels.contact.obstacles.Obstacles`.
         items: Vertices of the triangles, then of the edges, of all copies, each with 2·copy + kind, (items, 4) int32.
         triangles, edges: The numbers of both, over all copies.
         groups: The group of each item, (items,), and ``vertex_groups`` that of each vertex of a copy, (n + m,).
@@ -30,7 +32,7 @@ class ContactSurface:
         colliders: The index of the collider of each obstacle of a copy, (m,).
         moves: Whether a mesh moves or deforms.
         width: The largest area of an edge of the cloth over its length [m].
-        moves_of_step: Moves of obstacles in the step, (B·m,) vectors [m].
+        moves_of_step: Moves of obstacles in the step, (B·m,) [m].
     """
 
     def __init__(self, model, meets_itself=True):
@@ -41,7 +43,7 @@ class ContactSurface:
         self._vertices = np.concatenate([vertices for _, vertices, _, _ in found] or [np.empty(0, np.int64)])
         self.obstacles, self.moves = len(self.colliders), any(scene.colliders[c].moves for c, _, _, _ in found)
         self.count = model.count + model.copies * self.obstacles
-        self.layout = filled(kernels.Layout, cloth=model.count, per_copy=n, obstacles=self.obstacles)
+        self.layout = filled(Layout, cloth=model.count, per_copy=n, obstacles=self.obstacles)
         firsts = np.cumsum([0, *(len(vertices) for _, vertices, _, _ in found)])
         self._of_meshes = [
             (Mesh(points, triangles), first) for (_, _, points, triangles), first in zip(found, firsts, strict=False)
@@ -57,7 +59,6 @@ class ContactSurface:
             self.width = float(((of_edges[a] + of_edges[b]) / mesh.edge_lengths).max())
 
     def _find_elements(self):
-        """Finds the elements of a copy, and of all copies."""
         model, mesh, n = self.model, self.model.scene.mesh, self.model.per_copy
         held = (model.coordinate_mobility().reshape(-1, 3)[:n] == 0.0).all(axis=1)
         of_cloth = np.where(held, int(kernels.HELD), int(kernels.CLOTH))
@@ -144,11 +145,11 @@ class ContactSurface:
         return np.concatenate([np.tile(values[:n], copies), np.tile(values[n:], copies)])
 
     def vectors(self):
-        """Returns a new array of a zero vector for each vertex of the surface of all copies, (N + B·m,)."""
+        """Returns zero vectors for the vertices of the surface of all copies, (N + B·m,)."""
         return wp.zeros(self.count, dtype=self.model.vec3, device=self.model.device)
 
     def behind(self, whole):
-        """Returns the part (B·m,) of an array (N + B·m,) that belongs to the obstacles."""
+        """Returns the part (B·m,) of an array (N + B·m,) for the obstacles."""
         return whole[self.model.count :]
 
     def launch_positions(self, colliders, ahead, placed):

@@ -1,4 +1,4 @@
-"""As-rigid-as-possible deformation: a rest shape follows its handles, each neighbourhood as rigidly as possible."""
+"""As-rigid-as-possible deformation of a rest shape by handles."""
 
 import importlib.util
 import warnings
@@ -37,9 +37,9 @@ class Deformed:
     """The result of :meth:`Arap.solve`.
 
     Attributes:
-        points: (n, 3) [m]; the handles are at their targets.
+        points: (n, 3) [m], handles at their targets.
         rotations: (n, 3, 3), R_c of the cell of each vertex, fitted to ``points``.
-        energies: Energies (iterations + 1,) [m²] at the start and after each iteration, with rotations fitted to those points.
+        energies: (iterations + 1,) [m²], at the start and after each iteration, with rotations fitted to those points.
         iterations: Number of iterations.
         converged: Whether the last iteration met the tolerance.
     """
@@ -52,48 +52,39 @@ class Deformed:
 
 
 class Arap:
-    """As-rigid-as-possible deformation of a mesh by handles, with one rotation R_c for the cell of each vertex c.
+    """As-rigid-as-possible deformation of a mesh by handles, with a rotation R_c for the cell of each vertex c.
 
-    Minimises E(x, R) = Σ_c Σ_(i,j)∈c w ‖(xᵢ − xⱼ) − R_c(Xᵢ − Xⱼ)‖² [m²] over the rotations and, with the handles at their
-    targets, over x. Energies, each with its cells:
+    Minimises E(x, R) = Σ_c Σ_(i,j)∈c w ‖(xᵢ − xⱼ) − R_c(Xᵢ − Xⱼ)‖² [m²] over the rotations and, with handles at their targets,
+    over x. Energies by cells:
 
-    - "spokes": the edges at c (Sorkine & Alexa 2007, *As-rigid-as-possible surface modeling*). Every edge is in two cells.
-    - "spokes_and_rims": all edges of the triangles at c, with their weights in these triangles (Chao, Pinkall, Sanan &
-      Schröder 2010, *A simple geometric model for elastic deformations*). It is Σ_t area ‖∇x − R_c‖² over the triangles at c,
-      and so never negative.
+    - "spokes": the edges at c (Sorkine & Alexa 2007, *As-rigid-as-possible surface modeling*).
+    - "spokes_and_rims": all edges of the triangles at c (Chao, Pinkall, Sanan & Schröder 2010, *A simple geometric model for
+      elastic deformations*): Σ_t area ‖∇x − R_c‖² ≥ 0; with "cotangent" only.
 
-    An iteration first minimises E exactly over all R_c, then over all x, so the energy never rises. The second step solves
-    L x = b with a constant matrix, which is factorised once. Weights w_ij of edges:
+    An iteration minimises E exactly over R, then over x by L x = b, factorised once, so the energy never rises. Weights w_ij:
 
-    - "cotangent": ½(cot α + cot β) of the angles opposite the edge; negative if α + β > 180°.
-    - "clamped": the same, with negative weights set to 0. This loses linear precision: inside a flat mesh, L x = 0 no longer
-      holds.
-    - "intrinsic": cotangents of the intrinsic Delaunay triangulation, whose edges replace those of the mesh (Fisher et al.
-      2007); they can be negative only on the boundary. For orientable manifolds. Needs libigl:
-      ``pip install -e '.[intrinsic]'`` in the checkout.
-    - "uniform": 1 for each edge; an edge mesh takes only these.
-
-    "spokes_and_rims" takes only "cotangent".
+    - "cotangent": ½(cot α + cot β) of the opposite angles; negative if α + β > 180°.
+    - "clamped": these, at least 0, without linear precision.
+    - "intrinsic": cotangents of the intrinsic Delaunay triangulation and its edges (Fisher et al. 2007), negative only on the
+      boundary, for orientable manifolds. Needs libigl: ``pip install -e '.[intrinsic]'`` in the checkout.
+    - "uniform": 1; edge meshes take only these.
 
     Args:
         mesh: The rest shape, a :class:`warpcloth.Mesh`.
-        handles: Moved vertices (h,), each once, or a selection (see :meth:`warpcloth.Mesh.select`), which is sorted.
-            Every connected component of the mesh needs a handle.
-        weights: One of those above.
-        energy: One of those above.
-        device: A Warp device, ``"cpu"`` or ``"cuda:0"``.
-        dtype: ``"float32"`` or ``"float64"``.
+        handles: Moved vertices (h,), or a selection, which is sorted; every component of the mesh needs one.
+        weights, energy: One of those above.
+        device, dtype: A Warp device, and ``"float32"`` or ``"float64"``.
 
     Attributes:
-        handles: (h,) int32, in the order in which :meth:`solve` takes their positions.
-        parts: Number of the connected component of each vertex (n,); edges with a weight other than 0 connect vertices.
-        laplacian: L (n, n), scipy CSR, with L_ij = −w_ij and rows that sum to 0.
-        negative_edges: Edges (k, 2) with a negative weight. With "spokes", each adds a negative energy, so that even a rigid
-            motion may not be a minimum; a warning says so.
+        handles: (h,) int32, in the order of positions in :meth:`solve`.
+        parts: Number of each vertex's connected component (n,), by edges of nonzero weight.
+        laplacian: L (n, n), scipy CSR, L_ij = −w_ij, rows summing to 0.
+        negative_edges: Edges (k, 2) with a negative weight; with "spokes" a rigid motion may not be a minimum, as a warning
+            says.
 
     Raises:
-        ValueError: An argument is not one of those above, a vertex is isolated, a component of the mesh has no handle, or the
-            matrix of the weights is not positive definite.
+        ValueError: An argument is not allowed, a vertex is isolated, a component has no handle, or the matrix is not positive
+            definite.
         ImportError: "intrinsic" without libigl.
 
     Examples:
@@ -188,16 +179,15 @@ class Arap:
     def solve(
         self, positions: ArrayLike, iterations: int = 100, tolerance: float = 1e-6, initial: ArrayLike | None = None
     ) -> Deformed:
-        """Moves the handles and solves for all points. Reuses the factorisation and all arrays of earlier calls.
+        """Moves the handles and solves for all points; reuses the factorisation.
 
         Args:
-            positions: Targets of the handles (h, 3) [m], in their order.
-            iterations: Maximum number of iterations, each of one solve and one fit of rotations.
-            tolerance: Iterations end when one lowers the energy by no more than this fraction of it, than the energy of edges
-                with this strain, or than rounding; 0 makes all iterations.
-            initial: Initial points (n, 3) [m]; those of handles are ignored. By default the rest shape, each component moved
-                rigidly so that its handles fit their targets best. If the energy is not negative, a rigid motion of all handles
-                is then followed exactly.
+            positions: Targets of the handles (h, 3) [m].
+            iterations: Maximum number of iterations.
+            tolerance: Iterations end when one lowers the energy by at most this fraction, the energy of edges with this strain,
+                or rounding; 0 makes all.
+            initial: Initial points (n, 3) [m]; by default the rest shape, each component moved rigidly to fit its handles best,
+                which follows a rigid motion exactly.
 
         Raises:
             ValueError: An argument is not allowed, or the energy overflows.
@@ -236,11 +226,7 @@ class Arap:
         return Deformed(points, rotations, np.array(energies), len(energies) - 1, bool(converged))
 
     def _fit(self, iteration):
-        """Fits the rotations to x and gathers the right-hand side of the next solve.
-
-        Returns:
-            float: The energy [m²].
-        """
+        """Fits the rotations to x and gathers the next right-hand side; returns the energy [m²]."""
         self._local()
         energy = float(self._energy.read()[0]) * self._unit**2
         if not np.isfinite(energy):
@@ -251,11 +237,11 @@ class Arap:
 
     @in_turn
     def carry(self, points: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Moves points along with the handles: each component rigidly, by the best fit to the motion of its handles.
+        """Moves points with the handles, each component rigidly by the best fit.
 
         Args:
             points: (n, 3) [m].
-            before: Positions of the handles before (h, 3) [m], in their order.
+            before: Positions of the handles before (h, 3) [m].
             after: Their positions after (h, 3) [m].
 
         Returns:
@@ -268,11 +254,7 @@ class Arap:
         return np.einsum("nij,nj->ni", rotations[self.parts], points - old[self.parts]) + new[self.parts]
 
     def _connected(self, adjacency):
-        """Returns the connected component of each vertex (n,), numbered from 0.
-
-        Raises:
-            ValueError: A component has no handle.
-        """
+        """Returns the connected component of each vertex (n,); each must have a handle."""
         from scipy.sparse.csgraph import connected_components
 
         count, parts = connected_components(adjacency, directed=False)
@@ -286,7 +268,6 @@ class Arap:
         return parts
 
     def _record(self, mesh, pairs, w, rims):
-        """Captures the fit of the rotations of all cells, the energy and the right-hand side."""
         rest, rank, n = self._rest, self._rank, len(self._order)
         vec3, _ = types(self._scalar)
         if rims:
@@ -333,7 +314,6 @@ class Arap:
         return Segment(self.device, fit_cells)
 
     def _compressed(self, rows, columns, values, count):
-        """Returns entries with vector values as (offsets, columns, values) on the device, sorted by row and column."""
         order = np.lexsort((columns, rows))
         offsets = np.searchsorted(rows[order], np.arange(count + 1))
         indices = [wp.array(part.astype(np.int32), dtype=wp.int32, device=self.device) for part in (offsets, columns[order])]
@@ -347,7 +327,6 @@ class Arap:
 
 
 def _points(name, value, count, label):
-    """Returns ``value`` as finite points (count, 3), float64; ``label`` names a row in errors."""
     found = numeric(name, value, f"have shape {(count, 3)}")
     if found.shape != (count, 3):
         raise ValueError(f"{name} has shape {found.shape}; it must be {(count, 3)}")
@@ -357,7 +336,7 @@ def _points(name, value, count, label):
 
 
 def half_cotangents(mesh):
-    """Returns ½ cot of the angle at each corner of each triangle (T, 3), signed."""
+    """Returns signed ½ cot at each corner (T, 3)."""
     corners = mesh.points[mesh.triangles]
     one, other = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     return 0.5 * np.einsum("tki,tki->tk", one, other) / np.linalg.norm(np.cross(one, other), axis=2)
@@ -393,7 +372,6 @@ def edge_weights(mesh, weights):
 
 
 def _summed(rows, columns, values, n):
-    """Adds up entries with vector values that have equal rows and columns, and drops zeros off the diagonal."""
     keys, inverse = np.unique(rows.astype(np.int64) * n + columns, return_inverse=True)
     rows, columns = np.divmod(keys, n)
     values = np.stack([np.bincount(inverse, axis) for axis in values.T], axis=1)

@@ -1,4 +1,4 @@
-"""As-rigid-as-possible deformation by keyframes of handles."""
+"""As-rigid-as-possible deformation by keyframes."""
 
 import time
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ class Deformation(ShownInNotebooks):
     """The result of a deformation: a frame for each keyframe.
 
     Attributes:
-        points: (F, n, 3) [m], in memory, or with ``output`` float32, read from the file on demand.
-        largest_angles: Largest angle of each frame (F,) [rad].
-        angles: Rotation angle of the neighbourhood of each vertex from its rest shape, (F, n) [rad], 0 to π. In the file it is
-            ``primvars:rotationAngle``, in degrees.
-        energies: Final energy of each frame (F,) [m²].
-        iterations: Number of iterations of each frame (F,).
-        converged: Whether each frame reached the tolerance (F,).
+        points: (F, n, 3) [m]; with ``output`` float32, read from the file.
+        largest_angles: Largest angle in each frame (F,) [rad].
+        angles: Rotation angle of each vertex's neighbourhood from rest, (F, n) [rad], 0 to π; in files
+            ``primvars:rotationAngle`` [°].
+        energies: Final energies (F,) [m²].
+        iterations: Numbers of iterations (F,).
+        converged: Whether frames reached the tolerance (F,).
         times: (F,) [s].
         timings: ``factorise`` and ``frames`` (a list) [s].
         output: Path of the USD file, or None.
@@ -76,35 +76,33 @@ def deform(
 ) -> Deformation:
     """Deforms a mesh as rigidly as its moved handles allow (Sorkine & Alexa 2007).
 
-    Each solve starts from the previous frame, moved along with the handles (:meth:`warpcloth.Arap.carry`). So the handles may
-    rotate by any angle, if they rotate by less than half a turn per frame, and a rigid motion takes one iteration. A scene with
-    moved pins is deformed by ``deform(scene.mesh, scene.pins, fps=scene.fps, stage=scene.stage)``; it uses the keyframes of the
-    scene, not its start positions.
+    Each solve starts from the previous frame, moved along with the handles (:meth:`warpcloth.Arap.carry`), so handles may
+    rotate by up to half a turn per frame. For a scene with moved pins: ``deform(scene.mesh, scene.pins, fps=scene.fps,
+    stage=scene.stage)``.
 
     Args:
-        mesh: The :class:`warpcloth.Mesh`; its points are the rest shape.
-        pins: :class:`warpcloth.Pins`: the handles and their keyframes (F, p, 3), each of which is a frame.
+        mesh: The mesh at rest.
+        pins: Handles and their keyframes (F, p, 3), a frame each.
         fps: Frames per second.
-        weights: See :class:`warpcloth.Arap`, also for ``energy``, ``device`` and ``dtype``.
-        energy: See there.
-        iterations: Maximum number of iterations of a frame.
-        tolerance: See :meth:`warpcloth.Arap.solve`.
+        weights: As of :class:`warpcloth.Arap`.
+        energy: Likewise.
+        iterations: Maximum per frame.
+        tolerance: As of :meth:`warpcloth.Arap.solve`.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
-        output: Path of a USD file (.usd, .usda, .usdc, .usdz) to write, frame by frame, so that memory use does not grow.
-            Velocities are differences from the previous frame, zero in the first.
-        single_file: Whether ``output`` ends as one file, without a folder of frames beside it.
-        progress: Function called with (frame, frames) once each frame is kept, ``frames`` being those after the first; or None.
-        stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; ``output`` is then a layer over it.
-        up_axis: Up axis of an output that is not a layer, "Y" or "Z"; by default that of the mesh.
+        output: USD file (.usd, .usda, .usdc, .usdz) to write frame by frame; velocities are differences from the previous
+            frame.
+        single_file: Whether ``output`` ends as one file.
+        progress: Function called with (frame, frames), ``frames`` being those after the first; or None.
+        stage: The :class:`warpcloth.usd.StageMesh` of ``mesh``, over which ``output`` is a layer.
+        up_axis: Up axis of an output that is not a layer; by default that of the mesh.
 
     Returns:
         :class:`Deformation`.
 
     Raises:
         BlockingIOError, Interrupted, OSError: As for :func:`warpcloth.simulate`.
-        ValueError: An argument is not allowed here or by :class:`warpcloth.Arap`, or a frame overflows; the frames before it
-            are in ``output``.
+        ValueError: An argument is not allowed, or a frame overflows; frames before it are in ``output``.
 
     Examples:
         >>> import warpcloth as wc
@@ -155,7 +153,6 @@ def deform(
 
 
 def _refuse_beyond_float32(keyframes, fps):
-    """Raises ValueError if positions or velocities of handles overflow in the float32 of a file."""
     limit = np.finfo(np.float32).max
     rule = f"cannot be written: a file holds float32, up to {limit:.2g}"
     refuse("pins.keyframes", keyframes, ~(np.abs(keyframes) <= limit), rule)
@@ -165,15 +162,13 @@ def _refuse_beyond_float32(keyframes, fps):
 
 
 def rotation_angles(rotations: np.ndarray) -> np.ndarray:
-    """Returns the angles (n,) [rad], 0 to π, of rotation matrices (n, 3, 3), as precise as the matrices near both ends."""
+    """Returns the angles (n,) [rad] of rotation matrices (n, 3, 3), precise near 0 and π."""
     R = rotations
     axial = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
     return np.arctan2(np.linalg.norm(axial, axis=1), np.trace(R, axis1=1, axis2=2) - 1.0)  # 2 sin, 2 cos
 
 
 class _Memory:
-    """Keeps frames in memory."""
-
     def __init__(self, mesh, frames):
         self.points, self.angles = np.empty((frames, len(mesh.points), 3)), np.empty((frames, len(mesh.points)))
         self.frames = 0
@@ -193,8 +188,6 @@ class _Memory:
 
 
 class _File:
-    """Writes frames as USD, and reads them back on demand."""
-
     def __init__(self, mesh, pins, fps, output, single_file, stage, up_axis):
         self.single_file, primvars = single_file, {PRIMVAR: "vertex"}
         if stage is None:

@@ -1,4 +1,4 @@
-"""Resampling of captures to one topology: a template is moved onto each frame, as rigidly as possible."""
+"""Resampling of captures: a template is moved onto each frame, as rigidly as possible."""
 
 from __future__ import annotations
 
@@ -27,21 +27,20 @@ _CORNERS = np.arange(3)
 
 @dataclass(frozen=True, eq=False)
 class Resampled:
-    """A capture resampled to one topology, with a frame for each label from the first to the last.
+    """A capture resampled to one topology, at each label from the first to the last.
 
     Attributes:
         mesh: The template at rest.
-        points: Its vertices (F, n, 3) [m]. In frames that the capture lacks, they are interpolated linearly.
-        distances: Distances of the vertices from the surface of the capture (F, n) [m]; NaN in frames that it lacks.
-        observed: Whether a vertex faces the capture (F, n): the nearest point is within ``within`` and not on the boundary, as
-            that of a vertex over a hole is. Other vertices follow their neighbours alone.
-        rms: RMS distance of the points of the capture that count from the template (F,) [m]; NaN in frames that it lacks.
-        used: Share of the area of the capture that counts (F,) [1]; NaN in frames that it lacks.
-        iterations: Number of iterations (F,); 0 in frames that the capture lacks.
-        converged: Whether the last iteration moved no vertex by more than the tolerance (F,).
+        points: Its vertices (F, n, 3) [m], interpolated linearly where the capture lacks frames.
+        distances: Distances of vertices from the capture (F, n) [m]; NaN in such frames.
+        observed: Whether a vertex faces the capture (F, n): its nearest point is within ``within`` and not on the boundary.
+        rms: RMS distance of the points that count from the template (F,) [m]; NaN in such frames.
+        used: Share of the capture's area that counts (F,) [1]; NaN in such frames.
+        iterations: Numbers of iterations (F,); 0 in such frames.
+        converged: Whether the last moved no vertex by more than the tolerance (F,).
         labels: Numbers of the frames (F,).
         times: (F,) [s].
-        pins: Vertices whose positions were given (p,).
+        pins: Vertices of given positions (p,).
     """
 
     mesh: Mesh
@@ -61,7 +60,7 @@ class Resampled:
 
         Args:
             output: Path of a .usd, .usda, .usdc or .usdz file.
-            single_file: Whether it is one file, without a folder of frames beside it.
+            single_file: Whether it is one file.
         """
         fps = (len(self.times) - 1) / (self.times[-1] - self.times[0]) if len(self.times) > 1 else 24.0
         primvars = {"captureDistance": "vertex", "captureObserved": "vertex"}
@@ -85,40 +84,36 @@ def resample(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> Resampled:
-    """Moves a template onto each frame of a capture, so that the result has one topology, as :func:`warpcloth.analyze` needs.
+    """Moves a template onto each frame of a capture, for one topology, as :func:`warpcloth.analyze` needs.
 
-    Minimises α·E(x, R) + Σ aₚ dₚ²/Σ aₚ over the vertices p of the capture (non-rigid iterative closest points, after Amberg,
-    Romdhani & Vetter 2007), where aₚ is a third of the area of the triangles at p. E is 2 Σ area ‖∇x − R‖² over the triangles,
-    with a rotation for each, so that only strain has energy (Liu, Zhang, Xu, Gotsman & Gortler 2008), plus 0.12 times that of
-    :class:`warpcloth.Arap` with clamped weights, which resists bending too. The edges in the latter are 0.9 times those of the
-    last frame, in the first frame those of ``positions``, plus 0.1 times those of the rest shape, turned by the rotation of
-    each cell in that frame. So folds stay as they were seen. The share of the rest shape keeps noise from growing over frames.
-    dₚ is the distance of p from the tangent plane of the nearest point of the template; where that lies on the boundary, from
-    the point itself, which keeps the outline where it was seen. Points count within a distance, and, if they are not beyond the
-    outline, if the planes there enclose less than 60°. An iteration finds nearest points and rotations, and solves a sparse
-    system for all x. Each frame starts from the last one, moved on by as much as that had moved.
+    Minimises α·E(x, R) + Σ aₚ dₚ²/Σ aₚ over the vertices p of the capture (after Amberg, Romdhani & Vetter 2007, non-rigid
+    iterative closest points), aₚ a third of the area of triangles at p. E is 2 Σ area ‖∇x − R‖² over triangles, with a rotation
+    each (Liu, Zhang, Xu, Gotsman & Gortler 2008), plus 0.12 times that of :class:`warpcloth.Arap` with clamped weights, against
+    bending. The latter compares with 0.9 times the edges of the last frame, or ``positions``, plus 0.1 times those at rest. dₚ
+    is the distance of p from the tangent plane of the nearest point, on the boundary from that point. Points count within a
+    distance and, unless beyond the outline, if the planes enclose less than 60°. Frames start from the last one, moved on by
+    its motion.
 
     Args:
-        capture: The :class:`warpcloth.Capture`, with times.
-        template: The :class:`warpcloth.Mesh`; its points are the rest shape.
-        positions: Its positions near those of the first frame (n, 3) [m], with its folds; by default the rest shape.
-        pins: Vertices whose positions are known: :class:`warpcloth.Pins`, which stay at ``positions``, or follow keyframes, one
-            for each label from the first on.
-        stiffness: α [1]. With less, the result follows noise and slides; with more, it cuts across folds and has less strain.
-        within: Largest distance of points that count [m]; by default 10 % of the diagonal of the template.
-        iterations: Largest number of iterations of a frame.
-        tolerance: Iterations end when one moves no vertex by more than this share of the diagonal.
+        capture: The capture, with times.
+        template: The mesh at rest.
+        positions: Positions near the first frame (n, 3) [m], with its folds; by default at rest.
+        pins: :class:`warpcloth.Pins` of known positions: at ``positions``, or keyframes, one per label.
+        stiffness: α [1]: less follows noise and slides, more cuts across folds.
+        within: Maximum distance of points that count [m]; by default 10 % of the template's diagonal.
+        iterations: Maximum per frame.
+        tolerance: Share of the diagonal; iterations end when none of the vertices moves more.
         device: A Warp device, for nearest points.
-        progress: Function called with (frame, frames) once each frame is found, ``frames`` being those after the first.
+        progress: Function called with (frame, frames), ``frames`` being those after the first.
 
     Returns:
         :class:`Resampled`.
 
     Raises:
-        ValueError: An argument is not allowed, the capture has no times, or no point of a frame counts.
+        ValueError: An argument is not allowed, there are no times, or no point of a frame counts.
 
     Warns:
-        UserWarning: Less than 1 % of the capture counts, or less than 1 % of the template faces it, as with a wrong unit.
+        UserWarning: Less than 1 % of the capture counts or of the template faces it, as with a wrong unit.
 
     Examples:
         >>> import warpcloth as wc
@@ -183,7 +178,6 @@ def resample(
 
 
 def _filled(points, frames, count):
-    """Returns points (F, n, 3) of all ``count`` frames, interpolated linearly between the given ``frames`` (F,)."""
     after = np.searchsorted(frames, np.arange(count)).clip(min=min(1, len(frames) - 1))
     before = np.maximum(after - 1, 0)
     share = (np.arange(count) - frames[before]) / np.maximum(frames[after] - frames[before], 1)
@@ -191,7 +185,6 @@ def _filled(points, frames, count):
 
 
 def _spread(values, frames, count):
-    """Returns values (count, …), which are NaN, False or 0 in frames that are not given."""
     result = (
         np.full((count, *values.shape[1:]), np.nan)
         if values.dtype.kind == "f"
@@ -202,14 +195,11 @@ def _spread(values, frames, count):
 
 
 class Registration:
-    """Moves a template onto one surface after another; see :func:`resample`.
+    """Moves a template onto one surface after another (:func:`resample`).
 
     Args:
-        mesh: The template.
         held: Vertices that stay where a solve starts (p,).
-        stiffness: α [1].
-        within: Largest distance of points that count [m].
-        device: A Warp device.
+        within: Maximum distance of points that count [m].
     """
 
     def __init__(self, mesh: Mesh, held: np.ndarray, stiffness: float, within: float, device: str) -> None:
@@ -242,7 +232,7 @@ class Registration:
         self._rigid = np.repeat(values, 3)
 
     def keep(self, x: np.ndarray) -> None:
-        """Makes the energy of cells relative to the shape x (n, 3) [m], with a share of the rest shape."""
+        """Makes the energy of cells relative to x (n, 3) [m], with a share of the rest shape."""
         (i, j), cells = self._ends, self._of_cells
         turned = self._turned(x, self._rest)[cells]
         self._edges = self._rest.copy()
@@ -251,12 +241,9 @@ class Registration:
     def solve(self, surface: Surface, start: np.ndarray, iterations: int, tolerance: float) -> tuple:
         """Moves the template from ``start`` (n, 3) [m] onto a surface.
 
-        Returns:
-            tuple: Points (n, 3) [m], distances (n,) [m], observed (n,), RMS [m], share of the area that counts, number of
-            iterations and whether the last moved no vertex by more than ``tolerance`` [m].
-
-        Raises:
-            ValueError: No point of the surface counts; the message is the end of a sentence about it.
+        Returns points (n, 3) [m], distances (n,) [m], observed (n,), RMS [m], share of the area that counts, iterations, and
+        whether the last moved no vertex by more than ``tolerance`` [m]. Raises ValueError with the end of a sentence if no
+        point counts.
         """
         triangles = solid_triangles(surface)
         used, corners = np.unique(triangles, return_inverse=True)
@@ -278,7 +265,6 @@ class Registration:
         return x, distances, observed, rms, share, count, bool(moved <= tolerance)
 
     def _pairs(self, x, points, normals):
-        """Returns the distance of each point to the template, its triangle, weights and projection, and whether it counts."""
         distances, faces, weights = nearest_on_surface(points, x, self._triangles, self._device)
         normal = _normals(x, self._triangles)[faces]
         beyond = Boundary(x, self._triangles).has(faces, weights)
@@ -292,7 +278,6 @@ class Registration:
         return distances, faces, weights, projection, counts
 
     def _step(self, x, points, normals, areas):
-        """Returns the step of the free coordinates to the minimum with rotations and nearest points held."""
         from scipy.sparse import coo_matrix, identity
         from scipy.sparse.linalg import splu
 
@@ -318,7 +303,7 @@ class Registration:
         return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options).solve(residual[self._free])
 
     def _turned(self, x, edges):
-        """Returns edges (k, 3), turned by the rotations of their cells and triangles that minimise E for x."""
+        """Returns edges (k, 3) rotated with their cells and triangles as minimises E for x."""
         i, j = self._ends
         moments = self._weights[:, None, None] * np.einsum("ka,kb->kab", x[i] - x[j], edges)
         count = len(x) + len(self._triangles)
@@ -329,14 +314,12 @@ class Registration:
 
 
 def _normals(x, triangles):
-    """Unit normals (T, 3) of triangles; 0 without area."""
     a, b, c = x[triangles].transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     return normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
 
 
 def _vertex_normals(x, triangles):
-    """Unit normals (n, 3) of vertices, the mean over their triangles by area."""
     a, b, c = x[triangles].transpose(1, 0, 2)
     normal = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     sums = np.stack([np.bincount(triangles.ravel(), column, len(x)) for column in normal.T], axis=1)

@@ -5,14 +5,15 @@ from typing import NamedTuple
 
 import warp as wp
 
+import warpcloth.fast as fast
+
 from ..core.explicit_step import StepRecord
 from ..core.gradient import Gradient
 from ..kernels.fast import block_step as kernels
-from ..kernels.fast.contact_guard import NoGuard
+from ..kernels.fast.guard import NoGuard
 from ..kernels.fast.term_facts import TermFacts
 from ..terms.refresh import STEP, Moment
 from .block_layout import block_layout
-from .quadratic_pairs import as_pairs
 from .structs import chained, int32_array
 
 
@@ -57,7 +58,8 @@ class BlockStep:
         self.model, self.state, self._guard = model, state, guard
         window = window or Window(guard.terms if guard else model.terms, model.inverse_mass, model.pins, model.keyframes)
         self._pins = window.pins, window.keyframes, count
-        terms = [as_pairs(model, elements) for elements in window.terms]
+        quadratic = [each.term.whole.quadratic and each.damping is None for each in window.terms]
+        terms = [fast.as_pairs(model, each) if now else each for each, now in zip(window.terms, quadratic, strict=True)]
         pairs = tuple(now.label for now, before in zip(terms, window.terms, strict=True) if now is not before)
         refreshed, swept = ([each for each in terms if (each.refresh is not None) == apart] for apart in (True, False))
         self._refreshed, self.gradient = Gradient(model, terms=refreshed), wp.zeros_like(state[0])
@@ -67,8 +69,8 @@ class BlockStep:
         parts = [TermFacts(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
         # Fused multiply–add, as on CUDA: springs then take 0.8 of the time.
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
-        guarded = guard is not None, guard is not None and guard.moving
-        self._kernel = model.kernel(kernels.block_step, tuple(parts), model.dtype, symplectic, flags, compensated, *guarded)
+        contact = (guard.kernels, guard.moving) if guard else ()
+        self._kernel = model.kernel(kernels.block_step, tuple(parts), model.dtype, symplectic, flags, compensated, *contact)
         self.residual = wp.zeros_like(state[0]) if compensated else None
         self._arrays = arrays  # the structs hold no references
         scratch = [

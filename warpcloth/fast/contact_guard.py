@@ -20,11 +20,14 @@ class ContactGuard:
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`.
 
     Attributes:
+        kernels: The :class:`warpcloth.kernels.fast.guard.ContactFactories` that steps take.
         data: The struct of the kernels.
         terms: The elements of the other terms.
         moving: Whether a collider or a pin moves.
         followed: Whether contact terms are refreshed at the start of a step, because others read them.
     """
+
+    kernels = kernels.CONTACT_GUARD
 
     def __init__(self, model, colliders):
         self.model, self.colliders, declared = model, colliders, model.colliders

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..core.explicit_step import StepRecord
 from ..kernels.fast import gather_step as kernels
-from ..kernels.fast.contact_guard import NoGuard
+from ..kernels.fast.guard import NoGuard
 from ..terms.refresh import EVALUATION, STEP, Moment
 from .compensation import packed_unit
 from .gather_layout import gathered, lanes_of
@@ -44,7 +44,7 @@ class GatherStep:
         self._found = [gathered(model, elements, elements.damping is not None) for elements in model.terms]
         parts = [part for part, _arrays in self._found]
         fast = model.device.is_cuda and model.dtype is wp.float32
-        key = (tuple(parts), model.dtype, symplectic, fast)
+        key, contact = (tuple(parts), model.dtype, symplectic, fast), guard and guard.kernels
         unit = packed_unit(model) if compensated else None
         residual_type = None if not compensated else wp.int32 if unit else model.vec3
         self._lanes, self._block = lanes_of(model), 0 if compensated or (guard and guard.moving) else block_of(model, parts)
@@ -57,9 +57,9 @@ class GatherStep:
             packed=unit is not None,
         )
         if self._block:
-            self._kernel = model.kernel(kernels.gather_steps_of_copies, *key, self._block, guard is not None)
+            self._kernel = model.kernel(kernels.gather_steps_of_copies, *key, self._block, contact)
         else:
-            more = model.copies == 1, self._lanes, residual_type, guard is not None, guard is not None and guard.moving
+            more = model.copies == 1, self._lanes, residual_type, contact, bool(guard and guard.moving)
             self._kernel = model.kernel(kernels.gather_step, *key, *more)
         chain = chained(parts, [arrays for _part, arrays in self._found], model.dtype)
         (x, v), damped = state, any(part.damped for part in parts)

@@ -9,19 +9,13 @@
 Tests compare each backend with the core.
 """
 
+import warpcloth.fast as fast
+
 from ..base.checks import choice
 from ..core.explicit_step import ExplicitStep
 from ..core.gradient import Gradient
 from ..core.jacobi_sweeps import JacobiSweeps
-from .block_step import BlockStep
 from .compensation import needs_compensation
-from .contact_guard import ContactGuard
-from .gather_corrections import GatherSweeps
-from .gather_gradient import GatherGradient
-from .gather_step import GatherStep
-from .scatter_corrections import ScatterSweeps
-from .subdomains import SubdomainSteps
-from .touching_steps import TouchingSteps
 
 BACKENDS = ("auto", "core", "blocks", "gather")
 
@@ -44,8 +38,8 @@ class Plan:
 
     def gradient(self, corrected=False, terms=None, dynamic=()):
         """Returns a :class:`warpcloth.core.gradient.Gradient`, or a faster class with the same methods."""
-        of_backend = {"core": Gradient, "blocks": Gradient, "gather": GatherGradient}
-        return of_backend[self.backend](self.model, corrected, terms, dynamic)
+        made = fast.GatherGradient if self.backend == "gather" else Gradient
+        return made(self.model, corrected, terms, dynamic)
 
     def explicit_step(self, state, h, symplectic, count, pool, colliders=None, pairs=None):
         """Returns a :class:`warpcloth.core.explicit_step.ExplicitStep`, or a faster class with the same methods.
@@ -66,27 +60,30 @@ class Plan:
         given = self.model, state, h, symplectic, count, needs_compensation(self.model)
         if self.model.dynamic:
             blocks = self.backend == "blocks" and self.model.uniform and colliders is None
-            plain = (BlockStep if blocks else ExplicitStep)(self.model.with_dynamic(()), *given[1:-1])
-            steps = TouchingSteps(plain, pairs)
+            plain = (fast.BlockStep if blocks else ExplicitStep)(self.model.with_dynamic(()), *given[1:-1])
+            steps = fast.TouchingSteps(plain, pairs)
         elif pool.threads > 1:
             _refuse_undivided(self.model, self.backend, pool.threads)
-            steps = SubdomainSteps(*given, pool)
+            steps = fast.SubdomainSteps(*given, pool)
         else:
             backend = self.backend if self.model.uniform else "core"
             if colliders is not None and not self.model.colliders.plain:
                 backend = "core"
             if colliders is not None and backend != "core":
-                self.guard = ContactGuard(self.model, colliders)
+                self.guard = fast.ContactGuard(self.model, colliders)
                 given = *given, self.guard
-            steps = {"core": ExplicitStep, "blocks": BlockStep, "gather": GatherStep}[backend](*given)
+            if backend == "core":
+                steps = ExplicitStep(*given)
+            else:
+                steps = (fast.BlockStep if backend == "blocks" else fast.GatherStep)(*given)
         self.record = steps.record
         return steps
 
     def jacobi_sweeps(self, *given):
         """Returns a :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`, or a faster class with the same interface."""
-        if self.model.mobility is not None:
+        if self.model.mobility is not None or self.backend == "core":
             return JacobiSweeps(self.model, *given)
-        return {"core": JacobiSweeps, "blocks": ScatterSweeps, "gather": GatherSweeps}[self.backend](self.model, *given)
+        return (fast.ScatterSweeps if self.backend == "blocks" else fast.GatherSweeps)(self.model, *given)
 
 
 def plan(model, backend="auto"):

@@ -66,9 +66,7 @@ def _entries_of_cells(model, elements):
 
 
 def as_pairs(model, elements):
-    """Pairs of vertices with the same forces as the elements of a quadratic energy, or the elements if pairs are not faster."""
-    if not elements.term.whole.quadratic or elements.damping is not None:
-        return elements
+    """Pairs of vertices with the same forces as undamped elements of a quadratic energy, or these if pairs are not faster."""
     if elements.term.cell:
         rows, columns, numbers = _entries_of_cells(model, elements)
     elif elements.refresh:

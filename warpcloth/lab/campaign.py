@@ -4,9 +4,8 @@ import contextlib
 import json
 import multiprocessing
 import os
-import sys
 import time
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 from ..base.digest import source_digest
@@ -88,9 +87,9 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
 
     Args:
         tasks: :class:`warpcloth.lab.measurements.Task`\\s.
-        executor: Any `concurrent.futures.Executor`, such as that of :func:`warpcloth.lab.cluster.connect`; by default,
-            processes on this machine, for which a script needs ``if __name__ == "__main__":``. Threads of one process measure
-            one after another.
+        executor: Any `concurrent.futures.Executor`, such as that of a Dask client; by default, processes on this machine, for
+            which a script needs ``if __name__ == "__main__":``. Its processes may have another working directory; they read
+            scenes, references and extensions from the same absolute paths. Threads of one process measure one after another.
         store: A :class:`Store`; without one nothing is kept.
         progress: Function called with (finished, tasks, seconds left or None) first and after each; or None.
         workers: Number of parallel processes without an executor, by default that of cores. Measured times include the load
@@ -111,13 +110,14 @@ def sweep(tasks, executor=None, store=None, progress=None, workers=None):
         yield task, store[task]
     if not left:
         return
+    modules = tuple(extensions())
     with contextlib.ExitStack() as stack:
         if executor is None:
             executor = stack.enter_context(processes(min(workers or os.cpu_count() or 1, len(left))))
         futures = {}
         try:
             for task in left:
-                futures[executor.submit(run, task, source_digest())] = task
+                futures[executor.submit(run, task.located(), source_digest(), modules)] = task
             for done, future in enumerate(as_completed(futures), 1):
                 task = futures[future]
                 try:
@@ -170,7 +170,7 @@ def environment(values):
 def processes(workers):
     """Yields an executor of fresh processes, each with one thread for arithmetic. They start with the first task."""
     context = multiprocessing.get_context("spawn")
-    with environment(_ONE_THREAD), ProcessPoolExecutor(workers, context, initializer=begin, initargs=(_own(),)) as pool:
+    with environment(_ONE_THREAD), ProcessPoolExecutor(workers, context, initializer=begin) as pool:
         try:
             yield pool
         except BaseException:
@@ -178,15 +178,10 @@ def processes(workers):
             raise
 
 
-def _own():
-    """Returns the extensions that a process must load; it runs the main script again, and so has those of that."""
-    script = getattr(sys.modules["__main__"], "__file__", None)
-    return [name for name in extensions() if name != script]
-
-
 def kept_store(name, executor=None):
-    """Returns the :class:`Store` of a chart in the cache folder; another one for a cluster, because its times differ."""
-    return Store(cache_folder() / getattr(executor, "folder", "") / f"{name}.jsonl")
+    """Returns the :class:`Store` of a chart in the cache folder; another one for an executor that may be of other machines."""
+    local = executor is None or isinstance(executor, ProcessPoolExecutor | ThreadPoolExecutor)
+    return Store(cache_folder() / ("" if local else "elsewhere") / f"{name}.jsonl")
 
 
 def cache_folder():

@@ -5,14 +5,17 @@ import json
 import math
 import platform
 import threading
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 
 from ..base.digest import source_digest
+from ..base.extensions import extensions, load_only
 from ..core.status import Grade
 from ..others.simulators import other_solvers, shown_name, simulator_of
 from ..run import scene_files
+from ..run.listing import folders
 from ..solvers import SOLVERS
 from . import machine
 
@@ -108,6 +111,21 @@ class Task:
         text = json.dumps([self.function, self.arguments, source_digest(), here], sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
+    def located(self):
+        """Returns it with absolute paths of its scene and its reference, for a process in another working directory.
+
+        Raises:
+            FileNotFoundError: There is no such scene.
+        """
+        found = dict(self.arguments)
+        if found.get("scene"):
+            path = scene_files.find_path(found["scene"]["name"]).resolve()
+            if path.parent != folders()[-1].resolve():  # an included scene has another path on another machine
+                found["scene"] = found["scene"] | {"name": str(path)}
+        if isinstance(found.get("reference"), str):
+            found["reference"] = str(Path(found["reference"]).resolve())
+        return replace(self, arguments=found)
+
     def run(self):
         """Measures in this process, and returns the result."""
         module, name = self.function.split(":")
@@ -128,7 +146,7 @@ def task(function, **arguments):
 def usable(row):
     """Returns whether the run of a row counts as usable without a reference, see :class:`warpcloth.core.status.Grade`.
 
-    Rows without a grade, as of results that were stored before there were grades, do.
+    Rows without a grade do.
     """
     return row.get("grade") != Grade.NOT_USABLE.value
 
@@ -138,23 +156,33 @@ def finite(value):
     return float(value) if math.isfinite(value) else None
 
 
-def run(task, source):
+def run(task, source, modules):
     """Runs a task for an executor: returns its result and the name of the machine that measured it.
 
     Args:
         task: The :class:`Task`.
         source: The :func:`source_digest` of the calling process.
+        modules: Its :func:`warpcloth.base.extensions.extensions`, a tuple of names.
 
     Raises:
-        ValueError: This process has other code, so that its results would have other keys.
+        ValueError: This process has other code, so that its results would have other keys, or cannot import a module.
     """
-    if source != source_digest():
-        raise ValueError(
-            f"the code of warpcloth of {platform.node()} is {source_digest()}, and that of the process that asks {source}; "
-            "install the same on all machines and start the workers again"
-        )
     with _ALONE:
+        code = _code(modules)
+        if source != code:
+            raise ValueError(
+                f"the code of warpcloth of {platform.node()} is {code}, and that of the process that asks {source}; "
+                "install the same on all machines and start the workers again"
+            )
         return task.run(), machine.name(task.arguments.get("device", "cpu"))
+
+
+@cache
+def _code(modules):
+    """Loads the extensions of the process that asks, and returns the hash of the code as this process first read it."""
+    if {*modules} != {*extensions()}:
+        load_only(modules)
+    return source_digest()
 
 
 @cache

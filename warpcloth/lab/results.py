@@ -115,7 +115,7 @@ def read(path):
     """
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=distinct)
-        found["rows"] = [{"copies": 1, "threads": 1, **row} for row in found["rows"]]  # of before there were more
+        found["rows"] = [{"copies": 1, "threads": 1, **row} for row in found["rows"]]
         known = {*_SAME, "label", "status", "ms", "spread", "launches", "bytes", "start_s", "memory"}
         if all(known <= set(row) for row in found["rows"]) and {"device", "processor"} <= set(found["machine"]):
             return found

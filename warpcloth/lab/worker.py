@@ -8,12 +8,11 @@ import threading
 import warnings
 
 from ..base.collector import collector_paused
-from ..base.extensions import load_extension
 from ..base.quiet import initialise_warp
 
 
-def begin(modules):
-    """Starts a process of a campaign: loads Warp and extensions. It shows no warnings, because the parent process has them.
+def begin():
+    """Starts a process of a campaign: loads Warp. It shows no warnings, because the parent process has them.
 
     An interrupt ends the process without a message, because the parent process reports it. It also ends if the parent is
     killed, because otherwise it would wait forever.
@@ -24,8 +23,6 @@ def begin(modules):
     with collector_paused():
         initialise_warp()
     gc.freeze()  # Warp's objects are not garbage
-    for module in modules:
-        load_extension(module)
 
 
 def _end_with(parent):

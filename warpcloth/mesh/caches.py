@@ -1,10 +1,10 @@
 """Files of animations: the point caches .pc2 and .mdd, .npz files, and sequences of .obj and .ply files.
 
-A point cache has points and no triangles; a mesh beside it, an .obj file of the same name, has them. A .pc2 file is
-little-endian: "POINTCACHE2", the version 1, the numbers of points, first frame, frames per sample and number of samples, and
-float32 points. An .mdd file is big-endian: the numbers of frames and of points, float32 times [s], and float32 points.
+A point cache has no triangles; an .obj file of the same name beside it has them. .pc2 is little-endian: "POINTCACHE2", version
+1, numbers of points, first frame, frames per sample, number of samples, float32 points. .mdd is big-endian: numbers of frames
+and of points, float32 times [s], float32 points.
 
-The functions that write take an open binary file, such as that of :class:`warpcloth.base.outputs.OutputSet`.
+Functions that write take an open binary file.
 """
 
 import os
@@ -24,13 +24,8 @@ _DIGITS = 4  # of a frame number, at least
 
 
 def open_pc2(path):
-    """Opens a .pc2 file.
-
-    Returns:
-        Frame numbers (F,) float64, and points (F, n, 3) float32 that are read from the file when used.
-
-    Raises:
-        ValueError: It is no such file, or has another length than its header says.
+    """Opens a .pc2 file: frame numbers (F,) float64, and points (F, n, 3) float32 that are read when used; refuses broken
+    files.
     """
     with open(path, "rb") as file:
         head = file.read(_PC2.size)
@@ -46,14 +41,7 @@ def open_pc2(path):
 
 
 def open_mdd(path):
-    """Opens an .mdd file.
-
-    Returns:
-        Times (F,) [s] float64, and points (F, n, 3) float32 that are read from the file when used.
-
-    Raises:
-        ValueError: It has another length than its header says.
-    """
+    """Opens an .mdd file: times (F,) [s] float64, points (F, n, 3) float32 that are read when used; refuses broken files."""
     with open(path, "rb") as file:
         head = file.read(_MDD.size)
         if len(head) < _MDD.size:
@@ -75,14 +63,7 @@ def _mapped(path, dtype, start, frames, count):
 
 
 def write_pc2(file, frames, labels, count):
-    """Writes a .pc2 file.
-
-    Args:
-        file: The open file.
-        frames: Iterator over the points (n, 3) [m] of each frame.
-        labels: Frame numbers (F,), evenly spaced.
-        count: Number of points n.
-    """
+    """Writes a .pc2 file of ``count`` points (n, 3) [m] in each of the frames with evenly spaced labels (F,)."""
     spacing = float(labels[1] - labels[0]) if len(labels) > 1 else 1.0
     file.write(_PC2.pack(_SIGNATURE, 1, count, float(labels[0]), spacing, len(labels)))
     for points in frames:
@@ -90,21 +71,15 @@ def write_pc2(file, frames, labels, count):
 
 
 def write_mdd(file, frames, times, count):
-    """Writes an .mdd file, with times (F,) [s]; for the rest see :func:`write_pc2`."""
+    """Writes an .mdd file with times (F,) [s], as :func:`write_pc2`."""
     file.write(_MDD.pack(len(times), count) + np.asarray(times, ">f4").tobytes())
     for points in frames:
         file.write(points.astype(">f4").tobytes())
 
 
 def write_npz(file, frames, shape, dtype, arrays):
-    """Writes an .npz file as :func:`warpcloth.open_sequence` reads it.
-
-    Args:
-        file: The open file.
-        frames: Iterators over arrays (n, 3) of each frame by name, such as "points".
-        shape: (F, n, 3).
-        dtype: Type of these arrays.
-        arrays: Other arrays by name.
+    """Writes an .npz file for :func:`warpcloth.open_sequence`: frames (n, 3) by name, to (F, n, 3) of a dtype, and other
+    arrays.
     """
     header = {"descr": np.lib.format.dtype_to_descr(np.dtype(dtype)), "fortran_order": False, "shape": tuple(shape)}
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
@@ -119,13 +94,9 @@ def write_npz(file, frames, shape, dtype, arrays):
 
 
 def write_obj(file, points, mesh, digits=17):
-    """Writes an .obj file: vertices in their order, texture coordinates, and a group for each part of the mesh.
+    """Writes an .obj file: points (n, 3) [m] in order, texture coordinates, and a group for each part.
 
-    Args:
-        file: The open file.
-        points: (n, 3) [m].
-        mesh: The :class:`warpcloth.Mesh`.
-        digits: Digits of coordinates; 9 keep every bit of float32, 17 those of float64.
+    9 ``digits`` keep all bits of float32, 17 those of float64.
     """
     coordinates = mesh.texture_coordinates
     corner = "%d" if coordinates is None else "%d/%d"
@@ -143,7 +114,7 @@ def write_obj(file, points, mesh, digits=17):
 
 
 def write_ply(file, points, mesh):
-    """Writes a binary .ply file with points (n, 3) [m] as float32, in their order, and the triangles of a mesh."""
+    """Writes a binary .ply file: float32 points (n, 3) [m] and the triangles of a mesh."""
     import trimesh
     from trimesh.exchange.ply import export_ply
 
@@ -152,14 +123,12 @@ def write_ply(file, points, mesh):
 
 
 def numbered_paths(path, labels):
-    """Returns the path of each frame: its number, with four digits or more, is added to the name.
+    """Returns the path of each frame: its number, of four digits or more, is added to the name.
 
-    In a name such as cloth.####.obj it replaces the signs, with at least as many digits. Frames are numbered from 0 if a label
-    is negative or no whole number.
+    In cloth.####.obj it replaces the signs, with at least as many digits. Negative or fractional labels are numbered from 0.
 
     Raises:
-        ValueError: The name has # or a digit after these signs, or a file of that kind with another number is there, which
-            would be read as a frame of the sequence.
+        ValueError: The name has # or a digit after these signs, or a file with another number exists.
     """
     path, numbers = Path(path), np.asarray(labels)
     if numbers.dtype.kind != "i" or numbers.min() < 0:

@@ -1,7 +1,6 @@
-"""Captures: measured surfaces whose triangles may change from frame to frame, with noise and holes.
+"""Captures: measured surfaces with noise and holes, whose triangles may change from frame to frame.
 
-`open_capture` takes all that `open_sequence` takes. A folder or pattern of mesh files may have another mesh in each file, and
-the files may end with .stl, .glb and .gltf too. `as_capture` takes meshes in memory.
+`open_capture` takes what `open_sequence` takes, and numbered files with a mesh each, .stl, .glb and .gltf too.
 """
 
 import operator
@@ -24,18 +23,18 @@ from .sequences import Sequence, increasing, missing_labels, numbered_files, ope
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Frames that each have a mesh of their own. Indexing reads a frame and keeps nothing, so that memory stays constant.
+    """Frames with a mesh each, read on demand by index.
 
-    `capture[i]` is the mesh of frame i, a `Surface` with points [m] as the input has them, NaN included. Triangles with a
-    corner that is not finite count as holes.
+    `capture[i]` is a `Surface` with points [m] as in the input, NaN included. Triangles with a corner that is not finite are
+    holes.
 
     Attributes:
         labels: Frame numbers of the input (F,).
-        times: (F,) [s], increasing; None if the input gives none.
-        read: Function that returns the mesh of a frame from its index, 0 to F − 1.
+        times: (F,) [s], increasing, or None.
+        read: Function (0 … F − 1) → mesh of a frame.
         path: The file, folder or pattern, or None.
-        files: Paths of the files that frames are read from.
-        up_axis: "Y" or "Z"; None if the input does not say.
+        files: Paths of the files of frames.
+        up_axis: "Y" or "Z", or None.
     """
 
     labels: np.ndarray
@@ -53,7 +52,7 @@ class Capture:
 
     @cached_property
     def missing(self) -> list[float]:
-        """Labels that are missing between the first and the last; see `missing_labels`."""
+        """Labels missing between the first and the last."""
         return missing_labels(self.labels, self.path)
 
 
@@ -61,19 +60,17 @@ def open_capture(path: FilePath, prim: str | None = None, fps: float | None = No
     """Opens a capture from a file, a folder or a pattern.
 
     Args:
-        path: A folder or pattern of mesh files, the last number in a name being that of the frame; or a stage or an .npz file,
-            see `open_sequence`.
-        prim: Path or name of the prim, or name of the geometry in each file, if there are several.
-        fps: Frames per second: of numbers in file names, or of time codes in place of the stage's rate.
-        scale: Length of a unit of mesh files [m], such as 1e-3 for millimetres. Stages and arrays say theirs or are in metres.
+        path: A folder or pattern of mesh files, the last number in a name being the frame; or a stage or an .npz file.
+        prim: Prim, or geometry in each file, if there are several.
+        fps: Frames per second of file names, or time codes per second.
+        scale: Unit of mesh files [m], such as 1e-3 for millimetres.
 
     Returns:
-        Capture: Of files, none has been read.
+        Capture: No file has been read.
 
     Raises:
         FileNotFoundError: There is no such file or folder.
-        ValueError: The format is none of these, or there are no frames. The message begins with the path. A file that cannot be
-            read raises when its frame is read.
+        ValueError: The format is another, or there are no frames; a broken file raises when its frame is read.
     """
     if fps is not None:
         checks.number("fps", fps, above=0.0)
@@ -102,13 +99,13 @@ def as_capture(frames: Sequence | Iterable[Mesh], dt: float | None = None, times
     """Makes a `Capture` of a `Sequence`, or of meshes in memory.
 
     Args:
-        frames: A `Sequence`, which has times of its own; or a `Mesh` of each frame, its points those of the frame.
-        dt: Time from each mesh to the next [s].
-        times: (F,) [s], increasing. Give one of ``dt`` and ``times``, or neither.
+        frames: A `Sequence`, with its times; or a `Mesh` of each frame.
+        dt: Time between meshes [s].
+        times: (F,) [s], increasing, instead of ``dt``.
 
     Raises:
-        ValueError: There are no frames, one of them is no mesh with triangles, times do not increase, or both ``dt`` and
-            ``times`` are given, or one of them for a sequence.
+        ValueError: There are no frames or a frame has no triangles, times do not increase, or too many of ``dt`` and ``times``
+            are given.
     """
     if dt is not None and times is not None:
         raise ValueError("dt, times: both are given; give one of the two")

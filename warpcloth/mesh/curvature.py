@@ -1,15 +1,14 @@
-"""Second derivatives κ of a function on a mesh, one symmetric 2×2 matrix for each triangle.
+"""Second derivatives κ of a function on a mesh, a symmetric 2×2 matrix for each triangle.
 
 For a function f of the vertices and a triangle T of area A,
 
     κ_T = 1/A Σ_e l_e sym(n_e ⊗ g_e)
 
-over the edges e of T, with length l_e and outward normal n_e. g_e is the gradient of f at the midpoint of e, the same for both
-triangles at e. Its component along e is the difference of f at the two ends over l_e. Its component across e is the mean over
-the two triangles. Each triangle takes it from a quadratic function: the one through its three corners and the opposite vertices
-of its three neighbours. Where these six do not determine one, as at the boundary, the quadratic is fitted by least squares to
-the vertices of the surrounding triangles. So κ_T of a quadratic function is exact on flat meshes. Neighbours are unfolded into
-the plane of T, so that a curved mesh counts by its edge lengths alone.
+over the edges e of T, with length l_e and outward normal n_e. g_e, the gradient of f at the midpoint of e, is common to both
+triangles. Along e it is the difference of f over l_e, across e the mean over the two triangles. Each takes it from the
+quadratic function through its corners and the opposite vertices of its neighbours; where these do not determine one, as at the
+boundary, from a least-squares fit to surrounding vertices. So quadratic functions are exact on flat meshes. Neighbours are
+unfolded into the plane of T, so a curved mesh counts by its edge lengths.
 """
 
 import numpy as np
@@ -21,15 +20,8 @@ _RINGS = 4  # largest number of rings of triangles to fit to
 
 
 def curvature_operator(mesh):
-    """Returns K, a scipy sparse matrix (3T, n): rows 3t to 3t + 2 of K f are κ₁₁, κ₂₂, κ₁₂ of triangle t [unit of f/m²].
-
-    The axes are those of :func:`warpcloth.kernels.membrane.side_axes`.
-
-    Args:
-        mesh: The :class:`warpcloth.Mesh`, of triangles.
-
-    Raises:
-        ValueError: More than two triangles share an edge, or two triangles have the same three vertices.
+    """Returns K (3T, n), sparse: rows 3t to 3t + 2 of K f are κ₁₁, κ₂₂, κ₁₂ of triangle t [unit of f/m²], in axes of
+    :func:`warpcloth.kernels.membrane.side_axes`.
     """
     from scipy.sparse import csr_array
 
@@ -54,7 +46,6 @@ def curvature_operator(mesh):
     tangential = csr_array((slopes, (np.repeat(np.arange(3 * T), 2), ends.ravel())), shape=(3 * T, n))
 
     def summed(direction):
-        """Returns Σ l/A sym(n ⊗ direction) over the sides of each triangle, (3T, 3T)."""
         both = outward[..., :, None] * direction[..., None, :]
         both = (both + both.swapaxes(2, 3)) * (0.5 * length / area[:, None])[..., None, None]
         entries = both[:, :, [0, 1, 0], [0, 1, 1]].swapaxes(1, 2)  # (T, 3 entries, 3 sides)
@@ -65,13 +56,10 @@ def curvature_operator(mesh):
 
 
 def covariant_operator(mesh):
-    """Returns second and first covariant derivatives on a mesh that may be curved: matrices (3T, n) and (2T, n) [1/m², 1/m].
+    """Returns second and first covariant derivatives on a mesh that may be curved, (3T, n) and (2T, n) [1/m², 1/m].
 
-    Rows 2t and 2t + 1 of the second matrix give the gradient on triangle t. The first one is :func:`curvature_operator` less
-    the combination of these rows with which the second derivatives of the points of the mesh are normal to the triangles.
-
-    Args:
-        mesh: As for :func:`curvature_operator`.
+    Rows 2t and 2t + 1 of the second are the gradient on triangle t. The first is :func:`curvature_operator` less the
+    combination of these that makes second derivatives of the mesh's points normal to triangles.
     """
     from scipy.sparse import csr_array
 
@@ -90,7 +78,7 @@ def covariant_operator(mesh):
 
 
 def _partners(mesh):
-    """Returns the side 3t + k that coincides with each side (T, 3), −1 at the boundary. Side k joins corners k and k + 1."""
+    """Returns the side 3t + k that coincides with each side (T, 3), from corner k to k + 1; −1 at the boundary."""
     order, first, count = mesh._sides
     if len(mesh.hinges):  # raises for edges of three triangles
         shared = first[count == 2]
@@ -112,13 +100,7 @@ def _beyond(a, b, inside, ab, ac, bc):
 
 
 def _bubbles(points, origin, slope):
-    """Returns barycentric coordinates λ_k of points, and the bubble functions λ_k λ_{k+1}, both (…, J, 3).
-
-    Args:
-        points: (…, J, 2), NaN for unused entries, where both are 0.
-        origin: First corner (…, 2).
-        slope: Gradients of λ (…, 3, 2).
-    """
+    """Returns barycentric coordinates λ_k of points (…, J, 2), and bubble functions λ_k λ_{k+1}, both (…, J, 3), 0 for NaN."""
     there = np.isfinite(points[..., :1])
     of_corners = np.einsum("...ji,...ki->...jk", points - origin[..., None, :], slope)
     of_corners[..., 0] += 1.0
@@ -133,9 +115,8 @@ def _fixes(bubbles):
 
 
 def _normal_derivatives(mesh, p, outward, length, partner):
-    """Returns the matrix (3T, n) of outward derivatives at the midpoint of each side, of the quadratic of its triangle.
-
-    The quadratic is the linear function through the corners plus three bubble functions, fitted to the other vertices.
+    """Returns the matrix (3T, n) of outward derivatives at the midpoints of sides, of the quadratic of their triangle: linear
+    through the corners, plus three bubbles fitted to other vertices.
     """
     from scipy.sparse import coo_array
 
@@ -148,7 +129,6 @@ def _normal_derivatives(mesh, p, outward, length, partner):
     rows, columns, values = [], [], []
 
     def add(triangles, vertices, points):
-        """Adds entries of some triangles (t,), fitted to vertices (t, J) at points (t, J, 2), NaN for unused entries."""
         of_corners, bubbles = _bubbles(points, p[triangles, 0], slope[triangles])
         fit = bubble[triangles] @ np.linalg.pinv(bubbles, rcond=1e-8)  # (t, 3, J)
         sides = (3 * triangles[:, None] + np.arange(3))[..., None]
@@ -180,7 +160,7 @@ def _normal_derivatives(mesh, p, outward, length, partner):
 
 
 def _unfolded(mesh, p, t, partner, slope):
-    """Unfolds rings of triangles around t into its plane until they determine a quadratic function: {vertex: (2,)}."""
+    """Unfolds rings of triangles around t until they determine a quadratic: {vertex: (2,)}."""
     triangles, x = mesh.triangles, mesh.points
     own = triangles[t].tolist()
     found = dict(zip(own, p, strict=True))

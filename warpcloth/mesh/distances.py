@@ -1,4 +1,4 @@
-"""Distances of points to a surface of triangles, in float64, with Warp's `wp.Mesh` for the search; and samples of a surface."""
+"""Distances of points to a surface of triangles, and samples of a surface."""
 
 import numpy as np
 import warp as wp
@@ -14,26 +14,18 @@ _FLAT = 1e-3
 
 
 def surface_distances(points, x, triangles, device="cpu"):
-    """Returns the distance (k,) [m] of each point to a surface of triangles, degenerate ones included.
+    """Returns the distance (k,) [m] of points (k, 3) to a surface of triangles (T, 3) of x (n, 3) [m], all finite.
 
-    Warp searches in float32, relative to the centre and size of both; the distance to the triangle that it finds is computed in
-    float64. So a distance is never too small. It may be too large by the rounding of the search, about 1e-7 of the size, if
-    another triangle is nearer by less than that.
-
-    Args:
-        points: (k, 3) [m], finite.
-        x: Vertices of the surface (n, 3) [m], finite.
-        triangles: (T, 3), at least one.
-        device: A Warp device.
+    Warp finds the triangle in float32, its distance is computed in float64: never too small, and too large by at most about
+    1e-7 of the size.
     """
     return _nearest(points, x, triangles, device)[0]
 
 
 def nearest_on_surface(points, x, triangles, device="cpu"):
-    """Returns the distance (k,) [m] of each point to a surface, the triangle (k,) and the weights (k, 3) of its nearest point.
+    """Returns the distance (k,) [m] of each point, the triangle (k,) and the weights (k, 3) of the nearest point Σ wᵢxᵢ.
 
-    The nearest point is Σ wᵢxᵢ over the corners of the triangle. A weight is exactly 0 where it lies on a side or a corner
-    that the point is not above. Arguments and rounding are those of :func:`surface_distances`.
+    A weight is exactly 0 on a side or corner that the point is not above. Arguments are those of :func:`surface_distances`.
     """
     distances, faces = _nearest(points, x, triangles, device)
     return distances, faces, nearest_weights(points, x[triangles[faces]])
@@ -59,7 +51,7 @@ def _nearest(points, x, triangles, device):
 
 
 def nearest_weights(points, corners):
-    """Barycentric coordinates (k, 3) of the points of triangles (k, 3, 3) that are nearest to points (k, 3)."""
+    """Barycentric coordinates (k, 3) of the nearest points of triangles (k, 3, 3) to points (k, 3)."""
     a, b, c = corners.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     size = np.maximum(np.einsum("ki,ki->k", normal, normal), 1e-300)
@@ -80,16 +72,10 @@ def nearest_weights(points, corners):
 
 
 def surface_samples(x, triangles, count):
-    """Returns points that sample a surface by its area: triangles (k,), weights of their corners (k, 3) and areas (k,) [m²].
+    """Returns at least ``count`` samples of a surface by area: triangles (k,), weights of corners (k, 3) and areas (k,) [m²].
 
-    Each triangle is cut into m² equal parts, none larger than 3/count of the whole area, so that k is at least ``count``. In
-    each part three points with the weights (2/3, 1/6, 1/6) stand for a third of it. This rule is exact for polynomials of
-    degree 2 (Strang & Fix 1973), so for squares of distances that are linear over a triangle.
-
-    Args:
-        x: Vertices (n, 3) [m], finite.
-        triangles: (T, 3), at least one; the surface has an area.
-        count: Number of points at least.
+    Each triangle is cut into m² equal parts, none above 3/count of the whole area. Three points of each, with the weights (2/3,
+    1/6, 1/6), are exact for polynomials of degree 2 (Strang & Fix 1973).
     """
     areas = areas_of(x, triangles)
     cuts = np.maximum(np.ceil(np.sqrt(count / 3.0 * areas / areas.sum())), 1).astype(int)
@@ -107,7 +93,7 @@ def surface_samples(x, triangles, count):
 
 
 class Boundary:
-    """The boundary of a surface: sides of one triangle only, where vertices at the same position count as one.
+    """The boundary of a surface: sides of one triangle only; vertices at one position count as one.
 
     Args:
         x: Vertices (n, 3) [m].
@@ -125,7 +111,7 @@ class Boundary:
         self._corners = ends[corners]
 
     def has(self, faces, weights):
-        """Returns which points with weights (k, 3) in triangles (k,) lie on the boundary, (k,)."""
+        """Returns which points with weights (k, 3) in triangles (k,) are on the boundary, (k,)."""
         zero = weights == 0.0
         on_side, at_corner = zero.sum(axis=1) == 1, zero.sum(axis=1) == 2
         of_side = self._sides[faces, np.argmax(zero, axis=1)]

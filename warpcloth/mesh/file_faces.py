@@ -1,4 +1,4 @@
-"""Polygons as files have them, and what their readers share."""
+"""Polygons of files."""
 
 import re
 from itertools import chain
@@ -13,10 +13,10 @@ class FileFaces(NamedTuple):
     """The faces of a file.
 
     Attributes:
-        points: (n, 3) [m], float64, finite or not.
+        points: (n, 3) [m], float64.
         counts: Number of corners of each face (F,), at least 3.
         corners: Vertices of one face after another (C,), int64.
-        st: Texture coordinates of the corners (C, 2), not finite where there are none, or None.
+        st: Texture coordinates of the corners (C, 2), NaN where missing, or None.
     """
 
     points: np.ndarray
@@ -27,15 +27,11 @@ class FileFaces(NamedTuple):
     def triangles(self, triangles_of=triangles_of):
         """Returns points (n, 3), triangles (T, 3), and texture coordinates, or None.
 
-        Corners of polygons that repeat the one before are left out, and polygons that have fewer than three others. Texture
-        coordinates are (n, 2), or (T, 3, 2) if a vertex has several, and None if a corner has none. The second half of a
-        four-sided fan is (2, 3, 0).
-
-        Args:
-            triangles_of: Function that cuts faces, see `polygons.triangles_of`.
+        Repeated corners are dropped, and polygons with fewer than three others. Texture coordinates are (n, 2), (T, 3, 2) if a
+        vertex has several, or None if a corner has none.
 
         Raises:
-            ValueError: A face crosses or touches itself, or is far from planar; or none has three corners.
+            ValueError: A face crosses or touches itself, is far from planar, or none has three corners.
         """
         begins, ahead = np.cumsum(self.counts) - self.counts, np.append(self.corners[1:], -1)
         ahead[begins + self.counts - 1] = self.corners[begins]
@@ -54,18 +50,9 @@ class FileFaces(NamedTuple):
 
 
 def faces_of(path, points, rows, st=None, lines=None, first=0):
-    """Returns the `FileFaces` of a file. Faces of fewer than three corners, which are lines and points, are left out.
+    """Returns the `FileFaces` of a file, without lines and points, from points (n, 3) [m] and rows of vertices from 0.
 
-    Args:
-        path: The file, for messages.
-        points: (n, 3) [m].
-        rows: Vertices of each face, from 0.
-        st: As in `FileFaces`.
-        lines: The line of each face (F,), if the file is text.
-        first: The number of the first vertex and of the first face in it.
-
-    Raises:
-        ValueError: A face has a corner that is no vertex.
+    ``lines`` (F,) are the lines of faces in text, ``first`` is the number of the first vertex and face there, for messages.
     """
     points, counts = np.asarray(points, dtype=np.float64).reshape(-1, 3), np.fromiter(map(len, rows), np.int64, len(rows))
     try:
@@ -82,20 +69,20 @@ def faces_of(path, points, rows, st=None, lines=None, first=0):
 
 
 def text_lines(data):
-    """Returns pairs of the number and the text of each line of a file in bytes, which may end with a mark of its end."""
+    """Returns (number, text) of each line of a file in bytes, which may end with an end-of-file mark."""
     text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig", "replace")
     return enumerate(re.split(r"\r\n|\r|\n", text.removesuffix("\0").removesuffix("\x1a")), start=1)
 
 
 def plain_number(word, kind=float):
-    """Returns the number of a word; underscores, which Python allows, are refused."""
+    """Returns the number of a word; refuses underscores."""
     if "_" in word:
         raise ValueError(f"has {word!r}, must be a number")
     return kind(word)
 
 
 def optional_number(word):
-    """Returns a number, or NaN if it is none, as for texture coordinates, which a mesh can do without."""
+    """Returns a number, or NaN if it is none."""
     try:
         return float(word)
     except ValueError:
@@ -103,15 +90,12 @@ def optional_number(word):
 
 
 def plain_reason(error):
-    """Returns why a line could not be read, where Python says only that a word is none of its numbers."""
+    """Returns why a line could not be read."""
     words = re.fullmatch(r"(could not convert|invalid literal).* (float|int)\b.*?: (.*)", str(error))
     return str(error) if words is None else f"has {words[3]}, must be a {'whole ' * (words[2] == 'int')}number"
 
 
 def refuse_open_end(where, data, last, most):
-    """Raises ValueError if the last number has no line break after it and may be cut, as more digits would still be valid.
-
-    The last number is an index below ``most``, which is infinite if it is no index.
-    """
+    """Raises ValueError if the last number, an index below ``most``, has no line break after it and may be cut."""
     if data[-1:] not in b"\r\n" and not (last.isdecimal() and (int(last) == 0 or 10 * int(last) >= most)):
         raise ValueError(f"{where}: ends in {last} without a line break, so the file may be cut; end the line with one")

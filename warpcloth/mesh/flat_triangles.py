@@ -1,4 +1,4 @@
-"""Removes triangles without area from a surface, and keeps closed surfaces closed."""
+"""Removes triangles without area, and keeps closed surfaces closed."""
 
 import numpy as np
 
@@ -9,10 +9,8 @@ _FLAT = 1e-4  # ratio of height to longest side below which a triangle is flippe
 
 
 def without_slivers(points, triangles):
-    """Returns triangles (T, 3) with area for the same surface.
-
-    A triangle with two corners at one position is removed. A triangle with its corners on a line, as beside a vertex on a side
-    of another triangle, flips its longest side with the triangle across it.
+    """Returns triangles (T, 3) with area for the same surface: two corners at one position are removed, corners on a line flip
+    their longest side.
 
     Raises:
         ValueError: None has an area.
@@ -31,14 +29,13 @@ def without_slivers(points, triangles):
 
 
 def _flat(corners, least):
-    """Returns which triangles (T, 3, 3) have a height of at most ``least`` times their longest side, (T,)."""
     sides = corners - np.roll(corners, 1, axis=1)
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     return ~(doubled > least * np.einsum("tki,tki->tk", sides, sides).max(axis=1))
 
 
 def _flipped(points, triangles, index, flat):
-    """Flips the longest side of flat triangles, those whose neighbour is not flipped in this round."""
+    """Flips the longest side of flat triangles whose neighbour is not flipped in this round."""
     triangles = triangles.copy()
     beyond = {}
     for t, corners in enumerate(index[triangles].tolist()):

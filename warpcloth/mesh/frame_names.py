@@ -1,4 +1,4 @@
-"""The numbers of frames in the names of files."""
+"""Frame numbers in file names."""
 
 import re
 from collections.abc import Iterable
@@ -22,17 +22,16 @@ class _Name(NamedTuple):
 
 
 def frames_of_names(files: Iterable[Path]) -> dict[float, Path]:
-    """Returns files by the numbers of their frames, ascending.
+    """Returns files by frame number, the last number in a name, ascending.
 
-    The last number in a name is that of its frame. A hyphen before it is a minus unless a letter, digit or blank precedes it,
-    so "cloth_-4" is frame −4 and "cloth-4" is frame 4; beside "cloth1", however, "cloth-4" is frame −4. Decimals, as in
-    "c_1.25" and "c_2.00", are equal parts of a frame. After a version the point separates, as in "v2.0998". It separates also
-    after a number that all names have, in two cases: the number is not 0 and four digits or more follow, as in "take_2.0100"
-    and "take_2.0200"; or two digits or more follow, and two frames follow each other.
+    A hyphen before it is a minus unless a letter, digit or blank precedes it; beside "cloth1", however, "cloth-4" is frame −4.
+    Decimals, as in "c_1.25" and "c_2.00", are parts of a frame. A point separates after a version, as in "v2.0998", and after a
+    number that all names have if that is not 0 and four digits or more follow, as in "take_2.0100", or if two digits or more
+    follow and two frames are consecutive.
 
     Raises:
-        ValueError: A name has no number, or one of more than 15 digits, two names have one number, or it is not clear whether
-            a hyphen is a minus or digits after a point are decimals. The message begins with the file.
+        ValueError: A name has no number or one of more than 15 digits, two have the same, or a hyphen or point is ambiguous;
+            the message begins with the file.
     """
     names = {file: _parsed(file) for file in files}
     if any(name.decimals for name in names.values()):
@@ -66,11 +65,7 @@ def _parsed(file):
 
 
 def _without_separators(names):
-    """Returns names by file, with the digits after a point as whole numbers if the point is a separator.
-
-    Raises:
-        ValueError: It may be either.
-    """
+    """Returns names by file, without points that separate; refuses ambiguous ones."""
     digits = max(len(name.decimals) for name in names.values())
     if len({name[:3] for name in names.values()}) == 1:
         numbers = sorted(int(name.decimals or 0) for name in names.values())

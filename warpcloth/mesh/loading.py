@@ -1,4 +1,4 @@
-"""Meshes from files: .obj, .ply and .off by readers of their own, which keep polygons whole, .stl and glTF by trimesh."""
+"""Meshes from files: .obj, .ply and .off, with polygons, by readers here; .stl and glTF by trimesh."""
 
 import json
 import logging
@@ -24,20 +24,17 @@ _COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression"}
 
 
 def read_file(path, name=None, kind=Mesh):
-    """Reads the mesh in a file.
+    """Reads the mesh in a file, vertices in the order of the file.
 
-    Vertices keep the order of the file. STL and glTF repeat a vertex wherever triangles differ in normal or texture, which
-    would cut the cloth: there, vertices with exactly equal points are welded into the first of them. In other files, vertices
-    are welded along sides that lie exactly upon each other, as at seams, but not of a `Surface`, which frames must fit. glTF
-    node transforms are applied; lengths are taken for metres. Polygons are cut into triangles as `polygons.cut` says.
+    STL and glTF repeat vertices, so equal points are welded into the first; other files are welded along coinciding sides
+    (seams), but not a `Surface`. glTF node transforms are applied; lengths are metres; polygons are cut as by `polygons.cut`.
 
-    Texture coordinates are at vertices if each has one pair, else at the corners of triangles. They are read from OBJ, PLY and
-    glTF, and left out unless every corner of the mesh has them. Lines and faces of two corners are left out, too.
+    Texture coordinates (OBJ, PLY, glTF) are at vertices if each has one pair, else at corners; None unless all corners have
+    them.
 
     Args:
         path: An .obj, .ply, .stl, .off, .glb or .gltf file.
-        name: Name of the geometry (OBJ: object; glTF: node; STL: solid), if the file has several. Vertices of the others are
-            left out.
+        name: Geometry (object, node or solid), if there are several.
         kind: `Mesh` or `Surface`.
 
     Returns:
@@ -45,10 +42,9 @@ def read_file(path, name=None, kind=Mesh):
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The ending is none of those above; the file is empty, cannot be read or has no triangles; it does not have
-            the rows that its header announces; not all faces could be read; a face crosses or touches itself or is not planar;
-            the file has several geometries and `name` is none of them; or `kind` refuses the mesh. The message begins with the
-            path, and for text the line.
+        ValueError: The ending is unknown; the file is empty, broken, or without triangles; a face crosses or touches itself or
+            is not planar; there are several geometries and no `name`; or `kind` refuses the mesh. The message begins with the
+            path and line.
     """
     faces = read_faces(path, name)
     try:
@@ -62,7 +58,7 @@ READERS.update(dict.fromkeys(ENDINGS, read_file))
 
 
 def read_arrays(path, name=None):
-    """Returns points, triangles and texture coordinates of a file, see `FileFaces.triangles`; seams are not welded."""
+    """Returns points, triangles and texture coordinates of a file, seams not welded."""
     faces = read_faces(path, name)
     try:
         return faces.triangles()
@@ -71,7 +67,7 @@ def read_arrays(path, name=None):
 
 
 def read_faces(path, name=None):
-    """Reads the `FileFaces` of a file, see `read_file`; seams are not welded."""
+    """Reads the `FileFaces` of a file, seams not welded."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -91,7 +87,6 @@ def read_faces(path, name=None):
 
 
 def _chosen(path, geometries, name):
-    """Returns the name of a geometry, which may be None if there is only one."""
     names = ", ".join(repr(each) for each in sorted(geometries, key=str))
     if name is None and len(geometries) > 1:
         raise ValueError(f"{path}: has several geometries, name one of them: {names}")
@@ -101,7 +96,6 @@ def _chosen(path, geometries, name):
 
 
 def _some_of(faces, indices):
-    """Returns some faces of a file, without the vertices of the others."""
     chosen = np.zeros(len(faces.counts), dtype=bool)
     chosen[indices] = True
     at_corners = np.repeat(chosen, faces.counts)
@@ -130,7 +124,6 @@ def _read_by_trimesh(path, data, ending, name):
 
 
 def _check_count(path, data, ending, loaded):
-    """Raises ValueError if trimesh has not read all triangles of a file."""
     if ending == ".stl":
         binary = len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
         written = loaded if binary else len(re.findall(rb"\bfacet\s+normal\b", data, re.IGNORECASE))
@@ -149,7 +142,6 @@ def _check_count(path, data, ending, loaded):
 
 
 def _faces(path, geometry, transform, drop_unused):
-    """Returns the `FileFaces` of a trimesh.Trimesh, whose vertices with equal points are welded."""
     points, triangles = np.asarray(geometry.vertices, dtype=np.float64), np.asarray(geometry.faces, dtype=np.int64)
     if not np.array_equal(transform, np.eye(4)):
         points = points @ transform[:3, :3].T + transform[:3, 3]

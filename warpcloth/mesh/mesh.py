@@ -1,4 +1,4 @@
-"""The mesh of a cloth: NumPy arrays, validated once, and the topology that energies and solvers read."""
+"""The mesh of a cloth, and the topology that energies and solvers read."""
 
 import itertools
 import sys
@@ -33,25 +33,21 @@ _BYTES_OF_A_VERTEX = 24 + 16 + 48
 class Mesh:
     """A mesh in its rest shape: triangles, or edges alone, as for a chain or a net.
 
-    Every array is copied, checked and made read-only. Edges are computed at once, and the rest of the topology when it is first
-    used.
+    Arrays are copied, checked and made read-only.
 
     Attributes:
         points: Rest positions (n, 3) [m], float64.
         triangles: Vertices of each triangle (T, 3), int32, counter-clockwise from the front; (0, 3) of an edge mesh.
-        edges: Vertices of each edge (E, 2), int32. In a triangle mesh, each edge occurs once, with the smaller index first, and
-            rows are in lexicographic order. In an edge mesh, edges are as given.
-        texture_coordinates: One st pair for each vertex (n, 2), or for each corner of each triangle (T, 3, 2) if a vertex has
-            several, as on seams; float64, or None.
+        edges: Vertices of each edge (E, 2), int32. In a triangle mesh each occurs once, the smaller index first, in
+            lexicographic order; in an edge mesh as given.
+        texture_coordinates: st of each vertex (n, 2), or of each corner (T, 3, 2) if a vertex has several; float64, or None.
         grid_shape: (nx, ny) if vertex i + nx·j is column i, row j of a grid of four-sided cells, or None.
-        up_axis: "Y" or "Z", the up axis of gravity and of files; None if unknown, which counts as "Y".
-        parts: For a mesh that :meth:`join` made, (first vertex, number of vertices, grid_shape) of each part by name, else
-            None.
+        up_axis: "Y" or "Z"; None if unknown, which counts as "Y".
+        parts: (first vertex, count, grid_shape) by name of each part of :meth:`join`, or None.
 
     Raises:
-        ValueError: An array has the wrong shape or type, or is empty. An element, which the message names by its index, is not
-            finite, refers to a vertex that does not exist, repeats a vertex, has no area or length, or is an edge that occurs
-            twice. The up axis is neither "Y" nor "Z".
+        ValueError: An array has the wrong shape or type, or is empty. An element, named by its index, is not finite, refers to
+            no vertex, repeats one, has no area or length, or is an edge that occurs twice. The up axis is unknown.
 
     Examples:
         >>> import warpcloth as wc
@@ -112,22 +108,21 @@ class Mesh:
     def grid(cls: type[Own], nx: int, ny: int, size: float | tuple[float, float] = 1.0, pattern: Pattern = "diagonal") -> Own:
         """Builds a flat grid in the plane y = 0, its first corner at the origin, triangle normals along +y.
 
-        Vertex i + nx·j stands in column i along +x and row j along +z. Patterns:
+        Vertex i + nx·j is in column i along +x and row j along +z; patterns:
 
         - "diagonal": rectangular cells, all diagonals from (i, j) to (i+1, j+1).
         - "alternating": rectangular cells, the diagonals of neighbouring cells mirrored, like a checkerboard.
-        - "equilateral": rows along x with edges of length a = size/(nx−1), spaced a·√3/2 along z, odd rows shifted by a/2 along
-          +x, so that the boundary zigzags by a/2 at the ends of the rows. The grid has no four-sided cells, and therefore no
-          `grid_shape`. Hinge energies are isotropic on this pattern only.
+        - "equilateral": rows along x with edges of length a = size/(nx−1), a·√3/2 apart along z, odd rows shifted by a/2 along
+          +x; without `grid_shape`, and the only pattern with isotropic hinge energies.
 
         Args:
-            nx: Number of vertices of a row, at least 2.
-            ny: Number of rows, at least 2.
-            size: Width along x and depth along z, or one length for both [m]; for "equilateral", the length of a row.
-            pattern: How the grid is divided into triangles.
+            nx: Vertices in a row, at least 2.
+            ny: Rows, at least 2.
+            size: Width along x and depth along z, or one length [m]; for "equilateral" the width.
+            pattern: One of these.
 
         Returns:
-            Mesh: nx·ny vertices, 2(nx−1)(ny−1) triangles; texture coordinates fill the unit square.
+            Mesh: nx·ny vertices, 2(nx−1)(ny−1) triangles, texture coordinates in the unit square.
 
         Raises:
             ValueError: A count, the size or the pattern is not allowed.
@@ -161,25 +156,25 @@ class Mesh:
 
     @classmethod
     def join(cls: type[Own], meshes: Mapping[str, "Mesh"]) -> Own:
-        """Joins several meshes, such as the pieces of a garment: the vertices of the first part, then those of the next.
+        """Joins several meshes, such as pieces of a garment, part after part.
 
-        The selection ``part(name)`` gives the vertices of one part. A term with ``part=name`` acts on that part alone. A
-        :class:`warpcloth.Spring` with given pairs can join two parts. Texture coordinates are kept if all parts have them.
+        ``part(name)`` selects the vertices of a part; a term with ``part=name`` acts on it. A :class:`warpcloth.Spring` with
+        given pairs can join parts. Texture coordinates are kept if all parts have them.
 
         Args:
-            meshes: The mesh of each part by its name, which must be an identifier.
+            meshes: Meshes by name, an identifier.
 
         Raises:
-            ValueError: There is no mesh, a mesh has parts itself, triangle meshes are mixed with edge meshes, the up axes
-                differ, or a name is not an identifier.
+            ValueError: There is none, one has parts, triangle and edge meshes are mixed, up axes differ, or a name is not an
+                identifier.
         """
         return cls(**joined(meshes))
 
     def part(self, name: str) -> "Mesh":
-        """Returns the mesh of one part, as it was before :meth:`join`.
+        """Returns the mesh of a part, as before :meth:`join`.
 
         Raises:
-            ValueError: The mesh has no part of that name.
+            ValueError: There is no such part.
         """
         found = (self.parts or {}).get(name)
         if found is None:
@@ -207,23 +202,19 @@ class Mesh:
         )
 
     def _of_parts(self, indices: Callable[["Mesh"], np.ndarray]) -> np.ndarray:
-        """Applies a function that returns vertex indices to each part, and joins the results as indices of this mesh."""
         return np.concatenate([indices(self.part(name)) + part.first for name, part in (self.parts or {}).items()])
 
     @classmethod
     def chain(cls: type[Own], n: int, length: float = 1.0, direction: ArrayLike = (0, -1, 0)) -> Own:
-        """Builds a straight chain: n vertices evenly spaced from the origin, n−1 edges from each to the next.
+        """Builds a straight chain of n evenly spaced vertices from the origin, an edge mesh.
 
         Args:
-            n: Number of vertices, at least 2.
-            length: Length of the whole chain [m].
-            direction: Direction from the first vertex to the last; its length does not matter, but must not be 0.
-
-        Returns:
-            Mesh: An edge mesh.
+            n: Vertices, at least 2.
+            length: Its length [m].
+            direction: Direction to the last vertex, not 0.
 
         Raises:
-            ValueError: Fewer than two vertices, a length that is not positive, a direction that is not a vector.
+            ValueError: A value is not allowed.
         """
         n, length = _count("n", n), _length("length", length)
         refuse_memory(f"n = {n}", _BYTES_OF_A_VERTEX * n)
@@ -235,19 +226,19 @@ class Mesh:
 
     @classmethod
     def load(cls: type[Own], path: FilePath, prim: str | None = None, scale: float = 1.0, up_axis: UpAxis | None = None) -> Own:
-        """Reads the mesh in a file, see `loading.read_file`, or `usd.read_mesh` for USD stages, also for what is raised.
+        """Reads the mesh in a file, by `loading.read_file`, or `usd.read_mesh` for stages.
 
         Args:
             path: An .obj, .ply, .stl, .off, .glb or .gltf file, or a .usd, .usda, .usdc or .usdz stage.
-            prim: Name of the geometry, or path of the prim, if the file has several.
-            scale: Factor by which to multiply lengths, such as 0.01 for a mesh file in centimetres.
-            up_axis: "Y" or "Z", if the file does not say it. Stages do, and in .glb and .gltf files it is Y.
+            prim: Geometry or prim, if there are several.
+            scale: Factor on lengths, such as 0.01 for centimetres.
+            up_axis: "Y" or "Z", for files other than stages, .glb and .gltf (Y).
 
         Returns:
-            Mesh: An instance of the class on which it was called, with vertices in the order of the file.
+            Mesh: Of this class, vertices in the order of the file.
 
         Raises:
-            ValueError: The ending is none of those above, ``scale`` is not above 0, or ``up_axis`` is not that of the file.
+            ValueError: The mesh cannot be read, ``scale`` is not above 0, or ``up_axis`` contradicts the file.
         """
         read = READERS.get(Path(path).suffix.lower())
         if read is None:
@@ -264,29 +255,22 @@ class Mesh:
         return cls(scale * mesh.points, **elements, **given, up_axis=own or up_axis)
 
     def select(self, text: str) -> np.ndarray:
-        """Returns the vertices of a selection such as "z == 0 and not corners".
+        """Returns the vertices of a selection such as "z == 0 and not corners", sorted, int32.
 
         Args:
-            text: The selection; `selection.select` has the grammar.
-
-        Returns:
-            np.ndarray: Vertex indices, sorted, each once, int32.
+            text: The selection, in the grammar of `selection.select`.
 
         Raises:
-            ValueError: The text does not follow the grammar; the message says where, and what is allowed there.
+            ValueError: The text breaks the grammar; the message says where.
         """
         return select(self, text)
 
     def corners(self) -> np.ndarray:
-        """Returns the vertices at the corners.
+        """Returns the vertices at the corners, int32.
 
-        With a ``grid_shape`` these are the four corners (0, 0), (nx−1, 0), (0, ny−1), (nx−1, ny−1). For other triangle meshes
-        they are the boundary vertices nearest to the corners of the boundary's bounding box in the plane of its two largest
-        extents, in the same order; a vertex nearest to two corners occurs once. For edge meshes they are the ends, vertices of
-        exactly one edge. A mesh with parts has the corners of each part.
-
-        Returns:
-            np.ndarray: Vertex indices, int32.
+        With a ``grid_shape`` they are (0, 0), (nx−1, 0), (0, ny−1), (nx−1, ny−1). Else they are the boundary vertices nearest
+        to the corners of the boundary's bounding box in its two largest extents, in that order, each once. Edge meshes have
+        their ends, meshes with parts the corners of each.
 
         Raises:
             ValueError: The triangles are closed, without a boundary.
@@ -308,7 +292,7 @@ class Mesh:
         return self.boundary[list(dict.fromkeys(nearest.tolist()))]
 
     def springs(self, kind: str) -> np.ndarray:
-        """Returns the vertex pairs of one kind of springs (Provot 1995, "Deformation constraints in a mass-spring model").
+        """Returns the vertex pairs of a kind of springs (Provot 1995, "Deformation constraints in a mass-spring model").
 
         | kind | a grid with `grid_shape` | other triangle meshes | edge meshes |
         |---|---|---|---|
@@ -321,8 +305,8 @@ class Mesh:
             kind: One of the four.
 
         Returns:
-            np.ndarray: Pairs (E, 2), int32: the smaller index first, each pair once. If the table says "every edge", row e is
-                edge e of the mesh; otherwise the pairs are in lexicographic order.
+            np.ndarray: Pairs (E, 2), int32, the smaller index first, each once: "every edge" in the order of edges, others in
+            lexicographic order.
 
         Raises:
             ValueError: The kind is unknown, is "shear" on a mesh without cells, or "bending" on a mesh that refuses hinges.
@@ -358,13 +342,13 @@ class Mesh:
 
     @cached_property
     def hinges(self) -> np.ndarray:
-        """The four vertices of every pair of triangles that share an edge (H, 4), int32, in the order of the edges.
+        """The vertices of pairs of triangles that share an edge (H, 4), int32, in the order of edges.
 
-        In a row [x₀, x₁, x₂, x₃], the triangle of the lower index has the corners x₀, x₁, x₂ in this cyclic order, so its
-        normal is along (x₁−x₀)×(x₂−x₀). x₃ is the third vertex of the other triangle, whichever orientation that has.
+        In [x₀, x₁, x₂, x₃], x₀, x₁, x₂ is the triangle of the lower index in its cyclic order, with its normal along
+        (x₁−x₀)×(x₂−x₀). x₃ is the third vertex of the other.
 
         Raises:
-            ValueError: More than two triangles share an edge, or two triangles have the same three vertices.
+            ValueError: More than two triangles share an edge, or two share three vertices.
         """
         order, first, count = self._sides
         if (count > 2).any():
@@ -400,14 +384,14 @@ class Mesh:
 
     @cached_property
     def boundary(self) -> np.ndarray:
-        """Sorted vertices of the boundary edges, int32; for an edge mesh the ends, vertices of exactly one edge."""
+        """Sorted vertices of the boundary edges, int32; for an edge mesh the ends."""
         if len(self.triangles):
             return _read_only(np.unique(self.boundary_edges))
         return _read_only(np.flatnonzero(np.bincount(self.edges.ravel()) == 1).astype(np.int32))
 
     @cached_property
     def isolated(self) -> np.ndarray:
-        """Sorted vertices that belong to no edge, int32; they have no area and no length."""
+        """Sorted vertices without an edge, int32."""
         used = np.bincount(self.edges.ravel(), minlength=len(self.points))
         return _read_only(np.flatnonzero(used == 0).astype(np.int32))
 
@@ -425,23 +409,19 @@ class Mesh:
 
     @cached_property
     def vertex_areas(self) -> np.ndarray:
-        """Lumped areas (n,) [m²]: a third of the area of each adjacent triangle; areas that are not finite count as 0."""
+        """Lumped areas (n,) [m²]: thirds of adjacent triangles; areas that are not finite count as 0."""
         third = np.repeat(np.where(np.isfinite(self.triangle_areas), self.triangle_areas, 0.0) / 3, 3)
         return _read_only(np.bincount(self.triangles.ravel(), weights=third, minlength=len(self.points)))
 
     @cached_property
     def vertex_lengths(self) -> np.ndarray:
-        """Lumped lengths (n,) [m]: half the length of each adjacent edge."""
+        """Lumped lengths (n,) [m]: halves of adjacent edges."""
         half = np.repeat(self.edge_lengths / 2, 2)
         return _read_only(np.bincount(self.edges.ravel(), weights=half, minlength=len(self.points)))
 
     @cached_property
     def _sides(self):
-        """The 3T triangle sides, sorted by edge and then by triangle.
-
-        Returns:
-            Sides in that order (3T,), the first position of each edge in it (E,), and the number of sides of each edge (E,).
-        """
+        """The 3T sides sorted by edge, then triangle (3T,), and first position (E,) and number (E,) of each edge's sides."""
         keys = self._keys(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2))
         order = np.argsort(keys, kind="stable")
         keys = keys[order]
@@ -449,18 +429,17 @@ class Mesh:
         return order, first, np.diff(first, append=len(keys))
 
     def _keys(self, pairs):
-        """Packs each pair of (E, 2), smaller index first, into one int64, because these sort much faster than rows."""
+        """Packs pairs (E, 2), smaller index first, into int64, which sort faster."""
         one, other = pairs.T
         return np.minimum(one, other).astype(np.int64) * len(self.points) + np.maximum(one, other)
 
     def distinct_pairs(self, pairs: np.ndarray) -> np.ndarray:
-        """Returns the distinct pairs of vertices (E, 2), int32, the smaller index first, in lexicographic order."""
+        """Returns the distinct pairs of vertices (E, 2), int32, in lexicographic order."""
         keys = np.sort(self._keys(pairs))
         keys = keys[np.append(True, keys[1:] != keys[:-1])[: len(keys)]]
         return np.stack(np.divmod(keys, len(self.points)), axis=1).astype(np.int32)
 
     def _flat(self):
-        """Whether the height of each triangle is at most FLATTEST times its longest side, or is not finite, (T,)."""
         with np.errstate(invalid="ignore", over="ignore"):
             a, b, c = columns_of(self.points, *self.triangles.T)
             longest_squared = np.max([dot(side, side) for side in (a - c, b - a, c - b)], axis=0)
@@ -494,8 +473,7 @@ class Mesh:
 class Surface(Mesh):
     """A mesh that is only measured: triangles may be degenerate and points may be infinite or NaN.
 
-    Measures skip `degenerate` triangles and report them. Edges and topology include them, so an edge may join a vertex with
-    itself.
+    `degenerate` triangles have no measures but belong to the topology, so an edge may join a vertex with itself.
     """
 
     @cached_property
@@ -524,14 +502,12 @@ def _read_only(array):
 
 
 def _refuse(name, rows, bad, rule):
-    """Raises ValueError for the first row that is bad."""
     if bad.any():
         row = np.argmax(bad)
         raise ValueError(f"{name}[{row}] is {rows[row].tolist()}; it {rule}")
 
 
 def _rows(name, value, width, kinds):
-    """Returns the value as an array (count, width), count at least 1, whose type is one of NumPy's ``kinds``."""
     try:
         array = np.asarray(value)
     except ValueError as error:
@@ -560,7 +536,6 @@ def _indices(name, value, width, n):
 
 
 def _repeated(rows):
-    """Returns which rows of (count, width) have a number twice, (count,)."""
     columns = rows.T
     return np.any([one == other for one, other in itertools.combinations(columns, 2)], axis=0)
 

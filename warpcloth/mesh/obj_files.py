@@ -13,10 +13,10 @@ _CURVED = {*"surf bzp bsp cdc cdp res".split()}
 
 
 def read_obj(path, data):
-    """Returns the `FileFaces` of an .obj file in bytes, and the indices of those of each object by its name.
+    """Returns the `FileFaces` of an .obj file, and the indices of each object's faces by name.
 
     Raises:
-        ValueError: A line cannot be read, or names a vertex that the file does not have. The message has path, line and reason.
+        ValueError: A line cannot be read or names no vertex; the message has path, line and reason.
     """
     points, texture, rows, st, lines, objects, name, curved = [], [], [], [], [], {}, path.name, None
     joined = ""
@@ -65,6 +65,5 @@ def _index(word, count):
 
 
 def _texture_index(word, count):
-    """Like :func:`_index`, but for texture coordinates: −1 if there are none."""
     index = optional_number(word)
     return index - 1 if index > 0 else count + index if -count <= index < 0 else -1

@@ -8,10 +8,10 @@ from .file_faces import faces_of, plain_number, plain_reason, refuse_open_end, t
 
 
 def read_off(path, data):
-    """Returns the `FileFaces` of an .off file in bytes, without the normals, colours and texture coordinates that it may have.
+    """Returns the `FileFaces` of an .off file, without normals, colours and texture coordinates.
 
     Raises:
-        ValueError: The lines do not match the header, or one cannot be read. The message has path, line and reason.
+        ValueError: A line cannot be read or does not match the header; the message has path, line and reason.
     """
     rows = [(line, words) for line, text in text_lines(data) if (words := text.partition("#")[0].split())]
     if rows and rows[0][1][0].endswith("OFF"):

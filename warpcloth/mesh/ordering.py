@@ -11,15 +11,8 @@ LEAST = 4096
 
 
 def near_order(mesh: Mesh) -> np.ndarray:
-    """Returns the vertices in reverse Cuthill–McKee order of the graph of edges, which keeps neighbours near.
-
-    (Cuthill and McKee 1969, *Reducing the bandwidth of sparse symmetric matrices*; George 1971.)
-
-    Args:
-        mesh: The :class:`warpcloth.Mesh`.
-
-    Returns:
-        np.ndarray: (n,) int32, for :meth:`warpcloth.Scene.build`.
+    """Returns the vertices in reverse Cuthill–McKee order of the edges (Cuthill and McKee 1969, *Reducing the bandwidth of
+    sparse symmetric matrices*; George 1971), (n,) int32.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -31,13 +24,13 @@ def near_order(mesh: Mesh) -> np.ndarray:
 
 
 def spread(mesh: Mesh, order: np.ndarray | None = None) -> float:
-    """Returns the mean of |i − j| over the edges (i, j) of a mesh, as it is numbered or in another ``order`` (n,)."""
+    """Returns the mean of |i − j| over edges (i, j), in the order of the mesh or ``order`` (n,)."""
     ranks = np.arange(len(mesh.points)) if order is None else np.argsort(order)
     return float(np.abs(np.diff(ranks[mesh.edges], axis=1)).mean())
 
 
 def worthwhile_order(mesh: Mesh) -> np.ndarray | None:
-    """Returns `near_order` if the mesh has :data:`LEAST` vertices or more and the `spread` falls below half, else None."""
+    """Returns `near_order` if the mesh has :data:`LEAST` vertices and the `spread` halves, else None."""
     if len(mesh.points) < LEAST:
         return None
     order = near_order(mesh)
@@ -45,12 +38,8 @@ def worthwhile_order(mesh: Mesh) -> np.ndarray | None:
 
 
 def order_of_run(scene: Any, solver: Any) -> np.ndarray | None:
-    """Returns the vertex order of a run, see `worthwhile_order`, or None to keep that of the scene.
+    """Returns the vertex order of a run by `worthwhile_order`, or None.
 
-    Gauss–Seidel sweeps keep it, because their result depends on the order of elements by more than rounding.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        solver: Options such as ``Explicit(substeps=160)``.
+    Gauss–Seidel sweeps keep that of the scene, on which their result depends.
     """
     return None if solver.ordered else worthwhile_order(scene.mesh)

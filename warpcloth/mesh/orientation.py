@@ -4,16 +4,10 @@ import numpy as np
 
 
 def turned_over(triangles, chosen):
-    """Returns which of some triangles must be turned over so that all would wind like their neighbours, (t,) booleans.
+    """Returns which of the ``chosen`` triangles (t,) of (T, 3) must be turned over to wind like their neighbours, (t,).
 
-    In each connected piece the fewer of these are turned over. Neighbours share an edge that no third triangle has.
-
-    Args:
-        triangles: (T, 3), at least one.
-        chosen: The indices of some triangles (t,).
-
-    Raises:
-        ValueError: One belongs to a piece with one side only, like a Möbius strip. The message names it.
+    In each piece the fewer are turned over; neighbours share an edge that no third triangle has. A piece with one side only
+    raises ValueError.
     """
     from scipy.sparse import coo_array  # loaded late, as importing this package stays light
     from scipy.sparse.csgraph import connected_components

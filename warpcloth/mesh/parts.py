@@ -1,6 +1,6 @@
-"""Parts: several meshes joined into one, such as the pieces of a garment or layers of cloth.
+"""Parts: meshes joined into one, such as pieces of a garment.
 
-The vertices of a part are consecutive, and no triangle or edge joins two parts. Springs may join parts, such as seams.
+The vertices of a part are consecutive; only springs join parts.
 """
 
 import operator
@@ -27,14 +27,7 @@ class Part(NamedTuple):
 
 
 def joined(meshes):
-    """Returns the fields of a mesh with the given parts, by name.
-
-    Args:
-        meshes: A :class:`warpcloth.Mesh` for each name.
-
-    Raises:
-        ValueError: There are none, one has parts itself, some have triangles and others edges alone, or the up axes differ.
-    """
+    """Returns the fields of a mesh of these parts; refuses parts of parts, edges beside triangles, and differing up axes."""
     if not (isinstance(meshes, Mapping) and meshes and all(hasattr(mesh, "triangles") for mesh in meshes.values())):
         raise ValueError(f"parts is {shown(meshes)}; it must be a mapping of names to meshes, with one part or more")
     nested = [name for name, mesh in meshes.items() if mesh.parts]
@@ -70,15 +63,8 @@ def joined(meshes):
 
 
 def checked_parts(parts, count, elements):
-    """Returns parts as a dict of :class:`Part` by name.
-
-    Args:
-        parts: (first, count, grid_shape) by name.
-        count: Number of vertices of the mesh.
-        elements: Its triangles or edges, (m, K).
-
-    Raises:
-        ValueError: A name is not an identifier, the parts do not cover all vertices in order, or an element joins two parts.
+    """Returns :class:`Part` records from (first, count, grid_shape) by name; they must cover all vertices in order, and no
+    element (m, K) may join two.
     """
     try:
         rows = {name: (operator.index(first), operator.index(count), *grid) for name, (first, count, *grid) in parts.items()}

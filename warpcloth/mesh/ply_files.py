@@ -15,11 +15,11 @@ _TEXTURES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "
 
 
 def read_ply(path, data):
-    """Returns the `FileFaces` of a .ply file in bytes, with texture coordinates of vertices or of corners.
+    """Returns the `FileFaces` of a .ply file, with texture coordinates of vertices or corners.
 
     Raises:
-        ValueError: It is no .ply file, its rows do not match the header, or it has strips of triangles. The message has the
-            path, for text the line, and the reason.
+        ValueError: It is another file, rows do not match the header, or it has strips of triangles; the message has path, line
+            of text and reason.
     """
     order, elements, line, at = _header(path, data)
     lines = [] if order else [text for _, text in text_lines(data.rstrip())]
@@ -71,9 +71,9 @@ def read_ply(path, data):
 
 
 def _header(path, data):
-    """Returns the order of bytes, empty for text, the elements, the number of lines of the header, and its number of bytes.
+    """Returns the byte order (empty: text), the elements, and the header's lines and bytes.
 
-    An element is its name, its count, and of each property the name, the type, and for a list the type of its length.
+    An element is its name, count, and of each property name, type, and for a list the type of its length.
     """
     begin = re.match(rb"(?:\xef\xbb\xbf)?ply[ \t]*(\r\n|\r|\n)", data)
     if begin is None:
@@ -118,7 +118,6 @@ def _text_row(words, properties):
 
 
 def _binary_row(data, at, order, properties):
-    """Returns the values of each property of a row, and where the next row begins."""
     row = []
     for _, kind, length in properties:
         several = _list_length(*struct.unpack_from(order + np.dtype(length).char, data, at)) if length else 1
@@ -135,7 +134,7 @@ def _list_length(number):
 
 
 def _table(data, at, order, count, properties):
-    """Returns the columns of binary rows whose lists are all as long as in the first, and where they end; else None and at."""
+    """Returns the columns of binary rows whose lists have the length of the first, and their end; else None and at."""
     try:
         first = _binary_row(data, at, order, properties)[0] if order and count else ()
         kinds = []

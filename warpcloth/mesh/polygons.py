@@ -11,11 +11,7 @@ _TOUCHING = 1e-5  # how far sides must pass through each other to cross, relativ
 
 
 def triangles_of(points, counts, holes=()):
-    """Cuts faces into triangles like :func:`cut`, and refuses those that cannot be cut.
-
-    Raises:
-        ValueError: A face crosses or touches itself, or is far from planar; the message names it by its index.
-    """
+    """Cuts faces like :func:`cut`, and raises ValueError for one that crosses or touches itself or is far from planar."""
     triangles, bad = cut(points, counts, holes)
     for face in bad[:1]:
         raise ValueError(f"face {face} crosses or touches itself, or is not planar; its outline must be simple and nearly flat")
@@ -23,25 +19,17 @@ def triangles_of(points, counts, holes=()):
 
 
 def loose_triangles_of(points, counts, holes=()):
-    """Cuts faces into triangles like :func:`cut`; those that cannot be cut are fans, as other programs draw them."""
+    """Cuts faces like :func:`cut`; those that cannot be cut become fans."""
     return cut(points, counts, holes)[0]
 
 
 def cut(points, counts, holes=()):
-    """Cuts faces into triangles, each of k corners into k − 2.
+    """Cuts faces (F,) of ``counts`` corners (C, 3) into triangles (T, 3) of corners, each of k corners into k − 2, but for
+    ``holes``.
 
-    A face becomes a fan of triangles from its first corner if none of them is flat or turned over, as for all convex faces
-    without straight corners. Others are cut by ear clipping (mapbox-earcut) in a coordinate plane. Then diagonals are flipped
-    until all are Delaunay, which leaves no flat triangles beside corners on a line.
-
-    Args:
-        points: Positions of the corners of one face after another, (C, 3).
-        counts: Number of corners of each face (F,), at least 3.
-        holes: Faces that are left out.
-
-    Returns:
-        Triangles (T, 3), rows of ``points``, in the order of the faces, and a list of the faces that cross or touch
-        themselves or are far from planar. These are fans, like faces without area or with a corner that is not finite.
+    A face becomes a fan from its first corner if none of its triangles is flat or turned over. Others are cut by ear clipping
+    (mapbox-earcut) in a coordinate plane, and flipped until all diagonals are Delaunay. Faces that cross or touch themselves or
+    are far from planar become fans, and are returned too.
     """
     solid = np.ones(len(counts), dtype=bool)
     solid[np.asarray(holes, dtype=np.int64)] = False
@@ -83,16 +71,13 @@ def _normals(corners):
 
 
 def _heights(corners, normals):
-    """Returns heights of triangles (T, 3, 3) relative to their longest sides; a `Mesh` refuses those not above FLATTEST."""
     sides = corners - np.roll(corners, 1, axis=1)
     return np.linalg.norm(normals, axis=1) / np.einsum("tki,tki->tk", sides, sides).max(axis=1)
 
 
 def _ears(points, starts, counts, outlines):
-    """Cuts faces (F,) with given first corners in points (C, 3), numbers of corners, and area vectors (F, 3).
-
-    Returns:
-        Triangles of those that could be cut, (T, 3), rows of ``points``, and which faces these are (F,).
+    """Cuts faces with these first corners in points (C, 3), numbers of corners and area vectors (F, 3) into triangles (T, 3),
+    and returns which could be cut.
     """
     import mapbox_earcut
 
@@ -125,7 +110,7 @@ def _cross(a, b):
 
 
 def _delaunay(p, triangles):
-    """Flips the diagonals of triangles (T, 3) in the plane, with corners in p (k, 2), until none sees more than 180°."""
+    """Flips diagonals of plane triangles (T, 3) with corners p (k, 2) until none sees more than 180°."""
     for _ in range(len(p)):
         start, end, apex = (np.roll(triangles, -k, axis=1).ravel() for k in range(3))
         keys = np.minimum(start, end) * len(p) + np.maximum(start, end)
@@ -152,7 +137,7 @@ def _delaunay(p, triangles):
 
 
 def _crossing(p, face):
-    """Returns which polygons have sides that cross, beyond touching, from the corners (k, 2) of all and the polygon of each."""
+    """Returns which polygons have sides that cross, from all corners (k, 2) and their polygon."""
     found, after = np.zeros(face[-1] + 1, dtype=bool), np.arange(1, len(p) + 1)
     last = np.flatnonzero(np.diff(face, append=-1))
     after[last] = np.searchsorted(face, face[last])
@@ -171,7 +156,6 @@ def _crossing(p, face):
 
 
 def _pass(a, b, c, d):
-    """Returns which lines from a to b have c and d on either side."""
     least = _TOUCHING * np.linalg.norm(b - a, axis=1)
     left, right = _cross(b - a, c - a), _cross(b - a, d - a)
     return (np.minimum(left, right) < -least) & (np.maximum(left, right) > least)

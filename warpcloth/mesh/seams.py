@@ -1,10 +1,10 @@
-"""Vertices at one position: where a mesh is cut, as along the seams of textures, and how they are welded."""
+"""Vertices at one position, as along seams of textures, and how they are welded."""
 
 import numpy as np
 
 
 def welded(faces):
-    """Returns `FileFaces` without vertices that lie along a seam upon others; these are welded into the first of them."""
+    """Returns `FileFaces` whose seams are welded into the first vertices."""
     pairs = _seam_pairs(faces.points, faces.counts, faces.corners)
     into = np.arange(len(faces.points))
     into[pairs[:, 1]] = pairs[:, 0]
@@ -15,23 +15,19 @@ def welded(faces):
 def seam_pairs(points, triangles):
     """Returns pairs of vertices at one position (m, 2): the first on a seam, and each other.
 
-    A seam is a side of one triangle alone where another such side lies and the triangles do not lie upon each other, as those
-    of two layers do.
-
-    Args:
-        points: (n, 3).
-        triangles: (T, 3).
+    A seam is a side of one triangle (T, 3) where another such side lies, unless the triangles lie upon each other, as two
+    layers do.
     """
     return _seam_pairs(points, np.full(len(triangles), 3), triangles.ravel())
 
 
 def coincident(points):
-    """Returns how many of the points (n, 3) lie exactly upon another that comes before."""
+    """Returns how many of points (n, 3) equal one before."""
     return len(points) - len(first_of_equals(points)[0])
 
 
 def piece_count(mesh):
-    """Returns the number of connected pieces of a `Mesh`; a vertex without edges is one."""
+    """Returns the number of connected pieces of a `Mesh`, vertices without edges included."""
     from scipy.sparse import coo_array  # loaded late, as importing this package stays light
     from scipy.sparse.csgraph import connected_components
 
@@ -41,7 +37,6 @@ def piece_count(mesh):
 
 @np.errstate(invalid="ignore", over="ignore")  # points may be infinite
 def _seam_pairs(points, counts, corners):
-    """Like :func:`seam_pairs`, for faces of several numbers of corners (F,), with their vertices one after another (C,)."""
     first, group = first_of_equals(points)
     if len(first) == len(points):
         return np.empty((0, 2), dtype=np.int64)
@@ -64,21 +59,20 @@ def _seam_pairs(points, counts, corners):
 
 
 def _equal_rows(rows):
-    """Returns for each row the first one that is equal, the number of their set, and how many there are."""
+    """Returns for each row the first equal one, the number of their set, and its size."""
     _, first, which, times = np.unique(rows, axis=0, return_index=True, return_inverse=True, return_counts=True)
     which = which.ravel()
     return first[which], which, times[which]
 
 
 def _area_vectors(starts, ends, counts):
-    """Returns the area vectors (F, 3) of faces from the two ends of each of their sides (C, 3)."""
     begins = np.cumsum(counts) - counts
     origins = np.repeat(starts[begins], counts, axis=0)
     return np.add.reduceat(np.cross(starts - origins, ends - origins), begins)
 
 
 def first_of_equals(points):
-    """Returns the first row of each set of equal rows, in order, and for each row the index of its set."""
+    """Returns the first row of each set of equal rows, and the index of each row's set."""
     order = np.lexsort(points.T)  # stable: equal rows stay in order
     new = np.concatenate([[True], (points[order][1:] != points[order][:-1]).any(axis=1)])
     first = order[new]

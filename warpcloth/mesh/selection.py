@@ -33,21 +33,20 @@ def select(mesh, text):
         value     = "x" | "y" | "z" | number | ("-" | "+") value | "(" sum ")"
         range     = index | [start] ":" [stop] [":" step]
 
-    Comparisons are of rest points. Coordinates that differ by at most 1e-6 of the bounding box's diagonal are equal, and so are
-    values that differ by no more than such changes of their coordinates cause. `nearest`
-    gives the `count` vertices nearest to a point, 1 by default, the lower indices first among equally near ones. Ranges are
-    Python's, without negative numbers: `10:20` is 10 to 19. `part` gives the vertices of one part of a joined mesh.
+    Comparisons are of rest points, equal within 1e-6 of the bounding box's diagonal in each coordinate. `nearest` gives the
+    `count` nearest vertices, 1 by default, lower indices first among equals. Ranges are Python's without negative numbers:
+    `10:20` is 10 to 19.
 
     Args:
         mesh: A Mesh.
-        text: For example "z == 0 and not corners", "x*x + z*z < 0.01", "nearest(0.5, 0, 1)" or "index(0, 3, 10:20)".
+        text: Such as "z == 0 and not corners", "x*x + z*z < 0.01", "nearest(0.5, 0, 1)" or "index(0, 3, 10:20)".
 
     Returns:
-        np.ndarray: Vertex indices, sorted, each once, int32; empty if nothing fits.
+        np.ndarray: Vertex indices, sorted, int32, maybe none.
 
     Raises:
-        ValueError: The text does not follow the grammar, an index has no vertex, a value is not finite, or `corners` is
-            asked of a closed mesh. The message gives the text, the column and what is allowed there.
+        ValueError: The text breaks the grammar, an index has no vertex, a value is not finite, or a closed mesh has no
+            `corners`; the message gives text, column and what is allowed there.
     """
     if not isinstance(text, str):
         raise ValueError(f"selection is {text!r}; it must be a text")
@@ -55,10 +54,10 @@ def select(mesh, text):
 
 
 def distinct_vertices(name, vertices, mesh):
-    """Returns vertices (p,), int32, from a selection, sorted, or from indices, in the order given.
+    """Returns vertices (p,), int32, from a selection, sorted, or from indices, in order.
 
     Raises:
-        ValueError: They are not whole numbers, not vertices of the mesh, or repeated. The message begins with ``name``.
+        ValueError: They are not whole numbers, not vertices, or repeated; the message begins with ``name``.
     """
     if isinstance(vertices, str):
         return select(mesh, vertices)
@@ -77,7 +76,7 @@ def distinct_vertices(name, vertices, mesh):
 
 
 class _Reader:
-    """A recursive-descent parser: each method reads one rule of the grammar and returns a mask of the vertices (n,)."""
+    """A recursive-descent parser, a method per rule, with masks (n,) of vertices."""
 
     def __init__(self, mesh, text):
         self.mesh, self.text, self.position, self.depth = mesh, text, 0, 0
@@ -109,7 +108,6 @@ class _Reader:
         self.fail(column, f"found {shown(word)}, expected {what}" if word else f"the text ends, expected {what}")
 
     def accept(self, *words):
-        """Reads the next token and returns it if it is one of these words, else None."""
         word = self.tokens[self.position][1]
         if word not in words:
             return None
@@ -274,7 +272,7 @@ def some_vertices(option, selection, mesh):
     """Returns the vertices that an option selects.
 
     Raises:
-        ValueError: It selects none, or does not follow the grammar of selections.
+        ValueError: It selects none, or breaks the grammar.
     """
     vertices = mesh.select(selection)
     if not len(vertices):

@@ -2,14 +2,14 @@
 
 `open_sequence` takes
 
-- a USD stage with a Mesh prim whose points are sampled: each time code is a frame, and the stage's rates give the times;
-- a folder of .obj, .ply or .off files, or a pattern such as "frames/cloth_*.obj": the last number in a name is the frame, see
-  `frame_names.frames_of_names`, and a frame takes 1/fps s, so that file 12 is two frames after file 10;
-- an .npz file, as `np.savez` writes it: `points` (F, n, 3) [m], `triangles` (T, 3), and `times` (F,) [s] unless fps is given;
-- an .npy file, (F, n, 3) [m], with a mesh that has the triangles;
-- a point cache, .pc2 or .mdd, with a mesh that has the triangles, by default an .obj file of the same name beside it.
+- a USD stage with a Mesh prim whose points are sampled: each time code is a frame;
+- a folder of .obj, .ply or .off files, or a pattern such as "frames/cloth_*.obj": the last number in a name is the frame
+  (`frame_names.frames_of_names`), which takes 1/fps s;
+- an .npz file: `points` (F, n, 3) [m], `triangles` (T, 3), and `times` (F,) [s] unless fps is given;
+- an .npy file, (F, n, 3) [m], with a mesh;
+- a point cache, .pc2 or .mdd, with a mesh, by default an .obj file of the same name.
 
-`as_sequence` takes arrays. Lengths are metres unless a file says otherwise.
+Lengths are metres unless a file says otherwise.
 """
 
 import glob
@@ -61,25 +61,25 @@ class HasPoints(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Sequence(ShownInNotebooks):
-    """Frames of one mesh. Indexing reads a frame and keeps nothing, so that memory stays constant.
+    """Frames of one mesh. Indexing reads a frame and keeps nothing.
 
-    `sequence[i]` is a copy of the points of frame i, (n, 3) [m], float64, with infinities and NaN as the input has them. It
-    raises a ValueError that names file and frame if the frame does not fit the mesh or cannot be read.
+    `sequence[i]` is a copy of the points of frame i, (n, 3) [m], float64, with the infinities and NaN of the input. A frame
+    that does not fit or cannot be read raises ValueError.
 
     Attributes:
-        mesh: The rest shape; a `Surface` if it was read from a file.
-        labels: Frame numbers of the input (F,): time codes, or the numbers in file names; int64 if all are whole, else float64.
-        times: (F,) [s], increasing; None if the input gives none.
-        read: Function that returns the points of a frame from its index, 0 to F − 1.
+        mesh: The rest shape; a `Surface` if read from a file.
+        labels: Frame numbers (F,): time codes or numbers of files; int64 if whole, else float64.
+        times: (F,) [s], increasing, or None.
+        read: Function (0 … F − 1) → points of a frame.
         path: The file, folder or pattern, or None.
-        stage: `usd.StageMesh` of a stage, or None. If the prim's space moves, it is that of the first frame.
-        precision: Floating-point type of the input, which determines its rounding.
-        declared: Whether the input has a rest shape; else `mesh` has the points of the first frame.
-        files: Paths of the files that frames are read from.
-        up_axis: "Y" or "Z"; None if the input does not say.
+        stage: `usd.StageMesh` of a stage, at the first frame if its space moves, or None.
+        precision: Floating-point type of the input.
+        declared: Whether the input has a rest shape; else `mesh` has that of the first frame.
+        files: Paths of the files of frames.
+        up_axis: "Y" or "Z", or None.
 
     Raises:
-        ValueError: The mesh has no triangles, or times of a file are not within 1e15 s.
+        ValueError: The mesh has no triangles, or times are not within 1e15 s.
     """
 
     mesh: Mesh
@@ -109,15 +109,15 @@ class Sequence(ShownInNotebooks):
         return np.array(self.read(range(len(self))[operator.index(frame)]), dtype=np.float64)
 
     def rounding(self, points: np.ndarray) -> float:
-        """Returns the rounding [m] of points (n, 3) [m]: the machine epsilon of the input times the largest coordinate."""
+        """Returns the rounding [m] of points (n, 3) [m]: machine epsilon of the input times the largest coordinate."""
         return np.finfo(self.precision).eps * np.abs(points).max(initial=0.0, where=np.isfinite(points))
 
     @cached_property
     def missing(self) -> list[float]:
-        """Labels that are missing from the sequence; see `missing_labels`.
+        """Labels that are missing.
 
         Raises:
-            ValueError: More than a million labels are missing.
+            ValueError: More than a million are missing.
         """
         return missing_labels(self.labels, self.path)
 
@@ -125,12 +125,11 @@ class Sequence(ShownInNotebooks):
 def missing_labels(labels: np.ndarray, path: FilePath | None = None) -> list[float]:
     """Returns the labels that are missing between ascending labels (F,).
 
-    The spacing is the smallest interval between labels. If another interval is not a multiple of it, nothing counts as missing.
-    Fractional time codes may be shutter samples within a frame, so nothing counts as missing either if more than a third of
-    their intervals, and more than one, would be gaps.
+    The spacing is the smallest interval; if another is not a multiple of it, nothing is missing. Nor if labels are fractional
+    and more than a third of their intervals, and more than one, would be gaps (shutter samples).
 
     Raises:
-        ValueError: More than a million labels are missing. The message begins with ``path``, if it is given.
+        ValueError: More than a million are missing; the message begins with ``path``.
     """
     intervals = np.diff(labels)
     spacing = intervals.min() if len(intervals) else 1
@@ -147,25 +146,23 @@ def missing_labels(labels: np.ndarray, path: FilePath | None = None) -> list[flo
 
 
 def open_sequence(path: FilePath, prim: str | None = None, fps: float | None = None, mesh: Mesh | None = None) -> Sequence:
-    """Opens a mesh sequence from a file, a folder or a pattern. The docstring of this module lists the formats.
+    """Opens a mesh sequence from a file, a folder or a pattern; this module's docstring lists the formats.
 
-    Polygons are cut into triangles as by `usd.read_stage_mesh` and `loading.read_file`. A prim in a moving space is transformed
-    to world space at each time code, and its rest shape as at the first.
+    Polygons are cut as by `usd.read_stage_mesh` and `loading.read_file`. A moving prim is transformed to world space at each
+    time code, its rest shape as at the first.
 
     Args:
         path: A stage, a folder, a pattern, an .npz or an .npy file.
-        prim: Path or name of the prim, or name of the geometry in each file, if there are several.
-        fps: Frames per second: of numbers in file names, or of time codes in place of the stage's rate. Without it, ``times``
-            is None unless the input has times.
-        mesh: The `Mesh` of an .npy, .pc2 or .mdd file, which has no triangles; ignored for other inputs.
+        prim: Prim, or geometry in each file, if there are several.
+        fps: Frames per second of file names, or time codes per second.
+        mesh: The `Mesh` of an .npy, .pc2 or .mdd file.
 
     Returns:
         Sequence: Only its first frame has been read.
 
     Raises:
         FileNotFoundError: There is no such file or folder.
-        ValueError: The format is none of these, there are no frames, or the parts of the input do not fit together. The message
-            begins with the path.
+        ValueError: The format is unknown, there are no frames, or parts do not fit together; the message begins with the path.
     """
     path = os.fspath(path)
     if fps is not None:
@@ -197,17 +194,17 @@ def as_sequence(mesh: Mesh, frames: ArrayLike | HasPoints, dt: float | None = No
     """Makes a `Sequence` of frames in memory.
 
     Args:
-        mesh: The `Mesh`, its points the rest shape.
-        frames: An array (F, n, 3) [m], a list of F arrays (n, 3), `usd.FrameSequence`, `Animation` or `Deformation`.
-        dt: Time from each frame to the next [s].
-        times: (F,) [s], increasing. Give one of ``dt`` and ``times``, or neither to use the times of ``frames``, if any.
+        mesh: The `Mesh` at rest.
+        frames: An array (F, n, 3) [m], F arrays (n, 3), `usd.FrameSequence`, `Animation` or `Deformation`.
+        dt: Time between frames [s].
+        times: (F,) [s], increasing, instead of ``dt``; by default those of ``frames``, if any.
 
     Returns:
         Sequence: It keeps a reference to `frames`.
 
     Raises:
-        ValueError: A frame, named by its index, does not fit the mesh; times do not increase; both ``dt`` and ``times`` are
-            given; or `mesh` is no mesh with triangles.
+        ValueError: A frame does not fit the mesh; times do not increase; both ``dt`` and ``times`` are given; or `mesh` has no
+            triangles.
     """
     if not isinstance(mesh, Mesh):
         raise ValueError(f"mesh is {checks.shown(mesh)}; it must be a Mesh")
@@ -223,14 +220,8 @@ def as_sequence(mesh: Mesh, frames: ArrayLike | HasPoints, dt: float | None = No
 
 
 def numbered_files(path: FilePath, endings: List[str] = FRAME_ENDINGS) -> tuple[np.ndarray, list[Path]] | None:
-    """Returns the numbers (F,), ascending, and the paths of the mesh files of a folder or pattern; None if it is neither.
-
-    Args:
-        path: The folder or pattern.
-        endings: Endings that frames may have.
-
-    Raises:
-        ValueError: There are no such files, they are of several kinds, or `frames_of_names` refuses a name.
+    """Returns the numbers (F,), ascending, and paths of the mesh files of a folder or pattern, of one of the ``endings``; None
+    if it is neither.
     """
     path = os.fspath(path)
     if os.path.isdir(path):
@@ -269,7 +260,6 @@ def _open_files(path, labels, paths, prim, fps):
 
 
 def _read_file(paths, prim, counts, corners, count, frame):
-    """Reads the points (n, 3) of a file, which must have the same faces as the first file, with these ``counts`` of corners."""
     path = paths[frame]
     found = read_faces(path, prim)
     for name, here, there in (("vertices", len(found.points), count), ("faces", len(found.counts), len(counts))):
@@ -312,7 +302,7 @@ def _open_npz(path, fps):
 
 @contextmanager
 def _numpy_reads():
-    """Turns the many errors that NumPy raises for a broken file into ValueError."""
+    """Turns NumPy's errors for a broken file into ValueError."""
     try:
         yield
     except ValueError:
@@ -325,7 +315,7 @@ def _numpy_reads():
 
 
 def _mapped(path, member):
-    """Maps an array of an .npz file from disk, while `np.load` would read all of it."""
+    """Maps an array of an .npz file, which `np.load` would read whole."""
     with zipfile.ZipFile(path) as archive:
         info = archive.getinfo(member)
     if info.compress_type != zipfile.ZIP_STORED:
@@ -359,7 +349,6 @@ def _open_npy(path, fps, mesh):
 
 
 def _open_cache(path, fps, mesh):
-    """Opens a .pc2 file, which has frame numbers, or an .mdd file, which has times."""
     beside, declared, times = Path(path).with_suffix(".obj"), mesh is not None, None
     if path.lower().endswith(".pc2"):
         labels, points = open_pc2(path)
@@ -382,7 +371,6 @@ def _open_cache(path, fps, mesh):
 
 
 def _array(name, frames, mesh):
-    """Returns the number of frames, a function that reads one, and the floating-point type, of frames that fit the mesh."""
     shape = mesh.points.shape
     if isinstance(frames, (list, tuple)):
         for index, frame in enumerate(frames):
@@ -405,7 +393,6 @@ def _array(name, frames, mesh):
 
 
 def _coarsest(frames):
-    """Returns the least precise floating-point type of some frames."""
     types = [np.asarray(frame).dtype for frame in frames]
     return max((kind for kind in types if kind.kind == "f"), key=lambda kind: np.finfo(kind).eps, default=np.dtype(np.float64))
 

@@ -10,23 +10,23 @@ from .mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class StageMesh:
-    """The mesh of one prim, with the space and time settings of its stage.
+    """The mesh of one prim, with space and time settings of its stage.
 
     Attributes:
-        mesh: Rest shape in the stage's world space [m]; vertex i is point i of a Mesh prim.
+        mesh: Rest shape in world space [m]; vertex i is point i of a Mesh prim.
         path: The file.
         prim: Path of the prim.
-        transform: (4, 4) float64, for row vectors: x = [p, 1]·transform maps from the prim's own space and units to world space
-            [m]; at the first time code if it is animated.
-        meters_per_unit: Metres per unit of the stage; USD's default is 0.01.
+        transform: (4, 4) float64, for row vectors: x = [p, 1]·transform from the prim's space and units to world space [m], at
+            the first time code.
+        meters_per_unit: Of the stage; USD's default is 0.01.
         up_axis: "Y" or "Z".
-        fps: Frames per second, or None if the stage does not set it.
-        time_codes_per_second: Time codes per second; USD's default is 24.
-        start: First time code, or None if the stage does not set it.
-        pins: Sorted vertex indices (p,) int32 by name, of every GeomSubset of points.
-        point_vertices: For curves, the vertex of each point of the prim (P,); None for a Mesh prim, where they are the same.
+        fps: Frames per second, or None.
+        time_codes_per_second: Of the stage; USD's default is 24.
+        start: First time code, or None.
+        pins: Sorted vertices (p,) int32 by name, of every GeomSubset of points.
+        point_vertices: The vertex of each point of curves (P,); None for a Mesh prim.
         cloths: The `StageMesh` of each cloth if ``mesh`` joins several; else empty.
-        rest: Whether the stage has a rest shape, the default points; else the mesh is that of one time code.
+        rest: Whether the stage has default points; else the mesh is of one time code.
     """
 
     mesh: Mesh

@@ -58,9 +58,7 @@ class DeviceColliders(NamedTuple):
 
 
 def colliders_on(model, scene):
-    """Returns the colliders of a scene on the device of a model, or None if there are none."""
-    if not scene.colliders:
-        return None
+    """Returns the colliders of a scene, which has some, on the device of a model."""
     centred = [collider.centred() for collider in scene.colliders]
     poses = [collider.poses for collider in centred]
     cores, radii = zip(*(EMPTY if collider.is_mesh else collider.core for collider in scene.colliders), strict=True)

@@ -7,19 +7,19 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+import warpcloth.model as room
+
 from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.turns import in_turn
-from ..kernels.contact.pair_sums import PairTerm
 from ..kernels.copy import repeat_indices
 from ..kernels.step import lock
-from ..kernels.term import Term
+from ..kernels.term import PairTerm, Term
 from ..kernels.terms.air import AIR
 from ..kernels.terms.contact import Solid
 from ..kernels.vectors import types
 from ..mesh.selection import distinct_vertices
 from ..terms.refresh import STEP, Moment
-from .device_colliders import colliders_on
 from .elements import elements_on
 from .host_values import keep, repeat
 from .loads import loads_on
@@ -58,7 +58,7 @@ class Model:
         loads: The :class:`warpcloth.model.loads.DeviceLoads`, or None.
         terms: One :class:`warpcloth.model.elements.DeviceElements` for each declared term, then for contact with each collider
             and friction on it.
-        dynamic: The :class:`warpcloth.core.dynamic.DynamicElements` of a solver, as self-contact has them; at first none.
+        dynamic: The :class:`warpcloth.core.dynamic_elements.DynamicElements` of a solver, as self-contact has; at first none.
         colliders: :class:`warpcloth.model.device_colliders.DeviceColliders`, or None.
         rest_points: Rest shape of one copy, (n, 3) [m].
         order: As given, int32, or None.
@@ -141,7 +141,7 @@ class Model:
             self.loads.set(self, Moment(self.positions))
         for copy, start in enumerate(positions if vary.has("positions") else positions[:1]):
             scene.refuse_inside(start, f" in copy {copy}" if copies > 1 else "")
-        self.colliders = colliders_on(self, scene)
+        self.colliders = room.colliders_on(self, scene) if scene.colliders else None
         declared = (*scene.terms, *scene.contact_terms, *scene.air_terms)
         self.terms = tuple(elements_on(self, term, positions, vary) for term in declared)
         if vary.has("Air.wind") and scene.air is not None and scene.air.changes:

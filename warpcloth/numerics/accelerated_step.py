@@ -118,7 +118,7 @@ class AcceleratedStep:
         """Shortens both steps so that pairs stay apart."""
         stepper, d = self.stepper, self.stepper.correction
         # A line search for w has listed the pairs of its trial.
-        stepper.filter.launch_trial(stepper.state.x, d, part=0.5)
+        stepper.filter.launch_trial(stepper.state.x, d)
         for each in (self.plain, self.accelerated):
             stepper.filter.launch_between(d, each)
 

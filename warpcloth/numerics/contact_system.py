@@ -3,10 +3,10 @@
 import numpy as np
 import warp as wp
 
-from ..contact.no_filter import filter_of
 from ..core.capture import Mirror, Segment
 from ..core.dynamic import dynamic_of
 from ..core.hessian import Hessian
+from ..core.no_filter import filter_of
 from ..kernels import linear as kernels
 from ..kernels.accelerate import plain_step
 from ..kernels.contact.clear_elements import add_hessian
@@ -241,7 +241,7 @@ class PairSystem(CorrectedSystem):
         """Launches U and ∂U/∂x at the trial d + step·p."""
         given = [self._d, self._direction, self.model.per_copy]
         self._launch_on(set_trial, self.model.count, given, [self._state, self._trial, self._pull])
-        self._pairs.filter.launch_trial(self.x, self._trial, part=0.5)
+        self._pairs.filter.launch_trial(self.x, self._trial)
         self._dynamic.launch(self.x, self._trial)
         self._dynamic.add_energy(self._sums, self._state.other)
         self._dynamic.add_gradient(self._pull)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from ..kernels.terms import SPRING_LIMIT
+from ..kernels.terms.spring_limit import SPRING_LIMIT
 from ..model.elements import DeviceElements
 from ..model.host_values import host_values
 from .unfolding import UnfoldedSurface

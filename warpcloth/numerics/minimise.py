@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from ..contact.no_filter import filter_of
 from ..core.capture import Mirror, Segment
 from ..core.hessian import Hessian
+from ..core.no_filter import filter_of
 from ..core.status import Result
 from ..core.sums import Sums
 from ..kernels import minimise as kernels

@@ -12,7 +12,7 @@ class PairRows:
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        of: The :class:`warpcloth.core.dynamic.DynamicElements`.
+        of: The :class:`warpcloth.core.dynamic_elements.DynamicElements`.
         curved: Whether to add geometric stiffness.
 
     Attributes:

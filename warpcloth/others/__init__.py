@@ -1,1 +1,1 @@
-"""Other simulators on scenes of warpcloth, to compare with. Each is an optional package."""
+"""Other simulators, each an optional package, on scenes of warpcloth."""

@@ -1,4 +1,4 @@
-"""Samples that compare the stiffness of scenes in warpcloth and in another simulator: hanging strips and a cantilever."""
+"""Samples that compare stiffness in warpcloth and another simulator: hanging strips and a cantilever."""
 
 from typing import NamedTuple
 
@@ -18,8 +18,8 @@ class Calibration(NamedTuple):
     """Displacements of the free end in another simulator over those in warpcloth; 1 means equal stiffness.
 
     Attributes:
-        springs: Of the lower half of a hanging strip of springs, along it, where the clamp does not hold its width.
-        membrane: Of the same strip of a membrane; None if the solver has none.
+        springs: Of the lower half of a hanging strip of springs, along it.
+        membrane: Of that strip of a membrane, or None.
         bending: Of a cantilever with Γ = 2, across it.
     """
 
@@ -29,14 +29,8 @@ class Calibration(NamedTuple):
 
 
 def calibrated(coarse, fine, membrane, device="cpu"):
-    """Measures the :class:`Calibration` of a solver on three samples.
-
-    Args:
-        coarse: The record of the solver, see :class:`warpcloth.others.runs.OtherSolver`, with steps and iterations that
-            converge to the rest shape of the strips.
-        fine: The same for the cantilever.
-        membrane: The membrane of the second strip, or None.
-        device: A Warp device.
+    """Measures the :class:`Calibration` of a solver, with settings ``coarse`` that converge to the rest shape of strips, one of
+    ``membrane`` or None, and ``fine`` to that of the cantilever.
     """
     return Calibration(
         _ratio(hanging_strip(Spring(pairs=("structural", "shear"), stiffness=50.0)), coarse, device, 2),
@@ -46,12 +40,12 @@ def calibrated(coarse, fine, membrane, device="cpu"):
 
 
 def hanging_strip(term):
-    """Returns a strip of 0.8 × 0.2 m along z, with one energy, that hangs from its first row."""
+    """Returns a strip of 0.8 × 0.2 m along z that hangs from its first row."""
     return _strip([term], 1, (0.0, 0.0, 9.81), 400.0)
 
 
 def strip_cantilever():
-    """Returns the same strip with springs and quadratic bending, that is clamped at two rows and bends, Γ = ρgL³/D = 2."""
+    """Returns that strip with springs and quadratic bending, clamped at two rows, Γ = ρgL³/D = 2."""
     bending = QuadraticBending(stiffness=0.1 * 9.81 * 0.7**3 / 2.0)
     return _strip([Spring(pairs=("structural", "shear"), stiffness=100.0), bending], 2, (0.0, -9.81, 0.0), 60.0)
 
@@ -63,17 +57,9 @@ def _strip(terms, rows, gravity, fps):
 
 
 def rest_of(scene, record, device="cpu"):
-    """Returns the shape in which a scene rests by a solver of another simulator, (n, 3) float64 [m].
+    """Returns the rest shape of a scene by another simulator, (n, 3) float64 [m].
 
-    Velocities are set to 0 whenever the kinetic energy falls from one frame to the next, until peaks no longer move the cloth.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        record: The record of the solver, see :class:`warpcloth.others.runs.OtherSolver`.
-        device: A Warp device.
-
-    Raises:
-        ValueError: It does not come to rest, or the solver does not take the scene.
+    Velocities become 0 whenever the kinetic energy falls, until peaks no longer move the cloth; ValueError if it does not rest.
     """
     masses = scene.vertex_masses[:, None]
     with wp.ScopedDevice(device):
@@ -94,10 +80,7 @@ def rest_of(scene, record, device="cpu"):
 
 
 def _ratio(scene, record, device, axis):
-    """Returns how far the free end moves along an axis in another simulator, over that of the equilibrium in warpcloth.
-
-    Along a strip, moves are relative to its middle.
-    """
+    """Returns how far the free end moves along an axis, over that in warpcloth; along a strip relative to its middle."""
     rest = equilibrium(scene)
     if not rest.status.ok or not rest.stable:
         raise ValueError(f"{scene.name} has no stable equilibrium: {rest.status.message}")

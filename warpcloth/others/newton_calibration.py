@@ -1,4 +1,4 @@
-"""Stiffness of scenes in Newton, the physics engine, against that in warpcloth, by samples."""
+"""Stiffness of scenes in Newton, the physics engine, against that in warpcloth."""
 
 from ..terms import NeoHookeanMembrane
 from .calibration import calibrated
@@ -11,12 +11,7 @@ _FINER = {"semi-implicit": 5, "xpbd": 10, "vbd": 2, "style3d": 2}
 
 
 def calibrate(method, device="cpu"):
-    """Measures the :class:`warpcloth.others.calibration.Calibration` of a solver of Newton, of a membrane with ν = 0.3.
-
-    Args:
-        method: One of :data:`warpcloth.others.newton_model.METHODS`.
-        device: A Warp device.
-    """
+    """Measures the :class:`warpcloth.others.calibration.Calibration` of a solver of Newton, of a membrane with ν = 0.3."""
     substeps, iterations = _SETTINGS[method]
     coarse, fine = (NewtonPhysics(method, factor * substeps, iterations) for factor in (1, _FINER[method]))
     membrane = NeoHookeanMembrane(stiffness=50.0, poisson_ratio=0.3)

@@ -1,8 +1,7 @@
 """Scenes as models of Newton, the physics engine of newton-physics (https://github.com/newton-physics/newton), version 1.8.
 
-The solvers of Newton read the same arrays with different laws. The stiffness of each element follows from its energy, not from
-the name of a parameter. For a hinge with the angle θ, edge e and triangles of the areas A₁ and A₂, the energy of warpcloth has
-∂²U/∂θ² = K = D|e|²/(A₁+A₂) at rest. The solvers have:
+Its solvers read the same arrays with different laws, so stiffness follows from the energy of each element. A hinge with the
+angle θ, edge e and triangles of areas A₁ and A₂ has ∂²U/∂θ² = K = D|e|²/(A₁+A₂) at rest; there it is:
 
 | Solver | ∂²U/∂θ² for ``edge_ke`` κ | κ |
 |---|---|---|
@@ -11,16 +10,14 @@ the name of a parameter. For a hinge with the angle θ, edge e and triangles of 
 | vbd | κ|e| | K/|e| |
 | style3d | 3κ|e|²/(A₁+A₂) | D/3 |
 
-In the first two, the gradient of the angle is not divided by the length of the normals, so that their forces grow with the area
-2A of a triangle; both triangles of a hinge must then have the same area A. The bending of style3d is that of
-:class:`warpcloth.QuadraticBending`; the others have angles, which agree with it for small angles.
+In the first two, the gradient of the angle is not divided by the length of the normals, so both triangles must have the area A.
+style3d bends as :class:`warpcloth.QuadraticBending`; the others have angles.
 
-The damping of vbd is ½(κ′|e|/h)(θ − θₙ)² for ``edge_kd`` κ′, which is that of :class:`warpcloth.DihedralBending` with β
-in place of D. The others refuse damped bending.
+Damping of vbd, ½(κ′|e|/h)(θ − θₙ)² for ``edge_kd`` κ′, is that of :class:`warpcloth.DihedralBending` with β for D; the others
+refuse it.
 
-For membranes, ``tri_ke`` is μ, and ``tri_ka`` is λ in vbd and λ + μ in semi-implicit. style3d has no springs and no lateral
-contraction. Its stiffness along the two axes of the flat cloth is measured by pulling the cloth along them with free sides, and
-its shear stiffness is that under a uniform shear, see :func:`panel_moduli`.
+For membranes, ``tri_ke`` is μ, and ``tri_ka`` λ in vbd, λ + μ in semi-implicit. style3d has no springs and no lateral
+contraction; its moduli are measured, :func:`panel_moduli`.
 """
 
 import contextlib
@@ -57,7 +54,7 @@ class PanelModuli(NamedTuple):
     """Moduli of flat cloth under small strains [N/m].
 
     Attributes:
-        along: Force per width and strain if it is pulled along each axis and its sides are free, (2,).
+        along: Force per width and strain along each axis with free sides, (2,).
         shear: Force per length and angle of shear.
     """
 
@@ -81,18 +78,17 @@ def engine():
 def newton_model(scene, method, device="cpu"):
     """Returns a scene as a ``newton.Model``, with float32 arrays in the order of the scene.
 
-    ``particle_q``, ``particle_qd`` and ``particle_mass`` are the positions, velocities and masses; pinned particles are not
-    active and have an inverse mass of 0. Contact with colliders begins at the contact distance, which is the radius of all
-    particles; its stiffness per particle is that of warpcloth times the mean area of a vertex.
+    Pins are not active, with inverse mass 0. Contact begins at the contact distance, the radius of particles, with the
+    stiffness of warpcloth times the mean vertex area.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
-        method: The solver of Newton that will run it, one of :data:`METHODS`.
+        method: One of :data:`METHODS`.
         device: A Warp device.
 
     Raises:
         ImportError: Newton is not installed.
-        ValueError: The scene has something that the solver does not have.
+        ValueError: The scene has something that the solver lacks.
     """
     newton = engine()
     refuse_inexpressible(scene, method)
@@ -130,14 +126,7 @@ def newton_model(scene, method, device="cpu"):
 
 
 def newton_solver(model, scene, method, iterations):
-    """Returns the solver of Newton for a model of :func:`newton_model`.
-
-    Args:
-        model: The ``newton.Model``.
-        scene: Its :class:`warpcloth.Scene`.
-        method: One of :data:`METHODS`.
-        iterations: Iterations per step; semi-implicit steps have none.
-    """
+    """Returns the solver of Newton for a model of :func:`newton_model`; semi-implicit steps have no iterations."""
     solvers = engine().solvers
     if method == "semi-implicit":
         return solvers.SolverSemiImplicit(model, enable_tri_contact=False)
@@ -157,11 +146,7 @@ def newton_solver(model, scene, method, iterations):
 
 
 def refuse_inexpressible(scene, method):
-    """Checks that a solver of Newton can run a scene.
-
-    Raises:
-        ValueError: It cannot, or there is no such solver. The message names what the solver does not have.
-    """
+    """Raises ValueError with what a solver of Newton lacks to run a scene."""
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; it must be one of {', '.join(METHODS)}")
     whose = f"Newton's {method} solver"
@@ -202,23 +187,15 @@ def refuse_inexpressible(scene, method):
 
 
 def panel_moduli(scene):
-    """Returns the :class:`PanelModuli` of the cloth of a scene, by pulling it along two axes and by shearing it a little.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`; its cloth is flat at rest along two axes of space, with a straight end.
-
-    Raises:
-        ValueError: Its cloth has no a straight end.
+    """Returns the :class:`PanelModuli` of a cloth that is flat along two axes of space with a straight end, by pulling and
+    shearing it.
     """
     axes = _plane_axes(scene.mesh)
     return PanelModuli(np.array([_strip_modulus(scene, axes, i) for i in (0, 1)]), _shear_modulus(scene, axes))
 
 
 def _strip_modulus(scene, axes, i):
-    """Returns the modulus of the cloth [N/m] if its ends are pulled apart along an axis, and its sides are free.
-
-    The energy at rest with a strain ε is ½Eε² per area.
-    """
+    """Returns the modulus E of cloth pulled along an axis with free sides [N/m], from the energy ½Eε² per area."""
     mesh, (along, across) = scene.mesh, (axes[i], axes[1 - i])
     x = mesh.points @ along
     near = 1e-6 * np.ptp(x)
@@ -245,7 +222,7 @@ def _strip_modulus(scene, axes, i):
 
 
 def _shear_modulus(scene, axes):
-    """Returns the energy of the stretching terms under a small uniform shear γ, over ½γ² and the area [N/m]."""
+    """Returns the energy under a small shear γ over ½γ² and the area [N/m]."""
     mesh, found = scene.mesh, 0.0
     for term in scene.terms:
         if isinstance(term, Spring):
@@ -259,7 +236,6 @@ def _shear_modulus(scene, axes):
 
 
 def _add_term(builder, scene, term, method):
-    """Adds springs, membranes and hinges of a term to a builder, for the solvers other than style3d."""
     if isinstance(term, Spring):
         found = term.elements(scene.mesh, scene.positions)
         count = len(found.stencil)
@@ -280,7 +256,7 @@ def _add_term(builder, scene, term, method):
 
 
 def _hinges(term, scene, method):
-    """Returns the hinges (E, 4) of a term, their ``edge_ke`` and ``edge_kd`` by the table above, and rest angles [rad] (E,)."""
+    """Returns the hinges (E, 4), ``edge_ke`` and ``edge_kd`` by the table, and rest angles [rad] (E,)."""
     found, points = term.elements(scene.mesh, scene.positions), scene.mesh.points
     stiffness, damping = (np.broadcast_to(each, len(found.stencil)) for each in (found.stiffness, found.damping))
     angle, shape = rest_state(points, found.stencil).T
@@ -302,7 +278,7 @@ def _hinges(term, scene, method):
 
 
 def _add_surface(builder, mesh):
-    """Adds triangles and edges of a mesh that no energy has, without stiffness, so that self-contact has the whole surface."""
+    """Adds triangles and edges of a mesh without energy, for self-contact."""
     known = {frozenset(each) for each in np.reshape(builder.tri_indices, (-1, 3)).tolist()}
     stencil = np.array([each for each in mesh.triangles.tolist() if frozenset(each) not in known], dtype=int).reshape(-1, 3)
     none = [0.0] * len(stencil)
@@ -315,7 +291,7 @@ def _add_surface(builder, mesh):
 
 
 def lame(term, scene):
-    """Returns the triangles (T, 3) of an isotropic membrane, and μ and λ (T,) [N/m]."""
+    """Returns the triangles (T, 3) of an isotropic membrane, μ and λ (T,) [N/m]."""
     found = term.elements(scene.mesh, scene.positions)
     count = len(found.stencil)
     k = np.broadcast_to(found.stiffness, count)
@@ -324,10 +300,7 @@ def lame(term, scene):
 
 
 def _plane_axes(mesh):
-    """Returns axes of the plane of a flat mesh (2, 3): two axes of space if it lies along them; else None.
-
-    Their cross product is the normal of the triangles.
-    """
+    """Returns two axes of space (2, 3) in the plane of a flat mesh, whose product is its normal, or None."""
     normals = np.cross(*(mesh.points[mesh.triangles[:, i]] - mesh.points[mesh.triangles[:, 0]] for i in (1, 2)))
     axis = int(np.abs(normals).sum(axis=0).argmax())
     off = np.abs(np.delete(normals, axis, axis=1)).max()
@@ -358,7 +331,6 @@ def _refuse_style3d(scene):
 
 
 def _add_style3d(builder, scene, solvers):
-    """Adds cloth of style3d, whose panel is the flat mesh, with the :func:`panel_moduli` of the scene."""
     mesh, axes = scene.mesh, _plane_axes(scene.mesh)
     moduli = panel_moduli(scene)
     solvers.SolverStyle3D.register_custom_attributes(builder)
@@ -387,7 +359,7 @@ def _add_style3d(builder, scene, solvers):
 
 
 def _add_collider(builder, collider, newton):
-    """Adds a static shape; a plane and the axis of a capsule are along z there, along y here."""
+    """Adds a static shape; planes and capsules are along z there."""
     *position, x, y, z, w = collider.poses[0].tolist()
     upright = wp.quat(x, y, z, w) * wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), -0.5 * wp.pi)
     turn = upright if isinstance(collider, Plane | Capsule) else wp.quat(x, y, z, w)
@@ -413,8 +385,8 @@ def _add_collider(builder, collider, newton):
 def _set_contact(model, scene):
     """Sets stiffness and friction of contact.
 
-    A contact of a particle with a shape has the arithmetic mean of their stiffness, and the geometric mean of their friction;
-    a contact of cloth with itself has those of particles.
+    A particle and a shape have the arithmetic mean of stiffness and the geometric mean of friction, cloth with itself those of
+    particles.
     """
     areas = scene.mesh.vertex_areas if len(scene.mesh.triangles) else scene.vertex_masses / scene.vertex_masses.mean()
     area, declared = float(areas.mean()), scene.self_contact
@@ -428,7 +400,7 @@ def _set_contact(model, scene):
 
 
 def _colour(builder):
-    """Colours particles so that no element joins two of one colour, by the method of Newton, which ignores springs."""
+    """Colours particles by Newton's method, which ignores springs, so that no element joins two of one colour."""
     stencils = [np.reshape(each, (-1, size)) for each, size in ((builder.spring_indices, 2), (builder.tri_indices, 3))]
     stencils.append(np.reshape(builder.edge_indices, (-1, 4)))
     pairs = [each[:, [i, j]] for each in stencils for j in range(each.shape[1]) for i in range(j)]

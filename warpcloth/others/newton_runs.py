@@ -1,4 +1,4 @@
-"""The solvers of Newton, the physics engine, as records with settings, and their steps."""
+"""The solvers of Newton, the physics engine, as records, and their steps."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +19,7 @@ class NewtonPhysics:
     Attributes:
         method: One of :data:`warpcloth.others.newton_model.METHODS`.
         substeps: Steps per frame.
-        iterations: Iterations per step; semi-implicit steps have none, and need 1 here.
+        iterations: Iterations per step; 1 for semi-implicit steps.
 
     Raises:
         ValueError: A value is not allowed.
@@ -47,14 +47,13 @@ class NewtonPhysics:
 
 
 class NewtonSteps:
-    """A scene, a solver of Newton and its states; use it in the scope of its device.
+    """A scene, a solver of Newton and its states, for the scope of its device.
 
-    The steps of a frame are recorded as a graph and replayed, on the CPU too. Colliders are searched in each step. Compilation
-    comes with the constructor, which takes a step for it.
+    The steps of a frame are a recorded graph, on the CPU too; the constructor compiles by taking a step.
 
     Attributes:
         model: The ``newton.Model``.
-        states: The state after the last step, and one to write.
+        states: The last state, and one to write.
     """
 
     def __init__(self, scene, solver, device):

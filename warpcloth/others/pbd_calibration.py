@@ -1,4 +1,4 @@
-"""Stiffness of scenes in pyPBD against that in warpcloth, by samples."""
+"""Stiffness of scenes in pyPBD against that in warpcloth."""
 
 from ..terms import CorotatedMembrane
 from .calibration import calibrated
@@ -9,11 +9,6 @@ _COARSE, _FINE = 20, 200
 
 
 def calibrate(method, iterations=1):
-    """Measures the :class:`warpcloth.others.calibration.Calibration` of a method of pyPBD.
-
-    Args:
-        method: One of :data:`warpcloth.others.pbd_model.METHODS`.
-        iterations: Iterations per step.
-    """
+    """Measures the :class:`warpcloth.others.calibration.Calibration` of a method of pyPBD."""
     coarse, fine = (PositionBasedDynamics(method, substeps, iterations) for substeps in (_COARSE, _FINE))
     return calibrated(coarse, fine, CorotatedMembrane(stiffness=50.0))

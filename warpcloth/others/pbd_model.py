@@ -1,9 +1,8 @@
 """Scenes as models of pyPBD 2.2, the bindings of PositionBasedDynamics.
 
-Its constraints have other laws than energies with a stiffness. The XPBD constraint of a distance has a stiffness in N/m. A
-constraint of PBD moves its vertices by a fraction s of the way that satisfies it. Here s follows from the energy ½kC² and the
-step dt: if no other constraint acts, n iterations reduce C by w/(w + 1/(k dt²)), as one iteration of XPBD does. w is the sum
-of ‖∂C/∂xᵢ‖²/mᵢ at rest, and f = 1 − (1 + w k dt²)^(−1/n).
+Its XPBD constraint of a distance has a stiffness in N/m. A constraint of PBD moves vertices by a fraction s of the way that
+satisfies it. Here s follows from the energy ½kC² and the step dt: n iterations reduce C by w/(w + 1/(k dt²)), as one of XPBD
+does, w = Σ ‖∂C/∂xᵢ‖²/mᵢ at rest, so f = 1 − (1 + w k dt²)^(−1/n).
 
 | Energy | Constraint | s |
 |---|---|---|
@@ -12,12 +11,10 @@ of ‖∂C/∂xᵢ‖²/mᵢ at rest, and f = 1 − (1 + w k dt²)^(−1/n).
 | `QuadraticBending` | isometric bending | 2f, with y in place of C and k = D/(A₁ + A₂) |
 | `CorotatedMembrane` | strain of a triangle, normalised | f, with k = EtA for the stretch along two axes, EtA/2 for the shear |
 
-The constraint of bending is the energy itself, so that satisfying it halves y; hence the factor 2. As dt falls, the moves add
-up to those of the energies, for every n. The energy of a triangle is the corotated one for small strains. Two constraints are
-not used: the XPBD constraint of bending has the energy ½k(½‖y‖²)², which has no stiffness at rest, and PBD divides the
-stiffness of the FEM constraint of a triangle out.
+Bending is constrained by its energy, so that satisfying it halves y; hence the factor 2. As dt falls, moves add up to those of
+the energies, for every n.
 
-pyPBD has gravity of 9.81 m/s² along −y, which cannot be set. So scenes are turned, and time is scaled by √(|g|/9.81).
+Gravity is 9.81 m/s² along −y, so scenes are rotated, and time is scaled by √(|g|/9.81).
 """
 
 import numpy as np
@@ -44,7 +41,7 @@ def engine():
 
 
 def frame_of(gravity):
-    """Returns the rotation (3, 3) from the space of a scene to that of pyPBD, and the factor between times."""
+    """Returns the rotation (3, 3) from a scene to pyPBD, and the factor between times."""
     size = np.linalg.norm(gravity)
     down = np.asarray(gravity) / size
     side = np.eye(3)[np.abs(down).argmin()]
@@ -57,19 +54,13 @@ def frame_of(gravity):
 
 
 def pbd_model(scene, method, dt, iterations=1):
-    """Returns a scene as a ``pypbd.SimulationModel``, with float64 arrays in the order of the scene.
+    """Returns a scene as a ``pypbd.SimulationModel`` for steps ``dt`` [s], with float64 arrays in the order of the scene.
 
-    Positions are turned, and velocities are per scaled time, see :func:`frame_of`. Pinned particles have the mass 0.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        method: One of :data:`METHODS`.
-        dt: The step [s].
-        iterations: Iterations per step, on which the fractions depend.
+    Positions are rotated, velocities per scaled time (:func:`frame_of`), pins have mass 0.
 
     Raises:
         ImportError: pyPBD is not installed.
-        ValueError: The scene has something that pyPBD does not have.
+        ValueError: The scene has something that pyPBD lacks.
     """
     pypbd = engine()
     refuse_inexpressible(scene, method)
@@ -101,11 +92,7 @@ def pbd_model(scene, method, dt, iterations=1):
 
 
 def refuse_inexpressible(scene, method):
-    """Checks that pyPBD can run a scene.
-
-    Raises:
-        ValueError: It cannot, or there is no such method. The message names what pyPBD does not have.
-    """
+    """Raises ValueError with what pyPBD lacks to run a scene."""
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; it must be one of {', '.join(METHODS)}")
 
@@ -137,14 +124,13 @@ def refuse_inexpressible(scene, method):
 
 
 def _fraction(w, stiffness, dt, iterations):
-    """Returns by which fraction an iteration must satisfy a constraint."""
     with np.errstate(invalid="ignore"):
         found = 1.0 - (1.0 + w * stiffness * dt**2) ** (-1.0 / iterations)
     return np.where(w > 0.0, found, 0.0)
 
 
 def _add_springs(model, found, inverse, method, dt, scale, iterations):
-    """Adds distances; infinitely stiff ones are constraints of PBD, which are satisfied."""
+    """Adds distances; infinitely stiff ones are PBD's."""
     stiffness = np.broadcast_to(found.stiffness, len(found.stencil))
     fractions = _fraction(inverse[found.stencil].sum(axis=1), stiffness, dt, iterations)
     # At a turned time t' = t·scale, a force per length is k/scale².
@@ -167,7 +153,7 @@ def _add_bending(model, found, inverse, dt, iterations):
 
 
 def _add_membrane(model, particles, found, mesh, inverse, dt, iterations):
-    """Adds triangles; the rest shape that each keeps is its own, laid flat into the plane that the constraint reads."""
+    """Adds triangles, each with its rest shape in the plane that the constraint reads."""
     stiffness = np.broadcast_to(found.stiffness, len(found.stencil))
     triangles = Mesh(mesh.points, found.stencil)
     x0, x1, x2 = (mesh.points[found.stencil[:, i]] for i in range(3))

@@ -1,4 +1,4 @@
-"""The solvers of pyPBD as records with settings, and their steps."""
+"""The solvers of pyPBD as records, and their steps."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -52,7 +52,7 @@ class PositionBasedDynamics:
 
 
 class PbdSteps:
-    """A scene and a solver of pyPBD, which has one clock and one setting of steps in a process.
+    """A scene and a solver of pyPBD, which has one clock per process.
 
     Attributes:
         model: The ``pypbd.SimulationModel``.

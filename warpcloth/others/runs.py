@@ -1,4 +1,4 @@
-"""Runs of scenes by other simulators, as animations of warpcloth, and what a simulator declares."""
+"""Runs of scenes by other simulators, as animations."""
 
 import time
 from collections.abc import Callable
@@ -20,8 +20,8 @@ class Simulator(NamedTuple):
     """A simulator, for charts.
 
     Attributes:
-        title: Its name in tables and charts.
-        package: The package whose version is in tables.
+        title: Its name.
+        package: The package of its version.
         check: Function that raises ImportError if it is not installed.
         dtype: The precision that it has.
         solvers: :class:`OtherSolver`\\s by their names in charts.
@@ -38,13 +38,12 @@ class OtherSolver(NamedTuple):
     """A solver of another simulator, for charts.
 
     Attributes:
-        title: Its name in tables and charts, after that of the simulator.
-        record: Function that returns its record for options by name. A record is a frozen dataclass with ``substeps`` and
-            ``iterations``, of which more are more accurate, ``version``, the simulator and its version in words, and
-            ``bind(scene, device)``. That raises ValueError if the solver does not take the scene. It returns an object with the
-            methods ``frame()``, ``points()`` and ``velocities()``, both (n, 3), which are called in the scope of the device.
-        runs: Options of settings that trade speed for accuracy, as in :class:`warpcloth.solvers.facts.Facts`; ``fewest`` is a
-            multiple of the fewest stable substeps of ``Explicit``.
+        title: Its name, after that of the simulator.
+        record: Function (options) → record: a frozen dataclass with ``substeps`` and ``iterations``, of which more are more
+            accurate, ``version`` in words, and ``bind(scene, device)``. That refuses scenes by ValueError, and returns an
+            object with ``frame()``, ``points()`` and ``velocities()`` (n, 3), for the scope of the device.
+        runs: Settings that trade speed for accuracy, as in :class:`warpcloth.solvers.facts.Facts`; ``fewest`` is a multiple of
+            the minimum of substeps of ``Explicit``.
         iterates: Whether it has iterations.
     """
 
@@ -56,24 +55,22 @@ class OtherSolver(NamedTuple):
 
 @in_turn
 def run_other(scene, record, device="cpu", frames=None, progress=None):
-    """Runs a scene with a solver of another simulator.
-
-    Compilation comes before frame 0.
+    """Runs a scene with a solver of another simulator; it compiles before frame 0.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
-        record: The record of the solver, see :class:`OtherSolver`.
+        record: The record of an :class:`OtherSolver`.
         device: A Warp device.
         frames: Number of frames after the first; by default that of the scene.
-        progress: Function called with (frame, frames) after each frame, from frame 0; or None.
+        progress: Function called with (frame, frames) from frame 0, or None.
 
     Returns:
-        :class:`warpcloth.Animation`, with the start as the simulator has it. It has diverged, and ends before that frame, if a
-        coordinate is not finite or an edge of the mesh is longer than 11 times its rest length.
+        :class:`warpcloth.Animation` from the simulator's start. It has diverged, and ends before that frame, if a coordinate is
+        not finite or an edge is longer than 11 times its rest length.
 
     Raises:
         ImportError: The simulator is not installed.
-        ValueError: An argument is not allowed, or the solver does not take or run the scene.
+        ValueError: An argument is not allowed, or the solver refuses the scene.
     """
     frames = scene.frames if frames is None else frames
     whole("frames", frames, 1)
@@ -109,7 +106,7 @@ def run_other(scene, record, device="cpu", frames=None, progress=None):
 
 
 def worst_strain(mesh, points):
-    """Returns the largest |l/L − 1| of the edges of a mesh at points (n, 3), or NaN or infinity if these are not finite."""
+    """Returns the largest |l/L − 1| of edges at points (n, 3), or NaN or infinity."""
     edges, lengths = mesh.edges[mesh.edge_lengths > 0.0], mesh.edge_lengths[mesh.edge_lengths > 0.0]
     with np.errstate(over="ignore", invalid="ignore"):
         now = np.linalg.norm((points[edges[:, 1]] - points[edges[:, 0]]).astype(np.float64), axis=1)

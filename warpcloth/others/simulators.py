@@ -1,4 +1,4 @@
-"""The simulators that ``--with`` names. A row adds one to charts, choices and tables."""
+"""The simulators that ``--with`` names, a row each."""
 
 from .newton_runs import NEWTON
 from .pbd_runs import PBD
@@ -8,11 +8,7 @@ SIMULATORS = {"newton": NEWTON, "pbd": PBD, "uipc": UIPC}
 
 
 def check_installed(names):
-    """Checks that simulators are installed.
-
-    Raises:
-        ImportError: Some are not; the message names all of them.
-    """
+    """Checks that simulators are installed; raises ImportError with the names of those that are not."""
     lacking = []
     for name in names:
         try:
@@ -24,12 +20,12 @@ def check_installed(names):
 
 
 def other_solvers():
-    """Returns the :class:`warpcloth.others.runs.OtherSolver`\\s of all simulators by their names in charts."""
+    """Returns the :class:`warpcloth.others.runs.OtherSolver`\\s by their names in charts."""
     return {name: solver for each in SIMULATORS.values() for name, solver in each.solvers.items()}
 
 
 def simulator_of(name):
-    """Returns the :class:`warpcloth.others.runs.Simulator` of a solver, or None for a solver of warpcloth."""
+    """Returns the :class:`warpcloth.others.runs.Simulator` of a solver, or None."""
     return next((each for each in SIMULATORS.values() if name in each.solvers), None)
 
 

@@ -1,4 +1,4 @@
-"""Stiffness of scenes in libuipc against that in warpcloth, by samples."""
+"""Stiffness of scenes in libuipc against that in warpcloth."""
 
 from ..terms import NeoHookeanMembrane
 from .calibration import calibrated

@@ -1,6 +1,6 @@
 """Scenes as scenes of libuipc 0.0.29 (https://github.com/spiriMirror/libuipc): incremental potential contact on CUDA.
 
-Its parameters follow from its energies, in which t is half of the thickness of the cloth, and C is FᵀF of a triangle:
+Its parameters follow from its energies, t half of the cloth's thickness, C = FᵀF of a triangle:
 
 | Energy | Element there | Its energy | Its parameters |
 |---|---|---|---|
@@ -8,12 +8,11 @@ Its parameters follow from its energies, in which t is half of the thickness of 
 | `NeoHookeanMembrane`, `StVKMembrane` | Neo-Hookean shell | 2tA(½μ(tr C − 2 − 2 ln J) + ½λ(ln J)²) | μ/2t, λ/2t |
 | `QuadraticBending`, `DihedralBending` | bending of a discrete shell | 3κ|e|²/(A₁+A₂)(θ − θ̄)² | κ = D/6 |
 
-Springs have the law of warpcloth, membranes for small strains, quadratic bending for small angles. Steps are implicit Euler's.
+Membranes agree for small strains, quadratic bending for small angles; steps are implicit Euler's.
 
-Contact has another law: elements at a distance d below a width w have the energy −κ(d² − w²)² ln(d²/w²). It begins at the
-distance r of the scene. κ = kAr/((3 ln 4 + 4.5)w³) gives a vertex of the mean area A the force of warpcloth at d = w/2, kAr/2.
-For cloth that touches itself, w = r. For bodies, w is the mean of a width of the cloth and one of the body. Planes have no
-width, and are moved along their normals. Friction is smoothed below 0.01 m/s.
+Contact differs: elements at a distance d below w have the energy −κ(d² − w²)² ln(d²/w²). It begins at r; κ = kAr/((3 ln 4 +
+4.5)w³) gives a vertex of mean area A the force of warpcloth at d = w/2, kAr/2. Cloth with itself has w = r, bodies the mean of
+a width of cloth and of body; planes have no width and are moved along normals. Friction is smoothed below 0.01 m/s.
 """
 
 import numpy as np
@@ -47,16 +46,11 @@ def engine():
 
 
 def uipc_scene(scene, dt, iterations=1):
-    """Returns a scene as a ``uipc.Scene``; its finite elements are those of the cloth, with vertices in the order of the scene.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        dt: The step [s].
-        iterations: Iterations of Newton's method per step, at least. Where contact shortens iterations, libuipc adds more.
+    """Returns a scene as a ``uipc.Scene`` for steps ``dt`` [s] of at least ``iterations``, vertices in its order.
 
     Raises:
         ImportError: libuipc is not installed.
-        ValueError: The scene has something that libuipc does not have.
+        ValueError: The scene has something that libuipc lacks.
     """
     uipc = engine()
     refuse_inexpressible(scene)
@@ -80,11 +74,7 @@ def uipc_scene(scene, dt, iterations=1):
 
 
 def refuse_inexpressible(scene):
-    """Checks that libuipc can run a scene; this does not need libuipc.
-
-    Raises:
-        ValueError: It cannot. The message names what libuipc does not have.
-    """
+    """Raises ValueError with what libuipc lacks to run a scene; this does not need libuipc."""
     mesh, (outer, own) = scene.mesh, _distances(scene)
     refused = {
         "vertices outside of triangles in this comparison": not (mesh.vertex_areas > 0.0).all(),
@@ -116,13 +106,12 @@ def refuse_inexpressible(scene):
 
 
 def _distances(scene):
-    """Returns distances [m] of contact with colliders and with itself; the other one, or 1 mm, if there is none."""
+    """Returns the distances [m] of contact with colliders and with itself; each defaults to the other, or to 1 mm."""
     outer, own = scene.colliders and scene.contact.distance, scene.self_contact and scene.self_contact.distance
     return float(outer or own or 1e-3), float(own or outer or 1e-3)
 
 
 def _add_cloth(made, scene, element, half, uipc):
-    """Adds a shell, half of whose thickness is given [m], and springs between its vertices."""
     law, view, mesh = uipc.constitution, uipc.view, scene.mesh
     rest = uipc.geometry.trimesh(mesh.points.copy(), mesh.triangles.astype(np.int32))
     uipc.geometry.label_surface(rest)
@@ -157,13 +146,12 @@ def _add_cloth(made, scene, element, half, uipc):
 
 
 def _indices(rows, sought):
-    """Returns the indices of the rows with the same vertices as those sought, in any order."""
     index = {frozenset(row): i for i, row in enumerate(rows.tolist())}
     return [index[frozenset(row)] for row in sought.tolist()]
 
 
 def _add_collider(made, collider, element, outer, own, uipc):
-    """Adds a half-space, or a body that stands still; nothing depends on its stiffness [Pa] and density [kg/m³]."""
+    """Adds a half-space or a fixed body, of any stiffness [Pa] and density [kg/m³]."""
     law, pose = uipc.constitution, collider.poses[0]
     if isinstance(collider, Plane):
         normal = turned(pose[3:], np.array([0.0, 1.0, 0.0]))
@@ -181,7 +169,6 @@ def _add_collider(made, collider, element, outer, own, uipc):
 
 
 def _surface(collider):
-    """Returns vertices (n, 3) [m] and triangles (T, 3) of a shape, in its frame; those of round shapes are on the surface."""
     if collider.is_mesh:
         return collider.frames[0], collider.triangles
     from trimesh import creation

@@ -1,4 +1,4 @@
-"""The solver of libuipc as a record with settings, and its steps."""
+"""The solver of libuipc as a record, and its steps."""
 
 from dataclasses import dataclass
 from tempfile import TemporaryDirectory
@@ -14,11 +14,11 @@ from .uipc_model import engine, uipc_scene
 
 @dataclass(frozen=True)
 class LibUipc:
-    """The solver of libuipc, implicit Euler by Newton's method, with its settings.
+    """The solver of libuipc: implicit Euler by Newton's method.
 
     Attributes:
         substeps: Steps per frame.
-        iterations: Iterations per step, at least; see :func:`warpcloth.others.uipc_model.uipc_scene`.
+        iterations: Minimum of iterations per step.
 
     Raises:
         ValueError: A value is not allowed.
@@ -48,7 +48,7 @@ class LibUipc:
 
 
 class UipcSteps:
-    """A scene in an engine of libuipc, on the CUDA device with the index ``ordinal``."""
+    """A scene in libuipc, on the CUDA device ``ordinal``."""
 
     def __init__(self, scene, solver, ordinal):
         uipc, self._substeps = engine(), solver.substeps
@@ -71,11 +71,11 @@ class UipcSteps:
         self._world.sync()
 
     def points(self):
-        """Returns positions (n, 3) float64 [m], NaN if libuipc has failed."""
+        """Returns positions (n, 3) float64 [m], NaN after a failure."""
         return self._read(self._points)
 
     def velocities(self):
-        """Returns velocities (n, 3) float64 [m/s], NaN if libuipc has failed."""
+        """Returns velocities (n, 3) float64 [m/s], NaN after a failure."""
         return self._read(self._velocities)
 
     def stop(self):

@@ -1,4 +1,4 @@
-"""A perspective camera, also one that frames a whole motion."""
+"""A perspective camera."""
 
 from dataclasses import dataclass
 
@@ -17,12 +17,11 @@ class Camera:
 
     Attributes:
         position: Position of the camera [m].
-        target: The point in the middle of the picture [m]. Its distance also sets the scale of the scene: rays to the sky are
-            about as long as half the height of the picture there.
-        up: Up direction in the picture, of any length, not along the view.
+        target: The point in the middle of the picture [m]; rays to the sky are about half as long as the picture is high there.
+        up: Up direction, of any length, not along the view.
         fov: Vertical field of view [°], above 0 and below 180.
-        shift: Lens shift: how far the middle of the picture is to the right of the target, in heights of the picture.
-        rise: How far it is above the target, in heights of the picture.
+        shift: Distance of the middle of the picture to the right of the target, in heights of the picture.
+        rise: That above the target.
 
     Raises:
         ValueError: A number is not finite or out of range, the target is at the position, or up is along the view.
@@ -55,16 +54,16 @@ class Camera:
         """Returns the nearest camera in a direction that shows all points of some frames.
 
         Args:
-            frames: Points (n, 3) of each [m], read once, one at a time; points that are not finite do not count.
-            azimuth: Angle of the viewer about the vertical [°], as in :class:`View`.
-            elevation: Angle of the viewer above the horizontal [°].
+            frames: Points (n, 3) of each [m], read one at a time; ones that are not finite are ignored.
+            azimuth: Angle about the vertical [°], as in :class:`View`.
+            elevation: Angle above the horizontal [°].
             up_axis: "Y" or "Z".
-            aspect: Width of the picture by its height.
-            fov: Angle from the lower to the upper side [°].
-            margin: Fraction of the picture that stays empty on each side.
+            aspect: Width over height of the picture.
+            fov: Vertical field of view [°].
+            margin: Empty fraction of the picture on each side.
 
         Raises:
-            ValueError: No point is finite, or a number is beyond its range.
+            ValueError: No point is finite, or a number is out of range.
         """
         number("aspect", aspect, above=0.0)
         number("fov", fov, above=0.0)
@@ -93,10 +92,8 @@ class Camera:
         return cls(axes @ eye, axes @ middle, axes[:, 1], fov)
 
     def sun(self, up):
-        """Returns the unit vector towards the sun (3,), over the right shoulder of the camera.
-
-        Args:
-            up: Unit vector (3,) away from the ground.
+        """Returns the unit vector (3,) towards the sun, over the right shoulder of the camera, for ``up`` (3,) away from the
+        ground.
         """
         view = np.subtract(self.target, self.position)
         right = np.cross(view, self.up)

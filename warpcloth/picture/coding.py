@@ -1,4 +1,4 @@
-"""Codes the positions and values of an animation in few bytes, for pages: whole numbers, their differences, deflated."""
+"""Codes positions and values of an animation for pages: whole numbers, their differences, deflated."""
 
 import base64
 import zlib
@@ -37,13 +37,12 @@ class Deflated:
 class CodedPositions(Deflated):
     """Positions as multiples of a quantum from the lower corner of a box, 16 bits each.
 
-    A frame is predicted from the two before it, as if it moved on at constant velocity. From the difference to it, each vertex
-    subtracts that of the vertex before. All is modulo 2¹⁶. Small differences of either sign become small numbers: 0, −1, 1, −2
-    are 0, 1, 2, 3. First come the upper bytes of all x, y and z of a frame, then the lower bytes.
+    A frame is predicted from the two before it at constant velocity. The difference of each vertex is relative to that of the
+    vertex before, modulo 2¹⁶. Then 0, −1, 1, −2 become 0, 1, 2, 3, and the upper bytes of a frame come before the lower.
 
     Args:
         low: Lower corner of the box (3,) [m].
-        quantum: The quantum [m], above 0. Positions beyond `STEPS` of it are not known, nor are those that are not finite.
+        quantum: The quantum [m], above 0. Positions beyond `STEPS` of it, or not finite, are unknown.
     """
 
     def __init__(self, low, quantum):
@@ -68,7 +67,7 @@ class CodedPositions(Deflated):
 class CodedValues(Deflated):
     """Values as steps of the range of a :class:`Scale`, 8 bits each, as differences from the frame before, modulo 2⁸.
 
-    Values beyond an end are those of the end; 0 stands for NaN.
+    Values beyond an end are at the end; 0 is NaN.
     """
 
     def __init__(self, scale):
@@ -85,7 +84,7 @@ class CodedValues(Deflated):
 
 
 def coded_indices(rows):
-    """Returns rows of indices (m, k), below 2³¹, as base64 of deflated int32: the first row, then differences between rows."""
+    """Returns indices (m, k) below 2³¹ as base64 of deflated int32 differences between rows."""
     data = Deflated()
     data.add(np.diff(rows.astype("<i4"), axis=0, prepend=np.int32(0)).tobytes())
     return data.text()

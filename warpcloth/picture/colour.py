@@ -1,4 +1,4 @@
-"""Colour scales of measures, one for all frames of a sequence."""
+"""Colour scales of measures."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -21,17 +21,16 @@ _NARROWEST = 1e-6
 
 @dataclass(frozen=True)
 class Scale:
-    """Maps values to colours. Values beyond an end get the colour of the end, and NaN gets the grey `EXCLUDED`.
+    """Maps values to colours. Values beyond an end have its colour, NaN the grey `EXCLUDED`.
 
     Attributes:
         low: Value at the lower end.
         high: Value at the upper end.
-        neutral: Value in the middle of a diverging map; the ends are extended to be symmetric about it. None for a sequential
-            map.
-        colormap: Name of a colour map of matplotlib; by default `DIVERGING` with a neutral value, `SEQUENTIAL` without.
+        neutral: Value in the middle of a diverging map, about which the ends become symmetric; None for a sequential map.
+        colormap: Map of matplotlib; by default `DIVERGING` with a neutral value, else `SEQUENTIAL`.
 
     Raises:
-        ValueError: A value is not finite, low is not below high, or matplotlib has no such map.
+        ValueError: A value is not finite, low is not below high, or there is no such map.
     """
 
     low: float
@@ -61,7 +60,7 @@ class Scale:
         """Returns the colours (…, 3) of values (…) in sRGB, for plots.
 
         Raises:
-            ImportError: matplotlib, which has the maps, is not installed.
+            ImportError: matplotlib is not installed.
         """
         values = np.asarray(values, dtype=np.float64)
         stops = table(self.map)
@@ -76,17 +75,12 @@ class Scale:
         """Returns the colours (…, 3) of values (…) in linear Rec. 709, for displayColor of USD.
 
         Raises:
-            ImportError: matplotlib, which has the maps, is not installed.
+            ImportError: matplotlib is not installed.
         """
         return to_linear(self.srgb(values))
 
     def legend(self, measure, unit):
-        """Returns the scale as a dictionary of numbers and texts, for metadata of files; colours are linear Rec. 709.
-
-        Args:
-            measure: Name of the scalar.
-            unit: Its unit.
-        """
+        """Returns the scale of a ``measure`` with a ``unit`` as numbers and texts for metadata, in linear Rec. 709."""
         values = np.linspace(self.low, self.high, 9)
         if self.neutral is not None:
             values[4] = self.neutral
@@ -99,21 +93,14 @@ class Scale:
 
 
 def range_over(summaries, neutral=None):
-    """Returns one range for all frames: from the smallest 1st percentile to the largest 99th.
-
-    Args:
-        summaries: Summaries of one scalar, one per frame, each with ``percentiles``: of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %.
-            Those that are not finite do not count.
-        neutral: Value about which the range is symmetric, or None.
-
-    Returns:
-        tuple: (low, high), with low below high even if all values are equal or there are none.
+    """Returns (low, high) over all frames: the smallest 1st and the largest 99th percentile of ``summaries``, symmetric about
+    ``neutral``.
     """
     return range_of([summary.percentiles for summary in summaries], neutral)
 
 
 def range_of(rows, neutral=None):
-    """Like `range_over`, for rows of percentiles, (9,) for each frame."""
+    """:func:`range_over` for percentiles (F, 9)."""
     ends = np.array(rows, dtype=np.float64).reshape(-1, 9)[:, [1, -2]]
     ends = ends[np.isfinite(ends)]
     if not len(ends):
@@ -132,19 +119,14 @@ def to_linear(colours):
 
 
 def byte_colour(linear):
-    """Converts linear Rec. 709 to a tuple of sRGB from 0 to 255."""
+    """Converts linear Rec. 709 to sRGB from 0 to 255. 709 to a tuple of sRGB from 0 to 255."""
     c = np.asarray(linear)
     coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
     return tuple(np.round(255.0 * coded).astype(int).tolist())
 
 
 def check_colormap(name):
-    """Checks that matplotlib has a colour map.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-        ValueError: There is no such map; the message suggests similar names, or some that exist.
-    """
+    """Raises ValueError if matplotlib has no colour map of a name, with similar names."""
     require_matplotlib()
     from difflib import get_close_matches
 
@@ -157,7 +139,7 @@ def check_colormap(name):
 
 @cache
 def table(name):
-    """Returns a map of matplotlib as (257, 3) in sRGB; an odd number, so that one colour is in the middle.
+    """Returns a map of matplotlib as sRGB (257, 3), with one colour in the middle.
 
     Raises:
         ImportError: matplotlib is not installed.

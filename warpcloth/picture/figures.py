@@ -1,4 +1,4 @@
-"""Figures of matplotlib without pyplot, which has global state and needs a window system."""
+"""Figures of matplotlib without pyplot's global state."""
 
 import importlib.util
 from io import BytesIO
@@ -23,13 +23,12 @@ def require_matplotlib():
 
 
 def check_path(path, endings):
-    """Checks that a picture can be written, before anything is drawn.
+    """Checks that a picture can be written.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        OSError: The folder cannot be written.
+        OSError: The folder does not exist, or cannot be written.
         ImportError: matplotlib is not installed.
-        ValueError: The name has none of the endings, or the path is a folder or a device.
+        ValueError: The ending is another, or the path is a folder or a device.
     """
     require_matplotlib()
     path = Path(path)
@@ -39,7 +38,7 @@ def check_path(path, endings):
 
 
 def number_axis(axis):
-    """Labels a logarithmic axis of less than two decades, on which the default labels overlap or are missing."""
+    """Labels a logarithmic axis of less than two decades."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     low, high = axis.get_view_interval()

@@ -1,4 +1,4 @@
-"""Writes pictures as a still, or as a film in real time. Equal pictures give equal bytes."""
+"""Writes pictures as a still or a film; equal pictures give equal bytes."""
 
 import importlib.util
 import io
@@ -30,17 +30,12 @@ _BINS = 64
 
 
 def check_film(path, size):
-    """Checks that a picture or film can be written, before anything is read or drawn.
-
-    Args:
-        path: The file.
-        size: Width and height [px].
+    """Checks that a picture or film of a size [px] can be written.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        OSError: The folder cannot be written.
+        OSError: The folder does not exist, or cannot be written.
         ImportError: PyAV, which writes films, is not installed.
-        ValueError: The ending is none of these, the size does not suit it, or the path is a folder or a device.
+        ValueError: The ending or the size is not supported, or the path is a folder or a device.
     """
     path, (width, height) = Path(path), size
     if path.suffix.lower() not in (STILL, *FILMS):
@@ -55,15 +50,7 @@ def check_film(path, size):
 
 
 def check_times(path, times):
-    """Checks that the format of a film can store the times of its pictures.
-
-    Args:
-        path: The file.
-        times: Times at which pictures are shown [s], ascending (F,).
-
-    Raises:
-        ValueError: An interval is out of range.
-    """
+    """Checks that a film can store the times of its pictures (F,) [s]."""
     ending, intervals = Path(path).suffix.lower(), np.diff(times)
     if not len(intervals) or ending not in _INTERVALS:
         return
@@ -75,23 +62,14 @@ def check_times(path, times):
 
 
 def open_film(path, size, times):
-    """Opens a file for pictures.
-
-    Args:
-        path: Ends with .png, .gif, .webp or .mp4.
-        size: Width and height [px].
-        times: Times at which pictures are shown [s], ascending (F,). The last is shown as long as the one before it.
-
-    Returns:
-        Output: With a method ``add`` that takes a Pillow image.
+    """Opens a .png, .gif, .webp or .mp4 file for Pillow images at ascending times (F,) [s]; the last lasts as long as the one
+    before.
     """
     kind = {".png": _Still, ".gif": _Gif, ".webp": _WebP, ".mp4": _Video}[Path(path).suffix.lower()]
     return kind(path, size, np.asarray(times, dtype=float))
 
 
 class _Still(Output):
-    """One picture, as PNG."""
-
     def __init__(self, path, size, times):
         super().__init__(path, "xb")
         self.frames = 0
@@ -102,9 +80,9 @@ class _Still(Output):
 
 
 class _Gif(Output):
-    """A looping GIF with one palette for all frames, so that static regions are stored once.
+    """A looping GIF with one palette, so that static regions are stored once.
 
-    The palette is known only at the end. Until then frames are kept as PNG, which takes about the memory of the GIF.
+    Frames are kept as PNG until the palette is known.
     """
 
     def __init__(self, path, size, times):
@@ -140,11 +118,6 @@ class _Gif(Output):
         return Image.open(io.BytesIO(self._held[k])).convert("RGB")
 
     def _palette(self):
-        """Returns an image with 256 colours that suit all frames.
-
-        A colour is weighted by the square root of its pixels. Otherwise a large ground would use all entries, and leave none
-        for a small pin.
-        """
         colours, found = np.nonzero(self._pixels)[0], self._pixels[self._pixels > 0]
         means = np.round(self._sums[colours] / found[:, None]).astype(np.uint8)
         rows = np.repeat(means, np.ceil(np.sqrt(found / found.min())).astype(int), axis=0)
@@ -156,18 +129,14 @@ class _Gif(Output):
 
 
 def durations(times, ticks=100):
-    """Returns the durations of frames [ms], in whole ticks, of so many a second, that add up to the times."""
+    """Returns durations of frames [ms] in whole ticks, ``ticks`` a second, that add up to the times."""
     last = times[-1] - times[-2] if len(times) > 1 else 1.0
     ends = np.floor(ticks * (np.append(times, times[-1] + last) - times[0]) + 0.5).astype(int)
     return (1000 // ticks * np.diff(ends)).tolist()
 
 
 class _WebP(Output):
-    """A looping WebP. Each frame is a still of the rectangle that differs from the frame before.
-
-    The container is that of the WebP specification: a header, and frames with their rectangles and durations. Pillow needs all
-    pictures at once to write it, and these may not fit into memory.
-    """
+    """A looping WebP, written frame by frame: stills of the rectangle that changes."""
 
     def __init__(self, path, size, times):
         super().__init__(path, "xb")
@@ -201,17 +170,15 @@ class _WebP(Output):
 
 
 def _chunk(name, data):
-    """Returns a chunk of a RIFF file."""
     return name + struct.pack("<I", len(data)) + data + bytes(len(data) % 2)
 
 
 def _threes(*numbers):
-    """Returns whole numbers in three bytes each, the lowest first."""
     return b"".join(number.to_bytes(3, "little") for number in numbers)
 
 
 class _Video(Output):
-    """A film in H.264, encoded by one thread, so that equal pictures give equal bytes."""
+    """A film in H.264, by one thread, so that equal pictures give equal bytes."""
 
     def __init__(self, path, size, times):
         import av

@@ -15,16 +15,10 @@ _NOTHING = "no triangle, line or pin has positions that are finite and below 1e1
 
 
 def frame_motion(subjects, pictures, view, aspect):
-    """Returns the camera that shows all of a motion, and the height of the ground below it [m].
+    """Returns the camera that shows all of a motion of :class:`Subject`\\s, side by side, and the height of the ground [m].
 
-    Args:
-        subjects: List of :class:`Subject`, side by side, all with one up axis.
-        pictures: Iterable over pictures, each a list with, for each subject, the positions (n, 3) [m] of its shapes.
-        view: Azimuth and elevation [°], and zoom.
-        aspect: Width of the picture of a subject by its height.
-
-    Raises:
-        ValueError: Nothing can be drawn, because no triangle, line or ball has positions that are finite and near enough.
+    ``pictures`` are lists, by subject, of positions (n, 3) [m] of shapes; ``view`` is azimuth and elevation [°] and zoom.
+    Raises ValueError if nothing has finite positions near enough.
     """
     azimuth, elevation, zoom = view
     up_axis = subjects[0].up_axis
@@ -55,7 +49,6 @@ def frame_motion(subjects, pictures, view, aspect):
 
 
 def _fitted(subject):
-    """Returns the indices of the shapes that the camera frames: the cloth, and surroundings that are not much larger."""
     drawn = [each[seen_points(shape)] for shape, each in zip(subject.shapes, subject.read(0), strict=True)]
     finite = [located(each) for each in drawn]
     sizes = [np.linalg.norm(np.ptp(each, axis=0)) if len(each) else 0.0 for each in finite]
@@ -63,21 +56,12 @@ def _fitted(subject):
 
 
 def seen_points(shape):
-    """Returns the indices of the points of a shape that belong to a triangle, line or ball."""
+    """Returns the points of a shape in a triangle, line or ball."""
     return np.unique(np.concatenate([shape.triangles.ravel(), shape.lines.ravel(), shape.balls]))
 
 
 def drawn_points(shape, points, seen):
-    """Returns what is drawn of a frame of a shape.
-
-    Args:
-        shape: The :class:`Shape`.
-        points: Positions (n, 3) [m].
-        seen: Its :func:`seen_points`.
-
-    Returns:
-        tuple: The points of triangles, lines and balls whose points are all :func:`located`, (m, 3), and the number of others.
-    """
+    """Returns the points (m, 3) of elements of a shape whose points are all :func:`located`, and the number of others."""
     known = are_located(points)
     if known[seen].all():
         return points[seen], 0

@@ -15,22 +15,13 @@ def scalar_names(measure):
 
 
 def neutral_of(measure):
-    """Returns the middle of the colour scale of a measure's scalars; None for norms, whose scales start at 0."""
+    """Returns the middle of a measure's colour scale; None for norms."""
     return measure.neutral if len(measure.shape) < 2 else None
 
 
 def scale_of(analyzers, name, measure, given=None, colormap=None):
-    """Returns one scale for all rows of some analyses.
-
-    Args:
-        analyzers: List of :class:`warpcloth.Analyzer`.
-        name: The scalar.
-        measure: The :class:`warpcloth.analysis.measures.Measure` that has it.
-        given: (low, high), or None for those of :func:`warpcloth.chart.range_over`.
-        colormap: A colour map of matplotlib, or None.
-
-    Returns:
-        Scale: Symmetric about the value without deformation, if there is one.
+    """Returns one scale of a scalar for all rows of some analyses: ``given``, else of percentiles, symmetric about the
+    undeformed value.
     """
     neutral = neutral_of(measure)
     if given is None:
@@ -44,14 +35,12 @@ class MeasuredScalar:
     """The values of a scalar on the cloths of a subject.
 
     Args:
-        subject: The :class:`Subject`.
         name: The scalar, such as "stretch_1".
         rest: The rest shape, or None for that of the subject.
-        device: A Warp device.
-        options: Further options of :class:`warpcloth.Analyzer`, by name.
+        options: Options of :class:`warpcloth.Analyzer` by name.
 
     Raises:
-        ValueError: There is no such scalar, it cannot be measured, or the cloth has no triangles.
+        ValueError: There is no such scalar, it cannot be measured, or there are no triangles.
     """
 
     def __init__(self, subject, name, rest, device, options):
@@ -69,15 +58,13 @@ class MeasuredScalar:
         return scale_of(analyzers, self.name, self.measure, given, colormap)
 
     def rows(self, frames):
-        """Yields the values (E,) of frames with ascending indices; NaN for a frame that is not measured."""
+        """Yields values (E,) of frames with ascending indices; NaN if not measured."""
         rows = [_Rows(each, self.name, self.measure) for each in self.analyzers]
         for frame in frames:
             yield np.concatenate([each.at(frame) for each in rows])
 
 
 class _Rows:
-    """The rows of an analysis, one after another."""
-
     def __init__(self, analyzer, name, measure):
         self._rows, self._name, self._measure = iter(analyzer), name, measure
         self._sample, self._none = next(self._rows, None), np.full(analyzer.count, np.nan)
@@ -91,7 +78,7 @@ class _Rows:
 
 
 class GivenScalar:
-    """Values that the user gives, (F, n) of vertices or (F, T) of triangles."""
+    """Values of the user, (F, n) of vertices or (F, T) of triangles."""
 
     unit = "1"
 
@@ -119,7 +106,7 @@ class GivenScalar:
 
 
 class GivenColours:
-    """Colours that the user gives, linear Rec. 709, (F, n, 3) of vertices or (F, T, 3) of triangles."""
+    """Colours of the user, linear Rec. 709, (F, n, 3) of vertices or (F, T, 3) of triangles."""
 
     unit, name = "1", ""
 
@@ -131,7 +118,7 @@ class GivenColours:
             raise ValueError(f"colour has shape {self.values.shape}; it must be {rule} in all frames")
 
     def scale(self, others, given, colormap):
-        """Returns None, because colours need no scale."""
+        """Returns None."""
 
     def rows(self, frames):
         for frame in frames:

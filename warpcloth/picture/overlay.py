@@ -1,4 +1,4 @@
-"""Draws the colour bar, names and the time on pictures, in sizes that suit the picture."""
+"""Draws the colour bar, names and the time on pictures."""
 
 import unicodedata
 from functools import cached_property
@@ -20,12 +20,10 @@ class Overlay:
 
     Args:
         size: Width and height [px].
-        scale: The :class:`Scale` of the bar, or None for none.
-        title: Name of the coloured scalar.
-        unit: Its unit, "1" if it has none.
-        names: Names of the panels, which are side by side; empty for none.
-        background: sRGB of the background, from 0 to 255.
-        columns: Number of panels in a row; None puts all in one row.
+        scale: The :class:`Scale` of the bar, or None.
+        names: Names of panels side by side, or empty.
+        background: Its sRGB, 0 to 255.
+        columns: Panels in a row; None for all.
     """
 
     def __init__(self, size, scale=None, title="", unit="1", names=(), background=(255, 255, 255), columns=None):
@@ -38,7 +36,7 @@ class Overlay:
 
     @cached_property
     def beside(self):
-        """Width of the space for the bar, to the right of the picture [px]."""
+        """Width of the bar's space, right of the picture [px]."""
         if self.scale is None:
             return 0
         em, labels = self.letters, [self._length(text) for _, text in self._ticks]
@@ -48,13 +46,11 @@ class Overlay:
 
     @cached_property
     def _ticks(self):
-        """Values and labels of the ticks of the bar."""
         room = _BAR * self.height / (2.4 * self.letters)
         return bar_ticks(self.scale, max(2, min(6, int(room))))
 
     @cached_property
     def _head(self):
-        """Lines above the bar: the name, broken after _ where it is wide, and the unit."""
         lines, widest = [""], max(8 * self.letters, 0.16 * self.width)
         for part in self.title.replace("_", "_\n").split("\n"):
             if lines[-1] and self._length(lines[-1] + part) > widest:
@@ -67,15 +63,8 @@ class Overlay:
         return self._font.getlength(text)
 
     def draw(self, panels, time=None, excluded=False):
-        """Puts panels side by side, in rows, and draws the bar, names and time.
-
-        Args:
-            panels: Images (height, width, 3) uint8; panels in one row have one height.
-            time: Text in the lower left corner, or None.
-            excluded: Whether to explain the colour of elements without a value.
-
-        Returns:
-            PIL.Image.Image: The whole picture.
+        """Returns a Pillow image of panels (height, width, 3) uint8 in rows, with the bar, names, time, and the colour of
+        missing values.
         """
         canvas = Image.new("RGB", (self.width, self.height), self.background)
         pen = ImageDraw.Draw(canvas)
@@ -98,7 +87,6 @@ class Overlay:
         return canvas
 
     def _write(self, pen, position, text, anchor="lm"):
-        """Writes text with an outline in the colour of the background, so that it stands out."""
         rim = max(1, self.letters // 8)
         pen.text(position, text, INK, self._font, anchor, stroke_width=rim, stroke_fill=self.background)
 
@@ -134,7 +122,7 @@ class Overlay:
 
 
 def bar_ticks(scale, most):
-    """Returns the values and labels of at most some ticks of the bar of a scale; labels are divided by a power of ten."""
+    """Returns values and labels of at most some ticks of a bar; labels are divided by a power of ten."""
     values = round_numbers(scale.low, scale.high, most)
     factor = 10.0 ** _exponent(scale)
     step = float(np.diff(values).min()) / factor if len(values) > 1 else abs(values[0] / factor) or 1.0
@@ -146,27 +134,26 @@ def bar_ticks(scale, most):
 
 
 def bar_unit(scale, unit):
-    """Returns the text of the power of ten and the unit of the labels of `bar_ticks`; empty if there are none."""
+    """Returns the text of the power of ten and unit of a bar, or ""."""
     exponent = _exponent(scale)
     return " ".join(filter(None, (f"1e{exponent}" if exponent else "", "" if unit == "1" else unit)))
 
 
 def _exponent(scale):
-    """Returns the power of ten by which the labels of a bar are divided."""
     most = max(abs(scale.low), abs(scale.high))
     exponent = 3 * int(np.floor(np.log10(most) / 3.0)) if most > 0.0 else 0
     return exponent if not -3 < exponent < 6 else 0
 
 
 def written(text):
-    """Returns a text in characters of the built-in font: m^2 for m², e for é, and a question mark for all others."""
+    """Returns text in the built-in font: m^2 for m², e for é, ? for others."""
     powers = text.translate(str.maketrans({"²": "^2", "³": "^3", "⁻": "-", "−": "-", "×": "x"}))
     decomposed = "".join(c for c in unicodedata.normalize("NFKD", powers) if not unicodedata.combining(c))
     return "".join(c if c.isascii() or c in "°·…" else "?" for c in decomposed)
 
 
 def round_numbers(low, high, most):
-    """Returns at most ``most`` multiples of 1, 2 or 5 times a power of ten in [low, high], or else low and high."""
+    """Returns at most ``most`` multiples of 1, 2 or 5 times a power of ten in [low, high], or low and high."""
     rough = (high - low) / most
     power = 10.0 ** np.floor(np.log10(rough))
     for factor in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0):

@@ -1,4 +1,4 @@
-"""Pages: one file of HTML that shows an animation in a browser, from all sides, without a server or a network."""
+"""Pages: an animation in one file of HTML, without a server or network."""
 
 import base64
 import html
@@ -48,7 +48,7 @@ _FOLDER = Path(__file__).parent / "viewer"
 
 
 class TooLarge(ValueError):
-    """A page would be larger than it may be."""
+    """A page would be too large."""
 
 
 def view(
@@ -75,35 +75,31 @@ def view(
 ) -> str:
     """Writes a page that shows an animation in a browser: one file of HTML, which loads nothing else.
 
-    The page plays the motion in real time, has a slider for the frames, turns about the cloth by the mouse, and colours it by
-    one of its measures. Positions are rounded to 1/65534 of the longest side of the box of the motion of a shape, values to
-    1/254 of the range of their bar: a page is for looking, not for measuring. The same input gives the same bytes.
+    The page plays the motion in real time, turns about the cloth, and colours it by measures. Positions are rounded to 1/65534
+    of the motion's box, values to 1/254 of the bar. The same input gives the same bytes.
 
     Args:
-        source: Any source of :func:`warpcloth.render`, but only one.
+        source: One source of :func:`warpcloth.render`.
         output: File to write, .html.
-        mesh: The :class:`warpcloth.Mesh` of frames given as an array; for other sources, the rest shape relative to which they
-            are measured.
-        prim: Path or name of the cloth in a stage, or name of the geometry in a mesh file.
-        fps: Frames per second of the source, if the source does not give them or to override them.
+        mesh: The mesh of frames in an array; of other sources the rest shape for measures.
+        prim: Cloth in a stage, or geometry of a mesh file.
+        fps: Frames per second, instead of the source's.
         up_axis: "Y" or "Z", if the source does not give it.
-        copy: Index of the cloth of a batch; None shows all of them side by side.
-        frames: Numbers of the first and the last frame, as the source counts them; None stands for the first or last one.
-        every: Show only every k-th frame.
-        colours: Names of measures that the page can show as colours, such as ("stretch_1", "area_ratio"); or arrays (F, n) or
-            (F, T) of all frames of the source, by the text above their bar. () for none; None for the two principal stretches,
-            if matplotlib is installed and the source is one cloth of triangles with several frames. The page opens with the
-            first of them if they are given, else with plain cloth.
-        colour_range: Values at the ends of the bar of the only measure; by default from the 1st to the 99th percentile of all
-            frames.
-        colormap: A colour map of matplotlib; by default viridis, or coolwarm about the undeformed value.
-        measuring: Further options of :class:`warpcloth.Analyzer`, by name, such as {"reference": "first"}.
-        azimuth: Angle of the camera about the vertical [°], at the start.
+        copy: Index of a cloth of a batch; None for all, side by side.
+        frames: Numbers of the first and last frame; None for the ends of the source.
+        every: Show every k-th frame.
+        colours: Measures to show, such as ("stretch_1", "area_ratio"); or arrays (F, n) or (F, T) by the text of their bar. ()
+            for none; None for the two principal stretches, with matplotlib and one cloth of triangles with several frames. The
+            page opens with the first that is given.
+        colour_range: Ends of the only measure's bar; by default from the 1st to the 99th percentile of all frames.
+        colormap: Map of matplotlib; by default viridis, or coolwarm about the undeformed value.
+        measuring: Options of :class:`warpcloth.Analyzer` by name.
+        azimuth: Angle of the camera about the vertical [°].
         elevation: Angle of the camera above the horizontal [°].
-        zoom: Factor by which the camera is nearer than needed to see the whole motion.
-        ground: Whether to show a ground at the lowest point of the motion; or its height [m].
+        zoom: Factor by which the camera is nearer than to see the whole motion.
+        ground: Whether there is a ground below the motion, or its height [m].
         device: A Warp device, which measures.
-        progress: Function called with (frames coded, frames), from 0; or None.
+        progress: Function called with (frames coded, frames), from 0, or None.
 
     Returns:
         str: The path of the file.
@@ -111,11 +107,10 @@ def view(
     Raises:
         FileNotFoundError: There is no such file or folder.
         ImportError: Colours need matplotlib.
-        ValueError: An argument is not allowed, a source cannot be drawn, a frame of it cannot be read, or the page would be
-            larger than 400 MB.
+        ValueError: An argument is not allowed, the source cannot be read or drawn, or the page would be above 400 MB.
 
     Warns:
-        UserWarning: Triangles, lines or pins are not drawn, because a position is not finite or too far away. The page says so.
+        UserWarning: Something is not drawn because a position is not finite or too far away.
 
     Examples:
         >>> import os, tempfile
@@ -144,13 +139,10 @@ def view(
 
 
 def notebook_html(source):
-    """Returns the HTML by which a notebook shows an animation: its page, or a line that says how to write a page that is large.
+    """Returns the HTML of an animation in a notebook: its page, how to write a large one, or None if it cannot be drawn.
 
     Args:
         source: An :class:`warpcloth.Animation`, :class:`warpcloth.Deformation` or :class:`warpcloth.Sequence`.
-
-    Returns:
-        str: None if the source has no mesh, so that it cannot be drawn.
     """
     if any(getattr(source, name, True) is None for name in ("mesh", "scene")):
         return None
@@ -170,13 +162,7 @@ def notebook_html(source):
 
 
 def check_page(path):
-    """Checks that a page can be written, before anything is read.
-
-    Raises:
-        FileNotFoundError: The folder does not exist.
-        OSError: The folder cannot be written.
-        ValueError: The ending is not .html, or the path is a folder or a device.
-    """
+    """Checks that a page can be written; raises OSError or ValueError."""
     path = Path(path)
     if path.suffix.lower() != ENDING:
         raise ValueError(f"{path}: the ending is {path.suffix!r}; it must be {ENDING}")
@@ -201,7 +187,6 @@ def _chosen(subject, frames, every):
 
 
 def _values(subject, colours, rest=None, measuring=None, device="cpu"):
-    """Returns the values by which a page can colour a subject."""
     if colours is None:
         cloths = [shape for shape in subject.shapes if tuple(shape.colour) == CLOTH]
         can = len(cloths) == 1 and len(cloths[0].triangles) and len(subject) > 1 and importlib.util.find_spec("matplotlib")
@@ -227,21 +212,12 @@ def _page(
     progress=None,
     largest=None,
 ):
-    """Returns the text of the page of some frames of a subject.
+    """Returns the text of the page of the ``chosen`` frames of a subject.
 
-    Args:
-        subject: The :class:`Subject`.
-        chosen: Indices of the frames.
-        values: What colours the cloth: list of `MeasuredScalar` or `GivenScalar`.
-        opened: Whether the page opens with the first of these colours.
-        scaling: Range of the bar of the only colour, or None; and colour map, or None.
-        seen_from: Azimuth and elevation of the camera [°], and its zoom.
-        ground: Whether there is a ground, or its height [m].
-        progress: Function called with (frames coded, frames), or None.
-        largest: Size of the largest page [bytes], or None for that of a file.
+    ``values`` are `MeasuredScalar` or `GivenScalar`, ``scaling`` the range and map of the only one, or None each.
 
     Raises:
-        TooLarge: The page would be larger.
+        TooLarge: The page would be larger than ``largest`` [bytes], by default than a file may be.
     """
     given, colormap = scaling
     largest = largest or LARGEST
@@ -313,7 +289,6 @@ def _page(
 
 
 def _left_out(labels, counts):
-    """Returns a sentence about what is not shown, and in which frames; empty if nothing is left out."""
     lost = [f"{label:g}" for label, count in zip(labels, counts, strict=True) if count]
     if not lost:
         return ""
@@ -324,10 +299,10 @@ def _left_out(labels, counts):
 
 
 class _Motion:
-    """The box of the motion of each shape, and whether it moves; found in one pass over the frames.
+    """The box of each shape's motion, and whether it moves.
 
     Attributes:
-        left_out: Number of triangles, lines and balls that are not shown, in each of the frames so far.
+        left_out: Number of elements not shown in each frame so far.
     """
 
     def __init__(self, subject):
@@ -337,7 +312,6 @@ class _Motion:
         self._shapes, self.moves, self.left_out = subject.shapes, [False] * len(self._seen), []
 
     def note(self, picture):
-        """Notes the positions of the shapes in a frame, and returns them."""
         self._first = picture if self._first is None else self._first
         self.left_out.append(0)
         for k, (points, start, seen) in enumerate(zip(picture, self._first, self._seen, strict=True)):
@@ -349,7 +323,6 @@ class _Motion:
         return picture
 
     def coders(self):
-        """Returns what codes the positions of each shape."""
         found = []
         for low, high in zip(self._low, self._high, strict=True):
             known = np.isfinite(low).all()
@@ -394,7 +367,6 @@ def _measure_data(values, scale, coder, count, excluded):
 
 
 def _filled(title, data):
-    """Returns the page with its parts filled in."""
     parts = {
         "title": html.escape(title),
         "licence": html.escape((_FOLDER / "three.LICENSE").read_text(encoding="utf-8").strip()),
@@ -409,7 +381,6 @@ def _filled(title, data):
 
 @cache
 def _viewer():
-    """Returns the code of the viewer, deflated, as base64."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
     code = deflate.compress((_FOLDER / "viewer.js").read_bytes()) + deflate.flush()
     return base64.b64encode(code).decode()

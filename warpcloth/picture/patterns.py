@@ -1,13 +1,12 @@
-"""Sampling patterns that are even, and fixed, so that equal pictures have equal bytes."""
+"""Fixed, even sampling patterns."""
 
 import numpy as np
 
 
 def pixel_samples(count):
-    """Returns positions (count, 2) in a pixel, from 0 to 1, as even as possible in each direction.
+    """Returns positions (count, 2) in a pixel, from 0 to 1, even in each direction.
 
-    Four samples are the corners of a square rotated by atan ½. Other counts use the lattice (k + ½, gk + ½)/count with the g
-    that maximises the smallest distance.
+    Four are a square rotated by atan ½; others the lattice (k + ½, gk + ½)/count with the g of the largest smallest distance.
     """
     if count == 4:
         return np.array([(0.125, 0.625), (0.375, 0.125), (0.625, 0.875), (0.875, 0.375)])
@@ -24,7 +23,7 @@ def pixel_samples(count):
 def disc(count):
     """Returns points (count, 2) of a low-discrepancy sequence in the unit disc.
 
-    Multiples of 1/g and 1/g² modulo 1, where g³ = g + 1 (Roberts 2018), are squared radii and angles.
+    Multiples of 1/g and 1/g² modulo 1, g³ = g + 1 (Roberts 2018), are squared radii and angles.
     """
     g = 1.3247179572447460
     squared, turn = np.modf(0.5 + np.arange(count)[:, None] / [g, g**2])[0].T

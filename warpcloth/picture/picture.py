@@ -21,30 +21,28 @@ _GREYS = (0.0, 1.0, 0.5)
 def draw(
     path, points, triangles, values, scale, on="triangle", title="", unit="1", view=None, directions=None, both_sides=False
 ):
-    """Writes a PNG of a cloth in parallel projection, coloured on both sides, with a colour bar.
+    """Writes a PNG of a cloth in parallel projection with a colour bar.
 
-    The value of a vertex colours a third of each triangle at it, the part nearest in barycentric coordinates. Dark grey means
-    no value. Triangles with a corner that is not finite are not drawn, and the picture gives their number.
+    A vertex colours the nearest third of each triangle; dark grey is no value. Triangles that are not finite are counted, not
+    drawn.
 
     Args:
         path: The file.
         points: (n, 3) [m].
         triangles: Vertices (T, 3).
-        values: (T,), or (n,) on vertices; NaN for no value.
+        values: (T,), or (n,); NaN for no value.
         scale: The :class:`Scale`.
         on: "triangle" or "vertex".
-        title: Title above the picture.
-        unit: Unit of the values, beside the bar.
-        view: The :class:`View`, fitted to all frames of a sequence if pictures should be comparable. If it is None or has no
-            window, it is fitted to these points.
-        directions: Segments to draw on the cloth, as a dictionary from names to (centres (E, 3) [m], vectors (E, 3) [m] from
-            end to end); the first are black, the second white, the third grey. Segments that are not finite are left out.
-        both_sides: Whether a second panel shows the cloth from the opposite side; each panel then has its view as a title.
+        title: Title.
+        unit: Unit of the values.
+        view: The :class:`View`, fitted to a whole sequence to compare; without a window it is fitted to these points.
+        directions: Segments by name, (centres (E, 3) [m], vectors (E, 3) [m] from end to end): the first black, the second
+            white, the third grey; those not finite are ignored.
+        both_sides: Whether a second panel shows the opposite side.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ImportError: matplotlib is not installed.
-        ValueError: An array has another shape, a triangle refers to no vertex, no point is finite, the file is no .png.
+        OSError, ImportError: The file cannot be written, or matplotlib is not installed.
+        ValueError: A shape is another, a triangle refers to no vertex, no point is finite, or the file is not .png.
     """
     check_path(path, (".png",))
     choice("on", on, ("triangle", "vertex"))
@@ -69,7 +67,6 @@ def draw(
 
 
 def _paint_cloth(axes, view, points, triangles, colours, on, directions):
-    """Draws the triangles and directions in a view; returns how many triangles have a corner that is not finite."""
     corners = view.project(points)[triangles]
     placed = np.isfinite(corners).all(axis=(1, 2))
     outlines, colours = (_whole if on == "triangle" else _thirds)(corners[placed], colours[placed])
@@ -87,14 +84,8 @@ def _paint_cloth(axes, view, points, triangles, colours, on, directions):
 
 
 def paint(axes, outlines, depths, colours, widths):
-    """Draws polygons from the back to the front.
-
-    Args:
-        axes: Axes of matplotlib.
-        outlines: Corners (P, k, 2), to the right and up.
-        depths: Coordinates towards the viewer (P,).
-        colours: sRGB (P, 3) or with alpha (P, 4).
-        widths: Widths of the edges [pt], one or (P,).
+    """Draws polygons (P, k, 2) from the back to the front by depths (P,), in sRGB (P, 3) or with alpha (P, 4), edges of widths
+    [pt].
     """
     from matplotlib.collections import PolyCollection
 
@@ -104,7 +95,6 @@ def paint(axes, outlines, depths, colours, widths):
 
 
 def _check(points, triangles, values, on):
-    """Raises ValueError if arrays have wrong shapes or indices."""
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points has shape {points.shape}; it must be (n, 3)")
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
@@ -117,12 +107,11 @@ def _check(points, triangles, values, on):
 
 
 def _whole(corners, colours):
-    """Returns outlines (T, 3, 3) and shaded colours (T, 3) of triangles, from their corners and colours (T, 3)."""
     return corners, colours * brightness(corners, _LEAST_LIGHT)[:, None]
 
 
 def _thirds(corners, colours):
-    """Returns outlines (3T, 4, 3) and shaded colours (3T, 3) of thirds of triangles, from corners and colours (T, 3, 3)."""
+    """Returns outlines (3T, 4, 3) and shaded colours (3T, 3) of thirds of triangles with colours of corners (T, 3, 3)."""
     following, before = np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)
     middle = np.broadcast_to(corners.mean(axis=1, keepdims=True), corners.shape)
     outlines = np.stack([corners, (corners + following) / 2.0, middle, (corners + before) / 2.0], axis=2)
@@ -130,7 +119,6 @@ def _thirds(corners, colours):
 
 
 def _segments(view, directions):
-    """Returns the projected ends (S, 2, 3) and greys (S, 3) of all finite segments."""
     ends, greys = [], []
     for (name, (centres, vectors)), grey in zip(directions.items(), cycle(_GREYS), strict=False):
         if np.shape(centres) != np.shape(vectors) or np.shape(centres)[1:] != (3,):
@@ -143,10 +131,7 @@ def _segments(view, directions):
 
 
 def _layout(window, title, count=1):
-    """Creates a figure, ``count`` axes as large as the window, and axes for the colour bar; they depend only on the window.
-
-    Panels that are taller than wide are side by side, others one above the other.
-    """
+    """Creates a figure, ``count`` axes of the window's shape, side by side if tall, and axes for the bar."""
     from matplotlib.figure import Figure
 
     left, right, bottom, top = window
@@ -166,7 +151,6 @@ def _layout(window, title, count=1):
 
 
 def _explain(figure, beside, scale, unit, excluded, unplaced):
-    """Adds the colour bar, and notes on excluded elements and triangles that cannot be drawn."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 

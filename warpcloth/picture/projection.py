@@ -18,13 +18,13 @@ class View:
     """A parallel projection and its visible window.
 
     Attributes:
-        azimuth: Angle of the viewer about the vertical [°], from +z of a y-up world, from −y of a z-up one.
+        azimuth: Angle of the viewer about the vertical [°], from +z if y is up, from −y if z is.
         elevation: Angle of the viewer above the horizontal [°].
         up_axis: "Y" or "Z".
-        window: Visible window (left, right, bottom, top) [m] in the plane of the picture; None until :meth:`fit`.
+        window: (left, right, bottom, top) [m] in the picture's plane; None until :meth:`fit`.
 
     Raises:
-        ValueError: A number is not finite, the axis is neither of the two, or the window is empty.
+        ValueError: A number is not finite, the axis is another, or the window is empty.
     """
 
     azimuth: float = -38.0
@@ -45,7 +45,7 @@ class View:
         """Returns this view with a window that shows all points of some frames.
 
         Args:
-            frames: Points (n, 3) of each [m], read once, one at a time; points that are not finite do not count.
+            frames: Points (n, 3) of each [m], read one at a time; ones that are not finite are ignored.
 
         Raises:
             ValueError: No point is finite.
@@ -69,7 +69,7 @@ class View:
         return replace(self, azimuth=azimuth, elevation=-self.elevation, window=window)
 
     def project(self, points):
-        """Returns the coordinates to the right, up and towards the viewer (…, 3) of points or vectors (…, 3)."""
+        """Returns coordinates to the right, up and towards the viewer (…, 3)."""
         a, e = np.radians([self.azimuth, self.elevation])
         towards = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
         right = np.array([np.cos(a), 0.0, -np.sin(a)])
@@ -80,11 +80,8 @@ class View:
 
 
 def brightness(corners, least):
-    """Returns the brightness (T,) of triangles, from ``least`` to 1, in light from the viewer's upper left, on both sides.
-
-    Args:
-        corners: Corners of the triangles (T, 3, 3), to the right, up and towards the viewer.
-        least: Brightness without light, up to 1.
+    """Returns the brightness (T,) of triangles (T, 3, 3) in view, from ``least`` to 1, in light from the upper left, on both
+    sides.
     """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)[:, None]

@@ -1,4 +1,4 @@
-"""Ray-casts surfaces, tubes and balls in the light of a sun and the sky."""
+"""Ray-casts surfaces, tubes and balls in sun and sky."""
 
 import numpy as np
 import warp as wp
@@ -29,32 +29,26 @@ _ROWS = 8
 
 
 class RayCaster:
-    """Draws moving shapes: allocates once, and takes positions, a camera and colours for each picture.
+    """Draws moving shapes; allocates once.
 
-    Light comes from the sky and from a sun over the viewer's right shoulder. From each visible point, one ray tests whether the
-    sun is visible and another tests the sky. The light on a surface that faces the sun and sees the whole sky is 1, so that it
-    shows its own colour. Light is white and at most 1.01, so that colours keep their hue. Rays are the same for each picture,
-    so that on one device equal input gives equal bytes.
+    Light comes from the sky and from a sun over the viewer's right shoulder, one ray to each from a visible point. A surface
+    that faces the sun and sees the whole sky shows its own colour, and light is at most 1.01. On one device equal input gives
+    equal bytes.
 
     Args:
-        shapes: The :class:`Shape` list.
-        width: Width of the picture [px].
-        height: Height of the picture [px].
-        samples: Rays from the camera through each pixel.
-        ground: Height of a horizontal ground that fades into the background [m], or None.
-        device: A Warp device.
-        up_axis: "Y" or "Z".
-        threads: Threads of the CPU; by default all of its cores.
-        sun_angle: Angular diameter of the sun [°], which makes shadows soft.
-        contrast: Strength of shading on coloured surfaces, from 0, colours alone, to 1.
-        background: Colour of the background, linear Rec. 709.
+        shapes: List of :class:`Shape`.
+        samples: Rays through each pixel.
+        ground: Height of a ground that fades into the background [m], or None.
+        threads: Threads of the CPU, by default all cores.
+        sun_angle: Angular diameter of the sun [°].
+        contrast: Strength of shading on coloured surfaces, 0 to 1.
+        background: Linear Rec. 709.
 
     Attributes:
-        left_out: After :meth:`image`, number of triangles, lines and balls that are not drawn, because a point is not finite or
-            too far away for float32.
+        left_out: Elements not drawn by the last :meth:`image`, because a point is not finite or too far away.
 
     Raises:
-        ValueError: A number is out of range, or this machine has no such device.
+        ValueError: A number is out of range, or there is no such device.
     """
 
     def __init__(
@@ -137,16 +131,16 @@ class RayCaster:
         """Draws a picture.
 
         Args:
-            points: Positions (n, 3) of each shape [m]. Elements with a point that is not finite are left out.
+            points: Positions (n, 3) of each shape [m]. Elements that are not finite are not drawn.
             camera: A :class:`Camera`.
-            colours: Colours of each shape, linear Rec. 709, or None: (n, 3) of vertices, (T, 3, 3) of corners of triangles, or
-                (E, 2, 3) of ends of lines.
+            colours: Of each shape, linear Rec. 709: (n, 3) of vertices, (T, 3, 3) of corners, (E, 2, 3) of ends of lines, or
+                None.
 
         Returns:
             np.ndarray: (height, width, 3) uint8 in sRGB.
 
         Raises:
-            ValueError: An array has another shape.
+            ValueError: A shape is another.
         """
         if len(points) != len(self.shapes):
             raise ValueError(f"points has {len(points)} arrays; there are {len(self.shapes)} shapes")
@@ -169,7 +163,7 @@ class RayCaster:
             return self._image.numpy().reshape(height, width, 3).copy()
 
     def _viewer(self, camera):
-        """Returns the unit of length of the picture [m], a power of two, and the rays of the camera in that unit."""
+        """Returns the unit of length of the picture [m], a power of two, and the rays in it."""
         width, height = self._size
         position, target, up = (np.asarray(a) for a in (camera.position, camera.target, camera.up))
         forward = target - position
@@ -205,7 +199,6 @@ class RayCaster:
         return light
 
     def _set_positions(self, points, camera, unit):
-        """Copies the positions to the device, and updates trees and normals."""
         first = 0
         for k, (shape, found) in enumerate(zip(self.shapes, points, strict=True)):
             found = np.asarray(found)
@@ -239,7 +232,6 @@ class RayCaster:
             g.tree = self._tree.id
 
     def _colour(self, colours):
-        """Copies the colours to the device."""
         values, corners, ends = [], [], []
         shares, line_shares, backs = [], [], []
         first = 0
@@ -284,7 +276,6 @@ class RayCaster:
         g.backs = wp.array(np.concatenate([none, *backs]), dtype=wp.vec3)
 
     def _launch_rows(self, kernel, inputs, outputs):
-        """Launches over the pixels; on the CPU, each thread takes the next free rows until none are left."""
         width, height = self._size
         step = _ROWS if self._device.is_cpu else height
         launches = iter(

@@ -55,47 +55,41 @@ def render(
     device: str = "cpu",
     progress: Progress | None = None,
 ) -> str:
-    """Draws a picture or a film by casting rays, on the CPU or a GPU, without a display.
+    """Draws a picture or a film by ray casting, on the CPU or a GPU, without a display.
 
-    Frames are read and drawn one at a time, so memory use does not grow. The camera stands still and shows all of the motion. A
-    film plays in real time. On one device, the same input gives the same bytes.
+    Frames are drawn one at a time; the camera shows all of the motion; a film plays in real time. On one device, the same input
+    gives the same bytes.
 
     Args:
-        source: A path: a stage, all of whose meshes and linear curves are drawn; a mesh file; a folder or pattern of mesh
-            files; .npz or .npy. Or an :class:`warpcloth.Animation`, whose pins, strings and bars are drawn too,
-            :class:`warpcloth.Deformation`, :class:`warpcloth.Scene`, :class:`warpcloth.Mesh`, :class:`warpcloth.Sequence`,
-            or frames (F, n, 3) [m]. Several of them in a list are drawn side by side, by one camera.
+        source: A path (stage, mesh file, folder or pattern, .npz, .npy); an :class:`warpcloth.Animation`, with its pins,
+            strings and bars, :class:`warpcloth.Deformation`, :class:`warpcloth.Scene`, :class:`warpcloth.Mesh` or
+            :class:`warpcloth.Sequence`; frames (F, n, 3) [m]; or a list of these, side by side.
         output: File to write: .png, .gif, .webp or, with PyAV, .mp4.
-        names: A text for each source, shown above it; by default the names of the sources if there are several.
-        mesh: The :class:`warpcloth.Mesh` of frames given as an array; for other sources, the rest shape relative to which they
-            are measured.
-        prim: Path or name of the cloth in a stage, or name of the geometry in a mesh file. Without it, the prims of a stage
-            that move are cloths.
-        fps: Frames per second of the source, if the source does not give them or to override them.
+        names: Texts above sources, by default their names if several.
+        mesh: The mesh of frames in an array; of other sources the rest shape for measures.
+        prim: Cloth in a stage, by default what moves, or geometry of a mesh file.
+        fps: Frames per second, instead of the source's.
         up_axis: "Y" or "Z", if the source does not give it.
-        copy: Index of the cloth of a batch; None draws all of them side by side.
-        frame: Number of the frame of a .png, as the source counts them; by default the last.
-        frames: Numbers of the first and the last frame of a film; None stands for the first or last frame of the source.
-        every: Draw only every k-th frame.
+        copy: Index of a cloth of a batch; None for all, side by side.
+        frame: Number of the frame of a .png, by default the last.
+        frames: Numbers of the first and last frame of a film; None for the ends of the source.
+        every: Draw every k-th frame.
         speed: 0.5 plays at half speed.
         size: Width and height [px].
         samples: Rays through each pixel.
-        colour: A number that ``warpcloth analyze`` measures, such as "stretch_1", shown with a colour bar; or values (F, n) of
-            vertices or (F, T) of triangles, also as ``{"text above the bar": values}``; or linear Rec. 709 colours, (F, n, 3)
-            or (F, T, 3); None is the plain colour of cloth.
-        colour_range: Lowest and highest value of the colour scale; by default from all frames of the source, as in `analyze`.
-        colormap: Name of a colour map of matplotlib.
-        measuring: Options of :class:`warpcloth.Analyzer` for the colour, by name, such as ``{"neighbourhood": "1-ring"}``.
-        azimuth: Angle of the viewer about the vertical [°], from +z of a y-up world, from −y of a z-up one.
+        colour: A measure such as "stretch_1"; values (F, n) of vertices or (F, T) of triangles, or ``{"text above the bar":
+            values}``; linear Rec. 709 colours, (F, n, 3) or (F, T, 3); or None.
+        colour_range: Ends of the colour scale, by default of all frames.
+        colormap: Map of matplotlib.
+        measuring: Options of :class:`warpcloth.Analyzer` by name.
+        azimuth: Angle of the viewer about the vertical [°], from +z if y is up, from −y if z is.
         elevation: Angle of the viewer above the horizontal [°].
-        zoom: Factor by which the camera zooms in; 2 shows half of the width and height.
-        camera: Path or name of a Camera prim of the stage, from which to look, in place of ``azimuth``, ``elevation`` and
-            ``zoom``; it may move.
-        ground: Whether there is a ground at the lowest point of the motion, or the height of the ground [m]. From below it is
-            not drawn.
-        time: Whether to write the time into a corner, or the number of the frame if the source has no times.
+        zoom: 2 shows half of the width and height.
+        camera: A Camera prim of the stage, in place of ``azimuth``, ``elevation`` and ``zoom``.
+        ground: Whether there is a ground below the motion, or its height [m]; invisible from below.
+        time: Whether to write the time, or without times the frame.
         device: A Warp device.
-        progress: Function called with (pictures drawn, pictures), from 0; or None.
+        progress: Function called with (pictures drawn, pictures), from 0, or None.
 
     Returns:
         str: The path of the file.
@@ -103,8 +97,8 @@ def render(
     Raises:
         FileNotFoundError: There is no such file or folder.
         ImportError: Colours need matplotlib, .mp4 needs PyAV.
-        Interrupted: A KeyboardInterrupt, if the user interrupts; the message says what is in the file.
-        ValueError: An argument is not allowed, a source cannot be drawn, or a frame of it cannot be read.
+        Interrupted: A KeyboardInterrupt that says what is in the file.
+        ValueError: An argument is not allowed, or a source cannot be read or drawn.
 
     Examples:
         >>> import os, tempfile
@@ -179,24 +173,21 @@ def _checked_size(size):
 
 
 def _are_several(source):
-    """Returns whether it is a list of sources, not a list of frames."""
     if not isinstance(source, (list, tuple)) or not len(source):
         return False
     return not any(isinstance(each, np.ndarray | list | tuple) for each in source)
 
 
 class _Shot:
-    """One picture of a film: the time at which it is shown [s], the frame of each subject, and the text of its time."""
+    """A picture of a film: its time [s], the frame of each subject, and the text of its time."""
 
     def __init__(self, time, frames, text):
         self.time, self.frames, self.text = time, frames, text
 
 
 def _shots(subjects, ending, frame, frames, every, speed):
-    """Returns the pictures to be drawn.
-
-    There is one for each frame of the first subject, with the frames of the others that are nearest in time. They go on to the
-    end of the longest.
+    """Returns the pictures, one for each frame of the first subject, with the nearest in time of others, to the end of the
+    longest.
     """
     first = subjects[0]
     if ending == STILL:
@@ -225,7 +216,6 @@ def _shots(subjects, ending, frame, frames, every, speed):
 
 
 def _text(subject, k):
-    """Returns the time of a frame, or its number, as text."""
     if subject.times is None:
         return f"{subject.labels[k]:g}"
     digits = 2 if subject.interval < 10.0 else 0
@@ -241,7 +231,7 @@ def _index(subject, label):
 
 
 def _colours(subjects, colour, given, colormap, rest, device, measuring):
-    """Returns the values of each subject, and their common scale; None without colours."""
+    """Returns the values of each subject, and a common scale, or None."""
     if not isinstance(colour, str):
         options = {"measuring": measuring or None}
         options |= {"colour_range": given, "colormap": colormap} if colour is None else {}
@@ -267,7 +257,7 @@ def _colours(subjects, colour, given, colormap, rest, device, measuring):
 
 
 class _Picture:
-    """Draws all pictures of a film, in one size and with one camera."""
+    """Draws all pictures of a film, with one size and camera."""
 
     def __init__(self, subjects, names, shots, size, samples, view, ground, values, scale, device):
         self._subjects, self._shots, self._values, self._scale, self.left_out = subjects, shots, values, scale, 0
@@ -317,7 +307,7 @@ class _Picture:
             yield self._overlay.draw(panels, shot.text if with_time else None, excluded)
 
     def _seen(self, k, frame):
-        """Returns the camera of the stage of subject k, whose target is as far away as the middle of the motion."""
+        """Returns the camera of subject k's stage, with the middle of the motion as distance."""
         width, height = self._sizes[k]
         position, forward, up, *lens = self._subjects[k].camera(frame, width / height)
         forward = forward / np.linalg.norm(forward)
@@ -331,7 +321,6 @@ class _Picture:
 
 
 def _held(rows, frames):
-    """Yields the row of each frame; frames may repeat."""
     found = rows(dict.fromkeys(frames))
     last = values = None
     for frame in frames:

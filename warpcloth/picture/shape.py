@@ -13,22 +13,22 @@ BACK = (1.7, 1.12, 0.86)
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The topology and the look of one shape in a picture. Positions come with each picture.
+    """Topology and look of a shape; positions come with each picture.
 
     Attributes:
         count: Number n of points.
         triangles: Vertices of triangles (T, 3), visible from both sides.
         lines: Vertices of tubes with round ends (E, 2).
-        radius: Radius of the tubes [m]. Tubes are drawn at least one pixel wide.
+        radius: Radius of tubes [m], drawn at least one pixel wide.
         balls: Vertices drawn as balls (k,).
         ball_radius: Radius of the balls [m].
         colour: Linear Rec. 709 of elements without colours of their own.
         ball_colour: Linear Rec. 709 of the balls.
-        back: Factors of the colour on the back of triangles. Colours of a measure are the same on both sides.
-        smooth: Whether to shade triangles as a smooth surface. Edges that bend by more than some 70° stay sharp.
+        back: Factors of the colour on the back, but for measures.
+        smooth: Whether to shade smoothly, but for edges that bend by more than some 70°.
 
     Raises:
-        ValueError: An array has another shape, an index has no point, or a radius is not above 0.
+        ValueError: A shape is another, an index has no point, or a radius is not above 0.
     """
 
     count: int

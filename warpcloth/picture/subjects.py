@@ -1,4 +1,4 @@
-"""Turns any source into shapes to draw, whose positions are read one frame at a time."""
+"""Turns any source into shapes whose positions are read frame by frame."""
 
 import glob
 import os
@@ -45,16 +45,13 @@ class Subject:
     """Everything that is drawn of a source.
 
     Attributes:
-        name: Name of the source, shown in pictures with two sources.
-        shapes: List of :class:`Shape`.
-        labels: Numbers of the frames in the source (F,).
-        times: Times of the frames (F,) [s], or None.
-        read: Function that returns the positions (n, 3) [m] of each shape from the index of a frame.
-        up_axis: "Y" or "Z"; None if the source does not say.
-        coloured: Index of the shape that is coloured by a measure.
-        sequences: Function that returns the :class:`Sequence` of each cloth of the coloured shape, to be measured.
-        files: Paths of the files of the source.
-        camera: Function (frame, aspect) of :func:`warpcloth.usd.drawn.camera_of`; None to frame the motion.
+        labels: Frame numbers (F,).
+        times: (F,) [s], or None.
+        read: Function (index) → positions (n, 3) [m] of each shape.
+        up_axis: "Y" or "Z", or None.
+        coloured: Index of the coloured shape.
+        sequences: Function that returns the :class:`Sequence` of each of its cloths.
+        camera: Function (frame, aspect) of :func:`warpcloth.usd.drawn.camera_of`, or None.
     """
 
     name: str
@@ -73,25 +70,18 @@ class Subject:
 
     @property
     def interval(self):
-        """Time between frames [s]; 1/24 s if the source has no times."""
+        """Time between frames [s], by default 1/24 s."""
         if self.times is None or len(self.times) < 2:
             return 1.0 / 24.0
         return float(np.median(np.diff(self.times)))
 
     @property
     def ends(self):
-        """The numbers of the first and the last frame, as text."""
+        """Numbers of the first and last frame, as text."""
         return f"{self.labels[0]:g} to {self.labels[-1]:g}"
 
     def between(self, frames):
-        """Returns the indices of the frames from one number to another.
-
-        Args:
-            frames: Numbers of the first and the last frame, None for one that is left out; or None for all frames.
-
-        Raises:
-            ValueError: There are none, or `frames` is not as above.
-        """
+        """Returns the indices of frames between two numbers, None for an end; refuses an empty range."""
         if frames is None:
             return np.arange(len(self))
         if not isinstance(frames, Several) or isinstance(frames, str) or len(frames) != 2:
@@ -106,20 +96,10 @@ class Subject:
 
 
 def subject_of(source, mesh=None, prim=None, fps=None, copy=None, azimuth=0.0, camera=None):
-    """Returns the :class:`Subject` of a source.
+    """Returns the :class:`Subject` of a source of :func:`warpcloth.render`, whose arguments these are; raises ValueError
+    without anything to draw.
 
-    Args:
-        source: Any source of :func:`warpcloth.render`.
-        mesh: The :class:`warpcloth.Mesh` of frames that have none.
-        prim: Path or name of the cloth in a stage, or of the geometry in a file.
-        fps: Frames per second, if the source does not give them or to override them.
-        copy: Index of the cloth of a batch, or None for all, side by side.
-        azimuth: Azimuth of the view in which cloths of a batch are side by side [°].
-        camera: Path or name of a Camera prim of a stage; None to frame the motion.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The source is not supported, or has nothing to draw.
+    A batch shows ``copy`` or all cloths, side by side for an ``azimuth`` [°].
     """
     if isinstance(source, (str, os.PathLike)):
         found = _of_path(os.fspath(source), mesh, prim, fps, camera)
@@ -164,7 +144,6 @@ def _of_path(path, mesh, prim, fps, camera):
 
 
 def _of_stage(path, name, prim, fps, camera=None):
-    """Returns all meshes and curves of a stage."""
     stage = read_drawn(path, prim)
     codes = stage.codes
     first = np.concatenate([each.points(codes[0]) for each in stage.prims if each.cloth])
@@ -189,7 +168,6 @@ def _of_stage(path, name, prim, fps, camera=None):
 
 
 def _prim_shape(prim, code, size):
-    """Returns the shape of a `DrawnPrim`, beside a cloth of a size."""
     edge = np.linalg.norm(np.diff(prim.points(code)[prim.edges], axis=1), axis=-1).mean() if len(prim.edges) else 0.0
     radius = max(prim.radius, min((_THINNEST if prim.cloth else _THINNEST_LINE) * size, 0.2 * edge))
     colour = prim.colour or (CLOTH if prim.cloth else LINES if len(prim.edges) else SURROUNDINGS)
@@ -210,7 +188,6 @@ def _of_sequence(sequence, mesh):
 
 
 def _of_frames(name, mesh, frames, times, pins=(), scene=None):
-    """Returns frames (F, n, 3) of a mesh, with the strings, bars and colliders of a scene."""
     positions, count = _reader(frames, mesh)
     times = None if times is None else np.asarray(times, dtype=float)
     shapes, read = _with_surroundings(scene, _cloth(mesh, positions(0), pins), positions)
@@ -222,7 +199,6 @@ def _of_frames(name, mesh, frames, times, pins=(), scene=None):
 
 
 def _reader(frames, mesh):
-    """Returns a function that returns a frame (n, 3) from its index, and the number of frames."""
     if not hasattr(frames, "exact"):
         frames = frames if isinstance(frames, (list, tuple)) else np.asarray(frames)
     if not len(frames):
@@ -234,7 +210,6 @@ def _reader(frames, mesh):
 
 
 def _of_animation(animation, scene, copy, azimuth):
-    """Returns the frames of a run; for a batch, all cloths side by side, or one."""
     points = animation.points
     if points.ndim == 3 and copy is not None:
         raise ValueError(f"copy is {shown(copy)}; the animation is of one cloth, so that it must be None")
@@ -262,13 +237,8 @@ def _of_animation(animation, scene, copy, azimuth):
 
 
 def _with_surroundings(scene, cloth, positions, offsets=0.0):
-    """Returns the shapes of a cloth, of the strings, bars and colliders of its scene, and a function that reads positions.
-
-    Args:
-        scene: The scene, or None.
-        cloth: The shape of the cloth.
-        positions: Function that returns the positions of the cloth from the index of a frame.
-        offsets: Offsets of the cloths of a batch, (B, 1, 3) [m], each with its own colliders; 0 for one cloth.
+    """Returns the shapes of a cloth and of its scene, and a function that reads positions, with ``offsets`` (B, 1, 3) [m] of a
+    batch, or 0.
     """
     if scene is None:
         return [cloth], lambda frame: [positions(frame)]
@@ -284,7 +254,7 @@ def _with_surroundings(scene, cloth, positions, offsets=0.0):
 
 
 def _side_by_side(points, azimuth, up_axis):
-    """Returns offsets (B, 1, 3) [m] that arrange the cloths of a batch in rows, seen from an azimuth."""
+    """Returns offsets (B, 1, 3) [m] of a batch in rows, seen from an azimuth."""
     batch = points.shape[1]
     a = np.radians(azimuth)
     right, back = np.array([np.cos(a), 0.0, -np.sin(a)]), np.array([-np.sin(a), 0.0, -np.cos(a)])
@@ -305,7 +275,6 @@ def _side_by_side(points, azimuth, up_axis):
 
 
 def _repeated(shape, batch):
-    """Returns the shape of all cloths of a batch, one after another."""
     offsets = shape.count * np.arange(batch)
 
     def tiled(rows):
@@ -321,13 +290,11 @@ def _repeated(shape, batch):
 
 
 def _strings(mesh, lines):
-    """Returns the shapes of strings and bars, from pairs and a thickness by name."""
     count, least = len(mesh.points), _THINNEST_LINE * _size(mesh.points)
     return [Shape(count, lines=pairs, radius=max(width / 2.0, least), colour=LINES) for pairs, width in (lines or {}).values()]
 
 
 def _cloth(mesh, points, pins=()):
-    """Returns the shape of a cloth: its triangles, or tubes for a mesh of edges, and its pins as balls."""
     lengths = mesh.edge_lengths[np.isfinite(mesh.edge_lengths)]
     edge = float(lengths.mean()) if len(lengths) else 0.0
     edges = np.empty((0, 2), int) if len(mesh.triangles) else mesh.edges
@@ -351,16 +318,15 @@ def _shape(count, triangles, edges, radius, pins, size, edge, colour):
 
 
 def located(points):
-    """Returns the points (n, 3) that a camera can show: finite, and near enough that products of distances do not overflow."""
+    """Returns the points (n, 3) that a camera can show: finite, without overflow of products."""
     return points[are_located(points)]
 
 
 def are_located(points):
-    """Returns whether each of the points (n, 3) is :func:`located`, (n,)."""
+    """Returns which points (n, 3) are :func:`located`, (n,)."""
     return (np.abs(points) < _FARTHEST).all(axis=1)
 
 
 def _size(points):
-    """Returns the diagonal of the bounding box of the finite points [m]."""
     finite = located(points)
     return float(np.linalg.norm(np.ptp(finite, axis=0))) if len(finite) else 1.0

@@ -11,11 +11,7 @@ class AirWork:
     """Sums the work −∇U·Δx of the air over the steps of one stepper, from the forces that its steps used.
 
     ∇U is that of the elements that the step froze, where the step takes its forces: at the end of implicit Euler and BDF2, in
-    the middle of midpoint, at the start of explicit steps. It is linear in the positions, so in the middle it is the mean of
-    both ends.
-
-    Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+    the middle of midpoint, at the start of explicit steps.
     """
 
     def __init__(self, stepper):

@@ -1,25 +1,13 @@
-"""Compares the energy of a cloth with the energy that its sources can have added.
+"""Compares the energy of a cloth with the energy that its sources can have added; docs/stability.md has the derivations.
 
-Whether a run has diverged is judged by kinetic energy and the potential energy of gravity. Elastic energy is left out, because
-unconverged sweeps store a huge ½kx² without diverging; strain is judged separately. Negative elastic energy, such as that of an
-attraction, counts like that of gravity, because the cloth may fall into it.
+Divergence is judged by kinetic energy and the potential energy of gravity, with u = v − ½hω²x for v in symplectic Euler.
+:meth:`Balance.surplus` is stricter: elastic energy and that of contact count too. After unconverged steps elastic energy counts
+beyond that of a uniform strain of 2 %, and that of a single element beyond a strain of 5 %, both in the norm √U.
 
-Whether a run is usable is judged more strictly, by :meth:`Balance.surplus`: elastic energy and that of contact count too, but
-for the excess that a step leaves because it has not converged. After steps that have not, elastic energy counts as far as it is
-beyond that of a uniform strain of 2 %, and that of a single element beyond a strain of 5 %: in the norm √U the state is that
-far from all states that the energy allows. What contact adds by moving vertices at the end of a step counts in any case.
-
-Euler steps with a semi-definite Hessian never raise the sum, as E₁ − E₀ = −½‖v₁ − v₀‖²_M + U(x₁) − U(x₀) − ∇U(x₁)·(x₁ − x₀).
-BDF2 does not raise ¼(5‖z₁‖² − 4z₁·z₀ + ‖z₀‖²) (Dahlquist 1978), with ‖z‖² twice the energy. That is at least ¼‖z₁‖², and
-½‖z₀‖² at the start, so that the energy stays below twice that at the start. Midpoint conserves the energy where U is quadratic.
-Contact that begins within a step adds up to what contact then stores, for which there is no bound over many steps, and midpoint
-is held to that of BDF2.
-
-In symplectic Euler, velocities are half a step behind positions. For x″ = −ω²x it conserves v² + ω²x² − hω²xv, which near the
-limit ωh = 2 is far below v², by a factor of up to 200 at ωh = 1.995. With the velocity at the time of the position,
-u = v − ½hω²x, the conserved quantity is u² + ω²x²(1 − ω²h²/4). Below the limit u² never exceeds it, so u is used instead of v.
-
-:mod:`warpcloth.run.sources` has the sources of energy.
+Euler steps with a semi-definite Hessian never raise the sum: E₁ − E₀ = −½‖v₁ − v₀‖²_M + U(x₁) − U(x₀) − ∇U(x₁)·(x₁ − x₀). BDF2
+does not raise ¼(5‖z₁‖² − 4z₁·z₀ + ‖z₀‖²) (Dahlquist 1978), with ‖z‖² twice the energy, which so stays below twice that at the
+start. Midpoint conserves the energy of a quadratic U; as contact that begins within a step adds energy, it is held to the bound
+of BDF2.
 """
 
 from functools import cached_property
@@ -110,28 +98,19 @@ class Elastic:
 class Balance:
     """Compares the energy of each copy, frame by frame, with the energy that the sources of the scene can have added.
 
-    Potential energy counts from the lowest value so far, so that falling is not a source. Negative elastic energy is included;
-    it is computed at the start, and in frames that would otherwise count as diverged. A cloth without pins and attachments is
-    judged by its motion relative to its centre of mass, to which gravity adds nothing. If pins and colliders move at one
-    velocity, they add nothing to the energy relative to that motion, and cloth is judged by it.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        stepper: The :class:`warpcloth.solvers.solver.Stepper` of a solver that is bound to it.
+    Potential energy counts from its lowest value so far. A free cloth is judged by its motion about its centre of mass; a cloth
+    whose pins and colliders all move at one velocity is judged relative to that velocity.
 
     Attributes:
         mass, total: Masses of the free vertices (B, n) and their sum (B,) [kg].
         free: Whether no pin, attachment or rail holds it.
         gravity: Of each copy, (B, 3) [m/s²].
         loads: Constant loads on cloth that is held, (B, n, 3) [N], or None.
-        elastic: :class:`Elastic` of the model.
-        attached: Whether attachments hold it.
-        sources: The sources of the scene.
         points: Positions of the frame that is checked, (B·n, 3) [m].
         has, given: Energy of each copy, and the energy that its sources can have added, in the last checked frame, (B,) [J].
-        driven: Whether sources beside the start add energy, of which only estimates are known, or the energy of explicit steps
-            in contact is not known better.
-        whole, allowed: All energy of each copy, and the most that a correct run can have, after :meth:`surplus`, (B,) [J].
+        driven: Whether the bound of the energy is only an estimate: sources beside the start add energy, or explicit steps have
+            contact.
+        whole, allowed: All energy of each copy, and the maximum of a correct run, after :meth:`surplus`, (B,) [J].
     """
 
     carried = ("_lowest", "_fastest", "_rounding", "_rounded_height", "_unbalanced")  # from frame to frame
@@ -181,12 +160,8 @@ class Balance:
         return 0.5 * (self.mass * np.einsum("bij,bij->bi", velocities, velocities)).sum(axis=1)
 
     def gains(self, frame, points, velocities):
-        """Returns the energy of each copy over the energy that its sources can have added, (B,).
-
-        Args:
-            frame: Number of the frame; they come in order from 1.
-            points: (B·n, 3) [m] in the order of the scene.
-            velocities: (B·n, 3) [m/s].
+        """Returns the energy of each copy over that of its sources, (B,), in frames in order from 1, of points [m] and
+        velocities [m/s], (B·n, 3).
         """
         with np.errstate(all="ignore"):
             points, velocities = points.astype(np.float64, copy=False), velocities.astype(np.float64, copy=False)
@@ -217,16 +192,10 @@ class Balance:
         return found
 
     def surplus(self, frame, error, velocities, converged):
-        """Returns all energy of each copy in the last checked frame, over the most that a correct run can have, (B,).
+        """Returns all energy of each copy in the last checked frame, over the maximum of a correct run, (B,).
 
-        Where sources add energy, of which only estimates are known, the most is ``GAIN`` times as much, and the energy of
-        contact does not count, as they may press cloth.
-
-        Args:
-            frame: Number of the frame.
-            error: Its :class:`warpcloth.run.step_errors.StepError`.
-            velocities: (B·n, 3) [m/s].
-            converged: Whether all steps of a copy have met the tolerance of the solver so far, (B,).
+        An estimated maximum is multiplied by ``GAIN``, without the energy of contact. ``converged`` (B,) are copies whose steps
+        met the tolerance so far.
         """
         contact, pushed = (np.where(self.driven, 0.0, each) for each in (error.contact, np.fmax(error.pushed, 0.0)))
         stored = error.elastic + contact
@@ -252,7 +221,7 @@ class Balance:
         return np.where(self.total > 0.0, found, 0.0)
 
     def _of_residuals(self, frame, error, converged):
-        """Returns the energy that the residuals of ``converged`` steps (B,) can have added by a frame, (B,) [J].
+        """Returns the energy that the residuals of ``converged`` steps (B,) can have added, (B,) [J].
 
         Those of one sign in all steps change the RMS speed by δ = t √(Σ‖rᵢ‖²/mᵢ/M), the largest so far.
         """
@@ -271,7 +240,6 @@ class Balance:
 
     @cached_property
     def _strained(self):
-        """The elastic energy of a uniform strain of :data:`STRAIN`, (B,) [J]."""
         model, elastic = self.model, self.elastic
         terms = [each for each in elastic.soft if not each.cells and each.term.vertices > 1 and each.collider is None]
         if not terms:
@@ -289,7 +257,7 @@ class Balance:
 
     @cached_property
     def _conserved(self):
-        """The fraction of the elastic energy that symplectic Euler bounds, 1 − ω²h²/4, see the docstring of the module."""
+        """The fraction of the elastic energy that symplectic Euler bounds, 1 − ω²h²/4."""
         return max(0.0, 1.0 - (self._h / min(self._stepper.options.step_limits(self.model))) ** 2)
 
     @property
@@ -323,11 +291,9 @@ class Balance:
         return _over(self.has, given)
 
     def _relative(self, kinetic, carried):
-        """Returns the kinetic energy relative to a motion at the speed ``carried`` [m/s], (B,) [J]."""
         return np.maximum(np.sqrt(kinetic) - carried * np.sqrt(0.5 * self.total), 0.0) ** 2
 
     def _note_farthest(self, points):
-        """Updates the bounds of kinetic and potential energy that rounding adds, from the largest coordinate."""
         farthest = np.abs(points).reshape(self.model.copies, -1).max(axis=1)
         rounded = 4.0 * np.finfo(self.model.numpy_dtype).eps * farthest
         stored = self._strained * (rounded / (STRAIN * self._edge)) ** 2
@@ -338,7 +304,6 @@ class Balance:
         return np.einsum("bi,bij->bj", self.mass, points.reshape(*self.mass.shape, 3))
 
     def _height(self, points):
-        """Returns the potential energy of gravity and constant loads since the start, (B,) [J]; 0 for a free cloth."""
         if self.free:
             return np.zeros(self.model.copies)
         moved = self._frame / self.model.scene.fps * self._velocity
@@ -348,7 +313,6 @@ class Balance:
         return height
 
     def _at_positions(self, points, velocities):
-        """Returns the velocities at the time of the positions, half a step later."""
         mass, shape = self.mass[..., None], (*self.mass.shape, 3)
         forces = mass * self.gravity[:, None] - self.elastic.gradient(self.elastic.put(points)).reshape(shape)
         if self.model.loads is not None:
@@ -360,6 +324,5 @@ class Balance:
 
 
 def _over(has, given):
-    """Returns has/given (B,), 0 where there is no energy, and NaN where ``has`` is."""
     with np.errstate(all="ignore"):
         return np.where(has > 0.0, has / given, np.where(has <= 0.0, 0.0, np.nan))

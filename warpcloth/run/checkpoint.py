@@ -1,6 +1,6 @@
 """Checkpoints, from which an interrupted run continues with the same bits as an uninterrupted one.
 
-A run that writes a file replaces its checkpoint, beside the frames, after each chunk of frames, and deletes it at the end.
+A run with a file replaces its checkpoint after each chunk of frames, and deletes it at the end.
 """
 
 import json
@@ -32,7 +32,7 @@ def facts_of(scene, solver, device, dtype, vary, threads, record=()):
     """Returns everything that the bits of a run depend on, by name.
 
     Raises:
-        ValueError: The scene cannot be hashed, see :func:`warpcloth.base.digest.digest_of`.
+        ValueError: The scene cannot be hashed.
     """
     device = wp.get_device(device)
     return {
@@ -52,8 +52,6 @@ class Checkpoint:
     """The state of a run after the last frame of a chunk.
 
     Attributes:
-        frame: Number of the frame.
-        facts: See :func:`facts_of`.
         chunks: Time code of the first frame, and name of the file, of each chunk so far.
         span: Time codes of the first and of the last frame.
         state, watch: Values of :class:`warpcloth.core.state.State` and :class:`warpcloth.run.watch.Watch` on the host.
@@ -67,11 +65,7 @@ class Checkpoint:
     watch: dict
 
     def write(self, folder):
-        """Writes it into a folder, in place of an older one.
-
-        Raises:
-            OSError: It cannot be written; the older one stays.
-        """
+        """Writes it into a folder, in place of an older one, which an OSError leaves."""
         arrays = {f"state {name}": values for name, values in self.state.items()}
         arrays |= {f"watch {name}": values for name, values in self.watch.items()}
         facts = {"frame": self.frame, "facts": self.facts, "chunks": self.chunks, "span": self.span}
@@ -88,11 +82,7 @@ class Checkpoint:
 
     @classmethod
     def read(cls, path):
-        """Reads the checkpoint in a file.
-
-        Raises:
-            ValueError: The file has none that can be read.
-        """
+        """Reads the checkpoint in a file; refuses files without."""
         try:
             with np.load(path) as file:
                 (facts, keys), parts = json.loads(str(file["about"])), {"state": {}, "watch": {}}
@@ -104,11 +94,7 @@ class Checkpoint:
             raise ValueError(f"{path}: is no checkpoint that can be read; run without resume to begin anew") from None
 
     def refuse_other(self, output, facts):
-        """Checks that it is of a run with the same facts.
-
-        Raises:
-            ValueError: A fact differs. The message names the first.
-        """
+        """Raises ValueError with the first fact in which a run differs."""
         for name, called in _CALLED.items():
             if self.facts.get(name) != facts[name]:
                 theirs, mine = called.format(self.facts.get(name)), called.format(facts[name])

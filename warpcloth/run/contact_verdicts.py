@@ -1,7 +1,4 @@
-"""Faults of contact that make a run not usable: pins held back, cloth caught in colliders, meshes that move through cloth.
-
-And warnings, where contact is too soft for what presses on it, and where cloth crosses a mesh from the start.
-"""
+"""Faults and warnings of contact: pins held back, cloth caught in colliders, meshes that move through cloth, soft contact."""
 
 from typing import NamedTuple
 
@@ -20,8 +17,7 @@ class Inside(NamedTuple):
         vertex: Its index in the mesh.
         frame: The frame in or before which it came in.
         collider: Name of the collider.
-        other: For a free vertex, the obstacle on its other side: the name of a collider, or ``"other cloth"`` with
-            self-contact. None for a vertex that pins or locked axes hold.
+        other: For a free vertex, the obstacle on its other side: a collider, or ``"other cloth"``. None for a held vertex.
         copy: Index of its copy.
     """
 
@@ -38,7 +34,7 @@ class Inside(NamedTuple):
 
 
 class Forced(NamedTuple):
-    """The first time that a mesh moved through cloth that could not get out of its way.
+    """The first time that a mesh moved through cloth that could not move away.
 
     Attributes:
         frame: The frame in whose steps it did.
@@ -56,9 +52,6 @@ class Forced(NamedTuple):
 
 class Pressed:
     """Notes the first frame in which free vertices are nearer to each collider than half the contact distance.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model` of a scene with colliders.
 
     Attributes:
         first: That frame, from 1, or 0, (B, C).
@@ -80,8 +73,9 @@ class Pressed:
 
 @in_turn
 def soft_contact_of(watch, stepper):
-    """Returns a sentence each about the first frame in which a gap to a collider, and one between cloth and cloth, falls below
-    half the contact distance. That of edges, and of vertices of meshes, is r/4."""
+    """Returns a sentence each about the first frame in which a gap to a collider, or between cloth and cloth, is below half the
+    contact distance (r/4 for edges and for vertices of meshes).
+    """
     scene, found = stepper.model.scene, {}
     if watch.pressed is not None:
         names, first = collider_names(scene), watch.pressed.first
@@ -126,10 +120,8 @@ class Unresolved(NamedTuple):
     """The first time that rounding of positions stopped cloth where its contact begins.
 
     Attributes:
-        frame: The frame in or before which it did.
         vertex: Index of a vertex of the pair in the mesh.
         type: Name of the scalar type of positions.
-        copy: Index of the copy.
     """
 
     frame: int
@@ -156,7 +148,7 @@ def unresolved_of(stepper):
 def crossings_at_start(model):
     """Returns a sentence about the triangles of free cloth that cross each mesh at the start of the first copy where some do.
 
-    Triangles with a vertex that is pinned, or locked along an axis, are left out, because these may be inside a mesh.
+    Triangles with a held vertex are left out: they may be inside a mesh.
     """
     scene, sentences, n = model.scene, [], model.per_copy
     if not scene.meshes:
@@ -182,7 +174,6 @@ def crossings_at_start(model):
 
 
 def _count_crossing(own, others):
-    """Returns how many triangles (T, 3, 3) others (S, 3, 3) cross. Those that only touch do not cross."""
     from scipy.spatial import cKDTree
 
     if not len(own):
@@ -202,19 +193,15 @@ def _count_crossing(own, others):
 
 
 def _boxes_meet(one, other):
-    """Returns whether the bounding boxes of points (k, i, 3) and of points (k, j, 3) have a common point, (k,)."""
     return ((one.min(axis=1) <= other.max(axis=1)) & (other.min(axis=1) <= one.max(axis=1))).all(axis=1)
 
 
 def _balls(corners):
-    """Returns centres (T, 3) and radii (T,) of balls around triangles (T, 3, 3)."""
     centres = corners.mean(axis=1)
     return centres, np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
 
 
 def _passes_through(p, q, a, b, c):
-    """Returns whether the segments from p to q pass through triangles a, b, c, all (k, 3), (k,)."""
-
     def volume(a, b, c, d):
         return np.einsum("ki,ki->k", np.cross(b - a, c - a), d - a)
 
@@ -231,28 +218,20 @@ def held_pins_of(stepper):
 
 
 def held_sentence(pin, copies):
-    """Returns the sentence about pins that cloth holds back, without its end, in one of several copies."""
+    """Returns the sentence, without its end, about pins that cloth holds back."""
     of_copy = f" of copy {pin.copy}" if copies > 1 else ""
     return f"cloth holds back pins from frame {pin.frame}{of_copy} on, vertex {pin.vertex} first, by up to {pin.farthest:.3g} m"
 
 
 def unwanted(scene, held):
-    """Returns those of the pins that cloth holds back that the scene does not allow."""
+    """Returns the held pins that the scene does not allow."""
     return held if scene.self_contact is None or scene.self_contact.held_pins != "allow" else []
 
 
 def contact_faults(scene, held, inside, forced, unresolved, copies=1):
-    """Returns what makes a run not usable because of contact, a list of (copy, frame, sentence), the first frame first.
+    """Returns the faults of contact that make a run not usable, (copy, frame, sentence), sorted by frame.
 
-    Vertices that are not free and inside a collider are no fault, as the scene puts them there.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        held: As of :func:`held_pins_of`.
-        inside: The :class:`Inside` of the run.
-        forced: The :class:`Forced` of the run.
-        unresolved: The :class:`Unresolved` of the run.
-        copies: Number of copies.
+    Held vertices inside a collider are no fault: the scene puts them there.
     """
     remedy = 'move the pins so that they do not run into cloth, or allow it by SelfContact(held_pins="allow")'
     found = [(pin.copy, pin.frame, f"{held_sentence(pin, copies)}; {remedy}") for pin in unwanted(scene, held)]

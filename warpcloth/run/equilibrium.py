@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+import warpcloth.contact as contact
+
 from ..base.checks import array, choice, number, whole
 from ..base.limits import MOST_FRAMES
 from ..base.turns import in_turn
 from ..base.types import Precision
-from ..contact.collider_steps import ColliderSteps
-from ..contact.self_steps import SelfSteps
 from ..core.state import State
 from ..core.status import Grade, Residual, Result, Status, digits, sentence
 from ..kernels.terms.air import AIR
@@ -41,20 +41,18 @@ class Equilibrium(NamedTuple):
 
     Attributes:
         points: (n, 3) [m].
-        status: How it ended, see :class:`warpcloth.core.status.Result`, with the residual: the sum Σ‖fᵢ‖ of the unbalanced
-            forces of all free vertices, divided by the weight Σmᵢ‖g‖; without gravity by the sum of the loads, and without
-            these by its value at the start. ``distance`` is the length of the last Newton step. ``ok`` is false if the forces
-            do not balance to the tolerance or as far as rounding allows, or the cloth is not stable there.
-        iterations: Total number of Newton iterations; each round of proximal steps counts as one more.
+        status: How it ended, with the residual Σ‖fᵢ‖/Σmᵢ‖g‖ of the unbalanced forces; without gravity the divisor is the sum of
+            the loads, and without loads the value at the start. ``distance`` is the length of the last Newton step. ``ok`` is
+            false if forces do not balance to the tolerance or to rounding, or the shape is not stable.
+        iterations: Total number of Newton iterations; a round of proximal steps counts as one more.
         lowest_eigenvalue: Lowest eigenvalue of the Hessian of the energy over the free vertices [N/m]; NaN if forces do not
             balance.
-        stable: Whether forces balance, and no eigenvalue is more negative than rounding and the tolerance explain. Then no
-            small move lowers the energy to second order. Moves that change no energy, such as those of a free body, have the
-            eigenvalue 0 and count as stable.
+        stable: Whether forces balance and no eigenvalue is negative beyond rounding and the tolerance. A move without energy,
+            as of a free body, has the eigenvalue 0 and counts as stable.
         energies: With ``record="energies"``, a dictionary [J]: each term, ``"self-contact"``, ``"gravity"`` since the start,
-            and ``"work of loads"`` that are constant.
-        reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (p, 3) [N].
-        collider_forces: With ``record="reactions"``, the force of the cloth on each collider by its name, (3,) [N].
+            and ``"work of loads"`` (constant loads).
+        reactions: With ``record="reactions"``, forces of the pins on the cloth along held axes, (p, 3) [N].
+        collider_forces: With ``record="reactions"``, forces of the cloth on the colliders by name, (3,) [N].
     """
 
     points: np.ndarray
@@ -82,37 +80,27 @@ def equilibrium(
 ) -> Equilibrium:
     """Finds the shape that minimises U(x) − Σ m g·x, from the positions of the scene, with the pins in their final positions.
 
-    Pins with keyframes end at the last keyframe; all others stay where they start. Loads have the values of their last
-    keyframes. Pressure follows the cloth: its forces are held constant while the cloth settles, then computed again, until they
-    balance. ``stable`` and ``lowest_eigenvalue`` are for these forces. Colliders stand at their last keyframe, however they
-    came there, and free vertices must start outside them. With friction there are many rest shapes, and the motion decides
-    among them, so colliders and self-contact with friction are refused: run such a scene with damping until it rests.
+    Pins, loads, wind and colliders have the values of their last keyframes; a wind function has that of the end. Pressure and
+    wind follow the cloth: their forces are held constant while it settles, and computed again until all forces balance.
+    ``stable`` and ``lowest_eigenvalue`` are for constant forces; a shape at rest in wind may flutter in a run.
 
-    With self-contact, no iterate crosses itself, pins included: pins with keyframes move as far as cloth lets them, and if they
-    do not arrive, the iterations are used up. With mesh colliders, no iterate crosses a mesh. The pairs are held constant while
-    the cloth settles, then found again, until forces balance. ``stable`` and ``lowest_eigenvalue`` neglect the rotation of
-    pairs. Layers without friction may slide off one another, so they often have no equilibrium.
+    With friction the rest shape depends on the motion, so it is refused: run such a scene with damping. With self-contact or
+    mesh colliders no iterate crosses cloth or mesh. If cloth stops pins on their way, the iterations are used up. The pairs are
+    held constant while the cloth settles; ``stable`` neglects their rotation. Layers without friction may slide off one another
+    and then have no equilibrium.
 
-    Wind is that of the last keyframe, or of a function at the end of the scene. Its force follows the normals: cloth without
-    mass moves in it until it rests. ``stable`` and ``lowest_eigenvalue`` are those under the final forces, held constant.
-    Flutter needs mass, so a shape that rests here may flutter in a run.
-
-    The method is Newton's with a line search, without inertia; gravity is applied in equal load steps. Cloth that gravity
-    hardly stretches and that does not settle in 10 iterations starts from the equilibrium of cloth that stretches more easily,
-    unless it starts from another shape than its rest shape, the scene has colliders, self-contact, loads, air or pins with
-    keyframes, or ``start`` is given. Where a scene has several rest shapes, this may find another than
-    ``start=scene.positions``, which never takes softer cloth. If the Hessian is singular, for example because a flat cloth
-    without bending stiffness cannot carry its weight, a term s/2‖x − x_now‖²_M is added, and s is lowered from there. This is a
-    proximal point method, in which the energy never rises. Cloth that nothing holds has no equilibrium and is reported as not
-    converged. If the final Hessian has a negative eigenvalue, the shape is in balance but not a minimum: it is perturbed a
-    little and settles again.
+    The method is Newton's with a line search; gravity grows in load steps. Nearly inextensible cloth that does not settle in 10
+    iterations starts from the equilibrium of softer cloth if the scene has only gravity and energies and starts at its rest
+    shape; ``start=scene.positions`` prevents this. For a singular Hessian, a proximal term s/2‖x − x_now‖²_M is added and s
+    lowered. A final shape with a negative eigenvalue is perturbed and settles again. Cloth that nothing holds is reported as
+    not converged.
 
     Args:
-        scene: The :class:`warpcloth.Scene`; velocities and duration do not matter.
-        tolerance: Tolerance of the residual, see :class:`Equilibrium`, and of the unbalanced acceleration of each vertex
-            divided by gravity (without gravity by loads over masses, without these by the largest at the start). If rounding
-            leaves more than this at a vertex, the descent ends when it cannot lower the energy any more, and the residual
-            decides. With gravity, a shape with half of the weight or more unbalanced is no equilibrium.
+        scene: Its velocities and duration have no effect.
+        tolerance: Tolerance of the residual of :class:`Equilibrium`, and of the unbalanced acceleration of each vertex over
+            gravity (without gravity over loads per mass, without loads over the largest at the start). If rounding exceeds it
+            at a vertex, the descent ends when the energy no longer falls, and the residual decides. With gravity, an unbalanced
+            half of the weight is no equilibrium.
         load_steps: Number of steps in which gravity and loads grow and pins move along their keyframes. Pins that rotate far
             need several.
         iterations: Maximum number of Newton iterations in total.
@@ -120,19 +108,15 @@ def equilibrium(
         dtype: ``"float32"`` or ``"float64"``.
         linear: ``"factorised"``; ``"cg"``, conjugate gradients with multigrid; or ``"auto"``, the first below 200 vertices and
             else the second.
-        record: ``"energies"``, ``"reactions"`` or both, to be included in the result.
-        vary: Values in place of those of the scene, one each, as for one copy; see :class:`warpcloth.model.model.Model`.
-        start: Positions from which it descends, (n, 3) [m], instead of those of the scene; the energy of gravity is
-            still measured from the scene's.
-            Pins without keyframes and locked coordinates stay where the scene has them. Cloth must not cross itself there, and
-            free vertices must be outside colliders, as in a scene.
-
-    Returns:
-        :class:`Equilibrium`.
+        record: ``"energies"``, ``"reactions"`` or both.
+        vary: Values of one copy in place of those of the scene, as of :class:`warpcloth.model.model.Model`.
+        start: Positions to descend from, (n, 3) [m]; gravity is still measured from the positions of the scene. Pins without
+            keyframes and locked coordinates keep the positions of the scene. Cloth must not cross itself there, and free
+            vertices must be outside colliders.
 
     Raises:
         ValueError: An argument is not allowed, a stiffness is infinite, there is friction, a free vertex starts inside a
-            collider at its last keyframe, or cloth crosses cloth at the start.
+            collider, or cloth crosses cloth at the start.
 
     Examples:
         >>> import warpcloth as wc
@@ -150,7 +134,7 @@ def equilibrium(
     record = checked_record(record)
     scene = _with_colliders_at_rest(scene)
     model = scene.build(device=device, dtype=dtype, vary=vary)
-    refuse_unmet(model.terms, "equilibrium", (FINITE,), {})
+    refuse_unmet(model.terms, "equilibrium", (FINITE,), ())
     base = wp.clone(model.positions)
     if start is not None:
         base.assign(_with_held(scene, model, array("start", start, (model.count, 3))))
@@ -158,9 +142,9 @@ def equilibrium(
     if model.has_pairs:
         state, colliders = State(base, model.vectors(), 1), None
         if model.colliders is not None and model.colliders.meshes is not None:  # whose poses the pairs need
-            colliders = ColliderSteps(model, state, 0.0, 1, 1.0)
+            colliders = contact.ColliderSteps(model, state, 0.0, 1, 1.0)
             colliders.launch_move()
-        pairs = SelfSteps(model, state, h=0.0, steps_per_frame=1, bounded=False, colliders=colliders)
+        pairs = contact.SelfSteps(model, state, h=0.0, steps_per_frame=1, bounded=False, colliders=colliders)
         pairs.filter.iterates()
     if linear == "auto":
         linear = "cg" if model.per_copy >= LEAST else "factorised"
@@ -219,22 +203,20 @@ def equilibrium(
 
 
 def _only_hangs(scene):
-    """Whether a scene has gravity and energies alone, so that its rest shape rarely depends on how the cloth came there."""
     others = scene.colliders, scene.loads, scene.air_terms
     return not any(others) and scene.self_contact is None and scene.pins.keyframes is None
 
 
 def _is_at_rest(model, base):
-    """Whether the cloth starts from its rest shape. Another start may be near an equilibrium, which softer cloth leaves."""
     points = model.rest_points
     return bool(np.abs(base.numpy() - points).max() <= 1e-6 * np.ptp(points, axis=0).max())
 
 
 def _start_softly(model, base, descent, linear):
-    """Sets the positions to the rest shape of softer cloth, see :mod:`.softened`, unless few iterations suffice without.
+    """Sets the positions to the rest shape of softer cloth, unless few iterations suffice without or softer cloth does not
+    rest.
 
-    Where softer cloth does not come to rest, the positions stay as they are. Cloth that is nearly at rest is left to settle: it
-    may stand in a shape in which softer cloth would not, such as an arch.
+    Cloth that is nearly at rest is left to settle: it may stand in a shape, such as an arch, that softer cloth does not hold.
     """
     factors = softening(model)
     if not factors or descent.settle(0.0, 1.0, PATIENCE) in SETTLED or descent.residual < NEARLY:
@@ -251,7 +233,6 @@ def _start_softly(model, base, descent, linear):
 
 
 def _with_colliders_at_rest(scene):
-    """Returns the scene with static colliders at their last keyframes; raises ValueError if there is friction."""
     for collider in scene.colliders:
         if collider.friction:
             raise ValueError(
@@ -272,8 +253,6 @@ def _with_colliders_at_rest(scene):
 
 
 class _Descent:
-    """Repeated minimisations from the present positions, with a limit on the total number of iterations."""
-
     def __init__(self, minimiser, base, tolerance, iterations, wind):
         self.minimiser, self.base, self.tolerance, self.iterations = minimiser, base, tolerance, iterations
         self.wind = wind
@@ -289,7 +268,7 @@ class _Descent:
         self.size = np.linalg.norm(np.ptp(base.numpy(), axis=0))
 
     def run(self, load, s):
-        """Settles without inertia, with proximal steps in between if it gets stuck; returns the last result."""
+        """Settles, with proximal steps if it gets stuck; returns the last result."""
         while True:
             result = self.settle(0.0, load, self.iterations)
             least, found = (np.inf, np.inf), (self.moved, self.unbalanced)
@@ -306,7 +285,7 @@ class _Descent:
             self.used += 1  # so that rounds without a direction end too
 
     def balanced(self, update):
-        """Returns whether forces balance to the tolerance or to rounding, with new areas and the loads of ``update``."""
+        """Returns whether forces balance to the tolerance or to rounding, with updated areas and loads."""
         self.minimiser.clear()
         rounded = float(self.minimiser.unbalanced()[0])
         update()
@@ -320,11 +299,10 @@ class _Descent:
 
     @property
     def residual(self):
-        """The fraction of the load that is unbalanced after the last descent."""
         return self.unbalanced / self.load
 
     def settle(self, s, load, most):
-        """Minimises once, with at most so many iterations; returns the result."""
+        """Minimises once, in at most ``most`` iterations; returns the result."""
         self.minimiser.set_objective(s, load)
         self._begin()
         if self.load == 0.0:
@@ -349,7 +327,6 @@ class _Descent:
         return result
 
     def _begin(self):
-        """Lists the pairs of self-contact."""
         if self.pairs is None:
             return
         self.pairs.launch_begin(self._apart)
@@ -365,10 +342,8 @@ class _Descent:
 class _Wind:
     """The forces of wind on cloth at rest, which follow its normals and have no energy.
 
-    Cloth without mass moves in the wind until it rests, by implicit steps of the law of air from velocity 0. The force on a
-    shape that does not move is that at rest, whatever the step. Long steps overshoot where the force depends more on the
-    normals than the cloth resists. So a step is half as long as the one before if that raised the unbalanced force, else a
-    tenth longer.
+    Cloth without mass moves by implicit steps of the law of air from velocity 0; at rest the force does not depend on the step.
+    A step is half as long as the last if that raised the unbalanced force, else a tenth longer.
     """
 
     def __init__(self, model, base):
@@ -380,15 +355,13 @@ class _Wind:
         self._residual = np.inf
 
     def set(self):
-        """Takes the force of a step from the present positions."""
         self._set(self._seconds)
 
     def hold(self):
-        """Makes the force constant, so that the Hessian is that of the other energies."""
         self._set(1e9 * self._seconds)
 
     def adapt(self, residual):
-        """Chooses the length of the next step from the unbalanced force after the last."""
+        """Chooses the next step from the unbalanced force."""
         self._seconds *= 0.5 if residual > self._residual else 1.1
         self._residual = residual
 
@@ -398,10 +371,7 @@ class _Wind:
 
 
 def _settle_all(model, base, descent, part):
-    """Settles under the fraction ``part`` of loads and keyframes until loads that follow the cloth are constant.
-
-    Pressures and wind follow the cloth. Pins that cloth held back move on.
-    """
+    """Settles under the fraction ``part`` of loads and keyframes until the loads that follow the cloth are constant."""
     pins, loads, wind = model.scene.pins, model.loads, descent.wind
     follows = descent.pairs is not None or wind is not None or (loads is not None and loads.follows)
 
@@ -430,10 +400,8 @@ def _settle_all(model, base, descent, part):
 
 
 def _with_held(scene, model, start):
-    """Returns a start (n, 3) [m] with the coordinates that nothing moves where the model has them.
-
-    Raises:
-        ValueError: A free vertex is inside a collider.
+    """Returns a start (n, 3) [m] with the coordinates that nothing moves where the model has them; refuses vertices in
+    colliders.
     """
     held = model.coordinate_mobility().reshape(-1, 3) == 0.0
     if scene.pins.keyframes is not None:  # these are set in each load step
@@ -444,12 +412,10 @@ def _with_held(scene, model, start):
 
 
 def _halved(found, least):
-    """Returns whether a number is at most half of its earlier minimum."""
     return any(one <= 0.5 * before for one, before in zip(found, least, strict=True))
 
 
 def _with_pins(pins, points, part):
-    """Returns the points (n, 3) [m] with moved pins after the fraction ``part`` of their keyframes."""
     if pins.keyframes is None:
         return points
     at = part * (len(pins.keyframes) - 1)
@@ -461,14 +427,14 @@ def _with_pins(pins, points, part):
 
 
 def _nudge(model):
-    """Returns displacements of the free vertices of about 1e-4 of the size of the cloth, (n, 3) [m], equal in every call."""
+    """Returns displacements of free vertices of about 1e-4 of the cloth's size, (n, 3) [m], always equal."""
     size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
     noise = np.random.default_rng(0).normal(size=(model.count, 3))
     return 1e-4 * size * noise * (model.coordinate_mobility() > 0.0).reshape(-1, 3)
 
 
 def _frequency_scale(model):
-    """Returns (10ω)² = 100 g over the size of the cloth [1/s²], ω that of a pendulum of this length; 1 without gravity."""
+    """Returns (10ω)² = 100 g over the size of the cloth [1/s²]; 1 without gravity."""
     size = np.linalg.norm(np.ptp(model.positions.numpy(), axis=0))
     gravity = float(np.linalg.norm(model.gravity.numpy()))
     return 100.0 * gravity / size if gravity > 0.0 else 1.0

@@ -35,17 +35,15 @@ class Fit:
 
     Attributes:
         parameters: Estimates by name.
-        errors: Their standard errors relative to the estimates, by name; infinite if the data do not determine them, NaN if
-            the noise is not known, because there is no sigma and no more numbers than parameters.
-        correlation: Correlation of the logarithms of the parameters, (P, P); NaN where the data do not determine them.
-        freedom: Degrees of freedom of the estimate of the noise; infinite if data have a sigma.
-        residual: RMS of the residuals: of positions along an axis [m], of free points and captures to the cloth [m]; divided by
-            sigma, where it is given, so that it should be about 1.
-        residuals: The same in each of the frames 1 … F, (F,), over markers; NaN in frames without any.
-        runs: Number of batches that were run, or of sets of equilibria.
+        errors: Standard errors over the estimates, by name; infinite if the data do not determine them, NaN if neither a sigma
+            nor surplus numbers give the noise.
+        correlation: Correlation of the logarithms of the parameters, (P, P); NaN where undetermined.
+        freedom: Degrees of freedom of the noise; infinite with a sigma.
+        residual: RMS of the residuals [m]; divided by sigma, where given, so that it should be about 1.
+        residuals: That RMS in each of the frames 1 … F, (F,), over markers; NaN in frames without any.
+        runs: Number of batches, or of sets of equilibria.
         message: How the fit ended.
-        status: The :class:`warpcloth.core.status.Status` of the batch, or of the equilibrium, with the estimates. Only diverged
-            runs end the search for them.
+        status: The :class:`warpcloth.core.status.Status` with the estimates.
     """
 
     parameters: dict[str, float]
@@ -60,7 +58,7 @@ class Fit:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Intervals that contain the true values with a probability of 95 %, if errors are independent and normal."""
+        """95 % confidence intervals, if errors are independent and normal."""
         from scipy.stats import t
 
         limits = {
@@ -85,34 +83,30 @@ def fit(
 ) -> Fit:
     """Finds the positive parameters with which a scene moves, or rests, most nearly as measured.
 
-    It minimises the sum of squared residuals by ``scipy.optimize.least_squares`` over the logarithms of the parameters. One
-    batch of 2P + 1 copies gives the motion and, by central differences of 0.1 %, its derivatives. Errors follow from the
-    Jacobian J at the minimum. The covariance is (JᵀJ)⁻¹ if residuals are divided by a sigma, else s²(JᵀJ)⁻¹ with s² = Σr²/(m −
-    P). Choose a motion that is not chaotic: of a cloth that crumples, a short time. Without a solver, the scene is fitted at
-    rest. Each shape is then found by :func:`warpcloth.equilibrium`, from the one before, so of several rest shapes it follows
-    that of ``start``.
+    Minimises Σr² by ``scipy.optimize.least_squares`` over the logarithms of the parameters. One batch of 2P + 1 copies gives
+    the residuals and their central differences of 0.1 %. The covariance is (JᵀJ)⁻¹ if residuals are divided by a sigma, else
+    s²(JᵀJ)⁻¹ with s² = Σr²/(m − P). The motion must not be chaotic: of cloth that crumples, take a short time. Without a
+    solver, shapes at rest are fitted, by :func:`warpcloth.equilibrium` from the shape before.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
-        solver: Its solver, with steps so small that their error is below that of the measurement; None for the equilibrium.
-        start: Parameters by their name in ``vary``, such as ``"Spring.stiffness"``, and values to start from, above 0.
+        solver: Its solver, with an error of steps below that of the measurement; None for the equilibrium.
+        start: Start values above 0 by names in ``vary``, such as ``"Spring.stiffness"``.
         measured: :class:`warpcloth.Markers`, :class:`warpcloth.Reading`, :class:`warpcloth.CapturePoints` or a list of these,
-            each with a sigma. Or a :class:`warpcloth.Capture`, in short for all its points. Or, in short for the markers
-            ``vertices``, their positions at frames 1 … F of the scene, (F, v, 3) [m], NaN where there is none; or an animation
-            of v vertices: a path or a sequence that `open_sequence` takes or returns, with times from the start of the scene
-            on. Its frames at the times of frames of the scene are used. It is turned to the up axis of the mesh of the scene.
-            Or the path of a .csv file, see :meth:`warpcloth.Markers.read`.
-        vertices: The v vertices that were measured, indices or a selection, in their order in ``measured``.
+            each with a sigma; a :class:`warpcloth.Capture`; the path of a .csv file of markers; positions of ``vertices`` at
+            frames 1 … F, (F, v, 3) [m], NaN where missing; or an animation of v vertices (path or sequence), whose frames at
+            times of frames of the scene are used, turned to its up axis.
+        vertices: The v measured vertices, indices or a selection, in the order of ``measured``.
         device: A Warp device.
         dtype: ``"float32"`` or ``"float64"``.
-        record: What runs record for readings, such as ``"reactions"``; see :func:`warpcloth.simulate`.
+        record: Records that readings need, such as ``"reactions"``.
 
     Returns:
         :class:`Fit`.
 
     Raises:
-        ValueError: If an argument is not allowed, if no frame of an animation is at the time of a frame of the scene, if
-            nothing measured depends on a parameter at the start, or if a run with parameters on the way fails.
+        ValueError: An argument is not allowed, no frame of an animation is at the time of a frame of the scene, nothing
+            measured depends on a parameter at the start, or a run fails.
 
     Examples:
         >>> import numpy as np, warpcloth as wc
@@ -142,7 +136,6 @@ def fit(
     rest = None
 
     def evaluated(logs):
-        """Returns residuals (m,), their derivatives (m, P) by the logarithms of the parameters, and the status of the run."""
         nonlocal rest
         key = logs.tobytes()
         if key not in runs:
@@ -192,7 +185,6 @@ def fit(
 
 
 def _checked_names(start, scene):
-    """Returns the names of the parameters."""
     if not (isinstance(start, Mapping) and start):
         raise ValueError(f"start is {shown(start)}; it must be a dict of parameters, such as {{'Spring.stiffness': 100.0}}")
     listed, taken = _parameters_of(scene)
@@ -204,7 +196,6 @@ def _checked_names(start, scene):
 
 
 def _parameters_of(scene):
-    """Returns the names in ``vary`` that take one number: a list of them by label, and a set that has those by class too."""
     quantities = [
         (term, field)
         for term in (*scene.terms, *scene.contact_terms, *scene.air_terms)
@@ -218,7 +209,6 @@ def _parameters_of(scene):
 
 
 def _bound_data(scene, measured, vertices, most, resting):
-    """Returns the residuals of each of the data on a scene of ``most`` frames, or at rest."""
     if isinstance(measured, Capture):
         measured = CapturePoints(measured)
     kinds = (Markers, Reading, CapturePoints)
@@ -242,7 +232,6 @@ def _bound_data(scene, measured, vertices, most, resting):
 
 
 def _of_vertices(scene, measured, vertices, resting):
-    """Returns the markers of positions, of an animation or of a file."""
     if isinstance(measured, (str, PathLike)) and fspath(measured).lower().endswith(".csv"):
         if not (isinstance(vertices, str) and vertices == "all"):
             raise ValueError(f"vertices is {shown(vertices)} and measured is a file of markers; leave vertices out")
@@ -256,7 +245,6 @@ def _of_vertices(scene, measured, vertices, resting):
 
 
 def _positions(scene, measured, count):
-    """Returns the positions (F, count, 3) [m] of an animation at frames 1 … F of a scene, NaN where it has no such frame."""
     sequence = measured if isinstance(measured, Sequence) else open_sequence(measured)
     where = "measured" if sequence.path is None else sequence.path
     if len(sequence.mesh.points) != count:
@@ -275,7 +263,6 @@ def _positions(scene, measured, count):
 
 
 def _motions(scene, solver, vary, frames, options) -> tuple[list[Animation], Status]:
-    """Runs a scene with each of the values (R,) of parameters, as one batch, and returns the animations and their status."""
     count = len(next(iter(vary.values())))
     found = simulate(scene, solver, frames=frames, copies=count, vary=vary, **options)
     if not found.status.complete:
@@ -284,7 +271,7 @@ def _motions(scene, solver, vary, frames, options) -> tuple[list[Animation], Sta
 
 
 def _rests(scene, vary, rest, options) -> list[Equilibrium]:
-    """Finds the equilibrium with each of the values (R,) of parameters, each from the one before, the first from ``rest``."""
+    """Finds the equilibrium with each of the values (R,), each from the one before."""
     found = []
     for k in range(len(next(iter(vary.values())))):
         one = {name: values[k : k + 1] for name, values in vary.items()}
@@ -300,14 +287,13 @@ def _listed(vary, k):
 
 
 def _of_frames(residuals, frames, count):
-    """Returns the RMS of the residuals (m,) in each of ``count`` frames, NaN without any; ``frames`` (m,), -1 of none."""
     squares = np.bincount(frames[frames >= 0], residuals[frames >= 0] ** 2, count)
     numbers = np.bincount(frames[frames >= 0], minlength=count)
     return np.sqrt(np.divide(squares, numbers, out=np.full(count, np.nan), where=numbers > 0))
 
 
 def _errors(jacobian, variance):
-    """Returns standard errors of the logarithms (P,), infinite where they are not determined, and their correlation (P, P)."""
+    """Returns standard errors of the logarithms (P,), infinite where undetermined, and their correlation (P, P)."""
     _, sizes, rows = np.linalg.svd(jacobian, full_matrices=False)
     kept = sizes > _UNDETERMINED * sizes[0] if sizes[0] > 0.0 else np.zeros(len(sizes), dtype=bool)
     lost = (np.abs(rows[~kept]) > 1e-3).any(axis=0)

@@ -1,8 +1,7 @@
-"""Tells whether cloth that slides on colliders with friction vibrates on its contact, so that friction acts in both directions.
+"""Tells whether cloth that slides on colliders with friction vibrates on its contact.
 
-Contact has no damping of its own, and steps that do not damp leave what friction drives, see `benchmarks/flutter.py`. In a
-frame of length T that moves a vertex by Δx, the velocity of a vertex that slides steadily is Δx/T. What its velocity at the end
-differs by, w, is a vibration, or acceleration: w = ½Δx/T where it starts from rest.
+Contact has no damping, so steps that do not damp keep what friction drives. In a frame of length T that moves a vertex by Δx,
+w, the deviation of its velocity at the end from Δx/T, is a vibration or an acceleration: w = ½Δx/T for a start from rest.
 """
 
 import numpy as np
@@ -21,12 +20,11 @@ class Flutter:
     """Follows the vertices of each copy that touch colliders with friction.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
         mass: Masses of the free vertices (B, n) [kg].
 
     Attributes:
         first: The first frame in which each copy flutters, from 1, or 0, (B,).
-        figure: The speed of its vibration over that of sliding, RMS, (B,).
+        figure: RMS speed of its vibration over that of sliding, (B,).
     """
 
     carried = ("first", "figure", "_rows", "_points", "_near", "_moved")  # from frame to frame
@@ -40,7 +38,7 @@ class Flutter:
         self._near, self._moved = self._touches(self._points, 0), np.zeros_like(self._points)
 
     def note(self, number, points, velocities, alive):
-        """Notes the frame ``number`` with points (B·n, 3) [m] and velocities [m/s] of the copies ``alive`` (B,)."""
+        """Notes a frame with points (B·n, 3) [m] and velocities [m/s] of the copies ``alive`` (B,)."""
         points, velocities = (each.astype(np.float64, copy=False).reshape(self._points.shape) for each in (points, velocities))
         near, moved = self._touches(points, number), self._fps * (points - self._points)
         mass = self._mass * (near & self._near)
@@ -66,13 +64,12 @@ class Flutter:
         return found
 
     def _touches(self, points, frame):
-        """Returns which vertices are nearer to a collider than the contact distance, (B, n)."""
         with np.errstate(all="ignore"):
             return np.any([each.distances(points, frame) < self._distance for each in self._colliders], axis=0)
 
 
 def flutter_of(stepper, mass):
-    """Returns a :class:`Flutter`, or None if steps damp vibrations, or no collider but meshes has much friction."""
+    """Returns a :class:`Flutter`, or None if steps damp vibrations or no collider but meshes has much friction."""
     scene, undamped = stepper.model.scene, stepper.options.staggered or not stepper.options.damps
     return Flutter(stepper.model, mass) if undamped and any(map(_rubs, scene.colliders)) else None
 

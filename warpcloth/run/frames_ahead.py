@@ -1,4 +1,4 @@
-"""The frames of a run on the host, in the order of the scene, computed while earlier ones are checked and written."""
+"""The frames of a run on the host, computed while earlier ones are checked and written."""
 
 import itertools
 import time
@@ -21,11 +21,11 @@ class Frame(NamedTuple):
     Attributes:
         points: (B·n, 3) [m], in the order of the scene, not a view.
         velocities: (B·n, 3) [m/s], not a view.
-        results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
+        results: The worst :class:`warpcloth.core.status.Result` of each copy so far, (B,).
         residual: The largest residual of each copy so far, (B,).
         seconds: Time of its computation [s]; on CUDA by events of the device.
-        found: What ``find`` of :func:`frames_of` returned after the frame, or None.
-        state: The state of the stepper, see :meth:`warpcloth.core.state.State.to_host`, or None.
+        found: Result of ``find`` of :func:`frames_of` after the frame, or None.
+        state: The state of the stepper on the host, or None.
     """
 
     points: np.ndarray
@@ -38,17 +38,17 @@ class Frame(NamedTuple):
 
 
 def frames_of(stepper, count, ahead, keeps=None, find=None):
-    """Yields the next frames of a stepper. Close the generator, which then waits for frames that are being computed.
+    """Yields the next frames of a stepper. Close the generator: it then waits for frames in work.
 
-    While the caller uses one frame, a thread computes the next ones. The first is computed alone, because it may capture
-    graphs, and a capture tolerates no other work on the device.
+    While the caller uses one frame, a thread computes the next ones. The first is computed alone: it may capture graphs, during
+    which the device must not do other work.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`. Its state is ahead of the frame that the caller has.
+        stepper: Its state is ahead of the frame that the caller has.
         count: Number of frames.
-        ahead: Largest number of frames computed ahead; 0 computes each on demand, without a thread.
+        ahead: Maximum number of frames computed ahead; 0 computes each on demand, without a thread.
         keeps: Function (number of frames before) → whether the next frame includes the state; or None.
-        find: Function that is called after each frame and returns its ``found``; or None.
+        find: Function that is called after each frame for ``found``, or None.
     """
     numbers = itertools.count()
     copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
@@ -93,13 +93,11 @@ def state_of(stepper):
 
 @in_turn
 def _state_of(stepper):
-    """Returns the whole state on the host."""
     return stepper.state.to_host()
 
 
 @in_turn
 def _copies(stepper, number):
-    """Returns this number of buffers for frames of a stepper."""
     model = stepper.model
     if not model.device.is_cuda:
         return [_HostCopy(stepper) for _ in range(number)]
@@ -113,7 +111,7 @@ def _copies(stepper, number):
 
 @cache
 def _copy_stream(device):
-    """Returns the stream that copies frames from a device, which is made once and kept.
+    """Returns the stream that copies frames from a device; it is made once and kept.
 
     Warp's table of streams has no lock: a stream deleted in one thread while another captures a graph would break it.
     """
@@ -121,8 +119,6 @@ def _copy_stream(device):
 
 
 class _HostCopy:
-    """A buffer for a frame that is computed on the CPU."""
-
     def __init__(self, stepper):
         self.stepper = stepper
 
@@ -138,10 +134,7 @@ class _HostCopy:
 
 
 class _DeviceCopy:
-    """A buffer for a frame on a CUDA device: x and v in the order of the scene, which a second stream copies to the host.
-
-    So the next frame begins during the copy, and a reader waits only for the event of this one.
-    """
+    """A buffer for a frame on a CUDA device, which a second stream copies to the host while the next frame begins."""
 
     def __init__(self, stepper, stream, indices, found, host):
         self.stepper, self._stream, self._indices, self._found, self._host = stepper, stream, indices, found, host

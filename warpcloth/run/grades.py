@@ -24,15 +24,9 @@ _WHY = (
 class Grades:
     """The grades of the copies of a run.
 
-    Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
-        balance: The :class:`warpcloth.run.balance.Balance` of the run.
-
     Attributes:
-        errors: The :class:`warpcloth.run.step_errors.StepErrors` of the stepper.
-        flutter: The :class:`warpcloth.run.flutter.Flutter` of the run, or None.
-        distance: The largest distance of a vertex from the solution of a step in a good frame of each copy, (B,) [m].
-        first: For each reason why a copy is not usable the first frame, from 1, in which that is so, or 0, (4, B).
+        distance: The largest distance of a vertex from the solution of a step in a good frame, (B,) [m].
+        first: For each reason why a copy is not usable, its first frame from 1, or 0, (4, B).
         figure: The figure of that frame, (4, B).
     """
 
@@ -52,14 +46,7 @@ class Grades:
         self.solved, self.ratio = np.zeros(model.copies), np.zeros(model.copies)
 
     def note(self, number, frame, error, alive):
-        """Notes the energy in a :class:`warpcloth.run.frames_ahead.Frame` of the copies ``alive`` (B,), and its error.
-
-        Args:
-            number: Number of the frame.
-            frame: The frame.
-            error: Its :class:`warpcloth.run.step_errors.StepError`.
-            alive: Copies that are good.
-        """
+        """Notes the energy and the error of a frame, of the copies ``alive`` (B,)."""
         balance = self._balance
         if self.flutter is not None:
             self.flutter.note(number, frame.points, frame.velocities, alive)
@@ -75,17 +62,12 @@ class Grades:
         self.most = np.where(news[-1], balance.allowed, self.most)
 
     def go_on(self):
-        """Gives the errors the values of a checkpoint, which were set here."""
+        """Continues from the values of a checkpoint, which were set here."""
         for name in ("distance", "solved", "ratio", "gap"):
             setattr(self.errors, name, getattr(self, name).copy())
 
     def faults(self, solver, result):
-        """Returns the reasons why copies are not usable, a list of (copy, frame, sentence).
-
-        Args:
-            solver: The record of the solver.
-            result: The worst result of any step.
-        """
+        """Returns the reasons why copies are not usable, a list of (copy, frame, sentence)."""
         rounded = self._model.numpy_dtype == np.float32 and result in (Result.ROUNDED, Result.STALLED)
         remedies = ['dtype="float64"'] * rounded + ["shorter steps"] + ["more iterations"] * hasattr(solver, "iterations")
         remedy, found = f"take {', '.join(remedies)} or another solver", []
@@ -100,13 +82,7 @@ class Grades:
         return found + ([] if self.flutter is None else self.flutter.faults())
 
     def grade(self, copy, result, faults):
-        """Returns the :class:`warpcloth.core.status.Grade` of a copy.
-
-        Args:
-            copy: Its index.
-            result: The worst result of any of its steps.
-            faults: The reasons why copies are not usable, as of :meth:`faults`.
-        """
+        """Returns the :class:`warpcloth.core.status.Grade` of a copy from its worst result and the :meth:`faults`."""
         if result in (Result.DIVERGED, Result.STOPPED) or any(fault[0] == copy for fault in faults):
             return Grade.NOT_USABLE
         results = _MAY_CONVERGE if self.errors.knows else _MAY_CONVERGE[1:]
@@ -115,7 +91,6 @@ class Grades:
 
 
 def _compared(energy, most):
-    """Returns how an energy compares with the most that it can be, which is less."""
     if most <= 0.0:
         return "where it can have none"
     if energy < 2.0 * most:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+import warpcloth.contact as contact
+
 from ..base.checks import shown
 from ..base.limits import MOST_FRAMES
 from ..base.texts import numbered
 from ..base.turns import in_turn
-from ..contact.collider_work import ColliderWork, FilterWork, PairWork
-from ..contact.present import ColliderPulls, PresentContact
 from ..core.capture import Segment
 from ..core.energy import Energy
 from ..core.sums import Sums
@@ -33,7 +33,7 @@ def checked_record(record: Any, scene: Scene | None = None) -> tuple[str, ...]:
     """Returns the words of a record, each once, in the order of :data:`RECORDS`.
 
     Raises:
-        ValueError: A word is not one of these, or is "pairs" without the scene of a run, or without self-contact.
+        ValueError: A word is unknown, or is "pairs" without a run or without self-contact.
     """
     words = (record,) if isinstance(record, str) else record if isinstance(record, Iterable) else (record,)
     words = tuple(words)
@@ -52,11 +52,8 @@ def energy_names(scene: Scene) -> list[str]:
 
 
 def _names_of_contact(scene):
-    """Returns the labels of terms, contact and friction, numbered if equal.
-
-    Returns:
-        A list of those of the terms, and a dictionary of those of the pairs with meshes: of contact with the mesh ``c`` by
-        ``(c, False)``, of friction on it by ``(c, True)``.
+    """Returns the labels of terms, contact and friction, numbered if equal: a list for terms, a dictionary for pairs with the
+    mesh c, by (c, False) for contact and (c, True) for friction.
     """
     labels = [term.label for term in (*scene.terms, *scene.contact_terms)]
     of_meshes = {}
@@ -87,18 +84,15 @@ class Evaluation:
     """Energies of a model and the forces at its pins and colliders, at any positions.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
         h: Step for damping [s], or None without motion.
-        stepper: The :class:`warpcloth.solvers.solver.Stepper` with the colliders and multipliers; None for colliders at their
-            start and without hard terms.
+        stepper: The stepper with the colliders and multipliers; None for colliders at their start and no hard terms.
         forces: Whether to compute forces.
-        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of a scene with pairs, if there is no stepper.
+        pairs: The :class:`warpcloth.contact.self_steps.SelfSteps`, if there is no stepper.
 
     Attributes:
-        names: Names of the energies.
-        stored: U of all friction springs, of the last :meth:`energies`, (B,) [J].
+        stored: Last U of all friction springs, (B,) [J].
         hidden: Whether some forces follow from multipliers.
-        gradient: ∂U/∂x of the last :meth:`launch`, (N,) [N].
+        gradient: Last ∂U/∂x, (N,) [N].
         pulls: Its :class:`warpcloth.contact.present.ColliderPulls`, or None without colliders.
 
     Raises:
@@ -109,7 +103,7 @@ class Evaluation:
         self.model, self._h, self._pull, self.pulls = model, h, None, None
         self._pairs = pairs if stepper is None else stepper.pairs
         shares = [] if stepper is None or model.colliders is None else stepper.shares
-        self._present = PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
+        self._present = contact.PresentContact(model, [(share.colliders, first, end) for share, first, end in shares])
         terms = [(present, own) for present, own in zip(self._present.terms, model.terms, strict=True) if own.term is not AIR]
         self._terms = tuple(present for present, _own in terms)
         self._blown = tuple(own for own in model.terms if own.term is AIR)
@@ -127,7 +121,7 @@ class Evaluation:
         if self.hidden:
             self._pull = stepper.constraint_forces()
         if model.colliders is not None:
-            self.pulls = ColliderPulls(model, self._terms, stepper and stepper.constraint_forces, self._pairs)
+            self.pulls = contact.ColliderPulls(model, self._terms, stepper and stepper.constraint_forces, self._pairs)
         soft = tuple(elements for elements in self._terms if not elements.hard and elements.collider is None)
         self._elastic = plan(model).gradient(terms=soft) if soft else None
         self._of_air = plan(model).gradient(terms=self._blown) if self._blown else None
@@ -141,7 +135,7 @@ class Evaluation:
         self._add = model.kernel(kernels.add_scaled, model.dtype) if self.pulls else None
 
     def launch(self, x, v=None):
-        """Launches ∂U/∂x at x into ``gradient`` (N,) [N], with damping at velocities v and the forces of hard terms."""
+        """Launches ∂U/∂x at x, damping at v and forces of hard terms into ``gradient`` (N,) [N]."""
         model = self.model
         self.gradient.zero_()
         if self._pairs is not None:
@@ -169,16 +163,16 @@ class Evaluation:
             self._pull(self.gradient)
 
     def reactions(self):
-        """Returns the forces of pins on the cloth along held axes, from the last :meth:`launch` and loads, (B, p, 3) [N]."""
+        """Returns the forces of pins on the cloth along held axes, (B, p, 3) [N], after :meth:`launch`."""
         found = self._host(self.gradient)[:, self._pins] - self._mass[:, self._pins, None] * self._gravity
         if self.model.loads is not None:
             found -= self._host(self.model.loads.force)[:, self._pins]
         return np.where(self._held, found, 0.0)
 
     def energies(self, x, v=None):
-        """Returns the energies of terms, motion and gravity, and the work of constant loads, by name, (B,) [J].
+        """Returns energies of terms, motion and gravity, and the work of constant loads, by name, (B,) [J].
 
-        Those of gravity and loads are relative to the start.
+        Gravity and loads count from the start.
         """
         model, found, self.stored = self.model, {}, np.zeros(self.model.copies)
         if self._energies is None:
@@ -205,7 +199,7 @@ class Evaluation:
         return found
 
     def _energies_of_pairs(self, x):
-        """Returns the energies of pairs at x, which are listed there, by name, and adds to ``stored``."""
+        """Returns the energies of the listed pairs at x by name, and adds to ``stored``."""
         model, pairs, found = self.model, self._pairs, {}
         of_cloth = [-1] if model.scene.self_contact is not None else []
         for c in (*of_cloth, *model.scene.meshes):
@@ -231,7 +225,7 @@ class Evaluation:
         return 0.5 * (self._mass[:, self._pins] * (v**2).sum(axis=2)).sum(axis=1)
 
     def mask(self):
-        """Returns vectors (N,) that are 1 along the axes that pins hold and 0 elsewhere."""
+        """Returns vectors (N,): 1 along axes that pins hold, else 0."""
         found = np.zeros((*self._mass.shape, 3))
         found[:, self._pins] = self._held
         return self.model.array(found.reshape(-1, 3), self.model.vec3)
@@ -241,12 +235,11 @@ class Evaluation:
 
 
 def last_frame(scene: Scene) -> int:
-    """Returns the frame of the wind at rest: that of the last keyframe, or the last frame of a scene with a function."""
+    """Returns the frame of the wind at rest: its last keyframe, or the last frame if it is a function."""
     return MOST_FRAMES if scene.air is not None and scene.air.keyframes is not None else scene.frames
 
 
 def _time_of(stepper):
-    """When the wind is taken after a step, as of a :class:`warpcloth.terms.refresh.Moment`."""
     air = stepper.model.scene.air
     if air is None or not air.changes:
         return {}
@@ -257,8 +250,6 @@ def _time_of(stepper):
 
 
 def _kept(name):
-    """Returns a property for the rows of one name, which a resumed run sets."""
-
     def get(history):
         return np.array(history._rows[name])
 
@@ -269,30 +260,27 @@ def _kept(name):
 
 
 class History:
-    """Wraps a stepper and records energies and reactions after each frame, without changing its state.
+    """Wraps a stepper and records energies and reactions after each frame.
 
-    Work that depends on the path is summed in every step: that of moving pins and colliders, of loads that change or follow the
-    cloth, against friction, and of the filter of colliders. Steps are then launched one by one; frames have the same bits.
+    Steps are launched one by one if work is summed: of moving pins and colliders, of loads, of friction and of the filter. The
+    bits of the frames stay the same.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
-        model: The model that it is bound to.
         record: Words of :data:`RECORDS`.
 
     Attributes:
-        names: Names of the energies.
         energies: Energies of each kept frame, (F, B, K) [J].
         reactions: Reactions of each kept frame, (F, B, p, 3) [N].
         forces: Total force and friction force on each collider in each kept frame, (F, B, C, 2, 3) [N].
         pairs: :data:`PAIRS` of each kept frame, (F, B, 5).
-        cuts: Fraction of the moves in each kept frame that contact cut short, (F, B).
-        find: Function that is called after the last step of each frame, or None; ``found`` is what it returned.
-        totals: Work of pins, without their kinetic energy, of loads, of colliders, against friction, of the filter and of the
-            air, up to the last kept frame, (6, B) [J].
+        cuts: Fraction of the moves that contact cut short in each kept frame, (F, B).
+        find: Function that is called after each frame for ``found``, or None.
+        totals: Work of pins (without their kinetic energy), loads, colliders, friction, filter and air up to the last kept
+            frame, (6, B) [J].
 
     Raises:
-        ValueError: A term is hard and the solver has no multipliers; or steps differ in length, and the work of contact or air
-            is asked for.
+        ValueError: A term is hard and the solver has no multipliers, or steps differ in length and work of contact or air is
+            asked for.
     """
 
     energies, reactions, pairs, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
@@ -329,12 +317,11 @@ class History:
         if self._moving or self._driven or self._filtered or self._blown or pushes:
             self._kinetic = self._evaluation.kinetic_of_pins(v)
             self._each_step = self._recorded_step(x, v)
-            self._of_pairs = PairWork(stepper, self._works[3]) if pushes else None
+            self._of_pairs = contact.PairWork(stepper, self._works[3]) if pushes else None
             self._room = None if stepper.pairs is None else stepper.pairs.capacities
         self._note()
 
     def _recorded_step(self, x, v):
-        """Allocates the sums over steps, and captures their launches."""
         model, evaluation = self.model, self._evaluation
         self._before = before = kernels.past(model.dtype)()
         before.x, before.gradient, before.force = (model.vectors() for _ in range(3))
@@ -347,9 +334,9 @@ class History:
             vertices = slice(first * model.per_copy, end * model.per_copy)
             sums = [work[vertices] for work in self._works[2:]]
             stepper.follow_contact()
-            cuts, touches, terms = FilterWork(stepper, sums[-1]), None, stepper.model.terms
+            cuts, touches, terms = contact.FilterWork(stepper, sums[-1]), None, stepper.model.terms
             if self._touched or not any(elements.hard and elements.collider is not None for elements in terms):
-                touches = ColliderWork(stepper.colliders, terms, cuts, *sums, stepper.constraint_forces)
+                touches = contact.ColliderWork(stepper.colliders, terms, cuts, *sums, stepper.constraint_forces)
             self._touches.append((cuts, touches, vertices))
         self._of_air = [AirWork(stepper) for stepper, _first, _end in (self._stepper.shares if self._blown else ())]
 
@@ -369,7 +356,7 @@ class History:
         return Segment(model.device, launch)
 
     def _begin(self):
-        """Starts the sums from the present state, in each frame anew, so that a resumed run has the same bits."""
+        """Starts the sums from the present state, in each frame anew."""
         (x, v), loads, before = self._stepper.state, self.model.loads, self._before
         wp.copy(before.x, x)
         if loads is not None:
@@ -421,7 +408,6 @@ class History:
             self.found = self.find()
 
     def _make_room(self):
-        """Allocates memory for all pairs at the present state, and captures their launches again."""
         pairs = self._stepper.pairs
         if pairs is None:
             return
@@ -434,7 +420,6 @@ class History:
             self._each_step, self._room = Segment(self.model.device, self._each_step.record), pairs.capacities
 
     def _note(self):
-        """Evaluates the present state."""
         self._make_room()
         evaluation, loads, (x, v), found = self._evaluation, self.model.loads, self._stepper.state, {}
         if "energies" in self._record:
@@ -468,13 +453,13 @@ class History:
         self._found.append((found, self._total.copy()))
 
     def _counted(self):
-        """Returns the counts of contact so far, (B,) each: cuts times frames, lists of pairs, and cuts of their filter."""
+        """Returns counts of contact so far, (B,) each: cuts times frames, lists of pairs, and cuts of their filter."""
         pairs, none = self._stepper.pairs, np.zeros(self.model.copies)
         of_pairs = (none, none) if pairs is None else (pairs.lists.numpy().copy(), pairs.share * self._frame)
         return self._stepper.cut * self._frame, *of_pairs
 
     def keep(self, alive):
-        """Keeps the values of the last frame, with NaN for copies that are not ``alive`` (B,), and returns them by name."""
+        """Keeps and returns the values of the last frame by name, NaN for copies that are not ``alive`` (B,)."""
         found, self.totals = self._found.popleft()
         for name, values in found.items():
             values[~alive] = np.nan
@@ -482,7 +467,7 @@ class History:
         return found
 
     def go_on(self):
-        """Continues from the frame kept last; the stepper must be set to it."""
+        """Continues from the frame kept last, to which the stepper must be set."""
         self._found.clear()
         self._total, self._frame = np.array(self.totals), max(map(len, self._rows.values())) - 1
         self._seen = self._counted()

@@ -1,12 +1,14 @@
 """Lists scenes, solvers and their options for the command line, by parsing source files.
 
-Nothing here imports Warp, so that help and shell completion respond at once.
+Nothing here imports Warp.
 """
 
 import ast
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+from ..solvers import __all__ as _SOLVERS
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -62,11 +64,11 @@ def _defaults(arguments):
 
 @cache
 def list_solvers():
-    """Returns a dict of the solvers of this package: by name a dict from options to the words that they take, or ()."""
+    """Returns the solvers of this package: their options, and the words that each takes, by name."""
     folder, classes = _PACKAGE / "solvers", {}
     for path in folder.glob("*.py"):
         classes |= {node.name: node for node in ast.parse(path.read_bytes()).body if isinstance(node, ast.ClassDef)}
-    records = [classes[name] for name in _assigned(ast.parse((folder / "__init__.py").read_bytes()), "__all__")]
+    records = [classes[name] for name in _SOLVERS]
     return {_assigned(record, "name"): _options(record, classes) for record in records}
 
 
@@ -77,7 +79,6 @@ def list_failures():
 
 
 def _assigned(node, name):
-    """Returns the literal that a module or class assigns to a name."""
     return ast.literal_eval(_value(node, name))
 
 
@@ -96,7 +97,6 @@ def _options(record, classes):
 
 
 def _words(annotation):
-    """Returns the words of each Literal[…] in an annotation."""
     found = [node for node in ast.walk(annotation) if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal"]
     return tuple(word for literal in found for word in ast.literal_eval(ast.Tuple(_elements(literal.slice), ast.Load())))
 

@@ -1,8 +1,7 @@
 """The elastic energy that cloth may gain when a body pulls it from what holds it.
 
-Let w be the velocity field of a rigid body. Its power on elastic cloth is Σ ∇U·w over the elements that join held vertices to
-others, because rigid motion changes no other energy. For springs it is at most √(2U Σk) ‖w‖, so √U grows by at most √(½Σk)
-times the way of the body relative to what is held, however the cloth moves meanwhile.
+With w the velocity of a rigid body, the power is Σ ∇U·w over the elements between held and other vertices. For springs √U grows
+by at most √(½Σk) times the body's relative way.
 """
 
 from functools import cached_property
@@ -11,15 +10,10 @@ import numpy as np
 
 
 def pulled(balance, way, held):
-    """Returns the elastic energy that a body may add on its way, (B,) [J].
+    """Returns the elastic energy that a body may add on its ``way`` [m] relative to ``held`` coordinates (n, 3), (B,) [J].
 
-    ½Σk way² is the energy that the start gains if all that is not held moves by the way along these springs. As they have all
-    directions, it is summed over the three axes, each the mean of both senses, which is 0.9 to 3 times as much.
-
-    Args:
-        balance: The :class:`warpcloth.run.balance.Balance` of the run.
-        way: The way of the body relative to what is held [m].
-        held: The coordinates that are held, (n, 3) booleans.
+    ½Σk way² is the energy gained at the start if all that is not held moves by the way along these springs, summed over the
+    three axes, each the mean of both senses (0.9 to 3 times too large).
     """
     model, cloth, energy = balance.model, balance.cloth, np.zeros(balance.model.copies)
     for move in way * np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))]):
@@ -38,15 +32,12 @@ def held_coordinates(scene):
 class Pull:
     """How a collider that moves pulls cloth.
 
-    Pins and attachments hold the vertices that they are of. Other colliders, and the collider itself if it deforms, may hold
-    any vertex: the energy is then twice that of a random half of the vertices that leaves the other half, because half of all
-    elements join the two.
+    Pins and attachments hold their vertices. Other colliders, and the collider itself if it deforms, may hold any vertex: the
+    energy is then twice that between a random half of the vertices and the rest.
 
     Args:
-        collider: The collider.
-        turns: The angles by which it rotates in each frame, (F,).
-        deforms: How far a point of it moves in its own frame in each frame, (F,) [m].
-        balance: The :class:`warpcloth.run.balance.Balance` of the run.
+        turns: Angle of rotation in each frame, (F,).
+        deforms: Maximum displacement of its points in its own frame, in each frame, (F,) [m].
     """
 
     def __init__(self, collider, turns, deforms, balance):
@@ -56,7 +47,7 @@ class Pull:
         self._others = [each for each in self._scene.colliders if each is not collider]
 
     def energy(self, frame):
-        """Returns a bound of the elastic energy that it has added up to a frame, (B,) [J]."""
+        """Returns a bound of the elastic energy added up to a frame, (B,) [J]."""
         held = held_coordinates(self._scene)
         found = pulled(self._balance, self._from_held[:frame].sum(), held)
         way = self._from_others[:frame].sum()
@@ -67,7 +58,7 @@ class Pull:
 
     @cached_property
     def _from_held(self):
-        """The ways in each frame relative to pins, and relative to what else holds the cloth, at its start, (F,) [m]."""
+        """Ways relative to pins, and to other holders at their start, in each frame, (F,) [m]."""
         scene, pins = self._scene, self._scene.pins
         ways = [np.zeros(len(self._turns))]
         if len(pins.vertices):
@@ -79,22 +70,20 @@ class Pull:
 
     @cached_property
     def _from_others(self):
-        """The ways in each frame relative to other colliders, where the cloth starts, (F,) [m]."""
+        """Ways relative to other colliders, where the cloth starts, (F,) [m]."""
         ways = [self._from(self._box + (poses[:, None] - poses[0])[..., :3]) for poses in (c.poses for c in self._others)]
         return np.max([self._deforms, *ways], axis=0)
 
     def _from(self, points):
-        """Returns the largest way of its material in each frame relative to points (F or 1, m, 3) [m] that hold it, (F,)."""
+        """Returns the largest way of its material in each frame relative to points (F or 1, m, 3) [m], (F,)."""
         points = self._at_frames(points) - self._path
         apart, radius = (np.linalg.norm(each, axis=-1) for each in (np.diff(points, axis=0), points[:-1]))
         return (apart + self._turns[:, None] * radius).max(axis=1) + self._deforms
 
     def _at_frames(self, keyframes):
-        """Returns keyframes at all frames; after the last they stay."""
         return keyframes[np.minimum(np.arange(len(self._turns) + 1), len(keyframes) - 1)]
 
     @cached_property
     def _box(self):
-        """The corners of the box around the cloth at the start, (1, 8, 3) [m]."""
         ends = np.stack([self._scene.positions.min(axis=0), self._scene.positions.max(axis=0)])
         return np.stack(np.meshgrid(*ends.T), axis=-1).reshape(1, 8, 3)

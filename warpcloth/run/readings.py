@@ -26,7 +26,7 @@ _BOUND = 1e-9  # largest distance of the sum of weights from 1
 
 
 def frames_at(times: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the nearest frames of a scene to times (m,) [s], (m,), and whether each is at the time of a frame."""
+    """Returns the frames nearest to times (m,) [s], (m,), and whether each is at the time of a frame."""
     wanted = np.asarray(times) * scene.fps
     frames = np.rint(wanted).astype(int)
     return frames, (np.abs(wanted - frames) <= _SAME_TIME) & (frames >= 0) & (frames <= scene.frames)
@@ -36,18 +36,15 @@ def frames_at(times: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 class Markers:
     """Positions of k markers in frames of a scene, or at rest.
 
-    Markers are vertices, or points of triangles, Σ wᵢxᵢ over the corners. Without ``vertices`` and ``triangles`` they are free
-    points, as of a scanner: each residual is the distance to the nearest point of the cloth. The nearest points, and the
-    directions to them, are those of the parameters in question, and are held while these are varied. In the derivative of the
-    distance the motion of the nearest point along the cloth cancels.
+    Markers are vertices, or points Σ wᵢxᵢ of triangles. Without ``vertices`` and ``triangles`` they are free points: each
+    residual is the distance to the nearest point of the cloth, which is held while parameters are varied.
 
     Attributes:
-        positions: At frames 1 … F of the scene, (F, k, 3) [m], or of an equilibrium (k, 3); NaN where there is none.
+        positions: At frames 1 … F (F, k, 3) [m], or of an equilibrium (k, 3); NaN where missing.
         vertices: The k vertices, indices or a selection.
         triangles: The triangle of each marker, (k,).
-        weights: Its barycentric coordinates there, (k, 3), with the sum 1.
-        sigma: Standard deviation of the error along each axis [m]; of free points of the error along the normal. None if it is
-            not known.
+        weights: Barycentric coordinates there, (k, 3), with the sum 1.
+        sigma: Standard deviation of the error along each axis, of free points along the normal [m]; None if unknown.
 
     Raises:
         ValueError: A value is not allowed.
@@ -70,22 +67,21 @@ class Markers:
 
     @staticmethod
     def read(path: FilePath, scene: Scene, sigma: float | None = None, resting: bool = False) -> Markers:
-        """Reads markers from a CSV file with columns time [s], id, x, y, z [m], in any order; others are ignored.
+        """Reads markers from a CSV file with columns time [s], id, x, y, z [m] in any order; others are ignored.
 
-        A row gives the position of a marker at a time from the start of the scene on. A row at time 0 binds the marker to the
-        point of the cloth that is nearest to it at the start. Rows at times of frames of the scene are used. Without a column
-        id, rows are free points, and those at time 0 are left out. Coordinates that are NaN count as not measured.
+        A row at time 0 binds a marker to the nearest point of the cloth at the start; rows at times of frames are used. Without
+        a column id, rows are free points, and those at time 0 are ignored. NaN means not measured.
 
         Args:
             path: The file.
-            scene: The scene that they are fitted to.
+            scene: The scene to fit.
             sigma: See :class:`Markers`.
-            resting: Whether rows after time 0, one of each marker, show the cloth at rest.
+            resting: Whether rows after time 0, one per marker, show the cloth at rest.
 
         Raises:
             OSError: The file cannot be read.
-            ValueError: It has no such columns or rows, a number is not allowed, a marker is not bound, occurs twice at a time
-                or is farther from the cloth at time 0 than its longest edge, or the mesh has no triangles.
+            ValueError: Columns or rows are missing, a number is not allowed, a marker is not bound, occurs twice at a time or
+                is farther from the cloth at time 0 than its longest edge, or the mesh has no triangles.
         """
         names, rows = read_table(path)
         for name in ("time", "x", "y", "z"):
@@ -143,7 +139,7 @@ class Markers:
         """Returns the residuals of these markers on a scene, in at most ``most`` frames, or at rest.
 
         Raises:
-            ValueError: Something does not fit the scene. The message begins with ``name``.
+            ValueError: The markers do not fit the scene; the message begins with ``name``.
         """
         chosen: Any = None
         if self.vertices is not None:
@@ -165,19 +161,16 @@ class Markers:
 
 @dataclass(frozen=True, eq=False)
 class CapturePoints:
-    """Vertices of a capture, whose triangles may change from frame to frame, as free points on the cloth.
+    """Vertices of a capture as free points on the cloth; its triangles may change from frame to frame.
 
-    Each residual is the distance of a vertex from the nearest triangle of the cloth, along the normal of that triangle. The
-    nearest triangles are found again for all parameters in question, and are held while these are varied. What the cloth has in
-    a hole of the capture is not compared. Motion along the surface, as of flat cloth that stretches, is not seen.
+    A residual is the distance of a vertex from the nearest triangle, along its normal; that triangle is held while parameters
+    are varied. Holes of the capture are not compared, and motion along the surface is not seen.
 
     Attributes:
-        capture: The :class:`warpcloth.Capture`, with times from the start of the scene on. Its frames at the times of frames of
-            the scene are used, but that at the start. At rest the last frame counts. It is turned to the up axis of the mesh of
-            the scene. Vertices that are not finite, or in no triangle with finite corners, are left out.
-        points: Largest number of vertices of a frame, which are then every second, third and so on; None takes all.
-        sigma: Standard deviation of the error along the normal [m]; None if it is not known. Errors of vertices count as
-            independent.
+        capture: The capture, turned to the up axis of the scene. Frames after the start at the times of frames of the scene are
+            used; at rest the last one. Vertices that are not finite, or in no finite triangle, are ignored.
+        points: Maximum number of vertices of a frame, taken at a stride; None takes all.
+        sigma: Standard deviation of the error along the normal [m], independent for each vertex; None if unknown.
 
     Raises:
         ValueError: A value is not allowed.
@@ -202,11 +195,11 @@ class CapturePoints:
         """Returns the residuals of these points on a scene.
 
         Raises:
-            ValueError: The mesh has no triangles, or the capture has no times, no frame at the time of a frame of the scene, or
-                another size than the cloth, as with a wrong unit. The message begins with its path, or ``name``.
+            ValueError: The mesh has no triangles, or the capture has no times, no common frame, or another size than the cloth.
+                The message begins with its path, or ``name``.
 
         Warns:
-            UserWarning: Frames of the capture are left out because all their triangles have a corner that is not finite.
+            UserWarning: A frame has no finite triangle and is left out.
         """
         capture = to_up_axis(self.capture, scene.mesh.up_axis, self.capture.up_axis)
         where = name if capture.path is None else str(capture.path)
@@ -236,7 +229,6 @@ class CapturePoints:
         return surface.points[np.unique(solid_triangles(surface))]
 
     def _thinned(self, seen):
-        """Returns the points (k, 3) [m] of each frame, at most ``points`` of them."""
         if self.points is None:
             return seen
         return {frame: points[:: max(1, -(-len(points) // self.points))] for frame, points in seen.items()}
@@ -244,14 +236,14 @@ class CapturePoints:
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """A number that was measured, or several, and the function that reads it from a run.
+    """Measured numbers, and the function that reads them from a run.
 
     Attributes:
         function: From an :class:`warpcloth.run.simulate.Animation` of one copy, or an
-            :class:`warpcloth.run.equilibrium.Equilibrium`, to a number, or to an array of the shape of ``value``. It must be
-            smooth in the parameters, because they are varied by 0.1 %.
-        value: Measured number, or an array; NaN where there is none.
-        sigma: Standard deviation of its error, a number or one for each value; None if it is not known.
+            :class:`warpcloth.run.equilibrium.Equilibrium`, to an array of the shape of ``value``; it must be smooth in the
+            parameters.
+        value: Measured numbers; NaN where missing.
+        sigma: Standard deviation of the error, one number or one per value; None if unknown.
 
     Raises:
         ValueError: A value is not allowed.
@@ -275,7 +267,7 @@ class Reading:
             refuse("reading.sigma", sigma, ~((sigma > 0.0) & np.isfinite(sigma)), "must be a finite number above 0")
 
     def bind(self, name: str, _scene: Scene, _most: int, _resting: bool = False) -> _Read:
-        """Returns the residuals of this reading. Errors begin with ``name``."""
+        """Returns the residuals of this reading; errors begin with ``name``."""
         return _Read(name, self)
 
 
@@ -294,7 +286,7 @@ class _Seen:
         self.last, self.frames = len(seen), np.nonzero(self._known)[0]
 
     def residuals(self, runs):
-        """Residuals in each of the runs, (R, m) [m]; the first run has the parameters, and the others vary them."""
+        """Returns residuals (R, m) [m] of runs; the first has the parameters, the others vary them."""
         points = [np.asarray(run.points, dtype=np.float64) for run in runs]
         points = [each[None] if each.ndim == 2 else each[1 : self.last + 1] for each in points]
         if self._chosen is None:
@@ -320,8 +312,6 @@ class _Seen:
 
 
 class _OnSurface:
-    """Residuals of points of captures, by frame; see :class:`_Seen`."""
-
     def __init__(self, seen, triangles, sigma):
         self._seen = {frame: points for frame, points in sorted(seen.items()) if len(points)}
         self._triangles, self.sigma = triangles, sigma
@@ -342,8 +332,6 @@ class _OnSurface:
 
 
 class _Read:
-    """Residuals of a reading; see :class:`_Seen`."""
-
     last = None
 
     def __init__(self, name, reading):
@@ -368,7 +356,7 @@ class _Read:
 
 
 def no_common_frame(where: str, times: np.ndarray, scene: Scene) -> str:
-    """Returns the sentence that no frame of an animation with these times is at that of a frame of a scene."""
+    """Returns the sentence that an animation with these times has no frame in common with a scene."""
     return (
         f"{where}: has {len(times)} frames from {times[0]:g} to {times[-1]:g} s, none at the time of a frame of the scene; it "
         f"must have one at a multiple of 1/{scene.fps:g} s, up to {scene.frames / scene.fps:g} s"
@@ -376,20 +364,17 @@ def no_common_frame(where: str, times: np.ndarray, scene: Scene) -> str:
 
 
 def _normals(corners):
-    """Unit normals (k, 3) of triangles with corners (k, 3, 3); 0 without area."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
 
 
 def _at(chosen, triangles, points):
-    """Positions of vertices (k,), or of points of triangles, (…, k, 3) [m], of points (…, n, 3) [m]."""
     if isinstance(chosen, tuple):
         return np.einsum("kc,...kci->...ki", chosen[1], points[..., triangles[chosen[0]], :])
     return points[..., chosen, :]
 
 
 def _bound(name, triangles, weights, of_mesh):
-    """Checks indices (k,) of triangles and weights (k, 3), and returns them."""
     given = numeric(f"{name}.triangles", triangles, "have shape (k,)")
     if given.ndim != 1:
         raise ValueError(f"{name}.triangles has shape {given.shape}; it must be (k,)")
@@ -406,7 +391,6 @@ def _bound(name, triangles, weights, of_mesh):
 
 
 def _starts(path, scene, rows):
-    """Returns (triangle, weights (3,)) of the nearest point, by name, of rows (line, name, position (3,)) at time 0."""
     if not rows:
         return {}
     lines, names, points = zip(*rows, strict=True)
@@ -435,7 +419,7 @@ def _refuse_no_triangles(name, scene, purpose="for markers; give the vertices th
 
 
 def _check_size(where, seen, scene):
-    """Checks that a capture, points (k, 3) [m] by frame, is about as large as the cloth: its box without 5 % at each end."""
+    """Checks that a capture, points (k, 3) [m] by frame, is about as large as the cloth, without 5 % at each end."""
     sizes = [np.linalg.norm(np.ptp(np.percentile(each, [5.0, 95.0], axis=0), axis=0)) for each in seen.values() if len(each)]
     cloth = np.linalg.norm(np.ptp(scene.positions, axis=0))
     if sizes and not _SMALLER * cloth <= np.median(sizes) <= _LARGER * cloth:

@@ -4,8 +4,9 @@ import re
 
 import numpy as np
 
+import warpcloth.usd as usd
+
 from ..scene.lines import lines_of
-from ..usd import AnimationWriter, FrameSequence, JoinedFrames
 from .checkpoint import NAME, Checkpoint
 from .history import PAIRS, collider_names, energy_names
 
@@ -13,7 +14,7 @@ REACTION = "reaction"  # name of the primvar
 
 
 def primvar_names(names, kind="energies"):
-    """Returns names of primvars, such as energies:work_of_pins, by the names of their values."""
+    """Returns names of primvars, such as energies:work_of_pins, by those of their values."""
     found = {}
     for name in names:
         key = before = f"{kind}:" + (re.sub(r"\W", "_", name, flags=re.ASCII) or "_")
@@ -55,15 +56,12 @@ class Memory:
 
 
 class File:
-    """Writes frames as USD, with a checkpoint until the run has ended, and reads them back on demand.
+    """Writes frames as USD, with a checkpoint until the run ends, and reads them back on demand.
 
     Args:
-        scene: The :class:`warpcloth.Scene`.
-        output: Path of the file.
         single_file: Whether to end with a single file.
-        facts: Function that returns the :func:`warpcloth.run.checkpoint.facts_of` of the run.
+        facts: Function that returns :func:`warpcloth.run.checkpoint.facts_of` of the run.
         resume: Whether to continue an interrupted run.
-        record: Words of :data:`warpcloth.run.history.RECORDS`.
 
     Attributes:
         checkpoint: The :class:`warpcloth.run.checkpoint.Checkpoint` to continue from, or None.
@@ -87,7 +85,7 @@ class File:
         if stage is None:
             pins = {"pins": scene.pins.vertices} if len(scene.pins.vertices) else None
             lines = lines_of(scene)
-            self.writer = AnimationWriter(
+            self.writer = usd.AnimationWriter(
                 output,
                 scene.mesh,
                 scene.fps,
@@ -101,7 +99,7 @@ class File:
         else:
             cloths = {name: each.prim for name, each in zip(scene.cloths, stage.cloths, strict=True)}
             given = {"source": stage.path, "prim": stage.prim, "history": history, "cloths": cloths}
-            self.writer = AnimationWriter(output, scene.mesh, scene.fps, **given)
+            self.writer = usd.AnimationWriter(output, scene.mesh, scene.fps, **given)
         self.saved = self.writer.saved
         if resume:
             try:
@@ -111,7 +109,6 @@ class File:
                 raise
 
     def _resume(self):
-        """Continues the run of the newest checkpoint."""
         found = self.writer.runs_with(NAME)
         if not found:
             raise ValueError(
@@ -131,7 +128,6 @@ class File:
         return (number + 1) % self.writer.chunk == 0 and self._known() is not None
 
     def _known(self):
-        """Returns the facts, or None if the scene cannot be hashed; such a run cannot be resumed."""
         if self._found is None:
             try:
                 self._found = (self._facts(),)
@@ -140,7 +136,7 @@ class File:
         return self._found[0]
 
     def append(self, points, velocities, state=None, watch=None, recorded=None):
-        """Adds a frame, and writes a checkpoint if state and watch are given and the frame ends a chunk."""
+        """Adds a frame, and at the end of a chunk a checkpoint of state and watch, if given."""
         self.writer.append(points, velocities, history=self._history(recorded or {}))
         if state is not None and self.writer.kept == self.writer.frames:
             chunks, span = self.writer.written()
@@ -148,7 +144,6 @@ class File:
             Checkpoint(frame, self._known(), chunks, span, state, watch.to_host()).write(self.writer.run)
 
     def _history(self, recorded):
-        """Returns the recorded values of a frame by the names of their primvars."""
         found = {}
         if "energies" in recorded:
             found |= dict(zip(self._energies.values(), recorded["energies"][0].tolist(), strict=True))
@@ -164,7 +159,7 @@ class File:
         return found
 
     def finish(self):
-        """Ends the recording of a run that was not interrupted, so that nothing is left to resume."""
+        """Ends an uninterrupted run, which leaves nothing to resume."""
         self._ended = True
         self.close()
 
@@ -179,5 +174,5 @@ class File:
     def read(self):
         path = self.writer.path
         if self._prims:
-            return JoinedFrames(path, self._prims), JoinedFrames(path, self._prims, "velocities")
-        return FrameSequence(path), FrameSequence(path, attribute="velocities")
+            return usd.JoinedFrames(path, self._prims), usd.JoinedFrames(path, self._prims, "velocities")
+        return usd.FrameSequence(path), usd.FrameSequence(path, attribute="velocities")

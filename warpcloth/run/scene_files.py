@@ -8,6 +8,8 @@ import typing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import warpcloth.usd as usd
+
 from ..base.checks import did_you_mean
 from ..base.outputs import STAGE_ENDINGS
 from ..base.texts import allowed, convert, kinds_of_parameter, parameters_of
@@ -16,11 +18,9 @@ from ..mesh.loading import ENDINGS
 from ..mesh.selection import some_vertices
 from ..scene.mesh_scene import mesh_scene
 from ..scene.scene import Scene
-from ..usd import read_scene
 from .listing import folders, list_scenes
 
 _number_of_modules = itertools.count()
-_READERS = dict.fromkeys(STAGE_ENDINGS, read_scene) | dict.fromkeys(ENDINGS, mesh_scene)
 _KINDS = f"a .py file, a USD stage or a mesh ({' '.join(ENDINGS)})"
 
 
@@ -29,10 +29,9 @@ class SceneSource:
     """The source of a scene: the ``scene`` function of a Python file, a USD stage, or a mesh file.
 
     Attributes:
-        path: The file.
         function: Function that returns a :class:`warpcloth.Scene`, called with ``parameters`` by name.
         parameters: Its parameters, `inspect.Parameter` by name.
-        pins: Selection of fixed vertices that replace the pins of the scene, or None.
+        pins: Selection of fixed vertices in place of the pins of the scene, or None.
     """
 
     path: Path
@@ -41,7 +40,7 @@ class SceneSource:
     pins: str | None = None
 
     def values(self, texts):
-        """Returns the values of all parameters: those of ``texts``, text by name, converted, and defaults.
+        """Returns the values of all parameters: converted ``texts`` by name, else defaults.
 
         Raises:
             ValueError: The function does not take a name or a value, or a required value is missing.
@@ -60,8 +59,7 @@ class SceneSource:
         """Builds the scene for the values of the parameters.
 
         Raises:
-            ValueError: The function raises (the message has its file and line) or returns no scene, or ``pins`` selects no
-                vertex.
+            ValueError: The function raises (with file and line) or returns no scene, or ``pins`` selects no vertex.
         """
         if self.path.suffix != ".py":
             scene = self.function(**values)
@@ -78,13 +76,28 @@ class SceneSource:
 def find_source(name, pins=None):
     """Finds a scene: a Python file, a USD stage, a mesh file, or the name of a file in one of :func:`folders`.
 
-    Args:
-        name: Path or name.
-        pins: See :class:`SceneSource`.
-
     Raises:
         FileNotFoundError: There is no such file or name.
         ValueError: The file cannot be loaded, or has no function ``scene``.
+    """
+    path = find_path(name)
+    if path.suffix == ".py":
+        return _python_source(path, pins)
+    if (ending := path.suffix.lower()) not in (*STAGE_ENDINGS, *ENDINGS):
+        animation = ending in (".abc", ".npz", ".npy", *CACHES)
+        hint = "; 'warpcloth convert' makes a stage of .pc2, .mdd, .npz and numbered .obj files" if animation else ""
+        raise ValueError(f"{path}: is no scene; it must be {_KINDS}{hint}")
+    read = usd.read_scene if ending in STAGE_ENDINGS else mesh_scene
+    parameters = parameters_of(read)
+    del parameters["path"]
+    return SceneSource(path, lambda **values: read(str(path), **values), parameters, pins)
+
+
+def find_path(name):
+    """Finds the file of a scene, as :func:`find_source`, and does not read it.
+
+    Raises:
+        FileNotFoundError: There is no such file or name.
     """
     path = Path(name)
     if not path.suffix and path.name == str(name):
@@ -98,16 +111,7 @@ def find_source(name, pins=None):
             )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: {'is a folder, no scene' if path.is_dir() else 'there is no such file'}")
-    if path.suffix == ".py":
-        return _python_source(path, pins)
-    read = _READERS.get(path.suffix.lower())
-    if read is None:
-        animation = path.suffix.lower() in (".abc", ".npz", ".npy", *CACHES)
-        hint = "; 'warpcloth convert' makes a stage of .pc2, .mdd, .npz and numbered .obj files" if animation else ""
-        raise ValueError(f"{path}: is no scene; it must be {_KINDS}{hint}")
-    parameters = parameters_of(read)
-    del parameters["path"]
-    return SceneSource(path, lambda **values: read(str(path), **values), parameters, pins)
+    return path
 
 
 def _python_source(path, pins):

@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -21,7 +21,6 @@ from ..core.status import Status, Stopped, millimetres
 from ..mesh.ordering import order_of_run
 from ..scene.scene import Scene
 from ..solvers.step import Step
-from ..usd import FrameSequence
 from .checkpoint import facts_of
 from .contact_verdicts import (
     Forced,
@@ -40,6 +39,9 @@ from .history import History, checked_record
 from .recorders import File, Memory
 from .watch import Watch, of_copies, watched_frames
 
+if TYPE_CHECKING:
+    from ..usd import FrameSequence
+
 # Limits on the frames that a CUDA device computes ahead: bytes on the host and on the device, fraction of the free memory of
 # the device, and number.
 AHEAD, SHARE, FRAMES = 2**30, 0.25, 1000
@@ -49,19 +51,15 @@ class SelfContactSummary(NamedTuple):
     """The pairs of cloth with cloth, and with meshes among the colliders, in a run.
 
     Attributes:
-        pairs: The largest number of pairs in a list of all copies. A list has the pairs nearer than the contact distance plus
+        pairs: The largest number of pairs in a list, of all copies. A list has the pairs nearer than the contact distance plus
             0.35 of the longest edge.
         lists: Number of lists that were made.
-        kept: The fraction of the moves of free vertices, over all steps, that the filter left whole; with B > 1 copies one
-            value per copy, (B,).
-        least_gap: The smallest distance of a pair in any good frame [m], or (B,); infinite if none was listed.
-        too_near: None if frames are kept in float64, or all gaps in all frames are at least 4 units in the last place of the
-            largest float32 coordinate of the pair. Else a sentence that names the first frame, a vertex there, and the smallest
-            gap.
-        moved_apart: None if no cloth touched other cloth at the start. Else a sentence that says how many vertices were moved,
-            and by how much, see :class:`SelfContact`.
-        held_pins: None if cloth held back no pin. Else a sentence that names the first pin that it held back and the frame, and
-            the largest distance by which it held one back.
+        kept: The fraction of the moves of free vertices that the filter left whole, or (B,).
+        least_gap: The smallest distance of a pair in any good frame [m], or (B,); infinite without pairs.
+        too_near: A sentence about the first frame in which a gap is below 4 units in the last place of the largest float32
+            coordinate of the pair; None otherwise, and for frames in float64.
+        moved_apart: A sentence about the vertices that touched other cloth at the start and were moved, or None.
+        held_pins: A sentence about the pins that cloth held back, with the first frame and the largest distance, or None.
     """
 
     pairs: int
@@ -78,43 +76,39 @@ class Animation(ShownInNotebooks):
     """The result of a run: the start and every good frame after it.
 
     Attributes:
-        points: (frames+1, n, 3) [m]; with B > 1 copies (frames+1, B, n, 3). With ``output`` they are float32, and are read from
-            the file when they are accessed; else they are in memory.
+        points: (frames+1, n, 3) [m], or (frames+1, B, n, 3) with B > 1 copies; with ``output`` float32, read from the file on
+            access.
         velocities: The same shape [m/s].
         times: (frames+1,) [s].
         status: :class:`warpcloth.core.status.Status`.
-        timings: Times [s]: ``compile`` (building the model and binding the solver, which compiles kernels that are not in the
-            cache), ``factorise`` (of constant matrices, a part of ``compile``) and ``frames`` (a list).
-        worst_strain: Largest |l/L − 1| of any edge of the mesh in any frame; with B > 1 copies one value per copy, (B,), over
-            its good frames.
+        timings: Times [s]: ``compile`` (model, binding, kernels not in the cache), ``factorise`` (constant matrices, a part of
+            ``compile``) and ``frames`` (a list).
+        worst_strain: Largest |l/L − 1| of any edge in any good frame, or (B,).
         output: Path of the USD file, or None.
         scene: The :class:`warpcloth.Scene` of the run, or None.
         energies: With ``record="energies"``, a dictionary of arrays (frames+1,) or (frames+1, B) [J]: each term under its
             label, ``"contact with Ball"`` and ``"friction on Ball"`` for a collider called Ball, ``"kinetic"``, ``"gravity"``
-            (0 at the start), and, if the scene has them, ``"work of pins"`` that move, ``"work of loads"``, ``"work of air"``,
-            ``"work of colliders"`` that move, and ``"heat of friction"``. A copy that diverged is NaN from then on.
-        reactions: With ``record="reactions"``, the forces of the pins on the cloth along the axes that they hold, (frames+1, p,
-            3) or (frames+1, B, p, 3) [N], in the order of ``scene.pins.vertices``.
-        collider_forces: With ``record="reactions"``, a dictionary from the name of a collider to the force of the cloth on it,
-            friction included, (frames+1, 3) or (frames+1, B, 3) [N].
-        friction_forces: In the same form, the part of these forces that is friction, for colliders that have friction.
-        pairs: With ``record="pairs"``, a dictionary of arrays (frames+1,) or (frames+1, B), of the pairs of self-contact at the
-            end of each frame: ``"pairs in contact"``, nearer than the contact distance; ``"pairs listed"``; ``"new lists"``
-            made in the frame, a number for all copies; ``"moves kept"``, the fraction of the moves of free vertices that the
-            filter left whole; and ``"least gap"``, the smallest distance of a pair [m], infinite if none is listed.
-        cuts: With a record, the fraction of the moves of free vertices in each frame that the filters of contact cut short,
-            (frames+1,) or (frames+1, B); see ``cut``.
-        cut: The fraction of the moves of free vertices, over all steps, that were cut short because they would have entered or
-            crossed a collider, plus the fraction cut short because cloth would have crossed cloth; with B > 1 copies one value
-            per copy, (B,).
-        inside: A tuple of :class:`Inside`, the first vertex inside each collider that contained one. It is either not free, and
-            the collider moved over it or it into the collider, or it is caught between two obstacles.
-        forced: A tuple of :class:`Forced`, the first time that each mesh moved through cloth that could not get out of its way.
+            (0 at the start), and, if the scene has them, ``"work of pins"``, ``"work of loads"``, ``"work of air"``, ``"work of
+            colliders"`` and ``"heat of friction"``. A copy is NaN after it diverged.
+        reactions: With ``record="reactions"``, forces of the pins on the cloth along held axes, (frames+1, p, 3) or (frames+1,
+            B, p, 3) [N], in the order of ``scene.pins.vertices``.
+        collider_forces: With ``record="reactions"``, forces of the cloth on colliders by name, friction included, (frames+1, 3)
+            or (frames+1, B, 3) [N].
+        friction_forces: In that form, the friction in them, for colliders with friction.
+        pairs: With ``record="pairs"``, a dictionary of arrays (frames+1,) or (frames+1, B) of self-contact at the end of each
+            frame: ``"pairs in contact"`` (nearer than the contact distance), ``"pairs listed"``, ``"new lists"`` (of all
+            copies), ``"moves kept"`` (the fraction of the moves of free vertices that the filter left whole) and ``"least
+            gap"`` [m].
+        cuts: With a record, ``cut`` of each frame.
+        cut: The fraction of the moves of free vertices that the filter of colliders cut short, plus that of the filter of cloth
+            with cloth, or (B,).
+        inside: The first vertex inside each collider that contained one, a tuple of :class:`Inside`.
+        forced: The first time that each mesh moved through cloth, a tuple of :class:`Forced`.
         self_contact: The :class:`SelfContactSummary` of a scene with self-contact or meshes among its colliders, else None.
     """
 
-    points: np.ndarray | FrameSequence
-    velocities: np.ndarray | FrameSequence
+    points: "np.ndarray | FrameSequence"
+    velocities: "np.ndarray | FrameSequence"
     times: np.ndarray
     status: Status
     timings: dict[str, Any]
@@ -148,8 +142,7 @@ class Animation(ShownInNotebooks):
     def of_copy(self, copy: int) -> "Animation":
         """Returns the animation of one of several copies, whose arrays have no axis of copies.
 
-        The result and the message of the status, and of ``self_contact`` the pairs, the lists and the sentences, are those of
-        all copies.
+        The message and result of the status, and pairs, lists and sentences of ``self_contact``, are those of all copies.
 
         Raises:
             ValueError: There is no such copy.
@@ -205,17 +198,15 @@ def simulate(
 ) -> Animation:
     """Runs a scene with a solver.
 
-    For the run, the vertices of a large mesh are reordered if neighbours are far apart in memory, see
-    :func:`warpcloth.mesh.ordering.order_of_run`; results keep the order of the scene. While a frame is written, the next one is
-    computed. Calls from several threads of a process take turns frame by frame, see :mod:`warpcloth.base.turns`.
+    If neighbours are far apart in memory, the run reorders the vertices; results keep the order of the scene. Calls from
+    several threads take turns frame by frame.
 
     Args:
         scene: The :class:`warpcloth.Scene`.
         solver: The solver with its options, such as ``wc.Newton(dt=1/240)``.
-        output: Path of a USD file (.usd, .usda, .usdc, .usdz) to write, frame by frame, so that memory does not grow. If the
-            scene was read from a stage, the animation is a layer over that stage.
+        output: USD file (.usd, .usda, .usdc, .usdz) to write frame by frame; for a scene from a stage, a layer over that stage.
         device: A Warp device.
-        dtype: ``"float32"`` or ``"float64"``, in which the run computes and keeps frames in memory; by default that of
+        dtype: ``"float32"`` or ``"float64"``, of the computation and of frames in memory; by default that of
             :meth:`warpcloth.solvers.step.Step.precision_on`. USD files hold float32.
         frames: Number of frames after the first; by default that of the scene.
         copies: See :class:`warpcloth.model.model.Model`; ``output`` takes one copy.
@@ -225,21 +216,19 @@ def simulate(
         threads: See :class:`warpcloth.model.model.Model`.
         resume: Whether to continue the interrupted run to ``output`` after its last finished chunk of frames. The result equals
             that of an uninterrupted run bit for bit. All arguments but ``frames`` and ``single_file`` must be the same.
-        record: Some of ``"energies"``, ``"reactions"`` and, of a scene with self-contact, ``"pairs"``. The :class:`Animation`
-            then has them for each frame, and ``output`` has them as primvars. The motion is the same bit for bit. With
-            ``"energies"``, the work of moving pins, moving colliders and changing loads, and the work against friction, are
-            summed in every step, which takes more time.
+        record: Some of ``"energies"``, ``"reactions"`` and, with self-contact, ``"pairs"``, for the :class:`Animation` and as
+            primvars of ``output``. The motion keeps its bits; ``"energies"`` sums work in every step, which takes time.
 
     Returns:
-        :class:`Animation`. A run that diverges, or that has no memory for the pairs of self-contact, ends with its last good
-        frame, and ``status`` says so. If one of several copies diverges, the others continue, and it is NaN from then on.
+        :class:`Animation`. A run that diverges, or has no memory for pairs, ends with its last good frame, as ``status`` says.
+        A copy that diverges is NaN from then on; the others continue.
 
     Raises:
         BlockingIOError: Another process or thread is writing ``output``.
-        Interrupted: The user interrupts; a KeyboardInterrupt whose message says which frames are in ``output``.
-        OSError: A file cannot be written; the message also says which frames are in ``output``.
-        ValueError: An argument is not allowed, the scene's stage has changed and no longer fits the frames, or ``output`` has
-            no run to resume, or another one.
+        Interrupted: The user interrupts; a KeyboardInterrupt whose message names the frames in ``output``.
+        OSError: A file cannot be written; the message names the frames in ``output``.
+        ValueError: An argument is not allowed, the scene's stage has changed and no longer fits, or ``output`` has no matching
+            run to resume.
 
     Examples:
         >>> import warpcloth as wc
@@ -311,14 +300,6 @@ def simulate(
 
 @in_turn
 def _self_contact(stepper, watch, in_file, held):
-    """Returns the :class:`SelfContactSummary` of a run that has ended, and notes the gaps of its last frame.
-
-    Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
-        watch: The :class:`warpcloth.run.watch.Watch` of the run.
-        in_file: Whether its frames are in a file, in float32.
-        held: The pins that cloth held back.
-    """
     pairs, model = stepper.pairs, stepper.model
     if pairs is None:
         return None
@@ -347,7 +328,6 @@ def _self_contact(stepper, watch, in_file, held):
 
 @in_turn
 def _resume(checkpoint, frames, stepper, watch):
-    """Sets a stepper and a watch to a checkpoint, and returns the number of its frame."""
     if frames < checkpoint.frame:
         raise ValueError(f"frames is {frames}; the run to be resumed has {checkpoint.frame} already, and this must be no less")
     stepper.state.from_host(checkpoint.state)
@@ -358,7 +338,6 @@ def _resume(checkpoint, frames, stepper, watch):
 
 
 def _refuse_size(frames, scene, dtype, copies, output):
-    """Raises ValueError if the frames do not fit in the free memory or, with an output, on the disk."""
     of = f" of {copies:,} copies" if copies > 1 else ""
     what, numbers = f"frames is {frames:,}{of}", 6 * len(scene.mesh.points) * (int(frames) + 1)
     if output is None:
@@ -368,10 +347,10 @@ def _refuse_size(frames, scene, dtype, copies, output):
 
 
 def _ahead(model, output):
-    """Returns the number of frames to compute ahead of the one that is checked and written.
+    """Returns the number of frames to compute ahead.
 
-    On CUDA, as many as fill ``AHEAD`` bytes or a fraction of the free memory, so that the device need not wait. On the CPU one
-    if there is a file to write and a free core, else none.
+    On CUDA, as many as fill ``AHEAD`` bytes or a fraction of the free memory; on the CPU one if a file is written and a core is
+    free.
     """
     if model.device.is_cuda:
         room = min(AHEAD, int(SHARE * model.device.free_memory))

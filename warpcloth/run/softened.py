@@ -1,8 +1,7 @@
 """Cloth that stretches more easily, whose rest shape is a start for that of stiff cloth.
 
-Newton's method turns a stiff sheet only a little in an iteration, because a straight move of a vertex on an arc stretches edges
-by the square of the angle. If the stiffness against stretch is lowered until gravity strains the cloth noticeably, it takes a
-few long steps. The rest shape of cloth 10 times as stiff is then near.
+Newton's method turns a stiff sheet little in an iteration, because straight moves stretch its edges. Cloth soft enough for a
+noticeable strain under gravity takes a few long steps, and the rest shape of cloth 10 times as stiff is near.
 """
 
 import numpy as np
@@ -19,10 +18,9 @@ EXPANSION = 1e-2
 
 
 def softening(model):
-    """Returns the factors of the stiffness against stretch, the smallest first, all below 0.3; none for cloth that is soft.
+    """Returns factors of the stiffness against stretch, ascending, all below 0.3; none for soft cloth.
 
-    The strain under gravity is estimated as WL/(2S), with the weight W, the diagonal L of the cloth and S = ∂²U/∂ε² for the
-    expansion of its rest shape by ε.
+    The strain under gravity is estimated as WL/(2S): weight W, diagonal L of the cloth, S = ∂²U/∂ε² for its expansion by ε.
     """
     terms = [each for each in model.terms if _stretches(each)]
     weight = float(np.linalg.norm(model.gravity.numpy()[0])) * float(model.mass.numpy()[model.inverse_mass.numpy() > 0.0].sum())
@@ -47,6 +45,5 @@ def softened(model, factor):
 
 
 def _stretches(elements):
-    """Whether a term is that of springs or membranes, of which the local coordinate are the edges of an element."""
     term = elements.term
     return term.vertices in (2, 3) and term.rows == term.vertices - 1 and elements.refresh is None and elements.cells is None

@@ -1,7 +1,6 @@
-"""Sources of energy for a cloth: upper bounds of the energy that the start, pins, loads and colliders add.
+"""Sources of energy for a cloth: upper bounds of what the start, pins, loads and colliders add, as docs/stability.md states.
 
-A part of a scene that adds energy registers a function for its type with ``source_of.register``, so that the check for
-divergence knows no part by name.
+A part of a scene that adds energy registers a function for its type with ``source_of.register``.
 """
 
 from functools import cached_property, singledispatch
@@ -24,53 +23,43 @@ _ROUNDED = 8.0
 
 
 class Source:
-    """A source of energy for a cloth. All its numbers are upper bounds.
+    """A source of energy for a cloth, in upper bounds.
 
     Attributes:
         name: Its name in messages.
-        carried: Names of its attributes that change from frame to frame, which checkpoints keep.
+        carried: Names of attributes that change from frame to frame, for checkpoints.
     """
 
     name = "a source"
     carried: tuple[str, ...] = ()
 
     def energy(self, frame, speed):
-        """Returns the energy that it added up to a frame, (B,) [J]; called once for each frame, in order from 1.
+        """Returns the energy added up to a frame, (B,) [J]; called for each frame in order from 1.
 
-        Args:
-            frame: Number of the frame.
-            speed: Largest RMS speed of each copy in any earlier frame plus what falling adds in one frame, (B,) [m/s].
+        ``speed`` is the maximum RMS speed of each copy so far, plus the speed that falling adds in a frame, (B,) [m/s].
         """
         return 0.0
 
     def speed(self, frame):
-        """Returns the speed at which it moves the whole cloth in a frame [m/s]; energy counts relative to that motion."""
+        """Returns the speed at which it moves the whole cloth in a frame [m/s]."""
         return 0.0
 
     def stored(self, frame):
-        """Returns further energy that it added, (B,) [J]; costly, so called only if the rest does not explain the motion."""
+        """Returns further added energy, (B,) [J]; costly, so called only if the rest does not suffice."""
         return 0.0
 
 
 @singledispatch
 def source_of(part, balance, stepper):
-    """Returns the :class:`Source` that a part of a scene is, or None if it adds no energy.
-
-    Args:
-        part: The part; ``source_of.register`` registers a function for a type.
-        balance: The :class:`warpcloth.run.balance.Balance` that asks.
-        stepper: The :class:`warpcloth.solvers.solver.Stepper` of the run.
-    """
+    """Returns the :class:`Source` that a part of a scene is, or None."""
 
 
 @source_of.register(Stepper)
 class Start(Source):
-    """Kinetic, elastic and contact energy at the start.
+    """Kinetic, elastic and contact energy at the start, and that of closing the gaps of constraints in one step.
 
-    Hard constraints count with the energy of closing their gaps in one step. A chain of N of them moves its end by up to
-    Σ gap ≤ √(N Σ gap²), and midpoint or a relaxation of 2 doubles the speed. Soft constraints count in the same way for solvers
-    whose sweeps may close them too (``closes``). Gaps that are rounding errors have random signs and do not add up along a
-    chain; with N they would explain any motion if steps are short.
+    Soft constraints count for solvers whose sweeps may close them (``closes``). A chain of N moves its end by up to Σ gap ≤ √(N
+    Σ gap²); midpoint or a relaxation of 2 doubles the speed.
     """
 
     name = "the start"
@@ -89,7 +78,7 @@ class Start(Source):
 
     @staticmethod
     def _of_chains(model, elastic, closed):
-        """Returns ½N Σ gap² of constraints at the start (B,) [m²], with N = 1 if their gaps are rounding errors."""
+        """Returns ½N Σ gap² of constraints at the start (B,) [m²], with N = 1 for gaps of rounding."""
         gaps = elastic.gaps(model.positions, closed)
         points = model.in_scene_order(model.positions.numpy()).astype(np.float64)
         rounding = np.finfo(model.numpy_dtype).eps * points * np.random.default_rng(0).choice([-1.0, 1.0], points.shape)
@@ -101,13 +90,10 @@ class Start(Source):
 
 
 class MovingPins(Source):
-    """Pins that keyframes move.
+    """Pins that keyframes move; those joined by edges form a patch, with which the cloth may move as a rigid body.
 
-    Pins joined by edges form a patch. If a patch moves as a rigid body, the cloth can move with it and keep its energy relative
-    to that motion. A change δ of the speed of a patch, over the whole cloth, adds at most ½δ² + δ·speed per unit mass. Apart
-    from that, only motion against gravity and constant loads adds energy. Patches that move relative to one another store at
-    most the energy of the start deformed by them, each vertex by the mean of their motions with weights 1/distance². From
-    colliders, which may hold the cloth back, also a single patch pulls it, see :mod:`warpcloth.run.pulling`.
+    A change δ of the speed of a patch adds at most ½δ² + δ·speed per unit mass. Patches that move relative to one another store
+    at most the energy of the start deformed by the mean of their motions, with weights 1/distance².
     """
 
     name = "moving pins"
@@ -140,7 +126,6 @@ class MovingPins(Source):
         self._lifted = np.maximum.accumulate(np.maximum(heights, 0.0))
 
     def _found(self):
-        """Returns the indices of the pins of each patch."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -167,7 +152,6 @@ class MovingPins(Source):
 
     @cached_property
     def _weights(self):
-        """Weights of the patches at each vertex, (n, P)."""
         from scipy.spatial import cKDTree
 
         pins = self._points[self._balance.model.scene.pins.vertices]
@@ -201,10 +185,8 @@ class MovingPins(Source):
 
 
 class DrivenLoads(Source):
-    """Loads that change or follow the cloth, and all loads on a free cloth; others count as potential energy.
-
-    Forces f on masses m have the power Σ f·v ≤ (Σ f²/m · Σ m v²)^½. With the acceleration a² = Σ f²/m / Σ m they add the speed
-    δ = a/fps in a frame, and so at most ½δ² + δ·speed per unit mass.
+    """Loads that change or follow the cloth, and all loads on a free cloth: in a frame at most ½δ² + δ·speed per unit mass, δ =
+    (Σ f²/m / Σ m)^½/fps.
     """
 
     name = "loads"
@@ -241,7 +223,6 @@ class DrivenLoads(Source):
 
     @staticmethod
     def _during(values, frame):
-        """Returns the larger of the values at the two ends of a frame, between which they are linear."""
         last = len(values) - 1
         return np.maximum(values[min(frame - 1, last)], values[min(frame, last)])
 
@@ -253,7 +234,7 @@ def _loaded(loads: Loads, balance, _stepper):
 
 
 def common_velocity(scene):
-    """Returns the velocity (3,) [m/s] at which pins and colliders all move; 0 if they stand, or move otherwise."""
+    """Returns the common velocity (3,) [m/s] of all pins and colliders; 0 if there is none."""
     moves, frames = [], scene.frames
     for collider in scene.colliders:
         poses = collider.poses
@@ -285,11 +266,8 @@ def moving_collider(collider, balance, stepper):
 
 
 class MovingCollider(Source):
-    """A collider that keyframes move.
-
-    In a frame in which its surface moves at V, it may give each vertex a velocity of up to 2V, as a bat does to a ball, and
-    move it against gravity and constant loads by V over the frame rate. A half-space that turns counts as large as the cloth.
-    It also pulls cloth that something else holds, see :class:`warpcloth.run.pulling.Pull`.
+    """A collider that keyframes move: at a surface speed V it may give each vertex 2V, move it by V over the frame rate, and
+    pull the cloth.
     """
 
     name = "moving colliders"
@@ -326,11 +304,8 @@ def _blowing(air: Air, balance, _stepper):
 
 
 class Wind(Source):
-    """Wind w on a cloth of area A, which gives at most the power Σ ½ρA(C_n + C_t)(w + |v|)w².
-
-    The force is c(w − v) with c ≤ ½ρAC(w + |v|), so its power is at most cw²/4; the factor 4 is for areas that grow and for
-    triangles that are faster than the mean. To a cloth that nothing holds, whose energy is that about its centre of mass, the
-    wind is the true one less the velocity of the centre, at most that of the start and of a free fall.
+    """Wind w on a cloth of area A, of at most the power Σ ½ρA(C_n + C_t)(w + |v|)w²; for free cloth relative to its centre of
+    mass.
     """
 
     name = "wind"

@@ -1,12 +1,9 @@
-"""How far the last step of a frame ended from its solution, and the energy that cloth stores there.
+"""Bounds how far the last step of a frame ended from its solution, and the energy that cloth stores there.
 
-An implicit step minimises φ(d) = 1/(2hₑ²)‖d‖²_M + U(x̃ + d), d = x − x̃. With the residual r = ∇φ at the end of the step, a
-length bounds the distance to the minimiser where U is convex: hₑ² max ‖rᵢ‖/mᵢ, because the Hessian of φ is at least M/hₑ².
-Stiff cloth is much nearer, as its Hessian is much larger. Where the bound exceeds what is allowed, one Newton step with the
-Hessian of φ, made semi-definite element by element, tells the distance: ‖H⁻¹r‖ (Nocedal and Wright 2006, *Numerical
-Optimization*, 3.3). In the same way φ is at most ½hₑ² rᵀM⁻¹r above its minimum.
-
-What contact changes after the minimiser counts too: r is taken where the step ends.
+An implicit step minimises φ(d) = 1/(2hₑ²)‖d‖²_M + U(x̃ + d). With r = ∇φ where the step ends, after contact, the distance to
+the minimiser is at most hₑ² max ‖rᵢ‖/mᵢ where U is convex, and φ at most ½hₑ² rᵀM⁻¹r above its minimum. Where the bound exceeds
+what is allowed, one Newton step with a semi-definite Hessian estimates the distance ‖H⁻¹r‖ (Nocedal and Wright 2006, *Numerical
+Optimization*, 3.3).
 """
 
 from typing import NamedTuple
@@ -39,17 +36,15 @@ class StepError(NamedTuple):
     """The error of the steps of each copy at the end of a frame, (B,) arrays.
 
     Attributes:
-        distance: The largest distance of a vertex from the solution of the step in this and earlier frames [m].
+        distance: The largest distance of a vertex from the solution of a step so far [m].
         solved: The bound in the last frame with a Newton step [m].
-        ratio: The distance that it found over this bound.
-        gap: The largest distance along its normal of a vertex in contact, of those that Newton steps found, over the contact
-            distance.
-        unresolved: Whether contact of a vertex is not resolved at the end of this frame and the one before, see
-            :func:`warpcloth.kernels.step_error.unresolved_contact`.
+        ratio: The distance of that Newton step over the bound.
+        gap: The largest normal distance of a vertex in contact that Newton steps found, over the contact distance.
+        unresolved: Whether contact of a vertex is not resolved at the end of this frame and the one before.
         elastic: Elastic energy [J].
         contact: Energy of contact [J].
-        largest: The largest energy of an element above that of the strain :data:`STRAIN` in it, (√u − √u_ε)² [J].
-        pushed: The energy that contact added when it changed positions at the end of the step [J].
+        largest: The largest excess of an element's energy over that of the strain :data:`STRAIN`, (√u − √u_ε)² [J].
+        pushed: The energy that contact added when it changed positions [J].
         excess: The bound of φ above its minimum, before contact changed positions [J].
         he: hₑ of the step [s].
     """
@@ -71,13 +66,12 @@ class StepErrors:
     """Finds the :class:`StepError` of each frame of a stepper.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
-        near: The bound above which a Newton step tells the distance [m].
-        allowed: The distance that a Newton step must confirm when the bound and the last ratio predict more [m].
+        near: The bound above which a Newton step estimates the distance [m].
+        allowed: The distance that a Newton step must confirm if bound and last ratio predict more [m].
 
     Attributes:
-        distance, solved, ratio, gap: See :class:`StepError`, of the frames so far.
-        knows: Whether ``distance`` is that from the solution; else it is 0, or the largest gap of constraints alone.
+        distance, solved, ratio, gap: As of :class:`StepError`.
+        knows: Whether ``distance`` is that from the solution, not 0 or the largest gap of constraints.
     """
 
     def __init__(self, stepper, near, allowed):
@@ -126,19 +120,18 @@ class StepErrors:
 
 
 def _measured(stepper):
-    """Returns what measures the steps of a stepper: an object with ``measure`` and, if ``solves``, ``solve``."""
     if stepper.integrator is None:
         return _Stored(stepper)
     return (_Gaps if any(elements.hard for elements in stepper.model.terms) else _Residuals)(stepper)
 
 
 class _Stored:
-    """The energy that the cloth of a stepper stores, without contact; its steps solve nothing, as those of :class:`Explicit`.
+    """The stored energy without contact; its steps solve nothing, as those of :class:`Explicit`.
 
     Attributes:
         bound: The largest acceleration ‖rᵢ‖/mᵢ of each copy, (B,) [m/s²].
-        energies: The energies of :class:`StepError` in their order, each (B,) [J]. Before they are read, ``pushed`` is the
-            energy before contact changed positions, and ``excess`` Σ ‖rᵢ‖²/mᵢ.
+        energies: The energies of :class:`StepError`, (B,) [J]; until read, ``pushed`` is the energy before contact changed
+            positions, and ``excess`` Σ ‖rᵢ‖²/mᵢ.
     """
 
     solves = False
@@ -159,7 +152,7 @@ class _Stored:
         self._measure = self._launch if stepper.model.dynamic else Segment(model.device, self._launch)
 
     def measure(self):
-        """Returns the bound of the distance (B,) [m], and the energies of :class:`StepError` in their order, (5, B) [J]."""
+        """Returns the bound (B,) [m], and the energies of :class:`StepError` in order, (5, B) [J]."""
         self._measure()
         bound, *energies = (mirror.read().copy() for mirror in self._read)
         return bound, np.array(energies)
@@ -181,7 +174,7 @@ class _Stored:
 
 
 class _Peak:
-    """The largest energy of an element of a term above that of the strain :data:`STRAIN`, of each copy."""
+    """The largest excess of an element's energy over that of the strain :data:`STRAIN`, of each copy."""
 
     def __init__(self, model, energy, k):
         self._model, self._values = model, energy.of_elements[k]
@@ -193,7 +186,7 @@ class _Peak:
         self._subtract, self._keep = model.kernel(kernels.energy_above), model.kernel(keep_largest)
 
     def launch(self, out):
-        """Launches out (B,) = max(out, the largest) [J], from the energies of elements as they were computed last."""
+        """Launches out (B,) = max(out, the largest) [J], from the last energies of elements."""
         model = self._model
         model.launch(self._subtract, len(self._values), [self._values, self._allowed], [self._above])
         self._rows.largest(self._above, self._found)
@@ -201,7 +194,7 @@ class _Peak:
 
 
 class _Gaps(_Stored):
-    """Steps with constraints of infinite stiffness, which have no residual: the bound is the largest gap of such a one."""
+    """Steps with constraints of infinite stiffness; the bound is the largest gap."""
 
     def _prepare(self):
         hard = [each for each in self.stepper.declared.terms if each.hard and each.collider is None]
@@ -221,8 +214,6 @@ class _Gaps(_Stored):
 
 
 class _Residuals(_Stored):
-    """Steps whose residual is ∇φ."""
-
     solves = True
 
     def _prepare(self):
@@ -246,7 +237,6 @@ class _Residuals(_Stored):
         self._taken.launch()
 
     def launch_sums(self, first):
-        """Launches the largest ‖rᵢ‖/mᵢ; with ``first`` also Σ ‖rᵢ‖²/mᵢ."""
         self.model.lock(self.residual)
         self.model.lock(self.weighted)
         self.sums.largest(self.model.inverse_mass, self.residual, self.bound)
@@ -254,26 +244,21 @@ class _Residuals(_Stored):
             self.sums.dot(self.weighted, self.weighted, self.energies[4])
 
     def launch_before(self, step, x, d):
-        """Launches the energy before contact changed positions, at x + d."""
         if self._pushes:
             self._before.add(x, self.energies[3], d)
             self.launch_contact(step, x, d, self.energies[3])
 
     def launch_contact(self, step, x, d, out):
-        """Launches out (B,) += the energy of contact at x + d [J]."""
         if step.contact is not None:
             step.contact.add(x, out, d)
 
     def solve(self):
-        """Returns the distance from the solution of the step by a Newton step, (B,) [m], and :attr:`StepError.gap` there."""
+        """Returns the distance by a Newton step, (B,) [m], and :attr:`StepError.gap` there."""
         return self._taken.solve()
 
     def unresolved(self, bound, counts):
-        """Returns whether contact of a vertex is not resolved, of each copy, (B,).
-
-        Args:
-            bound: Of the distance, (B,) [m].
-            counts: The frames in a row in which contact of each vertex was not resolved, (N,) int32, to be updated.
+        """Returns whether contact of a vertex is not resolved, (B,); updates ``counts`` (N,), the frames in a row without
+        resolution.
         """
         if (bound > 0.5 * self._taken.contact_distance).any():  # no smaller residual unbalances half of such a force
             return self._taken.unresolved(counts)
@@ -282,12 +267,7 @@ class _Residuals(_Stored):
 
 
 class _Step:
-    """φ of the steps of a stepper.
-
-    Args:
-        stepper: The stepper.
-        of: The :class:`_Residuals` that it serves, whose arrays it uses.
-    """
+    """φ of the steps of a stepper, in the arrays of the :class:`_Residuals` ``of``."""
 
     def __init__(self, stepper, of):
         self.stepper, self._of, self._newton = stepper, of, None
@@ -309,7 +289,6 @@ class _Step:
             self._forces = self.model.vectors(), self.model.vectors() if dynamic else None
 
     def launch(self):
-        """Launches ∇φ at the end of the step and its sums, and the energy of contact there."""
         stepper, of, d = self.stepper, self._of, self.stepper.correction
         self._launch_residual(d)
         of.launch_sums(True)
@@ -330,7 +309,6 @@ class _Step:
         of.kernels(kernels.finish_residual, model.count, given, [of.residual, of.weighted])
 
     def solve(self):
-        """Returns ‖H⁻¹r‖ of each copy, the largest of a vertex, (B,) [m], and :attr:`StepError.gap`."""
         model = self.model
         if self._newton is None:
             terms, dynamic = self._copy_by_copy(), model.dynamic
@@ -350,7 +328,7 @@ class _Step:
         return distance, np.max(gaps, axis=0)
 
     def _copy_by_copy(self):
-        """Returns the elements in the order of copies, which a Hessian needs; sweeps sort elements by colour."""
+        """Returns the elements in the order of copies, which a Hessian needs."""
         present, sorted_ones = self.stepper.elements, self.model.terms
         if self.model.copies == 1:
             return sorted_ones
@@ -358,7 +336,6 @@ class _Step:
         return tuple(a if np.array_equal(host_values(a.stencil), host_values(b.stencil)) else b for a, b in pairs)
 
     def unresolved(self, counts):
-        """See :meth:`_Residuals.unresolved`."""
         model = self.model
         if self._wrong is None:
             self._count, self._ones = model.kernel(kernels.unresolved_contact, model.dtype), model.constant(1.0, model.count)
@@ -373,7 +350,7 @@ class _Step:
         of.sums.largest(self._ones, of.weighted, self._wrong.array)
 
     def _launch_pushes(self):
-        """Launches the forces of contact that is terms, and of pairs, and returns them, the latter or None."""
+        """Launches the forces of contact of terms and of pairs, and returns both; those of pairs may be None."""
         for pushes, force in zip(self._pushes, self._forces, strict=True):
             if pushes is not None:
                 force.zero_()
@@ -382,7 +359,6 @@ class _Step:
 
     @property
     def _moved(self):
-        """d at the end of the step (N,) [m]."""
         return self.stepper.correction if self.stepper.unfiltered is None else self._of.moved
 
     def _launch_newton(self):
@@ -402,7 +378,7 @@ class _Step:
 def _contact_distances(scene):
     """Returns the contact distance of colliders that are not meshes, and that of pairs [m]; 0 for what the scene does not have.
 
-    Where cloth meets itself and meshes, a vertex may have both kinds of pairs: then the larger distance counts.
+    A vertex in both kinds of pairs has the larger distance.
     """
     of_pairs = [scene.contact] * bool(scene.meshes) + [scene.self_contact] * (scene.self_contact is not None)
     of_terms = scene.contact.distance if scene.colliders else 0.0

@@ -1,4 +1,4 @@
-"""Detects runs that have diverged, as opposed to runs that are merely fast, and ends them; and grades all others."""
+"""Ends runs that have diverged, and grades all others."""
 
 from contextlib import closing
 
@@ -14,18 +14,10 @@ from .grades import Grades
 
 
 def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
-    """Yields the frames of a stepper while a copy is good: the loop of every run.
+    """Yields the number of each frame up to ``frames``, and the frame, while a copy is good; diverged copies are NaN.
 
-    Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
-        watch: The :class:`Watch`; it also notes how the last frame ended, good or not.
-        frames: Number of the last frame.
-        ahead: See :func:`warpcloth.run.frames_ahead.frames_of`.
-        first: Number of the frame at which the stepper is.
-        keeps: Function (number of a frame) → whether it includes the state of the stepper; or None.
-
-    Yields:
-        The number of each frame and the :class:`warpcloth.run.frames_ahead.Frame`, in which copies that diverged are NaN.
+    This is the loop of every run. The watch also notes how the last frame ended. ``first`` is the stepper's frame, ``keeps`` a
+    function (number) → whether a frame includes the state, or None.
     """
     if first == frames:
         return
@@ -41,36 +33,29 @@ def watched_frames(stepper, watch, frames, ahead=0, first=0, keeps=None):
 
 
 def of_copies(values):
-    """Returns one value per copy, (B,), or a float if there is one copy."""
+    """Returns values per copy (B,), or a float of one copy."""
     return np.array(values) if len(values) > 1 else float(values[0])
 
 
 class Watch:
-    """Detects copies that have diverged, from frames alone and for every solver.
+    """Detects diverged copies, from frames alone and for every solver.
 
-    A copy has diverged if a value is not finite, a step of the solver says so, its energy exceeds what the sources can have
-    added, or an edge is longer than that energy explains; see :mod:`warpcloth.run.balance`. Frames are in the order of the
-    scene.
+    A copy has diverged if a value is not finite, a step says so, its energy exceeds what the sources can have added, or an edge
+    is longer than that energy explains. Frames are in the order of the scene.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
         stretched: Strain of an edge above which its energy is checked.
-        grades: Whether to find the errors of steps, from which :meth:`status` grades the run.
+        grades: Whether to find the errors of steps, for the grade.
 
     Attributes:
         good: The last good frame of each copy (B,).
         alive: Whether a copy is still good (B,).
-        growth: Largest kinetic and potential energy in a good frame, over what the sources can have added, (B,).
-        last: The last checked :class:`warpcloth.run.frames_ahead.Frame`; before the first, the state of the stepper.
+        growth: Largest kinetic and potential energy in a good frame over that of the sources, (B,).
+        last: The last checked frame; before the first, the state of the stepper.
         stopped: Whether the run could not go on.
-        seconds: Time of the computation of each frame [s], a list.
-        history: The :class:`warpcloth.run.history.History` of the run, if it has one.
+        seconds: Computation time of each frame [s].
         worst_strain: Largest |l/L − 1| of an edge of the mesh in a good frame of each copy, (B,).
-        grades: The :class:`warpcloth.run.grades.Grades` of the run, or None.
-        pressed: The :class:`warpcloth.run.contact_verdicts.Pressed` of a run with grades and colliders, else None.
-        least_gap: The smallest distance between cloth and cloth in the frames of each copy before its last checked one, (B,)
-            [m]. The stepper may be ahead of that frame, and goes on with copies that have diverged.
+        least_gap: The smallest distance of cloth to cloth in the frames before the last checked one, (B,) [m].
     """
 
     @in_turn
@@ -88,12 +73,7 @@ class Watch:
         self.least_gap = np.full(model.copies, np.inf)
 
     def passes(self, number, frame):
-        """Checks a frame, and sets copies that diverged to NaN. Returns whether a copy is still good.
-
-        Args:
-            number: Number of the frame; they come in order from 1.
-            frame: The :class:`warpcloth.run.frames_ahead.Frame`.
-        """
+        """Checks a frame, in order from 1, sets diverged copies to NaN, and returns whether a copy is still good."""
         self.last, points, velocities = frame, frame.points, frame.velocities
         self.seconds.append(frame.seconds)
         B, n = self.model.copies, self.model.per_copy
@@ -155,7 +135,6 @@ class Watch:
             self.messages[copy] = f"stopped before the end of frame {number}{of_copy}: {why}"
 
     def _carried(self):
-        """Returns pairs (object, names of its attributes that change from frame to frame)."""
         yield self, ("worst_strain", "good", "alive", "growth", "seconds")
         yield self.balance, self.balance.carried
         for source in self.balance.sources:
@@ -170,7 +149,7 @@ class Watch:
         return {f"{k} {name}": np.array(getattr(part, name)) for k, (part, names) in parts for name in names}
 
     def from_host(self, values, state):
-        """Sets the values of :meth:`to_host`, for a run that continues from a :class:`warpcloth.core.state.State`."""
+        """Sets the values of :meth:`to_host`, for a run that continues from a state."""
         for k, (part, names) in enumerate(self._carried()):
             for name in names:
                 found = values[f"{k} {name}"]
@@ -180,7 +159,6 @@ class Watch:
             self.grades.go_on()
 
     def _strain(self, points):
-        """Returns the largest |l/L − 1| of an edge of each copy, (B,), for points (B, n, 3); NaN for copies that diverged."""
         squares = np.zeros((int(self.alive.sum()), len(self.rest)))
         with np.errstate(over="ignore", invalid="ignore"):
             for column in np.moveaxis(points[self.alive], -1, 0):  # by columns, 15 times as fast as by rows of three
@@ -192,13 +170,7 @@ class Watch:
 
     @in_turn
     def status(self, solver, faults=(), warnings=()):
-        """Returns the :class:`Status` of a run from its last frame.
-
-        Args:
-            solver: The record of the solver.
-            faults: Further reasons why a copy is not usable, tuples (copy, frame, sentence).
-            warnings: Sentences that follow the message of a usable run.
-        """
+        """Returns the :class:`Status` of a run, from its last frame, further faults (copy, frame, sentence) and warnings."""
         results, residual = self.last.results, self.last.residual
         ended = [Result.STOPPED if self.stopped and alive else Result.DIVERGED for alive in self.alive]
         results = [ended[copy] if copy in self.messages else result for copy, result in enumerate(results)]

@@ -15,22 +15,20 @@ class Air:
     """Air that resists the motion of the cloth and that wind moves.
 
     Each triangle of area A receives F = ½ρA(C_n|u_n|u_n n + C_t|u_t|u_t). u is the wind minus the velocity of the triangle, u_n
-    its part along the normal n, u_t the rest. In a step, C|u| and n are those where the step begins, so that F is linear in the
-    velocity; implicit solvers take it with the velocity at the end of the step. In still air it never adds energy.
+    its part along the normal n, u_t the rest. C|u| and n are those where a step begins, so F is linear in the velocity;
+    implicit solvers take it at the end of the step. In still air it never adds energy.
 
     Attributes:
-        wind: [m/s], (3,), or (T, 3) with one for each triangle. Or a Warp function of a position ``wp.vec3`` [m] and a time
-            ``float`` [s] from the start, both float32, that returns a ``wp.vec3``. Steps call it at the centres of the
-            triangles, at the time at which they take forces.
-        keyframes: (F, 3) [m/s], in place of ``wind``: a wind that is the same everywhere, at frames 0 … F−1 of the scene;
-            linear between them, and constant after the last.
+        wind: [m/s], (3,), or (T, 3) of triangles; or a Warp function of a position ``wp.vec3`` [m] and a time ``float`` [s],
+            float32, that returns a ``wp.vec3``, called at the centres of triangles when forces are taken.
+        keyframes: (F, 3) [m/s], in place of ``wind``: a uniform wind at frames 0 … F−1, linear between, constant after.
         density: ρ [kg/m³].
         normal_drag: C_n, by default that of a flat plate across the wind.
         tangential_drag: C_t, friction along the surface.
-        max_speed: The largest speed of a function [m/s], from which limits of steps follow; faster wind is slowed to it.
+        max_speed: The largest speed of a function [m/s], for step limits; faster wind is slowed to it.
 
     Raises:
-        ValueError: If a value is not allowed.
+        ValueError: A value is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -87,10 +85,7 @@ class Air:
 
     @property
     def winds(self) -> np.ndarray:
-        """All winds that it has, (3,), (T, 3) or (F, 3) [m/s]; 0 if neither ``wind`` nor ``keyframes`` is given.
-
-        Of a function, a vector of its largest speed.
-        """
+        """All winds, (3,), (T, 3) or (F, 3) [m/s]; of a function its largest speed, else 0."""
         if self.max_speed is not None:
             return np.array([self.max_speed, 0.0, 0.0])
         if self.keyframes is not None:
@@ -104,7 +99,6 @@ class Air:
 
 
 def _check_function(wind):
-    """Checks that a function is Warp's, and takes a position and a time. What it returns is checked when it is compiled."""
     if not isinstance(wind, wp.Function):
         raise ValueError(f"air.wind is {shown(wind)}, which is not a Warp function; decorate it with @wp.func")
     for overload in (*getattr(wind, "user_templates", {}).values(), *getattr(wind, "user_overloads", {}).values()):

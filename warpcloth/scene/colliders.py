@@ -1,4 +1,4 @@
-"""Colliders: static or moving rigid shapes, and the contact of cloth with them."""
+"""Colliders: static or moving shapes, and the contact of cloth with them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from ..base.checks import array, as_array, keep_plain, number, shown
 from ..base.quiet import find_device
 from ..base.turns import in_turn
 from ..base.types import Converted, default
-from ..kernels.contact.colliders import find_distances
+from ..kernels.nearest import find_distances
 from ..kernels.terms.contact import ROUNDED_BOX, Solid
 
 
@@ -19,19 +19,17 @@ from ..kernels.terms.contact import ROUNDED_BOX, Solid
 class Contact:
     """Contact of cloth with colliders: a pressure of k(r − d) at distances r/2 ≤ d < r, and of kr²/(4d) at d < r/2.
 
-    The energy is U = Σ kA φ(d) over the vertices, where A is the area of a vertex; see :mod:`warpcloth.kernels.terms.contact`.
-    Meshes are met by vertices, edges and triangles of the cloth, as cloth meets itself in :class:`warpcloth.SelfContact`.
-    A pressure p leaves a gap of r − p/k, or of kr²/(4p) if p is above kr/2. Friction also has the stiffness k: a vertex that
-    sticks moves by up to μN/(kA) before it slides.
+    The energy is U = Σ kA φ(d) over the vertices, A the area of a vertex (:mod:`warpcloth.kernels.terms.contact`). Meshes meet
+    vertices, edges and triangles, as in :class:`warpcloth.SelfContact`. A pressure p leaves a gap of r − p/k, or of kr²/(4p) if
+    p is above kr/2. A vertex that sticks moves by up to μN/(kA) before it slides.
 
     Attributes:
-        distance: Contact distance r [m]. None lets the scene set it: to half of its thickness, or to 1 mm without one.
-        stiffness: k [Pa/m]; infinite for solvers that take hard constraints, but not with meshes. By default
-            (2/r)(wL/r + Y/L) with the weight w of the cloth per area [Pa], its stiffness Y, force per width and strain [N/m],
-            and its size L, the root of its area [m]; see :func:`warpcloth.scene.colliders.default_stiffness`.
+        distance: Contact distance r [m]; by default half of the scene's thickness, or 1 mm without one.
+        stiffness: k [Pa/m]; infinite for solvers that take hard constraints, without meshes. By default (2/r)(wL/r + Y/L):
+            weight per area w [Pa], stiffness Y [N/m], force per width and strain, and root L of the area [m].
 
     Raises:
-        ValueError: If a value is not allowed.
+        ValueError: A value is not allowed.
     """
 
     distance: Converted[float | None, float] = default(None)
@@ -47,17 +45,17 @@ class Contact:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Collider:
-    """The base class of colliders: a frame that moves by keyframes, and a shape in it.
+    """A frame that moves by keyframes, and a shape in it.
 
-    Another shape is a subclass with a ``solid``, a :class:`warpcloth.kernels.terms.contact.Solid`, whose device function gives
-    the signed distance d of a point and ∇d from the numbers in ``core``.
+    A subclass has a ``solid``, a :class:`warpcloth.kernels.terms.contact.Solid`, whose device function gives the signed
+    distance d of a point and ∇d from the numbers in ``core``.
 
     Attributes:
-        position: Position of its centre, (3,) [m], or positions at frames 0 … F−1 of the scene, (F, 3).
-        rotation: Rotation as a unit quaternion (x, y, z, w), (4,), or at these frames, (F, 4). Between frames it moves linearly
-            and rotates at constant speed, by the smaller angle; after the last it stands still.
+        position: Position of its centre, (3,) or at frames 0 … F−1 (F, 3) [m].
+        rotation: Unit quaternion (x, y, z, w), (4,) or at these frames (F, 4). Between frames it moves linearly and rotates
+            uniformly by the smaller angle; after the last it stands.
         friction: Coefficient μ of friction.
-        name: Name in messages and files; by default that of the class.
+        name: Name in messages and files.
 
     Raises:
         ValueError: A value is not allowed.
@@ -98,22 +96,18 @@ class Collider:
 
     @property
     def core(self) -> tuple[np.ndarray, float]:
-        """Half sizes of a box (3,), and the radius by which it is inflated [m] to contain the shape, whose sizes these are."""
+        """Half sizes of a box (3,), and the radius that inflates it [m] to contain the shape."""
         raise NotImplementedError  # each shape has its own
 
     @property
     def bounds(self) -> tuple[np.ndarray, float]:
-        """Half sizes and radius, as for :attr:`core`, of a shape that contains it at all frames."""
+        """:attr:`core` of a shape that contains it at all frames."""
         return self.core
 
     def clearing_gap(self, edge: float) -> float:
-        """Returns the gap d = √(R² + L²/3) − R of its vertices [m] that keeps a triangle outside.
+        """Returns the gap d = √(R² + L²/3) − R of vertices [m] that keeps a triangle with the longest edge L [m] outside.
 
-        R is the radius by which the shape is rounded, 0 for a box. Each point of the triangle is within L/√3 of a vertex. If it
-        is the nearest to a centre of rounding, at the distance h, then (R + d)² ≤ h² + L²/3, so h is not below R.
-
-        Args:
-            edge: The longest edge L of the triangle [m].
+        R is the radius of rounding, 0 for a box; each point of the triangle is within L/√3 of a vertex.
         """
         half, radius = self.core
         return 0.0 if np.isinf(half[0]) else float(np.sqrt(radius**2 + edge**2 / 3.0) - radius)
@@ -126,12 +120,12 @@ class Collider:
 
     @property
     def deforms(self) -> np.ndarray:
-        """Largest displacement of a point in its own frame from each keyframe to the next, (F − 1,) [m]; empty if rigid."""
+        """Largest displacement of a point in its frame between keyframes, (F − 1,) [m]; empty if rigid."""
         return np.zeros(0)
 
     @property
     def up(self) -> np.ndarray:
-        """The y axis of the frame of :attr:`core`, as a direction in the frame of ``rotation``, (3,)."""
+        """The y axis of the frame of :attr:`core` in that of ``rotation``, (3,)."""
         return np.array([0.0, 1.0, 0.0])
 
     @property
@@ -140,17 +134,17 @@ class Collider:
         return len(self.poses) > 1
 
     def at_last(self) -> "Collider":
-        """Returns a static collider at the last keyframe of this one."""
+        """Returns a static collider at the last keyframe."""
         position, rotation = np.atleast_2d(self.position)[-1], np.atleast_2d(self.rotation)[-1]
         return replace(self, position=position, rotation=rotation)
 
     def centred(self) -> "Collider":
-        """Returns this collider with its frame moved to the centre of its shape, which float32 needs."""
+        """Returns this collider with its frame at the centre of its shape, as float32 needs."""
         return self
 
     @property
     def most_move(self) -> float:
-        """Upper bound of how far a point of :attr:`bounds` moves in a frame [m]; infinite for a plane that turns."""
+        """Upper bound of the move of a point of :attr:`bounds` in a frame [m]; infinite for a plane that turns."""
         poses = self.poses
         turns = 2.0 * np.arccos(np.clip(np.einsum("fi,fi->f", poses[1:, 3:], poses[:-1, 3:]), -1.0, 1.0))
         turned = np.zeros_like(turns)  # turns of 1e-8 are rounding, and would be infinite moves of planes
@@ -159,7 +153,7 @@ class Collider:
 
     @property
     def poses(self) -> np.ndarray:
-        """Position and quaternion (x, y, z, w) of the frame of :attr:`core` at each frame, (F, 7); F = 1 if it is static."""
+        """Position and quaternion of the frame of :attr:`core` at each frame, (F, 7); F = 1 if static."""
         rotations = _product(np.atleast_2d(self.rotation), from_y(self.up))
         lengths = np.linalg.norm(rotations, axis=1)
         lengths[np.abs(lengths - 1.0) < 1e-15] = 1.0  # so that normalising twice changes no bit
@@ -177,7 +171,7 @@ class Collider:
         return _distances(self.solid, local.reshape(-1, 3), half, radius).reshape(local.shape[:-1])
 
     def is_near(self, points: np.ndarray, distance: float, frame: int = 0) -> bool:
-        """Returns whether one of points (n, 3) [m] is nearer to its surface than a distance [m], or inside it, at a frame."""
+        """Returns whether one of points (n, 3) [m] is nearer than a distance [m], or inside, at a frame."""
         return bool((self.distances(points, frame) < distance).any())
 
 
@@ -277,7 +271,6 @@ class Box(Collider):
 
 @in_turn
 def _distances(solid, points, half, radius):
-    """Signed distances (k,) of points (k, 3) in the frame of a shape, by its device function."""
     with wp.ScopedDevice(find_device("cpu")):
         out = wp.zeros(len(points), dtype=wp.float64)
         given = [wp.array(points, dtype=wp.vec3d), wp.vec3d(half), float(radius)]
@@ -286,7 +279,6 @@ def _distances(solid, points, half, radius):
 
 
 def _direction(name, given):
-    """Returns a vector of length 1 along the given one."""
     values = array(name, given, (3,))
     length = np.linalg.norm(values)
     if not length > 0.0:
@@ -303,7 +295,6 @@ def from_y(directions):
 
 
 def _product(p, q):
-    """Returns products of quaternions (F, 4) and (4,)."""
     u, v = p[:, :3], q[:3]
     vector = p[:, 3:] * v + q[3] * u + np.cross(u, v)
     return np.column_stack([vector, p[:, 3] * q[3] - u @ v])
@@ -318,11 +309,9 @@ def turned(q, vectors):
 def default_stiffness(distance: float, weight: float, stiffness: float, size: float) -> float:
     """Returns k = (2/r)(wL/r + Y/L) [Pa/m], at which a gap of r/2 carries the pressures kr/2 that hold or pull a whole cloth.
 
-    A tension T [N/m] presses on an edge of radius R by T/R. The smallest radius that contact resolves is r. The first pressure
-    is that of T = wL, when the cloth hangs over such an edge; pads of a height of r/2μ, pressed to a gap of r/2, therefore hold
-    a sheet by friction. The second is that of T = Yr/L, when the cloth is pulled over it until it is longer by r. k depends
-    neither on the step nor on the mesh. It adds less to the highest frequency of a mesh than its membrane does if edges are
-    shorter than about 2√(rL), and weight strains the cloth by less than r/L.
+    A tension T [N/m] presses on an edge of radius R ≥ r by T/R. The first pressure is that of T = wL, cloth that hangs over
+    such an edge; the second of T = Yr/L, cloth pulled over it until it is longer by r. It adds less to the highest frequency of
+    a mesh than its membrane does if edges are below about 2√(rL) and weight strains the cloth by less than r/L.
 
     Args:
         distance: Contact distance r [m].
@@ -334,7 +323,7 @@ def default_stiffness(distance: float, weight: float, stiffness: float, size: fl
 
 
 def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:
-    """Returns the given colliders as a tuple.
+    """Returns colliders as a tuple.
 
     Raises:
         ValueError: They are not a list of colliders.
@@ -349,17 +338,7 @@ def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:
 
 
 def refuse_inside(colliders: Sequence[Collider], positions: np.ndarray, free: np.ndarray, copy: str = "") -> None:
-    """Checks that no free vertex starts inside a collider.
-
-    Args:
-        colliders: The colliders.
-        positions: Initial positions, (n, 3) [m].
-        free: Which vertices move, (n,).
-        copy: Words for the error message that name the copy, or "".
-
-    Raises:
-        ValueError: One does. The message names the first vertex and the collider.
-    """
+    """Raises ValueError with the first free vertex of positions (n, 3) [m] in a collider, and a ``copy`` in words, or ""."""
     for collider in colliders:
         found = collider.distances(positions)
         for vertex in np.flatnonzero(free & ~(found > 0.0))[:1]:

@@ -1,33 +1,37 @@
-"""Fabrics: measured moduli, from which the energies of a cloth follow."""
+"""Fabrics: measured moduli, from which energies follow."""
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import warpcloth.terms as energies
+
 from ..base.checks import keep_plain, number, shown
 from ..terms.declared import Declared
-from ..terms.orthotropic_membrane import OrthotropicMembrane
-from ..terms.plate_bending import PlateBending, isotropic_twist
+from ..terms.woven import isotropic_twist
+
+if TYPE_CHECKING:
+    from ..terms import OrthotropicMembrane, PlateBending
 
 GRAVITY = 9.81  # [m/s²]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fabric:
-    """The density and the moduli of a fabric along warp and weft. A number that was not measured is None.
+    """The density and the moduli of a fabric along warp and weft. Numbers that were not measured are None.
 
     Attributes:
         name: Its key in ``warpcloth.fabrics``.
         density: ρ [kg/m²].
         warp, weft: E₁t and E₂t [N/m], Young's moduli times thickness.
         shear: Gt [N/m].
-        poisson_ratio: ν₁₂, by how much a strip that is pulled along the warp narrows.
+        poisson_ratio: ν₁₂, the narrowing of a strip along the warp.
         bending_warp, bending_weft: D₁ and D₂ [N·m].
         thickness: t [m].
         source: Where the numbers are from.
-        computed: Names of the numbers that were computed from others, not measured.
-        notes: How they were measured, what was derived, and how uncertain they are.
+        computed: Names of numbers that were computed, not measured.
+        notes: Method, derivations and uncertainty.
 
     Raises:
         ValueError: A number is not finite or not allowed.
@@ -66,29 +70,27 @@ class Fabric:
             elif value is not None or field.name == "density":
                 number(f"Fabric.{field.name}", value, above=None if field.name == "poisson_ratio" else 0.0)
 
-    def membrane(self, **given: Any) -> OrthotropicMembrane:
+    def membrane(self, **given: Any) -> "OrthotropicMembrane":
         """The :class:`warpcloth.OrthotropicMembrane` of the fabric, with further fields such as ``warp_angle``.
 
         Raises:
-            ValueError: A number that it needs is None, or the moduli are not positive definite.
+            ValueError: A number is None, or the moduli are not positive definite.
         """
         warp, weft, shear, ratio = self._known("a membrane", "warp", "weft", "shear", "poisson_ratio")
         direction = given.pop("warp", None)
-        return OrthotropicMembrane.from_moduli(warp, weft, shear, ratio, direction, **given)
+        return energies.OrthotropicMembrane.from_moduli(warp, weft, shear, ratio, direction, **given)
 
-    def bending(self, **given: Any) -> PlateBending:
+    def bending(self, **given: Any) -> "PlateBending":
         """The :class:`warpcloth.PlateBending` of the fabric, with further fields such as ``warp_angle``.
 
-        D₁₂ is that of a plate of one material, √(ν₁₂ν₂₁ D₁D₂). D₆₆ is Gt t²/12 if the thickness is known, else that of
-        :class:`warpcloth.PlateBending`.
+        D₁₂ is √(ν₁₂ν₂₁ D₁D₂), as of one material. D₆₆ is Gt t²/12, without thickness the default of the class.
 
         Raises:
-            ValueError: A number that it needs is None.
+            ValueError: A number is None.
         """
-        return PlateBending(**self._plate(), **given)
+        return energies.PlateBending(**self._plate(), **given)
 
     def _plate(self) -> dict[str, Any]:
-        """Returns the fields of :meth:`bending` that are known."""
         one, two = self._known("bending", "bending_warp", "bending_weft")
         E1, E2, ratio = self._known("bending", "warp", "weft", "poisson_ratio")
         found = {"stiffness": one, "weft_ratio": two / one, "poisson_ratio": ratio * (E2 / E1) ** 0.5}
@@ -97,32 +99,32 @@ class Fabric:
         return found
 
     def terms(self, **given: Any) -> list[Declared]:
-        """The energies of the fabric: :meth:`membrane` and :meth:`bending`.
+        """:meth:`membrane` and :meth:`bending`.
 
         Args:
-            **given: Fields of both, such as ``warp`` and ``warp_angle``.
+            **given: Fields of both, such as ``warp_angle``.
         """
         return [self.membrane(**given), self.bending(**given)]
 
     def modulus_along(self, angle: float) -> float:
-        """Returns E(θ) [N/m] of a strip cut at ``angle`` θ [rad] to the warp, that shears and narrows freely.
+        """Returns E(θ) [N/m] of a strip at ``angle`` θ [rad] to the warp, that shears and narrows freely.
 
-        1/E(θ) = c⁴/E₁ + s⁴/E₂ + (1/G − 2ν₁₂/E₁)s²c², with c and s the cosine and sine of θ.
+        1/E(θ) = c⁴/E₁ + s⁴/E₂ + (1/G − 2ν₁₂/E₁)s²c², c and s the cosine and sine of θ.
 
         Raises:
-            ValueError: A number that it needs is None.
+            ValueError: A number is None.
         """
         E1, E2, G, ratio = self._known("a membrane", "warp", "weft", "shear", "poisson_ratio")
         c, s = np.cos(angle), np.sin(angle)
         return float(1.0 / (c**4 / E1 + s**4 / E2 + (1.0 / G - 2.0 * ratio / E1) * s**2 * c**2))
 
     def bending_along(self, angle: float) -> float:
-        """Returns D(θ) [N·m] of a cylinder that is curved at ``angle`` θ [rad] to the warp, of :meth:`bending`.
+        """Returns D(θ) [N·m] of a cylinder curved at ``angle`` θ [rad] to the warp.
 
-        D(θ) = D₁c⁴ + D₂s⁴ + 2(D₁₂ + 2D₆₆)s²c². A narrow strip is softer, because it curves across its width too.
+        D(θ) = D₁c⁴ + D₂s⁴ + 2(D₁₂ + 2D₆₆)s²c². A narrow strip is softer: it curves across, too.
 
         Raises:
-            ValueError: A number that it needs is None.
+            ValueError: A number is None.
         """
         plate, c, s = self._plate(), np.cos(angle), np.sin(angle)
         root, ratio = plate["weft_ratio"] ** 0.5, plate["poisson_ratio"]

@@ -1,4 +1,4 @@
-"""Reads fabrics from material files of ARCSim and from tables of KES-F and FAST measurements."""
+"""Reads fabrics from material files of ARCSim and tables of KES-F and FAST."""
 
 import json
 import math
@@ -39,26 +39,10 @@ _FAST = (
 def read_fabrics(path: FilePath) -> dict[str, Fabric]:
     """Reads fabrics from a file, by name.
 
-    A .json file is a material of ARCSim, with density [kg/m²], stretching [N/m] and bending [N·m]; its name is that of the
-    file. A .csv file is a table with one fabric in each row, with a column ``name`` and columns of KES-F or of FAST under their
-    usual names. Names that end with 1 or warp, and 2 or weft, such as ``B1`` or ``E5 warp``, are of that direction, names
-    without an end are of both. Other columns are ignored. A number whose column is missing or empty stays None.
+    A .json file is a material of ARCSim: density [kg/m²], stretching [N/m], bending [N·m], named as the file. A .csv file has a
+    fabric in each row, with a column ``name`` and columns of KES-F or FAST, named as in docs/fabrics.md.
 
-    | KES-F | | FAST | |
-    |---|---|---|---|
-    | W | mg/cm² | W | g/m² |
-    | T | mm | T or T2 | mm |
-    | B | gf·cm²/cm | B, or C | µN·m, mm |
-    | G | gf/(cm·degree) | G, or EB5 | N/m, % |
-    | EMT, WT, LT (two of these) | %, gf·cm/cm², 1 | E5 and E20, or E100 | % |
-
-    ``notes`` of each fabric says what was derived, and which columns were ignored.
-
-    Args:
-        path: The file, .json or .csv.
-
-    Returns:
-        dict: Fabrics by name.
+    ``notes`` says what was derived and ignored.
 
     Raises:
         OSError: The file cannot be read.
@@ -77,7 +61,6 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
 
 
 def _arcsim(path):
-    """Returns the fabric of a material file, in which // begins a comment."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
         text = re.sub(r'("(?:[^"\\]|\\.)*")|//[^\n]*', lambda match: match[1] or "", text)
@@ -164,7 +147,6 @@ def _is_number(value):
 
 
 def _matched(text, names):
-    """Returns (name, direction or None) of a column, or None if it is none of the names."""
     if text in names:  # T2 is a number of FAST, and not that of the weft
         return text, None
     for name in names:
@@ -176,7 +158,6 @@ def _matched(text, names):
 
 
 def _keys(path, names, columns):
-    """Returns the indices of columns by (name, direction); of both directions for a column that names none."""
     found: dict[tuple[str, int], int] = {}
     for k, text in enumerate(names):
         match = _matched(text, columns)
@@ -191,7 +172,6 @@ def _keys(path, names, columns):
 
 
 def _of_kes(values):
-    """Returns the fields of a fabric from KES-F numbers by (name, direction)."""
     force, moduli = 500.0 * _PER_CM, []
     for direction in (1, 2):
         percent, work, linearity = (values.get((name, direction)) for name in ("EMT", "WT", "LT"))
@@ -225,7 +205,6 @@ def _of_kes(values):
 
 
 def _of_fast(values):
-    """Returns the fields of a fabric from FAST numbers by (name, direction)."""
     density, moduli, bending, notes = _times(1e-3, values.get(("W", 1))), [], [], _FAST
     for direction in (1, 2):
         low, middle, high, D, length = (values.get((name, direction)) for name in ("E5", "E20", "E100", "B", "C"))

@@ -1,10 +1,9 @@
-"""Counts the degrees of freedom that hard and stiff edges leave a cloth, by the rank of the Jacobian of their lengths.
+"""Counts the degrees of freedom that hard and stiff edges leave, by the rank of the Jacobian of their lengths.
 
-E edges between n vertices remove at most E of 3n degrees of freedom (Maxwell 1864, *On the calculation of the equilibrium and
-stiffness of frames*). All edges of a triangulated disc are independent. However fine it is, it keeps 3 degrees of freedom plus
-one for each boundary edge, 6 of them rigid motion. A closed surface is rigid (Gluck 1975, *Almost all simply connected closed
-surfaces are rigid*), and so is a grid with both diagonals in each cell. The count holds in general position. A flat or evenly
-curved cloth may have more freedom: a regular net bends in any one direction, and loses that freedom as it leaves this shape.
+E edges of n vertices remove at most E of 3n degrees of freedom (Maxwell 1864, *On the calculation of the equilibrium and
+stiffness of frames*). A triangulated disc keeps 3 plus one for each boundary edge, 6 of them rigid motion. Closed surfaces are
+rigid (Gluck 1975, *Almost all simply connected closed surfaces are rigid*), and grids with both diagonals. The count holds in
+general position; flat or evenly curved cloth may have more.
 """
 
 from dataclasses import dataclass
@@ -27,13 +26,13 @@ class Freedom:
     """Degrees of freedom that edges of fixed length leave, in general position.
 
     Attributes:
-        edges: Number of edges of fixed length. Each pair of vertices counts once; pairs of pinned vertices do not count.
+        edges: Number of edges of fixed length, but for pairs of pins.
         hard: Whether some of them are hard.
-        coordinates: Number of coordinates of the vertices that are neither pinned nor locked.
-        rank: Rank of the Jacobian of the lengths with respect to these coordinates.
-        left: Degrees of freedom that are left, ``coordinates`` − ``rank``.
-        rigid: Degrees of freedom of the pieces of cloth, each as one rigid body that hangs on its pins.
-        counted: Whether ``rank`` is only an upper bound from the number of edges, because the mesh is too large to compute it.
+        coordinates: Number of coordinates that are neither pinned nor locked.
+        rank: Rank of the Jacobian of the lengths.
+        left: ``coordinates`` − ``rank``.
+        rigid: Degrees of freedom of the pieces as rigid bodies on their pins.
+        counted: Whether ``rank`` is only bounded by the number of edges, as the mesh is too large.
     """
 
     edges: int
@@ -46,23 +45,16 @@ class Freedom:
 
     @property
     def locked(self):
-        """Whether only rigid motion is left, so the cloth cannot bend; with ``counted``, whether that is possible."""
+        """Whether only rigid motion is left, or with ``counted`` may be."""
         return self.edges > 0 and self.left <= self.rigid
 
 
 def freedom(scene):
-    """Counts the degrees of freedom that the hard and stiff edges of a scene leave.
+    """Counts the degrees of freedom that hard and stiff edges of a scene leave.
 
-    Springs hold their pairs, and membranes the edges of their triangles, if they are hard or stiff. A net that bends round a
-    fold of radius r = 4h strains by (h/r)²/24. An edge is stiff if that costs more than bending and weight,
-    K/2·((h/r)²/24)² > D/2r² + ρgL. K is 2k/√3 for springs and Et for membranes, D is the sum over all bending terms, and L the
-    diagonal of the bounding box. Limits, which act only when they are reached, and rigid clusters are left out.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-
-    Returns:
-        :class:`Freedom`.
+    Springs hold their pairs, membranes the edges of triangles. A net about a fold of radius r = 4h strains by (h/r)²/24. An
+    edge is stiff if that costs more than bending and weight, K/2·((h/r)²/24)² > D/2r² + ρgL, with K = 2k/√3 for springs and Et
+    for membranes, D of all bending terms, and L the diagonal of the bounding box. Limits and rigid clusters are ignored.
     """
     mesh = scene.mesh
     pairs, hard = _held(scene)
@@ -76,10 +68,9 @@ def freedom(scene):
 
 
 def rank_of(pairs, free):
-    """Rank of the Jacobian of the lengths of pairs (E, 2) with respect to free coordinates (n, 3), in general position.
+    """Rank of the Jacobian of lengths of pairs (E, 2) by free coordinates (n, 3), in general position.
 
-    The rank is the number of nonzero eigenvalues of JᵀJ at random positions. The signs of the pivots of JᵀJ − ε, with a small
-    ε, count them (Sylvester's law of inertia).
+    It is the number of positive pivots of JᵀJ − ε at random positions (Sylvester's law of inertia).
     """
     from scipy.sparse import csr_array, identity
     from scipy.sparse.linalg import splu
@@ -100,7 +91,6 @@ def rank_of(pairs, free):
 
 
 def _held(scene):
-    """Finds the pairs of vertices whose distance is held (E, 2), each once, and whether some of them are hard."""
     mesh, found, hard = scene.mesh, [np.empty((0, 2), dtype=np.int64)], False
     area, size = mesh.triangle_areas.sum(), np.linalg.norm(np.ptp(mesh.points, axis=0))
     bending = [term.stiffness for term in scene.terms if isinstance(term, Bending)]
@@ -118,7 +108,6 @@ def _held(scene):
 
 
 def _rigid(mesh, pairs, free):
-    """Counts the degrees of freedom of the pieces of cloth, each a rigid body that moves along free axes (n, 3) alone."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -16,15 +16,8 @@ _WHOLE = ("colliders", "contact", "self_contact", "air")
 
 
 def fields_of_cloths(cloths, whole):
-    """Returns the fields of a scene of several cloths, all but its pins.
-
-    Args:
-        cloths: A :class:`warpcloth.Scene` for each name.
-        whole: Fields of the whole scene by name.
-
-    Raises:
-        ValueError: There is no cloth, a name or a mesh is refused, a field may not be set there, or cloths differ in a field of
-            the whole scene that is not given.
+    """Returns the fields of a scene of several cloths, without pins; refuses fields that may not be set, and differing ones of
+    the whole.
     """
     if not (isinstance(cloths, Mapping) and cloths and all(hasattr(cloth, "mesh") for cloth in cloths.values())):
         raise ValueError(f"cloths is {shown(cloths)}; it must be a mapping of names to scenes, with one cloth or more")
@@ -58,7 +51,7 @@ def fields_of_cloths(cloths, whole):
 
 
 def pins_of_cloths(cloths):
-    """Returns the pins of all cloths: vertices of the joined mesh (p,), keyframes (F, p, 3) [m] or None, and axes."""
+    """Returns vertices of the joined mesh (p,), keyframes (F, p, 3) [m] or None, and axes."""
     firsts = np.cumsum([0, *(len(cloth.mesh.points) for cloth in cloths)])
     vertices = np.concatenate([cloth.pins.vertices + first for cloth, first in zip(cloths, firsts[:-1], strict=True)])
     axes = ["".join(axis for axis, holds in zip("xyz", held, strict=True) if holds) for c in cloths for held in c.pins.held]
@@ -86,7 +79,6 @@ def _free(cloth):
 
 
 def _common(cloths, whole):
-    """Returns gravity, duration and fps of the whole scene: those given, or those that all cloths have."""
     found = {}
     for field in _COMMON:
         if field in whole:

@@ -1,4 +1,4 @@
-"""Finds the lines to draw for strings and bars: pairs of vertices that a term joins outside the triangles."""
+"""Finds the lines to draw for strings and bars."""
 
 import numpy as np
 
@@ -7,17 +7,9 @@ _SPRING, _BODY = 0.05, 0.15
 
 
 def lines_of(scene):
-    """Finds the pairs of vertices that a term joins, at least one of them without a triangle.
+    """Finds the pairs of vertices (E, 2) that a term joins, at least one without a triangle, and their thickness [m], by label.
 
-    Springs give their own pairs, and rigid bodies the minimum spanning tree of their vertices without a triangle. A mesh of
-    edges alone gives none, because its edges are drawn anyway.
-
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-
-    Returns:
-        dict: Pairs (E, 2) and a thickness [m] by label of the term. Terms with one label share their pairs and the largest
-            thickness.
+    Springs give their pairs, rigid bodies the minimum spanning tree of vertices without a triangle, edge meshes none.
     """
     mesh = scene.mesh
     lines: dict[str, tuple[np.ndarray, float]] = {}
@@ -45,7 +37,6 @@ def lines_of(scene):
 
 
 def _tree(points, vertices):
-    """Finds the minimum spanning tree of vertices (k,), as pairs (k−1, 2)."""
     from scipy.sparse.csgraph import minimum_spanning_tree
 
     if len(vertices) < 2:

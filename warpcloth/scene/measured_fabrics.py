@@ -1,4 +1,4 @@
-"""Measured fabrics, by name. Where papers differ, each has records of its own."""
+"""Measured fabrics, by name. Papers that differ have a record each."""
 
 from ..base.checks import did_you_mean, shown
 from .fabric import Fabric
@@ -24,14 +24,14 @@ class Fabrics(dict[str, Fabric]):
     """Fabrics by name.
 
     Raises:
-        ValueError: From ``fabrics[name]``, if there is no such fabric; it lists the names.
+        ValueError: ``fabrics[name]`` does not exist; the message lists the names.
     """
 
     def __missing__(self, name: str) -> Fabric:
         raise ValueError(f"fabric is {name!r}; it must be one of {', '.join(self)}{did_you_mean(name, self)}")
 
     def find(self, fabric: Fabric | str) -> Fabric:
-        """Returns a fabric by its name, or one that is given itself.
+        """Returns a fabric by its name, or itself.
 
         Raises:
             ValueError: It is neither.
@@ -44,7 +44,6 @@ class Fabrics(dict[str, Fabric]):
 
 
 def _plate(name, density, millimetres, warp, weft, shear, ratio):
-    """A fabric whose bending is that of a plate of its thickness."""
     t = 1e-3 * millimetres
     whole = t**2 / 12.0 / (1.0 - ratio**2 * weft / warp)
     return Fabric(
@@ -103,5 +102,5 @@ DRAPES = {"cotton": 71.1, "wool": 96.8, "canvas": 90.9, "silk": 52.1, "denim": 9
 
 
 def computed_drape(fabric: Fabric) -> float | None:
-    """Returns the drape coefficient [%] of one of :data:`fabrics` that has one in :data:`DRAPES`; of others None."""
+    """Returns the drape coefficient [%] in :data:`DRAPES`, or None."""
     return DRAPES.get(fabric.name) if fabrics.get(fabric.name) is fabric else None

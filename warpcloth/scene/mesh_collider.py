@@ -25,18 +25,17 @@ _THIN = 0.02  # thickness below which fronts that face inwards are those of a sh
 class MeshCollider(Collider):
     """A triangle mesh, rigid or deforming.
 
-    A closed surface that encloses a volume is a solid, behind the fronts of its triangles; its winding number says where. Any
-    other surface, such as a card with a front and a back, is a sheet without thickness, which collides on both sides. Vertices
-    with the same position at all frames are merged, so that seams do not open a surface. At frames where all of its vertices
-    are at one position, the collider is absent.
+    A closed surface that encloses a volume is solid behind the fronts of its triangles. Any other is a sheet without thickness,
+    which collides on both sides. Vertices at one position in all frames are merged; at frames with all vertices at one
+    position, the collider is absent.
 
     Attributes:
-        points: Positions of its vertices, (n, 3) [m], or at frames 0 … F−1 of the scene, (F, n, 3), in the frame of
-            ``position`` and ``rotation``. Between frames they move linearly; after the last they stand still.
+        points: Vertices in the frame of the collider, (n, 3), or at frames 0 … F−1 (F, n, 3) [m], linear between, constant
+            after.
         triangles: Vertices of each triangle (T, 3), counter-clockwise from the front.
 
     Raises:
-        ValueError: If a value is not allowed.
+        ValueError: A value is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -69,7 +68,6 @@ class MeshCollider(Collider):
         self._refuse_turned_over()
 
     def _refuse_turned_over(self):
-        """Raises ValueError if a closed surface is inside out at a keyframe, because cloth cannot get there."""
         if len(self.frames) == 1 or not self.closed:
             return
         found = np.array([self._filling(vertices) for vertices in self.frames])
@@ -81,7 +79,7 @@ class MeshCollider(Collider):
             )
 
     def _filling(self, vertices):
-        """Returns its volume relative to the cube of its size; negative if its fronts face inwards."""
+        """Returns its volume over its cubed size, negative if fronts face inwards."""
         a, b, c = (vertices - vertices.mean(axis=0))[self.triangles].transpose(1, 0, 2)
         size = np.ptp(vertices, axis=0).max()
         return np.einsum("ti,ti", a, np.cross(b, c)) / (6.0 * size**3) if size else 0.0
@@ -126,27 +124,25 @@ class MeshCollider(Collider):
 
     @cached_property
     def closed(self) -> bool:
-        """Whether it has an inside: it encloses a volume, and each side of a triangle is that of as many others reversed."""
+        """Whether it encloses a volume and each side of a triangle is matched by a reversed one."""
         forth, back = self._directed_sides
         return np.array_equal(forth, back) and any(abs(self._filling(vertices)) > _FLAT for vertices in self.frames)
 
     @cached_property
     def _directed_sides(self):
-        """The sides of triangles in their direction and reversed, as sorted numbers (3T,) each."""
         sides = self.welded[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         return [np.sort(each @ [sides.max() + 1, 1]) for each in (sides, sides[:, ::-1])]
 
     @cached_property
     def _doubled(self):
-        """Whether triangles share a directed side, as where a front and a back coincide."""
+        """Whether triangles share a directed side, as coinciding fronts and backs do."""
         return bool((np.diff(self._directed_sides[0]) == 0).any())
 
     @cached_property
     def faces_inwards(self) -> bool:
-        """Whether it is closed and its fronts face what it encloses, so that all else is solid.
+        """Whether it is closed with its fronts inwards, so that all else is solid.
 
-        Where a front and a back with other diagonals lie upon each other, they enclose some volume too. It is thin beside the
-        sides of triangles, while that of a slab is as thick as its shortest side.
+        What a front and a back with other diagonals enclose is thin beside their sides, and does not count.
         """
         vertices = first_extended(self.frames)
         size, corners = np.ptp(vertices, axis=0).max(), vertices[self.triangles]
@@ -156,7 +152,7 @@ class MeshCollider(Collider):
 
     @cached_property
     def _uncovered(self):
-        """The triangles, less those that coincide with others reversed, as these enclose nothing together."""
+        """The triangles, less those that coincide with reversed ones."""
         at = self.welded.argmin(axis=1)[:, None]
         second, third = (np.take_along_axis(self.welded, (at + k) % 3, axis=1)[:, 0] for k in (1, 2))
         turns = np.where(second < third, 1, -1)
@@ -168,7 +164,7 @@ class MeshCollider(Collider):
     def distances(self, points: np.ndarray, frame: int = 0) -> np.ndarray:
         """Distances (…,) [m] of points (…, 3) [m] to the surface at a frame, negative inside a closed one.
 
-        If two triangles are equally near up to the rounding of float32, it may take either.
+        Of triangles that float32 finds equally near, it may take either.
         """
         points = np.asarray(points, dtype=np.float64)
         away, vertices, faces, weights = self._away(points.reshape(-1, 3), frame)
@@ -182,7 +178,7 @@ class MeshCollider(Collider):
         return found.reshape(points.shape[:-1])
 
     def is_near(self, points: np.ndarray, distance: float, frame: int = 0) -> bool:
-        """Returns whether one of points (n, 3) [m] is nearer to its surface than a distance [m] at a frame."""
+        """Returns whether one of points (n, 3) [m] is nearer than a distance [m] at a frame."""
         pose, vertices = (each[min(frame, len(each) - 1)] for each in (self.poses, self.frames))
         local = (points - pose[:3]) @ turned(pose[3:], np.eye(3)).T
         within = np.abs(local - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))) < 0.5 * np.ptp(vertices, axis=0) + distance
@@ -190,7 +186,7 @@ class MeshCollider(Collider):
         return bool(within.any() and np.linalg.norm(self._away(points[within], frame)[0], axis=1).min() < distance)
 
     def _away(self, points, frame):
-        """From the nearest points of the surface, in its frame; its vertices, and the faces and weights of these points."""
+        """From the nearest points of the surface, in its frame; its vertices, and faces and weights of these."""
         pose = self.poses[min(frame, len(self.poses) - 1)]
         local = turned(pose[3:] * [-1.0, -1.0, -1.0, 1.0], points - pose[:3])
         vertices = self.frames[min(frame, len(self.frames) - 1)]
@@ -198,10 +194,10 @@ class MeshCollider(Collider):
         return local - np.einsum("kc,kci->ki", weights, vertices[self.triangles[faces]]), vertices, faces, weights
 
     def _normals(self, vertices, faces, weights):
-        """The normals of the face, the side or the corner where the nearest points of faces (k,) are, (k, 3).
+        """Normals of the face, side or corner of the nearest points of faces (k,), (k, 3).
 
-        Those of sides and corners are the sums over the triangles about them by their angles (Bærentzen and Aanæs 2005,
-        *Signed distance computation using the angle weighted pseudonormal*).
+        Sides and corners sum those of their triangles by angles (Bærentzen and Aanæs 2005, *Signed distance computation using
+        the angle weighted pseudonormal*).
         """
         corners = vertices[self.triangles]
         ahead, behind = (np.roll(corners, shift, axis=1) - corners for shift in (-1, 1))
@@ -225,15 +221,14 @@ class MeshCollider(Collider):
 
 
 def first_extended(points):
-    """The first of points (F, n, 3) that are not all at one position, or points (n, 3)."""
+    """The first of points (F, n, 3) not all at one position, or points (n, 3)."""
     frames = points.reshape(-1, *points.shape[-2:])
     return frames[np.argmax(np.ptp(frames, axis=1).any(axis=1))]
 
 
 def winding_numbers(points, corners):
-    """How often triangles (T, 3, 3) enclose points (k, 3), (k,): the sum of their solid angles over 4π.
-
-    See van Oosterom and Strackee 1983, *The solid angle of a plane triangle*.
+    """How often triangles (T, 3, 3) enclose points (k, 3), (k,): their solid angles over 4π (van Oosterom and Strackee 1983,
+    *The solid angle of a plane triangle*).
     """
     found = np.empty(len(points))
     rows = max(1, 1_000_000 // len(corners))
@@ -247,7 +242,7 @@ def winding_numbers(points, corners):
 
 
 def nearest_points(points, vertices, triangles):
-    """The triangle nearest to each of points (k, 3), to within float32, (k,), and the weights (k, 3) of its nearest point."""
+    """The nearest triangle (k,) to points (k, 3), in float32, and weights (k, 3) of the nearest point."""
     faces = _nearest_faces(points, vertices, triangles)
     return faces, nearest_weights(points, vertices[triangles[faces]])
 

@@ -1,4 +1,4 @@
-"""Scenes of mesh files, which have no physics: the cloth is made of a fabric."""
+"""Scenes of mesh files with a fabric."""
 
 import warnings
 from pathlib import Path
@@ -31,7 +31,7 @@ def mesh_scene(
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The mesh cannot be read, see :meth:`warpcloth.Mesh.load`, or a value is not allowed.
+        ValueError: The mesh cannot be read, or a value is not allowed.
     """
     mesh = Mesh.load(path, prim, scale, up_axis)
     try:
@@ -44,7 +44,7 @@ def mesh_scene(
 
 
 def warn_of_unit(path: FilePath, scene: Scene, metres: float, remedy: str) -> None:
-    """Warns if a cloth is above 20 m or 20 kg, and names a likely unit of its file; ``remedy`` sets the metres per unit."""
+    """Warns if a cloth is above 20 m or 20 kg, with a likely unit; ``remedy`` sets the metres per unit."""
     size, mass = float(np.ptp(scene.mesh.points, axis=0).max()), float(scene.vertex_masses.sum())
     if size <= _LARGE and mass <= _HEAVY:
         return

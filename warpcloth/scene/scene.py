@@ -1,4 +1,4 @@
-"""Scenes. A scene is data without a solver, and any solver that supports its terms runs it unchanged."""
+"""Scenes: data that any solver which supports the terms runs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, InitVar, dataclass, fields, replace
@@ -39,12 +39,9 @@ class Pins:
 
     Attributes:
         vertices: Indices (p,), or a selection of the mesh such as ``"x<0.01"``.
-        keyframes: Positions (F, p, 3) [m] at frames 0 … F−1 of the scene, in the order of ``vertices``. Pins move linearly
-            between keyframes and stand still after the last. Without keyframes they stay where they start. Coordinates along
-            axes that a pin does not hold are ignored.
-        axes: The axes that the pins hold, such as ``"xz"``, or one such string for each pin (p,). A pin that holds ``"y"`` is a
-            roller, which moves freely along x and z. A pin that holds the normal of a plane keeps its vertex in that plane of
-            symmetry.
+        keyframes: Positions (F, p, 3) [m] at frames 0 … F−1, in the order of ``vertices``, linear between, constant after; by
+            default the start.
+        axes: The axes that the pins hold, such as ``"xz"``, or one string per pin (p,): ``"y"`` is a roller along x and z.
 
     Examples:
         >>> import warpcloth as wc
@@ -76,10 +73,10 @@ class Pins:
         return self.keyframes is not None and bool((self.keyframes != self.keyframes[:1])[:, self.held].any())
 
     def refuse_far(self, positions: np.ndarray, copy: str = "") -> None:
-        """Checks that pins start at their first keyframe; ``positions`` (n, 3) [m] are those at the start.
+        """Checks that pins start at their first keyframe, from ``positions`` (n, 3) [m] at the start.
 
         Raises:
-            ValueError: They do not. The message says how far apart they are.
+            ValueError: They do not; the message says by how far.
         """
         if self.keyframes is None:
             return
@@ -92,45 +89,39 @@ class Pins:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A cloth, all that acts on it, and a duration, in SI units. ``dataclasses.replace`` returns a scene with other fields.
+    """A cloth, all that acts on it, and a duration, in SI units.
 
     Attributes:
         mesh: The :class:`Mesh`; its points are the rest shape.
-        density: Mass per area [kg/m²]: each vertex has the mass of a third of each adjacent triangle. For an edge mesh, mass
-            per length [kg/m]: each vertex has the mass of half of each adjacent edge.
-        masses: Mass of each vertex, (n,) [kg], in place of ``density``; else None. :attr:`vertex_masses` has the masses in
-            either case.
-        positions: Positions at the start, (n, 3) [m]; by default the rest shape.
-        velocities: Velocities at the start, (n, 3) [m/s]; by default 0. Those of pinned vertices are ignored.
-        terms: The energies, see :mod:`warpcloth.terms`.
-        pins: :class:`Pins`, or the indices or a selection of fixed vertices.
-        gravity: Acceleration (3,) [m/s²]; by default 9.81 down the up axis of the mesh, or down y if it has none.
+        density: Mass per area [kg/m²], lumped by thirds of triangles; for an edge mesh mass per length [kg/m], by halves of
+            edges.
+        masses: Mass of each vertex, (n,) [kg], in place of ``density``; or None. :attr:`vertex_masses` has either.
+        positions: Positions at the start, (n, 3) [m], by default at rest.
+        velocities: Velocities at the start, (n, 3) [m/s], by default 0; those of pins are ignored.
+        terms: The energies.
+        pins: :class:`Pins`, or indices or a selection of fixed vertices.
+        gravity: Acceleration (3,) [m/s²], by default 9.81 down the up axis of the mesh, or y.
         duration: Duration [s], a whole number of frames.
         fps: Frames per second.
         name: Name in reports and files.
-        stage: The :class:`warpcloth.usd.StageMesh` that ``mesh`` was read from, if any; an animation is then written as a
-            layer over that stage.
-        free_axes: The axes of space along which each vertex may move, (n, 3) booleans; by default all. A locked coordinate
-            keeps its value, and its velocity is 0; planes of symmetry and rails are made this way. A vertex without a free axis
-            is a pin that stands still. Values of pinned vertices are ignored.
-        loads: Forces, tractions and pressures on the cloth: :class:`Force`, :class:`Traction`, :class:`Pressure`.
-        colliders: The colliders, such as :class:`warpcloth.Sphere`. Pinned vertices do not collide.
-        contact: The :class:`warpcloth.Contact` with all colliders, by default one with half of the thickness as its distance,
-            or 1 mm if that is not known; its stiffness is then computed. It has no effect without colliders.
-        self_contact: The :class:`warpcloth.SelfContact` of the cloth with itself; its stiffness is then computed. None if cloth
-            passes through cloth.
-        air: The :class:`warpcloth.Air` around the cloth, with its wind; None for none.
-        cloths: Names of the cloths of a scene that :meth:`join` made, the parts of the mesh; else empty. In files each is a
-            prim of its own.
-        fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, in place of ``density``, ``terms`` and
-            ``thickness``, which it sets.
-        warp: Vector along the warp of ``fabric``, (3,) or (T, 3); each triangle takes the part in its plane. By default along
-            the texture coordinate s, and where there is none along x of the rest shape, which a warning says.
-        thickness: Thickness of the cloth [m], from which contact without a distance takes it; None for cloth without one. NaN
-            if it is not known, because the fabric has none or the cloths of a scene differ; such contact is then refused.
+        stage: The :class:`warpcloth.usd.StageMesh` of ``mesh``, over which animations are layers; or None.
+        free_axes: Axes along which each vertex may move, (n, 3) booleans, as for planes of symmetry and rails; by default all.
+            Without a free axis a vertex is a fixed pin. Values of pins are ignored.
+        loads: :class:`Force`, :class:`Traction`, :class:`Pressure`.
+        colliders: The colliders, such as :class:`warpcloth.Sphere`; pins do not collide.
+        contact: The :class:`warpcloth.Contact` with all colliders, by default at half of the thickness, or 1 mm without one,
+            with a computed stiffness.
+        self_contact: The :class:`warpcloth.SelfContact` of the cloth, or None; its stiffness is then computed.
+        air: The :class:`warpcloth.Air` with its wind, or None.
+        cloths: Names of the cloths that :meth:`join` joined, each a part of the mesh and a prim in files; else empty.
+        fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, which sets ``density``, ``terms`` and ``thickness``.
+        warp: Vector along the warp of ``fabric``, (3,) or (T, 3), projected to each triangle; by default along the texture
+            coordinate s, or with a warning along x at rest.
+        thickness: Thickness of the cloth [m], for contact without a distance; None for none; NaN if unknown (of the fabric, or
+            different cloths), which such contact refuses.
 
     Raises:
-        ValueError: A value is not allowed. The message names it.
+        ValueError: A value is not allowed; the message names it.
 
     Examples:
         >>> import warpcloth as wc
@@ -165,17 +156,15 @@ class Scene:
 
     @classmethod
     def join(cls, cloths: Mapping[str, "Scene"], **whole: Any) -> "Scene":
-        """Joins several cloths, such as layers or the pieces of a garment, into one scene.
+        """Joins several cloths, such as layers or pieces of a garment, into one scene.
 
-        The mesh is that of :meth:`warpcloth.Mesh.join`. Each cloth keeps its masses, terms, pins, loads, positions and
-        velocities. The names of terms begin with that of their cloth, such as skirt_Spring. ``Animation.cloth(name)`` has the
-        motion of one cloth, and files have a prim for each.
+        Each keeps its masses, terms, pins, loads, positions and velocities. Names of terms begin with that of their cloth, such
+        as skirt_Spring. ``Animation.cloth(name)`` has the motion of one.
 
         Args:
-            cloths: A scene for each name, which must be an identifier. Cloths must not have colliders or contact.
-            **whole: Fields of the whole scene: gravity, duration and fps, by default those of the cloths if all have the same;
-                colliders, contact, self_contact, air and name; thickness, by default that of the cloths if all have the same,
-                else not known; and further terms, such as seams, on the vertices of all cloths.
+            cloths: A scene for each name, an identifier, without colliders or contact.
+            **whole: Fields of the whole scene: gravity, duration, fps and thickness, by default those that all cloths share
+                (thickness: else unknown); colliders, contact, self_contact, air and name; and further terms, such as seams.
 
         Raises:
             ValueError: There is no cloth, a name is not an identifier, meshes cannot be joined, or a field is not allowed.
@@ -192,7 +181,7 @@ class Scene:
 
     @property
     def declared(self) -> tuple[object, ...]:
-        """Pins, terms, loads and colliders, all of which may do work on the cloth."""
+        """Pins, terms, loads and colliders, which may do work on the cloth."""
         return (self.pins, *self.terms, self.loads, *self.colliders, self.air)
 
     def __post_init__(self, fabric: Fabric | str | None, warp: ArrayLike | None) -> None:
@@ -297,7 +286,6 @@ class Scene:
         return self._with_stiffness(self._with_distance(declared, "self_contact", 1.0), "self_contact")
 
     def _with_stiffness(self, contact, name):
-        """Returns contact with a stiffness: its own, or :func:`default_stiffness` for this cloth."""
         if contact.stiffness is not None:
             return contact
         weight = self._areal_mass * float(np.linalg.norm(self.gravity))
@@ -318,7 +306,7 @@ class Scene:
         return replace(contact, stiffness=found)
 
     def _with_distance(self, contact, name, thicknesses):
-        """Returns contact with a distance: its own, or that number of thicknesses, or `DISTANCE` for cloth without one."""
+        """Returns contact with its own distance, that number of thicknesses, or `DISTANCE`."""
         if contact.distance is not None:
             return contact
         if _is_nan(self.thickness):
@@ -330,7 +318,7 @@ class Scene:
 
     @property
     def touching_areas(self) -> np.ndarray:
-        """Areas of the vertices in contact (n,) [m²]; for a mesh of edges, their lengths times twice the contact distance."""
+        """Areas of vertices in contact (n,) [m²]; of edges, lengths times twice the contact distance."""
         mesh = self.mesh
         if len(mesh.triangles):
             return mesh.vertex_areas
@@ -339,13 +327,12 @@ class Scene:
 
     @property
     def _areal_mass(self):
-        """Mass per area [kg/m²] of the vertices that have an area."""
         areas = self.touching_areas
         return float(self.vertex_masses[areas > 0.0].sum() / areas.sum())
 
     @property
     def contact_terms(self) -> tuple[VertexContact, ...]:
-        """The terms of its colliders but meshes: contact of the free vertices with each, and friction if it has any."""
+        """Terms of all colliders but meshes: contact of free vertices, and friction."""
         if not self.colliders or self.contact is None or self.contact.stiffness is None:
             return ()
         areas, mass = self.touching_areas, self._areal_mass
@@ -397,14 +384,14 @@ class Scene:
 
     @property
     def has_pairs(self) -> bool:
-        """Whether contact is pairs of vertices, edges and triangles: of cloth with itself, or with a mesh."""
+        """Whether contact is pairs: of cloth with itself, or with a mesh."""
         return self.self_contact is not None or len(self.meshes) > 0
 
     def refuse_inside(self, positions: np.ndarray, copy: str = "") -> None:
         """Checks that no free vertex is inside a collider at ``positions`` (n, 3) [m].
 
         Raises:
-            ValueError: One is. The message names the vertex and the collider.
+            ValueError: One is; the message names it and the collider.
         """
         free = np.ones(len(positions), dtype=bool)
         free[self.fixed] = False
@@ -433,13 +420,13 @@ class Scene:
 
     @cached_property
     def fixed(self) -> np.ndarray:
-        """Vertices that do not respond to forces: those that pins hold along every axis, or without a free axis, (f,) int32."""
+        """Vertices that pins hold along every axis, or without a free axis, (f,) int32."""
         axes = self._unlocked
         return self.pins.vertices if axes is None else np.flatnonzero(~axes.any(axis=1)).astype(np.int32)
 
     @cached_property
     def _unlocked(self) -> np.ndarray | None:
-        """The axes along which each vertex moves, (n, 3) booleans; None if all but pins move along all axes."""
+        """Axes along which each vertex moves, (n, 3) booleans; None if all but pins are free."""
         if self.free_axes is None and self.pins.held.all():
             return None
         found = np.ones((len(self.mesh.points), 3), dtype=bool) if self.free_axes is None else self.free_axes.copy()
@@ -448,7 +435,7 @@ class Scene:
 
     @property
     def locked(self) -> np.ndarray | None:
-        """The locked coordinates of vertices that can move along another axis, (n, 3) booleans; None if there are none."""
+        """Locked coordinates of vertices that can move along another axis, (n, 3) booleans, or None."""
         if self._unlocked is None:
             return None
         found = ~self._unlocked
@@ -462,7 +449,7 @@ class Scene:
 
     @property
     def up_axis(self) -> UpAxis:
-        """The axis along which gravity acts, "Y" or "Z"; without gravity the up axis of the mesh."""
+        """The axis of gravity, "Y" or "Z"; without gravity that of the mesh."""
         if not self.gravity[1:].any():
             return self.mesh.up_axis or "Y"
         return "Z" if abs(self.gravity[2]) > abs(self.gravity[1]) else "Y"
@@ -478,8 +465,8 @@ class Scene:
     ) -> Model:
         """Builds the :class:`warpcloth.model.model.Model` of this scene on a device.
 
-        A model has no solver, so the default of ``dtype`` is float32 on every device. For the precision of
-        :func:`warpcloth.simulate`, pass :meth:`warpcloth.solvers.step.Step.precision_on` of the solver.
+        The default of ``dtype`` is float32; :meth:`warpcloth.solvers.step.Step.precision_on` is that of
+        :func:`warpcloth.simulate`.
         """
         return Model(self, device=device, dtype=dtype, copies=copies, vary=vary, order=order, threads=threads)
 
@@ -510,7 +497,7 @@ class Scene:
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
 
     def _cuts(self):
-        """Yields a line about the shapes that may cut into triangles of the cloth between their vertices."""
+        """Yields lines about shapes that may cut into triangles between vertices."""
         edge = self.mesh.edge_lengths.max()
         if self.contact is None or not len(self.mesh.triangles):
             return
@@ -527,7 +514,6 @@ def _is_nan(value):
 
 
 def _checked_axes(free_axes, n):
-    """Returns booleans (n, 3), or None."""
     if free_axes is None:
         return None
     found = as_array(free_axes).copy()
@@ -539,11 +525,8 @@ def _checked_axes(free_axes, n):
 
 
 def checked_pins(pins: Any, mesh: Mesh) -> Pins:
-    """Returns `Pins` with indices of a mesh, int32, from anything that a scene takes as pins.
-
-    Raises:
-        ValueError: A vertex is not in the mesh or occurs twice, keyframes have a wrong shape or are not finite, or axes are not
-            among x, y and z.
+    """Returns `Pins` with int32 indices of a mesh, from pins, indices or a selection; refuses repeated vertices, wrong
+    keyframes and axes.
     """
     pins = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins)
     vertices = distinct_vertices("pins.vertices", pins.vertices, mesh)
@@ -557,7 +540,6 @@ def checked_pins(pins: Any, mesh: Mesh) -> Pins:
 
 
 def _checked_pin_axes(axes, count):
-    """Returns the axes as one string, or as a tuple of strings if pins differ."""
     rule = "it must be some of the letters x, y and z, each once, such as 'xz'"
     each = [axes] if isinstance(axes, str) else list(axes) if isinstance(axes, Iterable) else [axes]
     for k, one in enumerate(each):
@@ -570,7 +552,6 @@ def _checked_pin_axes(axes, count):
 
 
 def _described(term):
-    """Returns a term in one line: Spring(pairs='structural', stiffness=1000.0)."""
     parts = []
     for field in fields(term):
         value = getattr(term, field.name)

@@ -16,17 +16,16 @@ class SelfContact:
     The energy is a function of the positions alone, U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)), over
     vertices v and faces, edges and vertices F near v, and over pairs of edges e and f, see
     :mod:`warpcloth.kernels.contact.pair_potential`. :class:`warpcloth.Explicit` leaves out the second sum. Elements with a
-    common vertex, and elements of one connected piece whose distance at rest is below 2r, have no energy. At the end of each
-    step a filter shortens moves that would cross, so that cloth never passes through cloth. A start in which cloth crosses
-    cloth is refused. Pieces that only touch or coincide at the start are moved apart along their normals, by at most the
-    contact distance.
+    common vertex, or of one piece and nearer than 2r at rest, have no energy. A filter at the end of each step shortens moves
+    that would cross, so cloth never passes through cloth. A start in which cloth crosses cloth is refused. Pieces that touch at
+    the start are moved apart along normals, by at most r.
 
     Attributes:
-        distance: Contact distance r [m]. None lets the scene set it: to its thickness, or to 1 mm without one.
-        stiffness: k [Pa/m], by default by the rule of :class:`warpcloth.Contact`.
+        distance: Contact distance r [m]; by default the thickness of the scene, or 1 mm without one.
+        stiffness: k [Pa/m], by default that of :class:`warpcloth.Contact`.
         friction: Coefficient μ of friction.
-        held_pins: What a run is in which cloth holds pins back from their keyframes: ``"fail"``, it is not usable, because the
-            pins are not where the scene says; or ``"allow"``, it may be usable, for scenes in which cloth is to stop pins.
+        held_pins: If cloth holds pins back from their keyframes, the run is not usable with ``"fail"``, and may be with
+            ``"allow"``.
 
     Raises:
         ValueError: A value is not allowed.

@@ -1,4 +1,4 @@
-"""The warp of a fabric on a mesh: along the texture coordinate s, and along an axis where there is none."""
+"""The warp of a fabric on a mesh: along the texture coordinate s, else along an axis."""
 
 import warnings
 
@@ -13,13 +13,13 @@ _FACING = 0.99  # cosine of the angle between x and a normal, above which a tria
 
 
 def warp_on(mesh: Mesh, warp: ArrayLike | None = None) -> np.ndarray | None:
-    """Returns ``warp``, or vectors along the warp of a fabric, (3,) or (T, 3); None if the mesh gives them to all triangles.
+    """Returns ``warp``, or vectors along the warp, (3,) or (T, 3); None if the mesh gives them to all triangles.
 
     Raises:
-        ValueError: ``warp`` has another shape, or is along the normal of a triangle.
+        ValueError: ``warp`` has another shape, or is normal to a triangle.
 
     Warns:
-        UserWarning: Triangles have no texture coordinates. Their warp is along x of the rest shape, or along y if they face x.
+        UserWarning: Triangles have no texture coordinates; their warp is along x at rest, or y if they face x.
     """
     x, st = mesh.points[mesh.triangles], mesh.corner_coordinates
     normals = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])

@@ -1,32 +1,25 @@
-"""The catalogue of solvers: each has a file of its own, with its record, and two lines here.
+"""The catalogue of solvers: each has a file of its own, with its record, and a line here.
 
 A file has the equation of a method and its source, its options, what it needs of every term, its settings for benchmarks and
 charts, and the bound solver. The command line, benchmarks and charts look up a solver by name in :data:`SOLVERS`.
 :func:`register` adds one from outside the package.
 """
 
-from .admm import ADMM
-from .constrained_dynamics import ConstrainedDynamics
-from .explicit import Explicit
-from .hierarchical_pbd import HierarchicalPBD
-from .newton import Newton
-from .pbd import PBD
-from .projective_dynamics import ProjectiveDynamics
-from .step import SOLVERS as SOLVERS
-from .step import register as register
-from .xpbd import XPBD
+from ..base.catalogue import Catalogue, imported_on_use
 
-# In the order of lists and charts.
-__all__ = [  # noqa: RUF022
-    "Explicit",
-    "Newton",
-    "ProjectiveDynamics",
-    "ADMM",
-    "PBD",
-    "HierarchicalPBD",
-    "XPBD",
-    "ConstrainedDynamics",
-]
+# The record of each, by its name, in the order of lists and charts; the module of a solver is called like it.
+_RECORDS = {
+    "explicit": "Explicit",
+    "newton": "Newton",
+    "projective-dynamics": "ProjectiveDynamics",
+    "admm": "ADMM",
+    "pbd": "PBD",
+    "hierarchical-pbd": "HierarchicalPBD",
+    "xpbd": "XPBD",
+    "constrained-dynamics": "ConstrainedDynamics",
+}
+SOLVERS = Catalogue(__name__, _RECORDS)
+__all__ = list(_RECORDS.values())
 
-for _name in __all__:
-    register(globals()[_name])
+_MODULES = {record: name.replace("-", "_") for name, record in _RECORDS.items()} | {"register": "step"}
+__getattr__ = imported_on_use(__name__, _MODULES)

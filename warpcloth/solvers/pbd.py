@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ..base.checks import ranged
-from ..base.renamed import renamed
 from ..model.model import Model
 from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
 from ..terms.needs import CLOSED_STEP, LOCAL_STEP, MERGED_DAMPING, NO_AIR, NORMAL_FORCE
@@ -13,7 +12,6 @@ from .solver import LaunchedStepper, Stepper
 from .step import Step
 
 
-@renamed(stiffness="correction")
 @dataclass(frozen=True)
 class PBD(Step):
     """Position based dynamics (Müller et al. 2006).

@@ -5,11 +5,11 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+import warpcloth.contact as contact
+
 from ..base.turns import in_turn, methods_in_turn
-from ..contact.collider_steps import ColliderSteps
-from ..contact.no_filter import filter_of
-from ..contact.self_steps import SelfSteps
 from ..core.capture import Segment
+from ..core.no_filter import filter_of
 from ..core.reset import Reset
 from ..core.state import Count, State
 from ..core.thread_pool import ThreadPool
@@ -72,11 +72,11 @@ class Stepper:
         self.colliders = None
         if model.colliders is not None:
             part = 0.0 if integrator is None else 1.0 / INTEGRATORS[integrator].parts
-            self.colliders = ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
+            self.colliders = contact.ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
             self.model = model = model.with_terms(self.colliders.terms)
         self.pairs, self._kept = None, None
         if model.has_pairs:
-            self.pairs = SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
+            self.pairs = contact.SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
             self.model = model = model.with_dynamic(self.pairs.forces.terms)
         if integrator is not None:
             self.integrator = INTEGRATORS[integrator](self)
@@ -121,9 +121,9 @@ class Stepper:
     def cut(self):
         """The fraction of the moves of free vertices that contact cut short so far, (B,)."""
         found = np.zeros(self.model.copies)
-        for contact in (self.colliders, self.pairs):
-            if contact is not None:
-                found += contact.share
+        for each in (self.colliders, self.pairs):
+            if each is not None:
+                found += each.share
         return found
 
     @property

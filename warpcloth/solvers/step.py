@@ -17,6 +17,7 @@ from ..model.precision import DTYPES
 from ..numerics.integrators import INTEGRATORS
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, NORMAL_FORCE, Need, listed, refuse_unmet
+from . import SOLVERS
 from .error_steps import SHORTEST, ErrorStepper
 from .facts import Facts
 from .solver import Stepper
@@ -24,8 +25,6 @@ from .threaded import ThreadedStepper
 
 # Steps per second by default; substeps are chosen nearest to it.
 _STEPS_A_SECOND = 240
-# The records by name, in the order of lists and charts.
-SOLVERS = {}
 
 
 def register(record):
@@ -164,9 +163,10 @@ class Step:
         if model.has_pairs:
             cls._refuse_pairs(model)
         if needs is None:
-            refuse_unmet(model.terms, cls.__name__, cls.needs, {record.__name__: record.needs for record in SOLVERS.values()})
+            others = ((record.__name__, record.needs) for record in SOLVERS.values())
+            refuse_unmet(model.terms, cls.__name__, cls.needs, others)
         else:
-            refuse_unmet(model.terms, f"{cls.__name__} with {options}", needs, {instead: ()})
+            refuse_unmet(model.terms, f"{cls.__name__} with {options}", needs, [(instead, ())])
 
     @classmethod
     def _refuse_pairs(cls, model):

@@ -1,53 +1,37 @@
-"""The catalogue of energies: each has a file of its own, with its record, and two lines here.
+"""The catalogue of energies: each has a file with its record, and a line here.
 
-USD stages, the command line and charts look up an energy by name in :data:`TERMS`. :func:`register` adds one from outside.
+:data:`TERMS` has them by name; :func:`register` adds one from outside.
 """
 
+from ..base.catalogue import Catalogue, imported_on_use
 from ..base.extensions import note
-from .attachment import Attachment
-from .corotated_membrane import CorotatedMembrane
 from .declared import Declared
-from .dihedral_bending import DihedralBending
-from .neo_hookean_membrane import NeoHookeanMembrane
-from .orthotropic_membrane import OrthotropicMembrane
-from .plate_bending import PlateBending
-from .quadratic_bending import QuadraticBending
-from .rigid_cluster import RigidCluster
-from .shell_bending import ShellBending
-from .spring import Spring
-from .spring_limit import SpringLimit
-from .strain_limit import StrainLimit
-from .stvk_membrane import StVKMembrane
 
-__all__ = [
-    "Attachment",
-    "CorotatedMembrane",
-    "DihedralBending",
-    "NeoHookeanMembrane",
-    "OrthotropicMembrane",
-    "PlateBending",
-    "QuadraticBending",
-    "RigidCluster",
-    "ShellBending",
-    "Spring",
-    "SpringLimit",
-    "StVKMembrane",
-    "StrainLimit",
-]
-
-TERMS = {name: globals()[name] for name in __all__}
+_MODULES = {
+    "Attachment": "attachment",
+    "CorotatedMembrane": "corotated_membrane",
+    "DihedralBending": "dihedral_bending",
+    "NeoHookeanMembrane": "neo_hookean_membrane",
+    "OrthotropicMembrane": "orthotropic_membrane",
+    "PlateBending": "plate_bending",
+    "QuadraticBending": "quadratic_bending",
+    "RigidCluster": "rigid_cluster",
+    "ShellBending": "shell_bending",
+    "Spring": "spring",
+    "SpringLimit": "spring_limit",
+    "StVKMembrane": "stvk_membrane",
+    "StrainLimit": "strain_limit",
+}
+__all__ = list(_MODULES)
+__getattr__ = imported_on_use(__name__, _MODULES)
+TERMS = Catalogue(__name__, {name: name for name in __all__})
 
 
 def register(energy):
-    """Adds the record of an energy to :data:`TERMS`, so that stages, charts and tests know it by its name.
-
-    It replaces a record of the same name that was registered before.
+    """Adds the record of an energy to :data:`TERMS`, in place of one of that name; also a decorator.
 
     Args:
         energy: A frozen dataclass that derives from :class:`warpcloth.terms.declared.Declared`.
-
-    Returns:
-        The same class, so that this can be used as a decorator.
 
     Raises:
         ValueError: It is not such a class, or it has the name of an energy of the package.
@@ -56,7 +40,7 @@ def register(energy):
         raise ValueError(
             f"{energy!r} is no energy; it must be a class with a term that derives from warpcloth.terms.declared.Declared"
         )
-    if energy.__name__ in __all__ and energy is not globals()[energy.__name__]:
+    if energy.__name__ in __all__ and energy is not TERMS[energy.__name__]:
         raise ValueError(f"{energy.__name__} is the name of an energy of warpcloth; it must have another")
     TERMS[energy.__name__] = energy
     note(energy)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import ATTACHMENT
+from ..kernels.terms.attachment import ATTACHMENT
 from ..mesh.mesh import Mesh
 from .declared import Damped, indices, own_stencil, quantity
 
@@ -20,8 +20,8 @@ class Attachment(Damped):
         vertices: Indices (E,), or a selection such as ``"corners"``.
         stiffness: k [N/m], one or (E,).
         targets: Positions (E, 3) [m], or one for all (3,); by default the positions at the start.
-        damping: β [N·s/m], one or (E,): a force −βv. Unlike the damping of other terms, it also damps rigid motion.
-        name: To tell two terms of one kind apart.
+        damping: β [N·s/m], one or (E,): a force −βv, also in rigid motion.
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = ATTACHMENT

@@ -1,4 +1,4 @@
-"""The base class of bending energies over hinges. A hinge is an edge with its two adjacent triangles."""
+"""The base class of bending energies over hinges, edges with two adjacent triangles."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from .declared import Damped
 
 @dataclass(frozen=True, kw_only=True)
 class Bending(Damped):
-    """The base class of bending energies, whose elements are the hinges of a mesh.
+    """The base class of bending energies over hinges.
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], one or (E,) in the order of ``mesh.hinges``.

@@ -1,4 +1,4 @@
-"""Contact and friction of vertices with one collider. A scene makes these terms from its colliders."""
+"""Contact and friction of vertices with one collider, which a scene makes."""
 
 from dataclasses import dataclass, field
 
@@ -14,14 +14,14 @@ from .declared import Declared, own_stencil
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VertexContact(Declared):
-    """Contact of vertices with a collider, U = Σ kA φ(d), see :mod:`warpcloth.kernels.terms.contact`.
+    """Contact of vertices with a collider, U = Σ kA φ(d) (:mod:`warpcloth.kernels.terms.contact`).
 
     Attributes:
         vertices: Indices (E,).
         stiffness: k [Pa/m].
         areas: A (E,) [m²].
         distance: r [m].
-        pose, solid, core, radius: Pose and shape of the collider at the start, see :mod:`warpcloth.kernels.terms.contact`.
+        pose, solid, core, radius: Pose and shape of the collider at the start.
         collider: Index of the collider in the scene.
     """
 
@@ -36,7 +36,7 @@ class VertexContact(Declared):
 
     @property
     def term(self) -> Term:
-        """That of contact with this shape."""
+        """Contact with this shape."""
         return contact(self.solid)
 
     def stencil(self, mesh: Mesh) -> np.ndarray:
@@ -48,7 +48,7 @@ class VertexContact(Declared):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VertexFriction(VertexContact):
-    """Friction of vertices on a collider, U = Σ kA H(‖u‖), see :mod:`warpcloth.kernels.terms.friction`."""
+    """Friction of vertices on a collider, U = Σ kA H(‖u‖) (:mod:`warpcloth.kernels.terms.friction`)."""
 
     law: Law = COULOMB
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 from ..kernels.term import Term
-from ..kernels.terms import COROTATED_MEMBRANE
+from ..kernels.terms.corotated_membrane import COROTATED_MEMBRANE
 from .membrane import Membrane, membrane_stiffness
 
 Own = TypeVar("Own", bound="CorotatedMembrane")
@@ -14,14 +14,13 @@ Own = TypeVar("Own", bound="CorotatedMembrane")
 class CorotatedMembrane(Membrane):
     """A corotated membrane with Poisson's ratio 0, U = Σ ½kA‖F − R‖², F = RU the polar decomposition (Chao et al. 2010).
 
-    F (3×2) is the deformation gradient and A the rest area of a triangle. The stress is linear in the stretch U, and the energy
-    has a projection.
+    F (3×2) is the deformation gradient and A the rest area of a triangle. The stress is linear in the stretch U.
 
     Attributes:
-        stiffness: k = Et = 2μ [N/m], Young's modulus times thickness: the force per width and strain of a strip that is pulled.
-            One or (T,); ``math.inf`` for solvers that take hard constraints.
-        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
-        name: To tell two terms of one kind apart.
+        stiffness: k = Et = 2μ [N/m], Young's modulus times thickness, one or (T,); ``math.inf`` for solvers that take hard
+            constraints.
+        damping: β [N·s/m], one or (T,): a stress βĖ, E the Green strain ½(FᵀF − I).
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = COROTATED_MEMBRANE
@@ -29,5 +28,5 @@ class CorotatedMembrane(Membrane):
 
     @classmethod
     def from_material(cls: type[Own], youngs_modulus: float, thickness: float, **fields: Any) -> Own:
-        """Returns the membrane of a material with E [Pa] and ν = 0, ``thickness`` t [m] thick."""
+        """Returns the membrane of a material with E [Pa], ν = 0 and thickness t [m]."""
         return cls(stiffness=membrane_stiffness(cls, youngs_modulus, thickness), **fields)

@@ -1,4 +1,4 @@
-"""The base classes of the records of energies: metadata and checks of fields, and the elements on a mesh."""
+"""The base classes of records of energies: fields, their checks, and elements on a mesh."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -17,15 +17,14 @@ class Elements:
     """The elements of one term on one mesh, as NumPy arrays.
 
     Attributes:
-        label: Name of the term within its scene.
-        term: The energy.
+        label: Name within the scene.
         stencil: Vertices of each element, (E, K) int32.
-        stiffness: One value or (E,); with cells one value or (C,) [unit of the term].
+        stiffness: One value, (E,), or (C,) with cells [unit of the term].
         rest: Rest states (E, P); with sparse cells (C, P).
         damping: One value or (E,) [unit of the term, times s].
-        cells: Offsets (C+1,) of cells: elements cells[c] to cells[c+1] − 1 are the vertices of cell c. None without cells.
-        weights: Weights (E, M) of the vertices of sparse cells, see :mod:`.sparse`; else None.
-        refresh: The :class:`warpcloth.terms.refresh.Refresh` of a rest state that changes during a run, or None.
+        cells: Offsets (C+1,) of cells: elements cells[c] to cells[c+1] − 1 are the vertices of cell c; or None.
+        weights: Weights (E, M) of the vertices of sparse cells (:mod:`.sparse`), or None.
+        refresh: The :class:`warpcloth.terms.refresh.Refresh` of a changing rest state, or None.
     """
 
     label: str
@@ -41,13 +40,13 @@ class Elements:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Metadata of a numeric field: one value for all elements or one for each, in SI units.
+    """Metadata of a numeric field in SI units: one value, or one per element.
 
-    The checks of the field, ``vary`` of batches and USD attributes are derived from it.
+    Checks, ``vary`` and USD attributes follow from it.
 
     Attributes:
-        rule: The rule for values, as part of an error message, such as "must be above 0".
-        holds: (array of values) → which of them obey the rule.
+        rule: The rule for values in error messages, such as "must be above 0".
+        holds: (array of values) → which of them obey it.
         shape: Shape of one value, () or (3,).
     """
 
@@ -61,8 +60,8 @@ class Indices:
     """Metadata of a field of vertex indices.
 
     Attributes:
-        each: Number of vertices per element.
-        text: The meaning of a string: "selection" of vertices, or a "word" that the energy defines; "" if none is allowed.
+        each: Vertices per element.
+        text: Meaning of a string: "selection" of vertices, a "word" of the energy, or "" if refused.
     """
 
     each: int = 1
@@ -88,17 +87,16 @@ FINITE_FROM_0 = quantity("must be finite, 0 or more", lambda values: (values >= 
 class Declared:
     """The base class of all terms: a stiffness, a name and the part of the mesh.
 
-    A subclass sets ``term`` and defines ``stencil``. Its numeric fields have the metadata of :func:`quantity`.
+    A subclass sets ``term`` and defines ``stencil``; numeric fields have the metadata of :func:`quantity`.
 
     Attributes:
-        term: The :class:`warpcloth.kernels.term.Term` with the functions of the energy.
+        term: The :class:`warpcloth.kernels.term.Term` of the energy.
         stiffness: One or (E,) [unit of the term].
-        name: To tell two terms of one kind apart.
-        part: Name of the part of the mesh that it acts on, see :meth:`warpcloth.Mesh.join`, or None for the whole mesh.
-            Selections, indices and arrays then refer to that part.
+        name: Label among terms.
+        part: Part of the mesh that selections, indices and arrays refer to (:meth:`warpcloth.Mesh.join`), or None.
 
     Raises:
-        ValueError: A value is not allowed. The lengths of arrays are checked when the scene is built.
+        ValueError: A value is not allowed. Lengths of arrays are checked when the scene is built.
     """
 
     term: ClassVar[Term]
@@ -132,11 +130,7 @@ class Declared:
         return numeric(f"{self.label}.{field}", getattr(self, field), "be a number or an array of numbers")
 
     def of_elements(self, field: str, count: int) -> np.ndarray:
-        """Returns a numeric field as one value or one for each element, (…) or (count, …).
-
-        Raises:
-            ValueError: It has another shape.
-        """
+        """Returns a numeric field as one value (…) or one per element (count, …); refuses other shapes."""
         values, shape = self._numeric(field), self.quantities()[field].shape
         if values.shape not in (shape, (count, *shape)):
             one = f"of shape {shape}" if shape else "number"
@@ -156,7 +150,7 @@ class Declared:
         """Returns the :class:`Elements` of this term on a mesh.
 
         Args:
-            mesh: The :class:`warpcloth.Mesh`; its points are the rest shape.
+            mesh: The mesh; its points are the rest shape.
             positions: Initial positions, (n, 3) [m].
 
         Raises:
@@ -170,7 +164,7 @@ class Declared:
         return replace(found, stencil=found.stencil + np.int32(first))
 
     def elements_on(self, mesh: Mesh, positions: np.ndarray) -> Elements:
-        """Returns the elements on a mesh; :meth:`elements` passes the mesh of the part."""
+        """Returns the elements on a mesh, that of the part."""
         stencil = self.stencil(mesh)
         if len(stencil) == 0:
             raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
@@ -189,18 +183,14 @@ class Declared:
         return Elements(self.label, self.term, stencil, stiffness, rest, damping)
 
     def rest(self, mesh: Mesh, positions: np.ndarray, stencil: np.ndarray) -> np.ndarray:
-        """Returns the rest states (E, P) of the elements, by default from the rest shape of the mesh."""
+        """Returns the rest states (E, P) of the elements, by default of the rest shape."""
         return self.term.rest_state(mesh.points, stencil)
 
     def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the pairs of vertices whose distance the term keeps, and the stiffness; none by default.
-
-        Args:
-            mesh: As for :meth:`elements`.
-            positions: As for :meth:`elements`.
+        """Returns the pairs of vertices whose distance the term keeps, by default none.
 
         Returns:
-            (pairs (m, 2), K (m,) [N/m]): K is the stiffness of a sheet, force per width and strain.
+            (pairs (m, 2), K (m,) [N/m]): K is force per width and strain of a sheet.
         """
         return np.empty((0, 2), dtype=np.int32), np.empty(0)
 
@@ -209,8 +199,7 @@ class Declared:
 class Damped(Declared):
     """The base class of terms with damping β, which adds the dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖² to each step.
 
-    s is an invariant such as the length of a spring; ``term.dissipation`` defines it, see
-    :class:`warpcloth.kernels.term.Dissipation`.
+    s is an invariant such as a length, by ``term.dissipation`` (:class:`warpcloth.kernels.term.Dissipation`).
 
     Attributes:
         damping: β, one or (E,) [unit of the term, per unit of s², times s].
@@ -220,11 +209,7 @@ class Damped(Declared):
 
 
 def own_indices(name, given):
-    """Returns indices as (E,) int32.
-
-    Raises:
-        ValueError: They are not a list of whole numbers below 2³¹.
-    """
+    """Returns indices as (E,) int32; refuses all but whole numbers below 2³¹."""
     found = as_array(given)
     found = found.astype(np.int32) if found.size == 0 else found
     if found.ndim != 1 or found.dtype.kind not in "iu":
@@ -236,10 +221,8 @@ def own_indices(name, given):
 
 
 def own_stencil(label, parameter, given, vertices, count):
-    """Returns indices (E, ``vertices``), or (E,) if ``vertices`` is 1, as (E, ``vertices``) int32.
-
-    Raises:
-        ValueError: The shape is another, an index is outside [0, ``count``), or a pair names one vertex twice.
+    """Returns indices below ``count`` (E, ``vertices``), or (E,) of one vertex, as (E, ``vertices``) int32; refuses pairs of
+    one vertex.
     """
     stencil = as_array(given)
     if vertices == 1 and stencil.ndim == 1:

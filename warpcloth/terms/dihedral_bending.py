@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..kernels.term import Term
-from ..kernels.terms import DIHEDRAL_BENDING
+from ..kernels.terms.dihedral_bending import DIHEDRAL_BENDING
 from .bending import Bending
 
 
@@ -14,8 +14,8 @@ class DihedralBending(Bending):
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated as in :class:`warpcloth.QuadraticBending`.
-        damping: β [N·m·s]. It damps the rate of θ.
-        name: To tell two terms of one kind apart.
+        damping: β [N·m·s] on the rate of θ.
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = DIHEDRAL_BENDING

@@ -15,12 +15,11 @@ FINITE_ABOVE_0 = quantity("must be finite, above 0", lambda values: (values > 0.
 
 @dataclass(frozen=True, kw_only=True)
 class Limit(Declared):
-    """An energy that is 0 in a range about the rest shape; beyond it the stiffness is infinite by default.
+    """An energy that is 0 in a range about the rest shape.
 
     Attributes:
-        least, most: Ends of the range, σ_min and σ_max, as ratios to the rest shape, each one or (E,). At least one is
-            required.
-        stiffness: k beyond the range, one or (E,).
+        least, most: Ends of the range, σ_min and σ_max, as ratios to the rest shape, each one or (E,); at least one.
+        stiffness: k beyond the range, one or (E,), by default infinite.
     """
 
     stiffness: float | Sequence[float] | np.ndarray = field(default=math.inf, metadata=FROM_0)

@@ -1,4 +1,4 @@
-"""Loads: forces on vertices, tractions on edges and pressures on triangles, constant or with keyframes."""
+"""Loads: forces on vertices, tractions on edges and pressures on triangles."""
 
 import warnings
 from collections.abc import Iterable, Sequence
@@ -15,18 +15,18 @@ from ..mesh.selection import distinct_vertices
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Load:
-    """The base class of all loads, which have a constant value or keyframes.
+    """The base class of loads, with a constant value or keyframes.
 
     Attributes:
         quantity: Name of the field with the constant value.
         shape: Shape of one value.
-        acts_on: Its elements, in the words of error messages.
+        acts_on: Its elements, for messages.
         vertices: Indices (p,), or a selection of the mesh such as ``"x == 1"``.
-        keyframes: Values at frames 0 … F−1 of the scene, (F, …): linear in between, constant after the last.
-        name: To tell two loads of one kind apart.
+        keyframes: Values at frames 0 … F−1, (F, …), linear in between, constant after.
+        name: Label among loads.
 
     Raises:
-        ValueError: A value is not allowed. The scene checks vertices and the lengths of arrays.
+        ValueError: A value is not allowed. The scene checks vertices and lengths.
     """
 
     quantity: ClassVar[str]
@@ -55,10 +55,7 @@ class Load:
         raise NotImplementedError  # every load has its own
 
     def of_elements(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the elements and the keyframes of each.
-
-        Returns:
-            (elements, values): Those of :meth:`elements`, and (F, count, …), with F = 1 for a constant load.
+        """Returns the elements, and the keyframes of each, (F, count, …), F = 1 if constant.
 
         Raises:
             ValueError: There are no elements, or there is another number of values.
@@ -120,7 +117,7 @@ class Traction(Load):
     """Tractions on edges, of fixed direction. A force ½tL acts at each end of an edge of rest length L.
 
     Attributes:
-        vertices: An edge of the mesh is loaded if both of its ends are among these.
+        vertices: An edge is loaded if both of its ends are among these.
         traction: t [N/m] of rest length, (3,), or (E, 3) in the order of ``mesh.edges``.
         keyframes: (F, 3) or (F, E, 3) [N/m].
     """
@@ -139,15 +136,15 @@ class Traction(Load):
 class Pressure(Load):
     """Pressure on triangles along their normals: a force pAn/3 on each corner, with the current area A and normal n.
 
-    The corners turn counter-clockwise about the normal. Triangles that wind against their neighbours are turned over, the fewer
-    in each piece of the mesh, with a warning; a surface with one side is refused.
+    Triangles that wind against their neighbours are turned over, the fewer in each piece, with a warning; a one-sided surface
+    is refused.
 
-    On cloth with free edges, pressure does not derive from an energy, so its force is evaluated once per step: at x for
-    explicit steps and implicit Euler, at x + ½h v for midpoint, and at 2xₙ − xₙ₋₁ for BDF2. Each integrator keeps its order.
+    With free edges, pressure has no energy, so it is evaluated once per step: at x for explicit steps and implicit Euler, at x
+    + ½h v for midpoint, at 2xₙ − xₙ₋₁ for BDF2, which keeps their order.
 
     Attributes:
-        vertices: A triangle is loaded if all of its corners are among these.
-        pressure: p [Pa], a number, or (T,) in the order of ``mesh.triangles``.
+        vertices: A triangle is loaded if all its corners are among these.
+        pressure: p [Pa], or (T,) in the order of ``mesh.triangles``.
         keyframes: (F,) or (F, T) [Pa].
     """
 
@@ -183,11 +180,7 @@ LOADS = {kind.__name__: kind for kind in (Force, Traction, Pressure)}
 
 
 def checked_loads(loads: Any, mesh: Mesh) -> Loads:
-    """Returns one load or several as :class:`Loads`.
-
-    Raises:
-        ValueError: One is not a load, or does not fit the mesh.
-    """
+    """Returns one load or several as :class:`Loads`; refuses what is none or does not fit the mesh."""
     if not isinstance(loads, Iterable):
         loads = (loads,)
     loads = Loads(loads)
@@ -199,7 +192,6 @@ def checked_loads(loads: Any, mesh: Mesh) -> Loads:
 
 
 def _within(load, mesh, elements):
-    """Returns which edges or triangles have all of their vertices among those of a load, (count,) booleans."""
     chosen = np.zeros(len(mesh.points), dtype=bool)
     chosen[distinct_vertices(f"{load.label}.vertices", load.vertices, mesh)] = True
     return chosen[elements].all(axis=1)

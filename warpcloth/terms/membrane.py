@@ -1,4 +1,4 @@
-"""The base classes of membranes: energies of the deformation gradient F (3×2) of each triangle."""
+"""The base classes of membranes, energies of the deformation gradient F (3×2) of triangles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,11 +15,11 @@ Own = TypeVar("Own", bound="IsotropicMembrane")
 
 @dataclass(frozen=True, kw_only=True)
 class Membrane(Damped):
-    """The base class of membranes, whose energy and stress :func:`warpcloth.analyze` can measure.
+    """A membrane, whose energy and stress :func:`warpcloth.analyze` can measure.
 
     Attributes:
-        material: Name of the material on the command line; None if its options do not describe it.
-        stiffness: k = Et [N/m], Young's modulus times thickness. One or (T,).
+        material: Name on the command line, or None.
+        stiffness: k = Et [N/m], Young's modulus times thickness, one or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
     """
 
@@ -49,7 +49,7 @@ class IsotropicMembrane(Membrane):
 
     @classmethod
     def from_material(cls: type[Own], youngs_modulus: float, poisson_ratio: float, thickness: float, **fields: Any) -> Own:
-        """Returns the membrane of a material with E [Pa] and ν, t [m] thick: μ = Et/(2(1 + ν)), λ = Eνt/(1 − ν²) [N/m]."""
+        """Returns the membrane of a material with E [Pa], ν and thickness t [m]."""
         return cls(stiffness=membrane_stiffness(cls, youngs_modulus, thickness), poisson_ratio=poisson_ratio, **fields)
 
     @classmethod

@@ -11,11 +11,10 @@ class Need:
     """A property that a solver needs of every term.
 
     Attributes:
-        met: (elements) → whether a term has the property; ``elements`` is a
-            :class:`warpcloth.model.elements.DeviceElements`, or another object with ``term``, ``hard`` and ``damping`` (None
-            without damping).
-        lack: Words for a term that lacks the property, with {label} in them, for the error message.
-        remedy: A change with which the solver takes the term, or "".
+        met: (elements) → whether a term has it; ``elements`` is :class:`warpcloth.model.elements.DeviceElements`, or has
+            ``term``, ``hard`` and ``damping`` (or None).
+        lack: Words for a term without it, with {label}, for the message.
+        remedy: A change that helps, or "".
     """
 
     met: Callable
@@ -95,19 +94,14 @@ def listed(names):
 def refuse_unmet(terms, solver, needs, others):
     """Checks that every term meets the needs of a solver.
 
-    Args:
-        terms: Elements of each term, see :class:`Need`.
-        solver: Name of the solver, for the error message.
-        needs: Its needs.
-        others: The needs of all solvers that could be used instead, by name.
-
     Raises:
-        ValueError: A term does not. The message names the term, the solver, the first need that is not met and what would work.
+        ValueError: A term does not. The message names the term, the solver, the first unmet need, and solvers of ``others`` or
+            changes that work.
     """
     for elements in terms:
         need = lacks(elements, needs)
         if need is not None:
-            able = [name for name, theirs in others.items() if lacks(elements, theirs) is None]
+            able = [name for name, theirs in others if lacks(elements, theirs) is None]
             # If another solver takes the term as it is, name the remedy only if it is enough: no other need is unmet.
             suffices = need.remedy and (not able or sum(not each.met(elements) for each in needs) == 1)
             instead = [f"{listed(able)} can"] * bool(able) + [need.remedy] * bool(suffices)

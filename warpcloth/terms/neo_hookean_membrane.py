@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..kernels.term import Term
-from ..kernels.terms import NEO_HOOKEAN_MEMBRANE
+from ..kernels.terms.neo_hookean_membrane import NEO_HOOKEAN_MEMBRANE
 from .membrane import IsotropicMembrane
 
 
@@ -16,11 +16,11 @@ class NeoHookeanMembrane(IsotropicMembrane):
     deformation.
 
     Attributes:
-        stiffness: k = Et [N/m], Young's modulus times thickness: the force per width and strain of a strip that is pulled a
-            little. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
+        stiffness: k = Et [N/m], Young's modulus times thickness at small strain, one or (T,). μ = k/(2(1 + ν)), λ = kν/(1 −
+            ν²).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
-        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
-        name: To tell two terms of one kind apart.
+        damping: β [N·s/m], one or (T,): a stress βĖ, E the Green strain ½(FᵀF − I).
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = NEO_HOOKEAN_MEMBRANE

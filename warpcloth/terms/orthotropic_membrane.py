@@ -8,7 +8,7 @@ import numpy as np
 
 from ..base.checks import numeric, refuse
 from ..kernels.term import Term
-from ..kernels.terms import ORTHOTROPIC_MEMBRANE
+from ..kernels.terms.orthotropic_membrane import ORTHOTROPIC_MEMBRANE
 from ..mesh.mesh import Mesh
 from .declared import FINITE
 from .membrane import Membrane
@@ -24,20 +24,18 @@ class OrthotropicMembrane(Woven, Membrane):
     ε = (E₁₁, E₂₂, 2E₁₂) is the Green strain ½(FᵀF − I) along warp (1) and weft (2), and A the rest area of a triangle. With
     k₁ = E₁t/(1 − ν₁₂ν₂₁), εᵀCε is k₁E₁₁² + (E₂/E₁)k₁E₂₂² + 2ν₂₁k₁E₁₁E₂₂ + 4GtE₁₂². It collapses under large compression.
 
-    E₁ and E₂ are Young's moduli: those of strips that are pulled along warp or weft and narrow freely.
+    E₁ and E₂ are moduli of strips along warp or weft that narrow freely.
 
     Attributes:
         stiffness: E₁t [N/m], Young's modulus along the warp times thickness, one or (T,).
         weft_ratio: E₂/E₁, one or (T,).
-        poisson_ratio: ν₁₂, by how much a strip that is pulled along the warp narrows; ν₂₁ = ν₁₂E₂/E₁. One or (T,). Its square
-            must be below E₁/E₂.
-        shear_ratio: G/E₁, one or (T,). If None, G = √(E₁E₂)/2(1 + √(ν₁₂ν₂₁)), that of an isotropic sheet if E₁ = E₂.
-        warp: Vector along the warp, (3,) or (T, 3); each triangle takes the part in its plane. By default the direction in
-            which the texture coordinate s grows and t does not.
-        warp_angle: Angle [rad] by which the warp is turned from there in the plane of the triangle, counter-clockwise if seen
-            from the front, one or (T,).
+        poisson_ratio: ν₁₂, the narrowing of a strip along the warp, with ν₁₂² < E₁/E₂, one or (T,); ν₂₁ = ν₁₂E₂/E₁.
+        shear_ratio: G/E₁, one or (T,). If None, G = √(E₁E₂)/2(1 + √(ν₁₂ν₂₁)), isotropic if E₁ = E₂.
+        warp: Vector along the warp, (3,) or (T, 3), projected to each triangle; by default where the texture coordinate s grows
+            and t does not.
+        warp_angle: Angle [rad] from there to the warp in the triangle, counter-clockwise from the front, one or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ.
-        name: To tell two terms of one kind apart.
+        name: Label among terms.
 
     Raises:
         ValueError: A value is not allowed, or the energy would not be positive definite.
@@ -73,10 +71,10 @@ class OrthotropicMembrane(Woven, Membrane):
         direction: Any = None,
         **fields: Any,
     ) -> Own:
-        """Returns the membrane with E₁t, E₂t and Gt [N/m] and ν₁₂, numbers or (T,); ``direction`` is the vector along the warp.
+        """Returns the membrane with E₁t, E₂t and Gt [N/m] and ν₁₂, numbers or (T,), and the warp along ``direction``.
 
         Raises:
-            ValueError: If E₁t, E₂t or Gt is not above 0, or ν₁₂² is not below E₁/E₂.
+            ValueError: E₁t, E₂t or Gt is not above 0, or ν₁₂² is not below E₁/E₂.
         """
         given = {"warp": warp, "weft": weft, "shear": shear}
         found = {name: numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in given.items()}

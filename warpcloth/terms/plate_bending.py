@@ -1,4 +1,4 @@
-"""Bending of an isotropic or orthotropic plate, independent of the pattern of the mesh."""
+"""Bending of an isotropic or orthotropic plate, on any mesh."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,42 +9,35 @@ import numpy as np
 from ..base.checks import numeric, refuse
 from ..kernels.membrane import side_axes
 from ..kernels.term import Term
-from ..kernels.terms import PLATE_BENDING
+from ..kernels.terms.plate_bending import PLATE_BENDING
 from ..mesh.curvature import curvature_operator
 from ..mesh.mesh import Mesh
 from .declared import quantity
 from .sparse import Sparse
-from .woven import ABOVE_0, Woven
+from .woven import ABOVE_0, Woven, isotropic_twist
 
 Own = TypeVar("Own", bound="PlateBending")
-
-
-def isotropic_twist(ratio: Any, weft: Any) -> Any:
-    """Returns D₆₆/D₁ = ½(1 − ν)√(D₂/D₁) where it is not declared, from ν and D₂/D₁."""
-    return 0.5 * (1.0 - ratio) * np.sqrt(weft)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlateBending(Woven, Sparse):
     """Plate bending, U = Σ ½AκᵀCκ.
 
-    κᵀCκ is D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂². κ holds the second derivatives of the positions of each triangle along warp
-    and weft. They are exact for surfaces of constant curvature on any mesh. The error of deflections falls with the square of
-    the edge length. Forces are linear in x. The plate is flat at rest: of a curved rest shape, only the edge lengths are used.
+    κᵀCκ is D₁κ₁₁² + D₂κ₂₂² + 2D₁₂κ₁₁κ₂₂ + 4D₆₆κ₁₂². κ holds second derivatives of the positions along warp and weft, exact at
+    constant curvature on any mesh. The error of deflections is of second order in the edge length. Forces are linear in x. The
+    plate is flat at rest: a curved rest shape gives edge lengths only.
 
-    The stiffness is given by D₁, Poisson's ratio ν = D₁₂/√(D₁D₂), and two ratios: D₂/D₁ and D₆₆/D₁. An isotropic plate has
-    D₂ = D₁ = D and D₆₆ = ½(1 − ν)D.
+    D₁₂ = ν√(D₁D₂); an isotropic plate has D₂ = D₁ and D₆₆ = ½(1 − ν)D₁.
 
     Attributes:
         stiffness: D₁ [N·m], the bending stiffness along warp, one or (T,).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
         weft_ratio: D₂/D₁, one or (T,).
         twist_ratio: D₆₆/D₁, one or (T,); ½(1 − ν)√(D₂/D₁) if None.
-        warp: Vector along the warp, (3,) or (T,3), of which each triangle takes the component in its plane. By default the
-            direction in which the texture coordinate s grows and t is constant. Isotropic plates need neither.
-        warp_angle: Angle [rad] by which the warp is turned from there in the plane of the triangle, counter-clockwise if seen
-            from the front, one or (T,).
-        name: To tell two terms of one kind apart.
+        warp: Vector along the warp, (3,) or (T, 3), projected to each triangle; by default where the texture coordinate s grows
+            and t is constant. Isotropic plates need neither.
+        warp_angle: Angle [rad] from there to the warp in the triangle, counter-clockwise from the front, one or (T,).
+        name: Label among terms.
 
     Examples:
         >>> import warpcloth as wc
@@ -65,10 +58,10 @@ class PlateBending(Woven, Sparse):
     def from_stiffnesses(
         cls: type[Own], warp: float, weft: float, coupling: float, twist: float, direction: Any = None, **fields: Any
     ) -> Own:
-        """Returns the plate with D₁, D₂, D₁₂ and D₆₆ [N·m], numbers or (T,); ``direction`` is the vector along the warp.
+        """Returns the plate with D₁, D₂, D₁₂ and D₆₆ [N·m], numbers or (T,), and the warp along ``direction``.
 
         Raises:
-            ValueError: If D₁, D₂ or D₆₆ is not above 0, or D₁₂² is not below D₁D₂.
+            ValueError: D₁, D₂ or D₆₆ is not above 0, or D₁₂² is not below D₁D₂.
         """
         given = {"warp": warp, "weft": weft, "coupling": coupling, "twist": twist}
         D1, D2, D12, D66 = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in given.items())
@@ -83,7 +76,7 @@ class PlateBending(Woven, Sparse):
         return self.roots(mesh) @ curvature_operator(mesh)
 
     def roots(self, mesh: Mesh) -> Any:
-        """Returns the square roots of C/D₁ of all triangles, as a block diagonal matrix (3T, 3T) for κ in their own axes.
+        """Returns square roots of C/D₁ as a block diagonal matrix (3T, 3T), for κ in the triangles' axes.
 
         Raises:
             ValueError: The mesh has no hinges.

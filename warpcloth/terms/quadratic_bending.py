@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..kernels.term import Term
-from ..kernels.terms import QUADRATIC_BENDING
+from ..kernels.terms.quadratic_bending import QUADRATIC_BENDING
 from .bending import Bending
 
 
@@ -13,12 +13,12 @@ class QuadraticBending(Bending):
     """Quadratic bending of a sheet that is flat at rest, U = Σ ½D‖y‖²/(A₁+A₂) (Bergou et al. 2006). Forces are linear in x.
 
     Attributes:
-        stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh, which has a Poisson's ratio
-            of −1/3. Other meshes are not isotropic. A grid with one diagonal per cell has the stiffness 3 D when it curves
-            along its diagonals, D when it folds about them or curves along its rows, and 0.75 D when it curves along directions
-            15° off the rows, away from the diagonals. A grid with alternating diagonals has 1 to 1.5 D.
-        damping: β [N·m·s]. It damps the rate of ‖y‖, where ‖y‖ is |e|·|θ| for a small angle θ.
-        name: To tell two terms of one kind apart.
+        stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh, whose Poisson's ratio is
+            −1/3. Other meshes are not isotropic. A grid with one diagonal per cell has 3 D curved along its diagonals, D folded
+            about them or curved along rows, and 0.75 D curved 15° off the rows, away from the diagonals. Alternating diagonals
+            have 1 to 1.5 D.
+        damping: β [N·m·s] on the rate of ‖y‖, |e|·|θ| for a small angle θ.
+        name: Label among terms.
 
     Examples:
         >>> import warpcloth as wc

@@ -1,7 +1,7 @@
-"""Updates of rest states during a run: a term says when, and by which launch.
+"""Updates of rest states during a run: when, and by which launch.
 
-Damping, rigid clusters, sparse energies and colliders use it. A solver calls :meth:`warpcloth.model.model.Model.refresh` at the
-start of each step. Every evaluation of an energy, a force or a projection calls it with the positions that it will use.
+A solver calls :meth:`warpcloth.model.model.Model.refresh` at the start of each step and before every evaluation of an energy, a
+force or a projection.
 """
 
 from collections.abc import Callable
@@ -19,19 +19,18 @@ class Moment(NamedTuple):
 
     Attributes:
         x: Positions (N,) vectors [m].
-        correction: d (N,) [m] for an evaluation at x + d; None for one at x.
-        move: Array (N,) such that d = scale·move is a displacement [m], for integrators that take rates from x − d too; None
-            for those that take them from x alone.
-        scale: 1 if ``move`` is in metres, or a time [s] if it is a velocity.
-        parts: n of the s̃ from which an integrator with a ``move`` takes the rate (s − s̃)/hₑ of any s: s̃ is s(x) less the mean
-            of n changes of s, the first of which is s(x − d) − s(x), and the others 0.
+        correction: d (N,) [m] of an evaluation at x + d, or None.
+        move: Array (N,) with d = scale·move a displacement [m], for integrators that take rates from x − d too; or None.
+        scale: 1, or a time [s] if ``move`` is a velocity.
+        parts: n in the rate (s − s̃)/hₑ of integrators with a ``move``: s̃ is s(x) less the mean of n changes, the first s(x −
+            d) − s(x), the others 0.
         both: Whether the second is s(x + d) − s(x).
-        steps: Number of keyframe steps that each copy has made, (B,) int32; None if nothing follows keyframes.
+        steps: Keyframe steps of each copy so far, (B,) int32; or None.
         per_frame: Keyframe steps per frame.
-        ahead: Keyframe steps from the start of the step to the time at which it takes forces.
-        v: Velocities (N,) [m/s] at the start of a step; None where nothing has a velocity yet.
-        he: hₑ [s], over which velocities are taken; the step, where ``explicit``.
-        explicit: Whether forces are those at x.
+        ahead: Keyframe steps from the start of the step to its forces.
+        v: Velocities (N,) [m/s] at the start of a step, or None.
+        he: hₑ [s]; the step, where ``explicit``.
+        explicit: Whether forces are at x.
     """
 
     x: wp.array
@@ -52,16 +51,14 @@ class Moment(NamedTuple):
 class Refresh:
     """The update of a term's elements during a run.
 
-    It writes rest states. It may also write stencils: then the arrays are as long as the largest number of elements, and the
-    launch sets the stiffness of unused ones to 0. But a solver reads stencils once, when it is bound, for incidences on CUDA,
-    the pattern of the Hessian, colours and constant matrices, which do not follow later changes.
+    It writes rest states, and may write stencils in arrays of maximum length, with stiffness 0 of unused elements. But solvers
+    read stencils only when they are bound, for incidences on CUDA, the pattern of the Hessian, colours and constant matrices.
 
     Attributes:
         when: :data:`STEP` or :data:`EVALUATION`.
-        launch: Function (model, elements, moment) that launches kernels which write the arrays of ``elements``, the
-            :class:`warpcloth.model.elements.DeviceElements`, at a :class:`Moment`. It is captured once and replayed, so it
-            must neither read on the host nor allocate.
-        arrays: Arrays that it reads, (B·E,), which are reordered with the elements.
+        launch: Function (model, elements, moment) that launches kernels which write the arrays of ``elements``; it is captured,
+            so it must neither read on the host nor allocate.
+        arrays: Arrays that it reads, (B·E,), in the order of elements.
     """
 
     when: str

@@ -10,7 +10,7 @@ import numpy as np
 from ..base.checks import shown
 from ..kernels.clusters import fit_targets
 from ..kernels.term import Term
-from ..kernels.terms import RIGID_CLUSTER
+from ..kernels.terms.rigid_cluster import RIGID_CLUSTER
 from ..mesh.mesh import Mesh
 from ..mesh.selection import distinct_vertices
 from .declared import FROM_0, Declared, Elements, indices, own_indices
@@ -22,18 +22,17 @@ class RigidCluster(Declared):
     """Rigid bodies by shape matching, U = Σ (κ/2)Σ mᵢ‖xᵢ − (c + R qᵢ)‖², c and R the best fit of the rest shape (Müller et al.
     2005).
 
-    Bodies that share a vertex are joined there; the vertex has its whole mass in each of them. In the fit, a pinned vertex has
-    a thousand times the mass of the rest of its body, so that the body turns about it. A body with all vertices on a line has
-    no orientation about that line. Newton's method uses κM as the Hessian, which also resists rigid motion: steps with κh² near
-    1 or above take more iterations, and ``equilibrium`` may use up its iterations if bodies move far.
+    Bodies are joined at shared vertices, which have their whole mass in each. In the fit, a pinned vertex has a thousand times
+    the mass of the rest of its body. A body on a line has no orientation about it. Newton's Hessian κM also resists rigid
+    motion: steps with κh² near 1 or above take more iterations, and ``equilibrium`` may use them up.
 
     Attributes:
-        vertices: Vertex indices of the bodies, one body after the other, (E,); or a list with one array per body; or a
-            selection such as ``"x < 0.1"`` for one body, or a list of selections.
-        sizes: Numbers of vertices of the bodies, (C,), if ``vertices`` is one array of several bodies.
-        stiffness: κ [1/s²], one or (C,): the square of the frequency at which a vertex swings about its position in the body;
-            infinite for solvers that take hard constraints.
-        name: To tell two terms of one kind apart.
+        vertices: Vertices of the bodies, one after the other, (E,); a list of an array per body; a selection such as ``"x <
+            0.1"`` for one body, or a list of these.
+        sizes: Numbers of vertices of the bodies in one array, (C,).
+        stiffness: κ [1/s²], one or (C,), the squared frequency of a vertex about its position in the body; infinite for solvers
+            that take hard constraints.
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = RIGID_CLUSTER
@@ -61,7 +60,6 @@ class RigidCluster(Declared):
 
     @property
     def _selections(self):
-        """The selection of each body, or () if bodies are given by indices."""
         vertices = (self.vertices,) if isinstance(self.vertices, str) else self.vertices
         texts = [isinstance(body, str) for body in vertices]
         if any(texts) and not all(texts):
@@ -71,7 +69,6 @@ class RigidCluster(Declared):
         return tuple(vertices) if any(texts) else ()
 
     def _bodies(self, mesh):
-        """Returns the vertices of each body, a list of index arrays."""
         if texts := self._selections:
             bodies = [mesh.select(text) for text in texts]
             for text in [text for text, body in zip(texts, bodies, strict=True) if not len(body)][:1]:
@@ -104,7 +101,6 @@ class RigidCluster(Declared):
 
 
 def _fit(model, elements, moment):
-    """Fits the rigid bodies at x, or at x + d, and sets the targets of their vertices."""
     cells, d = elements.cells, moment.correction
     kernel = model.kernel(fit_targets, model.dtype, d is not None)
     given = [cells.offsets, elements.stencil, cells.shape, moment.x, d]

@@ -1,4 +1,4 @@
-"""Bending of an isotropic or orthotropic shell, whose rest shape is curved, independent of the pattern of the mesh."""
+"""Bending of an isotropic or orthotropic shell with a curved rest shape, on any mesh."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import SHELL_BENDING
+from ..kernels.terms.shell_bending import SHELL_BENDING
 from ..mesh.curvature import covariant_operator
 from ..mesh.mesh import Mesh
 from .plate_bending import PlateBending
@@ -18,21 +18,19 @@ _FLAT = 1e-9  # κ̄ times the longest side of a triangle below which κ̄ is ro
 class ShellBending(PlateBending):
     """Shell bending, U = Σ ½AδᵀCδ.
 
-    δ = κ − κ̄n, and κᵀCκ is that of :class:`warpcloth.PlateBending`. κ̄ is the curvature of the rest shape along warp and weft,
-    and n the normal of a triangle. The rest shape has no energy, wherever it is and however it is turned. In motion without
-    stretch the energy is that of the change of curvature. Forces are not linear in x. Triangles with ‖κ̄‖ below 1e-9 over their
-    longest side are flat: κ̄ is 0.
+    δ = κ − κ̄n, and κᵀCκ is that of :class:`warpcloth.PlateBending`. κ̄ is the curvature at rest along warp and weft, n the
+    normal of a triangle. The rest shape has no energy, however it moves; without stretch the energy is that of the change of
+    curvature. Forces are not linear in x. Triangles with ‖κ̄‖ below 1e-9 over their longest side are flat.
 
     Attributes:
         stiffness: D₁ [N·m], the bending stiffness along warp, one or (T,).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
         weft_ratio: D₂/D₁, one or (T,).
         twist_ratio: D₆₆/D₁, one or (T,); ½(1 − ν)√(D₂/D₁) if None.
-        warp: Vector along the warp, (3,) or (T,3), of which each triangle takes the component in its plane. By default the
-            direction in which the texture coordinate s grows and t is constant. Isotropic shells need neither.
-        warp_angle: Angle [rad] by which the warp is turned from there in the plane of the triangle, counter-clockwise if seen
-            from the front, one or (T,).
-        name: To tell two terms of one kind apart.
+        warp: Vector along the warp, (3,) or (T, 3), projected to each triangle; by default where the texture coordinate s grows
+            and t is constant. Isotropic shells need neither.
+        warp_angle: Angle [rad] from there to the warp in the triangle, counter-clockwise from the front, one or (T,).
+        name: Label among terms.
 
     Examples:
         >>> import warpcloth as wc

@@ -1,4 +1,4 @@
-"""Energies of cells with any number of vertices, y = Dx with a sparse matrix D."""
+"""Energies of cells with any number of vertices."""
 
 from dataclasses import dataclass
 
@@ -11,11 +11,11 @@ from .refresh import EVALUATION, Refresh
 
 @dataclass(frozen=True, kw_only=True)
 class Sparse(Declared):
-    """An energy U = Σ_c k A u(y_c) of cells with any number of vertices, y = Dx linear in all of them.
+    """An energy U = Σ_c k A u(y_c) of cells with any number of vertices, y = Dx with a sparse D.
 
-    A subclass defines ``operator`` and ``rest``, and no ``stencil``. Its ``term`` has ``vertices`` 0 and ``weight`` None.
-    Explicit and Newton take it, and ProjectiveDynamics and ADMM if its ``term`` has a ``curvature``. All solvers take a
-    quadratic energy, whose ``term`` sets ``cells``, ``project``, ``linear`` and ``quadratic``.
+    A subclass defines ``operator`` and ``rest``, and no ``stencil``. Its ``term`` has ``vertices`` 0 and ``weight`` None; a
+    quadratic one sets ``cells``, ``project``, ``linear`` and ``quadratic``, and all solvers take it. Others go to Explicit and
+    Newton, and with a ``curvature`` to ProjectiveDynamics and ADMM.
     """
 
     def operator(self, mesh):
@@ -58,7 +58,6 @@ class Sparse(Declared):
 
 
 def _evaluate(model, elements, moment):
-    """Evaluates the cells at x, or at x + d, and sets the rest state of each vertex of a cell."""
     cells, d = elements.cells, moment.correction
     kernel = model.kernel(kernels.evaluate, cells.term, model.dtype, d is not None)
     given = [cells.offsets, elements.stencil, cells.weights, cells.rest, moment.x, d]

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import SPRING
+from ..kernels.terms.spring import SPRING
 from ..mesh.mesh import Mesh
 from .declared import FINITE_FROM_0, Damped, indices, own_stencil
 
@@ -17,16 +17,14 @@ class Spring(Damped):
     """Springs between vertex pairs, U = Σ ½k(l − L)² (Provot 1995).
 
     Attributes:
-        pairs: Pairs of vertices (E, 2), a kind, or a tuple of kinds; a pair of several kinds is one spring. Kinds are
-            ``"edges"`` of the mesh, and on a grid ``"structural"`` (along rows and columns), ``"shear"`` (both diagonals of
-            each cell) and ``"bending"`` (two apart; on other meshes the opposite vertices of each hinge). Arrays of the other
-            fields have one value per pair. Given pairs keep their order. ``"edges"`` (and ``"structural"`` without a grid) have
-            the order of ``mesh.edges``, which for an edge mesh is the order in which its edges were given. All other kinds, and
-            several kinds together, are in lexicographic order, the smaller index first.
+        pairs: Pairs of vertices (E, 2), a kind, or a tuple of kinds, without repeated pairs. Kinds are ``"edges"``, and on a
+            grid ``"structural"`` (rows and columns), ``"shear"`` (both diagonals of cells) and ``"bending"`` (two apart;
+            elsewhere opposite vertices of hinges). Arrays of other fields have their order: that of given pairs; that of
+            ``mesh.edges`` for ``"edges"`` (and ``"structural"`` without a grid); else lexicographic, the smaller index first.
         stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
         rest_lengths: L [m], one or (E,); by default the lengths in the rest shape.
         damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.
-        name: To tell two terms of one kind apart.
+        name: Label among terms.
 
     Examples:
         >>> import warpcloth as wc
@@ -51,7 +49,7 @@ class Spring(Damped):
         return np.broadcast_to(lengths, len(stencil))[:, None].copy()
 
     def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the pairs, and K = 2k/√3, the stiffness of a sheet of equilateral triangles of springs."""
+        """Returns the pairs, and K = 2k/√3 of a sheet of equilateral triangles."""
         found = self.elements(mesh, positions)
         return found.stencil, 2.0 / np.sqrt(3.0) * np.broadcast_to(found.stiffness, len(found.stencil))
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import SPRING_LIMIT
+from ..kernels.terms.spring_limit import SPRING_LIMIT
 from ..mesh.mesh import Mesh
 from .declared import indices
 from .limit import Limit
@@ -18,11 +18,11 @@ class SpringLimit(Limit):
     """Limits on the distance l between two vertices, U = Σ ½k(l − c)², c = l clamped to [σ_min L, σ_max L] (Provot 1995).
 
     Attributes:
-        least, most: σ_min, σ_max, ratios to the rest length L, each one or (E,); at least one of the two is required.
-        pairs: Pairs of vertices, and their order, as in :class:`warpcloth.Spring`.
-        stiffness: k [N/m], one or (E,): a pair beyond its limit is a spring of this stiffness. Infinite for solvers that take
-            hard constraints, such as PBD; finite for solvers that need forces.
-        name: To tell two terms of one kind apart.
+        least, most: σ_min, σ_max, ratios to the rest length L, each one or (E,); at least one.
+        pairs: Pairs of vertices as of :class:`warpcloth.Spring`.
+        stiffness: k [N/m] beyond a limit, one or (E,); infinite for solvers that take hard constraints, finite for those that
+            need forces.
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = SPRING_LIMIT

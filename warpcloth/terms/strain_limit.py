@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..kernels.term import Term
-from ..kernels.terms import STRAIN_LIMIT
+from ..kernels.terms.strain_limit import STRAIN_LIMIT
 from ..mesh.mesh import Mesh
 from .limit import Limit
 
@@ -18,10 +18,10 @@ class StrainLimit(Limit):
 
     Attributes:
         least, most: Bounds σ_min, σ_max of the singular values σᵢ of the deformation gradient F, each one or (T,); at least
-            one of the two is required.
-        stiffness: k [N/m], one or (T,), that of a :class:`warpcloth.CorotatedMembrane` beyond the limits. Infinite for solvers
-            that take hard constraints, such as PBD; finite for solvers that need forces.
-        name: To tell two terms of one kind apart.
+            one.
+        stiffness: k [N/m] beyond a limit, one or (T,), as of :class:`warpcloth.CorotatedMembrane`; infinite for solvers that
+            take hard constraints, finite for those that need forces.
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = STRAIN_LIMIT

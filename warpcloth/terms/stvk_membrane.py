@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..kernels.term import Term
-from ..kernels.terms import STVK_MEMBRANE
+from ..kernels.terms.stvk_membrane import STVK_MEMBRANE
 from .membrane import IsotropicMembrane
 
 
@@ -15,11 +15,11 @@ class StVKMembrane(IsotropicMembrane):
     F (3×2) is the deformation gradient and A the rest area of a triangle. It collapses under large compression.
 
     Attributes:
-        stiffness: k = Et [N/m], Young's modulus times thickness: the force per width and strain of a strip that is pulled a
-            little. One or (T,). μ = k/(2(1 + ν)), λ = kν/(1 − ν²).
+        stiffness: k = Et [N/m], Young's modulus times thickness at small strain, one or (T,). μ = k/(2(1 + ν)), λ = kν/(1 −
+            ν²).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
-        damping: β [N·s/m], one or (T,): a stress βĖ, E = ½(FᵀF − I) the Green strain.
-        name: To tell two terms of one kind apart.
+        damping: β [N·s/m], one or (T,): a stress βĖ.
+        name: Label among terms.
     """
 
     term: ClassVar[Term] = STVK_MEMBRANE

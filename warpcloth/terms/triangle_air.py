@@ -1,4 +1,4 @@
-"""The forces of air on triangles, which a scene declares by its air."""
+"""The forces of air on triangles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -17,14 +17,13 @@ from .refresh import STEP, Refresh
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TriangleAir(Declared):
-    """Drag and lift of the air on each triangle, see :mod:`warpcloth.kernels.terms.air`.
+    """Drag and lift of the air on each triangle (:mod:`warpcloth.kernels.terms.air`).
 
     Attributes:
         stiffness: Density of the air [kg/m³].
         wind: [m/s], (3,) or (T, 3).
-        keyframes: Of a wind that is the same everywhere, (F, 3) [m/s], in place of ``wind``; or None.
-        blow: Warp function of position [m] and time [s] that gives the wind [m/s], of which ``wind`` is then the largest; or
-            None.
+        keyframes: Of a uniform wind, (F, 3) [m/s], in place of ``wind``; or None.
+        blow: Warp function of position [m] and time [s] for the wind [m/s], at most ``wind``; or None.
         normal_drag, tangential_drag: C_n and C_t.
     """
 
@@ -50,7 +49,7 @@ class TriangleAir(Declared):
 
 
 class _Freeze:
-    """Launches the forces of a step. Keyframes are put on the device by the first call, which the model makes."""
+    """Launches the forces of a step; its first call, by the model, copies keyframes."""
 
     def __init__(self, keyframes, blow):
         self._keyframes, self._blow, self._held = keyframes, blow, {}

@@ -1,4 +1,4 @@
-"""The base of energies of fabrics, which are stiffer along warp or weft."""
+"""Energies of fabrics, stiffer along warp or weft."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -16,14 +16,13 @@ ABOVE_0 = quantity("must be finite and above 0", lambda values: (values > 0.0) &
 
 @dataclass(frozen=True, kw_only=True)
 class Woven(Declared):
-    """An energy of triangles with two directions at right angles: the warp, along which its stiffness is, and the weft.
+    """An energy of triangles with two directions at right angles, the warp, with its stiffness, and the weft.
 
     Attributes:
         weft_ratio: Stiffness along weft over that along warp, one or (T,).
-        warp: Vector along the warp, (3,) or (T, 3); each triangle takes the part in its plane. By default the direction in
-            which the texture coordinate s grows and t does not.
-        warp_angle: Angle [rad] by which the warp is turned from there in the plane of the triangle, counter-clockwise if seen
-            from the front, one or (T,).
+        warp: Vector along the warp, (3,) or (T, 3), projected to each triangle; by default where the texture coordinate s grows
+            and t does not.
+        warp_angle: Angle [rad] from there to the warp in the triangle, counter-clockwise from the front, one or (T,).
     """
 
     # The field with the stiffness of shear or twist over that along warp; None for that of an isotropic sheet.
@@ -41,16 +40,16 @@ class Woven(Declared):
         return getattr(self, self.shearing) is not None or bool((self._numeric("weft_ratio") != 1.0).any())
 
     def isotropic(self: Own) -> Own:
-        """Returns the isotropic energy whose stiffness is the geometric mean of those along warp and weft."""
+        """Returns the isotropic energy with the geometric mean of both stiffnesses."""
         mean = self._numeric("stiffness") * np.sqrt(self._numeric("weft_ratio"))
         unshearing: dict[str, Any] = {self.shearing: None}
         return replace(self, stiffness=mean[()], weft_ratio=1.0, **unshearing)
 
     def warp_directions(self, mesh: Mesh) -> np.ndarray:
-        """Unit vectors along the warp in the plane of each triangle, (T, 3).
+        """Unit vectors along the warp in each triangle, (T, 3).
 
         Raises:
-            ValueError: The mesh has no texture coordinates and ``warp`` is None, or a triangle has no such direction.
+            ValueError: ``warp`` is None without texture coordinates, or a triangle has no such direction.
         """
         axes, T = side_axes(mesh.points, mesh.triangles), len(mesh.triangles)
         if self.warp is not None:
@@ -68,11 +67,14 @@ class Woven(Declared):
 
 
 def along_s(x: np.ndarray, st: np.ndarray) -> np.ndarray:
-    """Returns vectors (T, 3) in the direction in which s grows and t does not; 0 where triangles have no area in (s, t).
+    """Vectors (T, 3) in which s grows and t does not, of corners x (T, 3, 3) [m] with coordinates ``st`` (T, 3, 2).
 
-    Args:
-        x: Corners of triangles (T, 3, 3) [m].
-        st: Their texture coordinates (T, 3, 2).
+    They are 0 where triangles have no area in (s, t).
     """
     sides, ((s1, t1), (s2, t2)) = x[:, 1:] - x[:, :1], (st[:, 1:] - st[:, :1]).transpose(1, 2, 0)
     return np.sign(s1 * t2 - s2 * t1)[:, None] * (t2[:, None] * sides[:, 0] - t1[:, None] * sides[:, 1])
+
+
+def isotropic_twist(ratio: Any, weft: Any) -> Any:
+    """Returns D₆₆/D₁ = ½(1 − ν)√(D₂/D₁) where it is not declared, from ν and D₂/D₁."""
+    return 0.5 * (1.0 - ratio) * np.sqrt(weft)

@@ -1,6 +1,7 @@
 """The table that maps attributes of a USD stage to fields of a scene, for reading and writing.
 
-A cloth is a Mesh prim (or linear BasisCurves) with attributes. For a linen cloth, by hand:
+A cloth is a Mesh prim (or linear BasisCurves) with attributes on it or on the Xform above it; those on the cloth win. Ours are
+in SI units and world space, standard ones in the units of the stage; where both are authored, ours win. For a linen cloth:
 
     double warpcloth:density = 0.15
     token warpcloth:terms:threads:type = "Spring"
@@ -9,20 +10,7 @@ A cloth is a Mesh prim (or linear BasisCurves) with attributes. For a linen clot
     token warpcloth:terms:bending:type = "QuadraticBending"
     double warpcloth:terms:bending:stiffness = 1e-5
 
-Our own attributes are on the cloth's prim. They are in SI units and world space, whatever the units of the stage, and in the
-precision of the scene. Standard attributes are read in the units of the stage; where both are authored, ours win.
-:mod:`.deformables` says what the names of the AOUSD proposal and of Newton, the physics engine, mean. Attributes that other
-cloth tools define for themselves are not read.
-
-An attribute may also be on the Xform above the cloth, where Blender puts the properties of an object. Those on the cloth itself
-win. Other data of a stage:
-
-- Rest shape: the default points, transformed as at the first frame. If points are animated, the cloth starts at those of the
-  first frame. Pinned vertices follow animated points and transforms.
-- Pins: the union of `warpcloth:pins`, `primvars:pins`, and the GeomSubsets of :func:`.stage.pinned_points`.
-- Frames per second: the stage's framesPerSecond, else its timeCodesPerSecond. Duration: `warpcloth:duration`, else the
-  whole frames from start to end time code, else 1 s.
-- Gravity: `warpcloth:gravity`, else the PhysicsScene's, else 9.81 m/s² down the stage's up axis.
+docs/usd.md says how rest shape, pins, frame rate, duration and gravity are found.
 """
 
 from dataclasses import dataclass, fields
@@ -41,9 +29,9 @@ class Attribute:
     """One row of the table.
 
     Attributes:
-        field: Field of `Scene`, `Pins` ("pins.…"), a term ("terms.…") or `Mesh` ("mesh.…"); in brackets, a quantity from which
-            fields are computed.
-        name: Name of the attribute; <name> is any name for a term.
+        field: Field of `Scene`, `Pins` ("pins.…"), a term ("terms.…") or `Mesh` ("mesh.…"); in brackets, a quantity for
+            several.
+        name: Name of the attribute; <name> is any name of a term.
         location: Its prim: "cloth", the cloth or the Xform above it; "body", the cloth or the nearest prim above it with
             PhysicsDeformableBodyAPI; "material", the physics material bound to that; "collider", a collider or the Xform above
             it; "its material", the physics material bound to a collider; "attachment", a PhysicsAttachment; "physics scene".
@@ -60,17 +48,14 @@ class Attribute:
 
     @property
     def types(self):
-        """The types that `type_names` stands for."""
+        """The allowed types."""
         return [Sdf.ValueTypeNames.Find(name) for name in self.type_names]
 
     @property
     def infinite(self):
-        """Whether it may be infinite: each term checks its own values, and USD uses −inf for the gravity of the earth."""
+        """Whether it may be infinite: terms check their values, and USD uses −inf for the earth's gravity."""
         return self.field.startswith("terms.") or self.field in _INFINITE
 
-
-# An attribute of earlier versions.
-ELEMENTS = "warpcloth:contact:elements"
 
 _INFINITE = ("(gravity magnitude)", "contact.stiffness", "(attachment stiffness)", "(shell thickness)")
 
@@ -196,11 +181,6 @@ def attributes():
 class Values:
     """The attributes of a cloth, a collider or an attachment by field, in SI units.
 
-    Args:
-        stage: The stage.
-        prim: The prim.
-        kind: "cloth", "collider" or "attachment".
-
     Raises:
         ValueError: A name in our namespace is not in the table.
     """
@@ -225,8 +205,6 @@ class Values:
         rows = [row for row in attributes() if row.location in self.locations]
         known = {row.name.replace("<name>", key) for row in rows for key in (*self.terms, *self.loads, "")}
         unknown = sorted(set(names) - known)
-        if ELEMENTS in unknown:
-            raise ValueError(f"{ELEMENTS} is not needed, as meshes always touch vertices, edges and faces of cloth; remove it")
         if unknown:
             for key in self.terms:  # an unknown type of a term may be the reason
                 kind_of(self, key)
@@ -236,11 +214,7 @@ class Values:
             )
 
     def authored(self, field, key=None):
-        """Returns the authored attributes of a field as (row, Usd.Attribute), in order of precedence.
-
-        Raises:
-            ValueError: An attribute has another type than its row.
-        """
+        """Returns the authored attributes of a field, (row, Usd.Attribute) in order of precedence; refuses wrong types."""
         for row in attributes():
             for prim in self.locations.get(row.location, ()) if row.field == field else ():
                 attribute = prim and prim.GetAttribute(row.name.replace("<name>", str(key)))
@@ -277,11 +251,7 @@ class Values:
 
 
 def kind_of(values, key, catalogue=TERMS, group="terms"):
-    """Returns the name of the energy of a term, or of the kind of a load.
-
-    Raises:
-        ValueError: There is none of that name.
-    """
+    """Returns the name of a term's energy, or of a load's kind; refuses unknown ones."""
     kind = values.get(f"{group}.type", key)
     if kind not in catalogue:
         given = "not given" if kind is None else repr(kind)
@@ -291,24 +261,22 @@ def kind_of(values, key, catalogue=TERMS, group="terms"):
 
 
 def _kind(type_name):
-    """Describes a type without its precision: text, numbers or unknown, one or several, and the number of components."""
     default = type_name.scalarType.defaultValue
     return default is None, isinstance(default, str), type_name.isArray, np.shape(default)
 
 
 def _rank(type_name):
-    """Returns the number of dimensions of an array of a type; -1 for texts."""
     default = type_name.scalarType.defaultValue
     return -1 if isinstance(default, str) else np.ndim(default) + type_name.isArray
 
 
 def has_api(prim, name):
-    """Returns whether an API schema is applied, by name, because the deformable ones need not be registered."""
+    """Returns whether an API schema is applied, by name: the deformable ones need not be registered."""
     return name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
 
 
 def holders(prim):
-    """Returns the prims that may have the attributes of a shape: itself, and the prim above if that is an Xform or SkelRoot."""
+    """Returns the prims that may have the attributes of a shape: itself, and an Xform or SkelRoot above it."""
     parent = prim.GetParent()
     return [prim, parent] if parent.IsA(UsdGeom.Xform) or parent.IsA(UsdSkel.Root) else [prim]
 
@@ -326,7 +294,7 @@ def _body(cloth):
 
 
 def author(cloth, field, value, key=None, time=None):
-    """Writes a value with the name and the type that the table has for its field."""
+    """Writes a value with the name and the type of the table."""
     row = next((row for row in attributes() if row.field == field), None)
     if row is None:
         raise ValueError(

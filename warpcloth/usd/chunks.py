@@ -31,24 +31,19 @@ _NAMES = {_ROOT, "rest.usdc", _COMPLETE, "checkpoint.npz", "checkpoint.unfinishe
 class ChunkWriter:
     """Writes samples of a few prims over a layer, in chunks that are each written once.
 
-    While it runs, the result is a small root layer, `path`, and a folder beside it, `<stem>_frames/<run>/`, with
+    The result is a root layer, `path`, and a folder `<stem>_frames/<run>/` beside it, with
 
-    - `rest.usdc`: everything that is not animated. Without a source, this is a complete stage, /World/Cloth and its material;
-      with one, constant opinions on the artist's prim. It is weaker than the frames and stronger than the source.
-    - `frames_000000.usdc` and so on: value clips of `chunk` frames. USD also interpolates between the last frame of a clip and
-      the first of the next.
-    - `manifest.usda`: the names of the animated attributes, so that USD need not open chunks to find them.
+    - `rest.usdc`: everything that is not animated, stronger than a source;
+    - `frames_000000.usdc` and so on: value clips of `chunk` frames;
+    - `manifest.usda`: the names of the animated attributes.
 
-    Every file is written under a temporary name and renamed when complete; the root is replaced after each chunk. So a process
-    killed at any moment leaves a result that opens, with at most one chunk of frames missing. The result of an earlier run
-    stays whole until the first chunk of this run is written, or for .usdz the whole package. Files are not flushed to the disk
-    (fsync), so that a power failure may lose the newest chunks. Memory holds one chunk. The folder belongs to the file: move
-    them together, or make one file with `close(single_file=True)`. Only one writer at a time, in all processes, can have an
-    output.
+    Files are written under temporary names and renamed; the root is replaced after each chunk. So a killed process leaves a
+    result that opens, without at most one chunk; a power failure may lose more. An earlier result stays whole until the first
+    chunk is written, or for .usdz the package. An output has one writer at a time, in all processes. An interrupt (Ctrl-C)
+    waits for a chunk or `close`; a second one does not.
 
-    An interrupt (Ctrl-C) waits until a chunk, or `close`, is finished; a second one does not. A run removes the files of
-    earlier runs to the same output from the folder, except files that it reads and the complete frames of a .usdz that was not
-    packed. It removes no other files, none from folders without the manifest of a run, and none behind a link.
+    A run removes the files of earlier runs to the output, except those that it reads and complete frames of a .usdz that was
+    not packed; nothing else, and nothing behind a link.
 
     Attributes:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
@@ -62,14 +57,8 @@ class ChunkWriter:
     _clip_set = METADATA_KEY
 
     def __init__(self, output, mesh, chunk, whole=False):
-        """Checks the output; the writer calls `_put_on` next.
-
-        Args:
-            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file. If it is a link, the file behind it
-                is written, with the folder beside that; viewers find the frames only through a link in the same folder.
-            mesh: The `Mesh`.
-            chunk: Number of frames per chunk, which memory holds, and which a killed process may lose.
-            whole: Whether only `close` writes the root, and an error removes the chunks.
+        """Checks the output, a stage or the link to one; `_put_on` comes next. If ``whole``, only `close` writes the root, and
+        an error removes the chunks.
         """
         self._whole = whole
         self._output = check_output(output)
@@ -95,14 +84,8 @@ class ChunkWriter:
     def _put_on(self, rest, targets, root_metadata, metadata, source=None, files=(), refit=None):
         """Sets the layer below the samples, and locks the output for this writer.
 
-        Args:
-            rest: Layer of everything that is not sampled; it has the sampled attributes without samples.
-            targets: The `Target` of each sampled prim, the main one first.
-            root_metadata: Metadata that USD reads from root layers only, and rates.
-            metadata: Numbers and texts for customLayerData, or None.
-            source: File of the artist's stage below, or None.
-            files: Real paths of all files of that stage.
-            refit: Function that raises a ValueError if the source, read again, no longer fits the frames.
+        ``rest`` has everything not sampled and the declarations of the rest, ``targets`` the sampled prims, the main one first,
+        ``source`` is the artist's stage of ``files``, and ``refit`` raises ValueError if that no longer fits.
 
         Raises:
             BlockingIOError: Another writer has the output.
@@ -138,7 +121,7 @@ class ChunkWriter:
                 self._lock.release()
 
     def saved(self) -> str:
-        """Returns a text that says how many frames there are, and in which file."""
+        """Returns a text with the number of frames and their file."""
         if not self.kept:
             return "nothing was saved"
         path = self._given
@@ -151,17 +134,15 @@ class ChunkWriter:
         """Writes the pending frames. Without frames nothing is written.
 
         Args:
-            single_file: Whether to make one self-contained file, which includes the source, and remove the folder. Frames are
-                copied chunk by chunk, so that memory stays constant; .usda alone is written from a binary file. A .usdz always
-                is one file.
+            single_file: Whether to make one file that includes the source, and remove the folder; .usdz always is one.
             keep: Whether to keep the chunks beside a single file, so that the run can be resumed.
 
         Raises:
             OSError: A file could not be written; the finished chunks stay.
-            ValueError: The source has changed in the meantime and no longer fits the frames, which stay in chunks.
+            ValueError: The source no longer fits the frames, which stay in chunks.
 
         Warns:
-            UserWarning: The source has changed but still fits, or there are frames of an earlier run that was not packed.
+            UserWarning: The source has changed but still fits, or an earlier run was not packed.
         """
         if self._closed:
             return
@@ -192,29 +173,22 @@ class ChunkWriter:
 
     @property
     def complete(self):
-        """Whether it is closed, and packed in one file if that was asked for."""
+        """Whether it is closed, and packed if asked for."""
         return self._closed and not self._packing
 
     def runs_with(self, name):
-        """Returns the folders of runs to this output that have a file of this name, the newest first."""
+        """Returns the folders of earlier runs that have a file of this name, the newest first."""
         found = self._folder.glob(f"{self._output.suffix[1:]}-*/{name}") if self._folder.is_dir() else ()
         runs = [path for path in found if _is_run(path.parent)]
         return [path.parent for path in sorted(runs, key=lambda path: path.stat().st_mtime, reverse=True)]
 
     def written(self):
-        """Returns (chunks, span) for :meth:`resume`: time code and file name of each chunk, first and last time code."""
+        """Returns (chunks, span) for :meth:`resume`: time code and file of each chunk, first and last time code."""
         return [(time, path.name) for time, path in self._chunks], self._span
 
     def resume(self, run, chunks, span, frames):
-        """Continues an interrupted run to this output; call it before the first frame is appended.
-
-        Later chunks of that run are removed once a new chunk replaces them.
-
-        Args:
-            run: Its folder.
-            chunks: From :meth:`written`.
-            span: From :meth:`written`.
-            frames: Number of frames in the chunks.
+        """Continues an interrupted run before the first frame is appended, from :meth:`written`; later chunks are removed once
+        replaced.
 
         Raises:
             FileNotFoundError: One of the chunks is gone.
@@ -233,7 +207,6 @@ class ChunkWriter:
         (self.run / _COMPLETE).unlink(missing_ok=True)
 
     def _keep_chunks(self):
-        """Writes a root layer into the folder of the chunks if the output cannot be written."""
         if self._closed or not (self.run / "rest.usdc").exists():
             return
         before, self.path = self.path, str(self.run / _ROOT)
@@ -244,7 +217,7 @@ class ChunkWriter:
             self.path = before
 
     def _check_source(self):
-        """Warns if the files of the source have changed since they were read; raises ValueError if they no longer fit."""
+        """Warns if the files of the source have changed; raises ValueError if they no longer fit."""
         changed = [file for file, before in self._files.items() if identity(file) != before]
         if not changed:
             return
@@ -259,7 +232,6 @@ class ChunkWriter:
         warnings.warn(f"{changed[0]}: has changed during the run; the frames belong to its earlier version", stacklevel=4)
 
     def _append(self, time, samples):
-        """Adds a frame, the values at a time code by path of attribute, and writes a chunk if it is full."""
         self._pending.append((time, samples))
         self._span = (time if self._span is None else self._span[0], time)
         self.frames += 1
@@ -271,7 +243,7 @@ class ChunkWriter:
             raise ValueError(f"{self._output}: is closed, no frame can be appended")
 
     def _checked_primvars(self, primvars, unknown=False):
-        """Checks the values of all declared primvars, and returns them; with ``unknown`` they may be NaN."""
+        """Checks and returns the values of all declared primvars; with ``unknown`` they may be NaN."""
         declared, primvars = self._targets[0].primvars, primvars or {}
         if primvars.keys() != declared.keys():
             names = ", ".join(map(repr, primvars)) or "none"
@@ -297,11 +269,9 @@ class ChunkWriter:
         return values
 
     def _attributes(self):
-        """Returns the paths of all sampled attributes."""
         return [f"{target.prim}.{name}" for target in self._targets for name in target.attributes]
 
     def _write_chunk(self, last=False):
-        """Writes the pending frames as a clip, and a root that includes it."""
         with deferred():
             if self._pending:
                 self._write_pending()
@@ -340,13 +310,11 @@ class ChunkWriter:
         export(self._rest, self.run / "rest.usdc", like=self._output)
 
     def _declared(self, layer):
-        """Declares all sampled attributes in a layer, and returns it."""
         for target in self._targets:
             target.declare(layer, target.attributes)
         return layer
 
     def _write_root(self, chunks):
-        """Writes a root that includes these chunks."""
         folder = Path(self.path).parent
         layer = Sdf.Layer.CreateAnonymous(".usda")
         stage = Usd.Stage.Open(layer)
@@ -366,7 +334,6 @@ class ChunkWriter:
         export(layer, self.path, self.run, self._output)
 
     def _describe(self, layer):
-        """Writes the metadata that USD reads from root layers only."""
         start, end = self._span
         for name, value in {"startTimeCode": start, "endTimeCode": end, **self._root_metadata}.items():
             layer.pseudoRoot.SetInfo(name, value)
@@ -380,13 +347,11 @@ class ChunkWriter:
         self._stale = set()
 
     def _remove_run(self):
-        """Removes the chunks of this run, and the folder of runs if it has no others."""
         with suppress(OSError):  # it is not empty, or was never made
             self._remove(self.run)
             self._folder.rmdir()
 
     def _remove_other_runs(self):
-        """Removes the files of earlier runs to the same output, to which the output no longer refers."""
         own_kind = re.compile(re.escape(self._output.suffix[1:]) + "-[0-9a-f]{8}")
         for folder in () if self._folder.is_symlink() else self._folder.iterdir():
             inside = os.path.join(os.path.realpath(folder), "")
@@ -404,10 +369,7 @@ class ChunkWriter:
                     self._remove(folder)
 
     def _remove(self, run):
-        """Removes the files of a run, and its folder if nothing else is in it.
-
-        The root is first, so that a process killed meanwhile leaves no root whose layers are gone, and the manifest last.
-        """
+        """Removes the files of a run, the root first and the manifest last, and its folder if empty."""
         if (unpacked := _temporary(run, "unpacked")).exists():
             shutil.rmtree(unpacked)
         fixed = _NAMES | {f"{self._output.stem}.usdc"}
@@ -446,7 +408,6 @@ class ChunkWriter:
             self._folder.rmdir()
 
     def _copy_frames(self, single):
-        """Copies all chunks to a binary layer, without a temporary name, because nobody needs it if the process dies."""
         layer = Sdf.Layer.FindOrOpen(str(single))
         for _, path in self._chunks:
             chunk = Sdf.Layer.FindOrOpen(str(path))
@@ -465,11 +426,10 @@ def frames_folder(output):
 
 
 def check_output(path):
-    """Returns the absolute path of the file that a writer of a stage writes; of a link, that of the file behind it.
+    """Returns the absolute path of the file that a writer writes, for a link that behind it.
 
     Raises:
-        FileNotFoundError: The folder does not exist.
-        ValueError: The ending is not that of a stage, a link ends otherwise than its file, or the path is a folder.
+        ValueError: The ending is not that of a stage or differs from that behind the link, or the path is a folder.
     """
     output = Path(os.path.abspath(followed(path)))
     refuse_path(output)
@@ -494,7 +454,6 @@ def check_scene(fps, up_axis):
 
 
 def _facts(metadata, where="metadata"):
-    """Converts metadata to what a file can keep: numbers, texts and dicts of these."""
     facts = {}
     for name, value in metadata.items():
         if isinstance(value, dict):
@@ -507,9 +466,8 @@ def _facts(metadata, where="metadata"):
 
 
 def export(layer, path, unfinished_in=None, like=None):
-    """Writes a layer under a temporary name and renames it, so that the path has either the old file or the whole layer.
-
-    It has the permissions of the file ``like``, by default of that at the path, if there is one.
+    """Writes a layer under a temporary name and renames it; it has the permissions of the file ``like``, else of the replaced
+    one.
     """
     path = Path(path)
     unfinished = _temporary(Path(unfinished_in or path.parent), "unfinished", path.suffix)
@@ -526,17 +484,16 @@ def _rename(finished, path, like=None):
 
 
 def _temporary(folder, word, suffix=""):
-    """Returns a path in a folder that no file of a user has: with the random end of the folder's name, if it is of a run."""
+    """Returns a path in a folder that no file of a user has."""
     return folder / f"{word}-{folder.name[-8:]}{suffix}"
 
 
 def _is_temporary(name, folder):
-    """Returns whether a file in the folder of a run is unfinished; USD writes first to a name with six random letters."""
     return re.fullmatch(rf"(un)?finished-{re.escape(folder.name[-8:])}\.\w+", name)
 
 
 def _is_run(folder):
-    """Returns whether a folder is no link and has the manifest of a run, or was left by one that was killed before or after."""
+    """Returns whether a folder has the manifest of a run, or was left by a killed one."""
     try:
         if folder.is_symlink():
             return False
@@ -547,12 +504,10 @@ def _is_run(folder):
 
 
 def _export(layer, file, meant=None):
-    """Writes a layer to a file that is ``meant`` for a path."""
     with _writing(meant or file):
         if not layer.Export(str(file)):
             raise OSError(f"{meant or file}: could not be written")
 
 
 def _writing(path):
-    """Turns pxr's errors about a file that cannot be written into one OSError."""
     return sentences(path, OSError, "could not be written: ")

@@ -27,18 +27,9 @@ _SAME = 1e-5
 def read_colliders(stage, cloths, surroundings, codes):
     """Reads the colliders of a stage, in the order of its prims.
 
-    A collider is a shape, visible or not, with PhysicsCollisionAPI or `warpcloth:collider` on itself or on the Xform above it.
-    Planes, spheres, capsules and cubes become primitives if their scale allows it. Cylinders, cones, and shapes whose size
-    changes become triangle meshes.
-
-    Args:
-        stage: The posed stage.
-        cloths: The prims of the cloth, which are not colliders.
-        surroundings: The `StageMesh` of one cloth.
-        codes: Function that returns the time codes of frames from those of the samples of a collider.
-
-    Returns:
-        list: The `Collider` of each.
+    A collider is a shape, visible or not, with PhysicsCollisionAPI or `warpcloth:collider`, on it or on the Xform above; cloth
+    is none. Planes, spheres, capsules and cubes become primitives if their scale allows it; other shapes, and those that change
+    in size, meshes. ``codes`` turns time codes of samples into those of frames.
 
     Raises:
         ValueError: A prim cannot be a collider; the message has its path.
@@ -69,9 +60,9 @@ def errors_at(where):
 
 
 def _mark(prim):
-    """Returns the attribute that marks a prim as a collider, on it or on the prim above it, ours first; or None.
+    """Returns the attribute that marks a prim as a collider, ours first; or None.
 
-    A PhysicsCollisionAPI of simulated cloth lets it touch colliders, and makes it none.
+    A PhysicsCollisionAPI on simulated cloth does not count.
     """
     own = [each.GetAttribute("warpcloth:collider") for each in holders(prim)]
     of_physics = [UsdPhysics.CollisionAPI(each) for each in holders(prim) if each.HasAPI(UsdPhysics.CollisionAPI)]
@@ -81,7 +72,7 @@ def _mark(prim):
 
 
 def collides(prim):
-    """Returns whether a prim is a collider; raises ValueError if it is marked as one but is no shape."""
+    """Returns whether a prim is a collider; refuses marked prims that are no shape."""
     mark = _mark(prim)
     if mark and mark.ValueMightBeTimeVarying():
         raise ValueError(f"{mark.GetName()} changes over time, must have one value")
@@ -96,7 +87,7 @@ def collides(prim):
 
 
 class _Reader:
-    """Reads the collider of a prim at the time codes of the frames; for the arguments see :func:`read_colliders`."""
+    """Reads the collider of a prim at the time codes of the frames."""
 
     def __init__(self, stage, prim, surroundings, codes):
         self.prim, self.kind, self.path = prim, str(prim.GetTypeName()), surroundings.path
@@ -107,13 +98,11 @@ class _Reader:
 
     @cached_property
     def _shape_codes(self):
-        """Time codes of the samples of the attributes of its shape, if that changes."""
         found = [self.prim.GetAttribute(name) for name in (*_SIZES, "points", "warpcloth:points")]
         codes = [time_codes_of(each) for each in found if each]
         return sorted({code for each in codes if len(each) > 1 for code in each})
 
     def collider(self):
-        """Returns the `Collider`."""
         approximation = self._approximation()
         self._warn_of_dynamics()
         given = {"friction": self._friction(), "name": self._name()}
@@ -144,7 +133,6 @@ class _Reader:
         return self._mesh(approximation, given)
 
     def _warn_of_dynamics(self):
-        """Warns that forces do not move a rigid body."""
         body = self.prim
         while body and not body.HasAPI(UsdPhysics.RigidBodyAPI):
             body = body.GetParent()
@@ -156,7 +144,7 @@ class _Reader:
         warnings.warn(f"{self.path}, prim {self.prim.GetPath()}: {text}", stacklevel=2)
 
     def _friction(self):
-        """Returns our own coefficient of friction, else the dynamic one of the material, else its static one."""
+        """Returns our coefficient of friction, else that of the material, dynamic before static."""
         said, static = next(self.values.authored("colliders.friction"), None), self.values.get("(static friction)")
         if said is None:
             return float(static or 0.0)
@@ -166,18 +154,16 @@ class _Reader:
         return friction
 
     def _name(self):
-        """Returns our own name, None if that is empty, or without it the path."""
+        """Returns our name (None if empty), else the path."""
         name = self.values.get("colliders.name")
         return str(self.prim.GetPath()) if name is None else name or None
 
     @property
     def _axis(self):
-        """The axis of the shape (3,) in its own space."""
         return np.eye(3)["XYZ".index(token_of(self.prim.GetAttribute("axis"), ("X", "Y", "Z")))]
 
     @property
     def _size(self):
-        """The sizes of a solid at its first sample."""
         found = {}
         for name in _SIZES:
             attribute = self.prim.GetAttribute(name)
@@ -190,7 +176,7 @@ class _Reader:
 
     @cached_property
     def _transforms(self):
-        """The transforms (4, 4) to metres at each frame, or one if the space does not move.
+        """The transforms (4, 4) to metres at each frame, or one.
 
         A scale of 0 shrinks a collider to a point, which hides it.
         """
@@ -203,9 +189,9 @@ class _Reader:
 
     @cached_property
     def _rigid(self):
-        """Scale S (3, 3), positions t (F, 3) [m] and quaternions (F, 4) with x = rotate(p·S) + t; None if there are none.
+        """Scale S (3, 3), positions t (F, 3) [m] and quaternions (F, 4) with x = rotate(p·S) + t, or None.
 
-        If the prim has translate, orient and scale, as those of `gprims` do, their values are returned unchanged.
+        Values of translate, orient and scale, as of `gprims`, are returned unchanged.
         """
         said = self._said
         if said is not None:
@@ -228,7 +214,7 @@ class _Reader:
 
     @property
     def _said(self):
-        """Like :attr:`_rigid`, for a prim in world space and metres with translate, orient and scale, in this order."""
+        """Like :attr:`_rigid`, for a prim in world space and metres with translate, orient and scale."""
         shape = UsdGeom.Xformable(self.prim)
         operations = {each.GetOpType(): each for each in shape.GetOrderedXformOps()}
         order = [UsdGeom.XformOp.TypeTranslate, UsdGeom.XformOp.TypeOrient, UsdGeom.XformOp.TypeScale]
@@ -254,7 +240,6 @@ class _Reader:
         return np.diag(sizes), positions, rotations
 
     def _mesh(self, approximation, given):
-        """Returns a `MeshCollider`, or a collider that approximates it."""
         prim = self.prim
         if not (prim.IsA(UsdGeom.Mesh) or self.kind in SOLIDS):
             raise ValueError(f"is {self.kind}, must be a Mesh or one of {', '.join(SOLIDS)} to be a collider")
@@ -273,7 +258,7 @@ class _Reader:
         return self._approximated(approximation, points, triangles, given)
 
     def _surface(self):
-        """Returns points (n, 3) or (F, n, 3) in the prim's own space, and triangles (T, 3) counter-clockwise there."""
+        """Returns points (n, 3) or (F, n, 3) in the prim's space, and triangles (T, 3) counter-clockwise there."""
         codes = self.codes if self._shape_codes else [Usd.TimeCode.EarliestTime()]
         if self.kind in SOLIDS:
             self._size  # noqa: B018 (checks the sizes)
@@ -298,7 +283,6 @@ class _Reader:
         return exact if same else points.astype(np.float64)
 
     def _approximation(self):
-        """Returns the approximation of a mesh, and checks it."""
         own = self.values.get("(collides)")
         name = "warpcloth:collider" if isinstance(own, str) else "physics:approximation"
         wanted = own if isinstance(own, str) else self.values.get("(approximation)") or "none"
@@ -308,7 +292,6 @@ class _Reader:
         return wanted
 
     def _approximated(self, wanted, points, triangles, given):
-        """Returns the collider that approximates a mesh."""
         if wanted in _TAKEN_AS_NONE or (wanted != "none" and points.ndim == 3):
             reason = "it deforms" if points.ndim == 3 else "it is not approximated in that way"
             self._warn(f"its approximation {wanted} is taken as none, as {reason}: its triangles are the collider")
@@ -329,19 +312,17 @@ class _Reader:
         return Sphere(radius=radius, **given | self._shifted(centre, given))
 
     def _shifted(self, centre, given):
-        """Returns the positions of a point of the body, as a field by name."""
         from scipy.spatial.transform import Rotation
 
         return {"position": given["position"] + Rotation.from_quat(given["rotation"]).apply(centre)}
 
 
 def _alone(values):
-    """Returns the values of all frames, or of the only one without its axis."""
     return values[0] if len(values) == 1 else values
 
 
 def _hull(points):
-    """Returns the points (n, 3) and triangles (T, 3) of the convex hull, with their fronts outwards."""
+    """Returns points (n, 3) and outward triangles (T, 3) of the convex hull."""
     from scipy.spatial import ConvexHull, QhullError  # loaded late, as importing this package stays light
 
     try:
@@ -357,7 +338,6 @@ def _hull(points):
 
 
 def _centre(points):
-    """Returns the centre (3,) of the smallest sphere around points."""
     import trimesh
     from scipy.spatial import QhullError
 

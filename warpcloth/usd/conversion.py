@@ -20,32 +20,29 @@ _UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
 
 
 def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
-    """Writes an animation in another format. A few frames are in memory at a time, or ten for a stage.
+    """Writes an animation in another format. All frames are checked before the first is written; few are in memory at a time.
 
-    All frames are read twice, because they are checked before the first is written. New files replace older ones, renamed one
-    after another once all are written. After an error or interrupt before that, older files are as before, and nothing is left
-    of new ones. An interrupt among the renames waits until all are renamed; if a rename fails, files renamed before it stay. A
-    killed process leaves temporary files, which the next conversion to the same output removes.
+    New files replace older ones by renames at the end, which an interrupt cannot split.
 
     Args:
         source: Path of an animation, as for :func:`warpcloth.open_sequence`.
-        output: The file to write; its ending is one of :data:`OUTPUTS`. For .obj and .ply the number of each frame is added to
-            the name. Beside a .pc2 or .mdd file, an .obj file of the same name has the first frame.
-        prim: See :func:`warpcloth.open_sequence`.
-        fps: See :func:`warpcloth.open_sequence`.
+        output: The file to write, with an ending of :data:`OUTPUTS`; .obj and .ply get the number of each frame. Beside .pc2
+            and .mdd, an .obj file has the first frame.
+        prim: As of :func:`warpcloth.open_sequence`.
+        fps: As of :func:`warpcloth.open_sequence`.
         mesh: The rest mesh of a source without triangles.
         progress: Function called with (frames written, frames), or None.
 
     Returns:
-        The :class:`warpcloth.Sequence` of the source, and a list of the paths of the files.
+        The :class:`warpcloth.Sequence` of the source, and a list of the written paths.
 
     Raises:
         BlockingIOError: Another conversion to this output is running.
         FileNotFoundError: There is no such file or folder.
-        OSError: A file cannot be written, or not be renamed.
-        ValueError: The source or the ending is not supported; a point, or a velocity that is written, is not finite as float32;
-            a frame has other triangles; the times of frames are needed and not known; frames are unevenly spaced where the
-            format has one interval for all; or an output is no regular file.
+        OSError: A file cannot be written or renamed.
+        ValueError: The source or the ending is not supported; a written point or velocity is not finite as float32; the
+            triangles change; times are needed and unknown, or uneven where the format has one interval; or an output is not a
+            regular file.
     """
     ending = Path(output).suffix.lower()
     if ending not in OUTPUTS:
@@ -93,7 +90,7 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
 
 
 def _check_beside(paths, points, mesh):
-    """Refuses to replace a mesh beside a new cache, which nobody named, unless it is the same."""
+    """Refuses to replace a different mesh beside a new cache, which nobody named."""
     cache, beside = paths
     if beside.exists() and not cache.exists():
         try:
@@ -110,7 +107,6 @@ def _digits(sequence):
 
 
 def _points(sequence, index):
-    """Returns the points (n, 3) [m] of a frame, which must be finite as float32."""
     points = sequence[index]
     _check_finite(sequence, index, "point", points)
     return points
@@ -124,7 +120,6 @@ def _check_finite(sequence, index, name, vectors):
 
 
 def _frames(sequence, progress=None):
-    """Yields the points of each frame."""
     for index in range(len(sequence)):
         yield _points(sequence, index)
         if progress:
@@ -138,7 +133,6 @@ def _times(sequence):
 
 
 def _interval(sequence, values, name):
-    """Returns the interval of evenly spaced values; 1 for one frame."""
     intervals = np.diff(values)
     if not len(intervals):
         return 1.0
@@ -150,7 +144,6 @@ def _interval(sequence, values, name):
 
 
 def _velocities(sequence):
-    """Returns a function (index of a frame) → its velocities (n, 3) [m/s] in a stage, or None if there are none."""
     if sequence.path is None or Path(sequence.path).suffix.lower() not in STAGE_ENDINGS:
         return None
     path = os.fspath(sequence.path)
@@ -165,9 +158,8 @@ def _velocities(sequence):
 
 
 def _moving(sequence, velocities, differences):
-    """Returns an iterator over the points (n, 3) [m] and the velocities (n, 3) [m/s] of each frame.
-
-    The velocities are those of a function as `_velocities` returns it; else differences, if they are asked for, or None.
+    """Returns an iterator over points (n, 3) [m] and velocities (n, 3) [m/s] of each frame: those of ``velocities``, else
+    ``differences``, or None.
     """
     if velocities is not None:
         return zip(_frames(sequence), map(velocities, range(len(sequence))), strict=True)
@@ -175,7 +167,7 @@ def _moving(sequence, velocities, differences):
 
 
 def _differences(sequence):
-    """Yields points and their central differences over time, one-sided for the first and the last frame."""
+    """Yields points and their differences over time, central, one-sided at the ends."""
     last = len(sequence) - 1
     before = now = _points(sequence, 0)
     for index in range(last + 1):

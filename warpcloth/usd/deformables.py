@@ -1,7 +1,7 @@
 """Reads and writes cloth by the names of the AOUSD proposal for deformable bodies and of Newton, the physics engine.
 
-Two laws give the names a meaning. K, G and D are `surfaceStretchStiffness`, `surfaceShearStiffness` [N/m] and
-`surfaceBendStiffness` [N·m], t is the thickness; a hinge has the edge e between triangles of the areas A₁ and A₂:
+Two laws, in docs/usd.md, give the names a meaning. K, G and D are `surfaceStretchStiffness`, `surfaceShearStiffness` [N/m] and
+`surfaceBendStiffness` [N·m], t is the thickness; a hinge has the edge e and triangles of areas A₁ and A₂:
 
 | Name | "proposal" | "newton" |
 |---|---|---|
@@ -9,10 +9,9 @@ Two laws give the names a meaning. K, G and D are `surfaceStretchStiffness`, `su
 | G | shear modulus times thickness | not read |
 | D | bending stiffness of the plate | κ of ½κ|e|θ², in N |
 
-The second is what the importer of Newton 1.8 makes of them for its VBD solver. Without K or D, both laws take Et/(1 − ν²) and
-Et³/12(1 − ν²) from `youngsModulus` and `poissonsRatio`. The bending of one stiffness D everywhere has κ = D|e|/(A₁ + A₂) at a
-hinge; the importer has one κ for all, so that of the same energy, averaged over the directions in which the cloth may curve, is
-written: D Σ(A₁ + A₂)/Σ((A₁ + A₂)²/|e|).
+The second is that of the importer of Newton 1.8 for VBD. Without K or D, both laws take Et/(1 − ν²) and Et³/12(1 − ν²) from
+`youngsModulus` and `poissonsRatio`. One stiffness D has κ = D|e|/(A₁ + A₂) at a hinge; as the importer has one κ, that of equal
+energy, averaged over directions, is written: D Σ(A₁ + A₂)/Σ((A₁ + A₂)²/|e|).
 """
 
 import warnings
@@ -36,11 +35,7 @@ _NEAR = 1e-5  # distance of an anchor from its point, relative to size and posit
 
 
 def thickness_of(values):
-    """Returns the thickness [m] that the names give, or None.
-
-    Raises:
-        ValueError: It is not the same everywhere, or the mass model is neither shell nor solid.
-    """
+    """Returns the thickness [m] that the names give, or None; refuses one that varies, and mass models but shell and solid."""
     _token(values, "(mass model)", "newton:massModel", "shell", "solid")
     several = values.get("(thicknesses)")
     if several is None:
@@ -52,12 +47,8 @@ def thickness_of(values):
 
 
 def masses_of(values, mesh):
-    """Returns masses (n,) [kg] from `physics:masses` and its element type, or None.
-
-    Those of faces, or of the whole, are spread over vertices in proportion to area.
-
-    Raises:
-        ValueError: The element type is another, or the number of masses is wrong.
+    """Returns masses (n,) [kg] from `physics:masses`, or None; those of faces, or of the whole, are spread over vertices by
+    area.
     """
     masses = values.get("(masses)")
     if masses is None:
@@ -79,17 +70,11 @@ def masses_of(values, mesh):
 def terms_of(values, mesh, law, where):
     """Returns the terms of a surface material by a law; none if it has no stiffness.
 
-    Args:
-        values: The :class:`.attributes.Values` of the cloth.
-        mesh: Its mesh.
-        law: One of :data:`LAWS`.
-        where: The file and the prim, for warnings.
-
     Raises:
-        ValueError: It has a stiffness in shear alone, or an attribute has a value that is not allowed.
+        ValueError: There is a stiffness in shear alone, or a value is not allowed.
 
     Warns:
-        UserWarning: It has only a bending stiffness, one is not read, or Young's modulus gives another stretch stiffness.
+        UserWarning: There is only a bending stiffness, one is not read, or Young's modulus gives another stretch stiffness.
     """
     names = ("stretch stiffness", "shear stiffness", "bend stiffness", "Young's modulus", "Poisson's ratio")
     stretch, shear, bend, modulus, ratio = (values.get(f"({name})") for name in names)
@@ -126,11 +111,6 @@ def terms_of(values, mesh, law, where):
 
 
 def _token(values, field, name, *allowed):
-    """Returns the value of an attribute, or None.
-
-    Raises:
-        ValueError: It is none of those ``allowed``.
-    """
     value = values.get(field)
     if value is not None and value not in allowed:
         raise ValueError(f"{name} is {value!r}, must be one of {', '.join(allowed)}")
@@ -158,14 +138,12 @@ def _kappa(mesh):
 
 
 def _hinge_sizes(mesh):
-    """Returns |e| [m] and A₁ + A₂ [m²] of each hinge, (H,)."""
     x0, x1, x2, x3 = (mesh.points[mesh.hinges[:, i]] for i in range(4))
     first, second = (0.5 * np.linalg.norm(np.cross(x1 - x0, x - x0), axis=1) for x in (x2, x3))
     return np.linalg.norm(x1 - x0, axis=1), first + second
 
 
 def _mean_kappa(mesh):
-    """Returns the one κ/D of the same bending energy, see above."""
     edges, areas = _hinge_sizes(mesh)
     return areas.sum() / (areas**2 / edges).sum()
 
@@ -185,14 +163,7 @@ class Held(NamedTuple):
 
 
 def attachments_of(stage, cloth, surroundings, start, codes):
-    """Returns what the PhysicsAttachments of a cloth hold, as :class:`Held`; attachments that are not enabled hold nothing.
-
-    Args:
-        stage: The stage.
-        cloth: The prim of the cloth.
-        surroundings: Its `StageMesh`.
-        start: Positions (n, 3) [m] at the start.
-        codes: Function that returns the time codes of frames from those of samples.
+    """Returns what the enabled PhysicsAttachments of a cloth hold, with positions (n, 3) [m] at the start.
 
     Raises:
         ValueError: An attachment is of another kind, or its anchors are not at its points.
@@ -238,7 +209,6 @@ def _targets(prim, name):
 
 
 def _anchors(stage, prim, values, surroundings, codes):
-    """Returns the vertices (a,) of an attachment, and the positions of their anchors (F, a, 3) [m], one frame if they rest."""
     for field, allowed in (("(kind of points)", "point"), ("(kind of anchors)", "xform")):
         kind = values.get(field)
         if kind != allowed:
@@ -266,11 +236,7 @@ def _anchors(stage, prim, values, surroundings, codes):
 
 
 def refuse_other_rest(prim):
-    """Checks that a prim has no rest shape besides its points.
-
-    Raises:
-        ValueError: It has.
-    """
+    """Raises ValueError if a prim has a rest shape besides its points."""
     for name in ("restShapePoints", "restTriVertexIndices", "restAdjTriPairs", "restBendAngles"):
         attribute = prim.GetAttribute(f"physics:{name}")
         value = value_of(attribute) if attribute else None
@@ -282,17 +248,12 @@ def refuse_other_rest(prim):
 
 
 def define_deformable(layer, scene, law):
-    """Writes the standard names of a cloth into a layer of :func:`.layers.scene_layer`, beside our own.
+    """Writes the standard names of a cloth into a layer of :func:`.layers.scene_layer`.
 
     The pins are points of the kinematic rigid body /World/Pins.
 
-    Args:
-        layer: The layer, with the cloth at /World/Cloth.
-        scene: The :class:`warpcloth.Scene`.
-        law: One of :data:`LAWS`.
-
     Raises:
-        ValueError: There is no such law, or the scene has something without a name.
+        ValueError: The law is unknown, or the scene has something without a name.
     """
     material = _material_of(scene, law)
     stage = Usd.Stage.Open(layer)
@@ -344,7 +305,7 @@ def _set(prim, name, type_name, value):
 
 
 def _material_of(scene, law):
-    """Returns the values of a surface material by a law, by name, and the thickness; refuses what has no name."""
+    """Returns the named values of a surface material by a law, and the thickness; refuses what has no name."""
     if law not in LAWS:
         raise ValueError(f"law is {law!r}; it must be one of {', '.join(LAWS)}")
 
@@ -389,7 +350,6 @@ def _material_of(scene, law):
 
 
 def _of_membrane(term, law, refuse):
-    """Returns the stiffness of a membrane by a law, by name."""
     isotropic = isinstance(term, NeoHookeanMembrane | StVKMembrane)
     if not isotropic and not (isinstance(term, OrthotropicMembrane) and np.all(term.weft_ratio == 1.0)):
         refuse(f"{type(term).__name__} with warp and weft or with another law")

@@ -1,4 +1,4 @@
-"""Directions of elements, drawn as one straight segment per element in curves beside the measured prim."""
+"""Directions of elements, drawn as segments in curves beside the measured prim."""
 
 import numpy as np
 
@@ -12,11 +12,7 @@ _COLOURS = ((0.05, 0.05, 0.05), (0.95, 0.95, 0.95))
 
 
 def check_directions(directions, mesh):
-    """Checks the names and interpolations of directions.
-
-    Raises:
-        ValueError: A name is not allowed, or an interpolation is neither "vertex" nor, with triangles, "uniform".
-    """
+    """Checks that names are allowed, and interpolations "vertex" or, with triangles, "uniform"."""
     allowed = ("vertex", "uniform") if len(mesh.triangles) else ("vertex",)
     for name, interpolation in directions.items():
         if not (isinstance(name, str) and Sdf.Path.IsValidIdentifier(name)):
@@ -26,18 +22,9 @@ def check_directions(directions, mesh):
 
 
 def define_directions(stage, prim, mesh, directions, material, nowhere):
-    """Defines linear BasisCurves `<prim>_<name>` beside a prim, without length until they are sampled.
+    """Defines linear BasisCurves `<prim>_<name>` beside a prim, in the stage's edit target, and returns their `Target` records.
 
-    Args:
-        stage: The stage, its edit target the layer to write to.
-        prim: Path of the prim that the elements are of.
-        mesh: The `Mesh`.
-        directions: "vertex" or "uniform" by name, for segments of vertices or of triangles.
-        material: The material to bind, which shows displayColor.
-        nowhere: As for `segments`.
-
-    Returns:
-        list: The `Target` of each, in the space and units of the prim's parent at its first time.
+    They are in the space of the prim's parent at its first time; ``directions`` are "vertex" or "uniform" by name.
 
     Raises:
         ValueError: The stage has another prim at that path.
@@ -70,12 +57,8 @@ def define_directions(stage, prim, mesh, directions, material, nowhere):
 
 
 def segments(centres, vectors, nowhere):
-    """Returns the ends c ± v/2 (2E, 3) [m] of a segment for each element, all finite; of length 0 if c or v is NaN.
-
-    Args:
-        centres: c (E, 3) [m].
-        vectors: v (E, 3) [m].
-        nowhere: (3,) [m], position of segments if no centre is finite.
+    """Returns the ends c ± v/2 (2E, 3) [m] of segments of centres c and vectors v (E, 3) [m]: of length 0 where NaN, and at
+    ``nowhere`` (3,) if no centre is finite.
     """
     placed = np.isfinite(centres).all(axis=1)[:, None]
     # In the middle of the others, so that invisible segments do not enlarge the extent.
@@ -85,24 +68,23 @@ def segments(centres, vectors, nowhere):
 
 
 def _middle(points, otherwise):
-    """Returns the mean of the finite points, or ``otherwise`` if there are none."""
     points = points[np.isfinite(points).all(axis=1)]
     return points.mean(axis=0) if len(points) else otherwise
 
 
 def to_metres(stage, prim, time):
-    """Returns the transform (4, 4) from the space of a prim's siblings to world space [m] at a time, for row vectors."""
+    """Returns the transform (4, 4), for row vectors, from the space of a prim's siblings to world space [m]."""
     parent = stage.GetPrimAtPath(prim).GetParent()
     return local_to_metres(parent, f"prim {parent.GetPath()}, time code {time}", time)
 
 
 def middle(mesh):
-    """Returns a position (3,) [m] for elements that have none in any frame: the mean of the finite points at rest."""
+    """Returns the mean finite rest point (3,) [m], for elements without a position in any frame."""
     return _middle(mesh.points, np.zeros(3))
 
 
 def refuse_taken(stage, path, kind):
-    """Raises ValueError if a stage has a prim of another type than ``kind`` at a path."""
+    """Raises ValueError if a prim at a path is not of type ``kind``."""
     prim = stage.GetPrimAtPath(path)
     if prim and prim.GetTypeName() != kind:
         raise ValueError(f"prim {path}: is {prim.GetTypeName() or 'untyped'} in the source, must be free for a {kind}")

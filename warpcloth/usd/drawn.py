@@ -1,4 +1,4 @@
-"""Everything visible in a stage: its meshes, solids and linear curves, read at one time code after another."""
+"""Everything visible in a stage: meshes, solids and linear curves, read frame by frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,19 +32,17 @@ from .values import array_of, check_composed, sentences, time_codes_of
 
 @dataclass(frozen=True, eq=False)
 class DrawnPrim:
-    """A Mesh prim, a solid such as a Sphere, or linear BasisCurves, for drawing.
+    """A Mesh prim, a solid such as a Sphere, or linear BasisCurves.
 
     Attributes:
-        path: Path of the prim.
-        cloth: Whether it is cloth, as opposed to surroundings.
-        count: Number of its points n.
+        cloth: Whether it is cloth.
         triangles: (T, 3) int32; empty for curves.
         edges: (E, 2) int32, the segments of curves; empty for a mesh.
         radius: Radius of the curves [m].
         pins: Pinned points (p,).
         colour: Base colour, linear Rec. 709; None if the stage gives none.
-        points: Function that returns the points (n, 3) [m] in world space at a time code.
-        codes: Time codes of the samples of its points, or if these are constant, of its transforms.
+        points: Function (time code) → points (n, 3) [m] in world space.
+        codes: Time codes of the samples of its points, or else of its transforms.
     """
 
     path: str
@@ -61,14 +59,11 @@ class DrawnPrim:
 
 @dataclass(frozen=True, eq=False)
 class DrawnStage:
-    """The prims of a stage that are drawn, and its time codes.
+    """The drawn prims of a stage, and its time codes.
 
     Attributes:
-        prims: List of `DrawnPrim`.
-        codes: Time codes of the frames (F,): those of the cloth, or else of its surroundings; one if nothing moves.
-        rate: Time codes per second.
-        up_axis: "Y" or "Z".
-        stage: The stage, whose prims are invalid once it is gone.
+        codes: Time codes of the frames (F,): of the cloth, else of its surroundings; one if nothing moves.
+        stage: The stage, which keeps the prims valid.
     """
 
     prims: list[DrawnPrim]
@@ -79,21 +74,14 @@ class DrawnStage:
 
 
 def read_drawn(path, prim=None):
-    """Reads all meshes, solids and linear curves that a stage shows. Solids keep their first size.
+    """Reads all meshes, solids (in their first size) and linear curves that a stage shows, at the first frame.
 
-    The cloth is the named prim, else the prim that an earlier run animated, else each prim whose points move, else all prims.
-    Invisible prims, guides, proxies and prototypes of point instancers are left out.
-
-    Args:
-        path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the cloth, or None.
-
-    Returns:
-        DrawnStage: It keeps the stage open. Only the first frame has been read.
+    The cloth is the named prim, else what an earlier run animated, else each prim whose points move, else all. Invisible prims,
+    guides, proxies and prototypes of point instancers are ignored.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no stage, or shows no mesh, solid or linear curves; there is no such prim; or a prim is broken.
+        ValueError: It is not a stage, shows nothing or has no such prim, or a prim is broken.
     """
     with sentences(path):
         stage = posed(open_stage(path), -np.inf, np.inf)
@@ -126,7 +114,6 @@ def draw_colliders(scene):
 
 
 def _shown(stage):
-    """Returns the visible meshes, solids and linear curves of a stage."""
     walk = iter(Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()))
     for prim in walk:
         if prim.IsA(UsdGeom.PointInstancer):
@@ -142,7 +129,6 @@ def _shown(stage):
 
 
 def _codes(prim):
-    """Returns the time codes of the samples of a prim's points, or else of its transforms."""
     codes = time_codes_of(UsdGeom.PointBased(prim).GetPointsAttr()) if prim.IsA(UsdGeom.PointBased) else []
     ancestor = prim
     while not codes and ancestor and not ancestor.IsPseudoRoot():
@@ -152,7 +138,6 @@ def _codes(prim):
 
 
 def _drawn(prim, path, cloth, codes):
-    """Returns the `DrawnPrim` of a prim, or None for surroundings without points."""
     check_composed(prim, path)
     where = f"{path}, prim {prim.GetPath()}"
     first = codes[0] if codes else Usd.TimeCode.Default()
@@ -202,7 +187,7 @@ def _drawn(prim, path, cloth, codes):
 
 
 def _base_colour(prim):
-    """Returns the constant base colour of the material of a prim, or else its constant displayColor; None for our own blue."""
+    """Returns the constant base colour of a prim's material, else its displayColor; or None."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     source = material.ComputeSurfaceSource() if material else ()
     base = source[0].GetInput("diffuseColor") if source and source[0] else None
@@ -212,10 +197,10 @@ def _base_colour(prim):
 
 
 def camera_of(stage, path, name):
-    """Returns a function (time code, aspect) of a Camera prim: its position [m], direction, up direction, and its lens.
+    """Returns a function (time code, aspect) of a Camera: position [m], direction, up direction, and lens.
 
-    The lens is the vertical field of view [°], so large that a picture of that width by height shows all of the aperture, and
-    the shift and the rise of :class:`warpcloth.picture.camera.Camera`.
+    The lens is the vertical field of view [°] that shows all of the aperture, and the shift and rise of
+    :class:`warpcloth.picture.camera.Camera`.
 
     Raises:
         ValueError: No Camera or several have that path or ``name``, or it has no perspective.
@@ -242,7 +227,6 @@ def camera_of(stage, path, name):
 
 
 def _radius(prim, points, edges, transform):
-    """Returns half the mean width of curves [m], by default a fraction of their mean segment."""
     widths = array_of(UsdGeom.Curves(prim).GetWidthsAttr())
     if widths is not None and len(widths) and np.isfinite(widths).all() and widths.mean() > 0.0:
         return 0.5 * float(widths.mean()) * abs(np.linalg.det(transform[:3, :3])) ** (1 / 3)

@@ -34,7 +34,7 @@ _VECTORS = ("points", "velocities")
 
 
 def open_sequence(path, prim, fps):
-    """Opens the frames of a stage for :func:`warpcloth.open_sequence`; if a run animated several cloths, those of all."""
+    """Opens the frames of a stage for :func:`warpcloth.open_sequence`; of several animated cloths all."""
     prims = [] if prim is not None else [str(each.GetPath()) for each in animated_prims(open_stage(path))]
     if len(prims) > 1:
         return _sequence_of_cloths(path, prims, fps)
@@ -52,7 +52,6 @@ def open_sequence(path, prim, fps):
 
 
 def _sequence_of_cloths(path, prims, fps):
-    """Returns the frames of several cloths, as one mesh whose parts are the cloths."""
     frames = JoinedFrames(path, prims)
     each = [read_stage_mesh(path, prim, Surface, frames.time_codes[0]) for prim in prims]
     joined = Mesh.join({prim.rsplit("/", 1)[1]: stage.mesh for prim, stage in zip(prims, each, strict=True)})
@@ -65,15 +64,12 @@ def _sequence_of_cloths(path, prims, fps):
 
 
 class FrameSequence:
-    """Sampled points, velocities or numbers of a prim, as an array that reads frames from the file on demand.
+    """Sampled points, velocities or numbers of a prim, as an array that reads frames on demand.
 
-    Indexing reads a frame and keeps nothing, so that memory stays constant. `np.asarray(sequence)` reads all frames. If the
-    file has been written again since, reading raises a RuntimeError, because USD may hold some of the earlier frames and mix
-    them with the new ones. If the file was deleted, reading works while USD holds it. A frame with another number of values
-    than the first, or whose faces differ from those of the prim, raises a ValueError.
+    Indexing reads a frame and keeps nothing; `np.asarray` reads all. If the file is written again meanwhile, reading raises
+    RuntimeError. A frame with another number of values, or other faces, raises ValueError.
 
-    If the prim's transform is animated, points are transformed at their own time codes, and the velocity of the transform since
-    the previous frame is added to the velocities of the prim.
+    Points follow an animated transform at their time codes; its velocity since the previous frame is added to the velocities.
 
     Attributes:
         shape: (frames, n, 3); for a primvar (frames, n), or if it is uniform (frames, faces of the prim).
@@ -89,9 +85,9 @@ class FrameSequence:
 
         Args:
             path: A .usd, .usda, .usdc or .usdz file.
-            prim: Path or name of the prim; see `read_stage_mesh`.
-            attribute: "points", in world space [m], "velocities" [m/s], or a primvar of single numbers, "primvars:<name>".
-            scale: Factor on a primvar, to convert its unit.
+            prim: Path or name of the prim, or None.
+            attribute: "points", in world space [m], "velocities" [m/s], or "primvars:<name>" of single numbers.
+            scale: Factor on a primvar.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -181,11 +177,7 @@ class FrameSequence:
         return result if dtype is None else result.astype(dtype, copy=False)
 
     def exact(self, frame: int) -> np.ndarray:
-        """Returns one frame of points [m] or velocities [m/s] (n, 3) in float64, so that a transform adds no float32 rounding.
-
-        Args:
-            frame: Its number, from 0.
-        """
+        """Returns a frame of points [m] or velocities [m/s] (n, 3) in float64, without rounding of transforms to float32."""
         values = self._values(frame).astype(np.float64)
         if not self._moving:
             return placed(values, self._transform)
@@ -195,12 +187,10 @@ class FrameSequence:
         return values @ now[:3, :3] + self._velocities_of_space(frame, now)
 
     def _space(self, frame):
-        """Returns the transform (4, 4) of a moving space at a frame."""
         code = self.time_codes[frame]
         return local_to_metres(self._moving, f"{self._where}, time code {code:g}", code)
 
     def _velocities_of_space(self, frame, now):
-        """Returns the velocities (n, 3) [m/s] of points fixed in a moving space."""
         if frame == 0:
             return 0.0
         with self._located():
@@ -214,7 +204,6 @@ class FrameSequence:
         return (self._values(frame) * self._scale).astype(np.float32, copy=False)
 
     def _values(self, frame):
-        """Reads the values of a frame from the file, each vertex once."""
         if identity(self._file) not in (None, self._identity):
             raise RuntimeError(
                 f"{self._file}: has been written again since these frames were opened; open it again, "
@@ -234,7 +223,6 @@ class FrameSequence:
 
     @contextmanager
     def _located(self):
-        """Adds the path of the prim to an error about an attribute."""
         try:
             yield
         except ValueError as error:
@@ -242,11 +230,9 @@ class FrameSequence:
 
 
 class JoinedFrames(FrameSequence):
-    """Points or velocities of several prims of one file, the vertices of the first and then those of the next.
+    """Points or velocities of several prims of one file, one after another.
 
     Args:
-        path: The file.
-        prims: Their paths.
         attribute: "points" or "velocities".
     """
 

@@ -14,14 +14,9 @@ _SPREAD = 4.0  # size of a drawn plane, in sizes of the cloth
 
 
 def define_colliders(layer, colliders, mesh):
-    """Defines a prim for each collider, such as a Sphere, in a layer of :func:`.layers.scene_layer`, with its motion.
+    """Defines a prim for each collider, with its motion, in a layer of :func:`.layers.scene_layer`.
 
-    `colliders.read_colliders` returns the same motion and shape, bit for bit.
-
-    Args:
-        layer: The layer.
-        colliders: Colliders of a scene.
-        mesh: The cloth, from which the size of a drawn plane follows.
+    `colliders.read_colliders` returns the same motion and shape, bit for bit. A drawn plane is sized by the cloth ``mesh``.
     """
     if not colliders:
         return
@@ -37,7 +32,6 @@ def define_colliders(layer, colliders, mesh):
 
 
 def _free_path(stage, parent, name):
-    """Returns a path below a prim with a name, numbered if it is taken."""
     name = Tf.MakeValidIdentifier(name)
     path, number = parent.AppendChild(name), 1
     while stage.GetPrimAtPath(path):
@@ -47,7 +41,6 @@ def _free_path(stage, parent, name):
 
 
 def _define(stage, path, collider, mesh):
-    """Defines the primitive of a collider at the origin, its axis along y."""
     if isinstance(collider, MeshCollider):
         return _define_mesh(stage, path, collider)
     _half, radius = collider.core
@@ -76,7 +69,6 @@ def _define(stage, path, collider, mesh):
 
 
 def _define_mesh(stage, path, collider):
-    """Defines a mesh with the triangles of a collider; if it deforms, with a time sample of the points for each frame."""
     gprim, frames = UsdGeom.Mesh.Define(stage, path), collider.frames
     gprim.CreateFaceVertexCountsAttr(np.full(len(collider.triangles), 3, np.int32))
     gprim.CreateFaceVertexIndicesAttr(collider.triangles.ravel())
@@ -95,7 +87,6 @@ def _define_mesh(stage, path, collider):
 
 
 def _move(gprim, collider):
-    """Writes position, rotation and the scale of a box; if the collider moves, with a time sample for each frame."""
     translate, orient = gprim.AddTranslateOp(), gprim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
     poses = collider.poses
     for frame, pose in enumerate(poses):
@@ -108,7 +99,6 @@ def _move(gprim, collider):
 
 
 def _add_physics(stage, prim, collider):
-    """Writes the UsdPhysics schemas of a collider, kinematic if it moves, its friction and its name."""
     UsdPhysics.CollisionAPI.Apply(prim)
     if prim.IsA(UsdGeom.Mesh):
         UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(UsdPhysics.Tokens.none)

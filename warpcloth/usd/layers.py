@@ -1,4 +1,4 @@
-"""The layer below an animation, with everything that is constant: a complete stage, or a layer over an artist's stage."""
+"""The constant layer below an animation: a complete stage, or a layer over an artist's stage."""
 
 import os
 from dataclasses import replace
@@ -34,20 +34,7 @@ CURVE_WIDTH = 0.05
 
 
 def scene_layer(mesh, pins, up_axis, name):
-    """Builds a complete stage of one cloth at rest, to be animated.
-
-    Args:
-        mesh: The `Mesh`.
-        pins: Vertex indices by name, or None.
-        up_axis: "Y" or "Z".
-        name: Name of the prim: /World/<name>.
-
-    Returns:
-        The layer, the `Target` in it, and its root's metadata.
-
-    Raises:
-        ValueError: The name of the prim or of a pin is not allowed.
-    """
+    """Builds a complete stage of one cloth at rest; returns the layer, the `Target` in it, and its root's metadata."""
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -60,7 +47,7 @@ def scene_layer(mesh, pins, up_axis, name):
 
 
 def define_cloth(layer, mesh, pins, name):
-    """Defines a cloth at rest in a layer of `scene_layer`, with its parameters, and returns its `Target`."""
+    """Defines a cloth at rest, with its parameters, in a layer of `scene_layer`; returns its `Target`."""
     if not Sdf.Path.IsValidIdentifier(name):
         raise ValueError(f"prim is {name!r}; it must be a name of letters, digits and _ where there is no source")
     stage, path = Usd.Stage.Open(layer), f"/World/{name}"
@@ -89,12 +76,9 @@ def define_cloth(layer, mesh, pins, name):
 
 
 def define_lines(layer, mesh, lines):
-    """Defines linear curves beside a cloth, along pairs of vertices of its mesh.
+    """Defines linear curves beside a cloth, along ``lines``: pairs (E, 2) of its vertices and a thickness [m] by name.
 
-    Args:
-        layer: A layer of `scene_layer`.
-        mesh: The `Mesh`.
-        lines: Pairs (E, 2) and a thickness [m] by name. The name of the prim keeps only letters, digits and _.
+    Names keep only letters, digits and _.
 
     Returns:
         list: The `Target` of each, to be sampled with all vertices of the mesh.
@@ -116,7 +100,6 @@ def define_lines(layer, mesh, lines):
 
 
 def _define_curves(stage, path, paths, width):
-    """Defines linear curves along paths of vertices; where curves meet, each has its own point."""
     width = float(np.float32(width))
     curves = UsdGeom.BasisCurves.Define(stage, path)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
@@ -129,14 +112,9 @@ def _define_curves(stage, path, paths, width):
 
 
 def edge_paths(edges, count):
-    """Returns paths along edges that use each edge once, found greedily, from the vertices of odd valence first.
+    """Returns paths of at least two vertices along edges (E, 2), each edge in one, found greedily from odd vertices first.
 
-    Args:
-        edges: (E, 2).
-        count: Number of vertices n.
-
-    Returns:
-        list: Vertices of each path, at least two. A vertex without edges has a path of length 0.
+    A vertex without edges has a path of length 0.
     """
     neighbours = [[] for _ in range(count)]
     for edge, (a, b) in enumerate(np.asarray(edges).tolist()):
@@ -161,7 +139,6 @@ def edge_paths(edges, count):
 
 
 def _add_primvars(geometry, mesh):
-    """Adds texture coordinates, if the mesh has them, and a colour that the material reads."""
     primvars = UsdGeom.PrimvarsAPI(geometry)
     coordinates = mesh.texture_coordinates
     if coordinates is not None and len(mesh.triangles):
@@ -172,7 +149,6 @@ def _add_primvars(geometry, mesh):
 
 
 def _add_pins(geometry, target, pins, count):
-    """Adds a GeomSubset of points for each set of pins, in a family of their own; sets may overlap."""
     for name, vertices in pins.items():
         if not Sdf.Path.IsValidIdentifier(name):
             raise ValueError(f"pins: {name!r} must be a name of letters, digits and _, not starting with a digit")
@@ -192,7 +168,7 @@ def _add_pins(geometry, target, pins, count):
 
 
 def define_material(stage, path):
-    """Defines a UsdPreviewSurface that reads displayColor, for viewers that ignore displayColor itself."""
+    """Defines a UsdPreviewSurface that reads displayColor."""
     material = UsdShade.Material.Define(stage, path)
     surface = UsdShade.Shader.Define(stage, f"{path}/Surface")
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -209,30 +185,21 @@ def define_material(stage, path):
 
 
 def bind_material(prim, material):
-    """Binds a material to a prim."""
     UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
 
 def over_layer(source, prim, mesh, primvars, history, layer=None):
-    """Builds a layer of opinions on the artist's prim, to be animated. It has no points, and sets how normals are read.
+    """Builds a layer over the artist's prim, to be animated, added to ``layer`` if that is not None.
 
-    The artist's default points stay the rest shape. If there are none, only samples, ours are written.
-
-    Args:
-        source: File of the stage.
-        prim: Path or name of the prim, or None.
-        mesh: The `Mesh` that is simulated.
-        primvars: Interpolation of sampled primvars, by name; the artist's primvars of the same name are blocked.
-        history: Types of the primvars of the history of a run, by name; likewise.
-        layer: A layer of other prims of the same source, to which this one is added, or None.
+    The artist's default points stay the rest shape; without them ours are written. The artist's primvars named as ours are
+    blocked.
 
     Returns:
-        The layer, the `Target`, the artist's root metadata, the `StageMesh` of the prim, real paths of all files of the
-        artist's stage, and a function that returns the transform of the prim, as in `StageMesh`, at a time code of that stage,
-        or None if it does not move.
+        The layer, the `Target`, the artist's root metadata, the `StageMesh`, real paths of all files of the stage, and a
+        function (time code) → transform of the prim, or None if it does not move.
 
     Raises:
-        ValueError: As for `read_stage_mesh` and `artist_prim`; or a primvar of the artist has another type than float[].
+        ValueError: As for `read_stage_mesh` and `artist_prim`, or a primvar of the artist is not float[].
     """
     surroundings = stage_mesh(source, prim)
     stage, artist = artist_prim(surroundings, mesh)
@@ -267,18 +234,7 @@ def over_layer(source, prim, mesh, primvars, history, layer=None):
 
 
 def artist_prim(surroundings, mesh):
-    """Returns the artist's prim for a layer over it, and checks that the mesh fits.
-
-    Args:
-        surroundings: The `StageMesh`.
-        mesh: The `Mesh` of the frames.
-
-    Returns:
-        The stage, which must be kept alive, and the prim in it.
-
-    Raises:
-        ValueError: The prim is an instance; the mesh has another number of vertices or other triangles.
-    """
+    """Returns the stage, to be kept alive, and the artist's prim in it; refuses instances and meshes of another topology."""
     where = f"{surroundings.path}, prim {surroundings.prim}"
     count = len(surroundings.mesh.points)
     if count != len(mesh.points):
@@ -293,7 +249,7 @@ def artist_prim(surroundings, mesh):
 
 
 def artist_target(artist, surroundings, primvars, **options):
-    """Returns the `Target` of an artist's prim; ``options`` are further fields."""
+    """Returns the `Target` of an artist's prim."""
     half_width = 0.0
     if artist.IsA(UsdGeom.Curves):
         half_width = float(_widths(artist, surroundings).max(initial=0.0)) / 2
@@ -310,7 +266,6 @@ def artist_target(artist, surroundings, primvars, **options):
 
 
 def _widths(curves, surroundings):
-    """Returns the widths (k,) of curves, in the units of the prim."""
     try:
         widths = array_of(UsdGeom.Curves(curves).GetWidthsAttr())
         widths = np.empty(0) if widths is None else widths
@@ -322,11 +277,7 @@ def _widths(curves, surroundings):
 
 
 def declare_primvars(layer, artist, target, path):
-    """Declares the sampled primvars in a layer, and blocks the artist's primvars of the same names.
-
-    Raises:
-        ValueError: One of the artist's has another type.
-    """
+    """Declares the sampled primvars in a layer, and blocks the artist's of the same names, which must be of these types."""
     sampled = {name: kind for name, kind in target.attributes.items() if name.startswith("primvars:")}
     over = layer.GetPrimAtPath(target.prim)
     for name, kind in sampled.items():
@@ -343,7 +294,6 @@ def declare_primvars(layer, artist, target, path):
 
 
 def _block(artist, over, name):
-    """Blocks an attribute in an over of its prim; returns whether it had a value."""
     attribute = artist.GetAttribute(name)
     if not (attribute and attribute.HasAuthoredValue()):
         return False
@@ -357,7 +307,7 @@ def files_of_stage(stage):
 
 
 def root_metadata(stage):
-    """Returns units, up axis and default prim. A root layer over it must repeat them, because USD reads no others."""
+    """Returns units, up axis and default prim, which USD reads from the root layer only."""
     facts = {
         "metersPerUnit": UsdGeom.GetStageMetersPerUnit(stage),
         "upAxis": UsdGeom.GetStageUpAxis(stage),
@@ -369,15 +319,8 @@ def root_metadata(stage):
 
 
 def flattened_layer(base_paths, describe, named):
-    """Flattens layers, without their clips, into one layer.
-
-    Args:
-        base_paths: Files of the layers, strongest first.
-        describe: Function that writes the root's metadata on a layer.
-        named: Function of the path of a file (such as a texture) and the stage, which returns the path in the layer.
-
-    Returns:
-        Sdf.Layer: Anonymous.
+    """Flattens layers, strongest first and without clips, into an anonymous one; ``named`` (path, stage) gives paths of files
+    in it.
     """
     root = Sdf.Layer.CreateAnonymous(".usda")
     # Rates first, because they scale the times of the layers below.
@@ -391,11 +334,11 @@ def flattened_layer(base_paths, describe, named):
 
 
 def named_from(folder):
-    """Returns a function for `flattened_layer` that makes paths of files relative to a folder; paths to missing files stay."""
+    """Returns a function for `flattened_layer`: paths of existing files relative to a folder."""
     return lambda path, _: relative_path(path, folder) if os.path.isabs(path) and os.path.exists(path) else path
 
 
 def relative_path(path, folder):
-    """Returns the path of a file for a layer in a folder, with "./", because USD searches for bare names elsewhere too."""
+    """Returns a path relative to a folder with "./", because USD searches for bare names elsewhere too."""
     path = os.path.relpath(os.path.abspath(path), os.path.abspath(folder)).replace(os.sep, "/")
     return path if path.startswith("../") else f"./{path}"

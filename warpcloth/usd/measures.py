@@ -31,16 +31,13 @@ from .targets import DISPLAY_COLOUR, Interpolation, check_primvars
 class MeasureWriter(ChunkWriter):
     """Writes measures of vertices or triangles as sampled primvars, in the files of `ChunkWriter`.
 
-    With a source, the result is a layer over the measured stage, which it sublayers by a relative path and never changes.
-    Points, time codes and rates are those of the source. The layer adds `primvars:<name>` to the measured prim. If a measure is
-    shown in colours, it also adds `primvars:displayColor`, doubleSided, and a material that shows displayColor, bound in place
-    of those of the prim and its faces. Without a source it is a complete stage, /World/Cloth, with points, normals and extent.
+    With a source, the result is a layer over the measured stage with its time codes and rates, which adds `primvars:<name>`. A
+    measure in colours also adds `primvars:displayColor`, doubleSided and a material that shows it. Without a source it is a
+    complete stage, /World/Cloth.
 
-    An unknown value is NaN, in the file too. An artist's face with more than three corners has the mean value, and the mean
-    colour, of its triangles that have a value.
+    Unknown values are NaN. An artist's face has the mean of the known values and colours of its triangles.
 
-    Directions are linear BasisCurves beside the prim, `<prim>_<name>`, with a segment for each element that moves with it. If
-    the prim is a root, they are roots too, and a reference to the default prim does not include them.
+    Directions are linear BasisCurves beside the prim, `<prim>_<name>`, a segment per element.
 
     Attributes:
         path: The file to open now: the output, or for .usdz before `close` a root layer in the folder.
@@ -60,26 +57,24 @@ class MeasureWriter(ChunkWriter):
         chunk: int = 10,
         metadata: Mapping[str, object] | None = None,
     ) -> None:
-        """Checks everything that can be checked before the first frame; writes nothing yet.
+        """Checks everything; writes nothing yet.
 
         Args:
             output: File to write, as for `AnimationWriter`.
-            mesh: The `Mesh` or `Surface`; its points are the rest shape. With a source, as read from it; only then may points
-                be infinite or NaN.
-            primvars: "vertex", a value for each vertex, or "uniform", one for each triangle, by name of the primvar.
-            coloured: Name of the primvar that displayColor shows, or None for no colours.
-            directions: "vertex" or "uniform" by name of each set of segments, or None.
-            source: The measured `StageMesh`, or several of one stage, whose meshes follow one another in ``mesh``; or None.
-            fps: Frames per second, also time codes per second; a source has its own.
-            up_axis: "Y" or "Z", by default that of the mesh; a source has its own.
-            chunk: Number of frames per chunk, which memory holds, and which a killed process may lose.
-            metadata: Further entries of the root layer's customLayerData["warpcloth"]: numbers, texts or dicts of these by
-                name.
+            mesh: The `Mesh` or `Surface`, at rest; with a source, as read from it.
+            primvars: "vertex" or "uniform" (per triangle), by name of the primvar.
+            coloured: Name of the primvar that displayColor shows, or None.
+            directions: "vertex" or "uniform" by name of the segments, or None.
+            source: The measured `StageMesh`, or several of one stage, in the order of ``mesh``; or None.
+            fps: Frames and time codes per second, without a source.
+            up_axis: "Y" or "Z", by default that of the mesh, without a source.
+            chunk: Number of frames per chunk.
+            metadata: Further customLayerData["warpcloth"]: numbers, texts or dicts of these.
 
         Raises:
             FileNotFoundError: The output's folder does not exist.
-            ValueError: A parameter is not as above; the output is a file of the source's stage; the source's prim is an
-                instance, is of another mesh, or has a primvar of another type under one of the names.
+            ValueError: A parameter is not allowed; the output is a file of the source's stage; the source's prim is an
+                instance, of another mesh, or has a primvar of another type.
         """
         super().__init__(output, mesh, chunk)
         # A set of its own, so that it does not hide earlier measures and the motion of the source.
@@ -136,16 +131,15 @@ class MeasureWriter(ChunkWriter):
         """Adds a frame; every `chunk` frames they are written.
 
         Args:
-            time_code: Time code of the frame in the source, or its number; greater than the last.
-            primvars: Values of all declared primvars by name, (n,) or, if uniform, (T,); NaN if unknown.
-            colours: Linear RGB (n, 3) or (T, 3), like the primvar that they show, if there is one.
-            directions: Centres and vectors [m] of all declared directions by name, both (n, 3) or (T, 3), in world space. If
-                either is NaN, there is no segment.
-            points: (n, 3) [m], world space; without a source. Leave out frames with points that are not finite.
+            time_code: Time code in the source, or the frame's number; it must increase.
+            primvars: Values by name, (n,) or (T,); NaN if unknown.
+            colours: Linear RGB (n, 3) or (T, 3) of the shown primvar, if any.
+            directions: Centres and vectors [m] by name, both (n, 3) or (T, 3), in world space; without a segment where NaN.
+            points: (n, 3) [m], finite, in world space; without a source.
 
         Raises:
-            ValueError: Other values than declared, a wrong shape, a value that is infinite as float32, with the frame and
-                the vertex or triangle; a time code that is not after the last; the writer is closed.
+            ValueError: Values, shapes or the time code are not as declared, a value is infinite as float32, or the writer is
+                closed.
         """
         self._check_open()
         if not math.isfinite(time_code) or (self._span and time_code <= self._span[1]):
@@ -162,7 +156,6 @@ class MeasureWriter(ChunkWriter):
         self._append(time, {f"{t.prim}.{name}": value for t, own in samples for name, value in own.items()})
 
     def _samples(self, vectors, primvars, colours):
-        """Returns the samples of the prims, each with its part of the values."""
         starts = {"vertex": 0, "uniform": 0}
         for k, target in enumerate(self._targets[: self._own]):
             mesh = self._sources[k].mesh if self._own > 1 else None
@@ -174,7 +167,6 @@ class MeasureWriter(ChunkWriter):
             starts = {kind: part.stop for kind, part in parts.items()}
 
     def _curves(self, time, directions):
-        """Returns the samples of the curves, in their space at a time."""
         if directions.keys() != self._directions.keys():
             names = [", ".join(map(repr, given)) or "none" for given in (directions, self._directions)]
             raise ValueError(f"directions: {names[0]} at frame {self.frames}, must be {names[1]}")
@@ -194,7 +186,6 @@ def _check_given(name, value, wanted):
 
 
 def _scene(mesh, up_axis, primvars, coloured):
-    """Returns a complete stage for measures as a layer, its `Target` and its root metadata."""
     rest, target, facts = scene_layer(mesh, None, up_axis, "Cloth")
     target = replace(target, vectors=("points", "normals", "extent"), primvars=primvars, coloured=coloured)
     target.declare(rest, target.attributes)
@@ -205,7 +196,7 @@ def _scene(mesh, up_axis, primvars, coloured):
 
 
 def _over(rest, source, mesh, primvars, coloured):
-    """Adds primvars on the artist's prim to a layer; returns the `Target`, and a stage with the layer as edit target."""
+    """Adds primvars on the artist's prim to a layer; returns the `Target`, and a stage that edits the layer."""
     stage, artist = artist_prim(source, mesh)
     target = artist_target(artist, source, primvars, vectors=(), coloured=coloured)
     Sdf.CreatePrimInLayer(rest, target.prim)
@@ -216,7 +207,6 @@ def _over(rest, source, mesh, primvars, coloured):
 
 
 def _facts_of(stage, source):
-    """Returns the metadata of the source's root layer, with rates and range, for the root layer over it."""
     root = stage.GetRootLayer()
     rates = {"timeCodesPerSecond": source.time_codes_per_second, "framesPerSecond": source.fps or source.time_codes_per_second}
     start = {"startTimeCode": root.startTimeCode} if root.HasStartTimeCode() else {}
@@ -225,7 +215,7 @@ def _facts_of(stage, source):
 
 
 def _show_colours(stage, source, with_mesh):
-    """Defines a material below the prim that shows displayColor; if ``with_mesh``, binds it to the prim and its faces."""
+    """Defines a material that shows displayColor; ``with_mesh`` binds it to the prim and its faces."""
     path = f"{source.prim}/DisplayColour"
     refuse_taken(stage, path, "Material")
     material = define_material(stage, path)

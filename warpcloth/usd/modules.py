@@ -1,6 +1,6 @@
-"""The modules of pxr, loaded when one of their names is first used, so that this package imports quickly.
+"""The modules of pxr, loaded when a name is first used.
 
-All are loaded together, with interrupts delayed, because pxr would swallow an interrupt and continue half loaded.
+All are loaded together, without interrupts, which pxr would swallow.
 """
 
 import math

@@ -14,26 +14,17 @@ _TILES = "<UDIM>"
 class Contents:
     """The files to which a layer refers, with their names in a package.
 
-    A stage can refer to any file on the machine without the knowledge of the user. So only files in or below the folders of its
-    layers are packed; `UsdUtils.CreateNewUsdzPackage` would pack all.
+    Only files in or below the folders of the stage's layers are packed, as a stage can refer to any file of the machine.
     """
 
     def __init__(self, folder):
-        """Starts empty.
-
-        Args:
-            folder: A folder for files that are extracted from packages.
-        """
+        """Starts empty, with a folder for files extracted from packages."""
         self._folder, self._names = folder, {}
 
     def named(self, path, stage):
-        """Returns the path of a file in the package.
+        """Returns the path in the package of a file of the flattened ``stage``.
 
-        A file that is not packed keeps its path, and a missing file gets "", both with a warning.
-
-        Args:
-            path: Path of the file in the flattened layer.
-            stage: The stage that was flattened.
+        A file outside keeps its path, a missing one gets "", both with a warning.
         """
         files, origins = self._files(path)
         if not files:
@@ -51,7 +42,6 @@ class Contents:
         return f"{os.path.dirname(self._names[files[0]])}/{os.path.basename(path.removesuffix(']'))}"
 
     def _files(self, path):
-        """Returns the files of a path (one, the tiles of a texture, or none), and their origins: themselves or a package."""
         if _TILES in path:
             head, tail = map(glob.escape, path.split(_TILES, 1))
             files = sorted(glob.glob(f"{head}[0-9][0-9][0-9][0-9]{tail}"))
@@ -68,16 +58,7 @@ class Contents:
             return [], []
 
     def write(self, layer, package, meant):
-        """Writes a package of a layer and all files that :meth:`named` found.
-
-        Args:
-            layer: The file of the layer.
-            package: The file to write.
-            meant: The final path of the package, for the error message.
-
-        Raises:
-            OSError: It could not be written.
-        """
+        """Writes a package, ``meant`` for a path, of a layer's file and all files of :meth:`named`; raises OSError."""
         writer = Sdf.ZipFileWriter.CreateNew(str(package))
         for file, name in {str(layer): os.path.basename(layer), **self._names}.items():
             writer.AddFile(file, name)
@@ -86,7 +67,6 @@ class Contents:
 
 
 def _folders(stage):
-    """Returns the real paths of the folders of a stage's layers."""
     return {os.path.dirname(os.path.realpath(layer.realPath)) for layer in stage.GetUsedLayers() if layer.realPath}
 
 
@@ -96,7 +76,7 @@ def _is_below(file, folders):
 
 
 def _as_authored(path, stage):
-    """Returns the path as authored in a layer of the stage, because flattening makes it absolute."""
+    """Returns the path as authored; flattening makes it absolute."""
     for layer in stage.GetUsedLayers():
         if layer.realPath:
             for authored in chain(*UsdUtils.ExtractExternalReferences(layer.realPath)):
@@ -106,7 +86,7 @@ def _as_authored(path, stage):
 
 
 def _is_whole(package):
-    """Returns whether the package is complete on the disk, because pxr does not notice a full disk."""
+    """Returns whether the package is complete; pxr does not notice a full disk."""
     try:
         with zipfile.ZipFile(package) as archive:
             return archive.testzip() is None

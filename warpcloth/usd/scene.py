@@ -1,4 +1,4 @@
-"""Reads scenes from USD stages and writes them. `attributes` lists the attributes."""
+"""Reads scenes from USD stages and writes them."""
 
 import os
 from dataclasses import MISSING, fields, replace
@@ -56,23 +56,22 @@ from .values import array_of, refuse_unknown, sentences, time_codes_of, value_of
 def read_scene(
     path: FilePath, prim: str | None = None, law: Literal["proposal", "newton"] = "proposal", fabric: str | None = None
 ) -> Scene:
-    """Reads a scene from a stage; `simulate` then writes its animation as a layer over that stage.
+    """Reads a scene from a stage.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the prim of the cloth. By default all prims with cloth attributes are cloths of the scene, or
-            without any the only mesh.
-        fabric: Name of a fabric for all cloths, in place of density, terms and thickness, which they then must not have.
-        law: What the standard names of a material mean: "proposal" or "newton", see :mod:`.deformables`.
+        prim: Path or name of the cloth; by default all prims with cloth attributes, else the only mesh.
+        fabric: Fabric of all cloths, in place of density, terms and thickness.
+        law: Meaning of standard names of a material: "proposal" or "newton", see :mod:`.deformables`.
 
     Returns:
-        Scene: With `stage` set. A file of `write_scene` gives the written scene, except that pins are sorted, that a
-        thickness that is NaN is None, and that texture coordinates are float32 and are lost for edge meshes.
+        Scene: With `stage` set. A file of `write_scene` gives the written scene, but with sorted pins, None for a NaN
+        thickness, and float32 texture coordinates, which edge meshes lose.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: See `read_stage_mesh`. Or there is no mass or no term. Or an attribute has a wrong type, an invalid value,
-            or an unknown name in the namespace "warpcloth".
+        ValueError: The prim or mesh is not valid (as of `read_stage_mesh`), there is no mass or no term, or an attribute has a
+            wrong type, an invalid value, or an unknown name in the namespace "warpcloth".
     """
     if law not in LAWS:
         raise ValueError(f"law is {law!r}; it must be one of {', '.join(LAWS)}")
@@ -114,11 +113,7 @@ def read_scene(
 
 
 def _teller(field, values):
-    """The values of the first cloth that gives a field of the whole scene, else those of the first cloth.
-
-    Raises:
-        ValueError: Two cloths give different values.
-    """
+    """The values of the first cloth that gives a field of the whole scene, else of the first; refuses differing ones."""
     telling = [(each, each.get(field)) for each in values if each.get(field) is not None]
     for _, value in telling[1:]:
         if not np.array_equal(value, telling[0][1]):
@@ -127,14 +122,12 @@ def _teller(field, values):
 
 
 def _names_of(each):
-    """Names of the cloths: those of their prims, or if two are equal the paths."""
     paths = [one.prim.strip("/") for one in each]
     names = [path.rsplit("/", 1)[-1] for path in paths]
     return names if len(set(names)) == len(names) else [path.replace("/", "_") for path in paths]
 
 
 def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law, fabric):
-    """The scene of one cloth without colliders and contact. Any of the cloths may give gravity."""
     refuse_other_rest(cloth)
     rest = surroundings.mesh.points
     surroundings = replace(surroundings, mesh=_exact_mesh(values, cloth, surroundings))
@@ -186,20 +179,7 @@ def _scene(stage, cloth, values, surroundings, fps, duration, of_all, law, fabri
 
 
 def read_limits(stage, cloth, surroundings):
-    """The strain limits that the prim of a cloth declares, and their mesh.
-
-    Args:
-        stage: The stage.
-        cloth: The prim.
-        surroundings: Its `StageMesh`.
-
-    Returns:
-        list: The `Limit`s.
-        Mesh: Their mesh.
-
-    Raises:
-        ValueError: See :func:`read_scene`.
-    """
+    """The strain limits that the prim of a cloth declares, a list of `Limit`, and their mesh."""
     with errors_at(f"{surroundings.path}, prim {cloth.GetPath()}"):
         values = Values(stage, cloth)
         kinds = {key: kind_of(values, key) for key in values.terms}
@@ -224,7 +204,6 @@ def _refuse_missing(mass, term):
 
 
 def _cloth_prims(stage, path, prim):
-    """The named prim, or all prims with cloth attributes, or that of `find_prim`."""
     if prim is None:
         of_colliders = {row.name for row in attributes() if row.location == "collider"}
         cloths = [
@@ -239,7 +218,7 @@ def _cloth_prims(stage, path, prim):
 
 
 def _exact_mesh(values, cloth, surroundings):
-    """The mesh with the exact points and edges of attributes, if those of the prim still agree, and with its grid and parts."""
+    """The mesh with exact points and edges of attributes, if they agree with the prim, and its grid and parts."""
     mesh, transform = surroundings.mesh, surroundings.transform
     points, edges, grid_shape = (values.get(f"mesh.{name}") for name in ("points", "edges", "grid_shape"))
     if points is not None:
@@ -266,7 +245,6 @@ def _exact_mesh(values, cloth, surroundings):
 
 
 def _parts(values):
-    """The parts of a mesh by name, or None."""
     names, sizes, shapes = (values.get(f"mesh.{name}") for name in ("parts", "part_sizes", "part_grid_shapes"))
     if names is None and sizes is None and shapes is None:
         return None
@@ -279,7 +257,7 @@ def _parts(values):
 
 
 def _duration(stage, values, fps):
-    """Duration [s]: from warpcloth:duration, else the whole frames from start to end time code, else 1."""
+    """Duration [s]: warpcloth:duration, else whole frames between the time codes, else 1."""
     duration = values.get("duration")
     if duration is None:
         seconds = stage.GetEndTimeCode() - stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
@@ -290,7 +268,7 @@ def _duration(stage, values, fps):
 
 
 def _density(values, mesh):
-    """Mass per area [kg/m²], or for curves per length [kg/m], from our attribute or the standard ones; or None."""
+    """Mass per area [kg/m²], or for curves per length [kg/m], or None."""
     density, total, per_volume = (values.get(field) for field in ("density", "(total mass)", "(mass per volume)"))
     if density is not None:
         return density
@@ -324,7 +302,6 @@ def _term(values, key):
 
 
 def _load(values, key, surroundings, frames, fps):
-    """A load; time samples of its value are keyframes."""
     prefix, kind = f"{LOADS_NAMESPACE}:{key}", kind_of(values, key, LOADS, "loads")
     quantity, given = LOADS[kind].quantity, {"vertices": values.get("loads.vertices", key)}
     wrong = [load.quantity for load in LOADS.values() if load.quantity != quantity]
@@ -347,7 +324,6 @@ def _load(values, key, surroundings, frames, fps):
 
 
 def _value_at(attribute, code):
-    """The value of a numeric attribute at a time code."""
     value = value_of(attribute, code)
     if value is None:
         raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
@@ -357,7 +333,6 @@ def _value_at(attribute, code):
 
 
 def _pinned(values, cloth, surroundings):
-    """Sorted vertices that the stage pins, (p,) int32."""
     selection, shown_by = values.get("pins.vertices"), surroundings.point_vertices
     count = len(surroundings.mesh.points) if shown_by is None else len(shown_by)
     points = pinned_points(cloth, count)
@@ -368,7 +343,6 @@ def _pinned(values, cloth, surroundings):
 
 
 def _with_held(vertices, keyframes, held, start):
-    """The pins (p,) and their keyframes, or None, with those of attachments; the others stand still where these move."""
     both = np.union1d(vertices, held.vertices).astype(np.int32)
     if len(both) == len(vertices) and (keyframes is not None or held.keyframes is None):
         return vertices, keyframes
@@ -382,10 +356,7 @@ def _with_held(vertices, keyframes, held, start):
 
 
 def _motion(values, cloth, surroundings, vertices, frames, fps):
-    """Initial positions (n, 3), and keyframes (F, p, 3) of the pinned vertices; each may be None.
-
-    Points move if they have time samples or an animated transform.
-    """
+    """Initial positions (n, 3), and keyframes (F, p, 3) of pins; each may be None."""
     animated, own = UsdGeom.PointBased(cloth).GetPointsAttr(), next(values.authored("pins.keyframes"), None)
     positions = keyframes = None
     if animated.GetNumTimeSamples():
@@ -404,7 +375,6 @@ def _motion(values, cloth, surroundings, vertices, frames, fps):
 
 
 def _frames(cloth, surroundings, frames, fps):
-    """Yields the positions (n, 3) [m] of the mesh in world space, frame by frame."""
     attribute, moving, rest = UsdGeom.PointBased(cloth).GetPointsAttr(), moving_space(cloth), surroundings.mesh.points
     count, first = len(rest), np.arange(len(rest))
     if surroundings.point_vertices is not None:
@@ -422,12 +392,10 @@ def _frames(cloth, surroundings, frames, fps):
 
 
 def _samples(attribute, surroundings, frames, fps):
-    """Values of a vector attribute at frames 0 to ``frames``, or to its last sample if that is earlier."""
     return (_vectors_at(attribute, code) for code in frame_codes(time_codes_of(attribute), surroundings, frames, fps))
 
 
 def _vectors_at(attribute, code):
-    """Vectors (…, 3) float64 of an attribute at a time code."""
     value = array_of(attribute, (3,), time=code)
     if value is None:
         raise ValueError(f"{attribute.GetName()} is blocked at time code {code:g}, must have a value")
@@ -436,7 +404,6 @@ def _vectors_at(attribute, code):
 
 
 def _free_axes(values):
-    """Axes along which vertices may move, (n, 3) bool, or None."""
     free_axes = values.get("free_axes")
     if free_axes is None:
         return None
@@ -446,14 +413,12 @@ def _free_axes(values):
 
 
 def _of_fields(kind, name, values):
-    """The record of type ``kind`` from the values under a name; None without any."""
     given = {field.name: _teller(f"{name}.{field.name}", values).get(f"{name}.{field.name}") for field in fields(kind)}
     given = {field: value if isinstance(value, str) else float(value) for field, value in given.items() if value is not None}
     return kind(**given) if given else None
 
 
 def _air(values, surroundings, frames, fps):
-    """The air around all cloths, or None. A wind has time samples where it has keyframes."""
     names = ("density", "normal_drag", "tangential_drag")
     given = {name: _teller(f"air.{name}", values).get(f"air.{name}") for name in names}
     given = {name: float(value) for name, value in given.items() if value is not None}
@@ -466,7 +431,6 @@ def _air(values, surroundings, frames, fps):
 
 
 def _keyframes_of(attribute, surroundings, frames, fps):
-    """The values of an attribute at each frame, up to its last time sample."""
     most = max(frames, attribute.GetNumTimeSamples() - 1)
     return [_value_at(attribute, code) for code in frame_codes(time_codes_of(attribute), surroundings, most, fps)]
 
@@ -490,21 +454,21 @@ def _gravity(stage, values, up_axis):
 
 
 def write_scene(scene: Scene, path: FilePath, law: str | None = None) -> str:
-    """Writes a scene as a new stage: /World/Cloth at rest, in metres, with the whole scene as attributes.
+    """Writes a scene as a new stage, /World/Cloth at rest, in metres.
 
     Args:
-        scene: The `Scene`. If it was read from a stage, the rest of that stage is not written.
+        scene: The `Scene`, without the rest of a stage that it was read from.
         path: File to write: .usd, .usda or .usdc.
-        law: Also write the names of deformable bodies that other programs read, with the values that mean the same scene by
-            the law "proposal" or "newton", see :mod:`.deformables`. By default these names are not written.
+        law: Also write the standard names of deformable bodies by the law "proposal" or "newton", see :mod:`.deformables`; None
+            writes none.
 
     Returns:
         str: The path.
 
     Raises:
         FileNotFoundError: The folder does not exist.
-        ValueError: The path has another ending, or is the stage that the scene was read from. Or the scene has no terms, or one
-            that does not fit the mesh, or a wind that is a function; or something that has no name by ``law``.
+        ValueError: The path has another ending or is the stage of the scene; the scene has no terms, a term that does not fit
+            the mesh, a wind that is a function, or something without a name by ``law``.
         OSError: The file could not be written.
     """
     path = Path(os.path.abspath(followed(path)))
@@ -565,7 +529,6 @@ def write_scene(scene: Scene, path: FilePath, law: str | None = None) -> str:
 
 
 def _scene_values(scene):
-    """Values of a scene and its mesh to write, by field, except terms and pins."""
     mesh = scene.mesh
     given = {"name": scene.name, "duration": scene.duration, "gravity": scene.gravity}
     given |= {"masses": scene.masses} if scene.density is None else {"density": scene.density}
@@ -603,13 +566,12 @@ def _scene_values(scene):
 
 
 def _kind_and_name(part, key):
-    """The type of a term or load, and its name if that is not ``key``."""
     kind, name = type(part).__name__, part.name or ""
     return {"type": kind, "name": None if name == ("" if key == kind else key) else name}
 
 
 def _keys_of(terms):
-    """Attribute names of terms or loads: their names, or else their kinds, with a number if taken."""
+    """Attribute names of terms or loads: names or kinds, numbered if taken."""
     keys = []
     for term in terms:
         kind = type(term).__name__

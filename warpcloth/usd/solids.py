@@ -6,11 +6,8 @@ from .modules import Usd
 
 
 def _solid(make, *sizes):
-    """Function (prim, time code) → the surface of a solid in the space of its prim; without a time code at the earliest one.
-
-    Args:
-        make: Function (trimesh, sizes…) → the surface along z.
-        sizes: Names of the attributes with the sizes.
+    """Function (prim, time code or None) → the surface of a solid in the prim's space, from ``make`` (trimesh, sizes…) → the
+    surface along z.
     """
 
     def made(prim, code=None):

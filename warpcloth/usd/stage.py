@@ -1,4 +1,4 @@
-"""Finds a cloth prim of a USD stage and reads it in metres and world space, with what is needed to write it back."""
+"""Finds a cloth prim of a stage and reads it in metres and world space, with what writing needs."""
 
 import os
 import warnings
@@ -33,19 +33,19 @@ VERTEX_PRIMVAR = "warpcloth:vertex"
 
 
 def read_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh) -> Mesh:
-    """Reads the rest shape of a cloth. `read_stage_mesh` also returns its context in the stage.
+    """Reads the rest shape of a cloth.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the prim; optional if there is only one mesh.
+        prim: Path or name of the prim; None for the only mesh.
         kind: `Mesh` or `Surface`.
 
     Returns:
-        Mesh: In metres and in the world space of the stage.
+        Mesh: In metres and world space.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: See `read_stage_mesh`.
+        ValueError: As of `read_stage_mesh`.
     """
     return read_stage_mesh(path, prim, kind).mesh
 
@@ -53,33 +53,31 @@ def read_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh) 
 def read_stage_mesh(path: FilePath, prim: str | None = None, kind: type[Mesh] = Mesh, time: float | None = None) -> StageMesh:
     """Reads a Mesh prim, or linear BasisCurves as an edge mesh, in metres and world space.
 
-    The points at the default time are the rest shape. If points have only time samples, the first is read, with a warning. This
-    is deprecated, for the first frame need not be at rest. Holes are omitted. Polygons are cut into triangles as
-    `polygons.cut` says. Their winding is reversed if the prim is left-handed or its transform mirrors, so that triangle normals
-    point to the front. The up axis is kept.
+    The rest shape is at the default time; without default points, the first sample is read, with a warning. Holes are omitted,
+    and polygons cut into triangles. Triangle normals point to the front.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
-        prim: Path or name of the prim. Optional if the stage has one mesh (or no mesh and one curves prim), and for a file of
-            `AnimationWriter`, which names it.
+        prim: Path or name of the prim; None for the only mesh (or the only curves without meshes), or what an `AnimationWriter`
+            animated.
         kind: `Mesh` or `Surface`.
-        time: Time code of an animated transform, by default the start of the stage. If given, points without a default value
-            are read at it without a warning.
+        time: Time code of an animated transform, by default the start. If given, points without default are read at it without
+            a warning.
 
     Returns:
         StageMesh: The mesh and its context in the stage.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is not a USD stage, has invalid units, rates or times, or has no mesh or several. Or the prim is
-            missing, is not a mesh, or refers to a missing file. Or its transform cannot be inverted, its topology changes, a
-            face crosses or touches itself or is not planar, or its points and topology do not make a valid `Mesh`.
+        ValueError: The file is not a stage, or has invalid units, rates or times. The prim is missing, ambiguous, not a mesh,
+            or refers to a missing file. Its transform is singular, its topology changes, a face crosses or touches itself or is
+            not planar, or the `Mesh` is not valid.
     """
     found = stage_mesh(path, prim, kind, time)
     if time is None and not found.rest:
         warnings.warn(
-            f"{path}, prim {found.prim}: points have no default value; their first sample is taken as the rest shape. "
-            "This is deprecated: author the rest shape as the default",
+            f"{path}, prim {found.prim}: points have no default value; their first sample is taken as the rest shape; "
+            "author the rest shape as the default",
             stacklevel=2,
         )
     return found
@@ -138,12 +136,12 @@ def _stage_mesh(stage, path, prim, kind, time):
 
 
 def followed(path):
-    """The target of a symbolic link, through all links; another path unchanged."""
+    """The target of a link, through all links; another path unchanged."""
     return os.path.realpath(path) if os.path.islink(path) else path
 
 
 def identity(path):
-    """Returns a value that changes when the file is replaced; None if there is no file."""
+    """Returns a value that changes when the file is replaced; None without a file."""
     try:
         status = os.stat(path)
     except OSError:
@@ -154,15 +152,12 @@ def identity(path):
 def open_stage(path):
     """Opens a stage as it is on disk now.
 
-    Args:
-        path: The file.
-
     Returns:
-        Usd.Stage: The stage. Keep a reference: without one its prims become invalid.
+        Usd.Stage: Keep a reference: without one its prims become invalid.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is not a USD stage, or has invalid units, rates or times, see `values.check_stage`.
+        ValueError: It is not a USD stage, or has invalid units, rates or times.
     """
     path = os.fspath(path)
     refuse_path(path)
@@ -183,26 +178,10 @@ def open_stage(path):
     return stage
 
 
-def flattened(path: FilePath) -> str:
-    """A stage as the text of one .usda file, with the contents of the files it refers to, except value clips.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is not a USD stage.
-    """
-    return open_stage(path).ExportToString(addSourceFileComment=False)
-
-
 def find_prim(stage, path, prim=None):
-    """Finds the prim of the cloth.
+    """Finds the prim of the cloth: a Mesh, or linear BasisCurves.
 
-    Args:
-        stage: The stage to search.
-        path: Its file, for messages.
-        prim: Path or name of the prim, or of the Xform above it. None: the only one, or the one that an earlier run animated.
-
-    Returns:
-        Usd.Prim: A Mesh, or linear BasisCurves.
+    ``prim`` is its path or name, or that of the Xform above; None for the only one, or what an earlier run animated.
 
     Raises:
         ValueError: The prim is missing or of another type, or there are several and ``prim`` is None.
@@ -231,7 +210,7 @@ def find_prim(stage, path, prim=None):
 
 
 def animated_prims(stage):
-    """Prims of several cloths that an earlier run animated, from the root layer; empty for a single cloth."""
+    """The cloths that an earlier run animated, if several."""
     own = dict(stage.GetRootLayer().customLayerData).get(METADATA_KEY)
     named = str(own.get("prims", "")).split() if isinstance(own, dict) else []
     return [prim for prim in map(stage.GetPrimAtPath, named) if prim]
@@ -242,13 +221,12 @@ def _called(prim, name):
 
 
 def _listed(prims, types=False, most=12):
-    """Paths of prims as text, at most ``most``."""
     names = [f"{p.GetPath()} ({p.GetTypeName() or 'untyped'})" if types else str(p.GetPath()) for p in prims]
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def moving_space(prim):
-    """The prim or the ancestor whose transform is animated; None if the space of the prim is fixed."""
+    """The prim or ancestor with an animated transform, or None."""
     ancestor = prim
     while ancestor and not ancestor.IsPseudoRoot():
         xformable = UsdGeom.Xformable(ancestor)
@@ -261,13 +239,7 @@ def moving_space(prim):
 
 
 def posed(stage, first, last):
-    """The stage, or if it has skinned characters a copy in memory with their animated points.
-
-    Args:
-        stage: The stage, which is not changed.
-        first: First time code of the animation.
-        last: Last time code.
-    """
+    """The stage, or a copy in memory with the animated points of its skinned characters between two time codes."""
     if not any(prim.IsA(UsdSkel.Root) for prim in stage.Traverse(Usd.TraverseInstanceProxies())):
         return stage
     root, own = Sdf.Layer.CreateAnonymous(".usda"), stage.GetRootLayer()
@@ -290,14 +262,7 @@ def _has_skeleton(prim):
 
 
 def frame_codes(samples, surroundings, frames, fps):
-    """Time codes of frames 0 to ``frames``, or to the last sample if that is earlier.
-
-    Args:
-        samples: Time codes of the samples.
-        surroundings: The `StageMesh` of the cloth.
-        frames: The last frame.
-        fps: Frames per second.
-    """
+    """Time codes of frames 0 to ``frames``, or to the last of the time codes ``samples``."""
     rate = surroundings.time_codes_per_second / fps
     start = surroundings.start or 0.0
     last = np.ceil((max(samples) - start) / rate * (1 - 1e-9)) if samples else 0
@@ -305,7 +270,7 @@ def frame_codes(samples, surroundings, frames, fps):
 
 
 def space_codes(prim):
-    """Sorted time codes of the transform samples of a prim and of its ancestors."""
+    """Sorted time codes of transforms of a prim and its ancestors."""
     codes, ancestor = set(), prim
     while ancestor and not ancestor.IsPseudoRoot():
         xformable = UsdGeom.Xformable(ancestor)
@@ -319,19 +284,10 @@ def space_codes(prim):
 
 
 def local_to_metres(prim, where, time=None, shrinks=False):
-    """The transform (4, 4) float64 for row vectors, from the space and units of a prim to the world space of the stage [m].
-
-    Args:
-        prim: The prim.
-        where: File and prim, for messages; may be empty.
-        time: Time code; None if the transform must be constant.
-        shrinks: Whether the scale may be 0.
-
-    Returns:
-        np.ndarray: The matrix; its last column is [0, 0, 0, 1].
+    """The transform (4, 4), for row vectors, from the space and units of a prim to world space [m], at a time code or constant.
 
     Raises:
-        ValueError: The transform is animated and ``time`` is None, or it is not affine or not finite, or cannot be inverted.
+        ValueError: The transform is animated without ``time``, not affine, not finite or, without ``shrinks``, singular.
     """
     where = f"{where}: " if where else ""
     moving = moving_space(prim) if time is None else None
@@ -349,7 +305,7 @@ def local_to_metres(prim, where, time=None, shrinks=False):
 
 
 def placed(points, transform):
-    """Points (P, 3) after a transform (4, 4); entries that are not finite stay so."""
+    """Points (P, 3) after a transform (4, 4)."""
     # Multiplication by the identity would spread NaN to all coordinates of a point.
     if not np.array_equal(transform[:3, :3], np.eye(3)):
         with np.errstate(invalid="ignore"):
@@ -358,20 +314,12 @@ def placed(points, transform):
 
 
 def carried(points, before, now):
-    """Displacements (P, 3) [m] of points (P, 3) that are fixed in a moving space, from one transform (4, 4) to the next."""
+    """Displacements (P, 3) [m] of points (P, 3) of a moving space between two transforms (4, 4)."""
     return points @ (now - before)[:3, :3] + (now - before)[3, :3]
 
 
 def curve_vertices(prim, count):
-    """The mesh vertex of each point of a curves prim.
-
-    Args:
-        prim: BasisCurves.
-        count: Number P of its points.
-
-    Returns:
-        np.ndarray: (P,) int32; without the primvar, the order of the points.
-    """
+    """The mesh vertex of each of ``count`` points of a curves prim, (count,) int32; without the primvar their order."""
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(VERTEX_PRIMVAR)
     if not (primvar and primvar.HasValue()):
         return np.arange(count, dtype=np.int32)
@@ -388,10 +336,7 @@ def first_points(point_vertices):
 
 
 def _rest_points(prim, time=None):
-    """Points (P, 3) float64 in the space of the prim, at the default time.
-
-    Without a default value, those at ``time``, or if that is None the first sample.
-    """
+    """Points (P, 3) in the prim's space, at the default time, else at ``time``, else at the first sample."""
     attribute = UsdGeom.PointBased(prim).GetPointsAttr()
     codes = time_codes_of(attribute)
     points = array_of(attribute, (3,))
@@ -405,11 +350,7 @@ def _rest_points(prim, time=None):
 
 
 def topology(attribute, time=None):
-    """An integer array attribute at a time code, by default the default time, else the first sample; empty without a value.
-
-    Raises:
-        ValueError: It is not an array of integers, or cannot be read.
-    """
+    """An integer array attribute at a time code or the default time, else the first sample; empty without a value."""
     found = array_of(attribute, whole=True, time=time)
     if time is None and (found is None or len(found) == 0):  # fallbacks of the schema are empty
         found = array_of(attribute, whole=True, time=Usd.TimeCode.EarliestTime())
@@ -417,11 +358,7 @@ def topology(attribute, time=None):
 
 
 def refuse_change(name, now, fixed, code):
-    """Checks that an integer array is unchanged at a time code.
-
-    Raises:
-        ValueError: The length or an entry differs; the message names the first such entry.
-    """
+    """Raises ValueError with the first changed entry if an integer array has changed at a time code."""
     if len(now) != len(fixed):
         raise ValueError(f"{len(now)} {name} at time code {code:g}, must stay {len(fixed)}")
     if not np.array_equal(now, fixed):
@@ -430,11 +367,7 @@ def refuse_change(name, now, fixed, code):
 
 
 def refuse_moving_topology(prim):
-    """Checks that faces or curves do not change over time.
-
-    Raises:
-        ValueError: They change; the message names the first changed entry.
-    """
+    """Raises ValueError with the first changed entry if faces or curves change over time."""
     if prim.IsA(UsdGeom.Mesh):
         mesh = UsdGeom.Mesh(prim)
         sampled = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr())
@@ -447,14 +380,9 @@ def refuse_moving_topology(prim):
 
 
 def face_corners(prim, points, triangles_of=triangles_of):
-    """Vertices (C,) int32 of the corners of the faces of a Mesh prim, and the corners of each triangle (T, 3).
+    """Vertices (C,) int32 of face corners of a Mesh prim, and the corners of each triangle (T, 3), cut by ``triangles_of``.
 
-    Triangles are counter-clockwise seen from the front in the space of the prim.
-
-    Args:
-        prim: The prim.
-        points: Its points (P, 3), in any space.
-        triangles_of: Function that cuts faces, see `polygons.triangles_of`.
+    Triangles are counter-clockwise from the front in the prim's space.
     """
     mesh = UsdGeom.Mesh(prim)
     counts, corners = topology(mesh.GetFaceVertexCountsAttr()), topology(mesh.GetFaceVertexIndicesAttr())
@@ -472,11 +400,7 @@ def face_corners(prim, points, triangles_of=triangles_of):
 
 
 def triangles_of_faces(prim):
-    """Returns the number of triangles (F,) of each face of a Mesh prim, 0 for a hole.
-
-    Raises:
-        ValueError: The index of a hole is not the index of a face.
-    """
+    """Returns the number of triangles (F,) of each face, 0 for a hole."""
     mesh = UsdGeom.Mesh(prim)
     triangles = topology(mesh.GetFaceVertexCountsAttr()) - 2
     holes = topology(mesh.GetHoleIndicesAttr())
@@ -504,7 +428,6 @@ def curve_edges(prim, count):
 
 
 def _texture_coordinates(prim, count, corners):
-    """`primvars:st` at vertices (n, 2), or at corners (C, 2) if a vertex has several values (a seam); the other is None."""
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
     if not (primvar and primvar.HasValue()):
         return None, None
@@ -521,17 +444,12 @@ def _texture_coordinates(prim, count, corners):
 
 
 def pinned_points(prim, count):
-    """Pinned points (p,) of a prim: those of GeomSubsets with the family or the name "pins", and those of `primvars:pins`.
+    """Pinned points (p,): of GeomSubsets with the family or name "pins", and of weights ≥ ½ in `primvars:pins`.
 
-    A subset of faces pins their corners. The primvar (a vertex group in Blender) pins points with a weight of at least ½.
-
-    Args:
-        prim: A Mesh, or BasisCurves.
-        count: Number of its points.
+    A subset of faces pins their corners.
 
     Raises:
-        ValueError: The elements of a subset are not points or faces. Or the primvar changes over time, or does not have one
-            number per point.
+        ValueError: A subset is not of points or faces, or the primvar changes over time or is not one number per point.
     """
     pinned = np.zeros(count, dtype=bool)
     for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):

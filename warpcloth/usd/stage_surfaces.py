@@ -1,4 +1,4 @@
-"""The meshes of a stage that may intersect, with its colliders and strain limits."""
+"""The meshes of a stage that may intersect, with colliders and strain limits."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ class StageSurface:
     """A mesh of a stage.
 
     Attributes:
-        stage: The `StageMesh`; its mesh, a `Surface`, is the rest shape.
+        stage: The `StageMesh` with the rest shape, a `Surface`.
         points: Function (time code) → points (n, 3) [m] in world space.
         faces: The face of the prim of each triangle (T,).
-        limits: The strain limits that the prim declares, and their mesh.
+        limits: The declared strain limits, and their mesh.
     """
 
     stage: StageMesh
@@ -40,13 +40,11 @@ class StageSurfaces:
     """The meshes of a stage, read by `read_surfaces`.
 
     Attributes:
-        surfaces: The meshes.
         codes: Time codes of the frames (F,) of all meshes.
-        rate: Time codes per second.
         colliders: The colliders, with a keyframe at each frame.
-        others: Paths of the other visible meshes.
+        others: Paths of other visible meshes.
         files: Real paths of the files of the stage.
-        stage: The stage; the reference keeps its prims valid.
+        stage: The stage, which keeps its prims valid.
     """
 
     surfaces: list[StageSurface]
@@ -59,18 +57,11 @@ class StageSurfaces:
 
 
 def read_surfaces(path, prims=None):
-    """Reads the meshes of a stage that `read_drawn` takes for cloth, without colliders, or those that are named.
-
-    Args:
-        path: A .usd, .usda, .usdc or .usdz file.
-        prims: Paths or names of prims, or None.
-
-    Returns:
-        StageSurfaces: The meshes. Only the first frame of points is read yet.
+    """Reads the named meshes of a stage, or those that `read_drawn` takes for cloth, without colliders, at the first frame.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is not a stage, or has no such mesh. Or a named prim is missing, is not a visible mesh, or is invalid.
+        ValueError: It is not a stage, or a mesh is missing, invisible or invalid.
     """
     drawn = read_drawn(path)
     with sentences(path):

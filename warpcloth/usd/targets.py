@@ -1,4 +1,4 @@
-"""An animated prim, and its attributes for a frame in its own space and units."""
+"""An animated prim, and its attributes for a frame in its space and units."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -18,21 +18,19 @@ _TAKEN = ("normals", "st", "displayColor", "displayOpacity", VERTEX_PRIMVAR)
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The prim to animate, with what is needed to express a frame in its space and units.
+    """The prim to animate, with what expresses a frame in its space and units.
 
     Attributes:
-        prim: Path of the prim.
         triangles: (T, 3), for normals; empty for curves.
-        transform: (4, 4) from the space of the prim to metres, as in `StageMesh`; None for the identity.
-        point_vertices: Vertex of each point of the prim; None if points are vertices.
-        half_width: Half the width of curves, in the units of the prim, for the extent.
-        face_triangles: Number of triangles of each face of the prim (F,), 0 for a hole; None if each has one.
-        vectors: Names of the sampled vectors, from `SAMPLED`. Curves need no normals: they are drawn as tubes.
+        transform: (4, 4) from its space to metres; None for the identity.
+        point_vertices: Vertex of each point; None if points are vertices.
+        half_width: Half the width of curves, in the prim's units.
+        face_triangles: Number of triangles of each face (F,), 0 for a hole; None if each has one.
+        vectors: Names of the sampled vectors, of `SAMPLED`.
         primvars: Interpolation of each sampled primvar by name, "vertex" or "uniform".
-        history: Types of the other sampled primvars by name: "float3[]" per vertex, or "double" or "double3" for the whole
-            cloth. They are in SI units and in world space.
-        vertices: Slice of the vertices of the mesh that belong to the prim; None for all.
-        coloured: Name of the primvar that displayColor shows; None if colours are not sampled.
+        history: Types of history primvars by name: "float3[]" per vertex, "double" or "double3" per cloth, in SI units.
+        vertices: Slice of the mesh's vertices; None for all.
+        coloured: Name of the primvar that displayColor shows, or None.
     """
 
     prim: str
@@ -57,7 +55,7 @@ class Target:
         return {name: Sdf.ValueTypeNames.Find(type_name) for name, type_name in own.items()}
 
     def declare(self, layer, names):
-        """Adds some of the sampled attributes to a layer, without values, if they are missing."""
+        """Adds sampled attributes, without values, to a layer."""
         prim = layer.GetPrimAtPath(self.prim) or Sdf.CreatePrimInLayer(layer, self.prim)
         for name in names:
             if name not in prim.attributes:
@@ -68,17 +66,13 @@ class Target:
                 prim.attributes[name].SetInfo("interpolation", self.primvars.get(shown, of_history))
 
     def samples(self, vectors, primvars=None, colours=None, history=None):
-        """The attribute values of a frame.
+        """A dictionary of a pxr array for each of `attributes` in a frame.
 
         Args:
             vectors: "points" (n, 3) [m] in world space, and "velocities" (n, 3) [m/s] if sampled.
-            primvars: Values by name, (n,), or (T,) if uniform. NaN is an unknown value. A face gets the mean over its triangles
-                with a value.
-            colours: (n, 3) or (T, 3), as the primvar that they show. A face gets the mean over its triangles with a value.
-            history: Values by name, (n, 3), (3,) or a number. NaN is an unknown value.
-
-        Returns:
-            dict: A pxr array for each of `attributes`.
+            primvars: Values by name, (n,) or (T,), NaN if unknown; a face gets the mean of its triangles.
+            colours: (n, 3) or (T, 3), of the shown primvar; likewise.
+            history: Values by name, (n, 3), (3,) or a number; NaN if unknown.
         """
         own = self._vectors({name: self._own(values) for name, values in vectors.items()})
         for name, values in (primvars or {}).items():
@@ -104,11 +98,9 @@ class Target:
         return own
 
     def _own(self, values):
-        """The rows of the vertices of the prim."""
         return values if self.vertices is None else values[self.vertices]
 
     def _shown(self, values, primvar, known):
-        """Values for the points or faces of the prim, in float32."""
         if self.primvars[primvar] == "vertex":
             values = values if self.point_vertices is None else values[self.point_vertices]
         elif self.face_triangles is not None:
@@ -142,11 +134,7 @@ class Target:
 
 
 def check_primvars(primvars, mesh):
-    """Checks primvars, given as interpolation by name.
-
-    Raises:
-        ValueError: A name is invalid or taken, or an interpolation is not "vertex" or, for triangles, "uniform".
-    """
+    """Checks that names are free, and interpolations "vertex" or, for triangles, "uniform"."""
     for name, interpolation in primvars.items():
         valid = isinstance(name, str) and Sdf.Path.IsValidNamespacedIdentifier(name) and not name.endswith(":indices")
         if not valid or name.startswith("primvars:"):
@@ -160,17 +148,7 @@ def check_primvars(primvars, mesh):
 
 
 def vertex_normals(points, triangles):
-    """Unit normals (n, 3) of vertices: area-weighted means of the normals of their triangles.
-
-    A vertex without area (isolated, or with collapsed triangles only) gets +y.
-
-    Args:
-        points: (n, 3).
-        triangles: (T, 3).
-
-    Returns:
-        np.ndarray: (n, 3) float64.
-    """
+    """Unit normals (n, 3) of vertices of points (n, 3): area-weighted means over triangles (T, 3); +y without area."""
     # By column: NumPy takes twice as long for rows of three.
     corners = triangles.T.astype(np.intp)
     columns = [np.ascontiguousarray(column) for column in np.asarray(points).T]
@@ -196,7 +174,7 @@ def _starts(counts):
 
 
 def _face_means(values, known, face_triangles):
-    """Means (F, …) of values (T, …) over the triangles of each face with a value; NaN without one, such as for a hole."""
+    """Means (F, …) of known values (T, …) over each face; NaN without one."""
     known = known.reshape(-1, *[1] * (values.ndim - 1))
     cut = face_triangles > 0
     starts = _starts(face_triangles[cut])

@@ -1,4 +1,4 @@
-"""Reads and checks values of a stage. Errors name the attribute."""
+"""Reads and checks values of a stage; errors name the attribute."""
 
 import os
 import textwrap
@@ -24,16 +24,7 @@ _listening = False
 
 @contextmanager
 def sentences(path, raised=ValueError, what=""):
-    """Context that turns errors of pxr about a file into exceptions, and warnings of pxr into Python warnings.
-
-    Args:
-        path: The file.
-        raised: Type of the exception.
-        what: Text before the message of pxr.
-
-    Raises:
-        ValueError: pxr reported an error; ``raised`` gives another type.
-    """
+    """Context that turns pxr's errors about a file into exceptions ``raised``, and its warnings into Python's."""
     global _listening
     heard = None if _listening else UsdUtils.CoalescingDiagnosticDelegate()  # every nested delegate would get all messages
     _listening = True
@@ -59,16 +50,11 @@ def reason_of(error):
 
 
 def _plain(text):
-    """A message of pxr, shortened, without line breaks and without the memory address of the stage."""
     return textwrap.shorten(text.partition(" (instantiating stage on")[0], 500, placeholder=" …")
 
 
 def refuse_path(path):
-    """Checks that a layer can refer to a path.
-
-    Raises:
-        ValueError: The path has control characters, such as a line break, or is not UTF-8.
-    """
+    """Raises ValueError if a path has control characters, or is not UTF-8, as a layer cannot refer to it."""
     text = os.fspath(path)
     if any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
         raise ValueError(f"{text!r}: a path in USD must be UTF-8 without line breaks and other control characters")
@@ -78,8 +64,8 @@ def check_stage(stage, path):
     """Checks the layers, the up axis, units, rates and times of a stage.
 
     Raises:
-        ValueError: A sublayer is missing, the up axis is neither Y nor Z, a unit, rate or time is out of range, or the end is
-            before the start.
+        ValueError: A sublayer is missing, the up axis is not Y or Z, a unit, rate or time is out of range, or the end is before
+            the start.
     """
     for error in stage.GetCompositionErrors():
         if type(error).__name__ == "ErrorInvalidSublayerPath":
@@ -106,11 +92,7 @@ def check_stage(stage, path):
 
 
 def check_composed(prim, path):
-    """Checks that no file is missing to which a prim or an ancestor refers.
-
-    Raises:
-        ValueError: pxr could not compose the prim.
-    """
+    """Raises ValueError if a file to which a prim or an ancestor refers is missing."""
     for error in prim.GetStage().GetCompositionErrors():
         if prim.GetPath().HasPrefix(error.rootSite.path) or error.rootSite.path.HasPrefix(prim.GetPath()):
             raise ValueError(f"{path}, prim {prim.GetPath()}: {_plain(str(error))} It must be there")
@@ -122,11 +104,7 @@ def _refuse_outside(where, name, value, least, most):
 
 
 def value_of(attribute, time=None):
-    """Returns the value of an attribute at a time code, or at the default time; None if it has none.
-
-    Raises:
-        ValueError: The file is broken there, or the value has a type that Python does not have.
-    """
+    """Returns the value of an attribute at a time code or the default time, or None; refuses values that cannot be read."""
     try:
         with redirect_stderr(StringIO()):  # pxr prints a value that it cannot convert to Python
             return attribute.Get(Usd.TimeCode.Default() if time is None else time)
@@ -137,11 +115,7 @@ def value_of(attribute, time=None):
 
 
 def token_of(attribute, allowed):
-    """Returns the value of an attribute with a fixed set of tokens.
-
-    Raises:
-        ValueError: The value is not one of ``allowed``.
-    """
+    """Returns the value of an attribute, which must be one of ``allowed``."""
     value = value_of(attribute)
     if value not in allowed:
         raise ValueError(f"{attribute.GetName()} is {shown(value)}, must be one of {', '.join(map(str, allowed))}")
@@ -149,11 +123,7 @@ def token_of(attribute, allowed):
 
 
 def array_of(attribute, components=(), whole=False, time=None):
-    """Returns the rows of an array attribute (count, *components), as int32 if ``whole``; None if it has no value.
-
-    Raises:
-        ValueError: The rows have another type or shape, or cannot be read.
-    """
+    """Returns the rows of an array attribute (count, *components), int32 if ``whole``; or None. Other rows are refused."""
     value = value_of(attribute, time)
     return None if value is None else checked_rows(attribute.GetName(), value, components, whole)
 
@@ -168,11 +138,7 @@ def checked_rows(name, value, components=(), whole=False):
 
 
 def refuse_outside(name, numbers, count, what):
-    """Checks that numbers are indices from 0 to ``count`` − 1.
-
-    Raises:
-        ValueError: A number is out of range; the message names the first.
-    """
+    """Raises ValueError with the first of some numbers that is not an index below ``count``."""
     wrong = (numbers < 0) | (numbers >= count)
     if wrong.any():
         first = int(np.argmax(wrong))
@@ -180,11 +146,7 @@ def refuse_outside(name, numbers, count, what):
 
 
 def refuse_unknown(name, values, where="", infinite=False):
-    """Checks that numbers are finite, or with ``infinite`` only that none is NaN.
-
-    Raises:
-        ValueError: A number is not; the message names the first.
-    """
+    """Raises ValueError with the first number that is not finite, or with ``infinite`` NaN."""
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     for entry in np.argwhere(wrong)[:1].tolist():
         index = "".join(f"[{i}]" for i in entry)
@@ -192,11 +154,7 @@ def refuse_unknown(name, values, where="", infinite=False):
 
 
 def time_codes_of(attribute):
-    """Lists the time codes of the samples of an attribute.
-
-    Raises:
-        ValueError: A time code is larger than `MOST_TIME_CODE`.
-    """
+    """Lists the time codes of the samples of an attribute, up to `MOST_TIME_CODE`; refuses larger ones."""
     codes = attribute.GetTimeSamples()
     for code in codes:
         if not abs(code) <= MOST_TIME_CODE:

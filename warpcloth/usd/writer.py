@@ -17,19 +17,16 @@ from .targets import Interpolation, check_primvars
 
 
 class AnimationWriter(ChunkWriter):
-    """Writes frames of a cloth as USD; see `ChunkWriter` for the files.
+    """Writes frames of a cloth as USD, in the files of `ChunkWriter`.
 
-    With a source, the result is a layer over the artist's stage, a sublayer with a relative path that is never changed. The
-    layer has opinions on points, velocities, normals, extent and subdivisionScheme of one prim, in its space and units. It
-    blocks accelerations and `primvars:normals`, which would take precedence. Time codes start at the first one of the source
-    (at the same second, if fps differs from its time codes per second), else at 0.
+    With a source, the result is a layer over the artist's stage, which never changes, with points, velocities, normals, extent
+    and subdivisionScheme of one prim, in its space and units. It blocks accelerations and `primvars:normals`. Time codes start
+    at the time of the source's first one, else at 0.
 
-    Data are float primvars, `primvars:<name>`, sampled like the points. A face of a source with more than three corners gets
-    the mean over its triangles.
+    Data are float primvars, `primvars:<name>`; a face gets the mean of its triangles.
 
-    Edge meshes become linear BasisCurves along paths of edges; a chain is one curve with its vertices in order. Where curves
-    meet, each has its own point, and `primvars:warpcloth:vertex` gives the vertex of each point. Lines are such curves beside a
-    mesh of triangles.
+    Edge meshes become linear BasisCurves along paths of edges; where curves meet, each has its own point, and
+    `primvars:warpcloth:vertex` gives vertices.
 
     Attributes:
         path: The file to open: the output, or for .usdz before `close` a root layer in the folder.
@@ -54,33 +51,29 @@ class AnimationWriter(ChunkWriter):
         cloths: Mapping[str, str] | None = None,
         whole: bool = False,
     ) -> None:
-        """Checks the arguments. Nothing is written before the first frame.
+        """Checks the arguments; nothing is written before the first frame.
 
         Args:
-            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file. For a symbolic link, its target is
-                written, with the folder beside it; viewers then find the frames only through a link in the same folder.
-            mesh: The `Mesh`; its points are the rest shape. With a source: as read from it.
+            output: File to write: .usd, .usda, .usdc, or .usdz, which is always one file; for a link the file behind it.
+            mesh: The `Mesh` at rest; with a source as read from it.
             fps: Frames per second; also time codes per second.
             source: A stage to write a layer over, or None.
-            prim: With a source, path or name of the prim. Else name of the prim under /World, by default "Cloth".
-            pins: Vertex indices by name, written as GeomSubsets in the family "pins". Not used with a source.
-            up_axis: "Y" or "Z", by default that of the mesh. Not used with a source.
-            chunk: Number of frames that are held in memory and written together. A killed process loses at most these.
-            metadata: Further entries of customLayerData["warpcloth"] of the root layer: numbers or texts by name.
-            primvars: Interpolation of each primvar of `append` by name: "vertex", a value per vertex, or "uniform", one per
-                triangle.
-            lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves beside the cloth;
-                `lines.lines_of` finds those of a scene. Not allowed with a source.
-            colliders: Written as gprims under /World/Colliders, with their motion; not with a source.
-            history: Types of the primvars of the history of a run, by name: "float3[]", a vector per vertex, or "double3" or
-                "double", a vector or a number for the whole cloth. With several cloths, the first has those of the whole.
-            cloths: Prims by part, if each part of the mesh has its own prim: names under /World, or with a source paths.
-                Primvars are then not allowed.
-            whole: Whether an older output is replaced only once all frames are written, and an error leaves no frames.
+            prim: With a source, path or name of the prim; else name under /World, by default "Cloth".
+            pins: Vertex indices by name, written as GeomSubsets; without a source.
+            up_axis: "Y" or "Z", by default that of the mesh; without a source.
+            chunk: Number of frames written together, which a killed process may lose.
+            metadata: Further customLayerData["warpcloth"]: numbers or texts by name.
+            primvars: Interpolation of each primvar by name: "vertex", or "uniform" for triangles.
+            lines: Pairs of vertices (E, 2) and a thickness [m] by name, drawn as curves; without a source.
+            colliders: Written as gprims under /World/Colliders, with motion; without a source.
+            history: Types of history primvars by name: "float3[]" per vertex, "double3" or "double" per cloth. Of several
+                cloths, the first has those of the whole.
+            cloths: Prims by part, if each part has its own: names under /World, or paths in a source; without primvars.
+            whole: Whether an older output is replaced only once all frames are written.
 
         Raises:
             FileNotFoundError: The folder of the output or the source does not exist.
-            ValueError: A parameter is not as above, or the output is a file of the source's stage.
+            ValueError: A parameter is not allowed, or the output is a file of the source's stage.
         """
         super().__init__(output, mesh, chunk, whole)
         up_axis = up_axis or mesh.up_axis or "Y"
@@ -135,17 +128,16 @@ class AnimationWriter(ChunkWriter):
         primvars: Mapping[str, ArrayLike] | None = None,
         history: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        """Adds a frame. Frames are written when there are `chunk` of them.
+        """Adds a frame; `chunk` of them are written together.
 
         Args:
             points: (n, 3) [m], world space.
             velocities: (n, 3) [m/s].
-            primvars: Values of all declared primvars by name, (n,), or (T,) if uniform.
-            history: Values of all declared history primvars by name, (n, 3), (3,) or a number, in SI units and world space.
+            primvars: Values of declared primvars by name, (n,), or (T,) if uniform.
+            history: Values of declared history primvars by name, (n, 3), (3,) or a number, in SI units.
 
         Raises:
-            ValueError: Primvars are not those declared, a shape is wrong, or a value is not finite as float32; the message
-                names the frame and the vertex or triangle. Or the writer is closed.
+            ValueError: Values or shapes are not as declared, a value is not finite as float32, or the writer is closed.
         """
         self._check_open()
         vectors = {"points": self._checked("points", points), "velocities": self._checked("velocities", velocities)}
@@ -164,14 +156,12 @@ class AnimationWriter(ChunkWriter):
 
 
 def _of_part(mesh, name, prim):
-    """The vertices of a part (a slice), its mesh and its prim."""
     own = mesh.part(name)
     first = (mesh.parts or {})[name].first
     return slice(first, first + len(own.points)), own, prim
 
 
 def _pins_of(pins, vertices):
-    """Pins by name among the vertices of a part, as indices in the part."""
     if vertices is None or not pins:
         return pins
     found = {name: np.asarray(given) for name, given in pins.items()}
@@ -180,18 +170,11 @@ def _pins_of(pins, vertices):
 
 
 def _of_vertices(history):
-    """The types of the history primvars with a value per vertex."""
     return {name: kind for name, kind in history.items() if kind == "float3[]"}
 
 
 class _MovingSpace:
-    """The space of a prim of the source with an animated transform, frame by frame.
-
-    Args:
-        transform_at: Function (time code) → transform (4, 4).
-        stage: The `StageMesh`.
-        fps: Frames per second.
-    """
+    """The space of a prim of the source with an animated transform, frame by frame."""
 
     def __init__(self, transform_at, stage, fps):
         self._transform_at, self._fps = transform_at, fps
@@ -200,7 +183,7 @@ class _MovingSpace:
     def at(self, frame, points, velocities):
         """The transform (4, 4) at a frame, and the velocities (n, 3) [m/s] relative to the moving space.
 
-        The velocity of the space is its displacement since the frame before, times fps, as for moving pins.
+        The velocity of the space is its displacement since the frame before, times fps.
         """
         now = self._transform_at(self._first + frame * self._rate)
         if frame == 0:
