@@ -7,18 +7,10 @@ from .style import LABEL, LEGEND, SMALL, drawn, dress, series_style, small_print
 
 
 def plot_physics(path, results, facts=None):
-    """Plots the error over h and over time, two panels for each case, pattern and angle.
+    """Plots the error of :func:`physics.measure` over h and over time, two panels for each case, pattern and angle.
 
     Dashed lines are the effect of a cantilever's free sides and the accuracy of equilibria, below which errors mean nothing.
-    Points that failed are named.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        results: Pairs of arguments and result of :func:`physics.measure`, in any order.
-        facts: The machine, as of :func:`warpcloth.lab.machine.machine`; None for this one.
-
-    Raises:
-        ValueError: There is nothing to plot.
+    Points that failed are named. ``results`` are pairs of arguments and result; without any ValueError is raised.
     """
     rows = {}
     for arguments, found in results:

@@ -116,7 +116,7 @@ def _writer(arguments, cloths):
     if arguments.output is None:
         return nullcontext()
     from ..usd import MeasureWriter
-    from .reports import rate_of
+    from .reports import codes_per_second
 
     return MeasureWriter(
         arguments.output,
@@ -124,7 +124,7 @@ def _writer(arguments, cloths):
         {"intersections": "uniform", "inside": "uniform"},
         coloured="intersections",
         source=cloths.stages or None,
-        fps=rate_of(cloths),
+        fps=codes_per_second(cloths),
         up_axis=cloths.up_axis or arguments.up_axis or "Y",
     )
 

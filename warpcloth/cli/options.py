@@ -121,7 +121,6 @@ _SHARED = {
     "debug": {"action": "store_true", "help": "show the traceback of an error"},
     "device": {"default": "cpu", "help": "cpu (default), cuda:0, …"},
     "json": {"action": "store_true", "help": "print the result as one JSON object"},
-    "threads": {"type": int, "default": 1, "metavar": "N", "help": "number of CPU threads (default: 1)"},
     "dtype": {"choices": ("float32", "float64"), "help": "precision (default: by device and solver)"},
     "single_file": {"action": "store_true", "help": "write one file instead of a file and a folder of frames"},
 }

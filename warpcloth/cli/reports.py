@@ -249,7 +249,7 @@ def _count(analyzer, name):
     return next(measure.shape[0] for measure in analyzer.measures if measure.name == name)
 
 
-def rate_of(sequence):
+def codes_per_second(sequence):
     """Returns frame numbers per second of a sequence or of cloths; 24 if there are no times."""
     if sequence.times is None or len(sequence.labels) < 2:
         return 24.0
@@ -293,7 +293,7 @@ class _Shown:
             frames = {pair.frame for pair in analyzer.pairs if sequence.labels[pair.frame] in self.stills}
             view = replace(looks.view or View(), up_axis=up_axis)
             self.view = view.fit(sequence[frame] for frame in sorted(frames))
-        self.writer, self.rate = None, rate_of(sequence)
+        self.writer, self.rate = None, codes_per_second(sequence)
         if files.usd:
             from ..usd import MeasureWriter
 

@@ -4,7 +4,6 @@ import numpy as np
 import warp as wp
 
 from ..base.limits import refuse_memory
-from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.filled import filled
 from ..core.scan import Scan
@@ -52,7 +51,6 @@ class Proximity:
         alike: See :meth:`launch_along` [m].
     """
 
-    @in_turn
     def __init__(self, surface, distance, skin, of_meshes=0.0):
         self.surface, self.model, self.skin = surface, surface.model, skin
         model, device = self.model, self.model.device
@@ -322,7 +320,6 @@ class Proximity:
         """Whether more pairs were found than fit; waits for the device."""
         return self._mirror.read().sum(dtype=np.int64) > self.capacity
 
-    @in_turn
     def grow(self, count=None):
         """Allocates room for 1.5 times ``count`` pairs, by default as last found. Graphs must be recorded again.
 
