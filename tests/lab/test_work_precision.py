@@ -13,7 +13,7 @@ import pytest
 import warpcloth as wc
 from support.rows import slow_but
 from warpcloth.base.digest import scene_digest
-from warpcloth.chart import pareto
+from warpcloth.chart import pareto, style
 from warpcloth.cli import main
 from warpcloth.lab import campaign, convergence, machine, spectrum, work_precision
 from warpcloth.lab.campaign import Store
@@ -366,8 +366,8 @@ class Nobody:
 def drawn(monkeypatch):
     """Figures that are saved."""
     figures = []
-    save = pareto.save
-    monkeypatch.setattr(pareto, "save", lambda figure, path: (figures.append(figure), save(figure, path)))
+    save = style.save
+    monkeypatch.setattr(style, "save", lambda figure, path: (figures.append(figure), save(figure, path)))
     return figures
 
 

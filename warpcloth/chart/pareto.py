@@ -1,13 +1,14 @@
 """Draws speed against accuracy with the Pareto front, and the convergence of methods."""
 
 import textwrap
+from contextlib import contextmanager
 
 from ..lab.measurements import usable
 from ..lab.work_precision import WITHIN, cheapest, front, quartiles, without_point
 from ..numerics.integrators import INTEGRATORS
 from ..others.simulators import SIMULATORS, shown_name
-from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
-from .style import DASHES, LABEL, LEGEND, SMALL, dress, headline, name_all_ends, series_style, small_print, style_of
+from ..picture.figures import GREY, number_axis
+from .style import DASHES, LABEL, LEGEND, SMALL, drawn, dress, headline, name_all_ends, series_style, small_print, style_of
 
 _CROSS = {"marker": "x", "markersize": 8, "color": "black", "markeredgewidth": 0.8}  # over points of runs that are not usable
 _WIDTH, _LINES = 46, 48  # characters and lines of the texts beside a picture
@@ -37,93 +38,84 @@ def plot_time(path, found):
         *(row["label"] + _doubt(row) for row in cheapest(rows, reference["error"])),
     ]
     texts += _missing("not drawn:", found)
-    figure, panels, notes = _figure(path, texts)
     lines = {}
     for row in rows:
         if row["status"] == "ok":
             lines.setdefault((row["solver"], row["options"].get("integrator", "euler")), []).append(row)
-    ends, dashes = {axes: [] for axes in panels}, dict(zip(INTEGRATORS, DASHES, strict=False))
-    for (solver, integrator), line in lines.items():
-        line.sort(key=lambda row: row["ms_per_second"])
-        style = style_of(solver)
-        own = [(row["ms_per_second"], row["own_error"]) for row in line if row.get("own_error") is not None]
-        if own:
-            panels[0].plot(*zip(*own, strict=True), ".", color=style.colour, markersize=5, linestyle=":", linewidth=0.7)
-        for axes, error in zip(panels, _ERRORS, strict=True):
-            x, y = ([row[of] for row in line] for of in ("ms_per_second", error))
-            axes.plot(x, y, dashes.get(integrator, "-"), color=style.colour, linewidth=0.7, alpha=0.6)
-            axes.hlines(y, *zip(*map(quartiles, line), strict=True), color=style.colour, linewidth=2.5, alpha=0.45)
-            axes.plot(x, y, linestyle="none", markersize=5, **style.line)
-            crossed = [point for point, row in zip(zip(x, y, strict=True), line, strict=True) if not usable(row)]
-            if crossed:
-                axes.plot(*zip(*crossed, strict=True), linestyle="none", label="not usable", **_CROSS)
-            name = shown_name(solver) if integrator == "euler" else f"{solver} {integrator}"
-            ends[axes].append((x[-1], y[-1], name, style.colour))
-    for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
-        x, y = ([rows[i][of] for i in curves[name]] for of in ("ms_per_second", name))
-        axes.plot(x, y, color="gold", linewidth=5.0, zorder=0, label="nothing is better in both")
-        for i in curves[name]:
-            point, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": LABEL}
-            axes.annotate(str(best.index(i) + 1), point, (-4, -4), textcoords="offset points", **below)
-        axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="scatter of the times")
-        if found.get("others"):
-            label = "from the solver's own converged motion"
-            axes.plot([], [], ".", color=GREY, markersize=5, linestyle=":", linewidth=0.7, label=label)
-        _floor(axes, reference[name], "error of the reference")
-        axes.set(xlabel="ms for a second of motion", ylabel=text)
-    title = f"{found['scene']}, {found['frames']} frames, {found['dtype']}"
-    _finish(figure, panels, notes, title, texts, found)
-    name_all_ends(figure, [(axes, of) for axes, of in ends.items() if of])
-    save(figure, path)
+    dashes = dict(zip(INTEGRATORS, DASHES, strict=False))
+    with _panels(path, found, f"{found['scene']}, {found['frames']} frames, {found['dtype']}", texts) as (panels, ends):
+        for (solver, integrator), line in lines.items():
+            line.sort(key=lambda row: row["ms_per_second"])
+            style = style_of(solver)
+            own = [(row["ms_per_second"], row["own_error"]) for row in line if row.get("own_error") is not None]
+            if own:
+                panels[0].plot(*zip(*own, strict=True), ".", color=style.colour, markersize=5, linestyle=":", linewidth=0.7)
+            for axes, error in zip(panels, _ERRORS, strict=True):
+                x, y = ([row[of] for row in line] for of in ("ms_per_second", error))
+                axes.plot(x, y, dashes.get(integrator, "-"), color=style.colour, linewidth=0.7, alpha=0.6)
+                axes.hlines(y, *zip(*map(quartiles, line), strict=True), color=style.colour, linewidth=2.5, alpha=0.45)
+                axes.plot(x, y, linestyle="none", markersize=5, **style.line)
+                crossed = [point for point, row in zip(zip(x, y, strict=True), line, strict=True) if not usable(row)]
+                if crossed:
+                    axes.plot(*zip(*crossed, strict=True), linestyle="none", label="not usable", **_CROSS)
+                name = shown_name(solver) if integrator == "euler" else f"{solver} {integrator}"
+                ends[axes].append((x[-1], y[-1], name, style.colour))
+        for axes, (name, text) in zip(panels, _ERRORS.items(), strict=True):
+            x, y = ([rows[i][of] for i in curves[name]] for of in ("ms_per_second", name))
+            axes.plot(x, y, color="gold", linewidth=5.0, zorder=0, label="nothing is better in both")
+            for i in curves[name]:
+                point, below = (rows[i]["ms_per_second"], rows[i][name]), {"ha": "right", "va": "top", "fontsize": LABEL}
+                axes.annotate(str(best.index(i) + 1), point, (-4, -4), textcoords="offset points", **below)
+            axes.plot([], [], color=GREY, linewidth=2.5, alpha=0.45, label="scatter of the times")
+            if found.get("others"):
+                label = "from the solver's own converged motion"
+                axes.plot([], [], ".", color=GREY, markersize=5, linestyle=":", linewidth=0.7, label=label)
+            _floor(axes, reference[name], "error of the reference")
+            axes.set(xlabel="ms for a second of motion", ylabel=text)
 
 
 def plot_solver(path, found):
     """Draws the gap of a step's objective, of :func:`warpcloth.lab.work_precision.solver_diagram`, over iterations and time."""
     texts = _missing("ended early:", found)
-    figure, panels, notes = _figure(path, texts)
-    seen, floor = {}, max((row["floor"] for row in found["rows"]), default=None)
-    for row in found["rows"]:
-        dashes = DASHES[seen.setdefault(row["solver"], 0) % len(DASHES)]
-        seen[row["solver"]] += 1
-        if not row["points"]:
-            continue
-        for axes, name in zip(panels, ("iterations", "ms"), strict=True):
-            x, y = ([point[name] for point in row["points"]], [max(point["gap"], floor) for point in row["points"]])
-            style = style_of(row["solver"]).line
-            axes.plot(x, y, linestyle=dashes, markersize=3, linewidth=1.0, label=row["label"], **style)
-    for axes, text in zip(panels, ("iterations", "ms of the step"), strict=True):
-        axes.set(xlabel=text)
-        if floor is not None:
-            _floor(axes, floor, "rounding of the objective")
-    panels[0].set_ylabel("gap of the objective, 1 at x̃")
     step = f"a step of 1/{found['rate']:g} s after {found['frame']} frames"
-    title = f"{found['scene']}, {step}, {found['dtype']}"
-    _finish(figure, panels, notes, title, texts, found)
-    save(figure, path)
+    with _panels(path, found, f"{found['scene']}, {step}, {found['dtype']}", texts) as (panels, _ends):
+        seen, floor = {}, max((row["floor"] for row in found["rows"]), default=None)
+        for row in found["rows"]:
+            dashes = DASHES[seen.setdefault(row["solver"], 0) % len(DASHES)]
+            seen[row["solver"]] += 1
+            if not row["points"]:
+                continue
+            for axes, name in zip(panels, ("iterations", "ms"), strict=True):
+                x, y = ([point[name] for point in row["points"]], [max(point["gap"], floor) for point in row["points"]])
+                style = style_of(row["solver"]).line
+                axes.plot(x, y, linestyle=dashes, markersize=3, linewidth=1.0, label=row["label"], **style)
+        for axes, text in zip(panels, ("iterations", "ms of the step"), strict=True):
+            axes.set(xlabel=text)
+            if floor is not None:
+                _floor(axes, floor, "rounding of the objective")
+        panels[0].set_ylabel("gap of the objective, 1 at x̃")
 
 
 def plot_spectrum(path, found):
     """Draws μ over its rank, and measured errors on lines predicted by the spectrum."""
     texts = _missing("not drawn:", found)
-    figure, panels, notes = _figure(path, texts)
-    good = [row for row in found["rows"] if row["points"]]
-    for k, row in enumerate(good):
-        mu, colour, points = row["eigenvalues"], series_style(k).colour, row["points"]
-        panels[0].plot(range(1, len(mu) + 1), mu, color=colour, linewidth=1.2)
-        at, errors = ([point[name] for point in points] for name in ("iterations", "error"))
-        panels[1].plot(
-            at, errors, "o", color=colour, markersize=3, label=f"{row['label']}: max |1 − μ| = {row['contraction']:.4f}"
-        )
-        known = [point for point in points if point["predicted"] is not None]
-        at, errors = ([point[name] for point in known] for name in ("iterations", "predicted"))
-        panels[1].plot(at, errors, color=colour, linewidth=0.8)
-    for k, row in enumerate(good):
-        _floor(panels[1], row["floor"], "rounding of the positions", series_style(k).colour)
-    panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
-    panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
     title = f"{found['scene']}, steps after {found['frame']} frames, plain projective dynamics"
-    _finish(figure, panels, notes, title, texts, found)
-    save(figure, path)
+    with _panels(path, found, title, texts) as (panels, _ends):
+        good = [row for row in found["rows"] if row["points"]]
+        for k, row in enumerate(good):
+            mu, colour, points = row["eigenvalues"], series_style(k).colour, row["points"]
+            panels[0].plot(range(1, len(mu) + 1), mu, color=colour, linewidth=1.2)
+            at, errors = ([point[name] for point in points] for name in ("iterations", "error"))
+            panels[1].plot(
+                at, errors, "o", color=colour, markersize=3, label=f"{row['label']}: max |1 − μ| = {row['contraction']:.4f}"
+            )
+            known = [point for point in points if point["predicted"] is not None]
+            at, errors = ([point[name] for point in known] for name in ("iterations", "predicted"))
+            panels[1].plot(at, errors, color=colour, linewidth=0.8)
+        for k, row in enumerate(good):
+            _floor(panels[1], row["floor"], "rounding of the positions", series_style(k).colour)
+        panels[0].set(xlabel="rank", ylabel="eigenvalue μ of the Hessian relative to the matrix")
+        panels[1].set(xlabel="iterations", ylabel="error, 1 at x̃; lines: by the spectrum")
 
 
 def _doubt(row):
@@ -139,30 +131,30 @@ def _missing(head, found):
     return ["", head, *lines] if lines else []
 
 
-def _figure(path, texts):
-    check_path(path, PICTURES)
-    from matplotlib.figure import Figure
+@contextmanager
+def _panels(path, found, title, texts):
+    """Yields two panels on logarithmic scales, and the ends of lines to be named in each; then finishes and writes the figure.
 
+    A third panel has the legend and the texts below it.
+    """
     if len(texts) > _LINES:
         texts[_LINES:] = [f"… {len(texts) - _LINES} lines more in the table"]
-    height = max(4.6, 0.135 * (len(texts) + 14))
-    figure = Figure(figsize=(11.0, height), layout="constrained")
-    *axes, notes = figure.subplots(1, 3, width_ratios=[1.7, 1.7, 1.0])
-    for each in axes:
-        each.set(xscale="log", yscale="log")
-    notes.axis("off")
-    return figure, axes, notes
-
-
-def _finish(figure, axes, notes, title, texts, found):
-    known = {}
-    for each in axes:
-        number_axis(each.xaxis)
-        dress(each)
-        known.update(zip(*reversed(each.get_legend_handles_labels()), strict=True))
-    notes.legend(known.values(), known, loc="upper left", borderaxespad=0.0, **LEGEND)
-    top = 1.0 - 0.17 * (len(known) + 1) / figure.get_size_inches()[1]
-    notes.text(0.0, top, "\n".join(texts), fontsize=SMALL, color=GREY, va="top", transform=notes.transAxes, parse_math=False)
-    headline(figure, title)
-    named = [name for name, each in SIMULATORS.items() if set(each.solvers) & {row.get("solver") for row in found["rows"]}]
-    small_print(figure, found["machine"], others=named)
+    with drawn(path, 11.0, max(4.6, 0.135 * (len(texts) + 14))) as figure:
+        *panels, notes = figure.subplots(1, 3, width_ratios=[1.7, 1.7, 1.0])
+        for axes in panels:
+            axes.set(xscale="log", yscale="log")
+        notes.axis("off")
+        ends, known = {axes: [] for axes in panels}, {}
+        yield panels, ends
+        for axes in panels:
+            number_axis(axes.xaxis)
+            dress(axes)
+            known.update(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+        notes.legend(known.values(), known, loc="upper left", borderaxespad=0.0, **LEGEND)
+        top = 1.0 - 0.17 * (len(known) + 1) / figure.get_size_inches()[1]
+        style = {"fontsize": SMALL, "color": GREY, "va": "top", "parse_math": False}
+        notes.text(0.0, top, "\n".join(texts), transform=notes.transAxes, **style)
+        headline(figure, title)
+        used = {row.get("solver") for row in found["rows"]}
+        small_print(figure, found["machine"], others=[name for name, each in SIMULATORS.items() if used & set(each.solvers)])
+        name_all_ends(figure, [(axes, of) for axes, of in ends.items() if of])

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..core.capture import Mirror, Segment
 from ..core.status import Residual, Result
 from ..core.sums import RowSums, Sums
@@ -93,15 +93,10 @@ class ConstrainedDynamics(ImplicitStep):
     )
     residual = Residual("largest residual of a vertex or a constraint (as an acceleration)")
 
-    iterations: int = 20
-    tolerance: float = 1e-3
+    iterations: int = ranged(20, whole=True, least=1)
+    tolerance: float = ranged(1e-3, above=0.0)
     stabilisation: Literal["none", "geometric-stiffness", "line-search"] = "geometric-stiffness"
     linear: Literal["cg", "factorised"] = "cg"
-
-    def __post_init__(self):
-        super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        number("tolerance", self.tolerance, above=0.0)
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..kernels.hierarchy import follow
 from ..model.model import Model
 from ..numerics.hierarchy import levels, on_device
@@ -62,18 +62,10 @@ class HierarchicalPBD(Step):
         runs=grid([(4, 1), (8, 1), (15, 1), (30, 1), (8, 2), (15, 2), (30, 2), (60, 2), (120, 2)]),
     )
 
-    iterations: int = 20
-    coarse_iterations: int = 5
-    levels: int | None = None
-    relaxation: float = 1.0
-
-    def __post_init__(self):
-        super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        whole("coarse_iterations", self.coarse_iterations, 1)
-        if self.levels is not None:
-            whole("levels", self.levels, 0)
-        number("relaxation", self.relaxation, above=0.0)
+    iterations: int = ranged(20, whole=True, least=1)
+    coarse_iterations: int = ranged(5, whole=True, least=1)
+    levels: int | None = ranged(None, whole=True, least=0)
+    relaxation: float = ranged(1.0, above=0.0)
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..model.model import Model
 from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
 from ..terms.needs import CLOSED_STEP, LOCAL_STEP, MERGED_DAMPING, NO_AIR, NORMAL_FORCE
@@ -73,17 +73,14 @@ class PBD(Step):
         limits=("ω λ_max = 2", "Gauss–Seidel, |z| = 1", "a ring an iteration"),
     )
 
-    iterations: int = 20
+    iterations: int = ranged(20, whole=True, least=1)
     sweep: Literal["vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential"] = "coloured"
-    alpha: float = 0.0
-    relaxation: float = 1.0
+    alpha: float = ranged(0.0, least=0.0)
+    relaxation: float = ranged(1.0, above=0.0)
     correction: Literal["per-sweep", "per-step"] = "per-sweep"
 
     def __post_init__(self):
         super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        number("alpha", self.alpha, least=0.0)
-        number("relaxation", self.relaxation, above=0.0)
         if self.sweep != "vertex-averaged" and self.alpha != 0.0:
             raise ValueError(f"alpha is {self.alpha:g}; it belongs to sweep='vertex-averaged' and must be 0 without")
 

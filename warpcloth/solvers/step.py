@@ -1,10 +1,10 @@
 """The base classes of the records of solvers: the step, the needs of every term and the facts; and the catalogue by name."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
-from ..base.checks import choice, keep_plain, number, shown, whole
+from ..base.checks import choice, keep_plain, ranged, shown
 from ..base.extensions import note
 from ..base.limits import MOST
 from ..base.quiet import find_device
@@ -94,8 +94,8 @@ class Step:
         super().__init_subclass__(**options)
         methods_in_turn(cls, "bind")
 
-    dt: float | None = None
-    substeps: int | None = None
+    dt: float | None = ranged(None, above=0.0)
+    substeps: int | None = ranged(None, whole=True, least=1)
 
     @classmethod
     def precision_on(cls, device: str, dtype: Precision | None = None) -> Precision:
@@ -209,11 +209,10 @@ class Step:
         given = [name for name in self.step_options if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"only one of {', '.join(self.step_options[:-1])} and {self.step_options[-1]} may be given")
-        for name in given:
-            if name == "substeps":
-                whole(name, self.substeps, 1)
-            else:
-                number(name, getattr(self, name), above=0.0)
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if "range" in field.metadata and (value is not None or field.default is not None):
+                field.metadata["range"].check(field.name, value)
         for name, words in words_of(type(self)).items():
             choice(name, getattr(self, name), words)
 
@@ -268,7 +267,7 @@ class ImplicitStep(Step):
     step_options: ClassVar[tuple[str, ...]] = ("dt", "substeps", "error")
 
     integrator: Literal["euler", "midpoint", "bdf2"] = "euler"
-    error: float | None = None
+    error: float | None = ranged(None, above=0.0)
 
     def __post_init__(self):
         super().__post_init__()

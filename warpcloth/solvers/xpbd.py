@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..core.capture import Mirror
 from ..core.status import UNBALANCED, Residual, Result
 from ..core.sums import Sums
@@ -92,15 +92,13 @@ class XPBD(ImplicitStep):
         limits=("ω λ_max = 2", "Gauss–Seidel, |z| = 1", "a ring an iteration", "h² = m/(k(L/l − 1))"),
     )
 
-    iterations: int = 20
+    iterations: int = ranged(20, whole=True, least=1)
     sweep: Literal["coloured", "sequential", "constraint-averaged"] = "coloured"
     form: Literal["vector", "scalar"] = "vector"
-    relaxation: float = 1.0
+    relaxation: float = ranged(1.0, above=0.0)
 
     def __post_init__(self):
         super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        number("relaxation", self.relaxation, above=0.0)
         if INTEGRATORS[self.integrator].to_and_fro and self.ordered and self.iterations % 2:
             raise ValueError(
                 f'iterations is {self.iterations}; with integrator="{self.integrator}" sweeps go forward and backward in turn, '

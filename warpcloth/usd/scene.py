@@ -3,6 +3,7 @@
 import os
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -52,7 +53,9 @@ from .stage import (
 from .values import array_of, refuse_unknown, sentences, time_codes_of, value_of
 
 
-def read_scene(path: FilePath, prim: str | None = None, law: str = "proposal", fabric: str | None = None) -> Scene:
+def read_scene(
+    path: FilePath, prim: str | None = None, law: Literal["proposal", "newton"] = "proposal", fabric: str | None = None
+) -> Scene:
     """Reads a scene from a stage.
 
     Args:
