@@ -11,7 +11,7 @@ from .obstacles import CLOTH, OBSTACLE, copy_of, has_obstacle, in_copy, vector_w
 from .proximity_grid import MODULE, box_tests, boxes, boxes_meet, code_of, grids, surfaces
 from .self_gaps import nearest_of_face
 
-MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
+MAX_COUNT = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 
 
 @wp.struct
@@ -112,7 +112,7 @@ def take_near(dtype, of_edges: bool):
                 if has_obstacle(surface.layout, s) and (wp.static(of_edges) or s[0] >= surface.layout.cloth):
                     r = surface.close
             if d < surface.skin + r:
-                if pairs.counts[KIND] < MOST:
+                if pairs.counts[KIND] < MAX_COUNT:
                     slot = wp.atomic_add(pairs.counts, KIND, 1)
                     row = i
                     item = k

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .limits import MOST
+from .limits import MAX_COUNT
 
 
 class _Short(reprlib.Repr):
@@ -60,7 +60,7 @@ def _is_finite(value):
         return False
 
 
-def whole(name: str, value: Any, least: int, most: int = MOST) -> None:
+def whole(name: str, value: Any, least: int, most: int = MAX_COUNT) -> None:
     """Checks that an option is a whole number from ``least`` to ``most``.
 
     Raises:

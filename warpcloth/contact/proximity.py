@@ -14,13 +14,13 @@ from ..kernels.contact.pair_potential import CLOSE
 # The longest move of a vertex in a round of the filter, relative to the common motion, over the skin. A list serves for another
 # round while its sides have approached by less than the rest of the skin. Meshes stand in a round. A round moves a vertex by a
 # 64th less, so that a list serves two rounds despite rounding.
-WAY = 0.25
-ROUND = WAY * 63 / 64
+MAX_MOVE = 0.25
+ROUND = MAX_MOVE * 63 / 64
 # Memory of a listed pair, with its gap, its near face and two keys [bytes].
 BYTES_OF_A_PAIR = 200
 # Edges along a cluster of vertices whose moves have a mean.
 CLUSTER = 8
-MOST = (1 << 28) - 1  # four corners of each of two keys
+MAX_PAIRS = (1 << 28) - 1  # four corners of each of two keys
 
 
 class Proximity:
@@ -54,7 +54,7 @@ class Proximity:
     def __init__(self, surface, distance, skin, of_meshes=0.0):
         self.surface, self.model, self.skin = surface, surface.model, skin
         model, device = self.model, self.model.device
-        self.kept = 0.5 * (1.0 - (2.0 if surface.meets_itself else 1.0) * WAY)
+        self.kept = 0.5 * (1.0 - (2.0 if surface.meets_itself else 1.0) * MAX_MOVE)
         self._max_distance = max(distance * surface.meets_itself, of_meshes)
         self._triangles, self._edges, self._vertices = surface.triangles, surface.edges, surface.count
         self.pieces, points = self._connected(model.in_model(model.scene.mesh.edges))
@@ -179,8 +179,8 @@ class Proximity:
     def _allocate(self, capacity):
         model, rows = self.model, self._vertices + self._edges
         what = f"the cloth needs room for {capacity} pairs that are near one another"
-        if capacity > MOST:
-            raise ValueError(f"{what}; it must be at most {MOST}, because corners of contacts are numbered in 32 bits")
+        if capacity > MAX_PAIRS:
+            raise ValueError(f"{what}; it must be at most {MAX_PAIRS}, because corners of contacts are numbered in 32 bits")
         refuse_memory(what, BYTES_OF_A_PAIR * capacity, model.device)
 
         def zeros(count, dtype=wp.int32):

@@ -14,7 +14,7 @@ _SIDE, _RIGHT, _TOP, _FOOT, _GAP = 6.0, 1.2, 0.5, 0.3, 0.15
 # Line widths [pt]: edges in the colour of their triangle close hairline gaps between neighbours, which at 150 dpi needs 0.8.
 _EDGE, _LINE = 0.8, 0.7
 # Smallest brightness of shading, because the bar shows the colours in full light.
-_LEAST_LIGHT = 0.85
+_MIN_LIGHT = 0.85
 _GREYS = (0.0, 1.0, 0.5)
 
 
@@ -95,7 +95,7 @@ def _check(points, triangles, values, on):
 
 
 def _whole(corners, colours):
-    return corners, colours * brightness(corners, _LEAST_LIGHT)[:, None]
+    return corners, colours * brightness(corners, _MIN_LIGHT)[:, None]
 
 
 def _thirds(corners, colours):
@@ -103,7 +103,7 @@ def _thirds(corners, colours):
     following, before = np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)
     middle = np.broadcast_to(corners.mean(axis=1, keepdims=True), corners.shape)
     outlines = np.stack([corners, (corners + following) / 2.0, middle, (corners + before) / 2.0], axis=2)
-    return outlines.reshape(-1, 4, 3), (colours * brightness(corners, _LEAST_LIGHT)[:, None, None]).reshape(-1, 3)
+    return outlines.reshape(-1, 4, 3), (colours * brightness(corners, _MIN_LIGHT)[:, None, None]).reshape(-1, 3)
 
 
 def _segments(view, directions):

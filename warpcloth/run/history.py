@@ -10,7 +10,7 @@ import warp as wp
 import warpcloth.contact as contact
 
 from ..base.checks import shown
-from ..base.limits import MOST_FRAMES
+from ..base.limits import MAX_FRAMES
 from ..base.texts import numbered
 from ..core.capture import Segment
 from ..core.energy import Energy
@@ -235,7 +235,7 @@ class Evaluation:
 
 def last_frame(scene: Scene) -> int:
     """Returns the frame of the wind at rest: its last keyframe, or the last frame if it is a function."""
-    return MOST_FRAMES if scene.air is not None and scene.air.keyframes is not None else scene.frames
+    return MAX_FRAMES if scene.air is not None and scene.air.keyframes is not None else scene.frames
 
 
 def _time_of(stepper):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import whole
 from ..base.interrupts import recording
-from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
+from ..base.limits import MAX_FRAMES, refuse_disk, refuse_memory
 from ..base.notebooks import ShownInNotebooks
 from ..base.turns import TURN
 from ..base.types import FilePath, Precision, Progress
@@ -240,7 +240,7 @@ def simulate(
         (31, 2, 3)
     """
     frames = scene.frames if frames is None else frames
-    whole("frames", frames, 1, MOST_FRAMES)
+    whole("frames", frames, 1, MAX_FRAMES)
     whole("copies", copies, 1)
     dtype = solver.precision_on(device, dtype)
     record = checked_record(record, scene)

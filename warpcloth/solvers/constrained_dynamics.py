@@ -16,7 +16,7 @@ from ..model.model import Model
 from ..numerics.constraints import Constraints
 from ..numerics.iterate import ResidualScale
 from ..numerics.linear import ConjugateGradients, FactorisedRows
-from ..numerics.multigrid import LEAST
+from ..numerics.multigrid import MIN_VERTICES
 from ..numerics.primal import PrimalSolver
 from ..numerics.search import Search
 from ..terms.needs import FINITE, MERGED_DAMPING, ROWS, STEADY_ROWS
@@ -143,7 +143,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
 
         self._active, self._stepped = Mirror(model.scalars(wp.int32)), Mirror(self._step)
         if options.linear == "cg":
-            through = model.per_copy >= LEAST and self.constraints.of_elements
+            through = model.per_copy >= MIN_VERTICES and self.constraints.of_elements
             self._linear = (PrimalSolver if through else ConjugateGradients)(self.constraints, LINEAR_ITERATIONS)
             self._tolerance = Mirror(self._linear.tolerance)
         else:

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from ..base.checks import choice, keep_plain, ranged, shown
 from ..base.extensions import note
-from ..base.limits import MOST
+from ..base.limits import MAX_COUNT
 from ..base.quiet import find_device
 from ..base.texts import words_of
 from ..base.turns import methods_in_turn
@@ -232,8 +232,10 @@ class Step:
         if self.dt is None:
             return max(1, round(_STEPS_A_SECOND / fps))
         steps = 1.0 / max(float(fps) * self.dt, 1e-300)
-        if steps > MOST:
-            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be {MOST:,} steps or less, not {steps:.3g}")
+        if steps > MAX_COUNT:
+            raise ValueError(
+                f"dt is {self.dt:g} s; at fps {fps:g} a frame must be {MAX_COUNT:,} steps or less, not {steps:.3g}"
+            )
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be a whole number of steps, not {steps:g}")
         return round(steps)
@@ -309,6 +311,6 @@ def fewest_substeps(fps, rest, motion):
         ValueError: They would be more than a solver takes.
     """
     longest = min(rest / 1.1, motion)
-    if not fps * longest * MOST > 1.0:
+    if not fps * longest * MAX_COUNT > 1.0:
         raise ValueError(f"the scene is so stiff that this solver is stable only below {longest:.3g} s; take an implicit one")
     return math.floor(1.0 / (fps * longest)) + 1

@@ -15,7 +15,7 @@ from .stage import animated_prims, open_stage
 from .writer import AnimationWriter
 
 OUTPUTS = (*NUMBERED, *CACHES, ".npz", *STAGE_ENDINGS)
-_MOST = float(np.finfo(np.float32).max)
+_MAX_FLOAT32 = float(np.finfo(np.float32).max)
 _UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
 
 
@@ -109,7 +109,7 @@ def _points(sequence, index):
 
 
 def _check_finite(sequence, index, name, vectors):
-    bad = np.flatnonzero(~(np.abs(vectors) <= _MOST).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(vectors) <= _MAX_FLOAT32).all(axis=1))
     if len(bad):
         where, given = f"{sequence.path}, frame {sequence.labels[index]}", vectors[bad[0]].tolist()
         raise ValueError(f"{where}: {name} {bad[0]} is {given}; it must be finite as float32")

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..base.limits import MOST_FRAMES
+from ..base.limits import MAX_FRAMES
 from ..base.types import FilePath
 from ..mesh.mesh import Mesh
 from ..mesh.parts import Part
@@ -262,8 +262,8 @@ def _duration(stage, values, fps):
     if duration is None:
         seconds = stage.GetEndTimeCode() - stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
         return max(0.0, np.floor(seconds / stage.GetTimeCodesPerSecond() * fps * (1 + 1e-9)) / fps) or 1.0
-    if not 0.0 < float(duration) * fps <= MOST_FRAMES:
-        raise ValueError(f"warpcloth:duration is {duration} s, must be finite and above 0, and {MOST_FRAMES:,} frames at most")
+    if not 0.0 < float(duration) * fps <= MAX_FRAMES:
+        raise ValueError(f"warpcloth:duration is {duration} s, must be finite and above 0, and {MAX_FRAMES:,} frames at most")
     return float(duration)
 
 
