@@ -13,18 +13,11 @@ _FADED, _BAR = 0.25, 0.035  # opacity of the colour of a solver behind texts, an
 
 
 def plot_cheapest(path, found):
-    """Draws a cell for each pair of values, the first value of y lowest.
+    """Draws a cell for each pair of values of :func:`warpcloth.lab.cheapest.cheapest_map`, the first value of y lowest.
 
     A cell has the cheapest solver's colour, marker and settings, the time of a frame, its error, the second best by ratio of
-    times, and the error of the reference. Cells without an accurate setting are hatched and say why; "not usable" is the grade
-    of a run. A question mark is an incomplete search.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: As :func:`warpcloth.lab.cheapest.cheapest_map` returns it.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
+    times, and the error of the reference. Cells without an accurate setting are hatched and say why. A question mark is an
+    incomplete search.
     """
     check_path(path, PICTURES)
     from matplotlib.figure import Figure

@@ -7,18 +7,10 @@ from .style import LABEL, LEGEND, SMALL, dress, series_style, small_print
 
 
 def plot_physics(path, results, facts=None):
-    """Plots the error over h and over time, two panels for each case, pattern and angle.
+    """Plots the error of :func:`physics.measure` over h and over time, two panels for each case, pattern and angle.
 
     Dashed lines are the effect of a cantilever's free sides and the accuracy of equilibria, below which errors mean nothing.
-    Points that failed are named.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        results: Pairs of arguments and result of :func:`physics.measure`, in any order.
-        facts: The machine, as of :func:`warpcloth.lab.machine.machine`; None for this one.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`, or there is nothing to plot.
+    Points that failed are named. ``results`` are pairs of arguments and result; without any ValueError is raised.
     """
     check_path(path, PICTURES)
     rows = {}

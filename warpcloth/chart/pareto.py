@@ -19,19 +19,13 @@ _ERRORS = {
 
 
 def plot_time(path, found):
-    """Draws the error of each setting over its time, with the scatter of times, and names each line.
+    """Draws the error of each setting of :func:`warpcloth.lab.work_precision.time_diagram` over its time, with the scatter of
+    times.
 
     Panels show errors of positions and the 99th percentile of errors of strains. Settings that no other beats beyond the spread
-    are joined, numbered and named. Settings without an error are named with the reason; runs that are not usable are crossed. A
+    are joined, numbered and named; those without an error are named with the reason; runs that are not usable are crossed. A
     line is the error of the reference, below which points mean nothing. For other simulators, dots are errors relative to the
     motion to which they converge.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        found: As :func:`warpcloth.lab.work_precision.time_diagram` returns it.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
     """
     rows, reference = found["rows"], found["reference"]
     curves = {name: front(rows, reference[name], name) for name in _ERRORS}

@@ -15,20 +15,11 @@ _NOTE = {"ha": "right", "fontsize": SMALL, "color": GREY, "bbox": {"facecolor": 
 
 
 def plot_percentiles(path, summaries, along="time", neutrals=None, device="cpu"):
-    """Plots each scalar in a panel: median, bands from 25 to 75, 5 to 95 and 1 to 99 %, and extremes.
+    """Plots each scalar in a panel: median, bands from 25 to 75, 5 to 95 and 1 to 99 %, and extremes, along "time" or "frame".
 
-    Rows without values leave gaps; extremes far outside the bands are given as numbers.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        summaries: Summaries by row, with ``name``, ``unit``, ``time`` [s], ``frame`` and ``percentiles`` of 0, 1, 5, 25, 50,
-            75, 95, 99 and 100 %.
-        along: "time" or "frame".
-        neutrals: Undeformed values by name, or None.
-        device: The Warp device that measured them.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`, or there is nothing to plot.
+    Rows without values leave gaps; extremes far outside the bands are given as numbers. ``summaries`` have ``name``, ``unit``,
+    ``time`` [s], ``frame`` and ``percentiles`` of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, ``neutrals`` the undeformed values by
+    name, or None.
     """
     check_path(path, PICTURES)
     choice("along", along, ("time", "frame"))

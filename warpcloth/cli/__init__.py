@@ -251,8 +251,6 @@ def _parser():
         if sub is not checks:
             sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
         sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    for sub in (runs, benches):
-        sub.add_argument("--threads", type=int, default=1, metavar="N", help="number of CPU threads (default: 1)")
     for sub in (runs, infos, deforms, analyzes, chooses, benches, fitted):
         default = "float64" if sub in (deforms, analyzes, fitted) else None
         text = default or "by device and solver"

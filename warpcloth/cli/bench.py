@@ -70,6 +70,8 @@ def add_arguments(parser):
         help="frames to time (default: 20); fewer if they take over 10 s, but at least 3",
     )
     add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="number of cloths in a batch (default: 1)")
+    text = "number of CPU threads that share out the cloths of a batch (default: 1)"
+    add("--threads", type=int, default=_OF_A_RUN["threads"], metavar="N", help=text)
     add("--csv", metavar="FILE", help="write the measurements as a table")
     add("--compare", nargs=2, metavar=("OLD", "NEW"), help="compare two files saved from --json, and print the ratios")
 
@@ -79,7 +81,6 @@ def bench(arguments):
         return _compare(arguments)
     whole("frames", arguments.frames, 1)
     whole("copies", arguments.copies, 1)
-    whole("threads", arguments.threads, 1)
     for size in arguments.sizes:
         whole("sizes", size, 2)
     if arguments.csv:
@@ -88,6 +89,9 @@ def bench(arguments):
         check_writable(arguments.csv)
     device = find_device(arguments.device)
     from ..lab.benchmarks import Run
+    from ..model.threads import refuse_one_copy
+
+    refuse_one_copy(arguments.threads, arguments.copies)
 
     run = Run(_benchmarks(arguments, device))
     progress = _Rows()

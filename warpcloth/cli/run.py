@@ -48,7 +48,7 @@ def run(arguments):
             progress=progress,
             dtype=setup.dtype,
             record=record,
-            **values_of(arguments, "output", "single_file", "resume", "threads"),
+            **values_of(arguments, "output", "single_file", "resume"),
         )
         progress.close()
         status = animation.status
@@ -84,7 +84,7 @@ def run(arguments):
             "dtype": setup.dtype,
             "file": arguments.output,
             "frames_folder": frames_folder_of(arguments),
-            **values_of(arguments, "threads", "film", "csv", "report"),
+            **values_of(arguments, "film", "csv", "report"),
         }
         print(json_text(facts) if arguments.json else _summary(facts, animation.inside, animation.forced))
         if status.ok:
@@ -114,7 +114,7 @@ def _lines_of(found):
 def _summary(facts, inside, forced):
     from ..core.status import digits
 
-    threads, measured = facts["threads"], facts["residual_measure"] is not None
+    measured = facts["residual_measure"] is not None
     residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none, the method does not compute one"
     touching = facts.get("self_contact")
     cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by contact"] if "cut" in facts else []
@@ -130,7 +130,7 @@ def _summary(facts, inside, forced):
             *(_lines_of(touching) if touching else ()),
             f"  residual      {residual}",
             f"  solver        {solver_line(facts)}",
-            f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),
+            f"  device        {facts['device']}, {facts['dtype']}",
             f"  file          {location(facts)}",
             *(f"  {name:<13} {facts[name]}" for name in ("film", "csv", "report") if facts[name]),
         ]

@@ -116,7 +116,7 @@ def solver_setup(arguments, scene, device, limits=False):
     from ..solvers.step import fewest_substeps
 
     began = time.perf_counter()
-    model = scene.build(device=device, dtype=dtype, order=order_of_run(scene, solver), threads=getattr(arguments, "threads", 1))
+    model = scene.build(device=device, dtype=dtype, order=order_of_run(scene, solver))
     rest, motion = record.step_limits(model)
     setup = Chosen(dtype, solver, solver, None, model, (rest, motion), time.perf_counter() - began)
     if not step_given:

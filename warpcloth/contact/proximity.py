@@ -4,7 +4,6 @@ import numpy as np
 import warp as wp
 
 from ..base.limits import refuse_memory
-from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.filled import filled
 from ..core.scan import Scan
@@ -52,7 +51,6 @@ class Proximity:
         alike: See :meth:`launch_along` [m].
     """
 
-    @in_turn
     def __init__(self, surface, distance, skin, of_meshes=0.0):
         self.surface, self.model, self.skin = surface, surface.model, skin
         model, device = self.model, self.model.device
@@ -92,6 +90,7 @@ class Proximity:
         self._near = self.searches(kernels.take_near, "near")
         self._launch = model.launcher(
             ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
+            ((proximity_grid.note_large,), model.dtype),
             ((kernels.write_pairs,), model.dtype),
             ((piece_motion.extend_boxes, piece_motion.find_drift, piece_motion.compare_positions), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.add_positions), model.dtype),
@@ -245,10 +244,11 @@ class Proximity:
         for k, start in enumerate((np.inf, -np.inf) * 2):
             motion.tables[k].fill_(start)
         motion.some.zero_()
-        moving = len(motion.mean) + len(p) - model.count
-        self._launch(local_motion.find_means, moving, [p], [motion])
+        self._launch(local_motion.find_means, len(motion.mean) + self._vertices - model.count, [p], [motion])
         self._launch(local_motion.note_moves, model.count, [x, p, self.found], [motion])
         self._launch(local_motion.bound_moves, self._vertices, [x], [motion])
+        given = [self._along, x, self._grid.size, self._triangles]
+        self._launch(proximity_grid.note_large, self._edges, given, [motion])
         wp.capture_if(motion.some, lambda: self._launch_grid(self._along, x, p, searches, out))
 
     def _launch_grid(self, surface, x, p, searches, out):
@@ -322,7 +322,6 @@ class Proximity:
         """Whether more pairs were found than fit; waits for the device."""
         return self._mirror.read().sum(dtype=np.int64) > self.capacity
 
-    @in_turn
     def grow(self, count=None):
         """Allocates room for 1.5 times ``count`` pairs, by default as last found. Graphs must be recorded again.
 

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from ..base.turns import in_turn
 from ..kernels import reduce
 
 # Threads of a block that share a sum, and the most blocks of a copy, on a GPU; on the CPU one thread takes a copy.
@@ -38,7 +37,6 @@ class Sums:
 
     numbers = False  # whether arrays hold numbers, not vectors
 
-    @in_turn
     def __init__(self, model, per_copy=None):
         self.model, self.per_copy = model, model.per_copy if per_copy is None else per_copy
         self._lanes = lanes = Lanes(model, self.per_copy)

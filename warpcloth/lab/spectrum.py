@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 
+from ..base.turns import in_turn
 from ..core.constant_matrix import constant_matrices
 from ..core.hessian import Hessian
 from ..kernels.term import HessianPolicy
@@ -24,6 +25,7 @@ MOST = 2000
 LINEAR, RESOLVED = 1e-2, 1e-8
 
 
+@in_turn
 def relative_spectrum(step):
     """Returns μ and v of Hv = μAv at the minimiser of a step, VᵀAV = 1.
 

@@ -21,24 +21,12 @@ _GREYS = (0.0, 1.0, 0.5)
 def draw(
     path, points, triangles, values, scale, on="triangle", title="", unit="1", view=None, directions=None, both_sides=False
 ):
-    """Writes a PNG of a cloth in parallel projection with a colour bar.
+    """Writes a PNG of a cloth, points (n, 3) [m] and triangles (T, 3), in parallel projection with a colour bar.
 
-    A vertex colours the nearest third of each triangle; dark grey is no value. Triangles that are not finite are counted, not
-    drawn.
-
-    Args:
-        path: The file.
-        points: (n, 3) [m].
-        triangles: Vertices (T, 3).
-        values: (T,), or (n,); NaN for no value.
-        scale: The :class:`Scale`.
-        on: "triangle" or "vertex".
-        title: Title.
-        unit: Unit of the values.
-        view: The :class:`View`, fitted to a whole sequence to compare; without a window it is fitted to these points.
-        directions: Segments by name, (centres (E, 3) [m], vectors (E, 3) [m] from end to end): the first black, the second
-            white, the third grey; those not finite are ignored.
-        both_sides: Whether a second panel shows the opposite side.
+    The values (T,), or (n,) ``on`` vertices, colour by a :class:`Scale`, NaN in dark grey; a vertex colours the nearest third
+    of each triangle. Triangles that are not finite are counted, not drawn. A ``view`` without a window is fitted to these
+    points. ``directions`` are segments by name, centres and vectors (E, 3) [m]: the first black, the second white, the third
+    grey. ``both_sides`` adds a panel from the opposite side.
 
     Raises:
         OSError, ImportError: The file cannot be written, or matplotlib is not installed.

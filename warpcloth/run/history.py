@@ -12,7 +12,6 @@ import warpcloth.contact as contact
 from ..base.checks import shown
 from ..base.limits import MOST_FRAMES
 from ..base.texts import numbered
-from ..base.turns import in_turn
 from ..core.capture import Segment
 from ..core.energy import Energy
 from ..core.sums import Sums
@@ -285,7 +284,6 @@ class History:
 
     energies, reactions, pairs, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
 
-    @in_turn
     def __init__(self, stepper, model, record):
         self._stepper, self.model, self._record, scene = stepper, model, record, model.scene
         changing = model.loads is not None and model.loads.constant is None

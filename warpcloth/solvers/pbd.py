@@ -91,10 +91,6 @@ class PBD(Step):
     def ordered(self) -> bool:
         return self.sweep in IN_PLACE
 
-    @property
-    def divides(self) -> bool:
-        return self.sweep == "coloured"
-
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
@@ -117,20 +113,22 @@ class PBDStepper(LaunchedStepper):
     def __init__(self, options, model):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations
-        model = self.model
+        self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
+
+    def arranged(self, model):
+        options = self.options
         # With one sweep, both kinds of correction are equal.
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         given = model, self.state.x, self.h, options.sweep, options.relaxation
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool)
+            self.sweep = GaussSeidelSweep(*given, spread=spread)
         else:
             self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread)
-        self.model = model.with_terms(self.sweep.elements)
-        self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
+        return model.with_terms(self.sweep.elements)
 
     def _launch_start(self):
-        self.pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        self.launch_prediction()
+        self.sweep.launch_start()
 
     def _launch_last(self):
-        if self.pool.leads:
-            self.launch_finish(self.sweep.correction)
+        self.launch_finish(self.sweep.correction)

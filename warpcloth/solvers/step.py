@@ -125,11 +125,6 @@ class Step:
         """Whether its steps damp frequencies that they do not resolve, or are refused above a stability limit."""
         return True
 
-    @property
-    def divides(self) -> bool:
-        """Whether several threads can share the steps of one cloth."""
-        return False
-
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
@@ -206,23 +201,8 @@ class Step:
         return self
 
     def _on(self, stepper, model):
-        """Returns the :class:`Stepper` of type ``stepper`` on a model, which threads share if there are several.
-
-        Raises:
-            ValueError: Several threads cannot share one cloth, or there are more threads than vertices.
-        """
-        threads = model.threads
-        if threads > 1 and model.copies > 1:
-            return ThreadedStepper(self, stepper, model)
-        if threads > 1 and not self.divides:
-            able = ", ".join(record.__name__ for record in SOLVERS.values() if record(substeps=1).divides)
-            raise ValueError(
-                f"threads is {threads} with one copy, whose steps {type(self).__name__} cannot divide as it is set; "
-                f"{able} can as they are by default, and with several copies every solver"
-            )
-        if threads > model.count:
-            raise ValueError(f"threads is {threads} for {model.count} vertices; there must be one for each at least")
-        return stepper(self, model)
+        """Returns the :class:`Stepper` of type ``stepper`` on a model, or one that divides its copies among threads."""
+        return ThreadedStepper(self, stepper, model) if model.threads > 1 else stepper(self, model)
 
     def __post_init__(self):
         keep_plain(self)

@@ -116,10 +116,6 @@ class XPBD(ImplicitStep):
             return self.residual._replace(measure="largest move of a vertex in the last sweep (divided by h²)")
         return self.residual
 
-    @property
-    def divides(self) -> bool:
-        return self.sweep == "coloured"
-
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
 
@@ -143,16 +139,9 @@ class XPBDStepper(LaunchedStepper):
         super().__init__(options, model, options.integrator)
         self.iterations = options.iterations
         model = self.model
-        given = model, self.state.x, self.he, options.sweep, options.relaxation
-        more = {"scalar": options.form == "scalar", "multipliers": True}
-        if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool)
-        else:
-            self.sweep = JacobiSweep(*given, **more)
-        self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
-        self._gradient = plan(self.model).gradient(corrected=True) if soft else None
+        self._gradient = plan(model).gradient(corrected=True) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
         self._acceleration = model.scalars()
         self._largest = Mirror(self.state.add("largest acceleration", model.scalars()))
@@ -164,8 +153,16 @@ class XPBDStepper(LaunchedStepper):
         self.record((self._launch_start, 1), *sweeps, (self._launch_last, 1))
         self.integrator.start()
 
+    def arranged(self, model):
+        options = self.options
+        kind = GaussSeidelSweep if options.ordered else JacobiSweep
+        more = {"scalar": options.form == "scalar", "multipliers": True}
+        self.sweep = kind(model, self.state.x, self.he, options.sweep, options.relaxation, **more)
+        return model.with_terms(self.sweep.elements)
+
     def _launch_start(self):
-        self.pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        self.launch_prediction()
+        self.sweep.launch_start()
 
     def _launch_to_and_fro(self):
         """Launches one sweep forward and one backward."""
@@ -174,16 +171,12 @@ class XPBDStepper(LaunchedStepper):
 
     def _launch_last(self):
         """Launches the end of a step and its residual: the unbalanced force, or with hard constraints the last move."""
-        if self._gradient is None:
-            self.pool.launch_alone(self.model, self._force.zero_, lambda: self._launch_momentum(-1.0))
-            self.sweep.launch()
-        if self.pool.leads:
-            self._launch_end()
-
-    def _launch_end(self):
         model, d = self.model, self.sweep.correction
-        if self._gradient is not None:
-            self._force.zero_()
+        self._force.zero_()
+        if self._gradient is None:
+            self._launch_momentum(-1.0)
+            self.sweep.launch()
+        else:
             self._gradient.add(self.state.x, self._force, d)
         self._launch_momentum(1.0)
         model.lock(self._force)
