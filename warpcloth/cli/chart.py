@@ -99,6 +99,8 @@ def _add_work_precision(charts):
         "--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure only these solvers (default: all)"
     )
     add_with(sub)
+    text = "draw every setting of the diagram time, not each solver's best ones alone"
+    sub.add_argument("--every-setting", action="store_true", help=text)
     text = (
         "frames to simulate (default: half of the scene's); for the diagrams solver and spectrum, frames to simulate "
         "before the step that is measured (default: a third)"
@@ -255,13 +257,16 @@ def work_precision(arguments):
     options = {name: value for name, value in chosen.items() if value is not None}
     if arguments.diagram == "physics" and (set(options) & {"solvers", "frames"}):
         raise ValueError("the diagram physics is of equilibria; --solvers and --frames are for the others")
-    elif arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
+    if arguments.every_setting and arguments.diagram != "time":
+        raise ValueError(f"--every-setting is for the diagram time, not {arguments.diagram}")
+    if arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
         raise ValueError("the diagram spectrum is of projective dynamics in float64; --solvers and --dtype are for the others")
     measure, plot, lines = _parts(arguments.diagram)
     with measuring(arguments, device) as run:
         watch = {"watch": run["progress"].watch} if arguments.diagram == "time" else {}
         scene = SceneRef(arguments.scene, given, arguments.pins)
         found = measure(scene, device=str(device), limit=arguments.limit, **watch, **run, **options)
+    plot = partial(plot, every=True) if arguments.every_setting else plot
     return _write(arguments, found, plot, write_csv, partial(_summary, lines_of=lines))
 
 

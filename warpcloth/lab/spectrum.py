@@ -43,7 +43,7 @@ def relative_spectrum(step):
     unknowns = np.flatnonzero(np.repeat(step.free, 3))
     if len(unknowns) > MAX_UNKNOWNS:
         raise ValueError(
-            f"{step.scene.name} has {len(unknowns)} unknowns; a spectrum takes at most {MAX_UNKNOWNS}, of a coarser mesh"
+            f"{step.scene.name} has {len(unknowns)} unknowns; a spectrum takes at most {MAX_UNKNOWNS}; take a coarser mesh"
         )
     model, s = step.model, 1.0 / step.h**2
     touching = [elements for elements in model.terms if elements.collider is not None]
