@@ -14,7 +14,7 @@ from stills import run
 
 import warpcloth as wc
 from warpcloth.chart.style import LEGEND, dress, series_style, small_print
-from warpcloth.cli.reports import write_report
+from warpcloth.cli.reports import ReportFiles, ReportLooks, write_report
 from warpcloth.lab import elastica
 from warpcloth.scenes import bar_twist, bunny, cantilever, character, cusick, hanging, mobile, tablecloth
 
@@ -116,7 +116,7 @@ def picture_analysis(n=32, frame=20):
     scene = hanging.scene(n=n)
     animation = run(scene, wc.Newton(dt=1 / 240), frames=frame)
     analyzer = wc.Analyzer(animation, scene.mesh, measures=("stretch", "directions"))
-    write_report(analyzer, stills={frame: DOCS / "analysis.png"}, curves=True)
+    write_report(analyzer, ReportFiles(stills={frame: DOCS / "analysis.png"}), ReportLooks(curves=True))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ STIFFEST = 1e5
 # many times smaller.
 INNER, TIGHTEST, GAIN, TIGHTER = 1e-6, 1e-9, 0.1, 0.1
 # Passes at most, and the fraction of r² that must go in a pass with the smallest tolerance, or no pass follows.
-PASSES, LEAST_GAIN = 12, 0.2
+PASSES, MIN_GAIN = 12, 0.2
 
 
 @wp.struct
@@ -277,7 +277,7 @@ def end_pass():
             if now > wp.float64(GAIN) * before:
                 if passes.inner[copy] > wp.float64(1.01 * TIGHTEST):
                     passes.inner[copy] = wp.float64(TIGHTER) * passes.inner[copy]
-                elif now > wp.float64(1.0 - LEAST_GAIN) * before:
+                elif now > wp.float64(1.0 - MIN_GAIN) * before:
                     going = False
             passes.left[copy] = now
             passes.active[copy] = wp.where(going, 1, 0)

@@ -14,7 +14,7 @@ ENOUGH = wp.constant(wp.float64(0.25))
 # Change of an objective, relative to its summands, that counts as rounding.
 NOISE = wp.constant(wp.float64(1e-10))
 # Rows of the sums over vertices that a trial needs, and their number.
-WORK, SLOPE, SQUARE, LARGEST, ROWS = 0, 1, 2, 3, 4
+WORK, SLOPE, SQUARE, MAX_NORM, ROWS = 0, 1, 2, 3, 4
 
 
 @wp.struct
@@ -138,7 +138,7 @@ def set_trial(dtype):
 def finish_gradient(dtype, block: int):
     """Kernel over (copies, lanes): gradient += s m d − load m g, 0 at pins and along locks; parts of ``ROWS`` sums.
 
-    ``WORK`` is Σ s/2 m d·d − load m g·d [J], ``SLOPE`` ∇φ·p, ``SQUARE`` ‖∇φ‖², and ``LARGEST`` max ‖∇φᵢ‖/mᵢ.
+    ``WORK`` is Σ s/2 m d·d − load m g·d [J], ``SLOPE`` ∇φ·p, ``SQUARE`` ‖∇φ‖², and ``MAX_NORM`` max ‖∇φᵢ‖/mᵢ.
     """
     vec3, _ = types(dtype)
     (store, _add_up), (store_largest, _find) = block_sums(block), block_largest(block)
@@ -180,7 +180,7 @@ def finish_gradient(dtype, block: int):
         store(lane, work, parts[WORK], copy)
         store(lane, slope, parts[SLOPE], copy)
         store(lane, square, parts[SQUARE], copy)
-        store_largest(lane, largest, parts[LARGEST], copy)
+        store_largest(lane, largest, parts[MAX_NORM], copy)
 
     return finish
 
@@ -203,7 +203,7 @@ def add_trial(block: int):
             energy += add_up(lane, of_terms[k], copy)
         slope = add_up(lane, of_vertices[SLOPE], copy)
         square = add_up(lane, of_vertices[SQUARE], copy)
-        largest = find(lane, of_vertices[LARGEST], copy)
+        largest = find(lane, of_vertices[MAX_NORM], copy)
         if lane == 0:
             search.trial_energy[copy] = energy + search.other[copy]
             search.trial_slope[copy] = slope

@@ -9,10 +9,13 @@ With a fabric, it is the sample of a Shirley tester: 25 mm wide by default, cut 
 D; for Γ = 8, twice the bending length, the tip hangs 41.5° below the clamp.
 """
 
+from typing import Literal, get_args
+
 import numpy as np
 
 import warpcloth as wc
 
+Bending = Literal["quadratic", "dihedral", "plate"]
 CLAMP = 0.18  # distance from the second row of pins back to where a plate is clamped, in elements
 
 
@@ -20,7 +23,7 @@ def scene(
     gamma: float = 10.0,
     width: float = 0.0,
     elements: int = 40,
-    bending: str = "quadratic",
+    bending: Bending = "quadratic",
     stretching: float = 1e7,
     length: float = 1.0,
     duration: float = 2.0,
@@ -32,7 +35,7 @@ def scene(
     wc.checks.number("width", width, least=0.0)
     wc.checks.whole("elements", elements, 2)
     wc.checks.number("length", length, above=0.0)
-    wc.checks.choice("bending", bending, ("quadratic", "dihedral", "plate"))
+    wc.checks.choice("bending", bending, get_args(Bending))
     if bending == "plate" and width == 0.0 and fabric is None:
         raise ValueError("bending is 'plate' and width is 0, one row of triangles, which has no plate; give a width")
     wc.checks.number("angle", angle)

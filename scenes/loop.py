@@ -8,6 +8,8 @@ With a fabric, a heart is the heart loop test. L follows from Γ, ρ and D at an
 behind the second row of pins, as in `cantilever`.
 """
 
+from typing import Literal
+
 import numpy as np
 
 import warpcloth as wc
@@ -18,7 +20,7 @@ KINDS = {"pear": (0.5, 1.171066, [1, 0, 0]), "ring": (1.0, 0.0, [0, 1, 0]), "hea
 
 
 def scene(
-    kind: str = "heart",
+    kind: Literal["pear", "ring", "heart"] = "heart",
     gamma: float = 100.0,
     elements: int = 128,
     length: float = 0.2,

@@ -1,16 +1,18 @@
 """A sheet of 1 m at rest on a collider, in contact with all vertices, or far above it, to measure the cost of contact."""
 
+from typing import Literal, get_args
+
 import numpy as np
 
 import warpcloth as wc
 
 BEND = 5.0  # radius of the ball and the capsule [m], on which friction of 0.14 and more holds the sheet
-SHAPES = ("plane", "sphere", "capsule", "box", "mesh")
+Shape = Literal["plane", "sphere", "capsule", "box", "mesh"]
 
 
-def scene(collider: str = "plane", gap: float = 0.9e-3, n: int = 64, friction: float = 0.3, triangles: int = 20000):
+def scene(collider: Shape = "plane", gap: float = 0.9e-3, n: int = 64, friction: float = 0.3, triangles: int = 20000):
     """Shape of the collider, gap [m], vertices per side, coefficient of friction, triangles of the flat mesh collider."""
-    wc.checks.choice("collider", collider, SHAPES)
+    wc.checks.choice("collider", collider, get_args(Shape))
     wc.checks.number("gap", gap, above=0.0)
     wc.checks.whole("triangles", triangles, least=2)
     grid = wc.Mesh.grid(n, n, size=1.0, pattern="alternating")

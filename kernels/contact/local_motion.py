@@ -11,7 +11,7 @@ from ..memory import load
 from ..pairs import Layout
 from ..rotation import epsilon
 from ..vectors import types
-from .obstacles import copy_of
+from .obstacles import copy_of, vector_within
 
 FARTHEST = 1e9  # largest cell coordinate; the outermost cells contain everything beyond
 MODULE = "warpcloth.local_motion"
@@ -32,7 +32,8 @@ def motions(dtype):
     is ``calm`` if its move differs by at most ``size`` [m] from the mean. ``lowest`` and ``highest`` (B,) bound means and moves
     of obstacles. ``tables`` (4, buckets) bound moves of calm vertices in cells: p from x, and q from the positions ``found`` of
     the last list. ``low`` and ``high`` (V,) bound p in the cells about a vertex. They are +∞ and −∞ where all q differ by at
-    most ``alike`` [m], so that only listed pairs may meet; ``some`` is 1 if there are others.
+    most ``alike`` [m], so that only listed pairs may meet; ``some`` is 1 if there are others, or elements with vertices
+    farther apart than a cell.
     """
     vec3, _ = types(dtype)
 
@@ -72,9 +73,9 @@ def _extend(dtype):
 
 @cache
 def find_means(dtype):
-    """Kernel over clusters, then over moving obstacles: means of moves p, and their range in each copy."""
+    """Kernel over clusters, then obstacles, which stand if p ends before them: means of moves p, and their range in a copy."""
     vec3, _ = types(dtype)
-    extend = _extend(dtype)
+    extend, vector_or_zero = _extend(dtype), vector_within(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
     def find_each_mean(
@@ -87,7 +88,7 @@ def find_means(dtype):
         clusters = motion.mean.shape[0]
         if c >= clusters:
             i = motion.layout.cloth + c - clusters
-            extend(motion.lowest, motion.highest, copy_of(motion.layout, i), p[i])
+            extend(motion.lowest, motion.highest, copy_of(motion.layout, i), vector_or_zero(p, i))
             return
         total = vec3()
         first = motion.first[c]
@@ -144,7 +145,9 @@ def note_moves(dtype):
         c = motion.cluster[i]
         if c < 0:
             return
-        calm = wp.length(p[i] - motion.mean[c]) <= motion.size
+        # Ranges have no moves whose square is not finite.
+        finite = wp.max(wp.length_sq(p[i]), wp.length_sq(motion.mean[c])) < dtype(wp.inf)
+        calm = finite and wp.length(p[i] - motion.mean[c]) <= motion.size
         motion.calm[i] = wp.where(calm, 1, 0)
         if calm:
             copy = copy_of(motion.layout, i)

@@ -11,7 +11,7 @@ from .obstacles import CLOTH, OBSTACLE, copy_of, has_obstacle, in_copy, vector_w
 from .proximity_grid import MODULE, box_tests, boxes, boxes_meet, code_of, grids, surfaces
 from .self_gaps import nearest_of_face
 
-MOST = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
+MAX_COUNT = wp.constant(1 << 29)  # largest number of pairs of a kind that is counted
 
 
 @wp.struct
@@ -112,7 +112,7 @@ def take_near(dtype, of_edges: bool):
                 if has_obstacle(surface.layout, s) and (wp.static(of_edges) or s[0] >= surface.layout.cloth):
                     r = surface.close
             if d < surface.skin + r:
-                if pairs.counts[KIND] < MOST:
+                if pairs.counts[KIND] < MAX_COUNT:
                     slot = wp.atomic_add(pairs.counts, KIND, 1)
                     row = i
                     item = k
@@ -139,7 +139,7 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
     ``shares`` threads share a search.
     """
     vec3, _ = types(dtype)
-    box_at, box_along, stored_box, cell_of = boxes(dtype)
+    box_at, box_along, stored_box, cell_of, _level_of = boxes(dtype)
     relative_box, _all_calm = differences(dtype)
     vector, vector_or_zero = load(vec3), vector_within(dtype)
     number, four = load(wp.int32), load(wp.vec4i)
@@ -231,20 +231,21 @@ def search_pairs(dtype, of_edges: bool, take, name: str):
                     width = wp.min(two[0] - one[0] + 1, buckets)
                     height = two[1] - one[1] + 1
                     rows = wp.int64(height) * wp.int64(two[2] - one[2] + 1)
-                    everywhere = rows > wp.int64(buckets)
+                    everywhere = rows * wp.int64(width) > wp.int64(buckets)
                     if everywhere:
-                        width = 1
+                        rows = wp.int64(1)
+                        width = buckets
                     # Many rows are divided among the threads. Of few rows the entries are, for most of these rows may be empty.
                     by_rows = rows >= wp.int64(shares * shares)
                     stride = wp.where(by_rows, 1, shares)
                     skipped = wp.where(by_rows, 0, share)
-                    for line in range(share - skipped, wp.int32(wp.min(rows, wp.int64(buckets))), shares // stride):
+                    for line in range(share - skipped, wp.int32(rows), shares // stride):
                         cz = one[2] + line // height
                         cy = one[1] + line - height * (cz - one[2])
                         if wp.static(of_edges):
                             if within and not everywhere and cz == centre[2] and cy < centre[1]:
                                 continue
-                        run = line
+                        run = wp.int32(0)
                         if not everywhere:
                             run = bucket_of(one[0], cy, cz, code, buckets)
                         begin = number(grid.first, run)

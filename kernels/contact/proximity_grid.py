@@ -82,7 +82,7 @@ def grids(dtype):
 
 @cache
 def boxes(dtype):
-    """Device functions on boxes and cells: ``box_at``, ``box_along``, ``stored_box``, ``cell_of``."""
+    """Device functions on boxes and cells: ``box_at``, ``box_along``, ``stored_box``, ``cell_of``, ``level_of``."""
     vec3, _ = types(dtype)
     _relative_box, all_calm = differences(dtype)
     half, farthest, corner, vector_or_zero = dtype(0.5), dtype(FARTHEST), load(vec3), vector_within(dtype)
@@ -170,7 +170,7 @@ def boxes(dtype):
                 cell[i] = wp.int32(wp.floor(wp.clamp(q[i], -farthest, farthest)))
         return cell
 
-    return box_at, box_along, stored_box, cell_of
+    return box_at, box_along, stored_box, cell_of, level_of
 
 
 @wp.func
@@ -216,6 +216,33 @@ def code_of(copy: int, kind: int, level: int):
 
 
 @cache
+def note_large(dtype):
+    """Kernel over edges: notes in ``some`` those with a box above level 0, for the vertices of these may be far apart."""
+    vec3, _ = types(dtype)
+    box_at, *_, level_of = boxes(dtype)
+
+    @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)
+    def note_each_large(
+        # elements
+        surface: surfaces(dtype),
+        # state in
+        x: wp.array(dtype=vec3),
+        # parameters
+        size: dtype,
+        triangles: int,
+        # in and out
+        motion: motions(dtype),
+    ):
+        if motion.some[0] == 0:
+            v = surface.items[triangles + wp.tid()]
+            low, high, _radius = box_at(surface, x, v[0], v[1], v[2])
+            if level_of(size, low, high) > 0:
+                motion.some[0] = 1
+
+    return note_each_large
+
+
+@cache
 def bound_cloth(dtype):
     """Kernel over vertices of the cloth: extends the box of their copy by their boxes along p."""
     vec3, _ = types(dtype)
@@ -246,7 +273,7 @@ def count_items(dtype):
     Obstacles count where they meet the box of the cloth.
     """
     vec3, _ = types(dtype)
-    *_, stored_box, cell_of = boxes(dtype)
+    *_, stored_box, cell_of, _level_of = boxes(dtype)
     largest_in_warp, number = largest_of_warp(dtype), f"wp::{dtype.__name__}"
 
     # Volatile, because a cached value would miss what other multiprocessors have stored.
@@ -295,7 +322,7 @@ def count_items(dtype):
 def fill_buckets(dtype):
     """Kernel over items: the entries of the buckets; counts ``counts`` down to 0."""
     vec3, _ = types(dtype)
-    *_, stored_box, cell_of = boxes(dtype)
+    *_, stored_box, cell_of, _level_of = boxes(dtype)
     ends_of, _next_meeting = box_tests(dtype)
 
     @wp.kernel(module=f"{MODULE}.{dtype.__name__}", enable_backward=False)

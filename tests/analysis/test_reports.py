@@ -17,7 +17,7 @@ from warpcloth.analysis.measures import scalars
 from warpcloth.base.texts import camel_case
 from warpcloth.chart import Scale
 from warpcloth.cli import main
-from warpcloth.cli.reports import write_report
+from warpcloth.cli.reports import ReportFiles, ReportLooks, write_report
 from warpcloth.picture.colour import table
 from warpcloth.picture.measured import scalar_names
 from warpcloth.scenes import hanging
@@ -51,7 +51,9 @@ def test_every_file_says_what_the_arrays_say(cloth, tmp_path, neighbourhood):
     options = {"measures": measures, "neighbourhood": neighbourhood, "every": 2}
     expected = wc.analyze(cloth, **options)
     files = {name: tmp_path / f"out.{name}" for name in ("csv", "json", "npz")}
-    report = write_report(wc.Analyzer(cloth, **options), usd=tmp_path / "out.usdc", colour="stretch_2", curves=True, **files)
+    report = write_report(
+        wc.Analyzer(cloth, **options), ReportFiles(usd=tmp_path / "out.usdc", **files), ReportLooks("stretch_2", curves=True)
+    )
     fields = {name: found for m in measures for name, found in rows_of(expected, m).items()}
     with open(files["csv"], encoding="utf-8") as file:
         table = list(csv.DictReader(file))
@@ -96,7 +98,7 @@ def rows_of(analysis, name):
 def test_curves_are_the_principal_directions(cloth, tmp_path):
     options = {"measures": ["stretch", "directions"], "reference": "first"}
     found = wc.analyze(cloth, **options)
-    write_report(wc.Analyzer(cloth, **options), usd=tmp_path / "out.usda", curves=True)
+    write_report(wc.Analyzer(cloth, **options), ReportFiles(usd=tmp_path / "out.usda"), ReportLooks(curves=True))
     stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
     sequence = wc.open_sequence(cloth)
     centres = sequence[5][sequence.mesh.triangles].mean(axis=1)
@@ -156,7 +158,7 @@ def test_files_of_the_input_are_not_written_over(folder, kind):
     (folder / "link").symlink_to(sequence.files[-1])
     for path in (sequence.files[-1], folder / "link"):
         with pytest.raises(ValueError, match="is a file of the input, which must not be changed"):
-            write_report(wc.Analyzer(sequence), csv=path)
+            write_report(wc.Analyzer(sequence), ReportFiles(csv=path))
     assert {path: path.read_bytes() for path in before} == before
 
 
@@ -185,7 +187,8 @@ def test_points_without_a_place_hide_no_other_directions(tmp_path, recwarn, plac
     stage.Save()
     analyzer = wc.Analyzer(tmp_path / "cache.usda", measures=["stretch", "directions"], neighbourhood=neighbourhood)
     more = {"plot": tmp_path / "p.png"} if frame == "rest" else {}
-    report = write_report(analyzer, usd=tmp_path / "out.usdc", curves=True, csv=tmp_path / "t.csv", **more)
+    files = ReportFiles(usd=tmp_path / "out.usdc", csv=tmp_path / "t.csv", **more)
+    report = write_report(analyzer, files, ReportLooks(curves=True))
     assert report.rows == 3 and report.excluded
     shown = Usd.Stage.Open(str(tmp_path / "out.usdc"))
     curves = UsdGeom.BasisCurves(shown.GetPrimAtPath("/Sheet_principal1"))
@@ -408,14 +411,14 @@ def test_a_stage_of_frames_that_are_not_even_in_time(tmp_path):
     times = np.array([0.0, 0.1, 0.4, 0.5])
     path = str(tmp_path / "frames.npz")
     np.savez(path, points=frames, triangles=mesh.triangles, times=times)
-    write_report(wc.Analyzer(path), usd=tmp_path / "out.usdc")
+    write_report(wc.Analyzer(path), ReportFiles(usd=tmp_path / "out.usdc"))
     stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
     codes = np.array(stage.GetPrimAtPath("/World/Cloth").GetAttribute("primvars:stretch1").GetTimeSamples())
     np.testing.assert_allclose(codes / stage.GetTimeCodesPerSecond(), times, atol=1e-9)
     frames[0, 3] = np.nan
     np.savez(path, points=frames, triangles=mesh.triangles, times=times)
     with pytest.raises(ValueError, match="which is the rest shape, has vertex 3 without a finite position"):
-        write_report(wc.Analyzer(path), usd=tmp_path / "out.usdc")
+        write_report(wc.Analyzer(path), ReportFiles(usd=tmp_path / "out.usdc"))
 
 
 def test_a_layer_over_a_measured_stage(cloth, tmp_path):
@@ -431,5 +434,5 @@ def test_an_animation_of_other_lengths_has_its_own_colours(tmp_path):
     mesh = wc.Mesh.grid(4, 4)
     with AnimationWriter(tmp_path / "still.usdc", mesh, FPS) as writer:
         writer.append(mesh.points, np.zeros_like(mesh.points))
-    report = write_report(wc.Analyzer(tmp_path / "still.usdc", measures="spin"), usd=tmp_path / "out.usdc")
+    report = write_report(wc.Analyzer(tmp_path / "still.usdc", measures="spin"), ReportFiles(usd=tmp_path / "out.usdc"))
     assert report.scale[0] < report.scale[1] and report.extremes["spin_norm"].largest is None

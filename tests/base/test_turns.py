@@ -2,15 +2,17 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import wraps
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warpcloth as wc
 from warpcloth.base.turns import TURN
 from warpcloth.core.capture import Segment
 from warpcloth.mesh.distances import surface_distances
-from warpcloth.scenes import hanging
+from warpcloth.scenes import drape, hanging
 from warpcloth.solvers.explicit import step_limits
 
 MESH = wc.Mesh.grid(4, 4)
@@ -39,6 +41,12 @@ CALLS = {
     ),
     "reset": (lambda: wc.XPBD(substeps=2).bind(scene().build()), lambda stepper: stepper.reset()),
     "simulate": (lambda: None, lambda _: wc.simulate(scene(), wc.Newton(substeps=1), frames=2).points),
+    "record": (
+        lambda: None,
+        lambda _: wc.simulate(
+            drape.scene(n=4, self_contact=True), wc.XPBD(substeps=2), frames=2, record=("energies", "reactions")
+        ),
+    ),
     "equilibrium": (scene, lambda declared: wc.equilibrium(declared, tolerance=1e-3).points),
     "arap": (lambda: None, lambda _: wc.Arap(MESH, np.arange(4)).solve(MESH.points[:4]).points),
     "deform": (pins, lambda moved: wc.deform(MESH, moved, fps=24).points),
@@ -132,3 +140,25 @@ def test_a_run_within_the_progress_of_a_run(device, tmp_path):
     for points in inner:
         np.testing.assert_array_equal(points, run())
     np.testing.assert_array_equal(outer, inner[0])
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_all_of_a_call_holds_the_lock(name, device, monkeypatch):
+    """Whatever it launches, allocates, copies and replays, not only its first use of Warp."""
+    apart, (prepare, call) = [], CALLS[name]
+
+    def noting(function):
+        @wraps(function)
+        def noted(*args, **options):
+            if not TURN.held:
+                apart.append(function.__name__)
+            return function(*args, **options)
+
+        return noted
+
+    prepared = prepare()
+    for use in ("launch", "zeros", "empty", "clone", "copy", "capture_launch", "capture_while"):
+        monkeypatch.setattr(wp, use, noting(getattr(wp, use)))
+    monkeypatch.setattr(wp.Module, "load", noting(wp.Module.load))
+    call(prepared)
+    assert not apart

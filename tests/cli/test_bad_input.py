@@ -17,7 +17,7 @@ from pxr import Sdf, Usd
 
 import warpcloth as wc
 from support.stage_texts import CURVES, MOVED, STAGE
-from warpcloth.base import kernel_cache, limits
+from warpcloth.base import limits, warp_internals
 from warpcloth.base.quiet import initialise_warp
 from warpcloth.cli import main
 from warpcloth.cli.terminal import printable
@@ -586,9 +586,9 @@ def test_all_threads_read_headers_parsed_once(tmp_path, kernel, monkeypatch):
     kernel()
     folder = tmp_path / "headers"
     folder.mkdir()
-    for path in Path(kernel_cache.headers_folder()).glob("*.pch"):
+    for path in Path(warp_internals.headers_folder()).glob("*.pch"):
         shutil.copy(path, folder)
-    monkeypatch.setattr(kernel_cache, "headers_folder", lambda: str(folder))
+    monkeypatch.setattr(warp_internals, "headers_folder", lambda: str(folder))
     copied = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
     assert copied and compiled_again() == copied
     # The compiler says that it cannot read these files, and removes the one that it tried.

@@ -279,8 +279,46 @@ def test_moves_stop_at_pairs_that_were_far_apart(name, dtype, device):
     model, pairs = stepper.model, stepper.pairs
     order = np.arange(27) if model.order is None else model.order
     pairs.launch_begin(stepper.state.x)
-    direction = model.array(np.concatenate([p[order], 0.0 * p]), model.vec3)
+    direction = model.array(np.concatenate([0.0 * p, p[order]]), model.vec3)
     pairs.filter.launch_limit(direction)
     # To rounding of the positions and of the gap.
     bound = 64 * np.finfo(model.numpy_dtype).eps * (np.abs(mesh.points).max() + np.abs(p).max()) / APPROACH + 2e-6 / gap
-    np.testing.assert_allclose(pairs.filter.fraction.numpy(), [0.9 * gap / APPROACH, 1.0], rtol=0, atol=bound)
+    np.testing.assert_allclose(pairs.filter.fraction.numpy(), [1.0, 0.9 * gap / APPROACH], rtol=0, atol=bound)
+
+
+def fraction_of(scene, p, device, dtype="float64"):
+    """The fraction of moves p (N, 3) [m], in the order of the scene, that its only copy may make from its start."""
+    stepper = wc.Newton().bind(scene.build(dtype=dtype, device=device))
+    model, pairs = stepper.model, stepper.pairs
+    pairs.launch_begin(stepper.state.x)
+    pairs.filter.launch_limit(model.array(p if model.order is None else p[model.order], model.vec3))
+    return pairs.filter.fraction.numpy()[0]
+
+
+TRIANGLE = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.0, 0.0, 0.02]])
+
+
+@pytest.mark.parametrize("stretch", [100.0, 150.0])
+def test_moves_stop_at_triangles_whose_vertices_are_far_away(stretch, device):
+    """A triangle that is stretched, with one below its middle. A sheet far away is there for the size of the hash table."""
+    sheet, middle = wc.Mesh.grid(30, 30, size=0.58), TRIANGLE.mean(axis=0)
+    points = np.concatenate([TRIANGLE, TRIANGLE + np.array([0.1, 0.0, 0.0]), sheet.points + np.array([1.0, 0.0, 0.0])])
+    mesh = wc.Mesh(points, np.concatenate([[[0, 1, 2], [3, 4, 5]], sheet.triangles + 6]))
+    below = TRIANGLE + (stretch - 1.0) * middle - [0.0, 0.02, 0.0]
+    x = np.concatenate([stretch * TRIANGLE, below, 0.02 * sheet.points + [0.5, 2.0, 0.5]])
+    settings = {"density": 0.1, "terms": [wc.Spring(stiffness=1.0)], "self_contact": wc.SelfContact(distance=1e-3)}
+    p = np.zeros_like(points)
+    p[3:6, 1] = 0.06
+    assert fraction_of(wc.Scene(mesh, positions=x, **settings), p, device) == pytest.approx(0.3, abs=1e-4)
+
+
+def test_moves_of_cloth_alone_stop_at_a_vertex_of_a_mesh(device):
+    """A sheet falls by 0.6 m onto the tip of a needle, 0.3 m below the inside of a triangle, which keeps a tenth of this."""
+    sheet = wc.Mesh.grid(5, 5, size=0.1)
+    tip = sheet.points[sheet.triangles[12]].mean(axis=0) - [0.0, 0.3, 0.0]
+    points = tip + 1e-3 * np.array([[0.0, 0.0, 0.0], [1.0, -300.0, 0.0], [-1.0, -300.0, 1.0], [0.0, -300.0, -1.0]])
+    needle = wc.MeshCollider(points, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 2, 3]])
+    settings = {"density": 0.1, "terms": [wc.Spring(stiffness=1.0)], "self_contact": wc.SelfContact(distance=1e-3)}
+    scene = wc.Scene(sheet, contact=wc.Contact(distance=1e-3), colliders=[needle], **settings)
+    p = np.tile([0.0, -0.6, 0.0], (25, 1))
+    assert fraction_of(scene, p, device) == pytest.approx(0.45, abs=1e-5)

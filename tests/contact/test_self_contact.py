@@ -798,6 +798,7 @@ def test_directions_by_the_list(device):
     for listed in (True, False):
         if not listed:
             pairs.proximity.found.assign(random.uniform(-1.0, 1.0, scene.positions.shape))
+            pairs.pairs.counts.zero_()  # so that the search alone limits the direction
         pairs.filter.launch_limit(pairs.model.array(direction, pairs.model.vec3))
         assert pairs.proximity.copies.numpy() == [not listed]
         found.append(pairs.filter.fraction.numpy()[0])

@@ -11,7 +11,7 @@ import warpcloth as wc
 from support.contacts import energy, gradient, slope_of
 from support.layers import after_frames, cloth, ground, positions, stack
 from support.pairs import between_edges, detect, from_triangle
-from warpcloth.contact.proximity import WAY, Proximity
+from warpcloth.contact.proximity import MAX_MOVE, Proximity
 from warpcloth.contact.surface import ContactSurface
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.contact.obstacles import CLOTH, OBSTACLE
@@ -244,7 +244,7 @@ def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
     x[model.count :] += 0.02 * skin * ways(len(x) - model.count)
     x[: model.count] += (found.kept - 0.12) * skin * ways(model.count)
     assert not found.moved(wp.array(x, dtype=model.vec3, device=device), found.kept).numpy()[0]
-    x[: model.count] += WAY * skin * ways(model.count)
+    x[: model.count] += MAX_MOVE * skin * ways(model.count)
     assert len(near(x)) > 50 and set(near(x)) <= set(listed)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 KERNELS = Path(__file__).parents[2] / "kernels"
 # Elements are what a model fixes when it is built; parameters are numbers, and which copies or vertices take part.
 GROUPS = ("elements", "state in", "parameters", "in and out", "out")
-MOST = 12
+MAX_PARAMETERS = 12
 
 
 def faults(path):
@@ -26,8 +26,8 @@ def faults(path):
                 found.append(f"{function.name}: {argument.arg} is in no group")
         if groups != [group for group in GROUPS if group in groups]:
             found.append(f"{function.name}: the groups are {groups}; they must be of {GROUPS}, in this order")
-        if len(arguments) > MOST:
-            found.append(f"{function.name}: {len(arguments)} parameters are more than {MOST}; a struct can hold some of them")
+        if len(arguments) > MAX_PARAMETERS:
+            found.append(f"{function.name}: {len(arguments)} parameters; at most {MAX_PARAMETERS}, a struct can hold some")
     return found
 
 

@@ -30,6 +30,10 @@ INSTEAD = {
 ALLOWED = {"in_place", "correct_in_place", "launch_in_place", "refuse_in_place"}
 
 
+# Constants say what they bound.
+BARE = re.compile(r"_?(MOST|LEAST|WAY|ALIKE|LARGEST|SMALLEST)(_|$)")
+
+
 def words(name):
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().strip("_").split("_")
 
@@ -68,3 +72,8 @@ def test_names_are_words_of_the_field():
         for word in INSTEAD.keys() & set(words(name))
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def test_constants_say_what_they_bound():
+    wrong = [f"{path}: {name}" for path in PATHS for name in sorted(read(path)[1]) if BARE.match(name)]
+    assert not wrong, "a bound is MAX_ or MIN_ of a value, not\n" + "\n".join(wrong)

@@ -13,7 +13,7 @@ from scipy.special import jv
 
 import warpcloth as wc
 from support.rows import slow_but
-from warpcloth.chart import closed_forms
+from warpcloth.chart import style
 from warpcloth.chart.closed_forms import plot_physics
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.hessian import Hessian
@@ -533,8 +533,8 @@ def test_the_plot(tmp_path, monkeypatch):
                 results.append((arguments, found))
     results[0][1].update(status="slow", error=None)
     results.append(({"case": "chain", "resolution": 3}, measure("chain", 3)))
-    kept, save = [], closed_forms.save
-    monkeypatch.setattr(closed_forms, "save", lambda figure, path: (kept.append(figure), save(figure, path)))
+    kept, save = [], style.save
+    monkeypatch.setattr(style, "save", lambda figure, path: (kept.append(figure), save(figure, path)))
     plot_physics(tmp_path / "plot.svg", results)
     # The largest floor of a panel is a line, and its words say where it is; one far below does not squeeze the errors.
     chain = results[-1][1]["floor"]

@@ -178,7 +178,7 @@ def test_a_wrong_gradient_is_exposed(shared, monkeypatch):
 @pytest.mark.parametrize(("explicit", "least", "most"), [(4096, 2.8, 3.2), (0, 6.0, 16.0)], ids=["explicit", "newton"])
 def test_the_error_is_a_bound(explicit, least, most, folder, monkeypatch):
     """Against an independent integration of the chain to 1e-11, and a reference of a hundredth of the error."""
-    monkeypatch.setattr(module, "_MOST_EXPLICIT", explicit)
+    monkeypatch.setattr(module, "_MAX_EXPLICIT", explicit)
     for scene in (CHAIN, CLOTH):
         coarse = reference(scene, FRAMES, tolerance=1e-6)
         points = true_chain() if scene is CHAIN else reference(scene, FRAMES, tolerance=1e-2 * coarse.error).points

@@ -648,7 +648,7 @@ def test_an_update_writes_what_changed(device):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_sums_and_maxima(dtype, device, monkeypatch):
     """Sums, products and maxima of each copy, but for copies that are left out; on CUDA with more entries than lanes."""
-    monkeypatch.setattr(of_copies, "MOST_BLOCKS", 2)
+    monkeypatch.setattr(of_copies, "MAX_BLOCKS", 2)
     model = scene().build(device=device, dtype=dtype, copies=COPIES)
     random, n, rows = np.random.default_rng(5), model.per_copy, 1100
     a, b = (random.normal(size=(COPIES, n, 3)).astype(dtype) for _ in range(2))

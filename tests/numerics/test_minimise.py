@@ -251,7 +251,7 @@ def test_sums_are_shared_by_blocks(device, monkeypatch):
     ends, found = [], []
     for most, block_of_cpu in (1, 0), (7, 1):
         monkeypatch.setattr(sums, "BLOCKS", {"cuda": 256, "cpu": block_of_cpu})
-        monkeypatch.setattr(sums, "MOST_BLOCKS", most)
+        monkeypatch.setattr(sums, "MAX_BLOCKS", most)
         for solver in solvers:
             stepper = solver.bind(model)
             stepper.frame()

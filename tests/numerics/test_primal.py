@@ -94,8 +94,8 @@ def test_steps_of_large_meshes_end_where_those_of_rows_do(device, monkeypatch):
     """Two frames of ``hanging`` with 15² vertices; a run by conjugate gradients over rows ends there too."""
     declared = scene("hanging", n=15)
     found = []
-    for least in (constrained_dynamics.LEAST, 10**9):
-        monkeypatch.setattr(constrained_dynamics, "LEAST", least)
+    for least in (constrained_dynamics.MIN_VERTICES, 10**9):
+        monkeypatch.setattr(constrained_dynamics, "MIN_VERTICES", least)
         stepper = wc.ConstrainedDynamics(substeps=2, tolerance=1e-9, iterations=100).bind(
             declared.build(device=device, dtype="float64")
         )

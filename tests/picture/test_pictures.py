@@ -298,7 +298,7 @@ def test_what_has_no_meaning_is_refused(make, message):
 
 def test_a_folder_that_does_not_exist_is_refused(tmp_path):
     path = tmp_path / "no" / "a.png"
-    for write in (lambda: plot_percentiles(path, []), lambda: draw(path, None, None, None, None)):
+    for write in (lambda: plot_percentiles(path, summaries(GROWING)), lambda: draw(path, None, None, None, None)):
         with pytest.raises(FileNotFoundError, match=r"a\.png: the folder .*no does not exist"):
             write()
 

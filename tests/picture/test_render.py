@@ -14,6 +14,7 @@ import warpcloth as wc
 from support.command_line import refused, run
 from warpcloth.cli import check as checking
 from warpcloth.cli import render as drawing
+from warpcloth.cli.terminal import Counter
 from warpcloth.picture import render as rendering
 from warpcloth.picture.colour import Scale, to_linear
 from warpcloth.picture.films import durations, open_film
@@ -797,7 +798,7 @@ def test_an_interrupt_while_a_film_is_drawn_says_where_the_frames_are(pictures, 
         if done == pictures:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(drawing._Drawing, "__call__", stop)
+    monkeypatch.setattr(Counter, "__call__", stop)
     code, out, err = run(capfd, "run", "hanging", "-p", "n=4", "--frames", "2", "-o", "a.usdc", "--film", "a.gif")
     assert (code, out) == (130, "") and said in err and err.endswith("; frames 0 to 2 are in a.usdc\n")
     assert (small_films / "a.gif").exists() == (pictures > 0) and (small_films / "a.usdc").exists()

@@ -229,7 +229,7 @@ def test_what_is_not_finite_is_left_out_and_said(tmp_path, capfd):
 
 
 def test_a_page_that_is_too_large_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(pages, "LARGEST", 250_000)
+    monkeypatch.setattr(pages, "MAX_BYTES", 250_000)
     noise, mesh = np.random.default_rng(0).normal(size=(FRAMES, 10_000, 3)), wc.Mesh.grid(100, 100)
     with pytest.raises(ValueError, match=r"larger than 250 kB, with [2-5] of 6 frames in it"):
         wc.view(noise, tmp_path / "a.html", mesh=mesh, colours=())

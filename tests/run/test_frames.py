@@ -170,7 +170,7 @@ def test_nothing_reads_a_device_beside_the_frames(scene, device, monkeypatch):
     read, apart = wp.array.numpy, []
 
     def numpy(array, **options):
-        if threads() and not TURN._lock._is_owned() and array.device == wp.get_device(device):
+        if threads() and not TURN.held and array.device == wp.get_device(device):
             apart.append(threading.current_thread().name)
         return read(array, **options)
 

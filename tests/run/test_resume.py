@@ -242,32 +242,21 @@ def test_another_run_is_refused(name, tmp_path, device):
     assert len(wc.simulate(**given, output=output, resume=True).points) == LAST + 1
 
 
-@pytest.mark.host
-def test_other_threads_are_refused(tmp_path):
-    given = {"scene": moved(300.0), "solver": SOLVERS["explicit"], "threads": 2, "output": str(tmp_path / "out.usdc")}
-    with pytest.raises(KeyboardInterrupt):
-        wc.simulate(**given, progress=stop_at(STOP))
-    with pytest.raises(ValueError, match="was interrupted had threads 2, and this one has threads 1; run as then"):
-        wc.simulate(**given | {"threads": 1}, resume=True)
-    assert len(wc.simulate(**given, resume=True).points) == LAST + 1
-
-
 FOREIGN = {
     "code": "another version of warpcloth or of Warp; run as then",
     "device": "the device Toaster 3, and this one has the device ",
-    "threads": "threads 7, and this one has threads 1; run as then",
 }
 
 
 @pytest.mark.parametrize("fact", FOREIGN)
 def test_a_checkpoint_of_another_machine_is_refused(fact, tmp_path, device):
-    """Which has another device, more cores or another version."""
+    """Which has another device or another version."""
     given = {"scene": moved(), "solver": SOLVERS["xpbd"], "device": device, "output": str(tmp_path / "out.usdc")}
     with pytest.raises(KeyboardInterrupt):
         wc.simulate(**given, progress=stop_at(STOP))
     (path,) = tmp_path.rglob("checkpoint.npz")
     checkpoint = Checkpoint.read(path)
-    replace(checkpoint, facts=checkpoint.facts | {fact: 7 if fact == "threads" else "Toaster 3"}).write(path.parent)
+    replace(checkpoint, facts=checkpoint.facts | {fact: "Toaster 3"}).write(path.parent)
     with pytest.raises(ValueError, match=f"the run that was interrupted had {FOREIGN[fact]}"):
         wc.simulate(**given, resume=True)
 

@@ -118,7 +118,7 @@ def test_of_a_large_mesh_the_count_is_a_bound(monkeypatch):
     disc = wc.Scene(wc.Mesh.grid(6, 6), density=0.1, terms=[wc.Spring(stiffness=np.inf)])
     scenes = [disc, hanging.scene(n=6, stiffness=np.inf), cantilever.scene(elements=8, stretching=1e9)]
     exact = [freedom(scene) for scene in scenes]
-    monkeypatch.setattr(module, "MOST", 10)
+    monkeypatch.setattr(module, "MAX_VERTICES", 10)
     bounds = [freedom(scene) for scene in scenes]
     assert all(bound.counted and bound.left <= known.left for bound, known in zip(bounds, exact, strict=True))
     assert [(b.rank, b.locked) for b in bounds[:2]] == [(k.rank, k.locked) for k in exact[:2]]
@@ -140,6 +140,6 @@ def test_info_counts_and_warns(capfd, monkeypatch):
     out, warned = info("cantilever", "-p", "elements=8", "stretching=1e9", "width=0.5", "--json")
     found = json.loads(out)["freedom"]
     assert found["locked"] is False and found["left"] == found["coordinates"] - found["rank"] > found["rigid"] and not warned
-    monkeypatch.setattr(module, "MOST", 10)
+    monkeypatch.setattr(module, "MAX_VERTICES", 10)
     out, (warned,) = info("hanging", "-p", "n=5", "stiffness=inf")
     assert "of rank up to 68 in 69 coordinates; 1 or more degrees" in out and "so many that they may leave" in warned

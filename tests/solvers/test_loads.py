@@ -265,11 +265,9 @@ def test_bad_loads_are_refused(make, sentence):
 
 
 @pytest.mark.host
-def test_batches_and_threads_refuse_what_they_cannot():
+def test_batches_refuse_what_they_cannot():
     scene = sail()
     with pytest.raises(ValueError, match=r"^vary\['Pressure.keyframes'\] has shape \(2,\); it must have 3 entries"):
         scene.build(copies=3, vary={"Pressure.keyframes": [1.0, 2.0]})
     with pytest.raises(ValueError, match=r"names nothing in this scene; .*Pressure.pressure, Pressure.keyframes, "):
         scene.build(copies=3, vary={"Force.force": np.zeros((3, 3))})
-    with pytest.raises(ValueError, match="with one copy that has loads, whose steps Explicit cannot divide; threads=1 can"):
-        SOLVERS["explicit"].bind(scene.build(threads=2))

@@ -21,7 +21,7 @@ from .surfaces import RATES, Neighbourhoods, Triangles, check_material, material
 
 # The types of frames that `analyze` takes.
 Frames = FilePath | Sequence | ArrayLike | HasPoints
-_MOST = 100  # missing frames that get a message each
+_MAX_MESSAGES = 100  # missing frames that get a message each
 
 
 def analyze(frames: Frames, mesh: Mesh | None = None, dt: float | None = None, **options: Any) -> Analysis:
@@ -273,7 +273,7 @@ class _Held:
 
 
 def _missing(labels):
-    if len(labels) <= _MOST:
+    if len(labels) <= _MAX_MESSAGES:
         return [_frame(label, "is missing") for label in labels]
     return [_frame(labels[0], f"is missing, and so are {len(labels) - 1} more, the last of them {labels[-1]:g}")]
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from ..base.checks import choice, number, shown, whole
 from ..base.types import FilePath, Progress, UpAxis
 from ..mesh.distances import surface_distances
-from ..mesh.mesh import UP_AXES, Mesh, areas_of, same_topology
+from ..mesh.mesh import UP_AXES, Mesh, Surface, areas_of, same_topology
 from ..mesh.sequences import HasPoints, Sequence, as_sequence, open_sequence
 from .measures import MEASURES
 from .samples import Exclusion
@@ -20,40 +20,26 @@ Compared = FilePath | Sequence | tuple[Mesh, FilePath | ArrayLike | HasPoints]
 _SAME_TIME = 1e-6  # tolerance of times, relative to the shortest frame
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """The comparison of two sequences, a and b, in this order on axes of length 2.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ComparedFrames:
+    """The frames of two animations, a and b, that were compared, in this order on axes of length 2.
 
-    A frame is a pair at one time, or NaN where ``excluded`` says why it could not be compared. With different topologies arrays
-    of vertices and triangles are None.
+    A frame is a pair at one time, or NaN where ``excluded`` says why it could not be compared.
 
     Attributes:
-        same_topology: Whether both have equally many vertices and the same triangles.
         up_axes: "Y" or "Z" of a and b, or None; b was turned to a's.
         times: Times of the frames (F,) [s].
         frames: Indices in a and in b (F, 2).
         labels: Numbers in the files (F, 2).
         unmatched: Indices of frames of a, and of b, without a partner.
-        excluded: Two lists of `analysis.Exclusion`, of a and b, with the frame numbers of the files. Triangles without area at
-            rest do not count for stretches.
+        excluded: Two lists of `analysis.Exclusion`, of a and b, with the frame numbers of the files.
         sizes: Diagonal of the bounding box of a (F,) [m].
-        rms: Root mean square of ‖aᵢ − bᵢ‖ over vertices (F,) [m], or None.
-        largest: The largest of these (F,) [m], or None.
-        largest_vertex: Its vertex (F,), −1 in excluded frames, or None.
-        surface_mean: Mean distance of a's vertices to the surface of b, and vice versa (F, 2) [m], weighted by thirds of
-            triangle areas in the frame.
-        surface_rms: Root mean square of these (F, 2) [m].
-        surface_largest: The largest of these (F, 2) [m].
-        hausdorff: The larger of the two (F,) [m], the Hausdorff distance of the vertices, a lower bound, but for rounding, of
-            that of the surfaces.
+        hausdorff: The largest distance of a sampled point of either surface to the other (F,) [m], a lower bound, but for
+            rounding, of that of the surfaces.
         hausdorff_bound: Upper bound of the Hausdorff distance of the surfaces (F,) [m]: hausdorff + l/√3 with the longest side
-            l, or ``largest`` if less.
-        stretch_rms: Root mean square over triangles of the differences of principal stretches λ₁ ≥ λ₂ from each rest shape (F,
-            2) [1], or None.
-        stretch_largest: The largest of these differences (F, 2) [1], or None.
+            l.
     """
 
-    same_topology: bool
     up_axes: tuple[UpAxis | None, UpAxis | None]
     times: np.ndarray
     frames: np.ndarray
@@ -61,11 +47,36 @@ class Comparison:
     unmatched: tuple[np.ndarray, ...]
     excluded: tuple[list[Exclusion], ...]
     sizes: np.ndarray
+    hausdorff: np.ndarray
+    hausdorff_bound: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison(ComparedFrames):
+    """The comparison of two sequences, a and b.
+
+    With different topologies arrays of vertices and triangles are None. Triangles without area at rest do not count for
+    stretches.
+
+    Attributes:
+        up_axes, times, frames, labels, unmatched, excluded, sizes, hausdorff, hausdorff_bound: See :class:`ComparedFrames`.
+        same_topology: Whether both have equally many vertices and the same triangles.
+        rms: Root mean square of ‖aᵢ − bᵢ‖ over vertices (F,) [m], or None.
+        largest: The largest of these (F,) [m], or None; ``hausdorff_bound`` is no more.
+        largest_vertex: Its vertex (F,), −1 in excluded frames, or None.
+        surface_mean: Mean distance of a's vertices to the surface of b, and vice versa (F, 2) [m], weighted by thirds of
+            triangle areas in the frame.
+        surface_rms: Root mean square of these (F, 2) [m].
+        surface_largest: The largest of these (F, 2) [m]; ``hausdorff`` is the larger of the two.
+        stretch_rms: Root mean square over triangles of the differences of principal stretches λ₁ ≥ λ₂ from each rest shape (F,
+            2) [1], or None.
+        stretch_largest: The largest of these differences (F, 2) [1], or None.
+    """
+
+    same_topology: bool
     surface_mean: np.ndarray
     surface_rms: np.ndarray
     surface_largest: np.ndarray
-    hausdorff: np.ndarray
-    hausdorff_bound: np.ndarray
     rms: np.ndarray | None = None
     largest: np.ndarray | None = None
     largest_vertex: np.ndarray | None = None
@@ -134,22 +145,10 @@ def compare(
         whole("frames", frames, least=0)
     one = opened("a", a, prim_a, fps if fps_a is None else fps_a)
     other = opened("b", b, prim_b, fps if fps_b is None else fps_b)
-    up_axes = up_axis_of("up_axis_a", one, up_axis_a or up_axis), up_axis_of("up_axis_b", other, up_axis_b or up_axis)
-    other = to_up_axis(other, *up_axes)
-    pairs, unmatched = matching(one, other, frames)
+    one, other, up_axes = in_one_axis(one, other, up_axis_a or up_axis, up_axis_b or up_axis)
     pair = _Pair(one, other, device)
-    rows = []
-    for frame, (i, j) in enumerate(pairs):
-        rows.append(pair.measure(i, j))
-        if progress is not None:
-            progress(frame, len(pairs) - 1)
-    if not any(rows):
-        why = next(first for excluded in pair.excluded for first in excluded if first.kind == "vertex")
-        raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
-    labels = np.column_stack([one.labels[pairs[:, 0]], other.labels[pairs[:, 1]]])
-    return Comparison(
-        pair.same, up_axes, np.asarray(one.times)[pairs[:, 0]], pairs, labels, unmatched, tuple(pair.excluded), **_columns(rows)
-    )
+    found = measured_frames(one, other, pair.measure, pair.excluded, frames, progress)
+    return Comparison(same_topology=pair.same, up_axes=up_axes, **found)
 
 
 def opened(name: str, source: Any, prim: str | None = None, fps: float | None = None) -> Sequence:
@@ -171,18 +170,27 @@ def opened(name: str, source: Any, prim: str | None = None, fps: float | None = 
     return replace(sequence, mesh=mesh, declared=True, up_axis=sequence.up_axis or mesh.up_axis)
 
 
-def up_axis_of(name, sequence, given):
-    """Returns the given up axis, else that of the sequence."""
-    if given is not None:
-        choice(name, given, UP_AXES)
-    return given or sequence.up_axis
+def in_one_axis(a, b, up_axis_a, up_axis_b):
+    """Returns a, b rotated to the up axis of a, and the two axes, given or their own."""
+    for name, given in (("up_axis_a", up_axis_a), ("up_axis_b", up_axis_b)):
+        if given is not None:
+            choice(name, given, UP_AXES)
+    axes = up_axis_a or a.up_axis, up_axis_b or b.up_axis
+    return a, to_up_axis(b, *axes), axes
 
 
-def to_up_axis(b: Sequence, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Sequence:
-    """Returns b rotated to the up axis of a, without rounding; b itself if they agree or one is unknown."""
+def to_up_axis(b: Any, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Any:
+    """Returns a sequence or capture rotated to the up axis of a, without rounding; b itself if they agree or one is unknown."""
     if axis_a is None or axis_b is None or axis_a == axis_b:
         return b
-    return replace(b, read=lambda frame: turned_up(b[frame], axis_a))
+
+    def read(frame):
+        found = b[frame]
+        if isinstance(found, Surface):
+            return Surface(turned_up(found.points, axis_a), found.triangles)
+        return turned_up(found, axis_a)
+
+    return replace(b, read=read)
 
 
 def turned_up(points: np.ndarray, axis: UpAxis) -> np.ndarray:
@@ -190,11 +198,22 @@ def turned_up(points: np.ndarray, axis: UpAxis) -> np.ndarray:
     return points[:, [0, 2, 1]] * ([1.0, 1.0, -1.0] if axis == "Y" else [1.0, -1.0, 1.0])
 
 
-def matching(a, b, frames=None):
-    """Returns the indices of frames of two sequences or captures at one time (F, 2), F at least 1, and those without a partner.
+def measured_frames(a, b, measure, excluded, frames, progress):
+    """Measures the frames of two sequences or captures, a and b, at one time.
+
+    Args:
+        a: Read by index.
+        b: The same.
+        measure: (i, j) of a frame of a and of b → its numbers by name, or {} once ``excluded`` has the reason.
+        excluded: Two lists of `Exclusion`, of a and b.
+        frames: Number of frames after the first; None for all.
+        progress: (frame, frames) → None, or None.
+
+    Returns:
+        dict: Fields of `ComparedFrames` but ``up_axes``, and arrays of the other numbers.
 
     Raises:
-        ValueError: One has no times, or no frames match.
+        ValueError: One has no times, no frames match, or none can be compared.
     """
     for name, each in (("a", a), ("b", b)):
         if each.times is None:
@@ -202,7 +221,20 @@ def matching(a, b, frames=None):
             raise ValueError(f"{where}: has no times, by which frames belong together; give fps (--fps or --fps-{name})")
     pairs = _at_one_time(a, b)
     unmatched = tuple(np.setdiff1d(np.arange(len(s)), partners) for s, partners in zip((a, b), pairs.T, strict=True))
-    return pairs if frames is None else pairs[: frames + 1], unmatched
+    pairs = pairs if frames is None else pairs[: frames + 1]
+    labels = np.column_stack([a.labels[pairs[:, 0]], b.labels[pairs[:, 1]]])
+    rows = []
+    for frame, (i, j) in enumerate(pairs):
+        rows.append(measure(i, j))
+        if progress is not None:
+            progress(frame, len(pairs) - 1)
+    if not any(rows):
+        reasons = [one for k in (0, 1) for one in excluded[k] if one.kind != "triangle" and one.frame in labels[:, k]]
+        why = next((one for one in reasons if one.kind == "frame"), reasons[0])
+        raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
+    times = np.asarray(a.times)[pairs[:, 0]]
+    about = {"times": times, "frames": pairs, "labels": labels, "unmatched": unmatched, "excluded": tuple(excluded)}
+    return about | _columns(rows)
 
 
 def _at_one_time(a, b):

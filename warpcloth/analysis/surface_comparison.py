@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,9 +13,9 @@ from ..base.checks import number, shown, whole
 from ..base.types import FilePath, Progress, UpAxis
 from ..mesh.captures import Capture, as_capture, open_capture, solid_triangles
 from ..mesh.distances import Boundary, nearest_on_surface, surface_samples
-from ..mesh.mesh import Mesh, Surface, areas_of
+from ..mesh.mesh import Mesh, areas_of
 from ..mesh.sequences import HasPoints, Sequence, as_sequence
-from .compare import longest_side, matching, turned_up, up_axis_of, whole_frame
+from .compare import ComparedFrames, in_one_axis, longest_side, measured_frames, whole_frame
 from .samples import Exclusion
 
 Captured = FilePath | Capture | Sequence | tuple[Mesh, ArrayLike | HasPoints] | Iterable[Mesh]
@@ -41,41 +40,23 @@ class SurfaceDistances:
     largest: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceComparison:
-    """The comparison of two captures, a and b, in this order on axes of length 2.
-
-    A frame is a pair at one time, or NaN where ``excluded`` says why it could not be compared.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SurfaceComparison(ComparedFrames):
+    """The comparison of two captures, a and b; triangles that are not finite are holes.
 
     Attributes:
-        up_axes: "Y" or "Z" of a and b, or None; b was turned to a's.
-        times: Times of the frames (F,) [s].
-        frames: Indices in a and in b (F, 2).
-        labels: Numbers in the files (F, 2).
-        unmatched: Indices of frames of a, and of b, without a partner.
-        excluded: Two lists of `analysis.Exclusion`, of a and b; triangles that are not finite are holes.
-        sizes: Diagonal of the bounding box of a (F,) [m].
+        up_axes, times, frames, labels, unmatched, excluded, sizes, hausdorff, hausdorff_bound: See
+            :class:`warpcloth.analysis.compare.ComparedFrames`.
         vertices: Numbers of vertices (F, 2).
         all: Distances of all points; those that face a hole are as far as its rim.
         inner: Distances of points whose nearest point is not on the boundary of the other.
         inner_area: Share of the area that these stand for (F, 2) [1].
-        hausdorff: The larger of the two largest distances (F,) [m], a lower bound, but for rounding, of that of the surfaces.
-        hausdorff_bound: Upper bound of the Hausdorff distance (F,) [m]: hausdorff + l/√3 with the longest side l.
     """
 
-    up_axes: tuple[UpAxis | None, UpAxis | None]
-    times: np.ndarray
-    frames: np.ndarray
-    labels: np.ndarray
-    unmatched: tuple[np.ndarray, ...]
-    excluded: tuple[list[Exclusion], ...]
-    sizes: np.ndarray
     vertices: np.ndarray
     all: SurfaceDistances
     inner: SurfaceDistances
     inner_area: np.ndarray
-    hausdorff: np.ndarray
-    hausdorff_bound: np.ndarray
 
 
 def compare_surfaces(
@@ -138,26 +119,15 @@ def compare_surfaces(
         whole("frames", frames, least=0)
     one = opened_capture("a", a, prim_a, fps if fps_a is None else fps_a, scale_a)
     other = opened_capture("b", b, prim_b, fps if fps_b is None else fps_b, scale_b)
-    up_axes = up_axis_of("up_axis_a", one, up_axis_a or up_axis), up_axis_of("up_axis_b", other, up_axis_b or up_axis)
-    other = capture_to_up_axis(other, *up_axes)
-    pairs, unmatched = matching(one, other, frames)
+    one, other, up_axes = in_one_axis(one, other, up_axis_a or up_axis, up_axis_b or up_axis)
     excluded = tuple([whole_frame(label, "is missing") for label in each.missing] for each in (one, other))
-    rows = []
-    for frame, (i, j) in enumerate(pairs):
-        rows.append(_measured(one[i], other[j], (one.labels[i], other.labels[j]), excluded, samples, device))
-        if progress is not None:
-            progress(frame, len(pairs) - 1)
-    first = next(filter(None, rows), None)
-    if first is None:
-        why = next(last for each in excluded for last in reversed(each))
-        raise ValueError(f"none of the {len(pairs)} frames that a and b both have can be compared: {why}")
-    columns: dict[str, Any] = {
-        name: np.array([row.get(name, np.full(np.shape(value), np.nan)) for row in rows]) for name, value in first.items()
-    }
-    both: dict[str, Any] = {kind: SurfaceDistances(*np.moveaxis(columns.pop(kind), 2, 0)) for kind in ("all", "inner")}
-    labels = np.column_stack([one.labels[pairs[:, 0]], other.labels[pairs[:, 1]]])
-    times = np.asarray(one.times)[pairs[:, 0]]
-    return SurfaceComparison(up_axes, times, pairs, labels, unmatched, excluded, **columns, **both)
+
+    def measure(i, j):
+        return _measured(one[i], other[j], (one.labels[i], other.labels[j]), excluded, samples, device)
+
+    found = measured_frames(one, other, measure, excluded, frames, progress)
+    both = {kind: SurfaceDistances(*np.moveaxis(found.pop(kind), 2, 0)) for kind in ("all", "inner")}
+    return SurfaceComparison(up_axes=up_axes, **found, **both)
 
 
 def opened_capture(
@@ -178,18 +148,6 @@ def opened_capture(
     if not isinstance(source, (list, tuple)):
         raise ValueError(f"{name} is {shown(source)}; it must be a path, a Capture, a Sequence, (mesh, frames) or meshes")
     return as_capture(source, dt=dt)
-
-
-def capture_to_up_axis(b: Capture, axis_a: UpAxis | None, axis_b: UpAxis | None) -> Capture:
-    """Returns b rotated to the up axis of a; b itself if they agree or one is unknown."""
-    if axis_a is None or axis_b is None or axis_a == axis_b:
-        return b
-
-    def read(frame):
-        surface = b[frame]
-        return Surface(turned_up(surface.points, axis_a), surface.triangles)
-
-    return replace(b, read=read)
 
 
 def _measured(a, b, labels, excluded, samples, device):

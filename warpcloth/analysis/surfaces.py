@@ -5,7 +5,7 @@ import warp as wp
 
 from ..base.checks import array, numeric, shown
 from ..base.quiet import find_device
-from ..base.turns import in_turn
+from ..base.turns import in_turn, methods_in_turn
 from ..kernels import deformation, neighbourhood_fit, rates
 from ..model.precision import DTYPES
 from ..terms import TERMS
@@ -24,6 +24,10 @@ class _Elements:
         values: Results (E, *shape) by measure, overwritten by each call.
     """
 
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        methods_in_turn(cls, "__init__", "refer", "start", "measure", "touched")
+
     def __init__(self, count, measures, device, dtype):
         self.device, self.count, self.measures = find_device(device), count, measures
         self.scalar, self.numpy = DTYPES[dtype]
@@ -33,11 +37,9 @@ class _Elements:
         self.materials = None
         self.sizes = self.empty(self.scalar)
 
-    @in_turn
     def empty(self, kind, count=None):
         return wp.empty(self.count if count is None else count, dtype=kind, device=self.device)
 
-    @in_turn
     def upload(self, values, kind):
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy), dtype=kind, device=self.device)
 
@@ -48,7 +50,6 @@ class _Elements:
             points = points - points[finite.argmax()] if finite.any() else points
         return self.upload(points, self.vec3)
 
-    @in_turn
     def launch(self, kernel, inputs, outputs, count=None):
         """Launches a kernel; outputs are arrays, or measures, which may not be chosen."""
         outputs = [self.results.get(out) if isinstance(out, str) else out for out in outputs]
@@ -64,6 +65,7 @@ class _Elements:
     def wanted(self, *names):
         return any(name in self.results for name in names)
 
+    @in_turn
     def rates(self, dt, method, rounding):
         """Computes rates from ``before`` to ``gradients``, dt [s] later, of points with ``rounding`` [m]."""
         inputs = [self.materials, self.sizes, self.before, self.gradients]

@@ -4,13 +4,13 @@ import difflib
 import math
 import reprlib
 from collections.abc import Collection, Iterable
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .limits import MOST
+from .limits import MAX_COUNT
 
 
 class _Short(reprlib.Repr):
@@ -32,10 +32,10 @@ def shown(value: object) -> str:
 
 def keep_plain(record: Any) -> None:
     """Replaces NumPy's numbers in fields of a frozen dataclass by Python's, so that its text has plain numbers."""
-    for field in fields(record):
-        if isinstance(value := getattr(record, field.name), np.generic):
+    for each in fields(record):
+        if isinstance(value := getattr(record, each.name), np.generic):
             plain = float(value) if isinstance(value, np.longdouble) else value.item()
-            object.__setattr__(record, field.name, plain)
+            object.__setattr__(record, each.name, plain)
 
 
 def number(name: str, value: Any, above: float | None = None, least: float | None = None) -> None:
@@ -60,7 +60,7 @@ def _is_finite(value):
         return False
 
 
-def whole(name: str, value: Any, least: int, most: int = MOST) -> None:
+def whole(name: str, value: Any, least: int, most: int = MAX_COUNT) -> None:
     """Checks that an option is a whole number from ``least`` to ``most``.
 
     Raises:
@@ -70,6 +70,47 @@ def whole(name: str, value: Any, least: int, most: int = MOST) -> None:
         raise ValueError(f"{name} is {shown(value)}; it must be a whole number of {least} or more")
     if value > most:
         raise ValueError(f"{name} is {shown(value)}; it must be {most:,} or less")
+
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers that an option of a record takes, from which its check and its help follow.
+
+    Attributes:
+        above: The option is greater than this, or None.
+        least: The option is no less than this, or None.
+        whole: Whether it is a whole number.
+        word: A word that it takes in place of a number, or None.
+    """
+
+    above: float | None = None
+    least: int | float | None = None
+    whole: bool = False
+    word: str | None = None
+
+    def __str__(self) -> str:
+        rule = f"above {self.above:g}" if self.above is not None else f"of {self.least:g} or more"
+        number_text = f"a {'whole ' if self.whole else ''}number {rule}"
+        return number_text if self.word is None else f"{self.word!r} or {number_text}"
+
+    def check(self, name: str, value: object) -> None:
+        """Checks the value of an option.
+
+        Raises:
+            ValueError: It is not allowed.
+        """
+        if isinstance(value, str) and self.word is not None:
+            if value != self.word:
+                raise ValueError(f"{name} is {shown(value)}; it must be {self}")
+        elif self.whole:
+            whole(name, value, self.least)
+        else:
+            number(name, value, self.above, self.least)
+
+
+def ranged(default: Any, **of_range: Any) -> Any:
+    """Returns a field of a dataclass with a default, and the :class:`Range` of these arguments as metadata."""
+    return field(default=default, metadata={"range": Range(**of_range)})
 
 
 def choice(name: str, value: object, allowed: Collection[str]) -> None:

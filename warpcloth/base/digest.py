@@ -7,9 +7,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 from .extensions import extensions
+from .warp_internals import hash_of_function
 
 
 def scene_digest(scene):
@@ -52,23 +52,13 @@ def _add(digest, value):
         for part in value:
             _add(digest, part)
     elif hasattr(value, "adj"):  # a Warp function
-        # Warp's own hash has the source, the values that it refers to, and the functions that it calls.
-        digest.update(b"function" + _hash_of_function(value) + b";")
+        digest.update(b"function" + hash_of_function(value) + b";")
     elif is_dataclass(value) and not isinstance(value, type):
         digest.update(f"{type(value).__name__};".encode())
         for field in fields(value):
             _add(digest, getattr(value, field.name))
     else:
         raise ValueError(f"a scene has {value!r}, a {type(value).__name__}; a key needs numbers, texts, lists and arrays")
-
-
-def _hash_of_function(function):
-    """Returns Warp's hash of a function, which is not part of its public interface."""
-    try:
-        hasher = wp._src.context.ModuleHasher
-    except AttributeError:
-        raise ValueError(f"this version of Warp, {wp.__version__}, gives no hash of functions, which a key needs") from None
-    return hasher([], {}).hash_function(function)
 
 
 def source_digest():

@@ -4,9 +4,9 @@ import os
 import shutil
 
 # Largest number of steps a frame, iterations a step, and copies. Each takes at least a microsecond.
-MOST = 10_000_000
-# Largest number of frames, because their numbers are time codes of a stage, see `usd.values.MOST_TIME_CODE`.
-MOST_FRAMES = 1_000_000_000
+MAX_COUNT = 10_000_000
+# Largest number of frames, because their numbers are time codes of a stage, see `usd.values.MAX_TIME_CODE`.
+MAX_FRAMES = 1_000_000_000
 
 
 def available_memory():

@@ -6,13 +6,13 @@ import tempfile
 from functools import cache
 
 from .checks import shown
-from .kernel_cache import described, mend, parse_headers_once
-from .kernel_hashes import hash_once
+from .kernel_cache import described
+from .warp_internals import change_warp
 
 
 @cache
 def prepare_warp():
-    """Sets Warp's log level to warnings, and makes it repair its kernel cache, keep parsed headers there and hash kernels once.
+    """Sets Warp's log level to warnings, and changes Warp as :mod:`warpcloth.base.warp_internals` says.
 
     A log level that the user sets, before or later, is kept.
     """
@@ -20,9 +20,7 @@ def prepare_warp():
 
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
-    mend()
-    parse_headers_once()
-    hash_once()
+    change_warp()
 
 
 def find_device(name):

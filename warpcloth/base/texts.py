@@ -23,6 +23,13 @@ def parameters_of(function):
     return {name: parameter for name, parameter in found.items() if parameter.kind in by_name}
 
 
+def words_in(annotation):
+    """Returns the words of the Literals in an annotation."""
+    if typing.get_origin(annotation) is typing.Literal:
+        return typing.get_args(annotation)
+    return tuple(word for each in typing.get_args(annotation) for word in words_in(each))
+
+
 @cache
 def words_of(record):
     """Returns the allowed words of each field of a dataclass that is annotated as Literal, by name."""

@@ -1,12 +1,18 @@
 """A lock through which the threads of one process take turns with Warp, whose global state is not thread-safe.
 
 Graph capture, loaded modules and kernel overloads belong to the whole process. Threads that bind or step at the same time get
-wrong arrays or crash. So every call that captures, launches or allocates holds the lock: building a model, binding, each step
-or frame, each solve of :class:`warpcloth.Arap`, each measure of a frame, :func:`warpcloth.equilibrium`, :func:`warpcloth.svd`
-and the like. Several calls of :func:`warpcloth.simulate` alternate frame by frame. Work between frames, such as writing a file
-or calling ``progress``, does not hold it. The lock is re-entrant. Other libraries that use Warp in this process do not take
-it. Nor does ``numpy()`` of an array on CUDA, which sets another stream for the device meanwhile, so that a capture in another
-thread fails.
+wrong arrays or crash. So calls that use Warp hold the lock from end to end. It is taken where they enter:
+
+- by building a model; by ``bind``, ``step``, ``frame`` and ``reset`` of every solver and stepper, their subclasses included;
+- by :func:`warpcloth.simulate` while it binds, for each frame and what is found at its end, and for the verdicts on the run;
+- by functions that are complete in themselves, such as :func:`warpcloth.equilibrium`, :func:`warpcloth.svd`, each solve of
+  :class:`warpcloth.Arap`, each measure of a frame and each picture;
+- by every capture of a graph.
+
+The kernels, arrays, energies and solvers below these entries do not take it again. Several calls of :func:`warpcloth.simulate`
+alternate frame by frame. Work between frames, such as writing a file or calling ``progress``, does not hold the lock. It is
+re-entrant. Other libraries that use Warp in this process do not take it. Nor does ``numpy()`` of an array on CUDA, which sets
+another stream for the device meanwhile, so that a capture in another thread fails.
 """
 
 import os
@@ -30,6 +36,11 @@ class _Turn:
     def __exit__(self, *error):
         if not self._shared:
             self._lock.release()
+
+    @property
+    def held(self):
+        """Whether this thread holds the lock, or works for a thread that does."""
+        return self._shared or self._lock._is_owned()
 
     @property
     def _shared(self):

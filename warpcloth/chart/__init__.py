@@ -1,4 +1,7 @@
-"""Plots of measured cloth and of solvers, with the extra "chart"."""
+"""Plots of measured cloth and of solvers, with the extra "chart".
+
+Paths end with .png, .svg or .pdf; functions raise what :func:`warpcloth.picture.figures.check_path` does.
+"""
 
 from ..picture.colour import Scale, range_over
 from ..picture.picture import draw

@@ -2,56 +2,44 @@
 
 import math
 
-from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
-from .style import LABEL, LEGEND, SMALL, dress, series_style, small_print
+from ..picture.figures import GREY, number_axis
+from .style import LABEL, LEGEND, SMALL, drawn, dress, series_style, small_print
 
 
 def plot_physics(path, results, facts=None):
-    """Plots the error over h and over time, two panels for each case, pattern and angle.
+    """Plots the error of :func:`physics.measure` over h and over time, two panels for each case, pattern and angle.
 
     Dashed lines are the effect of a cantilever's free sides and the accuracy of equilibria, below which errors mean nothing.
-    Points that failed are named.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        results: Pairs of arguments and result of :func:`physics.measure`, in any order.
-        facts: The machine, as of :func:`warpcloth.lab.machine.machine`; None for this one.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`, or there is nothing to plot.
+    Points that failed are named. ``results`` are pairs of arguments and result; without any ValueError is raised.
     """
-    check_path(path, PICTURES)
     rows = {}
     for arguments, found in results:
         rows.setdefault(_title(arguments), {}).setdefault(_label(arguments), []).append((arguments, found))
     if not rows:
         raise ValueError(f"{path}: there are no results; a plot must have one or more")
-    from matplotlib.figure import Figure
-
     across = min(math.ceil(math.sqrt(len(rows) / 2)), 3)
     down = math.ceil(len(rows) / across)
-    figure = Figure(figsize=(6.0 * across, 2.4 * down + 0.3), layout="constrained")
-    panels = figure.subplots(down, 2 * across, squeeze=False, sharey=True).reshape(-1, 2)
-    for (left, right), (title, lines) in zip(panels, rows.items(), strict=False):
-        for k, (label, points) in enumerate(lines.items()):
-            # An error of 0 cannot be drawn on logarithmic axes.
-            good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if found["error"])
-            style = series_style(k).line | {"markersize": 4, "linewidth": 1.0}
-            left.plot([h for h, _, _ in good], [error for _, error, _ in good], label=label, **style)
-            timed = sorted((ms, error) for _, error, ms in good if ms is not None)
-            if timed:
-                right.plot([ms for ms, _ in timed], [error for _, error in timed], **style)
-            for side in {found["sides"] for _, found in points if found["sides"] is not None}:
-                for axes in (left, right):
-                    text = "_" if k else "what free sides take"
-                    axes.axhline(side, color=series_style(k).colour, linewidth=0.8, linestyle=(0, (4, 3)), label=text)
-        _finish(left, right, title, [pair for points in lines.values() for pair in points])
-    for (left, right), lines in zip(panels, rows.values(), strict=False):
-        _floor(left, right, [found["floor"] for points in lines.values() for _, found in points if found["floor"]])
-    for axes in panels[len(rows) :].ravel():
-        axes.remove()
-    small_print(figure, facts)
-    save(figure, path)
+    with drawn(path, 6.0 * across, 2.4 * down + 0.3) as figure:
+        panels = figure.subplots(down, 2 * across, squeeze=False, sharey=True).reshape(-1, 2)
+        for (left, right), (title, lines) in zip(panels, rows.items(), strict=False):
+            for k, (label, points) in enumerate(lines.items()):
+                # An error of 0 cannot be drawn on logarithmic axes.
+                good = sorted((found["h"], found["error"], found["ms"]) for _, found in points if found["error"])
+                style = series_style(k).line | {"markersize": 4, "linewidth": 1.0}
+                left.plot([h for h, _, _ in good], [error for _, error, _ in good], label=label, **style)
+                timed = sorted((ms, error) for _, error, ms in good if ms is not None)
+                if timed:
+                    right.plot([ms for ms, _ in timed], [error for _, error in timed], **style)
+                for side in {found["sides"] for _, found in points if found["sides"] is not None}:
+                    for axes in (left, right):
+                        text = "_" if k else "what free sides take"
+                        axes.axhline(side, color=series_style(k).colour, linewidth=0.8, linestyle=(0, (4, 3)), label=text)
+            _finish(left, right, title, [pair for points in lines.values() for pair in points])
+        for (left, right), lines in zip(panels, rows.values(), strict=False):
+            _floor(left, right, [found["floor"] for points in lines.values() for _, found in points if found["floor"]])
+        for axes in panels[len(rows) :].ravel():
+            axes.remove()
+        small_print(figure, facts)
 
 
 def _floor(left, right, floors):

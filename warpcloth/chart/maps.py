@@ -8,8 +8,8 @@ from ..base.outputs import write_table
 from ..lab.axes import AXES
 from ..lab.cells import FRAMES
 from ..lab.stability_limits import DIVERGES, KNOWN
-from ..picture.figures import GREY, PICTURES, check_path, save
-from .style import BAD, DOUBTFUL, GOOD, add_legend, dress, headline, small_print, title_style
+from ..picture.figures import GREY
+from .style import BAD, DOUBTFUL, GOOD, add_legend, drawn, dress, headline, small_print, title_style
 
 # sRGB colours. Divergence goes from dark, at once, to light, in the last frame. All differ in lightness too, for people who do
 # not see red.
@@ -46,38 +46,34 @@ def plot_maps(path, survey, cells, accuracy=None, facts=None):
     Lines are where :mod:`warpcloth.lab.stability_limits` are 1; ``accuracy`` is the error above which cells are inaccurate, or
     None.
     """
-    check_path(path, PICTURES)
-    from matplotlib.figure import Figure
-
     count = len(survey.setups)
     columns = min(count, 4)
     lines = math.ceil(count / columns)
-    figure = Figure(figsize=(max(2.5 * columns, 6.0), 2.3 * lines + 1.6), layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
-    coordinates = [_coordinates(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
-    shown = {}
-    for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
-        axes.pcolormesh(*map(edges, coordinates), _colours(rows), edgecolors="white", linewidth=0.4)
-        _hatch(axes, coordinates, rows)
-        for name, (dashes, _) in _STYLES.items():
-            style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
-            if _line(axes, coordinates, rows, name, style):
-                shown[name] = style
-        axes.set_title(str(setup), **title_style(str(setup)))
-        for of, name, values, at in zip("xy", (survey.x, survey.y), (survey.xs, survey.ys), coordinates, strict=True):
-            ticks, numbers = _ticks(name, values, at)
-            axes.set(**{f"{of}ticks": ticks, f"{of}ticklabels": numbers})
-            if (of == "x" and k >= count - columns) or (of == "y" and k % columns == 0):
-                getattr(axes, f"set_{of}label")(AXES[name].label)
-        dress(axes, grid=False)
-        axes.tick_params(labelbottom=k >= count - columns)
-    for axes in panels[count:]:
-        axes.remove()
-    _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row}, accuracy)
-    rest = ", ".join(f"{name} {value:.4g}" for name, value in survey.fixed.items())
-    headline(figure, f"{survey.scene}, {survey.duration:g} s of motion" + (f", {rest}" if rest else ""))
-    small_print(figure, facts)
-    save(figure, path)
+    with drawn(path, max(2.5 * columns, 6.0), 2.3 * lines + 1.6) as figure:
+        panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
+        coordinates = [_coordinates(name, values) for name, values in ((survey.x, survey.xs), (survey.y, survey.ys))]
+        shown = {}
+        for k, (axes, setup, rows) in enumerate(zip(panels, survey.setups, cells, strict=False)):
+            axes.pcolormesh(*map(edges, coordinates), _colours(rows), edgecolors="white", linewidth=0.4)
+            _hatch(axes, coordinates, rows)
+            for name, (dashes, _) in _STYLES.items():
+                style = {"colors": "black" if name in DIVERGES else "0.4", "linestyles": [dashes], "linewidths": 1.5}
+                if _line(axes, coordinates, rows, name, style):
+                    shown[name] = style
+            axes.set_title(str(setup), **title_style(str(setup)))
+            for of, name, values, at in zip("xy", (survey.x, survey.y), (survey.xs, survey.ys), coordinates, strict=True):
+                ticks, numbers = _ticks(name, values, at)
+                axes.set(**{f"{of}ticks": ticks, f"{of}ticklabels": numbers})
+                if (of == "x" and k >= count - columns) or (of == "y" and k % columns == 0):
+                    getattr(axes, f"set_{of}label")(AXES[name].label)
+            dress(axes, grid=False)
+            axes.tick_params(labelbottom=k >= count - columns)
+        for axes in panels[count:]:
+            axes.remove()
+        _legend(figure, shown, {cell["verdict"] for rows in cells for row in rows for cell in row}, accuracy)
+        rest = ", ".join(f"{name} {value:.4g}" for name, value in survey.fixed.items())
+        headline(figure, f"{survey.scene}, {survey.duration:g} s of motion" + (f", {rest}" if rest else ""))
+        small_print(figure, facts)
 
 
 def _coordinates(name, values):

@@ -5,12 +5,13 @@ import math
 import numpy as np
 
 from ..lab.panels import Map
-from ..picture.figures import GREY, PICTURES, check_path, number_axis, save
+from ..picture.figures import GREY, number_axis
 from .panel_maps import add_keys, draw_map
 from .style import (
     DASHES,
     LEGEND,
     SMALL,
+    drawn,
     dress,
     headline,
     name_all_ends,
@@ -27,34 +28,30 @@ _FAR = 16.0  # from a line to its name [pt]; beyond, a legend is easier to read
 
 def plot_panels(path, panels, rows, title, facts):
     """Draws :class:`warpcloth.lab.panels.Panel` records: points as markers or cells, and laws as lines."""
-    check_path(path, PICTURES)
-    from matplotlib.figure import Figure
-
     across = 4 if len(panels) > 9 else 2 if len(panels) == 4 else min(len(panels), 3)
     down = math.ceil(len(panels) / across)
     width, height = (3.8, 3.2) if any(isinstance(panel, Map) for panel in panels) else (5.0, 4.1)
-    figure = Figure(figsize=(width * across, height * down + 0.3), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
-    grid, maps, lines, named = figure.subplots(down, across, squeeze=False).ravel(), [], {}, []
-    for axes, panel in zip(grid, panels, strict=False):
-        of = [row for row in rows if row["panel"] == panel.key]
-        if isinstance(panel, Map):
-            maps.append((axes, panel, draw_map(axes, panel, of, lines)))
-        else:
-            named.append((axes, _draw(axes, panel, of)))
-        axes.set_title(panel.title, loc="left", **title_style(panel.title))
-        axes.set(xlabel=panel.x, ylabel=panel.y)
-        dress(axes, grid=not isinstance(panel, Map))
-    for axes in grid[len(panels) :]:
-        axes.remove()
-    if maps:
-        add_keys(figure, maps, lines)
-    headline(figure, title)
-    small_print(figure, facts)
-    for (axes, _ends), legible in zip(named, name_all_ends(figure, named, _FAR), strict=True):
-        if not legible:
-            axes.legend(**LEGEND | {"frameon": True}, framealpha=0.85, edgecolor="none")
-    save(figure, path)
+    with drawn(path, width * across, height * down + 0.3) as figure:
+        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
+        grid, maps, lines, named = figure.subplots(down, across, squeeze=False).ravel(), [], {}, []
+        for axes, panel in zip(grid, panels, strict=False):
+            of = [row for row in rows if row["panel"] == panel.key]
+            if isinstance(panel, Map):
+                maps.append((axes, panel, draw_map(axes, panel, of, lines)))
+            else:
+                named.append((axes, _draw(axes, panel, of)))
+            axes.set_title(panel.title, loc="left", **title_style(panel.title))
+            axes.set(xlabel=panel.x, ylabel=panel.y)
+            dress(axes, grid=not isinstance(panel, Map))
+        for axes in grid[len(panels) :]:
+            axes.remove()
+        if maps:
+            add_keys(figure, maps, lines)
+        headline(figure, title)
+        small_print(figure, facts)
+        for (axes, _ends), legible in zip(named, name_all_ends(figure, named, _FAR), strict=True):
+            if not legible:
+                axes.legend(**LEGEND | {"frameon": True}, framealpha=0.85, edgecolor="none")
 
 
 def _draw(axes, panel, rows):

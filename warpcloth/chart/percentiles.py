@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from ..base.checks import choice
-from ..picture.figures import GREY, PICTURES, check_path, save
-from .style import COLOURS, LEGEND, SMALL, dress, small_print
+from ..picture.figures import GREY
+from .style import COLOURS, LEGEND, SMALL, drawn, dress, small_print
 
 # Columns of each band among the percentiles 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, its grey and its label.
 _BANDS = ((1, 7, "0.88", "1 to 99 %"), (2, 6, "0.76", "5 to 95 %"), (3, 5, "0.6", "25 to 75 %"))
@@ -15,50 +15,37 @@ _NOTE = {"ha": "right", "fontsize": SMALL, "color": GREY, "bbox": {"facecolor": 
 
 
 def plot_percentiles(path, summaries, along="time", neutrals=None, device="cpu"):
-    """Plots each scalar in a panel: median, bands from 25 to 75, 5 to 95 and 1 to 99 %, and extremes.
+    """Plots each scalar in a panel: median, bands from 25 to 75, 5 to 95 and 1 to 99 %, and extremes, along "time" or "frame".
 
-    Rows without values leave gaps; extremes far outside the bands are given as numbers.
-
-    Args:
-        path: The file, .png, .svg or .pdf.
-        summaries: Summaries by row, with ``name``, ``unit``, ``time`` [s], ``frame`` and ``percentiles`` of 0, 1, 5, 25, 50,
-            75, 95, 99 and 100 %.
-        along: "time" or "frame".
-        neutrals: Undeformed values by name, or None.
-        device: The Warp device that measured them.
-
-    Raises:
-        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`, or there is nothing to plot.
+    Rows without values leave gaps; extremes far outside the bands are given as numbers. ``summaries`` have ``name``, ``unit``,
+    ``time`` [s], ``frame`` and ``percentiles`` of 0, 1, 5, 25, 50, 75, 95, 99 and 100 %, ``neutrals`` the undeformed values by
+    name, or None.
     """
-    check_path(path, PICTURES)
     choice("along", along, ("time", "frame"))
     rows = {}
     for summary in summaries:
         rows.setdefault(summary.name, []).append(summary)
     if not rows:
         raise ValueError(f"{path}: there are no summaries; a plot must have one or more")
-    from matplotlib.figure import Figure
-
     columns = min(math.ceil(math.sqrt(len(rows))), 5)
     lines = math.ceil(len(rows) / columns)
-    figure = Figure(figsize=(max(3.6 * columns, 5.0), 2.6 * lines + 0.4), layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False, sharex=True).ravel()
-    for axes, (name, found) in zip(panels, rows.items(), strict=False):
-        at = np.array([getattr(summary, along) for summary in found], dtype=np.float64)
-        _panel(axes, at, np.array([summary.percentiles for summary in found], dtype=np.float64), (neutrals or {}).get(name))
-        unit = "" if found[0].unit == "1" else f" [{found[0].unit}]"
-        axes.set_ylabel(f"{name}{unit}", parse_math=False)
-        axes.set_xlabel("time [s]" if along == "time" else "frame")
-        dress(axes)
-        axes.tick_params(labelbottom=True)
-    for axes in panels[len(rows) :]:
-        axes.remove()
-    known = {}
-    for axes in panels[: len(rows)]:
-        known.update(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    figure.legend(known.values(), known, loc="outside upper center", ncols=3, **LEGEND)
-    small_print(figure, device=device)
-    save(figure, path)
+    with drawn(path, max(3.6 * columns, 5.0), 2.6 * lines + 0.4) as figure:
+        panels = figure.subplots(lines, columns, squeeze=False, sharex=True).ravel()
+        for axes, (name, found) in zip(panels, rows.items(), strict=False):
+            at = np.array([getattr(summary, along) for summary in found], dtype=np.float64)
+            _panel(axes, at, np.array([summary.percentiles for summary in found], dtype=np.float64), (neutrals or {}).get(name))
+            unit = "" if found[0].unit == "1" else f" [{found[0].unit}]"
+            axes.set_ylabel(f"{name}{unit}", parse_math=False)
+            axes.set_xlabel("time [s]" if along == "time" else "frame")
+            dress(axes)
+            axes.tick_params(labelbottom=True)
+        for axes in panels[len(rows) :]:
+            axes.remove()
+        known = {}
+        for axes in panels[: len(rows)]:
+            known.update(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+        figure.legend(known.values(), known, loc="outside upper center", ncols=3, **LEGEND)
+        small_print(figure, device=device)
 
 
 def _panel(axes, at, percentiles, neutral):

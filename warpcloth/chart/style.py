@@ -5,6 +5,7 @@ markers differ too.
 """
 
 import math
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from ..lab.machine import in_words, machine
 from ..others.simulators import other_solvers, shown_name
-from ..picture.figures import GREY
+from ..picture.figures import GREY, PICTURES, check_path, save
 from ..solvers import SOLVERS
 from ..solvers import __all__ as _INCLUDED
 
@@ -109,6 +110,21 @@ def dress(axes, grid=True):
     if grid:
         axes.grid(True, **_GRID)
         axes.set_axisbelow(True)
+
+
+@contextmanager
+def drawn(path, width, height):
+    """Yields an empty figure of a size [in] with a constrained layout, and writes it when the block ends.
+
+    Raises:
+        OSError, ImportError, ValueError: As of :func:`warpcloth.picture.figures.check_path`.
+    """
+    check_path(path, PICTURES)
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    yield figure
+    save(figure, path)
 
 
 def headline(figure, text):

@@ -42,7 +42,7 @@ from . import (
     scenes,
     view,
 )
-from .terminal import DTYPES, StandardStreams, say, warnings_once
+from .terminal import StandardStreams, say, warnings_once
 
 
 def main(argv=None):
@@ -114,6 +114,26 @@ def _sentence(error, debug):
     return type(error).__name__ + (f": {error}" if str(error) else "") + more
 
 
+# In the order of the manual. Each module has the text of the command, its arguments, and a function of its own name.
+_COMMANDS = (
+    run,
+    info,
+    deform,
+    analyze,
+    compare,
+    resample,
+    measure,
+    check,
+    render,
+    view,
+    convert,
+    chart,
+    choose,
+    bench,
+    fit,
+    fabrics,
+    scenes,
+)
 _GROUPS = {
     "make": ("run", "deform", "resample", "convert"),
     "look": ("scenes", "fabrics", "info", "view", "render"),
@@ -163,125 +183,17 @@ def _parser():
     parser.add_argument("--version", action="version", version=f"warpcloth {version}")
     parser.set_defaults(command=None)
     commands = parser.add_subparsers(prog=parser.prog, metavar="COMMAND", help=argparse.SUPPRESS)
-
-    def add(name, command, text, **more):
-        form = {"formatter_class": options.HelpFormatter, "allow_abbrev": False}
-        sub = commands.add_parser(name, description=text, **form, **more)
-        sub.set_defaults(command=command)
-        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    for module in _COMMANDS:
+        name = module.__name__.rpartition(".")[2]
+        if module is chart:  # each chart has the options of all commands
+            chart.add_arguments(commands.add_parser(name, description=chart.TEXT, allow_abbrev=False))
+            continue
+        form = {"formatter_class": options.HelpFormatter, "epilog": getattr(module, "EPILOG", None)}
+        sub = commands.add_parser(name, description=module.TEXT, allow_abbrev=False, **form)
+        sub.set_defaults(command=getattr(module, name))
+        options.add_shared(sub, "debug")
         options.add_import(sub)
-        return sub
-
-    runs = add("run", run.run, "Run a scene and write its animation as USD.", epilog=run.EPILOG)
-    infos = add("info", info.info, "Show what a scene contains, and the model that is built from it.", epilog=info.EPILOG)
-    deforms = add("deform", deform.deform, "Deform a mesh by handles, as rigidly as possible (ARAP).", epilog=deform.EPILOG)
-    deform.add_arguments(deforms)
-    analyzes = add("analyze", analyze.analyze, "Measure how an animated cloth deforms.", epilog=analyze.EPILOG)
-    analyze.add_arguments(analyzes)
-    compares = add("compare", compare.compare, "Measure the distance between two animations.", epilog=compare.EPILOG)
-    compare.add_arguments(compares)
-    text = "Move a mesh onto each frame of a capture, so that its triangles stay."
-    resamples = add("resample", resample.resample, text, epilog=resample.EPILOG)
-    resample.add_arguments(resamples)
-    measures = add("measure", measure.measure, "Read what a device of a textile laboratory measures.", epilog=measure.EPILOG)
-    options.add_scene(measures)
-    measure.add_arguments(measures)
-    checks = add("check", check.check, "Find what intersects in an animation, exactly.", epilog=check.EPILOG)
-    check.add_arguments(checks)
-    renders = add("render", render.render, "Draw a picture or a film of an animation.", epilog=render.EPILOG)
-    render.add_arguments(renders)
-    views = add("view", view.view, "Write a page that shows an animation in a browser.", epilog=view.EPILOG)
-    view.add_arguments(views)
-    converts = add("convert", convert.convert, "Write an animation in another format.", epilog=convert.EPILOG)
-    convert.add_arguments(converts)
-    charts = commands.add_parser("chart", description=chart.TEXT, allow_abbrev=False)
-    chart.add_arguments(charts)
-    chooses = add("choose", choose.choose, "Choose the cheapest solver and settings for a scene.", epilog=choose.EPILOG)
-    choose.add_arguments(chooses)
-    benches = add("bench", bench.bench, "Measure the time and memory of frames, or compare two results.", epilog=bench.EPILOG)
-    bench.add_arguments(benches)
-    fitted = add("fit", fit.fit, "Find parameters with which a scene moves as measured.", epilog=fit.EPILOG)
-    fit.add_arguments(fitted)
-    for sub in (runs, infos):
-        options.add_scene(sub)
-        of_info = "also show the step and the kernels of this solver (default: none, or newton if -s or --advise is given)"
-        options.add_solver(sub, of_info if sub is infos else "the solver (default: newton)")
-        options.add_values(sub, "-s", "option", "options of the solver")
-        options.add_cloth(sub)
-    infos.add_argument(
-        "--advise",
-        action="store_true",
-        help="find out whether each term, the precision, the step and the resolution matter to the result",
-    )
-    infos.add_argument(
-        "--tolerance", metavar="SHARE", help="with --advise: the largest change that does not matter (default: 1%%)"
-    )
-    infos.add_argument(
-        "--frames", type=int, metavar="N", help="with --advise: number of frames to simulate (default: at most 30)"
-    )
-    runs.add_argument(
-        "--tolerance",
-        metavar="SHARE",
-        help="find the cheapest solver and settings with at most this error, such as 1%% of the size of the cloth, and run "
-        "with them; this takes many trial runs, see 'warpcloth choose'",
-    )
-    runs.add_argument(
-        "--budget",
-        metavar="TIME",
-        help="find the most accurate solver and settings within this time per frame, such as 16ms, and run with them",
-    )
-    runs.add_argument(
-        "--frames", type=int, metavar="N", help="number of frames after the start (default: those of the scene's duration)"
-    )
-    for sub in (
-        runs,
-        infos,
-        deforms,
-        analyzes,
-        compares,
-        resamples,
-        measures,
-        checks,
-        renders,
-        views,
-        chooses,
-        benches,
-        fitted,
-    ):
-        if sub is not checks:
-            sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
-        sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    for sub in (runs, benches):
-        sub.add_argument("--threads", type=int, default=1, metavar="N", help="number of CPU threads (default: 1)")
-    for sub in (runs, infos, deforms, analyzes, chooses, benches, fitted):
-        default = "float64" if sub in (deforms, analyzes, fitted) else None
-        text = default or "by device and solver"
-        sub.add_argument("--dtype", choices=DTYPES, default=default, help=f"precision (default: {text})")
-    for sub in (runs, deforms, resamples):
-        text = "the .usd, .usda, .usdc or .usdz file to write"
-        text += (
-            ""
-            if sub is not runs
-            else " (default: named after the scene, such as hanging.usdc; an existing file is then not replaced)"
-        )
-        sub.add_argument("-o", "--output", required=sub is not runs, metavar="FILE", help=text)
-    runs.add_argument("--film", metavar="FILE", help="also draw the run as a film, .mp4, .webp or .gif; see 'warpcloth render'")
-    runs.add_argument("--csv", metavar="FILE", help="also write a table of energies and forces, one row per frame")
-    runs.add_argument("--report", metavar="FILE", help="also write energies, forces and the reaction of each pin as JSON")
-    runs.add_argument(
-        "--resume",
-        action="store_true",
-        help="continue the interrupted run to this output from its last checkpoint; there is one every ten frames",
-    )
-    for sub in (runs, deforms, resamples, analyzes, checks):
-        sub.add_argument("--single-file", action="store_true", help="write one file instead of a file and a folder of frames")
-    lists = add("fabrics", fabrics.fabrics, "List measured fabrics, their moduli, bending lengths and sources.")
-    text = "show one fabric, or list those of a file instead: .json of ARCSim, or a .csv table of KES-F or FAST measurements"
-    lists.add_argument("file", metavar="NAME|FILE", nargs="?", help=text)
-    lists = add("scenes", scenes.scenes, "List scenes and their parameters.")
-    lists.add_argument(
-        "folder", metavar="FOLDER", nargs="?", help="a folder of scene files (default: ./scenes and the included scenes)"
-    )
+        module.add_arguments(sub)
     about = {name: command.description for name, command in commands.choices.items()}
     groups = ["\n".join([f"{group}:", *(f"  {name:9} {about[name]}" for name in names)]) for group, names in _GROUPS.items()]
     parser.epilog = "\n\n".join([*groups, "'warpcloth COMMAND --help' has the options and examples of a command."])

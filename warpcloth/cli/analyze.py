@@ -8,9 +8,10 @@ from ..base.checks import choice
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import convert, json_text
-from .options import values_of
+from .options import DOUBLE, add_shared, values_of
 from .terminal import Progress, aligned, check_writable, frames_folder_of, location
 
+TEXT = "Measure how an animated cloth deforms."
 EPILOG = """\
 INPUT is a USD stage, a folder of .obj, .ply or .off files, a pattern such as "frames/*.obj", or arrays in .npz or .npy.
 --measure help lists the measures. --colour takes a scalar measure, such as area_ratio, or a component of a vector, such as
@@ -25,40 +26,23 @@ _SENTENCES = 8
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
-    add(
-        "input",
-        metavar="INPUT",
-        nargs="?",
-        help="the animation: a USD stage, a folder or pattern of mesh files, a .npz or a .npy file; may be left out with "
-        "'--measure help'",
+    text = (
+        "the animation: a USD stage, a folder or pattern of mesh files, a .npz or a .npy file; may be left out with "
+        "'--measure help'"
     )
+    add("input", metavar="INPUT", nargs="?", help=text)
     add_measuring(parser)
-    add(
-        "--measure",
-        nargs="+",
-        default=["stretch"],
-        metavar="NAME",
-        help="measures to compute, or all; '--measure help' lists them (default: stretch)",
-    )
-    add(
-        "--pairs",
-        metavar="A:B,…",
-        help="compare these pairs of reference and frame, such as 1:2,1:3,72:75; in place of --reference and --lag",
-    )
+    text = "measures to compute, or all; '--measure help' lists them (default: stretch)"
+    add("--measure", nargs="+", default=["stretch"], metavar="NAME", help=text)
+    text = "compare these pairs of reference and frame, such as 1:2,1:3,72:75; in place of --reference and --lag"
+    add("--pairs", metavar="A:B,…", help=text)
     add("--every", type=int, default=1, metavar="K", help="measure only every K-th frame")
-    add(
-        "-o",
-        "--output",
-        metavar="FILE",
-        help="write a .usd, .usda, .usdc or .usdz file with the measures as primvars, and one as colour",
-    )
-    add(
-        "--colour",
-        metavar="NAME",
-        help="the value to show as colour, such as stretch_1, or none (default: the first that is measured)",
-    )
+    text = "write a .usd, .usda, .usdc or .usdz file with the measures as primvars, and one as colour"
+    add("-o", "--output", metavar="FILE", help=text)
+    text = "the value to show as colour, such as stretch_1, or none (default: the first that is measured)"
+    add("--colour", metavar="NAME", help=text)
     add("--curves", action="store_true", help="draw the principal directions as curves in the stage and in stills")
     add("--csv", metavar="FILE", help="write a table: percentiles of each measure in each frame, and where its extremes are")
     add("--report", metavar="FILE", help="write the table of --csv as JSON, with a list of what could not be measured")
@@ -69,6 +53,7 @@ def add_arguments(parser):
     add("--elevation", type=float, metavar="DEGREES", help="elevation of the camera of --still (default: 24)")
     add("--both-sides", action="store_true", help="also show the opposite side of the cloth in each still")
     add("--still-frames", type=float, nargs="+", metavar="FRAME", help="frames to show with --still (default: the last)")
+    add_shared(parser, "device", "json", "dtype", "single_file", dtype=DOUBLE)
 
 
 def add_measuring(parser):
@@ -76,48 +61,23 @@ def add_measuring(parser):
     add = parser.add_argument
     add("--prim", help="path or name of the mesh, if the file has several")
     add("--fps", type=float, help="frames per second (default: that of the input); rates need it")
-    add(
-        "--rest",
-        metavar="MESH",
-        help="mesh file or stage with the rest shape (default: the rest shape in the animation, else its first frame)",
-    )
+    text = "mesh file or stage with the rest shape (default: the rest shape in the animation, else its first frame)"
+    add("--rest", metavar="MESH", help=text)
     add("--rest-prim", metavar="PRIM", help="path or name of the mesh in the file of --rest")
-    add(
-        "--neighbourhood",
-        metavar="N",
-        help="measure vertices instead of triangles: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%",
-    )
+    text = "measure vertices instead of triangles: 1-ring, 2-ring, nearest:k=12, nearest:radius=0.05, nearest:2%%"
+    add("--neighbourhood", metavar="N", help=text)
     add("--reference", metavar="R", help="compare each frame with rest (default), first, previous, or a frame number")
     add("--lag", type=int, metavar="K", help="compare each frame with the one K frames earlier; in place of --reference")
-    add(
-        "--rates",
-        choices=("midpoint", "forward", "logarithm"),
-        default="midpoint",
-        help="formula of rates (default: midpoint), see docs/measuring.md",
-    )
-    add(
-        "--directions",
-        metavar="D",
-        help="direction of the warp, for measures along warp and weft: st for texture coordinates, or a vector such as 1,0,0",
-    )
-    add(
-        "--material",
-        metavar="M",
-        help="membrane for energy and stress, with --stiffness: neo-hookean (default), stvk or corotated",
-    )
-    add(
-        "--range",
-        dest="colour_range",
-        type=float,
-        nargs=2,
-        metavar=("LOW", "HIGH"),
-        help="values at the ends of the colour scale (default: from the 1st to the 99th percentile of all frames)",
-    )
-    add(
-        "--colormap",
-        metavar="NAME",
-        help="a colormap of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)",
-    )
+    text = "formula of rates (default: midpoint), see docs/measuring.md"
+    add("--rates", choices=("midpoint", "forward", "logarithm"), default="midpoint", help=text)
+    text = "direction of the warp, for measures along warp and weft: st for texture coordinates, or a vector such as 1,0,0"
+    add("--directions", metavar="D", help=text)
+    text = "membrane for energy and stress, with --stiffness: neo-hookean (default), stvk or corotated"
+    add("--material", metavar="M", help=text)
+    text = "values at the ends of the colour scale (default: from the 1st to the 99th percentile of all frames)"
+    add("--range", dest="colour_range", type=float, nargs=2, metavar=("LOW", "HIGH"), help=text)
+    text = "a colormap of matplotlib, such as cividis (default: viridis, or coolwarm around the undeformed value)"
+    add("--colormap", metavar="NAME", help=text)
     add("--up-axis", choices=("Y", "Z"), help="up axis, if the input does not say (default: Y)")
     add("--stiffness", type=float, metavar="K", help="stiffness of the material, Young's modulus times thickness [N/m]")
     add("--poisson", type=float, metavar="NU", help="Poisson's ratio of the material (default: 0)")
@@ -125,7 +85,7 @@ def add_measuring(parser):
 
 def analyze(arguments):
     from ..analysis.measures import MEASURES
-    from .reports import write_report
+    from .reports import ReportFiles, ReportLooks, write_report
 
     if arguments.measure == ["help"]:
         print(_listed(MEASURES))
@@ -140,16 +100,10 @@ def analyze(arguments):
     analyzer = _analyzer(arguments)
     stills = _stills(arguments, analyzer)
     with closing(Progress(len(analyzer), first="measuring")) as progress:
-        found = write_report(
-            analyzer,
-            usd=arguments.output,
-            json=arguments.report,
-            stills=stills,
-            view=view,
-            progress=progress,
-            **values_of(arguments, "csv", "npz", "plot", "colour", "colour_range", "colormap", "curves", "both_sides"),
-            **values_of(arguments, "single_file", "up_axis"),
-        )
+        others = values_of(arguments, "csv", "npz", "plot", "single_file", "up_axis")
+        written = ReportFiles(usd=arguments.output, json=arguments.report, stills=stills, **others)
+        looks = ReportLooks(view=view, **values_of(arguments, "colour", "colour_range", "colormap", "curves", "both_sides"))
+        found = write_report(analyzer, written, looks, progress)
     facts = {
         "input": arguments.input,
         "vertices": len(analyzer.mesh.points),

@@ -6,10 +6,11 @@ from ..base.checks import whole
 from ..base.outputs import check_apart, check_replaceable
 from ..base.quiet import find_device
 from ..base.texts import assignments, json_text, options
-from .options import CLOTH, DEFAULT, add_cloth, add_scene, add_solver, add_values, values_of
+from .options import CLOTH, DEFAULT, add_cloth, add_scene, add_shared, add_solver, add_values, values_of
 from .setup import named_scene, solver_setup
 from .terminal import Bar, Interrupted, aligned, check_writable, say
 
+TEXT = "Measure the time and memory of frames, or compare two results."
 EPILOG = """\
 Without SCENE, every solver runs the scene hanging in growing sizes, and PBD also runs Jacobi sweeps over the springs of the
 scene net. The scene resting then shows what contact costs, for colliders of each shape, touched and far away, and for meshes of
@@ -48,30 +49,22 @@ _OF_A_RUN = {"frames": 20, "copies": 1, "threads": 1, "device": "cpu", "dtype": 
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add_scene(parser, nargs="?")
     add_cloth(parser)
     add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
-    add(
-        "--sizes",
-        nargs="+",
-        type=int,
-        default=[],
-        metavar="N",
-        help="resolutions to measure: values of the parameter of the scene that sets it (n, links or elements)",
-    )
-    add(
-        "--frames",
-        type=int,
-        default=_OF_A_RUN["frames"],
-        metavar="N",
-        help="frames to time (default: 20); fewer if they take over 10 s, but at least 3",
-    )
+    text = "resolutions to measure: values of the parameter of the scene that sets it (n, links or elements)"
+    add("--sizes", nargs="+", type=int, default=[], metavar="N", help=text)
+    text = "frames to time (default: 20); fewer if they take over 10 s, but at least 3"
+    add("--frames", type=int, default=_OF_A_RUN["frames"], metavar="N", help=text)
     add("--copies", type=int, default=_OF_A_RUN["copies"], metavar="N", help="number of cloths in a batch (default: 1)")
+    text = "number of CPU threads that share out the cloths of a batch (default: 1)"
+    add("--threads", type=int, default=_OF_A_RUN["threads"], metavar="N", help=text)
     add("--csv", metavar="FILE", help="write the measurements as a table")
     add("--compare", nargs=2, metavar=("OLD", "NEW"), help="compare two files saved from --json, and print the ratios")
+    add_shared(parser, "device", "json", "dtype")
 
 
 def bench(arguments):
@@ -79,7 +72,6 @@ def bench(arguments):
         return _compare(arguments)
     whole("frames", arguments.frames, 1)
     whole("copies", arguments.copies, 1)
-    whole("threads", arguments.threads, 1)
     for size in arguments.sizes:
         whole("sizes", size, 2)
     if arguments.csv:
@@ -88,6 +80,9 @@ def bench(arguments):
         check_writable(arguments.csv)
     device = find_device(arguments.device)
     from ..lab.benchmarks import Run
+    from ..model.threads import refuse_one_copy
+
+    refuse_one_copy(arguments.threads, arguments.copies)
 
     run = Run(_benchmarks(arguments, device))
     progress = _Rows()

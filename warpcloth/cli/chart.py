@@ -2,6 +2,7 @@
 
 import sys
 from collections import Counter
+from functools import partial
 
 from ..base.checks import number, whole
 from ..base.quiet import find_device
@@ -9,9 +10,9 @@ from ..base.texts import assignments, fraction, json_text
 from ..picture.figures import PICTURES
 from ..run.listing import list_failures
 from . import stability
-from .options import HelpFormatter, add_cloth, add_import, add_scene, add_with, solvers, values_of
+from .options import HelpFormatter, add_cloth, add_import, add_scene, add_shared, add_with, solvers, values_of
 from .setup import named_scene, scene_ref
-from .terminal import DTYPES, check_outputs, measuring
+from .terminal import check_outputs, measuring
 
 TEXT = "Draw charts of accuracy against time, of stability, and of failures."
 NOT_USABLE = ", not usable"
@@ -80,12 +81,11 @@ def add(charts, name, command, text, epilog):
     form = {"formatter_class": HelpFormatter, "allow_abbrev": False}
     sub = charts.add_parser(name, help=text, description=text, epilog=epilog, **form)
     sub.set_defaults(command=command)
-    sub.add_argument("--device", default="cpu", help="cpu (default), cuda:0, …")
+    add_shared(sub, "device")
     sub.add_argument("--workers", type=int, metavar="N", help="number of processes (default: one per core, or one on a GPU)")
     sub.add_argument("-o", "--output", metavar="FILE", help=f"draw the chart ({', '.join(PICTURES)})")
     sub.add_argument("--csv", metavar="FILE", help="write the measurements as a table")
-    sub.add_argument("--json", action="store_true", help="print the result as one JSON object")
-    sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    add_shared(sub, "json", "debug")
     add_import(sub)
     return sub
 
@@ -99,22 +99,17 @@ def _add_work_precision(charts):
         "--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="measure only these solvers (default: all)"
     )
     add_with(sub)
-    sub.add_argument(
-        "--frames",
-        type=int,
-        metavar="N",
-        help="frames to simulate (default: half of the scene's); for the diagrams solver and spectrum, frames to simulate "
-        "before the step that is measured (default: a third)",
+    text = "draw every setting of the diagram time, not each solver's best ones alone"
+    sub.add_argument("--every-setting", action="store_true", help=text)
+    text = (
+        "frames to simulate (default: half of the scene's); for the diagrams solver and spectrum, frames to simulate "
+        "before the step that is measured (default: a third)"
     )
+    sub.add_argument("--frames", type=int, metavar="N", help=text)
     text = "precision (default: by device and solver for the diagram time, else float64)"
-    sub.add_argument("--dtype", choices=DTYPES, help=text)
-    sub.add_argument(
-        "--limit",
-        type=float,
-        default=20.0,
-        metavar="SECONDS",
-        help="time limit of each setting (default: 20); a reference may take six times as long",
-    )
+    add_shared(sub, "dtype", dtype={"help": text})
+    text = "time limit of each setting (default: 20); a reference may take six times as long"
+    sub.add_argument("--limit", type=float, default=20.0, metavar="SECONDS", help=text)
 
 
 def _add_cheapest(charts):
@@ -125,24 +120,15 @@ def _add_cheapest(charts):
     for of, needed in (("x", True), ("y", False)):
         text = f"parameter of the scene on the {of} axis and its values" + ("" if needed else " (default: a map of one row)")
         sub.add_argument(f"--{of}", nargs="+", required=needed, metavar=("PARAMETER", "VALUE"), help=text)
-    sub.add_argument(
-        "--tolerance",
-        default="1%",
-        metavar="SHARE",
-        help="largest error allowed, as a share of the size of the cloth (default: 1%%)",
-    )
+    text = "largest error allowed, as a share of the size of the cloth (default: 1%%)"
+    sub.add_argument("--tolerance", default="1%", metavar="SHARE", help=text)
     sub.add_argument("--solvers", nargs="+", metavar="SOLVER", choices=solvers(), help="solvers to choose among (default: all)")
     sub.add_argument(
         "--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)"
     )
-    sub.add_argument("--dtype", choices=DTYPES, help="precision (default: by device and solver)")
-    sub.add_argument(
-        "--limit",
-        type=float,
-        default=60.0,
-        metavar="SECONDS",
-        help="time limit of the search in each cell (default: 60); a reference may take six times as long",
-    )
+    add_shared(sub, "dtype")
+    text = "time limit of the search in each cell (default: 60); a reference may take six times as long"
+    sub.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help=text)
 
 
 def _add_failure(charts):
@@ -158,6 +144,7 @@ def _add_failure(charts):
 
 
 def map_cheapest(arguments):
+    from ..chart.cheapest import plot_cheapest
     from ..lab.cheapest import cheapest_map, write_csv
 
     if arguments.frames is not None:
@@ -176,14 +163,7 @@ def map_cheapest(arguments):
             **values_of(arguments, "solvers", "frames", "dtype", "limit"),
             **run,
         )
-    if arguments.output:
-        from ..chart.cheapest import plot_cheapest
-
-        plot_cheapest(arguments.output, found)
-    if arguments.csv:
-        write_csv(arguments.csv, found)
-    print(json_text(found) if arguments.json else _cheapest_summary(found))
-    return 0
+    return _write(arguments, found, plot_cheapest, write_csv, _cheapest_summary)
 
 
 def _axis(of, words):
@@ -229,11 +209,16 @@ def failure(arguments):
     device = find_device(arguments.device)
     with measuring(arguments, device) as run:
         found = failure_chart(arguments.failure, device=str(device), **run)
+    return _write(arguments, found, plot_failure, write_csv, _failure_summary)
+
+
+def _write(arguments, found, plot, write_csv, summary):
+    """Draws and writes a chart as the arguments ask for, and prints it; returns the exit code."""
     if arguments.output:
-        plot_failure(arguments.output, found)
+        plot(arguments.output, found)
     if arguments.csv:
         write_csv(arguments.csv, found)
-    print(json_text(found) if arguments.json else _failure_summary(found))
+    print(json_text(found) if arguments.json else summary(found))
     return 0
 
 
@@ -272,19 +257,17 @@ def work_precision(arguments):
     options = {name: value for name, value in chosen.items() if value is not None}
     if arguments.diagram == "physics" and (set(options) & {"solvers", "frames"}):
         raise ValueError("the diagram physics is of equilibria; --solvers and --frames are for the others")
-    elif arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
+    if arguments.every_setting and arguments.diagram != "time":
+        raise ValueError(f"--every-setting is for the diagram time, not {arguments.diagram}")
+    if arguments.diagram == "spectrum" and (set(options) & {"solvers", "dtype"}):
         raise ValueError("the diagram spectrum is of projective dynamics in float64; --solvers and --dtype are for the others")
     measure, plot, lines = _parts(arguments.diagram)
     with measuring(arguments, device) as run:
         watch = {"watch": run["progress"].watch} if arguments.diagram == "time" else {}
         scene = SceneRef(arguments.scene, given, arguments.pins)
         found = measure(scene, device=str(device), limit=arguments.limit, **watch, **run, **options)
-    if arguments.output:
-        plot(arguments.output, found)
-    if arguments.csv:
-        write_csv(arguments.csv, found)
-    print(json_text(found) if arguments.json else _summary(found, lines))
-    return 0
+    plot = partial(plot, every=True) if arguments.every_setting else plot
+    return _write(arguments, found, plot, write_csv, partial(_summary, lines_of=lines))
 
 
 def _parts(diagram):

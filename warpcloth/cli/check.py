@@ -9,10 +9,11 @@ import numpy as np
 from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart, write_table
 from ..base.texts import assignments, json_text
-from .options import add_values, values_of
+from .options import add_shared, add_values, values_of
 from .render import SIZE, check_drawing, draw_film
 from .terminal import Progress, aligned, check_writable, frames_folder_of, location
 
+TEXT = "Find what intersects in an animation, exactly."
 EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. Of a result of warpcloth the
 cloth is checked, of other stages all meshes whose points move, or else all meshes, but no colliders; --prim names others. Pairs
@@ -35,7 +36,7 @@ _SENTENCES = 8
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation, mesh or scene to check")
     add_values(parser, "-p", "parameter", "parameters of a scene")
@@ -45,13 +46,11 @@ def add_arguments(parser):
     add("--stretch", type=float, metavar="RATIO", help="also report edges longer than this many times their rest length")
     add("--every", type=int, default=1, metavar="K", help="check only every K-th frame")
     add("-o", "--output", metavar="FILE", help="write a .usd, .usda, .usdc or .usdz file with what intersects in red")
-    add(
-        "--csv",
-        metavar="FILE",
-        help="write a table: a row for each pair, each vertex inside a collider and each stretch beyond a limit",
-    )
+    text = "write a table: a row for each pair, each vertex inside a collider and each stretch beyond a limit"
+    add("--csv", metavar="FILE", help=text)
     add("--still", metavar="FILE", help="draw the frame with the most intersections (.png)")
     add("--up-axis", choices=("Y", "Z"), help="up axis of -o and --still, if the input does not say (default: Y)")
+    add_shared(parser, "json", "single_file")
 
 
 def check(arguments):
@@ -117,16 +116,15 @@ def _writer(arguments, cloths):
     if arguments.output is None:
         return nullcontext()
     from ..usd import MeasureWriter
+    from .reports import codes_per_second
 
-    times = cloths.times
-    rate = 24.0 if times is None or len(times) < 2 else float((cloths.labels[-1] - cloths.labels[0]) / (times[-1] - times[0]))
     return MeasureWriter(
         arguments.output,
         cloths.mesh,
         {"intersections": "uniform", "inside": "uniform"},
         coloured="intersections",
         source=cloths.stages or None,
-        fps=rate,
+        fps=codes_per_second(cloths),
         up_axis=cloths.up_axis or arguments.up_axis or "Y",
     )
 

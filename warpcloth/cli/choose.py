@@ -5,10 +5,11 @@ import sys
 
 from ..base.quiet import find_device
 from ..base.texts import assignments, fraction, json_text, milliseconds
-from .options import add_cloth, add_scene, add_with, values_of
+from .options import add_cloth, add_scene, add_shared, add_with, values_of
 from .setup import named_scene, scene_ref
 from .terminal import Interrupted, Settings
 
+TEXT = "Choose the cheapest solver and settings for a scene."
 EPILOG = """\
 --tolerance finds the cheapest setting with at most this error, --budget the most accurate setting within this time, and both
 together the cheapest setting that meets both. The settings of each solver are tried from coarse to fine. A solver is done when
@@ -22,20 +23,18 @@ over vertices and frames to a reference solution, divided by the longest side of
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add_scene(parser)
     add_cloth(parser)
-    add(
-        "--tolerance",
-        metavar="SHARE",
-        help="largest error allowed, as a share of the size of the cloth, such as 1%%; needed unless --budget is given",
-    )
+    text = "largest error allowed, as a share of the size of the cloth, such as 1%%; needed unless --budget is given"
+    add("--tolerance", metavar="SHARE", help=text)
     add("--budget", metavar="TIME", help="longest time per frame allowed, such as 16ms; needed unless --tolerance is given")
     add("--solvers", nargs="+", metavar="SOLVER", help="solvers to choose among (default: all)")
     add_with(parser)
     add("--frames", type=int, metavar="N", help="number of frames to simulate (default: those of the scene's duration)")
     add("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
+    add_shared(parser, "device", "json", "dtype")
 
 
 def choose(arguments):

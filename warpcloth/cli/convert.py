@@ -1,8 +1,12 @@
 """The command ``convert``: writes an animation in another format."""
 
-from ..base.texts import json_text
-from .terminal import Bar, check_writable
+from contextlib import closing
 
+from ..base.texts import json_text
+from .options import add_shared
+from .terminal import Counter, check_writable
+
+TEXT = "Write an animation in another format."
 EPILOG = """\
 FILE is a USD stage, a folder or pattern of .obj, .ply or .off files, or arrays in .npz, .npy, .pc2 or .mdd. It must have
 triangles, the same in all frames. The ending of OUTPUT sets the format:
@@ -19,13 +23,13 @@ Vertices keep their order, and coordinates their axes; lengths are metres.
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     parser.add_argument("file", metavar="FILE", help="the animation to convert")
     parser.add_argument("output", metavar="OUTPUT", help="the file to write; its ending sets the format")
     parser.add_argument("--prim", help="path or name of the prim, or name of the geometry in each file, if there are several")
     parser.add_argument("--fps", type=float, help="frames per second (default: those of FILE, if it has them)")
     parser.add_argument("--rest", metavar="FILE", help="mesh with the triangles of an .npy, .pc2 or .mdd file")
-    parser.add_argument("--json", action="store_true", help="print the result as one JSON object")
+    add_shared(parser, "json")
 
 
 def convert(arguments):
@@ -34,11 +38,8 @@ def convert(arguments):
 
     check_writable(arguments.output)
     rest = None if arguments.rest is None else Surface.load(arguments.rest)
-    progress = _Writing()
-    try:
+    with closing(Counter("writing", "frames")) as progress:
         sequence, paths = write(arguments.file, arguments.output, arguments.prim, arguments.fps, rest, progress)
-    finally:
-        progress.close()
     facts = {
         "input": arguments.file,
         "frames": len(sequence),
@@ -49,18 +50,6 @@ def convert(arguments):
     }
     print(json_text(facts) if arguments.json else _summary(facts))
     return 0
-
-
-class _Writing(Bar):
-    """Shows the frames written on a terminal."""
-
-    def __init__(self):
-        self.open(None, "reading", "")
-
-    def __call__(self, done, total):
-        if done == 1:
-            self.open(total, "writing", "{n_fmt} of {total_fmt} frames, {remaining} left")
-        self.move(done)
 
 
 def _summary(facts):

@@ -13,12 +13,13 @@ from ..base.limits import refuse_memory
 from ..base.outputs import STAGE_ENDINGS
 from ..base.quiet import find_device
 from ..base.texts import convert, json_text
-from .options import add_values, values_of
+from .options import DOUBLE, add_shared, add_stage, add_values, values_of
 from .setup import named_scene, warn_of_seams
 from .terminal import Progress, check_writable, frames_folder_of, location
 
 _FRAMES, _FPS = 24, 24.0
 
+TEXT = "Deform a mesh by handles, as rigidly as possible (ARAP)."
 EPILOG = """\
 --fix holds vertices where they are. --move moves vertices by the --rotate and --translate that follow it, before the next
 --move. --rotate turns them by DEGREES about AXIS, which passes through (CX, CY, CZ), or through their centroid if that is not
@@ -47,7 +48,7 @@ class _Move:
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     text = "a mesh file, a USD stage, or a scene with moving pins (a name or a .py file)"
     parser.add_argument("mesh", metavar="MESH", help=text)
     hold = "vertices to hold in place; may be repeated"
@@ -58,36 +59,23 @@ def add_arguments(parser):
     parser.add_argument("--rotate", action=_AddRotation, dest="moves", nargs="+", metavar=("DEGREES", "AXIS"), help=turn)
     shift = "translate the vertices of the preceding --move [m]"
     parser.add_argument("--translate", action=_AddTranslation, dest="moves", nargs=3, metavar=("X", "Y", "Z"), help=shift)
-    parser.add_argument(
-        "--frames",
-        type=int,
-        metavar="N",
-        help=f"number of frames after the first (default: {_FRAMES}; for a scene, one per keyframe)",
-    )
+    text = f"number of frames after the first (default: {_FRAMES}; for a scene, one per keyframe)"
+    parser.add_argument("--frames", type=int, metavar="N", help=text)
     parser.add_argument("--fps", type=float, help=f"frames per second (default: that of the stage, else {_FPS:g})")
     parser.add_argument("--prim", help="path or name of the mesh, if the file has several")
     add_values(parser, "-p", "parameter", "parameters of the scene")
-    parser.add_argument(
-        "--weights",
-        choices=("cotangent", "intrinsic", "uniform", "clamped"),
-        default="cotangent",
-        help="weights of the edges (default: cotangent)",
-    )
-    parser.add_argument(
-        "--energy",
-        choices=("spokes", "spokes_and_rims"),
-        default="spokes",
-        help="edges in the ARAP energy of each vertex (default: spokes)",
-    )
+    text = "weights of the edges (default: cotangent)"
+    parser.add_argument("--weights", choices=("cotangent", "intrinsic", "uniform", "clamped"), default="cotangent", help=text)
+    text = "edges in the ARAP energy of each vertex (default: spokes)"
+    parser.add_argument("--energy", choices=("spokes", "spokes_and_rims"), default="spokes", help=text)
     parser.add_argument(
         "--iterations", type=int, default=500, metavar="N", help="maximum number of iterations per frame (default: 500)"
     )
-    parser.add_argument(
-        "--tolerance",
-        type=float,
-        default=1e-6,
-        help="stop when an iteration lowers the energy by less than this fraction (default: 1e-6)",
-    )
+    text = "stop when an iteration lowers the energy by less than this fraction (default: 1e-6)"
+    parser.add_argument("--tolerance", type=float, default=1e-6, help=text)
+    add_shared(parser, "device", "json", "dtype", dtype=DOUBLE)
+    add_stage(parser)
+    add_shared(parser, "single_file")
 
 
 class _AddMove(argparse.Action):

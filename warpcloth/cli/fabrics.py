@@ -4,9 +4,16 @@ from pathlib import Path
 
 from .terminal import aligned
 
+TEXT = "List measured fabrics, their moduli, bending lengths and sources."
 _DRAPE = """\
 * computed, not measured: D as E·t³/12(1 − ν₁₂ν₂₁), and drape % as the coefficient of 'warpcloth measure cusick -p rows=8',
 mean of eight starts. Several of these records drape less than such fabrics do (docs/fabrics.md)."""
+
+
+def add_arguments(parser):
+    """Adds the arguments of this command."""
+    text = "show one fabric, or list those of a file instead: .json of ARCSim, or a .csv table of KES-F or FAST measurements"
+    parser.add_argument("file", metavar="NAME|FILE", nargs="?", help=text)
 
 
 def fabrics(arguments):

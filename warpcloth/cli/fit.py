@@ -9,10 +9,11 @@ from ..base.checks import choice, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, json_text
 from ..picture.figures import PICTURES, check_path
-from .options import add_fabric, add_pins, add_scene, add_solver, add_values
+from .options import DOUBLE, add_fabric, add_pins, add_scene, add_shared, add_solver, add_values
 from .setup import named_scene, solver_facts, solver_line, solver_setup
 from .terminal import check_writable, say
 
+TEXT = "Find parameters with which a scene moves as measured."
 EPILOG = """\
 MEASURED is an animation of the scene's vertices, or of those of --vertices, in their order: a USD stage, a folder of .obj, .ply
 or .off files, a pattern such as "frames/*.obj", an .npz file. Its times count from the start of the scene, and its frames at
@@ -35,7 +36,7 @@ measure'. Each of several needs its standard deviation, NAME=VALUE+-DEVIATION; o
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add_scene(parser)
     add_fabric(parser)
     add_pins(parser)
@@ -47,22 +48,10 @@ def add_arguments(parser):
     parser.add_argument(
         "--points", type=int, metavar="N", help="use at most N vertices of each frame of --capture (default: all)"
     )
-    parser.add_argument(
-        "--reading",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME=VALUE",
-        help='fit what a laboratory\'s device reads from SCENE at rest, such as "drape coefficient=52+-1"',
-    )
-    parser.add_argument(
-        "--start",
-        nargs="+",
-        action="extend",
-        required=True,
-        metavar="NAME=VALUE",
-        help="parameters, such as Spring.stiffness=100, and values above 0 to start from",
-    )
+    text = 'fit what a laboratory\'s device reads from SCENE at rest, such as "drape coefficient=52+-1"'
+    parser.add_argument("--reading", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=text)
+    text = "parameters, such as Spring.stiffness=100, and values above 0 to start from"
+    parser.add_argument("--start", nargs="+", action="extend", required=True, metavar="NAME=VALUE", help=text)
     add_solver(parser, "the solver (default: newton)")
     add_values(parser, "-s", "option", "options of the solver")
     parser.add_argument(
@@ -73,6 +62,7 @@ def add_arguments(parser):
     parser.add_argument("--fps", type=float, help="frames per second of MEASURED; overrides its own")
     parser.add_argument("--frames", type=int, metavar="N", help="use the first N frames of the scene (default: all)")
     parser.add_argument("--plot", metavar="FILE", help=f"plot the residuals over time ({', '.join(PICTURES)})")
+    add_shared(parser, "device", "json", "dtype", dtype=DOUBLE)
 
 
 def fit(arguments):

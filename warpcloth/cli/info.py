@@ -7,10 +7,25 @@ from dataclasses import asdict
 
 from ..base.quiet import find_device
 from ..base.texts import fraction, json_text
-from .options import DEFAULT
+from .options import DEFAULT, add_shared
 from .setup import EPILOG as EPILOG
-from .setup import Chosen, fewest_below, hint_of, named_scene, solver_facts, solver_line, solver_setup
+from .setup import Chosen, add_scene_and_solver, fewest_below, hint_of, named_scene, solver_facts, solver_line, solver_setup
 from .terminal import Progress
+
+TEXT = "Show what a scene contains, and the model that is built from it."
+
+
+def add_arguments(parser):
+    """Adds the arguments of this command."""
+    text = "also show the step and the kernels of this solver (default: none, or newton if -s or --advise is given)"
+    add_scene_and_solver(parser, text)
+    text = "find out whether each term, the precision, the step and the resolution matter to the result"
+    parser.add_argument("--advise", action="store_true", help=text)
+    text = "with --advise: the largest change that does not matter (default: 1%%)"
+    parser.add_argument("--tolerance", metavar="SHARE", help=text)
+    text = "with --advise: number of frames to simulate (default: at most 30)"
+    parser.add_argument("--frames", type=int, metavar="N", help=text)
+    add_shared(parser, "device", "json", "dtype")
 
 
 def info(arguments):
@@ -29,7 +44,7 @@ def info(arguments):
         setup = solver_setup(arguments, scene, device, limits=True)
     else:  # in the precision of a run by default
         setup = Chosen(SOLVERS[DEFAULT].precision_on(device, arguments.dtype))
-    model = setup.model or scene.build(device=device, dtype=setup.dtype)
+    model = scene.build(device=device, dtype=setup.dtype)
     facts = {
         "scene": {
             "name": scene.name,

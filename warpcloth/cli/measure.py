@@ -7,10 +7,11 @@ import numpy as np
 from ..base.outputs import OutputSet, check_apart, check_replaceable
 from ..base.quiet import find_device
 from ..base.texts import json_text
-from .options import add_fabric
+from .options import add_fabric, add_scene, add_shared
 from .setup import named_scene
 from .terminal import aligned, check_writable, say
 
+TEXT = "Read what a device of a textile laboratory measures."
 EPILOG = """\
 SCENE is cantilever, loop, cusick, strip or picture_frame, all of them with --fabric NAME. The sample is at rest: there is no
 motion. With -o the shape is written as .npz, which 'warpcloth render' draws.
@@ -21,9 +22,11 @@ motion. With -o the shape is written as .npz, which 'warpcloth render' draws.
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
+    add_scene(parser)
     add_fabric(parser)
     parser.add_argument("-o", "--output", metavar="FILE", help="also write the shape, as .npz")
+    add_shared(parser, "device", "json")
 
 
 def measure(arguments):

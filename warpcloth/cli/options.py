@@ -6,13 +6,12 @@ Completion parses source files, so that it need not load Warp. Only for the allo
 import argparse
 import contextlib
 import os
-import warnings
 from dataclasses import fields
 from functools import partial
 
 from ..base.extensions import load_extension, load_installed
 from ..base.outputs import STAGE_ENDINGS
-from ..base.texts import WORDS, json_text, kinds_of_parameter, parameters_of, words_of
+from ..base.texts import WORDS, json_text, kinds_of_parameter, parameters_of, words_in, words_of
 from ..run.listing import folders, list_scenes, list_solvers
 from ..solvers import SOLVERS
 from .terminal import aligned
@@ -42,16 +41,19 @@ def show_help(arguments):
 def _of_solver(name):
     name = name or DEFAULT
     record = SOLVERS[name]
-    found = _listed(f"-s of {name}", record.__doc__, record, parameters_of(record))
+    known = {field.name: str(field.metadata["range"]) for field in fields(record) if "range" in field.metadata}
     error = " or error (tolerance [m])" if "error" in record.step_options else ""
-    return found | {"note": f"give dt (the step [s]) or substeps (steps per frame){error}, or none, for which a step is chosen"}
+    note = f"give dt (the step [s]) or substeps (steps per frame){error}, or none, for which a step is chosen"
+    return _listed(f"-s of {name}", record.__doc__, parameters_of(record), known) | {"note": note}
 
 
 def _of_scene(name):
     from ..run.scene_files import find_source
+    from ..scene.measured_fabrics import fabrics
 
     source = find_source(name)
-    return _listed(f"-p of {source.path}", source.function.__doc__, source.function, source.parameters)
+    known = {"fabric": f"one of {', '.join(fabrics)}"}
+    return _listed(f"-p of {source.path}", source.function.__doc__, source.parameters, known)
 
 
 def _scene_name(arguments):
@@ -61,13 +63,14 @@ def _scene_name(arguments):
     return name
 
 
-def _listed(title, doc, call, parameters):
+def _listed(title, doc, parameters, known):
+    """Returns the options of a solver or a scene as JSON values; ``known`` are the allowed values, by name, of some."""
     rows = [
         {
             "name": name,
             "default": None if parameter.default is parameter.empty else parameter.default,
             "needed": parameter.default is parameter.empty,
-            "allowed": _allowed(call, name, parameter),
+            "allowed": _allowed(parameter, known.get(name)),
         }
         for name, parameter in parameters.items()
     ]
@@ -92,25 +95,14 @@ def _values(row):
     return row["allowed"].removesuffix(", or none" if row["default"] is None and not row["needed"] else "")
 
 
-class _Refused:
-    """A value that no option takes, whose error lists the allowed values."""
-
-
-def _allowed(call, name, parameter):
-    """Returns the allowed values: from the error for a value that is refused, or else from the type."""
-    kinds = kinds_of_parameter(parameter)
-    refused = "?" if str in kinds else _Refused()
-    rule = ""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            call(**{name: refused})
-    except Exception as error:
-        said, _, rule = str(error).partition("; it must be ")
-        rule = rule if said.startswith(f"{name} is ") else ""
-    if not rule:
-        rule = " or ".join(words for kind, words in WORDS.items() if kind in kinds) or "nothing written as text"
-    return rule.replace("'", "") + (", or none" if type(None) in kinds else "")
+def _allowed(parameter, text):
+    """Returns the allowed values: ``text`` if it is not None, else the words or the types of its annotation."""
+    kinds, words = kinds_of_parameter(parameter), words_in(parameter.annotation)
+    if text is None and words:
+        text = f"one of {', '.join(map(str, words))}"
+    if text is None:
+        text = " or ".join(words for kind, words in WORDS.items() if kind in kinds) or "nothing written as text"
+    return text.replace("'", "") + (", or none" if type(None) in kinds else "")
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -121,6 +113,33 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         for action in first:
             self._prog += f" {self._format_args(action, action.dest.upper())}"
         super().add_usage(usage, [action for action in actions if action not in first], groups, prefix)
+
+
+# The options that several commands have, by the names of their values, as arguments of `add_argument`. The words of dtype are
+# those of :data:`warpcloth.model.precision.DTYPES`, which loads Warp.
+_SHARED = {
+    "debug": {"action": "store_true", "help": "show the traceback of an error"},
+    "device": {"default": "cpu", "help": "cpu (default), cuda:0, …"},
+    "json": {"action": "store_true", "help": "print the result as one JSON object"},
+    "dtype": {"choices": ("float32", "float64"), "help": "precision (default: by device and solver)"},
+    "single_file": {"action": "store_true", "help": "write one file instead of a file and a folder of frames"},
+}
+
+
+def add_shared(parser, *names, **changes):
+    """Adds options that several commands have; ``changes`` are changed arguments of `add_argument` by name of the option."""
+    for name in names:
+        parser.add_argument(f"--{name.replace('_', '-')}", **_SHARED[name] | changes.get(name, {}))
+
+
+# The changes to ``dtype`` of commands that compute in float64 by default.
+DOUBLE = {"default": "float64", "help": "precision (default: float64)"}
+
+
+def add_stage(parser):
+    """Adds the option that names a stage to write, which the command needs."""
+    text = "the .usd, .usda, .usdc or .usdz file to write"
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
 
 
 def values_of(arguments, *names):
@@ -136,14 +155,8 @@ def add_solver(parser, text):
 
 def add_with(parser):
     """Adds the option that names other simulators."""
-    parser.add_argument(
-        "--with",
-        dest="others",
-        nargs="+",
-        metavar="SIMULATOR",
-        choices=_SIMULATORS,
-        help="measure other simulators too: newton (the physics engine), pbd (pyPBD), uipc (libuipc); extras install them",
-    )
+    text = "measure other simulators too: newton (the physics engine), pbd (pyPBD), uipc (libuipc); extras install them"
+    parser.add_argument("--with", dest="others", nargs="+", metavar="SIMULATOR", choices=_SIMULATORS, help=text)
 
 
 def add_scene(parser, **more):
@@ -261,8 +274,8 @@ def _scene_words(prefix, parsed_args, **_):
     name, sign, _value = prefix.partition("=")
     scene = _scene_name(parsed_args)
     if sign:
-        (rule,) = [row["allowed"] for row in _of_scene(scene)["rows"] if row["name"] == name] or [""]
-        words = rule.removeprefix("one of ").split(", ") if rule.startswith("one of ") else []
+        (text,) = [row["allowed"] for row in _of_scene(scene)["rows"] if row["name"] == name] or [""]
+        words = text.removeprefix("one of ").split(", ") if text.startswith("one of ") else []
         return _words(prefix, {name: [word.removeprefix("or ") for word in words]})
     listed = {listed.name: listed for folder in folders()[::-1] for listed in list_scenes(folder)}
     known = listed[scene].parameters if scene in listed else [row["name"] for row in _of_scene(scene)["rows"]]

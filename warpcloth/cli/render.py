@@ -2,6 +2,7 @@
 
 import argparse
 import time
+from contextlib import closing
 from pathlib import Path
 
 from ..base.limits import shown_bytes
@@ -9,10 +10,11 @@ from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
 from .analyze import add_measuring, measuring_of
-from .options import values_of
-from .terminal import Bar, check_writable, own_output
+from .options import add_shared, values_of
+from .terminal import Counter, check_writable, own_output
 
 SIZE = (1280, 720)
+TEXT = "Draw a picture or a film of an animation."
 EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. All meshes and linear curves of
 a stage are drawn. Several FILEs are drawn side by side. The extension of -o selects the format: .png for one frame, .gif, .webp
@@ -26,7 +28,7 @@ or .mp4 for a film in real time (.mp4 needs PyAV: pip install -e '.[video]' in t
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to draw")
     add("beside", metavar="FILE", nargs="*", help="others to draw beside it")
@@ -43,22 +45,33 @@ def add_arguments(parser):
     add("--camera", metavar="PRIM", help="look from this Camera of the stage, a path or a name (default: the whole motion)")
     add("--time", action="store_true", help="write the time into a corner")
     add_measuring(parser)
+    add_shared(parser, "device", "json")
 
 
 def add_camera(parser):
     """Adds the options of the camera and the ground."""
     add = parser.add_argument
     add("--azimuth", type=float, default=-38.0, metavar="DEGREES", help="angle of the camera about the vertical (default: -38)")
-    add(
-        "--elevation",
-        type=float,
-        default=24.0,
-        metavar="DEGREES",
-        help="angle of the camera above the horizontal (default: 24)",
-    )
+    text = "angle of the camera above the horizontal (default: 24)"
+    add("--elevation", type=float, default=24.0, metavar="DEGREES", help=text)
     add("--zoom", type=float, default=1.0, metavar="FACTOR", help="zoom in by this factor (default: 1, the whole motion)")
     add("--ground", type=float, metavar="HEIGHT", help="height of the ground [m] (default: the lowest point of the motion)")
     add("--no-ground", action="store_true", help="draw no ground")
+
+
+def drawing_of(arguments):
+    """Returns the ground, a height or whether there is one, and the options of what is measured for colours.
+
+    Raises:
+        ValueError: Two options exclude one another, or one needs another.
+    """
+    if arguments.no_ground and arguments.ground is not None:
+        raise ValueError("--ground and --no-ground are given; give one of them")
+    measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
+    if arguments.colour is None:
+        for name in (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else [])):
+            raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    return not arguments.no_ground if arguments.ground is None else arguments.ground, measuring
 
 
 def size(text):
@@ -86,12 +99,7 @@ def render(arguments):
 
     files = [arguments.file, *arguments.beside]
     arguments.output = own_output(Path(arguments.file).stem, ".png") if arguments.output is None else arguments.output
-    if arguments.no_ground and arguments.ground is not None:
-        raise ValueError("--ground and --no-ground are given; give one of them")
-    measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
-    if arguments.colour is None:
-        for name in (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else [])):
-            raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    ground, measuring = drawing_of(arguments)
     check_drawing(arguments.output, files, arguments.size)
     device = find_device(arguments.device)
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
@@ -101,7 +109,7 @@ def render(arguments):
         arguments.output,
         mesh=rest,
         measuring=measuring,
-        ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
+        ground=ground,
         device=device.alias,
         **values_of(arguments, "prim", "fps", "up_axis", "frame", "frames", "every", "speed", "size", "samples", "time"),
         **values_of(arguments, "colour", "colour_range", "colormap", "azimuth", "elevation", "zoom", "camera"),
@@ -134,26 +142,9 @@ def draw_film(source, output, **options):
     """Draws by :func:`warpcloth.render` with a progress bar on a terminal; returns the number of pictures."""
     from ..picture.render import render
 
-    progress = _Drawing()
-    try:
+    with closing(Counter("drawing", "pictures")) as progress:
         render(source, output, progress=progress, **options)
-    finally:
-        progress.close()
-    return progress.pictures
-
-
-class _Drawing(Bar):
-    """Counts the pictures of a film, and shows them on a terminal."""
-
-    def __init__(self):
-        self.pictures = 0
-        self.open(None, "reading", "")
-
-    def __call__(self, done, total):
-        self.pictures = done
-        if done == 0:
-            self.open(total, "drawing", "{n_fmt} of {total_fmt} pictures, {remaining} left")
-        self.move(done)
+    return progress.done
 
 
 def _summary(facts):

@@ -57,44 +57,61 @@ class Report:
     scale: tuple[float, float] | None = None
 
 
-def write_report(
-    analyzer,
-    usd=None,
-    csv=None,
-    json=None,
-    npz=None,
-    plot=None,
-    stills=None,
-    colour=None,
-    colour_range=None,
-    curves=False,
-    single_file=False,
-    up_axis=None,
-    progress=None,
-    view=None,
-    both_sides=False,
-    colormap=None,
-):
+@dataclass(frozen=True)
+class ReportFiles:
+    """The files of a report, each a path, or None for no such file.
+
+    Attributes:
+        usd: A stage, a layer over the measured stage if there is one: each scalar as a primvar, and one as colour.
+        csv: A table with a line for each row and scalar, see :class:`warpcloth.analysis.summaries.CsvWriter`.
+        json: The same data as one object, with the exclusions.
+        npz: The measures as arrays, (rows, E, *shape).
+        plot: A picture of the percentiles over time, .png, .svg or .pdf.
+        stills: Pictures, .png, by number of the frame.
+        single_file: Whether the stage is one file, see :class:`warpcloth.usd.AnimationWriter`.
+        up_axis: "Y" or "Z", for inputs that have none.
+    """
+
+    usd: str | None = None
+    csv: str | None = None
+    json: str | None = None
+    npz: str | None = None
+    plot: str | None = None
+    stills: dict | None = None
+    single_file: bool = False
+    up_axis: str | None = None
+
+
+@dataclass(frozen=True)
+class ReportLooks:
+    """The looks of the stage and the pictures of a report.
+
+    Attributes:
+        colour: The scalar to show, such as "stretch_1"; by default the first; "none" for a stage without colours.
+        colour_range: (low, high) of its colours; by default from the smallest 1st percentile to the largest 99th of all rows,
+            symmetric about the value without deformation, if there is one.
+        colormap: Name of a colour map of matplotlib, or None, see :class:`warpcloth.picture.colour.Scale`.
+        curves: Whether they show the principal directions, with their stretches as lengths.
+        view: The :class:`warpcloth.picture.projection.View` of the stills, or None; its up axis is that of the animation.
+        both_sides: Whether stills also show the opposite side of the cloth, see :func:`warpcloth.picture.picture.draw`.
+    """
+
+    colour: str | None = None
+    colour_range: tuple[float, float] | None = None
+    colormap: str | None = None
+    curves: bool = False
+    view: object = None
+    both_sides: bool = False
+
+
+def write_report(analyzer, files, looks=ReportLooks(), progress=None):
     """Measures and writes all rows of an analysis, in constant memory but for the percentiles of the plot.
 
     Args:
         analyzer: The :class:`warpcloth.Analyzer`.
-        usd: Path of a stage, a layer over the measured stage if there is one: each scalar as a primvar, and one as colour.
-        csv: Path of a table with a line for each row and scalar, see :class:`warpcloth.analysis.summaries.CsvWriter`.
-        json: Path of the same data as one object, with the exclusions.
-        npz: Path of the measures as arrays, (rows, E, *shape).
-        plot: Path of a picture of the percentiles over time, .png, .svg or .pdf.
-        stills: Paths of pictures, .png, by number of the frame.
-        colour: The scalar to show, such as "stretch_1"; by default the first; "none" for a stage without colours.
-        colour_range: (low, high) of its colours; by default from the smallest 1st percentile to the largest 99th of all rows,
-            symmetric about the value without deformation, if there is one.
-        curves: Whether stage and pictures show the principal directions, with their stretches as lengths.
-        single_file: Whether the stage is one file, see :class:`warpcloth.usd.AnimationWriter`.
-        up_axis: "Y" or "Z", for inputs that have none.
+        files: The :class:`ReportFiles`.
+        looks: The :class:`ReportLooks`.
         progress: Function called with (row, rows) after each row, or None.
-        view: The :class:`warpcloth.picture.projection.View` of the stills, or None; its up axis is that of the animation.
-        both_sides: Whether stills also show the opposite side of the cloth, see :func:`warpcloth.picture.picture.draw`.
-        colormap: Name of a colour map of matplotlib, or None, see :class:`warpcloth.picture.colour.Scale`.
 
     Returns:
         :class:`Report`.
@@ -103,9 +120,11 @@ def write_report(
         ValueError: There is no such scalar or frame, ``curves`` is given without the measures "stretch" and "directions", a
             file is given twice or is the input, or a writer refuses its file.
     """
+    usd, csv, json, npz, plot, stills = files.usd, files.csv, files.json, files.npz, files.plot, files.stills
+    colour, colormap = looks.colour, looks.colormap
     listed = {name: measure for measure in analyzer.measures for name in scalar_names(measure)}
     report = Report(extremes={name: Extremes() for name in listed})
-    _check(analyzer, listed, usd, stills, colour, curves)
+    _check(analyzer, listed, usd, stills, colour, looks.curves)
     if colormap is not None:
         from ..picture.colour import check_colormap
 
@@ -114,7 +133,7 @@ def write_report(
     check_apart([usd, csv, json, npz, plot, *(stills or {}).values()], analyzer.sequence.files)
     if (usd or stills) and colour != "none" and (stills or colour or _can_colour()):
         report.coloured = colour or next(iter(listed))
-        scale = scale_of([analyzer], report.coloured, listed[report.coloured], colour_range)
+        scale = scale_of([analyzer], report.coloured, listed[report.coloured], looks.colour_range)
         report.scale = scale.low, scale.high
     kept, opened = [], []
     with _interruptible(report, len(analyzer), opened), ExitStack() as stack:
@@ -125,8 +144,7 @@ def write_report(
         opened += filter(None, (*writers, archive))
         shown = None
         if usd or stills:
-            looks = view, both_sides, colormap
-            shown = _Shown(analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack)
+            shown = _Shown(analyzer, report, listed, files, looks, stack)
             opened += filter(None, [shown.writer])
         try:
             for sample in analyzer:
@@ -231,9 +249,9 @@ def _count(analyzer, name):
     return next(measure.shape[0] for measure in analyzer.measures if measure.name == name)
 
 
-def _rate(sequence):
-    """Returns frame numbers per second; 24 if there are no times."""
-    if sequence.times is None or len(sequence) < 2:
+def codes_per_second(sequence):
+    """Returns frame numbers per second of a sequence or of cloths; 24 if there are no times."""
+    if sequence.times is None or len(sequence.labels) < 2:
         return 24.0
     return float((sequence.labels[-1] - sequence.labels[0]) / (sequence.times[-1] - sequence.times[0]))
 
@@ -255,29 +273,28 @@ def _archive(analyzer, path):
 class _Shown:
     """Writes the stage and the pictures, coloured by one scalar on one scale."""
 
-    def __init__(self, analyzer, report, listed, usd, stills, curves, single_file, up_axis, looks, stack):
-        view, self.both_sides, colormap = looks
-        self.analyzer, self.name, self.curves, self.stills = analyzer, report.coloured, curves, stills or {}
+    def __init__(self, analyzer, report, listed, files, looks, stack):
+        self.analyzer, self.name, self.looks, self.stills = analyzer, report.coloured, looks, files.stills or {}
         self.over, self.scale, metadata = analyzer.sequence.stage is not None, None, {"analysis": _input(analyzer)}
         if self.name:
             from ..chart import Scale
 
             self.unit = listed[self.name].unit
-            self.scale = Scale(*report.scale, neutral_of(listed[self.name]), colormap)
+            self.scale = Scale(*report.scale, neutral_of(listed[self.name]), looks.colormap)
             metadata["legend"] = self.scale.legend(self.name, self.unit)
         areas = analyzer.mesh.triangle_areas
         areas = areas[np.isfinite(areas) & (areas > 0.0)]  # others have no segments
         self.length = _SEGMENT * np.sqrt(np.median(areas)) if len(areas) else 0.0
         sequence = analyzer.sequence
-        up_axis = sequence.up_axis or up_axis or analyzer.mesh.up_axis or "Y"
+        up_axis = sequence.up_axis or files.up_axis or analyzer.mesh.up_axis or "Y"
         if self.stills:
             from ..chart import View
 
             frames = {pair.frame for pair in analyzer.pairs if sequence.labels[pair.frame] in self.stills}
-            view = replace(view or View(), up_axis=up_axis)
+            view = replace(looks.view or View(), up_axis=up_axis)
             self.view = view.fit(sequence[frame] for frame in sorted(frames))
-        self.writer, self.rate = None, _rate(sequence)
-        if usd:
+        self.writer, self.rate = None, codes_per_second(sequence)
+        if files.usd:
             from ..usd import MeasureWriter
 
             lost = np.flatnonzero(~np.isfinite(analyzer.mesh.points).all(axis=1))
@@ -289,9 +306,9 @@ class _Shown:
                 )
 
             kind = "uniform" if analyzer.on == "triangle" else "vertex"
-            names = [f"principal{k + 1}" for k in range(_count(analyzer, "stretch"))] if curves else []
+            names = [f"principal{k + 1}" for k in range(_count(analyzer, "stretch"))] if looks.curves else []
             self.writer = MeasureWriter(
-                usd,
+                files.usd,
                 analyzer.mesh if sequence.stage is None else sequence.mesh,
                 {camel_case(name): kind for name in listed},
                 coloured=camel_case(self.name) if self.name else None,
@@ -301,11 +318,11 @@ class _Shown:
                 up_axis=up_axis,
                 metadata=metadata,
             )
-            stack.callback(self.writer.close, single_file=single_file)
+            stack.callback(self.writer.close, single_file=files.single_file)
 
     def append(self, sample, values, positions):
         """Adds a row, whose scalars (E,) are ``values``."""
-        segments = self._segments(sample, positions) if self.curves else None
+        segments = self._segments(sample, positions) if self.looks.curves else None
         finite = np.isfinite(sample.points).all()
         if self.writer and (self.over or finite):  # only a layer over a stage may lack points
             primvars = {camel_case(name): _single(numbers) for name, numbers in values.items()}
@@ -326,7 +343,7 @@ class _Shown:
                 unit=self.unit,
                 view=self.view,
                 directions=segments,
-                both_sides=self.both_sides,
+                both_sides=self.looks.both_sides,
             )
 
     def _time_code(self, sample):

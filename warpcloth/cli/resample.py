@@ -9,10 +9,11 @@ import numpy as np
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
-from .options import add_values, values_of
+from .options import add_shared, add_stage, add_values, values_of
 from .setup import named_scene
 from .terminal import Progress, check_writable, frames_folder_of, location
 
+TEXT = "Move a mesh onto each frame of a capture, so that its triangles stay."
 EPILOG = """\
 CAPTURE is a folder of .obj, .ply, .off, .stl or .glb files, or a pattern such as "scan/*.ply", of meshes that may change from
 frame to frame, with noise and holes; or an animation. The template is a mesh file or a stage, which must lie near the first
@@ -28,7 +29,7 @@ captureObserved, 1 if it faces the capture.
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     parser.add_argument("capture", metavar="CAPTURE", help="a folder or pattern of mesh files, or an animation")
     parser.add_argument("--onto", required=True, metavar="TEMPLATE", help="the mesh to move: a mesh file, a stage or a scene")
     add_values(parser, "-p", "parameter", "parameters of the scene")
@@ -45,6 +46,9 @@ def add_arguments(parser):
     parser.add_argument("--iterations", type=int, default=60, metavar="N", help=text)
     text = "stop when no vertex moves by more than this share of the diagonal (default: 1e-5)"
     parser.add_argument("--tolerance", type=float, default=1e-5, help=text)
+    add_shared(parser, "device", "json")
+    add_stage(parser)
+    add_shared(parser, "single_file")
 
 
 def resample(arguments):

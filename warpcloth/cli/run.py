@@ -8,18 +8,47 @@ from ..base.quiet import find_device
 from ..base.texts import json_text
 from .history_files import EPILOG as OF_HISTORY
 from .history_files import record_of, write_history
-from .options import values_of
+from .options import add_shared, values_of
 from .render import check_drawing, draw_film
 from .setup import EPILOG as OF_STEPS
-from .setup import Built, hint_of, named_scene, solver_facts, solver_line, solver_setup, warn_of_seams
+from .setup import add_scene_and_solver, hint_of, named_scene, solver_facts, solver_line, solver_setup, warn_of_seams
 from .terminal import Progress, check_writable, frames_folder_of, location, own_output, say
 
+TEXT = "Run a scene and write its animation as USD."
 EPILOG = f"""\
   warpcloth run hanging --solver xpbd -s substeps=20 -p n=24 -o xpbd.usdc
   warpcloth run mine.obj --scale 0.01 --pins boundary --fabric cotton
 
 {OF_STEPS}
 {OF_HISTORY}"""
+
+
+def add_arguments(parser):
+    """Adds the arguments of this command."""
+    add = parser.add_argument
+    add_scene_and_solver(parser, "the solver (default: newton)")
+    add(
+        "--tolerance",
+        metavar="SHARE",
+        help="find the cheapest solver and settings with at most this error, such as 1%% of the size of the cloth, and run "
+        "with them; this takes many trial runs, see 'warpcloth choose'",
+    )
+    text = "find the most accurate solver and settings within this time per frame, such as 16ms, and run with them"
+    add("--budget", metavar="TIME", help=text)
+    text = "number of frames after the start (default: those of the scene's duration)"
+    add("--frames", type=int, metavar="N", help=text)
+    add_shared(parser, "device", "json", "dtype")
+    text = (
+        "the .usd, .usda, .usdc or .usdz file to write (default: named after the scene, such as hanging.usdc; an existing "
+        "file is then not replaced)"
+    )
+    add("-o", "--output", metavar="FILE", help=text)
+    add("--film", metavar="FILE", help="also draw the run as a film, .mp4, .webp or .gif; see 'warpcloth render'")
+    add("--csv", metavar="FILE", help="also write a table of energies and forces, one row per frame")
+    add("--report", metavar="FILE", help="also write energies, forces and the reaction of each pin as JSON")
+    text = "continue the interrupted run to this output from its last checkpoint; there is one every ten frames"
+    add("--resume", action="store_true", help=text)
+    add_shared(parser, "single_file")
 
 
 def run(arguments):
@@ -41,14 +70,14 @@ def run(arguments):
     progress = Progress(frames, hint_of(arguments, setup, scene))
     with progress.of(arguments.output):
         animation = simulate(
-            scene if setup.model is None else Built(scene, setup.model),
+            scene,
             setup.checked,
             device=device,
             frames=frames,
             progress=progress,
             dtype=setup.dtype,
             record=record,
-            **values_of(arguments, "output", "single_file", "resume", "threads"),
+            **values_of(arguments, "output", "single_file", "resume"),
         )
         progress.close()
         status = animation.status
@@ -84,7 +113,7 @@ def run(arguments):
             "dtype": setup.dtype,
             "file": arguments.output,
             "frames_folder": frames_folder_of(arguments),
-            **values_of(arguments, "threads", "film", "csv", "report"),
+            **values_of(arguments, "film", "csv", "report"),
         }
         print(json_text(facts) if arguments.json else _summary(facts, animation.inside, animation.forced))
         if status.ok:
@@ -114,7 +143,7 @@ def _lines_of(found):
 def _summary(facts, inside, forced):
     from ..core.status import digits
 
-    threads, measured = facts["threads"], facts["residual_measure"] is not None
+    measured = facts["residual_measure"] is not None
     residual = f"{digits(facts['residual'])} {facts['residual_unit']}" if measured else "none, the method does not compute one"
     touching = facts.get("self_contact")
     cut = [f"  cut short     {100.0 * facts['cut']:.3g} % of the moves of vertices, by contact"] if "cut" in facts else []
@@ -130,7 +159,7 @@ def _summary(facts, inside, forced):
             *(_lines_of(touching) if touching else ()),
             f"  residual      {residual}",
             f"  solver        {solver_line(facts)}",
-            f"  device        {facts['device']}, {facts['dtype']}" + (f", {threads} threads" if threads > 1 else ""),
+            f"  device        {facts['device']}, {facts['dtype']}",
             f"  file          {location(facts)}",
             *(f"  {name:<13} {facts[name]}" for name in ("film", "csv", "report") if facts[name]),
         ]

@@ -2,6 +2,14 @@
 
 from ..run.listing import folders, list_scenes
 
+TEXT = "List scenes and their parameters."
+
+
+def add_arguments(parser):
+    """Adds the arguments of this command."""
+    text = "a folder of scene files (default: ./scenes and the included scenes)"
+    parser.add_argument("folder", metavar="FOLDER", nargs="?", help=text)
+
 
 def scenes(arguments):
     found = [arguments.folder] if arguments.folder else folders()

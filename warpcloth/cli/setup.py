@@ -6,7 +6,7 @@ import warnings
 from dataclasses import asdict, dataclass, replace
 
 from ..base.texts import assignments, options
-from .options import DEFAULT
+from .options import DEFAULT, add_cloth, add_scene, add_solver, add_values
 
 # With more substeps per frame than this, print a hint at the implicit solver.
 _MANY_SUBSTEPS = 1000
@@ -17,6 +17,14 @@ explicit, take the fewest substeps that respect two limits. The first, with a ma
 rest shape. The second is for large motion. It is a strict bound for springs and quadratic bending, but only an estimate for
 dihedral bending and membranes, because it uses their stiffness at rest.
 """
+
+
+def add_scene_and_solver(parser, text):
+    """Adds the scene and the solver of a command; ``text`` says what the solver is for."""
+    add_scene(parser)
+    add_solver(parser, text)
+    add_values(parser, "-s", "option", "options of the solver")
+    add_cloth(parser)
 
 
 def named_scene(arguments):
@@ -63,39 +71,23 @@ def warn_of_seams(mesh, scene=None):
 
 @dataclass
 class Chosen:
-    """A solver, with the model that was built to choose its step.
+    """A solver, and how its step was chosen.
 
     Attributes:
         dtype: The precision of the run.
         solver: The solver with its options, as shown.
         checked: The solver to run, without a check of limits that are known to hold.
         chosen: How its step was chosen, or None if it was given.
-        model: The model of the scene, if it is built.
         limits: The result of ``step_limits``, if it was computed.
-        seconds: Time to build the model and compute the limits [s].
+        seconds: Time to build a model and compute the limits [s].
     """
 
     dtype: str
     solver: object = None
     checked: object = None
     chosen: str | None = None
-    model: object = None
     limits: tuple | None = None
     seconds: float = 0.0
-
-
-class Built:
-    """A scene whose model is already built."""
-
-    def __init__(self, scene, model):
-        self._scene, self._model = scene, model
-
-    def __getattr__(self, name):
-        return getattr(self._scene, name)
-
-    def build(self, **_):
-        """Returns the model, which has the device and precision of the command."""
-        return self._model
 
 
 def solver_setup(arguments, scene, device, limits=False):
@@ -116,9 +108,8 @@ def solver_setup(arguments, scene, device, limits=False):
     from ..solvers.step import fewest_substeps
 
     began = time.perf_counter()
-    model = scene.build(device=device, dtype=dtype, order=order_of_run(scene, solver), threads=getattr(arguments, "threads", 1))
-    rest, motion = record.step_limits(model)
-    setup = Chosen(dtype, solver, solver, None, model, (rest, motion), time.perf_counter() - began)
+    rest, motion = record.step_limits(scene.build(device=device, dtype=dtype, order=order_of_run(scene, solver)))
+    setup = Chosen(dtype, solver, solver, None, (rest, motion), time.perf_counter() - began)
     if not step_given:
         setup.solver = replace(solver, substeps=fewest_substeps(scene.fps, rest, motion))
         setup.chosen = f"by default the fewest stable ones, limits {rest:.3g} and {motion:.3g} s"

@@ -6,9 +6,9 @@ from ..base.checks import did_you_mean, number, whole
 from ..base.quiet import find_device
 from ..base.texts import assignments, convert, json_text, options
 from ..lab.axes import ACCURACY, AXES, FIXED, SEED
-from .options import add_cloth, add_scene, values_of
+from .options import DOUBLE, add_cloth, add_scene, add_shared, values_of
 from .setup import scene_ref
-from .terminal import DTYPES, check_outputs, measuring
+from .terminal import check_outputs, measuring
 
 _COUNT = 9
 
@@ -49,42 +49,25 @@ def add_arguments(parser):
     add_cloth(parser)
     for of in "xy":
         parser.add_argument(f"--{of}", required=True, choices=AXES, metavar="AXIS", help=f"quantity on the {of} axis")
-        parser.add_argument(
-            f"--{of}-range",
-            nargs=3,
-            metavar=("LOW", "HIGH", "N"),
-            help="lowest value, highest value and number of values, spaced logarithmically (compression: evenly; "
-            "default: depends on the axis, see 'warpcloth chart stability --help')",
+        text = (
+            "lowest value, highest value and number of values, spaced logarithmically (compression: evenly; "
+            "default: depends on the axis, see 'warpcloth chart stability --help')"
         )
-    parser.add_argument(
-        "--at",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="axis=value",
-        help="values of axes that are not drawn, such as dt=1/60",
-    )
-    parser.add_argument(
-        "--solvers",
-        nargs="+",
-        metavar="SOLVER",
-        help="solvers, each with options if wanted, such as xpbd:sweep=sequential,iterations=5 (default: all)",
-    )
+        parser.add_argument(f"--{of}-range", nargs=3, metavar=("LOW", "HIGH", "N"), help=text)
+    text = "values of axes that are not drawn, such as dt=1/60"
+    parser.add_argument("--at", nargs="+", action="extend", default=[], metavar="axis=value", help=text)
+    text = "solvers, each with options if wanted, such as xpbd:sweep=sequential,iterations=5 (default: all)"
+    parser.add_argument("--solvers", nargs="+", metavar="SOLVER", help=text)
     parser.add_argument(
         "--duration", type=float, metavar="SECONDS", help="simulated time that is compared (default: half of the scene's)"
     )
     parser.add_argument(
         "--steps", type=int, default=120, metavar="N", help="minimum number of steps of each run (default: 120)"
     )
-    parser.add_argument(
-        "--accuracy",
-        type=float,
-        default=ACCURACY,
-        metavar="SHARE",
-        help=f"runs with a larger error are inaccurate (default: {ACCURACY:g}); 0 measures no errors",
-    )
+    text = f"runs with a larger error are inaccurate (default: {ACCURACY:g}); 0 measures no errors"
+    parser.add_argument("--accuracy", type=float, default=ACCURACY, metavar="SHARE", help=text)
     parser.add_argument("--limit", type=float, default=60.0, metavar="SECONDS", help="time limit of each run (default: 60)")
-    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default: float64)")
+    add_shared(parser, "dtype", dtype=DOUBLE)
 
 
 def chart(arguments):

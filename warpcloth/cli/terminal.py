@@ -14,8 +14,6 @@ from ..base.interrupts import Interrupted
 from ..base.outputs import check_apart, check_replaceable
 from ..picture.figures import PICTURES, check_path
 
-# The same as :data:`warpcloth.model.precision.DTYPES`, which loads Warp.
-DTYPES = ("float32", "float64")
 _STREAMS = {1: "stdout", 2: "stderr"}
 # Unicode categories to escape: control, format (which can reverse text), surrogates, line ends.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
@@ -125,6 +123,20 @@ def measuring(arguments, device):
         raise Interrupted(progress.interrupted()) from None
     finally:
         progress.close()
+
+
+class Counter(Bar):
+    """Counts what a command makes, such as frames that it writes, and shows it on a terminal, after its input is read."""
+
+    def __init__(self, text, of):
+        self.text, self.of, self.done, self.total = text, of, 0, None
+        self.open(None, "reading", "")
+
+    def __call__(self, done, total):
+        if self.total is None:
+            self.open(total, self.text, f"{{n_fmt}} of {{total_fmt}} {self.of}, {{remaining}} left")
+        self.done, self.total = done, total
+        self.move(done)
 
 
 class Settings(Bar):

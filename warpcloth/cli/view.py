@@ -1,17 +1,19 @@
 """The command ``view``: writes a page that shows an animation in a browser."""
 
 import time
+from contextlib import closing
 from pathlib import Path
 
 from ..base.limits import shown_bytes
 from ..base.outputs import check_apart
 from ..base.quiet import find_device
 from ..base.texts import json_text
-from .analyze import add_measuring, measuring_of
-from .options import values_of
-from .render import add_camera, frames
-from .terminal import Bar, check_writable, own_output
+from .analyze import add_measuring
+from .options import add_shared, values_of
+from .render import add_camera, drawing_of, frames
+from .terminal import Counter, check_writable, own_output
 
+TEXT = "Write a page that shows an animation in a browser."
 EPILOG = """\
 FILE is a USD stage, a mesh file, a folder or pattern of mesh files, or arrays in .npz or .npy. The page is one file of HTML
 that loads nothing else: open it in a browser. It plays in real time and turns by the mouse. Positions are stored with 16 bits,
@@ -24,23 +26,22 @@ values with 8: the page is for looking, not for measuring. Colours need matplotl
 
 
 def add_arguments(parser):
-    """Adds the arguments of this command, without those of all commands."""
+    """Adds the arguments of this command."""
     add = parser.add_argument
     add("file", metavar="FILE", help="the animation or mesh to show")
     text = "the .html file to write (default: named after FILE; no file is then replaced)"
     add("-o", "--output", metavar="FILE", help=text)
     add("--frames", type=frames, metavar="A:B", help="the first and the last frame (default: all)")
     add("--every", type=int, default=1, metavar="K", help="show only every K-th frame")
-    add(
-        "--colour",
-        metavar="NAME",
-        action="append",
-        help="a measured value that the page can show as colour, such as area_ratio; may be given more than once "
-        "(default: stretch_1 and stretch_2, and the page opens with plain cloth)",
+    text = (
+        "a measured value that the page can show as colour, such as area_ratio; may be given more than once "
+        "(default: stretch_1 and stretch_2, and the page opens with plain cloth)"
     )
+    add("--colour", metavar="NAME", action="append", help=text)
     add("--plain", action="store_true", help="measure nothing, so that the page is smaller")
     add_camera(parser)
     add_measuring(parser)
+    add_shared(parser, "device", "json")
 
 
 def view(arguments):
@@ -48,15 +49,9 @@ def view(arguments):
     from ..picture.pages import check_page
     from ..picture.pages import view as write_page
 
-    if arguments.no_ground and arguments.ground is not None:
-        raise ValueError("--ground and --no-ground are given; give one of them")
     if arguments.plain and arguments.colour:
         raise ValueError("--plain and --colour are given; give one of them")
-    measuring = {name: value for name, value in measuring_of(arguments).items() if value not in (None, "midpoint")}
-    if arguments.colour is None:
-        given = (*measuring, *(["range"] if arguments.colour_range else []), *(["colormap"] if arguments.colormap else []))
-        for name in given:
-            raise ValueError(f"--{name} is given without --colour, the name of what is measured")
+    ground, measuring = drawing_of(arguments)
     arguments.output = own_output(Path(arguments.file).stem, ".html") if arguments.output is None else arguments.output
     check_page(arguments.output)
     check_apart([arguments.output], [arguments.file, arguments.rest])
@@ -64,46 +59,29 @@ def view(arguments):
     device = find_device(arguments.device)
     rest = None if arguments.rest is None else Surface.load(arguments.rest, arguments.rest_prim)
     started = time.perf_counter()
-    progress = _Coding()
-    try:
+    with closing(Counter("coding", "frames")) as progress:
         write_page(
             arguments.file,
             arguments.output,
             mesh=rest,
             colours=() if arguments.plain else arguments.colour,
             measuring=measuring or None,
-            ground=not arguments.no_ground if arguments.ground is None else arguments.ground,
+            ground=ground,
             device=device.alias,
             progress=progress,
             **values_of(arguments, "prim", "fps", "up_axis", "frames", "every", "colour_range", "colormap"),
             **values_of(arguments, "azimuth", "elevation", "zoom"),
         )
-    finally:
-        progress.close()
     facts = {
         "input": arguments.file,
         "file": arguments.output,
-        "frames": progress.frames,
+        "frames": progress.done,
         "bytes": Path(arguments.output).stat().st_size,
         "seconds": time.perf_counter() - started,
         "device": device.alias,
     }
     print(json_text(facts) if arguments.json else _summary(facts))
     return 0
-
-
-class _Coding(Bar):
-    """Counts the frames of a page, and shows them on a terminal."""
-
-    def __init__(self):
-        self.frames = 0
-        self.open(None, "reading", "")
-
-    def __call__(self, done, total):
-        self.frames = done
-        if done == 0:
-            self.open(total, "coding", "{n_fmt} of {total_fmt} frames, {remaining} left")
-        self.move(done)
 
 
 def _summary(facts):

@@ -4,7 +4,6 @@ import numpy as np
 import warp as wp
 
 from ..base.limits import refuse_memory
-from ..base.turns import in_turn
 from ..core.capture import Mirror
 from ..core.filled import filled
 from ..core.scan import Scan
@@ -15,13 +14,13 @@ from ..kernels.contact.pair_potential import CLOSE
 # The longest move of a vertex in a round of the filter, relative to the common motion, over the skin. A list serves for another
 # round while its sides have approached by less than the rest of the skin. Meshes stand in a round. A round moves a vertex by a
 # 64th less, so that a list serves two rounds despite rounding.
-WAY = 0.25
-ROUND = WAY * 63 / 64
+MAX_MOVE = 0.25
+ROUND = MAX_MOVE * 63 / 64
 # Memory of a listed pair, with its gap, its near face and two keys [bytes].
 BYTES_OF_A_PAIR = 200
 # Edges along a cluster of vertices whose moves have a mean.
 CLUSTER = 8
-MOST = (1 << 28) - 1  # four corners of each of two keys
+MAX_PAIRS = (1 << 28) - 1  # four corners of each of two keys
 
 
 class Proximity:
@@ -52,11 +51,10 @@ class Proximity:
         alike: See :meth:`launch_along` [m].
     """
 
-    @in_turn
     def __init__(self, surface, distance, skin, of_meshes=0.0):
         self.surface, self.model, self.skin = surface, surface.model, skin
         model, device = self.model, self.model.device
-        self.kept = 0.5 * (1.0 - (2.0 if surface.meets_itself else 1.0) * WAY)
+        self.kept = 0.5 * (1.0 - (2.0 if surface.meets_itself else 1.0) * MAX_MOVE)
         self._max_distance = max(distance * surface.meets_itself, of_meshes)
         self._triangles, self._edges, self._vertices = surface.triangles, surface.edges, surface.count
         self.pieces, points = self._connected(model.in_model(model.scene.mesh.edges))
@@ -92,6 +90,7 @@ class Proximity:
         self._near = self.searches(kernels.take_near, "near")
         self._launch = model.launcher(
             ((proximity_grid.bound_cloth, proximity_grid.count_items, proximity_grid.fill_buckets), model.dtype),
+            ((proximity_grid.note_large,), model.dtype),
             ((kernels.write_pairs,), model.dtype),
             ((piece_motion.extend_boxes, piece_motion.find_drift, piece_motion.compare_positions), model.dtype),
             ((piece_motion.find_motion, piece_motion.compare_motions, piece_motion.add_positions), model.dtype),
@@ -180,8 +179,8 @@ class Proximity:
     def _allocate(self, capacity):
         model, rows = self.model, self._vertices + self._edges
         what = f"the cloth needs room for {capacity} pairs that are near one another"
-        if capacity > MOST:
-            raise ValueError(f"{what}; it must be at most {MOST}, because corners of contacts are numbered in 32 bits")
+        if capacity > MAX_PAIRS:
+            raise ValueError(f"{what}; it must be at most {MAX_PAIRS}, because corners of contacts are numbered in 32 bits")
         refuse_memory(what, BYTES_OF_A_PAIR * capacity, model.device)
 
         def zeros(count, dtype=wp.int32):
@@ -245,10 +244,11 @@ class Proximity:
         for k, start in enumerate((np.inf, -np.inf) * 2):
             motion.tables[k].fill_(start)
         motion.some.zero_()
-        moving = len(motion.mean) + len(p) - model.count
-        self._launch(local_motion.find_means, moving, [p], [motion])
+        self._launch(local_motion.find_means, len(motion.mean) + self._vertices - model.count, [p], [motion])
         self._launch(local_motion.note_moves, model.count, [x, p, self.found], [motion])
         self._launch(local_motion.bound_moves, self._vertices, [x], [motion])
+        given = [self._along, x, self._grid.size, self._triangles]
+        self._launch(proximity_grid.note_large, self._edges, given, [motion])
         wp.capture_if(motion.some, lambda: self._launch_grid(self._along, x, p, searches, out))
 
     def _launch_grid(self, surface, x, p, searches, out):
@@ -322,7 +322,6 @@ class Proximity:
         """Whether more pairs were found than fit; waits for the device."""
         return self._mirror.read().sum(dtype=np.int64) > self.capacity
 
-    @in_turn
     def grow(self, count=None):
         """Allocates room for 1.5 times ``count`` pairs, by default as last found. Graphs must be recorded again.
 

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from ..base.turns import in_turn
 from ..kernels import assemble
 from ..terms.refresh import EVALUATION, Moment
 from .dynamic import dynamic_of
@@ -14,7 +13,6 @@ class Energy:
     It includes the dynamic elements of the model, or with ``terms`` those given.
     """
 
-    @in_turn
     def __init__(self, model, sums, corrected=False, terms=None, dynamic=()):
         self.model, self.sums, self.terms = model, sums, model.terms if terms is None else terms
         self.dynamic = dynamic_of(model, terms, dynamic)
@@ -48,7 +46,6 @@ class EnergyParts:
         parts: (T, B, blocks) [J], those of each term.
     """
 
-    @in_turn
     def __init__(self, model, lanes, sums):
         self.model, self._lanes, self._sums, self._dynamic = model, lanes, sums, dynamic_of(model)
         self.parts = lanes.parts(len(model.terms))

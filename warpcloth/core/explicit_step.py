@@ -13,7 +13,6 @@ class StepRecord(NamedTuple):
 
     Attributes:
         backend: ``"core"``, ``"blocks"`` or ``"gather"``.
-        threads: Threads of the CPU that share the steps of one cloth.
         lanes: GPU threads per vertex.
         block: Threads of a block that takes several steps of one copy in one launch, or 0.
         pairs: Labels of the quadratic terms whose forces are computed from the entries of their matrix.
@@ -22,7 +21,6 @@ class StepRecord(NamedTuple):
     """
 
     backend: str
-    threads: int = 1
     lanes: int = 1
     block: int = 0
     pairs: tuple[str, ...] = ()
@@ -41,8 +39,8 @@ class ExplicitStep:
         state: x and v (N,), which the steps update.
         h: Step [s].
         symplectic: Whether x is updated with v after the step.
-        count: Number of steps that moving pins have made (B,) int32, or None.
         compensated: Whether x is updated by compensated summation.
+        count: Number of steps that moving pins have made (B,) int32, or None.
 
     Attributes:
         gradient: ∂U/∂x (N,) [N]. Callers may add other forces before a step; it is 0 after each step.
@@ -50,10 +48,9 @@ class ExplicitStep:
         record: :class:`StepRecord`.
     """
 
-    def __init__(self, model, state, h, symplectic, count, compensated=False):
+    def __init__(self, model, state, h, symplectic, compensated=False, count=None):
         self.model, self.state, self.record = model, state, StepRecord("core", compensated=compensated)
         self.residual = model.vectors() if compensated else None
-        self._pins = model.pins, model.keyframes, count
         self.gradient, self._elastic = model.vectors(), Gradient(model, corrected=compensated)
         self._damped = dissipations(model, h)
         self._dissipative = Gradient(model, corrected=True, terms=self._damped)
@@ -64,7 +61,7 @@ class ExplicitStep:
         self._time = {"steps": count, "per_frame": round(1.0 / (model.scene.fps * h)), "he": h}
 
     def launch(self, steps, move_pins):
-        """Launches this number of steps, and calls ``move_pins(pins, keyframes, count, x, v)`` after each."""
+        """Launches this number of steps, and calls ``move_pins(x, v)`` after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
             model.refresh(STEP, Moment(x, v=v, explicit=True, **self._time))
@@ -75,4 +72,4 @@ class ExplicitStep:
                 self._dissipative.add(x, self.gradient, self._ahead)
             model.lock(self.gradient)
             model.launch(self._step, model.count, self._given, [self.gradient, x, v, self.residual])
-            move_pins(*self._pins, x, v)
+            move_pins(x, v)

@@ -1,6 +1,5 @@
 """The gradient of the energy of a model."""
 
-from ..base.turns import in_turn
 from ..kernels import assemble
 from ..terms.refresh import EVALUATION, Moment
 from .dynamic import dynamic_of
@@ -13,7 +12,6 @@ class Gradient:
     It includes the dynamic elements of the model, or with ``terms`` those given.
     """
 
-    @in_turn
     def __init__(self, model, corrected=False, terms=None, dynamic=()):
         self.model, self.terms = model, model.terms if terms is None else terms
         self.dynamic = dynamic_of(model, terms, dynamic)

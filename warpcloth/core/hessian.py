@@ -3,7 +3,6 @@
 import numpy as np
 import warp as wp
 
-from ..base.turns import in_turn
 from ..kernels import assemble, linear, sparse
 from ..kernels.block_rows import block_rows
 from ..kernels.term import HessianPolicy
@@ -184,7 +183,6 @@ class Hessian(BlockMatrix):
         policy: (B,) float64, a :class:`HessianPolicy` or a factor between for each copy.
     """
 
-    @in_turn
     def __init__(self, model, policy=HessianPolicy.RAW, corrected=False, terms=None, dynamic=()):
         self.dynamic = dynamic_of(model, terms, dynamic)
         self.terms = model.terms if terms is None else terms

@@ -15,16 +15,17 @@ class Reset:
 
     Args:
         stepper: The :class:`warpcloth.solvers.solver.Stepper`.
+        model, state: Those of some of its copies, if not those of the stepper.
     """
 
-    def __init__(self, stepper):
-        self.stepper, self.model = stepper, stepper.model
+    def __init__(self, stepper, model=None, state=None):
+        self.stepper, self.model, self.state = stepper, model or stepper.model, state or stepper.state
         self._kernel = None
         self._buffers = {}  # for values from the host, allocated on first use
 
     def _prepare(self):
         """Makes the kernel, and the addresses and sizes of the arrays of the state other than x and v, and of their starts."""
-        model, state = self.model, self.stepper.state
+        model, state = self.model, self.state
         names = [name for name in state.arrays if name not in ("x", "v")]
         carried, starts = ([arrays.get(name) for name in names] for arrays in (state.arrays, state.starts))
         words = [wp.types.type_size_in_bytes(array.dtype) // 4 * (array.size // len(array)) for array in carried]
@@ -38,8 +39,8 @@ class Reset:
         self._kernel = model.kernel(kernels.reset, model.dtype, model.pins is not None)
 
     def __call__(self, mask, positions, velocities):
-        stepper, model = self.stepper, self.model
-        if stepper.state.starts and not (positions is None and velocities is None):
+        stepper, model, state = self.stepper, self.model, self.state
+        if state.starts and not (positions is None and velocities is None):
             raise ValueError(
                 f"reset takes no positions or velocities with integrator={stepper.options.integrator!r}, which knows what was "
                 "before the start of the model alone; an integrator of one step, such as 'euler', takes them"
@@ -52,14 +53,12 @@ class Reset:
             self._prepare()
         starts, words, carried = self._given
         given = [model.inverse_mass, model.positions, x, v, starts, mask, model.per_copy, words]
-        model.launch(self._kernel, model.count, given, [carried, *stepper.state])
-        model.lock(stepper.state.v)
-        if stepper.residual.any() or any(result is not Result.COMPLETED for result in stepper.results):
+        model.launch(self._kernel, model.count, given, [carried, *state])
+        model.lock(state.v)
+        if state.residual.any() or any(result is not Result.COMPLETED for result in state.results):
             chosen = mask.numpy()
-            stepper.residual = np.where(chosen, 0.0, stepper.residual)
-            stepper.results = [
-                Result.COMPLETED if again else result for result, again in zip(stepper.results, chosen, strict=True)
-            ]
+            state.residual = np.where(chosen, 0.0, state.residual)
+            state.results = [Result.COMPLETED if again else result for result, again in zip(state.results, chosen, strict=True)]
 
     def on_device(self, mask, positions, velocities):
         """Returns the mask (B,), and positions and velocities, (B·n,) vectors or None, as Warp arrays.

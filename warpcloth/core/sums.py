@@ -2,11 +2,10 @@
 
 import warp as wp
 
-from ..base.turns import in_turn
 from ..kernels import reduce
 
 # Threads of a block that share a sum, and the most blocks of a copy, on a GPU; on the CPU one thread takes a copy.
-BLOCKS, MOST_BLOCKS = {"cuda": 256, "cpu": 0}, 1024
+BLOCKS, MAX_BLOCKS = {"cuda": 256, "cpu": 0}, 1024
 
 
 class Lanes:
@@ -24,7 +23,7 @@ class Lanes:
 
     def __init__(self, model, per_copy):
         self.model, self.block = model, BLOCKS["cuda" if model.device.is_cuda else "cpu"]
-        self._blocks = min(max(-(-per_copy // self.block), 1), MOST_BLOCKS) if self.block else 1
+        self._blocks = min(max(-(-per_copy // self.block), 1), MAX_BLOCKS) if self.block else 1
         self.count = self._blocks * max(self.block, 1)
         self.dim, self.of_block = (model.copies, self.count), (model.copies, max(self.block, 1))
 
@@ -38,7 +37,6 @@ class Sums:
 
     numbers = False  # whether arrays hold numbers, not vectors
 
-    @in_turn
     def __init__(self, model, per_copy=None):
         self.model, self.per_copy = model, model.per_copy if per_copy is None else per_copy
         self._lanes = lanes = Lanes(model, self.per_copy)

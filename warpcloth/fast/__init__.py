@@ -9,7 +9,6 @@ _MODULES = {
     "GatherStep": "gather_step",
     "GatherSweeps": "gather_corrections",
     "ScatterSweeps": "scatter_corrections",
-    "SubdomainSteps": "subdomains",
     "TouchingSteps": "touching_steps",
     "as_pairs": "quadratic_pairs",
 }

@@ -1,8 +1,5 @@
 """Explicit steps by blocks of vertices, for the CPU: one launch per step, one thread per copy."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
-
 import warp as wp
 
 import warpcloth.fast as fast
@@ -17,21 +14,6 @@ from .block_layout import block_layout
 from .structs import chained, int32_array
 
 
-class Window(NamedTuple):
-    """The arrays of consecutive vertices of a model that a step reads, numbered from the first of them.
-
-    Attributes:
-        terms: Their :class:`warpcloth.model.elements.DeviceElements`.
-        inverse_mass: (N,) [1/kg].
-        pins, keyframes: Moved pins among the vertices, and their keyframes; or None.
-    """
-
-    terms: Sequence
-    inverse_mass: wp.array
-    pins: wp.array | None
-    keyframes: wp.array | None
-
-
 class BlockStep:
     """Explicit steps in one launch, see :func:`warpcloth.kernels.fast.block_step.block_step`.
 
@@ -43,10 +25,8 @@ class BlockStep:
         state: x and v (N,), which steps update.
         h: Step [s].
         symplectic: Whether x is updated with v after the step.
-        count: Number of steps of the moved pins (B,) int32, or None.
         compensated: Whether x is updated by compensated summation.
         guard: The :class:`warpcloth.fast.contact_guard.ContactGuard` of a model with colliders.
-        window: The :class:`Window` of the vertices of ``state``, if these are not all of the model.
 
     Attributes:
         gradient: ∂U/∂x (N,) [N] of everything else, to which steps add; 0 after each step.
@@ -54,17 +34,16 @@ class BlockStep:
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
-    def __init__(self, model, state, h, symplectic, count, compensated=False, guard=None, window=None):
+    def __init__(self, model, state, h, symplectic, compensated=False, guard=None):
         self.model, self.state, self._guard = model, state, guard
-        window = window or Window(guard.terms if guard else model.terms, model.inverse_mass, model.pins, model.keyframes)
-        self._pins = window.pins, window.keyframes, count
-        quadratic = [each.term.whole.quadratic and each.damping is None for each in window.terms]
-        terms = [fast.as_pairs(model, each) if now else each for each, now in zip(window.terms, quadratic, strict=True)]
-        pairs = tuple(now.label for now, before in zip(terms, window.terms, strict=True) if now is not before)
+        declared = guard.terms if guard else model.terms
+        quadratic = [each.term.whole.quadratic and each.damping is None for each in declared]
+        terms = [fast.as_pairs(model, each) if now else each for each, now in zip(declared, quadratic, strict=True)]
+        pairs = tuple(now.label for now, before in zip(terms, declared, strict=True) if now is not before)
         refreshed, swept = ([each for each in terms if (each.refresh is not None) == apart] for apart in (True, False))
         self._refreshed, self.gradient = Gradient(model, terms=refreshed), wp.zeros_like(state[0])
         self.record = StepRecord("blocks", pairs=pairs, compensated=compensated)
-        vertices, swept, arrays, numbers = block_layout(swept, len(state[0]) // model.copies, model.copies)
+        vertices, swept, arrays, numbers = block_layout(swept, model.per_copy, model.copies)
         damped = [elements.damping is not None for elements in swept]
         parts = [TermFacts(each.term, own, 0 in each.stiffness.strides) for each, own in zip(swept, damped, strict=True)]
         # Fused multiply–add, as on CUDA: springs then take 0.8 of the time.
@@ -77,11 +56,11 @@ class BlockStep:
             wp.zeros(size, dtype=model.dtype, device=model.device) for size in (numbers, numbers * (compensated or any(damped)))
         ]
         chain = chained(parts, arrays, model.dtype)
-        self._given = [chain, int32_array(vertices, model.device), window.inverse_mass, model.gravity]
+        self._given = [chain, int32_array(vertices, model.device), model.inverse_mass, model.gravity]
         self._given += [guard.data if guard else NoGuard(), h, *scratch]
 
     def launch(self, steps, move_pins):
-        """Launches a number of steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        """Launches a number of steps, and ``move_pins`` (x, v) after each."""
         model, (x, v) = self.model, self.state
         for _ in range(steps):
             if self._guard:
@@ -89,6 +68,6 @@ class BlockStep:
             model.refresh(STEP, Moment(x), self._refreshed.terms)
             self._refreshed.add(x, self.gradient)
             model.launch(self._kernel, model.copies, self._given, [self.gradient, x, v, self.residual])
-            move_pins(*self._pins, x, v)
+            move_pins(x, v)
             if self._guard:
                 self._guard.launch_end(x)

@@ -1,6 +1,5 @@
 """The gradient of all terms in one launch, which gathers over the elements of each vertex."""
 
-from ..base.turns import in_turn
 from ..core.dynamic import dynamic_of
 from ..kernels.fast.gather_forces import gather_forces
 from ..terms.refresh import EVALUATION, Moment
@@ -18,7 +17,6 @@ class GatherGradient:
         dynamic: The dynamic elements if ``terms`` are given, else those of the model.
     """
 
-    @in_turn
     def __init__(self, model, corrected=False, terms=None, dynamic=()):
         self.model, self.terms, self._lanes = model, model.terms if terms is None else terms, lanes_of(model)
         self.dynamic = dynamic_of(model, terms, dynamic)

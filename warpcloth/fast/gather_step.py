@@ -29,7 +29,6 @@ class GatherStep:
         state: x and v (N,), which steps update.
         h: Step [s].
         symplectic: Whether x is updated with v after the step.
-        count: Number of steps of the moved pins (B,) int32, or None.
         compensated: Whether x is updated by compensated summation.
         guard: The :class:`warpcloth.fast.contact_guard.ContactGuard` of a model with colliders.
 
@@ -38,9 +37,9 @@ class GatherStep:
         record: :class:`warpcloth.core.explicit_step.StepRecord`.
     """
 
-    def __init__(self, model, state, h, symplectic, count, compensated=False, guard=None):
+    def __init__(self, model, state, h, symplectic, compensated=False, guard=None):
         model = model if guard is None else model.with_terms(guard.terms)
-        self.model, self._pins, self._guard = model, (model.pins, model.keyframes, count), guard
+        self.model, self._guard = model, guard
         self._found = [gathered(model, elements, elements.damping is not None) for elements in model.terms]
         parts = [part for part, _arrays in self._found]
         fast = model.device.is_cuda and model.dtype is wp.float32
@@ -73,7 +72,7 @@ class GatherStep:
         self._unit = unit or 1.0
 
     def launch(self, steps, move_pins):
-        """Launches a number of steps, and ``move_pins`` (pins, keyframes, count, x, v) after each."""
+        """Launches a number of steps, and ``move_pins`` (x, v) after each."""
         model = self.model
         if self._block:  # and nothing has to come between steps
             if self._guard:
@@ -88,7 +87,7 @@ class GatherStep:
             for when in (STEP, EVALUATION):
                 model.refresh(when, Moment(before[0]))
             model.launch(self._kernel, model.count * self._lanes, [*self._given, *before, self._h, self._unit], [*after])
-            move_pins(*self._pins, *after[:2])
+            move_pins(*after[:2])
             if self._guard:
                 self._guard.launch_end(after[0])
         if steps % 2:

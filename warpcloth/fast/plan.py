@@ -1,13 +1,15 @@
 """The entry to code that only increases speed. Each backend computes the same as the core, up to rounding.
 
 - ``core``: gradients and corrections term by term, then an update of the vertices.
-- ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices; several threads have a subdomain each. Jacobi
-  sweeps scatter corrections while they compute them. Gradients are those of the core.
+- ``blocks``, for the CPU: an explicit step is one launch over blocks of vertices. Jacobi sweeps scatter corrections while they
+  compute them. Gradients are those of the core.
 - ``gather``, for CUDA: a gradient, a Jacobi sweep or an explicit step is one launch for all terms. One launch may do several
   explicit steps.
 
 Tests compare each backend with the core.
 """
+
+from functools import partial
 
 import warpcloth.fast as fast
 
@@ -41,7 +43,7 @@ class Plan:
         made = fast.GatherGradient if self.backend == "gather" else Gradient
         return made(self.model, corrected, terms, dynamic)
 
-    def explicit_step(self, state, h, symplectic, count, pool, colliders=None, pairs=None):
+    def explicit_step(self, state, h, symplectic, count, colliders=None, pairs=None):
         """Returns a :class:`warpcloth.core.explicit_step.ExplicitStep`, or a faster class with the same methods.
 
         Args:
@@ -49,33 +51,25 @@ class Plan:
             h: Step [s].
             symplectic: Whether x is updated with v after the step.
             count: Number of steps of the moved pins (B,) int32, or None.
-            pool: The :class:`warpcloth.core.thread_pool.ThreadPool` that divides the work.
             colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`, with which faster classes handle contact
                 themselves. None: the terms and the end of each step handle it.
             pairs: The :class:`warpcloth.contact.self_steps.SelfSteps` of self-contact and mesh colliders, or None.
-
-        Raises:
-            ValueError: Threads cannot divide the steps; the message names the term.
         """
-        given = self.model, state, h, symplectic, count, needs_compensation(self.model)
+        core, given = partial(ExplicitStep, count=count), (state, h, symplectic)
         if self.model.dynamic:
             blocks = self.backend == "blocks" and self.model.uniform and colliders is None
-            plain = (fast.BlockStep if blocks else ExplicitStep)(self.model.with_dynamic(()), *given[1:-1])
+            plain = (fast.BlockStep if blocks else core)(self.model.with_dynamic(()), *given)
             steps = fast.TouchingSteps(plain, pairs)
-        elif pool.threads > 1:
-            _refuse_undivided(self.model, self.backend, pool.threads)
-            steps = fast.SubdomainSteps(*given, pool)
         else:
             backend = self.backend if self.model.uniform else "core"
             if colliders is not None and not self.model.colliders.plain:
                 backend = "core"
+            given = *given, needs_compensation(self.model)
             if colliders is not None and backend != "core":
                 self.guard = fast.ContactGuard(self.model, colliders)
                 given = *given, self.guard
-            if backend == "core":
-                steps = ExplicitStep(*given)
-            else:
-                steps = (fast.BlockStep if backend == "blocks" else fast.GatherStep)(*given)
+            made = core if backend == "core" else fast.BlockStep if backend == "blocks" else fast.GatherStep
+            steps = made(self.model, *given)
         self.record = steps.record
         return steps
 
@@ -102,29 +96,3 @@ def plan(model, backend="auto"):
     if backend == "blocks" and model.device.is_cuda:
         raise ValueError(f"backend is 'blocks' on {model.device}; it is for the CPU")
     return Plan(model, backend)
-
-
-def _refuse_undivided(model, backend, threads):
-    """Checks that the steps of a model can be divided into subdomains.
-
-    Raises:
-        ValueError: A term or the backend does not support subdomains; the message names it.
-    """
-    if backend != "blocks":
-        raise ValueError(f"threads is {threads} with backend {backend!r}; more than 1 is for 'blocks'")
-    if model.mobility is not None:
-        raise ValueError(
-            f"threads is {threads} with one copy, whose vertices that are locked along some axes Explicit cannot divide; "
-            "threads=1 can, and copies are shared out with every solver"
-        )
-    if model.loads is not None:
-        raise ValueError(
-            f"threads is {threads} with one copy that has loads, whose steps Explicit cannot divide; threads=1 can, or PBD and "
-            "XPBD, and copies are shared out with every solver"
-        )
-    for elements in model.terms:
-        if elements.refresh:
-            raise ValueError(
-                f"threads is {threads} with one copy, whose {elements.label} Explicit cannot divide; threads=1 can, or PBD "
-                "and XPBD, and copies are shared out with every solver"
-            )

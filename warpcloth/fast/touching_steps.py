@@ -25,7 +25,7 @@ class TouchingSteps:
         self._left, self._count_down = wp.zeros(1, dtype=wp.int32, device=model.device), model.kernel(count_down)
 
     def launch(self, steps, end):
-        """Launches a number of steps, and ``end`` (pins, keyframes, count, x, v) after each."""
+        """Launches a number of steps, and ``end`` (x, v) after each."""
         if steps == 1:
             self._launch_step(end)
             return

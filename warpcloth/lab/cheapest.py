@@ -15,6 +15,7 @@ from .choosing import FINER, Measured, climb, ladders, measured, percent
 from .machine import machine
 from .measurements import SceneRef, task
 from .reference import reference
+from .results import cells_of
 from .setups import label, precisions, setups_of_runs
 
 # Settings that take more than this many times the cheapest are not searched, so the second best is known up to this ratio.
@@ -195,8 +196,8 @@ def write_csv(path, found):
     def lines():
         for cell in found["cells"]:
             second = cell["second"] or {}
-            line = {**found, **found["machine"], **cell, **_columns(cell)}
-            line |= {f"second_{name}": value for name, value in {**second, **_columns(second)}.items()}
+            line = {**found, **found["machine"], **cells_of(cell)}
+            line |= {f"second_{name}": value for name, value in cells_of(second).items()}
             line |= {
                 "x_value": cell["x"],
                 "y_value": cell["y"],
@@ -207,10 +208,3 @@ def write_csv(path, found):
             yield map(line.get, COLUMNS + FACTS)
 
     write_table(path, COLUMNS + FACTS, lines())
-
-
-def _columns(setting):
-    if not setting.get("options"):
-        return {}
-    low, high = setting["spread"]
-    return {"options": json.dumps(setting["options"]), "ms_low": low, "ms_high": high}

@@ -9,7 +9,7 @@ CLOCKS = {"wall": time.perf_counter, "process": time.process_time}
 
 # A frame counts for at most so many times the time of the longer of its neighbours. Newton's method may take 5 times as long in
 # a frame as before and after it.
-MOST = 10.0
+MAX_RATIO = 10.0
 
 
 class TooSlow(Exception):
@@ -39,12 +39,12 @@ class Clock:
 def mean_time(times):
     """Returns the mean of the times of successive frames (F,).
 
-    A frame counts for at most ``MOST`` times as long as the longer of its neighbours, so that an interruption counts little.
+    A frame counts for at most ``MAX_RATIO`` times the longer of its neighbours, so that an interruption counts little.
     """
     times = np.asarray(times, dtype=np.float64)
     if len(times) > 1:
         near = np.pad(times, 1, mode="reflect")
-        times = np.minimum(times, MOST * np.maximum(near[:-2], near[2:]))
+        times = np.minimum(times, MAX_RATIO * np.maximum(near[:-2], near[2:]))
     return float(times.mean())
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ..base.digest import scene_digest
-from ..base.turns import in_turn
+from ..base.turns import TURN, in_turn
 from ..core.energy import Energy
 from ..core.sums import Sums
 from ..run.equilibrium import SETTLED
@@ -64,8 +64,9 @@ class OneStep:
         self.free = model.inverse_mass.numpy() > 0.0
         self._mass = model.mass.numpy() * self.free
         self.best = np.array(stepper.minimiser.correction.numpy())
-        self.base = model.array(stepper.state.x.numpy() - self.best, model.vec3)
-        self._energy_of = Energy(self.model, Sums(self.model), corrected=True)
+        with TURN:
+            self.base = model.array(stepper.state.x.numpy() - self.best, model.vec3)
+            self._energy_of = Energy(self.model, Sums(self.model), corrected=True)
         self.lowest, self.first = self.objective(self.best), self.objective(np.zeros_like(self.best))
         # The rounding of the state alone strains the cloth.
         if not np.abs(self.best).max() > 10.0 * np.finfo(np.float32).eps * np.abs(x).max():

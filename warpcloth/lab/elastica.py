@@ -19,7 +19,7 @@ import numpy as np
 
 from ..scenes.loop import KINDS
 
-MOST = 100.0
+MAX_GAMMA = 100.0
 
 
 def curve(gamma, at=None):
@@ -62,7 +62,7 @@ def gamma_of(ratio, at, near):
     def gap(gamma):
         return aspect(gamma, at) - ratio
 
-    low, high = near / 20.0, min(20.0 * near, MOST)
+    low, high = near / 20.0, min(20.0 * near, MAX_GAMMA)
     return brentq(gap, low, high, rtol=1e-8) if gap(low) < 0.0 < gap(high) else None
 
 

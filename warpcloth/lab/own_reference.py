@@ -16,7 +16,7 @@ from .campaign import cache_folder
 from .clock import Clock, TooSlow
 from .reference import Reference, kept_reference, position_error, strain_error
 
-_MOST = 12  # runs, each with twice the substeps of the one before
+_MAX_RUNS = 12  # runs, each with twice the substeps of the one before
 # A motion counts as converged if two successive doublings moved it by at most this share of the tolerance.
 SHARE = 0.1
 # Stands for a reference that is not known because the total time was used up.
@@ -81,7 +81,7 @@ def own_reference(
 
     runs, moves, spent, substeps = [], [], 0.0, min(each.substeps for each in records)
     started = time.perf_counter()
-    for _ in range(_MOST):
+    for _ in range(_MAX_RUNS):
         took, points = run(substeps, iterations, limit - spent)
         spent += took
         if points is None or (runs and isinstance(points, str)):

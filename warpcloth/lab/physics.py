@@ -87,8 +87,8 @@ def measure(
     for name, value in (("gamma", gamma), ("limit", limit), ("stretching", stretching), ("width", width)):
         number(name, value, above=0.0)
     number("angle", angle)
-    if gamma > elastica.MOST:
-        raise ValueError(f"gamma is {gamma:g}; it must be {elastica.MOST:g} or less")
+    if gamma > elastica.MAX_GAMMA:
+        raise ValueError(f"gamma is {gamma:g}; it must be {elastica.MAX_GAMMA:g} or less")
     settle = _Settling(device, dtype, limit)
     nothing = {"error": None, "stiffness": None, "sides": None, "elements": None, "h": None}
     if case == "cylinder":

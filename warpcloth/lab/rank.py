@@ -30,7 +30,7 @@ def least(degrees):
 
 
 _LAWS = {dtype: f"ε(σ₁/σ₂)², {dtype}" for dtype in EPS}
-_WHOLE, _LEAST, _NONE = "the turn", "angle between the lines", "0"
+_WHOLE, _ANGLE, _NONE = "the turn", "angle between the lines", "0"
 PANELS = (
     Panel(
         "line",
@@ -46,8 +46,8 @@ PANELS = (
         "What is kept of a turn about an axis at 45° to the line",
         "turn [°]",
         "rotation found [°]",
-        laws={_WHOLE: lambda d: d, _LEAST: least, _NONE: lambda d: 0.0},
-        follows={"in a plane": _WHOLE, "on a line": _LEAST, "in one place": _NONE},
+        laws={_WHOLE: lambda d: d, _ANGLE: least, _NONE: lambda d: 0.0},
+        follows={"in a plane": _WHOLE, "on a line": _ANGLE, "in one place": _NONE},
     ),
     Panel(
         "reflection",

@@ -24,7 +24,7 @@ from .clock import Clock, TooSlow
 
 # Largest number of explicit steps per frame on the CPU and on CUDA. A Newton step takes as long as some 250 explicit ones in
 # soft cloth and 5000 or more in stiff cloth, on CUDA more, and 4, 8 and 16 per frame are the fewest that may do.
-_MOST_EXPLICIT, _MOST_ON_CUDA = 20000, 65536
+_MAX_EXPLICIT, _MAX_ON_CUDA = 20000, 65536
 # Tolerance of solves within a step, so small that only the error of the step itself counts.
 _TOLERANCE = 1e-6
 # Iterations of a step of Newton's method. If pairs of self-contact turn, a step may need over 100: the Hessian leaves this out.
@@ -192,7 +192,7 @@ def _method(scene, device):
     if scene.colliders:
         return _Method(lambda s: Newton(substeps=s, tolerance=_TOLERANCE, iterations=_ITERATIONS, integrator="bdf2"), 4, 1)
     fewest = 1.0 / (scene.fps * min(step_limits(model)))
-    most = _MOST_ON_CUDA if model.device.is_cuda else _MOST_EXPLICIT
+    most = _MAX_ON_CUDA if model.device.is_cuda else _MAX_EXPLICIT
     if fewest < most:
         return _Method(lambda s: Explicit(substeps=s), max(4, int(fewest) + 1), 1)
     for elements in model.terms:

@@ -121,10 +121,11 @@ def write_csv(path, rows):
     Raises:
         FileNotFoundError: The folder does not exist.
     """
+    write_table(path, COLUMNS, (map(cells_of(row).get, COLUMNS) for row in rows))
 
-    def cells(row):
-        low, high = row["spread"] or (None, None)
-        texts = {name: json.dumps(row[name]) for name in ("parameters", "options")}
-        return map({**row, **texts, "ms_low": low, "ms_high": high}.get, COLUMNS)
 
-    write_table(path, COLUMNS, map(cells, rows))
+def cells_of(row):
+    """Returns a row as cells of a table: its dictionaries as JSON, and its spread of times as two columns, None if unknown."""
+    low, high = row.get("spread") or (None, None)
+    texts = {name: json.dumps(value) for name, value in row.items() if isinstance(value, dict)}
+    return row | texts | {"ms_low": low, "ms_high": high}

@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 
+from ..base.turns import in_turn
 from ..core.constant_matrix import constant_matrices
 from ..core.hessian import Hessian
 from ..kernels.term import HessianPolicy
@@ -18,12 +19,13 @@ from ..solvers import ProjectiveDynamics
 from .convergence import LADDER, one_step
 
 # Largest number of unknowns for the spectrum, which uses dense matrices.
-MOST = 2000
+MAX_UNKNOWNS = 2000
 # Range of errors, relative to that at x̃, in which iterations are linear and resolved. Predictions start at the first error
 # below LINEAR.
 LINEAR, RESOLVED = 1e-2, 1e-8
 
 
+@in_turn
 def relative_spectrum(step):
     """Returns μ (f,) ascending, V (f, f) and A (f, f) of Hv = μAv at the minimiser of a step, VᵀAV = 1, for f free coordinates.
 
@@ -33,8 +35,10 @@ def relative_spectrum(step):
     from scipy.linalg import eigh
 
     unknowns = np.flatnonzero(np.repeat(step.free, 3))
-    if len(unknowns) > MOST:
-        raise ValueError(f"{step.scene.name} has {len(unknowns)} unknowns; a spectrum takes {MOST} at most, of a coarser mesh")
+    if len(unknowns) > MAX_UNKNOWNS:
+        raise ValueError(
+            f"{step.scene.name} has {len(unknowns)} unknowns; a spectrum takes at most {MAX_UNKNOWNS}; take a coarser mesh"
+        )
     model, s = step.model, 1.0 / step.h**2
     touching = [elements for elements in model.terms if elements.collider is not None]
     (scalar,) = constant_matrices(model.with_terms([each for each in model.terms if each.collider is None]), s)

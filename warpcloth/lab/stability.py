@@ -21,7 +21,7 @@ from .stability_limits import KNOWN, limit_ratios
 VERDICTS = ("stable", "unsure", "inaccurate", "stalled", "diverged", "refused", "slow")
 # Steps of the reference per step of the map, and its largest total number of steps (at least one per frame). A run with half as
 # many steps gives the error of the reference.
-_FINER, _MOST = 4, 2000
+_FINER, _MAX_STEPS = 4, 2000
 _FAILED = (Result.STALLED, Result.SADDLE, Result.CONTRADICTED)
 
 
@@ -158,7 +158,7 @@ def _reference(ref, fixed, axis, group, length, device, limit):
     steps, duration = length
     steps = steps if duration is None else steps_in(duration, dt)
     scene = scene_at(ref, {**fixed, axis: group[0]}, steps)
-    half = min(_FINER // 2 * round(1.0 / (scene.fps * dt)), -(-_MOST // (2 * scene.frames)))
+    half = min(_FINER // 2 * round(1.0 / (scene.fps * dt)), -(-_MAX_STEPS // (2 * scene.frames)))
     found = []
     for substeps in (half, 2 * half):
         record = Newton(substeps=substeps, integrator="bdf2", tolerance=1e-6)

@@ -21,7 +21,7 @@ KNOWN = "error of the reference = accuracy"
 # (:data:`warpcloth.run.balance.GAIN`). In runs of 40 to 400 steps it is 7 to 16.
 GROWTH = 10.0
 # Largest number of springs for which the eigenvalues of a sweep are computed, by a dense solver.
-_MOST = 1000
+_MAX_SPRINGS = 1000
 
 
 def limit_ratios(scene, record, steps):
@@ -186,11 +186,11 @@ def largest_ordered(scene, he, record, steps):
     is (1 − ω)ⁿ, which is −1/3 for ω = 1 + 3^(−1/n); with more springs complex q grow before that.
 
     Returns:
-        float: ω; None if twice 1 + 3^(−1/n) is still stable, if no spring moves anything, or for more than :data:`_MOST`
+        float: ω; None if twice 1 + 3^(−1/n) is still stable, if no spring moves anything, or for more than :data:`_MAX_SPRINGS`
             springs, which take too long.
     """
     pairs, mobility, compliance = _springs(scene, he, _turns(scene, record))
-    if not 0 < len(pairs) <= _MOST:
+    if not 0 < len(pairs) <= _MAX_SPRINGS:
         return None
     J = (_directions(scene, pairs) * np.repeat(np.sqrt(_inverse_masses(scene)), 3)).toarray()
     share = _share(mobility, compliance, record)

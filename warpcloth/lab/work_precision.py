@@ -4,7 +4,6 @@ Each diagram is a function of a :class:`warpcloth.lab.measurements.SceneRef` tha
 dictionary for each setting in ``rows``. ``run`` has arguments of :func:`sweep`; ``limit`` [s] is that of each setting.
 """
 
-import json
 import math
 import re
 
@@ -17,6 +16,7 @@ from .machine import machine
 from .measurements import task
 from .own_reference import SHARE, of_own, own_facts, own_references
 from .reference import reference
+from .results import cells_of
 from .setups import label, precisions, setups_of_runs, setups_of_steps
 
 # Divisors of a scene's frames: the frames before the step of "solver" and "spectrum", and the frames of "time". Later motion is
@@ -255,11 +255,9 @@ def write_csv(path, found):
 
     def lines():
         for row in found["rows"]:
-            facts = {**found, **found["machine"], **row}
+            facts = {**found, **found["machine"], **cells_of(row)}
             for point in row.get("points") or [row]:
-                low, high = point.get("spread") or (None, None)
-                line = {**facts, **point, "options": json.dumps(row["options"]), "ms_low": low, "ms_high": high}
-                yield map(line.get, COLUMNS + FACTS)
+                yield map({**facts, **cells_of(point)}.get, COLUMNS + FACTS)
 
     write_table(path, COLUMNS + FACTS, lines())
 

@@ -24,7 +24,7 @@ READERS: dict[str, Callable[[FilePath, str | None, Any], Any]] = {}
 UP_AXES = ("Y", "Z")
 Own = TypeVar("Own", bound="Mesh")
 Pattern = Literal["diagonal", "alternating", "equilateral"]
-_MOST_VERTICES = 2**31 - 1  # indices are int32
+_MAX_VERTICES = 2**31 - 1  # indices are int32
 # Memory that a grid needs at least: float64 positions and texture coordinates, int64 corners of two triangles.
 _BYTES_OF_A_VERTEX = 24 + 16 + 48
 
@@ -541,8 +541,8 @@ def _repeated(rows):
 
 
 def _count(name, value):
-    if not isinstance(value, int | np.integer) or not 2 <= value <= _MOST_VERTICES:
-        allowed = f"a whole number of vertices, at least 2 and at most {_MOST_VERTICES:,}"
+    if not isinstance(value, int | np.integer) or not 2 <= value <= _MAX_VERTICES:
+        allowed = f"a whole number of vertices, at least 2 and at most {_MAX_VERTICES:,}"
         raise ValueError(f"{name} is {shown(value)}; it must be {allowed}")
     return int(value)
 

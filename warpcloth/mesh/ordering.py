@@ -7,7 +7,7 @@ import numpy as np
 from .mesh import Mesh
 
 # Smaller meshes fit in caches in any order, and gain less in a second of motion than the import of SciPy costs.
-LEAST = 4096
+MIN_VERTICES = 4096
 
 
 def near_order(mesh: Mesh) -> np.ndarray:
@@ -30,8 +30,8 @@ def spread(mesh: Mesh, order: np.ndarray | None = None) -> float:
 
 
 def worthwhile_order(mesh: Mesh) -> np.ndarray | None:
-    """Returns `near_order` if the mesh has :data:`LEAST` vertices and the `spread` halves, else None."""
-    if len(mesh.points) < LEAST:
+    """Returns `near_order` if the mesh has :data:`MIN_VERTICES` vertices and the `spread` halves, else None."""
+    if len(mesh.points) < MIN_VERTICES:
         return None
     order = near_order(mesh)
     return order if spread(mesh, order) < 0.5 * spread(mesh) else None

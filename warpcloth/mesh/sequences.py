@@ -42,7 +42,7 @@ from .stage_mesh import StageMesh
 
 # Functions that open a sequence, by file ending: (path, prim, fps) → :class:`Sequence`. `usd` registers that of stages.
 OPENERS: dict[str, Callable[[FilePath, str | None, float | None], Any]] = {}
-_MOST_MISSING = 1_000_000
+_MAX_MISSING = 1_000_000
 _LATEST = 1e15  # latest time of a frame [s]
 _CHANGES = (
     "meshes that change from frame to frame are captures: 'compare --by surface' and 'fit --capture' take them, "
@@ -138,10 +138,10 @@ def missing_labels(labels: np.ndarray, path: FilePath | None = None) -> list[flo
     uneven = np.abs(intervals / spacing - multiples) > 1e-6  # time codes have fewer than 10 digits, float64 has 16
     if uneven.any() or (labels.dtype.kind == "f" and 3 * len(gaps) > max(3, len(intervals))):
         return []
-    if (multiples[gaps] - 1.0).sum() > _MOST_MISSING:
+    if (multiples[gaps] - 1.0).sum() > _MAX_MISSING:
         first, last = labels[[gaps[0], gaps[0] + 1]].tolist()
         where = "" if path is None else f"{path}: "
-        raise ValueError(f"{where}more than {_MOST_MISSING:,} frames are missing, from {first} to {last} and on")
+        raise ValueError(f"{where}more than {_MAX_MISSING:,} frames are missing, from {first} to {last} and on")
     return [(labels[gap] + k * spacing).item() for gap in gaps for k in range(1, int(multiples[gap]))]
 
 

@@ -25,7 +25,7 @@ from .host_values import keep, repeat
 from .loads import loads_on
 from .precision import DTYPES, cast, refuse_coarse
 from .report import report
-from .threads import threads_on
+from .threads import refuse_one_copy, threads_on
 from .vary import Vary, unlike_copies
 
 
@@ -43,7 +43,7 @@ class Model:
         order: Vertices of the scene in the order of the model, (n,), such as :func:`warpcloth.mesh.ordering.near_order` gives;
             elements are then sorted by their lowest vertices. Arguments and messages use the order of the scene, attributes
             and solvers that of the model, and :meth:`in_scene_order` converts. None keeps the order of vertices and elements.
-        threads: Threads of the CPU that share the steps, see :class:`warpcloth.core.thread_pool.ThreadPool`.
+        threads: Threads of the CPU that share out the copies; 1 if there is one copy.
 
     Attributes:
         positions, velocities: Initial state, (B·n,) vectors [m], [m/s]; the velocity of a pinned vertex is 0.
@@ -64,6 +64,7 @@ class Model:
         order: As given, int32, or None.
         indices: Index in a copy of each vertex of the scene, (n,) int32; None without an order.
         kernels: Names of the kernels that solvers use.
+        motion: x and v (B·n,) of steppers, if they are views of those of a larger batch; else None.
         launches: Number of launches so far, in a list of one that models made from this one share.
         threads: As given.
 
@@ -81,13 +82,14 @@ class Model:
         copies = int(copies)
         self.scene, self.copies = scene, copies
         self.device = find_device(device)
+        refuse_one_copy(threads, copies)
         self.threads = threads_on(self.device, threads)
         self.dtype, self.numpy_dtype = DTYPES[dtype]
         self.vec3, self.mat33 = types(self.dtype)
         self.per_copy = len(scene.mesh.points)
         self.count = copies * self.per_copy
         self.kernels, self.launches = set(), [0]
-        self.dynamic = ()
+        self.dynamic, self.motion = (), None
         self.order = self.indices = None
         self.rest_points = scene.mesh.points
         if order is not None:
@@ -239,21 +241,27 @@ class Model:
         """Returns a model of one copy, whose arrays are views of those of this one."""
         return self if self.copies == 1 else self.part(copy, 1)
 
-    def part(self, first, count):
-        """Returns a model of copies ``first`` to ``first + count − 1``, for one thread, whose arrays are views."""
+    def part(self, first, count, motion=None):
+        """Returns a model of copies ``first`` to ``first + count − 1``, for one thread, whose arrays are views.
+
+        Args:
+            first: The first copy.
+            count: Number of copies.
+            motion: x and v of all copies, of which the steppers of the part have views; None for arrays of their own.
+        """
         n = self.per_copy
         other, of_copies, of_vertices = shallow_copy(self), slice(first, first + count), slice(first * n, (first + count) * n)
         other.copies, other.count, other.threads = count, count * n, 1
         for name in ("positions", "velocities", "mass", "inverse_mass", "mobility", "_vertex_gravity"):
             if getattr(self, name) is not None:
                 setattr(other, name, getattr(self, name)[of_vertices])
+        other.motion = motion and tuple(array[of_vertices] for array in motion)
         other.gravity = self.gravity[of_copies]
         if self.loads is not None:
             other.loads = self.loads.part(self, first, count)
         other.terms = tuple(elements.part(first, count) for elements in self.terms)
         return other
 
-    @in_turn
     def array(self, values, dtype):
         """Returns ``values`` as an array on the model's device, in its precision."""
         return wp.array(np.ascontiguousarray(values, dtype=self.numpy_dtype), dtype=dtype, device=self.device)
@@ -279,7 +287,6 @@ class Model:
         words = [] if each is None else [f"{each} {i}"]
         return " of ".join(words + ([f"copy {copy}"] if self.copies > 1 else []))
 
-    @in_turn
     def vectors(self):
         """Returns a new array of a zero vector for each vertex of all copies."""
         return wp.zeros(self.count, dtype=self.vec3, device=self.device)
@@ -288,7 +295,6 @@ class Model:
         """Returns a new array of a zero for each copy."""
         return wp.zeros(self.copies, dtype=dtype, device=self.device)
 
-    @in_turn
     def kernel(self, factory, *key):
         """Returns the kernel of ``factory(*key)``, and notes its name for :meth:`report`, as factory(variant).Term."""
         kernel = factory(*key)
@@ -299,7 +305,6 @@ class Model:
         self.kernels.add(".".join([f"{factory.__name__}{variant}", *terms]))
         return kernel
 
-    @in_turn
     def launch(self, kernel, dim, inputs, outputs=(), block_dim=256):
         self.launches[0] += 1
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)

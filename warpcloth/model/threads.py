@@ -1,4 +1,4 @@
-"""The number of CPU threads that share the steps of a model."""
+"""The number of CPU threads that share out the copies of a model."""
 
 import os
 import warnings
@@ -13,6 +13,19 @@ def cores(device):
     if not device.is_cpu:
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def refuse_one_copy(threads, copies):
+    """Checks that a number of threads has copies to share out.
+
+    Raises:
+        ValueError: It is not 1 or more, or is above 1 with one copy.
+    """
+    whole("threads", threads, 1)
+    if threads > 1 and copies == 1:
+        raise ValueError(
+            f"threads is {threads} with one copy; it must be 1, because threads share out the copies of a batch, not one cloth"
+        )
 
 
 def threads_on(device, threads):

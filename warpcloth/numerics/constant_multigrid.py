@@ -13,7 +13,7 @@ from .interpolation import interpolations, neighbours
 # A level of at most so many vertices is solved by its dense inverse; a larger one without a coarser level by its sweeps.
 DENSE = 300
 # Cycles are repeated until the error, in the norm of the matrix, has fallen to this fraction, at most so many times.
-LEFT, MOST = 0.4, 12
+LEFT, MAX_CYCLES = 0.4, 12
 # Cycles by which the contraction is measured.
 TRIALS = 15
 
@@ -58,7 +58,7 @@ class CopyCycles:
         hierarchies = _hierarchies(model, distinct)
         self.sizes = hierarchies[0].sizes
         contractions = np.array([hierarchy.contraction() for hierarchy in hierarchies])
-        cycles = np.ceil(np.log(LEFT) / np.log(np.clip(contractions, LEFT, LEFT ** (1.0 / MOST)))).astype(np.int32)
+        cycles = np.ceil(np.log(LEFT) / np.log(np.clip(contractions, LEFT, LEFT ** (1.0 / MAX_CYCLES)))).astype(np.int32)
         self.cycles, self.error = int(cycles.max()), (contractions**cycles)[of_copy]
         self._cycles = wp.array(cycles, dtype=wp.int32, device=model.device)
         self._levels = [

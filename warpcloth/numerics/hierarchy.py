@@ -19,7 +19,7 @@ from .unfolding import UnfoldedSurface
 
 _HUB = 8  # a dropped vertex with more kept neighbours links them to the nearest of them, not each to each
 _NEAREST = 2  # kept neighbours of a dropped vertex to which paths over two dropped ones lead
-_ALIKE = 4.0  # ratio of the stiffnesses of the springs of a triangle up to which it keeps its shape
+_MAX_RATIO = 4.0  # ratio of the stiffnesses of the springs of a triangle up to which it keeps its shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ def _keeping_shape(model, elements, lengths, bounds):
         order = np.argsort(keys, kind="stable")
         sides = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
         compliance = bounds.compliance[sides]
-        alike = (compliance.max(axis=1) <= _ALIKE * compliance.min(axis=1)).all(axis=1)
+        alike = (compliance.max(axis=1) <= _MAX_RATIO * compliance.min(axis=1)).all(axis=1)
         keeps = alike & (keys[sides] == wanted).all(axis=1)
         triangles, sides = triangles[keeps], sides[keeps]
     else:

@@ -19,7 +19,7 @@ from ..kernels.term import HessianPolicy
 from ..kernels.terms.air import AIR
 from .additive_multigrid import multigrid_of
 from .linear import ConjugateGradients, Factorised
-from .multigrid import LEAST
+from .multigrid import MIN_VERTICES
 from .preconditioner_choice import PreconditionerChoice
 from .search import Search
 
@@ -96,7 +96,7 @@ class Minimiser:
         self.correction = self.search.correction
         self.hessian = Hessian(model, POLICIES[hessian], corrected=True)
         if linear == "cg":
-            multigrid = multigrid_of(self.hessian) if model.per_copy >= LEAST else None
+            multigrid = multigrid_of(self.hessian) if model.per_copy >= MIN_VERTICES else None
             choice = multigrid and PreconditionerChoice(multigrid, linear_iterations)
             self.linear = ConjugateGradients(self.hessian, linear_iterations, multigrid, choice)
             self.kept = choice.kept if choice else {}

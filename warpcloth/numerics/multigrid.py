@@ -9,7 +9,7 @@ from ..kernels import multigrid as kernels
 from .interpolation import find, neighbours
 
 # Meshes of fewer vertices are solved faster without.
-LEAST = 200
+MIN_VERTICES = 200
 # A level of at most so many vertices gets no coarser one.
 COARSEST = 12
 # A coarsest level of at most so many vertices is solved by its dense inverse. One with more has many pieces that nothing joins.

@@ -10,7 +10,6 @@ Jᵀ; conjugate gradients over rows remove it.
 
 import warp as wp
 
-from ..base.turns import in_turn
 from ..core.hessian import BlockMatrix, BlockSum, ElementBlocks, pattern_of
 from ..core.sums import RowSums
 from ..kernels import constraint_jacobian as jacobian
@@ -46,7 +45,6 @@ class PrimalMatrix(BlockMatrix):
         penalties: D, one number for each row.
     """
 
-    @in_turn
     def __init__(self, constraints):
         model = constraints.model
         found = pattern_of(model, model.terms)

@@ -8,7 +8,6 @@ import numpy as np
 import warp as wp
 
 from ..core.dynamic import dynamic_of
-from ..core.thread_pool import ThreadPool
 from ..fast.plan import plan
 from ..kernels import project as kernels
 from ..kernels.clusters import correct_clusters
@@ -176,7 +175,6 @@ class GaussSeidelSweep(_Sweep):
         model, x, h, relaxation, scalar, multipliers, correction: See :class:`_Sweep`.
         kind: One of :data:`IN_PLACE`.
         spread: Number of sweeps over which the correction of finite stiffness is spread, or None.
-        pool: The :class:`warpcloth.core.thread_pool.ThreadPool` whose threads share coloured sweeps; None for one thread.
         follows: Whether dynamic elements are found anew after some of these sweeps.
 
     Attributes:
@@ -194,13 +192,12 @@ class GaussSeidelSweep(_Sweep):
         multipliers=False,
         spread=None,
         correction=None,
-        pool=None,
         follows=True,
     ):
         super().__init__(model, x, h, relaxation, scalar, multipliers, correction)
         self.multipliers_add, self._follows = multipliers, follows
         self._dynamic.sweeps(in_turn=True)
-        self.pool, self.spread, self.ordered = pool or ThreadPool(1), spread or 1, kind == "sequential"
+        self.spread, self.ordered = spread or 1, kind == "sequential"
         self.ranges = [[(0, (elements.cells or elements).count)] for elements in model.terms]
         if kind == "coloured" and model.terms:
             self.elements, self.ranges = zip(*map(self._by_colour, model.terms), strict=True)
@@ -236,9 +233,9 @@ class GaussSeidelSweep(_Sweep):
 
     def launch(self, backward=False):
         """Launches one sweep, forward or backward through terms, colours and elements."""
-        model, pool = self.model, self.pool
+        model = self.model
         if self._refreshed:
-            pool.launch_alone(model, lambda: model.refresh(EVALUATION, Moment(self.x, self.correction), self._refreshed))
+            model.refresh(EVALUATION, Moment(self.x, self.correction), self._refreshed)
         way = -1 if backward else 1
         if backward:
             self._sweep_dynamic(backward)
@@ -252,16 +249,14 @@ class GaussSeidelSweep(_Sweep):
                 of_elements = [cells.offsets, cells.shape, *elements.arguments]
             each = (cells or elements).per_copy if self.ordered else 1
             for first, count in self.ranges[i][::way]:
-                before, part = pool.part(count // each)
                 # On the CPU, one thread loops over all elements, in half of the time of one launch thread per element.
-                threads, each_thread = (1, part * each) if model.device.is_cpu else (part, each)
+                threads, each_thread = (1, count) if model.device.is_cpu else (count // each, each)
                 turn = kernels.sweep_turn(model.dtype)()
-                turn.first, turn.each = first + before * each, way * each_thread
+                turn.first, turn.each = first, way * each_thread
                 turn.h, turn.sweeps, turn.relaxation = self.h, self.spread, self.relaxation
                 given = [*of_elements, model.local_mobility, self.x, turn]
-                if part:
+                if count:
                     model.launch(self._kernels[i], threads, given, [self.multipliers[i], self.correction])
-                pool.launch_barrier(model)
         if not backward:
             self._sweep_dynamic(backward)
 

@@ -11,7 +11,7 @@ from ..scene.scene import Scene
 from ..terms import QuadraticBending, Spring
 
 # Move between two peaks of the kinetic energy, relative to that since the start, below which cloth rests; most frames.
-_STILL, _MOST = 1e-4, 3000
+_STILL, _MAX_FRAMES = 1e-4, 3000
 
 
 class Calibration(NamedTuple):
@@ -66,7 +66,7 @@ def rest_of(scene, record, device="cpu"):
         steps = record.bind(scene, device)
         start = peak = steps.points().astype(np.float64)
         energy = 0.0
-        for _ in range(_MOST):
+        for _ in range(_MAX_FRAMES):
             steps.frame()
             before, energy = energy, float((masses * steps.velocities().astype(np.float64) ** 2).sum())
             if not np.isfinite(energy):
@@ -76,7 +76,7 @@ def rest_of(scene, record, device="cpu"):
                 steps.stop()
                 if np.abs(peak - last).max() <= _STILL * np.abs(peak - start).max():
                     return peak
-    raise ValueError(f"{scene.name} does not come to rest by {record} within {_MOST} frames")
+    raise ValueError(f"{scene.name} does not come to rest by {record} within {_MAX_FRAMES} frames")
 
 
 def _ratio(scene, record, device, axis):

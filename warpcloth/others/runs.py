@@ -55,14 +55,9 @@ class OtherSolver(NamedTuple):
 
 @in_turn
 def run_other(scene, record, device="cpu", frames=None, progress=None):
-    """Runs a scene with a solver of another simulator; it compiles before frame 0.
+    """Runs a scene with the record of an :class:`OtherSolver`; it compiles before frame 0.
 
-    Args:
-        scene: The :class:`warpcloth.Scene`.
-        record: The record of an :class:`OtherSolver`.
-        device: A Warp device.
-        frames: Number of frames after the first; by default that of the scene.
-        progress: Function called with (frame, frames) from frame 0, or None.
+    ``frames`` is by default that of the scene, ``progress`` a function called with (frame, frames) from frame 0, or None.
 
     Returns:
         :class:`warpcloth.Animation` from the simulator's start. It has diverged, and ends before that frame, if a coordinate is

@@ -51,16 +51,11 @@ class Camera:
 
     @classmethod
     def framed(cls, frames, azimuth=-38.0, elevation=24.0, up_axis="Y", aspect=16 / 9, fov=30.0, margin=0.08):
-        """Returns the nearest camera in a direction that shows all points of some frames.
+        """Returns the nearest camera from an azimuth and elevation [°], as of :class:`View`, that shows all points of some
+        frames.
 
-        Args:
-            frames: Points (n, 3) of each [m], read one at a time; ones that are not finite are ignored.
-            azimuth: Angle about the vertical [°], as in :class:`View`.
-            elevation: Angle above the horizontal [°].
-            up_axis: "Y" or "Z".
-            aspect: Width over height of the picture.
-            fov: Vertical field of view [°].
-            margin: Empty fraction of the picture on each side.
+        Frames (n, 3) [m] are read one at a time; points that are not finite are ignored. ``aspect`` is width over height,
+        ``fov`` the vertical field of view [°], ``margin`` the empty fraction on each side.
 
         Raises:
             ValueError: No point is finite, or a number is out of range.

@@ -10,7 +10,7 @@ from .colour import EXCLUDED
 
 INK = (64, 64, 68)
 # Height of letters relative to that of the picture, or to 9/16 of its width; and the smallest legible height [px].
-_LETTERS, _LEAST = 0.03, 10
+_LETTERS, _MIN_LETTERS = 0.03, 10
 # Height of the bar relative to that of the picture, and largest width of everything around it relative to its width.
 _BAR, _WIDEST = 0.56, 0.4
 
@@ -31,7 +31,7 @@ class Overlay:
         self.columns = columns
         self.scale, self.title, self.unit = scale, written(title), written(unit)
         self.names, self.background = [written(name) for name in names], tuple(background)
-        self.letters = max(_LEAST, round(_LETTERS * min(self.height, self.width * 9 / 16)))
+        self.letters = max(_MIN_LETTERS, round(_LETTERS * min(self.height, self.width * 9 / 16)))
         self._font = ImageFont.load_default(self.letters)
 
     @cached_property

@@ -35,7 +35,7 @@ ENDING = ".html"
 # Measures in a page if none are named: both principal stretches.
 USUAL = ("stretch_1", "stretch_2")
 # Largest page [bytes] that a browser can be expected to open, and that a notebook embeds.
-LARGEST, EMBEDDED = 400_000_000, 5_000_000
+MAX_BYTES, EMBEDDED = 400_000_000, 5_000_000
 # Positions of more than this many times the bytes that a notebook embeds are not coded to see whether they fit. Coding shortens
 # those of cloth in motion to 0.3 or 0.6.
 _SHORTEN = 8
@@ -220,7 +220,7 @@ def _page(
         TooLarge: The page would be larger than ``largest`` [bytes], by default than a file may be.
     """
     given, colormap = scaling
-    largest = largest or LARGEST
+    largest = largest or MAX_BYTES
     if given is not None:
         if len(values) != 1:
             raise ValueError(

@@ -14,31 +14,19 @@ _SIDE, _RIGHT, _TOP, _FOOT, _GAP = 6.0, 1.2, 0.5, 0.3, 0.15
 # Line widths [pt]: edges in the colour of their triangle close hairline gaps between neighbours, which at 150 dpi needs 0.8.
 _EDGE, _LINE = 0.8, 0.7
 # Smallest brightness of shading, because the bar shows the colours in full light.
-_LEAST_LIGHT = 0.85
+_MIN_LIGHT = 0.85
 _GREYS = (0.0, 1.0, 0.5)
 
 
 def draw(
     path, points, triangles, values, scale, on="triangle", title="", unit="1", view=None, directions=None, both_sides=False
 ):
-    """Writes a PNG of a cloth in parallel projection with a colour bar.
+    """Writes a PNG of a cloth, points (n, 3) [m] and triangles (T, 3), in parallel projection with a colour bar.
 
-    A vertex colours the nearest third of each triangle; dark grey is no value. Triangles that are not finite are counted, not
-    drawn.
-
-    Args:
-        path: The file.
-        points: (n, 3) [m].
-        triangles: Vertices (T, 3).
-        values: (T,), or (n,); NaN for no value.
-        scale: The :class:`Scale`.
-        on: "triangle" or "vertex".
-        title: Title.
-        unit: Unit of the values.
-        view: The :class:`View`, fitted to a whole sequence to compare; without a window it is fitted to these points.
-        directions: Segments by name, (centres (E, 3) [m], vectors (E, 3) [m] from end to end): the first black, the second
-            white, the third grey; those not finite are ignored.
-        both_sides: Whether a second panel shows the opposite side.
+    The values (T,), or (n,) ``on`` vertices, colour by a :class:`Scale`, NaN in dark grey; a vertex colours the nearest third
+    of each triangle. Triangles that are not finite are counted, not drawn. A ``view`` without a window is fitted to these
+    points. ``directions`` are segments by name, centres and vectors (E, 3) [m]: the first black, the second white, the third
+    grey. ``both_sides`` adds a panel from the opposite side.
 
     Raises:
         OSError, ImportError: The file cannot be written, or matplotlib is not installed.
@@ -107,7 +95,7 @@ def _check(points, triangles, values, on):
 
 
 def _whole(corners, colours):
-    return corners, colours * brightness(corners, _LEAST_LIGHT)[:, None]
+    return corners, colours * brightness(corners, _MIN_LIGHT)[:, None]
 
 
 def _thirds(corners, colours):
@@ -115,7 +103,7 @@ def _thirds(corners, colours):
     following, before = np.roll(corners, -1, axis=1), np.roll(corners, 1, axis=1)
     middle = np.broadcast_to(corners.mean(axis=1, keepdims=True), corners.shape)
     outlines = np.stack([corners, (corners + following) / 2.0, middle, (corners + before) / 2.0], axis=2)
-    return outlines.reshape(-1, 4, 3), (colours * brightness(corners, _LEAST_LIGHT)[:, None, None]).reshape(-1, 3)
+    return outlines.reshape(-1, 4, 3), (colours * brightness(corners, _MIN_LIGHT)[:, None, None]).reshape(-1, 3)
 
 
 def _segments(view, directions):

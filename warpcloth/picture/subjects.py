@@ -26,7 +26,7 @@ from .shape import BACK, CLOTH, Shape
 SURROUNDINGS, LINES = (0.42, 0.41, 0.39), (0.06, 0.06, 0.065)
 # Largest and smallest radius of pins relative to the size of the cloth, and a limit relative to the edge length, so that
 # neighbours do not touch.
-_PIN, _PIN_LEAST, _PIN_EDGE = 0.005, 0.0025, 0.25
+_PIN, _PIN_MIN, _PIN_EDGE = 0.005, 0.0025, 0.25
 # Smallest radius of the tubes of a net or chain without widths, relative to its size, so that they are visible.
 _THINNEST = 0.003
 # The same for strings and bars beside a cloth.
@@ -304,7 +304,7 @@ def _cloth(mesh, points, pins=()):
 
 
 def _shape(count, triangles, edges, radius, pins, size, edge, colour):
-    ball = max(_PIN_LEAST * size, min(_PIN * size, _PIN_EDGE * edge), 1.6 * radius) or 1.0
+    ball = max(_PIN_MIN * size, min(_PIN * size, _PIN_EDGE * edge), 1.6 * radius) or 1.0
     return Shape(
         count,
         triangles,

@@ -23,12 +23,11 @@ _CALLED = {
     "solver": "the solver {}",
     "device": "the device {}",
     "dtype": "dtype {}",
-    "threads": "threads {}",
     "record": "record {}",
 }
 
 
-def facts_of(scene, solver, device, dtype, vary, threads, record=()):
+def facts_of(scene, solver, device, dtype, vary, record=()):
     """Returns everything that the bits of a run depend on, by name.
 
     Raises:
@@ -42,7 +41,6 @@ def facts_of(scene, solver, device, dtype, vary, threads, record=()):
         "solver": repr(solver.without_limits()),  # steps do not depend on the check of limits
         "device": device.name if device.is_cuda else "cpu",
         "dtype": dtype,
-        "threads": int(threads),
         "record": ", ".join(record) or "nothing",
     }
 

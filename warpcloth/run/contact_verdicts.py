@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.turns import in_turn
 from ..scene.colliders import turned
 from ..terms.needs import NORMAL_FORCE
 from .history import collider_names
@@ -71,7 +70,6 @@ class Pressed:
                 self.first[copy, c] = number
 
 
-@in_turn
 def soft_contact_of(watch, stepper):
     """Returns a sentence each about the first frame in which a gap to a collider, or between cloth and cloth, is below half the
     contact distance (r/4 for edges and for vertices of meshes).
@@ -98,7 +96,6 @@ def _where(found):
     return f"in frame {found.frame}" + (f" of copy {found.copy}" if found.copy else "")
 
 
-@in_turn
 def inside_of(stepper):
     """Returns the :class:`Inside` of each collider and copy in the steps so far, the first frame first."""
     names, found = collider_names(stepper.model.scene), []
@@ -108,7 +105,6 @@ def inside_of(stepper):
     return tuple(sorted(found, key=lambda each: each.frame))
 
 
-@in_turn
 def forced_of(stepper):
     """Returns the :class:`Forced` of each mesh and copy in the steps so far, the first frame first."""
     scene = stepper.model.scene
@@ -136,7 +132,6 @@ class Unresolved(NamedTuple):
         )
 
 
-@in_turn
 def unresolved_of(stepper):
     """Returns the :class:`Unresolved` of each copy in the steps so far, the first frame first."""
     found, name = [] if stepper.pairs is None else stepper.pairs.unresolved, stepper.model.numpy_dtype.__name__
@@ -144,7 +139,6 @@ def unresolved_of(stepper):
     return tuple(sorted(found, key=lambda each: each.frame))
 
 
-@in_turn
 def crossings_at_start(model):
     """Returns a sentence about the triangles of free cloth that cross each mesh at the start of the first copy where some do.
 
@@ -210,7 +204,6 @@ def _passes_through(p, q, a, b, c):
     return within & (volume(a, b, c, p) * volume(a, b, c, q) < 0.0)
 
 
-@in_turn
 def held_pins_of(stepper):
     """Returns the :class:`warpcloth.contact.self_steps.PinHeld` of each copy that holds pins back, with indices in the mesh."""
     held = [] if stepper.pairs is None else stepper.pairs.pins_held

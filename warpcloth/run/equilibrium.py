@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 import warpcloth.contact as contact
 
 from ..base.checks import array, choice, number, whole
-from ..base.limits import MOST_FRAMES
+from ..base.limits import MAX_FRAMES
 from ..base.turns import in_turn
 from ..base.types import Precision
 from ..core.state import State
@@ -19,7 +19,7 @@ from ..core.status import Grade, Residual, Result, Status, digits, sentence
 from ..kernels.terms.air import AIR
 from ..numerics.iterate import ResidualScale
 from ..numerics.minimise import Minimiser
-from ..numerics.multigrid import LEAST
+from ..numerics.multigrid import MIN_VERTICES
 from ..scene.scene import Scene
 from ..terms.needs import FINITE, refuse_unmet
 from ..terms.refresh import STEP, Moment
@@ -31,7 +31,7 @@ RESIDUAL = Residual("sum of the unbalanced forces")
 WEIGHT = "times the weight"
 # Iterations after which stiff cloth starts from the rest shape of softer cloth, and the residual below which it does not; the
 # tolerance of softer cloth, its most iterations for one stiffness, and for all of them as a share of those that are left.
-PATIENCE, NEARLY, ROUGHLY, MOST_SOFT, SOFT_SHARE = 10, 0.1, 1e-3, 200, 0.5
+PATIENCE, NEARLY, ROUGHLY, MAX_SOFT, SOFT_SHARE = 10, 0.1, 1e-3, 200, 0.5
 # A descent that ended by rounding, and moved by less than this fraction of the size of the cloth, is not repeated.
 NEAR = 1e-5
 
@@ -147,7 +147,7 @@ def equilibrium(
         pairs = contact.SelfSteps(model, state, h=0.0, steps_per_frame=1, bounded=False, colliders=colliders)
         pairs.filter.iterates()
     if linear == "auto":
-        linear = "cg" if model.per_copy >= LEAST else "factorised"
+        linear = "cg" if model.per_copy >= MIN_VERTICES else "factorised"
     touching = model if pairs is None else model.with_dynamic(pairs.forces.terms)
     minimiser = Minimiser(touching, base, "adaptive", linear, s=0.0, pairs=pairs)
     wind = _Wind(model, base) if scene.air_terms else None
@@ -224,7 +224,7 @@ def _start_softly(model, base, descent, linear):
     before, left = wp.clone(base), int(SOFT_SHARE * (descent.iterations - descent.used))
     for factor in factors:
         minimiser = Minimiser(softened(model, factor), base, "adaptive", linear, s=0.0)
-        stage = _Descent(minimiser, base, ROUGHLY, min(MOST_SOFT, left), None)
+        stage = _Descent(minimiser, base, ROUGHLY, min(MAX_SOFT, left), None)
         result = stage.run(1.0, _frequency_scale(model))
         descent.used, left = descent.used + stage.used, left - stage.used
         if result not in SETTLED:
@@ -380,7 +380,7 @@ def _settle_all(model, base, descent, part):
             wind.set()
         if loads is not None:
             # The last keyframe.
-            loads.set(model, Moment(base, ahead=MOST_FRAMES))
+            loads.set(model, Moment(base, ahead=MAX_FRAMES))
 
     while True:
         base.assign(_with_pins(pins, base.numpy(), part))

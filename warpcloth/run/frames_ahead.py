@@ -38,26 +38,22 @@ class Frame(NamedTuple):
 
 
 def frames_of(stepper, count, ahead, keeps=None, find=None):
-    """Yields the next frames of a stepper. Close the generator: it then waits for frames in work.
+    """Yields the next ``count`` frames of a stepper, at most ``ahead`` of them computed ahead by a thread, without one if 0.
 
-    While the caller uses one frame, a thread computes the next ones. The first is computed alone: it may capture graphs, during
-    which the device must not do other work.
-
-    Args:
-        stepper: Its state is ahead of the frame that the caller has.
-        count: Number of frames.
-        ahead: Maximum number of frames computed ahead; 0 computes each on demand, without a thread.
-        keeps: Function (number of frames before) → whether the next frame includes the state; or None.
-        find: Function that is called after each frame for ``found``, or None.
+    The first is computed alone: it may capture graphs, during which the device must not do other work. Close the generator: it
+    then waits for frames in work. ``keeps`` is a function (number of frames before) → whether the next frame includes the
+    state, ``find`` one that is called after each frame for ``found``, or None.
     """
     numbers = itertools.count()
-    copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
+    with TURN:
+        copies = itertools.cycle(_copies(stepper, max(min(ahead, count - 1), 1)))
 
+    @in_turn
     def compute():
         copy = next(copies)
         copy.frame()
         found = None if find is None else find()
-        state = _state_of(stepper) if keeps is not None and keeps(next(numbers)) else None
+        state = stepper.state.to_host() if keeps is not None and keeps(next(numbers)) else None
         return copy, list(stepper.results), np.array(stepper.residual), found, state
 
     def taken(copy, results, residual, found, state):
@@ -83,7 +79,6 @@ def frames_of(stepper, count, ahead, keeps=None, find=None):
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-@in_turn
 def state_of(stepper):
     """Returns copies of the present points [m] and velocities [m/s], (B·n, 3) each, in the order of the scene."""
     model = stepper.model
@@ -91,12 +86,6 @@ def state_of(stepper):
     return tuple(np.array(model.in_scene_order(array.numpy())) for array in stepper.state)  # on the CPU numpy() is a view
 
 
-@in_turn
-def _state_of(stepper):
-    return stepper.state.to_host()
-
-
-@in_turn
 def _copies(stepper, number):
     model = stepper.model
     if not model.device.is_cuda:
@@ -122,7 +111,6 @@ class _HostCopy:
     def __init__(self, stepper):
         self.stepper = stepper
 
-    @in_turn
     def frame(self):
         began = time.perf_counter()
         self.stepper.frame()
@@ -143,7 +131,6 @@ class _DeviceCopy:
         if indices is not None:
             self._take = stepper.model.kernel(take_vertices, stepper.model.dtype)
 
-    @in_turn
     def frame(self):
         model, stream = self.stepper.model, self.stepper.model.device.stream
         stream.record_event(self._began)

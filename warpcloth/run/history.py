@@ -10,9 +10,8 @@ import warp as wp
 import warpcloth.contact as contact
 
 from ..base.checks import shown
-from ..base.limits import MOST_FRAMES
+from ..base.limits import MAX_FRAMES
 from ..base.texts import numbered
-from ..base.turns import in_turn
 from ..core.capture import Segment
 from ..core.energy import Energy
 from ..core.sums import Sums
@@ -236,7 +235,7 @@ class Evaluation:
 
 def last_frame(scene: Scene) -> int:
     """Returns the frame of the wind at rest: its last keyframe, or the last frame if it is a function."""
-    return MOST_FRAMES if scene.air is not None and scene.air.keyframes is not None else scene.frames
+    return MAX_FRAMES if scene.air is not None and scene.air.keyframes is not None else scene.frames
 
 
 def _time_of(stepper):
@@ -285,7 +284,6 @@ class History:
 
     energies, reactions, pairs, forces, cuts = map(_kept, (*RECORDS, "forces", "cuts"))
 
-    @in_turn
     def __init__(self, stepper, model, record):
         self._stepper, self.model, self._record, scene = stepper, model, record, model.scene
         changing = model.loads is not None and model.loads.constant is None

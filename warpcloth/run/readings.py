@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..analysis.surface_comparison import capture_to_up_axis
+from ..analysis.compare import to_up_axis
 from ..base.checks import array, keep_plain, number, numeric, refuse, shown, whole
 from ..base.tables import number_in, read_table
 from ..base.types import FilePath
@@ -201,7 +201,7 @@ class CapturePoints:
         Warns:
             UserWarning: A frame has no finite triangle and is left out.
         """
-        capture = capture_to_up_axis(self.capture, scene.mesh.up_axis, self.capture.up_axis)
+        capture = to_up_axis(self.capture, scene.mesh.up_axis, self.capture.up_axis)
         where = name if capture.path is None else str(capture.path)
         _refuse_no_triangles(where, scene, "to compare a capture with; give markers on vertices")
         if resting:

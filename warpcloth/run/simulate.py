@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from ..base.checks import whole
 from ..base.interrupts import recording
-from ..base.limits import MOST_FRAMES, refuse_disk, refuse_memory
+from ..base.limits import MAX_FRAMES, refuse_disk, refuse_memory
 from ..base.notebooks import ShownInNotebooks
-from ..base.turns import in_turn
+from ..base.turns import TURN
 from ..base.types import FilePath, Precision, Progress
 from ..core.status import Status, Stopped, millimetres
 from ..mesh.ordering import order_of_run
@@ -240,7 +240,7 @@ def simulate(
         (31, 2, 3)
     """
     frames = scene.frames if frames is None else frames
-    whole("frames", frames, 1, MOST_FRAMES)
+    whole("frames", frames, 1, MAX_FRAMES)
     whole("copies", copies, 1)
     dtype = solver.precision_on(device, dtype)
     record = checked_record(record, scene)
@@ -250,24 +250,24 @@ def simulate(
         raise ValueError("resume is given without output, the file of the run to go on with")
 
     def facts():
-        return facts_of(scene, solver, device, dtype, vary, threads, record)
+        return facts_of(scene, solver, device, dtype, vary, record)
 
     # First, so that a wrong output is refused before anything compiles.
     recorder = Memory(frames, copies) if output is None else File(scene, output, single_file, facts, resume, record)
     with recording(recorder, frames):
         _refuse_size(frames, scene, dtype, copies, output)
         start = time.perf_counter()
-        model = scene.build(
-            device=device, dtype=dtype, copies=copies, vary=vary, order=order_of_run(scene, solver), threads=threads
-        )
-        stepper = solver.bind(model)
-        timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds}
-        watch, first = Watch(model, stepper), 0
-        history = watch.history = History(stepper, model, record) if record else None
-        if resume:
-            first = _resume(recorder.checkpoint, frames, stepper, watch)
-        else:
+        order = order_of_run(scene, solver)
+        with TURN:
+            model = scene.build(device=device, dtype=dtype, copies=copies, vary=vary, order=order, threads=threads)
+            stepper = solver.bind(model)
+            timings = {"compile": time.perf_counter() - start, "factorise": stepper.factorise_seconds}
+            watch, first = Watch(model, stepper), 0
+            history = watch.history = History(stepper, model, record) if record else None
+            if resume:
+                first = _resume(recorder.checkpoint, frames, stepper, watch)
             points, velocities = state_of(stepper)
+        if not resume:
             recorder.append(points, velocities, recorded=history and history.keep(watch.alive))
         timings["frames"] = watch.seconds
         if progress is not None:
@@ -280,16 +280,18 @@ def simulate(
                 if progress is not None:
                     progress(number, frames)
         recorder.finish()
-    held, inside, forced = held_pins_of(stepper), inside_of(stepper), forced_of(stepper)
-    self_contact = _self_contact(stepper, watch, output is not None, held)  # first, as it notes the gaps of the last frame
-    faults = contact_faults(scene, held, inside, forced, unresolved_of(stepper), copies)
-    status = watch.status(solver, faults, [*crossings_at_start(model), *soft_contact_of(watch, stepper)])
+    with TURN:
+        held, inside, forced = held_pins_of(stepper), inside_of(stepper), forced_of(stepper)
+        self_contact = _self_contact(stepper, watch, output is not None, held)  # first, as it notes the gaps of the last frame
+        faults = contact_faults(scene, held, inside, forced, unresolved_of(stepper), copies)
+        status = watch.status(solver, faults, [*crossings_at_start(model), *soft_contact_of(watch, stepper)])
+        cut = of_copies(stepper.cut)
     times = np.arange(status.frame + 1) / scene.fps
     points, velocities = recorder.read()
     recorded = {
         "output": output,
         "scene": scene,
-        "cut": of_copies(stepper.cut),
+        "cut": cut,
         "inside": inside,
         "forced": forced,
         "self_contact": self_contact,
@@ -298,7 +300,6 @@ def simulate(
     return Animation(points, velocities, times, status, timings, of_copies(watch.worst_strain), **recorded)
 
 
-@in_turn
 def _self_contact(stepper, watch, in_file, held):
     pairs, model = stepper.pairs, stepper.model
     if pairs is None:
@@ -326,7 +327,6 @@ def _self_contact(stepper, watch, in_file, held):
     return SelfContactSummary(pairs.most, int(pairs.lists.numpy().max()), *of_run)
 
 
-@in_turn
 def _resume(checkpoint, frames, stepper, watch):
     if frames < checkpoint.frame:
         raise ValueError(f"frames is {frames}; the run to be resumed has {checkpoint.frame} already, and this must be no less")

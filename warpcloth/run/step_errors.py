@@ -12,7 +12,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import warp as wp
 
-from ..base.turns import in_turn
 from ..core.capture import Mirror, Segment
 from ..core.energy import Energy
 from ..core.hessian import Hessian
@@ -87,7 +86,6 @@ class StepErrors:
             for taker, _first, _end in stepper.takers
         )
 
-    @in_turn
     def find(self):
         """Returns the :class:`StepError` of the frame that ended with the last step."""
         B = len(self.distance)

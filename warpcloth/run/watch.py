@@ -118,7 +118,6 @@ class Watch:
             return None
         stepper = self._stepper
 
-        @in_turn
         def find():
             return self.grades.errors.find(), np.inf if stepper.pairs is None else stepper.pairs.least_gap
 

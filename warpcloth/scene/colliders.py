@@ -309,14 +309,13 @@ def turned(q, vectors):
 def default_stiffness(distance: float, weight: float, stiffness: float, size: float) -> float:
     """Returns k = (2/r)(wL/r + Y/L) [Pa/m], at which a gap of r/2 carries the pressures kr/2 that hold or pull a whole cloth.
 
-    A tension T [N/m] presses on an edge of radius R ≥ r by T/R. The first pressure is that of T = wL, cloth that hangs over
-    such an edge; the second of T = Yr/L, cloth pulled over it until it is longer by r. It adds less to the highest frequency of
-    a mesh than its membrane does if edges are below about 2√(rL) and weight strains the cloth by less than r/L.
+    A tension T [N/m] presses on an edge of radius r by T/r: T = wL for cloth that hangs over it, Yr/L for cloth pulled over it
+    until it is longer by r.
 
     Args:
         distance: Contact distance r [m].
         weight: Weight per area w [Pa].
-        stiffness: Stiffness Y of the cloth, force per width and strain [N/m].
+        stiffness: Force per width and strain Y [N/m].
         size: Size L of the cloth [m].
     """
     return 2.0 / distance * (weight * size / distance + stiffness / size)

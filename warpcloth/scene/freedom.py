@@ -13,10 +13,10 @@ import numpy as np
 from ..terms.bending import Bending
 
 # Largest number of free vertices for which the rank is computed, in a few seconds; time and memory grow faster than linearly.
-MOST = 20_000
+MAX_VERTICES = 20_000
 # Radius, in edges, of the fold whose cost decides whether an edge is stiff.
 FOLD = 4.0
-# Squared singular values below this count as 0, for rows of unit length. In nets of up to MOST vertices, nonzero ones are 1e-9
+# Squared singular values below this count as 0, for rows of unit length. In nets of up to MAX_VERTICES, nonzero ones are 1e-9
 # or more, and zeros round to some 1e-13.
 _ZERO = 1e-11
 
@@ -62,7 +62,7 @@ def freedom(scene):
     free[scene.fixed] = False
     coordinates, rigid = int(free.sum()), _rigid(mesh, pairs, free)
     pairs = pairs[free[pairs].any(axis=(1, 2))]
-    counted = int(free.any(axis=1).sum()) > MOST
+    counted = int(free.any(axis=1).sum()) > MAX_VERTICES
     rank = min(len(pairs), max(coordinates - rigid, 0)) if counted else rank_of(pairs, free)
     return Freedom(len(pairs), hard, coordinates, rank, coordinates - rank, rigid, counted)
 

@@ -30,7 +30,7 @@ from .warp import warp_on
 EARTH = 9.81  # [m/s²]
 DOWN = {"Y": (0.0, -1.0, 0.0), "Z": (0.0, 0.0, -1.0)}
 DISTANCE = 1e-3  # of contact, where neither it nor a fabric has one [m]
-_MOST_FRAMES = 2**31 - 1  # frames are counted in int32 on the device
+_MAX_FRAMES = 2**31 - 1  # frames are counted in int32 on the device
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,9 +206,9 @@ class Scene:
         number("fps", self.fps, above=0.0)
         number("duration", self.duration, above=0.0)
         frames = float(self.duration) * float(self.fps)
-        if not (0.5 < frames < _MOST_FRAMES and abs(frames - round(frames)) < 1e-6 * frames):
+        if not (0.5 < frames < _MAX_FRAMES and abs(frames - round(frames)) < 1e-6 * frames):
             raise ValueError(
-                f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames from 1 to {_MOST_FRAMES}"
+                f"duration is {self.duration} s; at fps {self.fps} it must be a whole number of frames from 1 to {_MAX_FRAMES}"
             )
         keep("terms", self._checked_terms())
         gravity = EARTH * np.array(DOWN[self.mesh.up_axis or "Y"]) if self.gravity is None else self.gravity

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..core.capture import Mirror, Segment
 from ..core.constant_matrix import constant_matrices
 from ..core.gradient import Gradient
@@ -118,18 +118,9 @@ class ADMM(ImplicitStep):
         limits=("r = 1/(2hω)", "h² = m/(k(L/l − 1))"),
     )
 
-    iterations: int = 20
-    tolerance: float = 1e-3
-    weight: float | Literal["auto"] = "auto"
-
-    def __post_init__(self):
-        super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        number("tolerance", self.tolerance, above=0.0)
-        if isinstance(self.weight, str) and self.weight != "auto":
-            raise ValueError(f"weight is {self.weight!r}; it must be 'auto' or a number above 0")
-        if self.weight != "auto":
-            number("weight", self.weight, above=0.0)
+    iterations: int = ranged(20, whole=True, least=1)
+    tolerance: float = ranged(1e-3, above=0.0)
+    weight: float | Literal["auto"] = ranged("auto", above=0.0, word="auto")
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..core.capture import Mirror, Segment
 from ..core.status import Residual, Result
 from ..core.sums import RowSums, Sums
@@ -16,7 +16,7 @@ from ..model.model import Model
 from ..numerics.constraints import Constraints
 from ..numerics.iterate import ResidualScale
 from ..numerics.linear import ConjugateGradients, FactorisedRows
-from ..numerics.multigrid import LEAST
+from ..numerics.multigrid import MIN_VERTICES
 from ..numerics.primal import PrimalSolver
 from ..numerics.search import Search
 from ..terms.needs import FINITE, MERGED_DAMPING, ROWS, STEADY_ROWS
@@ -93,15 +93,10 @@ class ConstrainedDynamics(ImplicitStep):
     )
     residual = Residual("largest residual of a vertex or a constraint (as an acceleration)")
 
-    iterations: int = 20
-    tolerance: float = 1e-3
+    iterations: int = ranged(20, whole=True, least=1)
+    tolerance: float = ranged(1e-3, above=0.0)
     stabilisation: Literal["none", "geometric-stiffness", "line-search"] = "geometric-stiffness"
     linear: Literal["cg", "factorised"] = "cg"
-
-    def __post_init__(self):
-        super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        number("tolerance", self.tolerance, above=0.0)
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
@@ -148,7 +143,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
 
         self._active, self._stepped = Mirror(model.scalars(wp.int32)), Mirror(self._step)
         if options.linear == "cg":
-            through = model.per_copy >= LEAST and self.constraints.of_elements
+            through = model.per_copy >= MIN_VERTICES and self.constraints.of_elements
             self._linear = (PrimalSolver if through else ConjugateGradients)(self.constraints, LINEAR_ITERATIONS)
             self._tolerance = Mirror(self._linear.tolerance)
         else:

@@ -78,6 +78,7 @@ class ErrorStepper(Stepper):
         model: The model.
 
     Attributes:
+        model, declared: The model as it was bound; the stepper of each length has its own model of the steps.
         length: :class:`Length`.
         reported: The stepper that is always kept, whose contact has the present state after each step and frame.
         iterations: Iterations of all steps that the last frame or step needed, over the number of those taken.
@@ -91,7 +92,7 @@ class ErrorStepper(Stepper):
     even = False
 
     def __init__(self, options, bind, model):
-        self.options, self.model, self._reset = options, model, None
+        self.options, self.model, self.declared, self._reset = options, model, model, None
         self._bind, self._kept, self._segments, self.factorise_seconds = bind, {}, {}, 0.0
         self.reported = first = self._stepper(FIRST)
         self.integrator, self.count = getattr(first, "integrator", None), getattr(first, "count", None)
@@ -270,7 +271,8 @@ class ErrorStepper(Stepper):
             self._reset = Reset(self)
             self._resets = [self._reset]
             if self.state.shares:
-                self._resets = [Reset(each) for each in map(self._share, self.reported.shares, self.state.shares)]
+                shares = zip(self.reported.shares, self.state.shares, strict=True)
+                self._resets = [Reset(self, stepper.model, state) for (stepper, _first, _end), state in shares]
         mask, positions, velocities = self._reset.on_device(mask, positions, velocities)
         n, first = self.model.per_copy, 0
         for reset in self._resets:
@@ -281,12 +283,6 @@ class ErrorStepper(Stepper):
         if mask.numpy().all():
             self.length.assign(Length(FIRST))
         self._report()
-
-    def _share(self, of_thread, state):
-        """Returns what a reset needs of the copies of a thread: their model and state."""
-        share = Stepper.__new__(Stepper)
-        share.options, share.model, share.state, share.pairs = self.options, of_thread[0].model, state, None
-        return share
 
     def record_again(self):
         self.reported.record_again()

@@ -68,10 +68,6 @@ class Explicit(Step):
     above_limit: Literal["refuse", "allow"] = "refuse"
 
     @property
-    def divides(self) -> bool:
-        return True
-
-    @property
     def staggered(self) -> bool:
         return self.scheme == "symplectic"
 
@@ -313,7 +309,7 @@ class ExplicitStepper(LaunchedStepper):
         super().__init__(options, model, None)
         symplectic = options.scheme == "symplectic"
         self.plan = plan(self.model, backend)
-        given = tuple(self.state), self.h, symplectic, self.count, self.pool, self.colliders, self.pairs
+        given = tuple(self.state), self.h, symplectic, self.count, self.colliders, self.pairs
         self._steps = self.plan.explicit_step(*given)
         self.state.add("position residual", self._steps.residual)
         self.record((lambda: self.launch_steps(1), 1))
@@ -321,7 +317,7 @@ class ExplicitStepper(LaunchedStepper):
     def _record_frame(self):
         if not self.model.dynamic:
             return super()._record_frame()
-        return [(self._segments(lambda: self.launch_steps(self.steps_per_frame)), 1)]  # a loop on the device
+        return [(self._segment_of(self.steps_per_frame), 1)]  # a loop on the device
 
     def follow_contact(self):
         self.colliders.note_pushes()

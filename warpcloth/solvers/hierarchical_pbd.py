@@ -1,11 +1,10 @@
 """Hierarchical position based dynamics: PBD that sweeps over coarse levels before fine ones."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import warp as wp
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..kernels.hierarchy import follow
 from ..model.model import Model
 from ..numerics.hierarchy import levels, on_device
@@ -63,22 +62,10 @@ class HierarchicalPBD(Step):
         runs=grid([(4, 1), (8, 1), (15, 1), (30, 1), (8, 2), (15, 2), (30, 2), (60, 2), (120, 2)]),
     )
 
-    iterations: int = 20
-    coarse_iterations: int = 5
-    levels: int | None = None
-    relaxation: float = 1.0
-
-    def __post_init__(self):
-        super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        whole("coarse_iterations", self.coarse_iterations, 1)
-        if self.levels is not None:
-            whole("levels", self.levels, 0)
-        number("relaxation", self.relaxation, above=0.0)
-
-    @property
-    def divides(self) -> bool:
-        return True
+    iterations: int = ranged(20, whole=True, least=1)
+    coarse_iterations: int = ranged(5, whole=True, least=1)
+    levels: int | None = ranged(None, whole=True, least=0)
+    relaxation: float = ranged(1.0, above=0.0)
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
@@ -104,17 +91,18 @@ class HierarchicalPBDStepper(LaunchedStepper):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations
         self.levels = levels(model, options.levels)
-        given = self.model, self.state.x, self.h, "coloured", options.relaxation
-        self.sweep = GaussSeidelSweep(*given, pool=self.pool)
-        self.model = self.model.with_terms(self.sweep.elements)
         self._coarse = [self._on_level(level) for level in self.levels]
         self.record((self._launch_start, 1), (self.sweep.launch, options.iterations), (self._launch_last, 1))
+
+    def arranged(self, model):
+        self.sweep = GaussSeidelSweep(model, self.state.x, self.h, "coloured", self.options.relaxation)
+        return model.with_terms(self.sweep.elements)
 
     def _on_level(self, level):
         """Returns the sweep over a level, and the arguments of the launch that interpolates to the vertices that it drops."""
         model, d = self.model, self.sweep.correction
         given = on_device(model, level), self.state.x, self.h, "coloured", self.options.relaxation
-        sweep = GaussSeidelSweep(*given, correction=d, pool=self.pool, follows=False)
+        sweep = GaussSeidelSweep(*given, correction=d, follows=False)
         dropped, offsets, parents = (
             wp.array(each, dtype=wp.int32, device=model.device) for each in (level.dropped, level.offsets, level.parents)
         )
@@ -123,15 +111,13 @@ class HierarchicalPBDStepper(LaunchedStepper):
 
     def _launch_start(self):
         """Launches the prediction, and the sweeps over the levels, the coarsest first."""
-        pool = self.pool
-        pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        self.launch_prediction()
+        self.sweep.launch_start()
         for sweep, followers in reversed(self._coarse):
             for _ in range(self.options.coarse_iterations):
                 sweep.launch()
-            pool.launch_alone(
-                self.model, partial(self.model.launch, *followers), partial(self.model.lock, self.sweep.correction)
-            )
+            self.model.launch(*followers)
+            self.model.lock(self.sweep.correction)
 
     def _launch_last(self):
-        if self.pool.leads:
-            self.launch_finish(self.sweep.correction)
+        self.launch_finish(self.sweep.correction)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..core.capture import Segment
 from ..core.status import UNBALANCED, Residual
 from ..model.model import Model
@@ -76,15 +76,10 @@ class Newton(ImplicitStep):
         limits=("h² = m/(k(L/l − 1))",),
     )
 
-    tolerance: float = 1e-3
-    iterations: int = 300
+    tolerance: float = ranged(1e-3, above=0.0)
+    iterations: int = ranged(300, whole=True, least=1)
     hessian: Literal["adaptive", "raw", "clamp", "absolute"] = "adaptive"
     linear: Literal["cg", "factorised"] = "cg"
-
-    def __post_init__(self):
-        super().__post_init__()
-        number("tolerance", self.tolerance, above=0.0)
-        whole("iterations", self.iterations, 1)
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.

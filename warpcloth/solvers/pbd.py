@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..model.model import Model
 from ..numerics.sweeps import IN_PLACE, GaussSeidelSweep, JacobiSweep
 from ..terms.needs import CLOSED_STEP, LOCAL_STEP, MERGED_DAMPING, NO_AIR, NORMAL_FORCE
@@ -73,27 +73,20 @@ class PBD(Step):
         limits=("ω λ_max = 2", "Gauss–Seidel, |z| = 1", "a ring an iteration"),
     )
 
-    iterations: int = 20
+    iterations: int = ranged(20, whole=True, least=1)
     sweep: Literal["vertex-averaged", "constraint-averaged", "jacobi", "coloured", "sequential"] = "coloured"
-    alpha: float = 0.0
-    relaxation: float = 1.0
+    alpha: float = ranged(0.0, least=0.0)
+    relaxation: float = ranged(1.0, above=0.0)
     correction: Literal["per-sweep", "per-step"] = "per-sweep"
 
     def __post_init__(self):
         super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        number("alpha", self.alpha, least=0.0)
-        number("relaxation", self.relaxation, above=0.0)
         if self.sweep != "vertex-averaged" and self.alpha != 0.0:
             raise ValueError(f"alpha is {self.alpha:g}; it belongs to sweep='vertex-averaged' and must be 0 without")
 
     @property
     def ordered(self) -> bool:
         return self.sweep in IN_PLACE
-
-    @property
-    def divides(self) -> bool:
-        return self.sweep == "coloured"
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
@@ -117,20 +110,22 @@ class PBDStepper(LaunchedStepper):
     def __init__(self, options, model):
         super().__init__(options, model, "euler")
         self.iterations = options.iterations
-        model = self.model
+        self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
+
+    def arranged(self, model):
+        options = self.options
         # With one sweep, both kinds of correction are equal.
         spread = options.iterations if options.correction == "per-step" and options.iterations > 1 else None
         given = model, self.state.x, self.h, options.sweep, options.relaxation
         if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, spread=spread, pool=self.pool)
+            self.sweep = GaussSeidelSweep(*given, spread=spread)
         else:
             self.sweep = JacobiSweep(*given, alpha=options.alpha, spread=spread)
-        self.model = model.with_terms(self.sweep.elements)
-        self.record((self._launch_start, 1), *self.sweep.parts(options.iterations), (self._launch_last, 1))
+        return model.with_terms(self.sweep.elements)
 
     def _launch_start(self):
-        self.pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        self.launch_prediction()
+        self.sweep.launch_start()
 
     def _launch_last(self):
-        if self.pool.leads:
-            self.launch_finish(self.sweep.correction)
+        self.launch_finish(self.sweep.correction)

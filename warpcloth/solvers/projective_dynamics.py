@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..core.capture import Mirror, Segment
 from ..core.constant_matrix import constant_matrices
 from ..core.status import UNBALANCED, Residual
@@ -95,17 +95,11 @@ class ProjectiveDynamics(ImplicitStep):
         limits=("1 + Σk h²/m iterations", "h² = m/(k(L/l − 1))"),
     )
 
-    iterations: int = 20
-    tolerance: float = 1e-3
+    iterations: int = ranged(20, whole=True, least=1)
+    tolerance: float = ranged(1e-3, above=0.0)
     acceleration: Literal["none", "chebyshev", "anderson", "l-bfgs"] = "anderson"
-    window: int = 5
+    window: int = ranged(5, whole=True, least=1)
     linear: Literal["factorised", "jacobi"] = "factorised"
-
-    def __post_init__(self):
-        super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        number("tolerance", self.tolerance, above=0.0)
-        whole("window", self.window, 1)
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.

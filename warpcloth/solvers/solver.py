@@ -1,7 +1,5 @@
 """The base classes of bound solvers: the state, the step and the frame."""
 
-from functools import partial
-
 import numpy as np
 import warp as wp
 
@@ -12,7 +10,6 @@ from ..core.capture import Segment
 from ..core.no_filter import filter_of
 from ..core.reset import Reset
 from ..core.state import Count, State
-from ..core.thread_pool import ThreadPool
 from ..kernels import step as kernels
 from ..model.damping import damped_terms
 from ..numerics.integrators import INTEGRATORS
@@ -27,10 +24,10 @@ class Stepper:
     Attributes:
         state: The :class:`warpcloth.core.state.State`.
         h: Step [s].
-        model: The model, whose terms include damping, in the order of the steps.
-        declared: The model as it was bound, without damping and without rest states of its own for contact.
-        elements: The elements of ``model`` copy by copy, in the order of the scene; sweeps sort those of ``model``. They exist
-            with an integrator.
+        declared: The model as it was bound.
+        model: The model of the steps: with damping, with contact that has rest states of its own, and in the order of sweeps.
+            It is made once, by the constructor.
+        elements: The elements of ``model`` copy by copy, in the order of the scene.
         integrator: The integrator, see :mod:`warpcloth.numerics.integrators`, which computes x̃, and the new state from the
             minimiser; None for solvers without x̃.
         he: Effective step hₑ of the integrator [s], else h.
@@ -52,48 +49,41 @@ class Stepper:
     hard_pairs = False  # whether pairs of self-contact keep the contact distance as a constraint
     even = True
     uniform = False  # whether all steps have the same number of iterations
-    _motion = None  # x and v, if they are views of those of another stepper, see `part_of`
     predicted = correction = unfiltered = None
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        methods_in_turn(cls, "__init__", "step", "frame", "prepare_frame", "reset")
+        methods_in_turn(cls, "step", "frame", "prepare_frame", "reset")
 
     def __init__(self, options, model, integrator=None):
         fps = model.scene.fps
-        self.options, self.model, self.declared = options, model, model
+        self.options, self.declared = options, model
         self.steps_per_frame = options.per_frame(fps)
         self.h = 1.0 / (fps * self.steps_per_frame)
-        motion = self._motion or (wp.clone(model.positions), wp.clone(model.velocities))
-        self.state = State(*motion, model.copies)
+        self.state = State(*(model.motion or (wp.clone(model.positions), wp.clone(model.velocities))), model.copies)
         self.count = self.state.add("steps of keyframes", model.scalars(wp.int32) if model.timed else None, Count())
-        self._reset = None
-        self.integrator, self.he = None, self.h
-        self.colliders = None
+        self._reset = self._kept = self.colliders = self.pairs = self.integrator = None
+        method = None if integrator is None else INTEGRATORS[integrator]
+        self.he = self.h if method is None else method.share * self.h
         if model.colliders is not None:
-            part = 0.0 if integrator is None else 1.0 / INTEGRATORS[integrator].parts
+            part = 0.0 if method is None else 1.0 / method.parts
             self.colliders = contact.ColliderSteps(model, self.state, self.h, self.steps_per_frame, part)
-            self.model = model = model.with_terms(self.colliders.terms)
-        self.pairs, self._kept = None, None
+            model = model.with_terms(self.colliders.terms)
         if model.has_pairs:
-            self.pairs = contact.SelfSteps(model, self.state, self.h, self.steps_per_frame, integrator is None, self.colliders)
-            self.model = model = model.with_dynamic(self.pairs.forces.terms)
-        if integrator is not None:
-            self.integrator = INTEGRATORS[integrator](self)
-            self.he = self.integrator.he
-            self.model = model.with_terms(damped_terms(model, self.he))
-            self.elements = self.model.terms
+            self.pairs = contact.SelfSteps(model, self.state, self.h, self.steps_per_frame, method is None, self.colliders)
+            model = model.with_dynamic(self.pairs.forces.terms)
+        if method is not None:
+            model = model.with_terms(damped_terms(model, self.he))
+        self.elements, self.model = model.terms, self.arranged(model)
+        if method is not None:
+            self.integrator = method(self)
             self.predicted = model.vectors()
             if self.colliders is not None or self.pairs is not None:
                 self.unfiltered = model.vectors()
 
-    @classmethod
-    def part_of(cls, motion, options, model):
-        """Returns a stepper whose x and v are ``motion``, views of the arrays of a larger batch."""
-        stepper = cls.__new__(cls)
-        stepper._motion = motion
-        stepper.__init__(options, model)
-        return stepper
+    def arranged(self, model):
+        """Returns the model with its elements in the order of the steps, which sweeps determine; called once."""
+        return model
 
     @property
     def filter(self):
@@ -146,22 +136,17 @@ class Stepper:
 
     def launch_pins(self, parts=1):
         """Launches the move of pins with keyframes by h/``parts``; all calls must have the same ``parts``."""
-        self.launch_pins_of(self.model.pins, self.model.keyframes, self.count, *self.state, parts)
+        self.launch_pins_of(*self.state, parts)
 
-    def launch_pins_of(self, pins, keyframes, count, x, v, parts=1):
-        """Launches the move of these pins, or none, in x and v (N,), see `launch_pins`; ``count`` counts keyframe steps."""
-        model = self.model
-        add_one = model.kernel(kernels.count_step) if count is not None else None
-        if pins is None:
-            if count is not None and model.timed:
-                model.launch(add_one, model.copies, [], [count])
-            return
-        dim = (model.copies, len(pins))
-        move = model.kernel(kernels.move_pins, model.dtype)
-        # With pins that hold some axes, these are all pins of the model, because threads then do not share a step.
-        given = [pins, keyframes, model.pin_axes, count, parts * self.steps_per_frame, model.per_copy]
-        model.launch(move, dim, [*given, self.h / parts], [x, v])
-        model.launch(add_one, model.copies, [], [count])
+    def launch_pins_of(self, x, v, parts=1):
+        """Launches the move of pins in x and v (N,), see `launch_pins`, and counts the step."""
+        model, count = self.model, self.count
+        if model.pins is not None:
+            move = model.kernel(kernels.move_pins, model.dtype)
+            given = [model.pins, model.keyframes, model.pin_axes, count, parts * self.steps_per_frame, model.per_copy]
+            model.launch(move, (model.copies, len(model.pins)), [*given, self.h / parts], [x, v])
+        if count is not None:
+            model.launch(model.kernel(kernels.count_step), model.copies, [], [count])
 
     @property
     def loads_at_end(self):
@@ -222,9 +207,9 @@ class Stepper:
             self.colliders.launch_end(*self.state, self.integrator.move)
         self.filter.launch_end(*self.state, self.integrator.move, self.integrator.parts)
 
-    def launch_end_of(self, pins, keyframes, count, x, v):
+    def launch_end_of(self, x, v):
         """Launches the end of an explicit step in x and v (N,): the move of pins, and the filters of contact."""
-        self.launch_pins_of(pins, keyframes, count, x, v)
+        self.launch_pins_of(x, v)
         if self.colliders is not None:
             self.colliders.launch_end(x, v)
         self.filter.launch_end(x, v)
@@ -304,22 +289,18 @@ class LaunchedStepper(Stepper):
     """A solver whose steps consist of launches only, so that a frame is a few graphs of several steps each.
 
     The constructor of a subclass ends with `record`, and with an integrator with ``integrator.start()``.
-
-    Attributes:
-        pool: The :class:`warpcloth.core.thread_pool.ThreadPool` of the model's threads, which share each step.
     """
 
     uniform = True
 
     def __init__(self, options, model, integrator="euler"):
         super().__init__(options, model, integrator)
-        self.pool = ThreadPool(model.threads)
 
     def record(self, *parts):
         """Captures a step.
 
         Args:
-            parts: Pairs (function, number of calls). The function launches the share of the thread of the pool that calls it.
+            parts: Pairs (function that launches, number of calls).
         """
         self.parts = [(launch, times) for launch, times in parts if times]
         self._record_step()
@@ -329,13 +310,8 @@ class LaunchedStepper(Stepper):
         self._step, self._frame, self._size = [], None, 0
         for launch, times in self.parts:
             before = launches[0]
-            self._step.append((self._segments(launch), times))
-            self._size += (launches[0] - before) // self.pool.threads * times
-
-    def _segments(self, launch):
-        """Returns the segment of each thread."""
-        pool = self.pool
-        return [Segment(self.model.device, pool.as_thread(thread, launch)) for thread in range(pool.threads)]
+            self._step.append((Segment(self.model.device, launch), times))
+            self._size += (launches[0] - before) * times
 
     def follow_contact(self):
         super().follow_contact()
@@ -355,17 +331,17 @@ class LaunchedStepper(Stepper):
         if chunk < 2:
             return self._step * steps
         graphs, rest = divmod(steps, chunk)
-        frame = [(self._segments(lambda: self.launch_steps(chunk)), graphs)]
-        return frame + ([(self._segments(lambda: self.launch_steps(rest)), 1)] if rest else [])
+        frame = [(self._segment_of(chunk), graphs)]
+        return frame + ([(self._segment_of(rest), 1)] if rest else [])
+
+    def _segment_of(self, steps):
+        return Segment(self.model.device, lambda: self.launch_steps(steps))
 
     def _replay(self, segments):
-        self.pool.run([partial(self._replay_part, segments, thread) for thread in range(self.pool.threads)])
-        self.note()
-
-    def _replay_part(self, segments, thread):
-        for of_threads, times in segments:
+        for segment, times in segments:
             for _ in range(times):
-                of_threads[thread]()
+                segment()
+        self.note()
 
     def record_again(self):
         self._record_step()

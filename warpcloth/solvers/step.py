@@ -1,12 +1,12 @@
 """The base classes of the records of solvers: the step, the needs of every term and the facts; and the catalogue by name."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
-from ..base.checks import choice, keep_plain, number, shown, whole
+from ..base.checks import choice, keep_plain, ranged, shown
 from ..base.extensions import note
-from ..base.limits import MOST
+from ..base.limits import MAX_COUNT
 from ..base.quiet import find_device
 from ..base.texts import words_of
 from ..base.turns import methods_in_turn
@@ -94,8 +94,8 @@ class Step:
         super().__init_subclass__(**options)
         methods_in_turn(cls, "bind")
 
-    dt: float | None = None
-    substeps: int | None = None
+    dt: float | None = ranged(None, above=0.0)
+    substeps: int | None = ranged(None, whole=True, least=1)
 
     @classmethod
     def precision_on(cls, device: str, dtype: Precision | None = None) -> Precision:
@@ -124,11 +124,6 @@ class Step:
     def damps(self) -> bool:
         """Whether its steps damp frequencies that they do not resolve, or are refused above a stability limit."""
         return True
-
-    @property
-    def divides(self) -> bool:
-        """Whether several threads can share the steps of one cloth."""
-        return False
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
@@ -206,34 +201,18 @@ class Step:
         return self
 
     def _on(self, stepper, model):
-        """Returns the :class:`Stepper` of type ``stepper`` on a model, which threads share if there are several.
-
-        Raises:
-            ValueError: Several threads cannot share one cloth, or there are more threads than vertices.
-        """
-        threads = model.threads
-        if threads > 1 and model.copies > 1:
-            return ThreadedStepper(self, stepper, model)
-        if threads > 1 and not self.divides:
-            able = ", ".join(record.__name__ for record in SOLVERS.values() if record(substeps=1).divides)
-            raise ValueError(
-                f"threads is {threads} with one copy, whose steps {type(self).__name__} cannot divide as it is set; "
-                f"{able} can as they are by default, and with several copies every solver"
-            )
-        if threads > model.count:
-            raise ValueError(f"threads is {threads} for {model.count} vertices; there must be one for each at least")
-        return stepper(self, model)
+        """Returns the :class:`Stepper` of type ``stepper`` on a model, or one that divides its copies among threads."""
+        return ThreadedStepper(self, stepper, model) if model.threads > 1 else stepper(self, model)
 
     def __post_init__(self):
         keep_plain(self)
         given = [name for name in self.step_options if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"only one of {', '.join(self.step_options[:-1])} and {self.step_options[-1]} may be given")
-        for name in given:
-            if name == "substeps":
-                whole(name, self.substeps, 1)
-            else:
-                number(name, getattr(self, name), above=0.0)
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if "range" in field.metadata and (value is not None or field.default is not None):
+                field.metadata["range"].check(field.name, value)
         for name, words in words_of(type(self)).items():
             choice(name, getattr(self, name), words)
 
@@ -253,8 +232,10 @@ class Step:
         if self.dt is None:
             return max(1, round(_STEPS_A_SECOND / fps))
         steps = 1.0 / max(float(fps) * self.dt, 1e-300)
-        if steps > MOST:
-            raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be {MOST:,} steps or less, not {steps:.3g}")
+        if steps > MAX_COUNT:
+            raise ValueError(
+                f"dt is {self.dt:g} s; at fps {fps:g} a frame must be {MAX_COUNT:,} steps or less, not {steps:.3g}"
+            )
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
             raise ValueError(f"dt is {self.dt:g} s; at fps {fps:g} a frame must be a whole number of steps, not {steps:g}")
         return round(steps)
@@ -288,7 +269,7 @@ class ImplicitStep(Step):
     step_options: ClassVar[tuple[str, ...]] = ("dt", "substeps", "error")
 
     integrator: Literal["euler", "midpoint", "bdf2"] = "euler"
-    error: float | None = None
+    error: float | None = ranged(None, above=0.0)
 
     def __post_init__(self):
         super().__post_init__()
@@ -330,6 +311,6 @@ def fewest_substeps(fps, rest, motion):
         ValueError: They would be more than a solver takes.
     """
     longest = min(rest / 1.1, motion)
-    if not fps * longest * MOST > 1.0:
+    if not fps * longest * MAX_COUNT > 1.0:
         raise ValueError(f"the scene is so stiff that this solver is stable only below {longest:.3g} s; take an implicit one")
     return math.floor(1.0 / (fps * longest)) + 1

@@ -20,26 +20,22 @@ class ThreadedStepper(Stepper):
         model: The model.
 
     Attributes:
+        model, declared: The model as it was bound; each part has its own model of the steps.
         parts: The stepper of each thread. Its state is a view of ``state``.
     """
 
     def __init__(self, options, stepper, model):
-        self.options, self.model, self._reset = options, model, None
+        self.options, self.model, self.declared, self._reset = options, model, model, None
         self.pairs = None  # scenes with self-contact refuse threads
         motion = wp.clone(model.positions), wp.clone(model.velocities)
         self.pool = ThreadPool(min(model.threads, model.copies))
         threads = self.pool.threads
         self._copies = list(pairwise(model.copies * thread // threads for thread in range(threads + 1)))
-        self.parts = [self._part(stepper, motion, first, end) for first, end in self._copies]
+        self.parts = [stepper(options, model.part(first, end - first, motion)) for first, end in self._copies]
         self.state = State(*motion, model.copies, [part.state for part in self.parts])
         first = self.parts[0]
         self.steps_per_frame, self.h, self.he, self.uniform = first.steps_per_frame, first.h, first.he, first.uniform
         self.factorise_seconds = sum(part.factorise_seconds for part in self.parts)
-
-    def _part(self, stepper, motion, first, end):
-        """Returns the stepper of copies ``first`` to ``end − 1``."""
-        n, model = self.model.per_copy, self.model.part(first, end - first)
-        return stepper.part_of(tuple(array[first * n : end * n] for array in motion), self.options, model)
 
     @property
     def iterations(self):

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..base.checks import number, whole
+from ..base.checks import ranged
 from ..core.capture import Mirror
 from ..core.status import UNBALANCED, Residual, Result
 from ..core.sums import Sums
@@ -92,15 +92,13 @@ class XPBD(ImplicitStep):
         limits=("ω λ_max = 2", "Gauss–Seidel, |z| = 1", "a ring an iteration", "h² = m/(k(L/l − 1))"),
     )
 
-    iterations: int = 20
+    iterations: int = ranged(20, whole=True, least=1)
     sweep: Literal["coloured", "sequential", "constraint-averaged"] = "coloured"
     form: Literal["vector", "scalar"] = "vector"
-    relaxation: float = 1.0
+    relaxation: float = ranged(1.0, above=0.0)
 
     def __post_init__(self):
         super().__post_init__()
-        whole("iterations", self.iterations, 1)
-        number("relaxation", self.relaxation, above=0.0)
         if INTEGRATORS[self.integrator].to_and_fro and self.ordered and self.iterations % 2:
             raise ValueError(
                 f'iterations is {self.iterations}; with integrator="{self.integrator}" sweeps go forward and backward in turn, '
@@ -115,10 +113,6 @@ class XPBD(ImplicitStep):
         if any(elements.hard for elements in model.terms):
             return self.residual._replace(measure="largest move of a vertex in the last sweep (divided by h²)")
         return self.residual
-
-    @property
-    def divides(self) -> bool:
-        return self.sweep == "coloured"
 
     def bind(self, model: Model) -> Stepper:
         """Binds the solver to ``model`` and allocates all arrays that steps need.
@@ -143,16 +137,9 @@ class XPBDStepper(LaunchedStepper):
         super().__init__(options, model, options.integrator)
         self.iterations = options.iterations
         model = self.model
-        given = model, self.state.x, self.he, options.sweep, options.relaxation
-        more = {"scalar": options.form == "scalar", "multipliers": True}
-        if options.ordered:
-            self.sweep = GaussSeidelSweep(*given, **more, pool=self.pool)
-        else:
-            self.sweep = JacobiSweep(*given, **more)
-        self.model = model.with_terms(self.sweep.elements)
         self._sums, self._force = Sums(model), model.vectors()
         soft = not any(elements.hard for elements in model.terms)
-        self._gradient = plan(self.model).gradient(corrected=True) if soft else None
+        self._gradient = plan(model).gradient(corrected=True) if soft else None
         self._add_momentum = model.kernel(add_momentum, model.dtype)
         self._acceleration = model.scalars()
         self._largest = Mirror(self.state.add("largest acceleration", model.scalars()))
@@ -164,8 +151,16 @@ class XPBDStepper(LaunchedStepper):
         self.record((self._launch_start, 1), *sweeps, (self._launch_last, 1))
         self.integrator.start()
 
+    def arranged(self, model):
+        options = self.options
+        kind = GaussSeidelSweep if options.ordered else JacobiSweep
+        more = {"scalar": options.form == "scalar", "multipliers": True}
+        self.sweep = kind(model, self.state.x, self.he, options.sweep, options.relaxation, **more)
+        return model.with_terms(self.sweep.elements)
+
     def _launch_start(self):
-        self.pool.launch_alone(self.model, self.launch_prediction, self.sweep.launch_start)
+        self.launch_prediction()
+        self.sweep.launch_start()
 
     def _launch_to_and_fro(self):
         """Launches one sweep forward and one backward."""
@@ -174,16 +169,12 @@ class XPBDStepper(LaunchedStepper):
 
     def _launch_last(self):
         """Launches the end of a step and its residual: the unbalanced force, or with hard constraints the last move."""
-        if self._gradient is None:
-            self.pool.launch_alone(self.model, self._force.zero_, lambda: self._launch_momentum(-1.0))
-            self.sweep.launch()
-        if self.pool.leads:
-            self._launch_end()
-
-    def _launch_end(self):
         model, d = self.model, self.sweep.correction
-        if self._gradient is not None:
-            self._force.zero_()
+        self._force.zero_()
+        if self._gradient is None:
+            self._launch_momentum(-1.0)
+            self.sweep.launch()
+        else:
             self._gradient.add(self.state.x, self._force, d)
         self._launch_momentum(1.0)
         model.lock(self._force)

@@ -15,21 +15,18 @@ from .stage import animated_prims, open_stage
 from .writer import AnimationWriter
 
 OUTPUTS = (*NUMBERED, *CACHES, ".npz", *STAGE_ENDINGS)
-_MOST = float(np.finfo(np.float32).max)
+_MAX_FLOAT32 = float(np.finfo(np.float32).max)
 _UNEVEN = 1e-3  # of an interval, above the rounding of times as float32
 
 
 def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
-    """Writes an animation in another format. All frames are checked before the first is written; few are in memory at a time.
-
-    New files replace older ones by renames at the end, which an interrupt cannot split.
+    """Writes an animation in another format; docs/usd.md says what each has, and how files are replaced.
 
     Args:
         source: Path of an animation, as for :func:`warpcloth.open_sequence`.
-        output: The file to write, with an ending of :data:`OUTPUTS`; .obj and .ply get the number of each frame. Beside .pc2
-            and .mdd, an .obj file has the first frame.
+        output: The file to write, with an ending of :data:`OUTPUTS`.
         prim: As of :func:`warpcloth.open_sequence`.
-        fps: As of :func:`warpcloth.open_sequence`.
+        fps: Likewise.
         mesh: The rest mesh of a source without triangles.
         progress: Function called with (frames written, frames), or None.
 
@@ -38,8 +35,7 @@ def convert(source, output, prim=None, fps=None, mesh=None, progress=None):
 
     Raises:
         BlockingIOError: Another conversion to this output is running.
-        FileNotFoundError: There is no such file or folder.
-        OSError: A file cannot be written or renamed.
+        OSError: A file does not exist, or cannot be written or renamed.
         ValueError: The source or the ending is not supported; a written point or velocity is not finite as float32; the
             triangles change; times are needed and unknown, or uneven where the format has one interval; or an output is not a
             regular file.
@@ -113,7 +109,7 @@ def _points(sequence, index):
 
 
 def _check_finite(sequence, index, name, vectors):
-    bad = np.flatnonzero(~(np.abs(vectors) <= _MOST).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(vectors) <= _MAX_FLOAT32).all(axis=1))
     if len(bad):
         where, given = f"{sequence.path}, frame {sequence.labels[index]}", vectors[bad[0]].tolist()
         raise ValueError(f"{where}: {name} {bad[0]} is {given}; it must be finite as float32")

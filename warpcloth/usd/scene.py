@@ -3,10 +3,11 @@
 import os
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from ..base.limits import MOST_FRAMES
+from ..base.limits import MAX_FRAMES
 from ..base.types import FilePath
 from ..mesh.mesh import Mesh
 from ..mesh.parts import Part
@@ -52,7 +53,9 @@ from .stage import (
 from .values import array_of, refuse_unknown, sentences, time_codes_of, value_of
 
 
-def read_scene(path: FilePath, prim: str | None = None, law: str = "proposal", fabric: str | None = None) -> Scene:
+def read_scene(
+    path: FilePath, prim: str | None = None, law: Literal["proposal", "newton"] = "proposal", fabric: str | None = None
+) -> Scene:
     """Reads a scene from a stage.
 
     Args:
@@ -259,8 +262,8 @@ def _duration(stage, values, fps):
     if duration is None:
         seconds = stage.GetEndTimeCode() - stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
         return max(0.0, np.floor(seconds / stage.GetTimeCodesPerSecond() * fps * (1 + 1e-9)) / fps) or 1.0
-    if not 0.0 < float(duration) * fps <= MOST_FRAMES:
-        raise ValueError(f"warpcloth:duration is {duration} s, must be finite and above 0, and {MOST_FRAMES:,} frames at most")
+    if not 0.0 < float(duration) * fps <= MAX_FRAMES:
+        raise ValueError(f"warpcloth:duration is {duration} s, must be finite and above 0, and {MAX_FRAMES:,} frames at most")
     return float(duration)
 
 

@@ -13,7 +13,7 @@ from ..base.checks import shown
 from .modules import Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 # Beyond it, neighbouring float64 time codes are more than 1e-7 apart, too far to distinguish frames.
-MOST_TIME_CODE = 1e9
+MAX_TIME_CODE = 1e9
 # Range of frames and time codes per second: from one in eleven days to one per microsecond.
 _RATES = (1e-6, 1e6)
 # Range of metres and kilograms per unit: a light year is 1e16 m.
@@ -85,7 +85,7 @@ def check_stage(stage, path):
             rate = getattr(layer, name)
             _refuse_outside(where, name, rate, *_RATES)
         for name in ("startTimeCode", "endTimeCode"):
-            _refuse_outside(where, name, getattr(layer, name), -MOST_TIME_CODE, MOST_TIME_CODE)
+            _refuse_outside(where, name, getattr(layer, name), -MAX_TIME_CODE, MAX_TIME_CODE)
     if stage.HasAuthoredTimeCodeRange() and stage.GetEndTimeCode() < stage.GetStartTimeCode():
         end, start = stage.GetEndTimeCode(), stage.GetStartTimeCode()
         raise ValueError(f"{path}: endTimeCode is {end:g}, must be at least startTimeCode, which is {start:g}")
@@ -154,12 +154,11 @@ def refuse_unknown(name, values, where="", infinite=False):
 
 
 def time_codes_of(attribute):
-    """Lists the time codes of the samples of an attribute, up to `MOST_TIME_CODE`; refuses larger ones."""
+    """Lists the time codes of the samples of an attribute, up to `MAX_TIME_CODE`; refuses larger ones."""
     codes = attribute.GetTimeSamples()
     for code in codes:
-        if not abs(code) <= MOST_TIME_CODE:
+        if not abs(code) <= MAX_TIME_CODE:
             raise ValueError(
-                f"{attribute.GetName()} has a sample at time code {code:g}, "
-                f"must be at -{MOST_TIME_CODE:g} to {MOST_TIME_CODE:g}"
+                f"{attribute.GetName()} has a sample at time code {code:g}, must be at -{MAX_TIME_CODE:g} to {MAX_TIME_CODE:g}"
             )
     return codes

@@ -1,4 +1,6 @@
-"""Kept hashes of kernels are those that Warp computes, so that compiled kernels in the cache are found."""
+"""Warp below its public interface: one file uses it, and kept hashes of kernels are those that Warp computes."""
+
+from pathlib import Path
 
 import warp as wp
 
@@ -7,7 +9,14 @@ from warpcloth.kernels.transpose import scatter
 from warpcloth.scenes import hanging
 
 
+def test_one_file_uses_what_is_private_in_warp():
+    root = Path(wc.__file__).parent
+    files = [*root.rglob("*.py"), *(root / "kernels").rglob("*.py")]  # kernels/ is a link
+    assert {file.name for file in files if "wp._src" in file.read_text(encoding="utf-8")} == {"warp_internals.py"}
+
+
 def test_kept_hashes_are_those_of_warp(monkeypatch):
+    """So that compiled kernels in the cache are found."""
     loaded, load = {}, wp.Module.load
 
     def noting(module, *arguments, **options):
