@@ -126,7 +126,7 @@ def advise(scene, solver, tolerance=0.01, frames=None, resolutions=None, device=
         frames: Number of frames; by default those of the scene, but at most 30.
         resolutions: The scene with coarser or finer meshes by name, such as {"n=16": scene}.
         device: A Warp device.
-        dtype: By default that of a run; the other precision is a trial.
+        dtype: Precision, by default that of a run; the other precision is a trial.
         progress: Function called with (trials done, trials) after each.
 
     Raises:

@@ -22,7 +22,7 @@ class SolverBenchmark:
         scene: The scene, of any size.
         setup: The solver; a limited solver without a step takes the fewest stable substeps of each size.
         sizes: Resolutions of the scene; if empty, the scene as it is.
-        dtype: By default that of a run with the solver.
+        dtype: Precision, by default that of a run with the solver.
         frames: Maximum number of frames to time.
         variants: Parameters of the scene by name, one dictionary for each variant, in place of sizes.
     """

@@ -46,9 +46,9 @@ def cheapest_map(scene, x, y=None, tolerance=0.01, solvers=None, frames=None, de
         y: Another parameter, or None for a map of one row.
         tolerance: Largest error, relative to the size of the cloth; see :func:`warpcloth.lab.reference.position_error`.
         solvers: Names of solvers, by default all.
-        frames: By default those of the scene.
-        device: Of the runs and the reference solutions.
-        dtype: By default that of a run with each solver; reference solutions have float64.
+        frames: Number of frames, by default those of the scene.
+        device: A Warp device, also for the reference solutions.
+        dtype: Precision, by default that of a run with each solver; reference solutions have float64.
         limit: Time limit of the search in each cell [s].
         run: ``store``, ``progress``, ``executor``, ``workers`` of :func:`warpcloth.lab.campaign.sweep`.
 

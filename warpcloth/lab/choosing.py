@@ -263,9 +263,9 @@ def choose(
         tolerance: As for :func:`pick`.
         budget: As for :func:`pick`.
         solvers: Names of solvers, by default all.
-        frames: By default those of the scene.
-        device: Of the runs and the reference.
-        dtype: By default that of a run with each solver.
+        frames: Number of frames, by default those of the scene.
+        device: A Warp device, also for the reference.
+        dtype: Precision, by default that of a run with each solver.
         limit: Time limit of each run [s].
         others: Simulators whose solvers are measured too, each until its own cheapest setting is found, within six time limits;
             its own reference has as much time again.

@@ -127,7 +127,7 @@ def reference(scene, frames=None, tolerance=1e-3, limit=600.0, progress=None, de
 
     Args:
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
-        frames: By default those of the scene.
+        frames: Number of frames, by default those of the scene.
         tolerance: Steps are halved until ``error`` is at most this, or until two halvings did not lower it, a sign of chaotic
             motion or rounding.
         limit: Time limit [s].

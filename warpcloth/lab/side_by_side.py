@@ -25,8 +25,8 @@ def side_by_side(scene, others, tolerance=WITHIN, frames=None, device="cpu", **g
         scene: The :class:`warpcloth.lab.measurements.SceneRef`.
         others: Names of simulators.
         tolerance: Largest error of the settings whose times are compared, relative to the size of the cloth.
-        frames: By default those of the scene.
-        device: On the CPU times are those of the process, which others do not prolong.
+        frames: Number of frames, by default those of the scene.
+        device: A Warp device; on the CPU times are those of the process, which others do not prolong.
         given: ``solvers``, ``limit``, ``total`` and ``run`` of :func:`warpcloth.lab.choosing.choose`.
 
     Returns:
