@@ -2,13 +2,13 @@
 
 U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)). The first sum is over vertices v, with rest area aᵥ, half for
 each side, and the faces, edges and vertices F near v. The multiplicities m are those of inclusion and exclusion: 1 for a face,
-1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces with E edges there. Terms with one nearest point
-cancel: a plane leaves one, a valley two faces minus one edge. So a flat sheet has the pressure −kφ′, and the gradient is
-continuous.
+1 − N for an edge of N near faces, and 1 + N − E for a vertex of N near faces with E edges there. The nearest point of a face
+may be on its edge, so most terms cancel: over a plane or a convex edge one is left, over a valley two faces minus one edge. So
+a flat sheet has the pressure −kφ′, and the gradient is continuous.
 
 The second sum is over pairs of edges, because vertices do not find where two edges cross; b is the rest area of an edge over
 its length. D² = min over s and t of ‖y(s, t)‖² (1 + ⅛((2s − 1)² + (2t − 1)²)) is strictly convex, so D has a gradient for
-parallel edges too.
+parallel edges too. Edges act below a quarter of the contact distance.
 
 Elements with a common vertex have no contact, nor have those of one piece whose rest distance is below 2r. Against meshes,
 vertices of cloth have their whole area, and vertices of meshes act on faces of cloth by k aᵥ φ(4d). Positions of meshes are not
@@ -132,15 +132,15 @@ class Contacts:
     """The contacts at some positions, by slots: w, n, d, r [m], kA with the sign of m [N/m], ``share``, and ``fixed`` λ [kg·m].
 
     The contact of pair e of a list with C pairs has the key e. Keys of vertex i from C + 3·rows[i] on are for edges or corners
-    of near faces whose nearest points are elsewhere; three a face suffice, as F faces share at most 1.5 F edges and 1.5 F
-    vertices. ``code`` is TWO_EDGES for two edges, with r/c and c²kA where 4D = cd, and the ``ratio`` D/d, else 1.
+    of near faces whose nearest points are elsewhere; three a face suffice, because F faces share at most 1.5 F edges and 1.5 F
+    vertices. ``code`` is TWO_EDGES for two edges. With 4D = cd these have r/c and c²kA, and the ``ratio`` D/d, else 1.
 
     ``parts`` are the vertices of the surface; bit i of ``touching`` is 1 if wᵢ is not 0. The stencil has the first vertex of
     the cloth with w = 0 for each obstacle. Obstacles give the ``offset`` o = Σ wⱼXⱼ and the ``travel`` Σ wⱼΔXⱼ by their
     ``moves`` ΔX in the step (B·m,) [m].
 
     The ``share`` is the curvature Σ kA φ″ along n of contacts on its side of the vertex, over that of positive ones. The
-    definite part of the Hessian, and what sweeps compute anew, have this share.
+    definite part of the Hessian, and what sweeps compute anew, have this share; sweeps leave the rest ``fixed``.
     """
 
     weights: wp.array(dtype=wp.vec4d)

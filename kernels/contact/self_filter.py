@@ -104,7 +104,8 @@ def end_move(
 ):
     """Kernel over copies: ``active`` is 0 for those that have moved the whole way, and ``proceed`` 1 if one has not.
 
-    After ``most`` rounds meshes go through what is in their way: ``first`` is FIRST − frame for the first such frame.
+    After ``most`` rounds pins stop, and meshes go through what is in their way: ``first`` is FIRST − frame for the first
+    such frame.
     """
     c = wp.tid()
     if fraction[c] == ONE:
@@ -554,7 +555,8 @@ def divide_copies(
 def aim(dtype):
     """Kernel over vertices: p = goal − x along ``free`` axes, pinned ones, or both, else 0.
 
-    Copies whose ``fraction`` (B,) is 1 keep p; it may be None."""
+    Copies whose ``fraction`` (B,) is 1 keep p; it may be None.
+    """
     vec3, _ = types(dtype)
 
     @wp.kernel(module="unique", enable_backward=False)
