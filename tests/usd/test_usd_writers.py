@@ -30,7 +30,7 @@ from support.stages import (
 )
 from support.usd_validation import validate
 from warpcloth.analysis.analysis import Analyzer
-from warpcloth.cli.reports import write_report
+from warpcloth.cli.reports import ReportFiles, write_report
 from warpcloth.mesh.mesh import Mesh
 from warpcloth.usd import AnimationWriter, FrameSequence, chunks, read_mesh, read_stage_mesh
 
@@ -299,9 +299,9 @@ def test_a_run_that_was_cut_short_is_recovered_under_its_own_name(tmp_path, cut)
     analyzer = Analyzer(left)
     if cut:
         with pytest.raises(KeyboardInterrupt):
-            write_report(analyzer, usd=output, progress=lambda row, _: interrupt_twice(row == 4))
+            write_report(analyzer, ReportFiles(usd=output), progress=lambda row, _: interrupt_twice(row == 4))
     else:
-        write_report(analyzer, usd=output)
+        write_report(analyzer, ReportFiles(usd=output))
         for frame, points in enumerate(FrameSequence(output)):
             np.testing.assert_allclose(points, motion(mesh, frame)[0], atol=4 * EPS)
     again = np.asarray(FrameSequence(left))

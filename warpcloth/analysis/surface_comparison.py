@@ -126,8 +126,8 @@ def compare_surfaces(
         return _measured(one[i], other[j], (one.labels[i], other.labels[j]), excluded, samples, device)
 
     found = measured_frames(one, other, measure, excluded, frames, progress)
-    both = {kind: SurfaceDistances(*np.moveaxis(found.pop(kind), 2, 0)) for kind in ("all", "inner")}
-    return SurfaceComparison(up_axes=up_axes, **found, **both)
+    all_points, inner = (SurfaceDistances(*np.moveaxis(found.pop(kind), 2, 0)) for kind in ("all", "inner"))
+    return SurfaceComparison(up_axes=up_axes, all=all_points, inner=inner, **found)
 
 
 def opened_capture(

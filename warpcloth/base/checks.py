@@ -103,7 +103,7 @@ class Range:
             if value != self.word:
                 raise ValueError(f"{name} is {shown(value)}; it must be {self}")
         elif self.whole:
-            whole(name, value, self.least)
+            whole(name, value, int(self.least or 0))
         else:
             number(name, value, self.above, self.least)
 

@@ -117,6 +117,7 @@ def _wind(model, free):
     found, air = np.zeros(model.copies), model.scene.air
     for elements in model.terms:
         if elements.term is AIR:
+            elements = elements.by_copies(model)
             density, rest = (
                 host_values(each).astype(np.float64).reshape(model.copies, elements.per_copy, -1)
                 for each in (elements.stiffness, elements.rest)
