@@ -1,9 +1,4 @@
-"""The catalogue of solvers: each has a file of its own, with its record, and a line here.
-
-A file has the equation of a method and its source, its options, what it needs of every term, its settings for benchmarks and
-charts, and the bound solver. The command line, benchmarks and charts look up a solver by name in :data:`SOLVERS`.
-:func:`register` adds one from outside the package.
-"""
+"""The catalogue of solvers, :data:`SOLVERS`; :func:`register` adds one from outside the package."""
 
 from ..base.catalogue import Catalogue, imported_on_use
 

@@ -39,60 +39,26 @@ class ADMM(ImplicitStep):
 
     Dx are the local coordinates y of all elements, with weights W² = r k A. An iteration has three steps:
 
-    - z = argmin U(z) + ½‖W(Dx − z + u)‖². For U = ½kA‖z − p(z)‖² that is (p(v) + r v)/(1 + r) with v = Dx + u. For other
-      energies W² is r s k A with the curvature s = ‖∂²u/∂y²‖ at rest, and Newton's method with a line search finds z.
+    - z = argmin U(z) + ½‖W(Dx − z + u)‖². For U = ½kA‖z − p(z)‖² that is (p(v) + r v)/(1 + r) with v = Dx + u. Other energies
+      have W² = r s k A, s = ‖∂²u/∂y²‖ at rest, and Newton's method finds z.
     - u += Dx − z.
     - (M/h² + DᵀW²D) x = (M/h²) x̃ + DᵀW²(z − u), whose matrix is factorised once.
 
-    Sparse energies, such as :class:`warpcloth.PlateBending`, are not split: their matrix, or a bound of it at rest, is added to
-    that of the last step. The energy of self-contact is not split either: it makes the last step one of Newton's method. The
-    fixed point is that of :class:`warpcloth.ProjectiveDynamics`, and the x(t+h) of :class:`warpcloth.Newton`. Only the product
-    WD matters: if D is scaled and W inversely, the iterates stay the same.
+    Sparse energies and self-contact are not split: their Hessian, or a bound of it, is added to that matrix. The fixed point is
+    the x(t+h) of :class:`warpcloth.Newton`.
 
-    With too large a weight the iteration stalls, with too small a one it oscillates. An iteration multiplies the error of a
-    mode with s = h²ω² by (1 + r²s)/((1 + rs)(1 + r)), which is smallest for r = 1/√s. So ``"auto"`` is r = 1/(2hₑω) for each
-    element, where ω² is the largest eigenvalue of M⁻¹ s k A DᵀD of the element alone; the factor 2 accounts for the highest
-    frequency of a whole mesh, which is about twice as high. The table gives the measured number of iterations until the
-    distance to the solution is 1e-4 of that from x̃: with ``"auto"``, with the best of 17 weights from 1e-3 to 10 that all
-    elements share, and with r = 1:
+    With too large a weight the iteration stalls, with too small a one it oscillates, and may not converge for concave energies
+    such as hinges. ``"auto"`` is r = 1/(2hₑω) for each element, where ω² is the largest eigenvalue of M⁻¹ s k A DᵀD of the
+    element alone; with n iterations at least min(c/n, 1), c = 2 for Euler, 4 for BDF2, 20 for midpoint.
 
-    =============================  =======  =======  =======
-    hanging of 8 × 8, 1/240 s      "auto"   best     r = 1
-    =============================  =======  =======  =======
-    springs 1e3 N/m, 1/960 s       27       32       52
-    springs 1e3 N/m, 1/240 s       88       90       > 700
-    springs 1e3 N/m, 1/60 s        239      275      > 700
-    springs 1e3 N/m, 32 × 32       284      281      > 700
-    springs 1e2 to 1e5 N/m mixed   334      > 700    > 700
-    structural 1e5, shear 1e2 N/m  616      > 700    > 700
-    edges 1e3 N/m, dihedral        87       > 250    > 250
-    corotated 1e4 N/m              180      169      > 700
-    neo-Hookean 1e3 N/m            74       78       > 250
-    cantilever, 1/2000 s           215      418      > 700
-    catenary, 1/240 s              397      311      > 700
-    chain, straight                37       1        1
-    =============================  =======  =======  =======
-
-    With few iterations a small weight leaves the cloth soft, and in the next step the remaining error becomes a velocity.
-    Therefore, with n iterations, ``"auto"`` is at least min(c/n, 1), where c is 2 for Euler, 4 for BDF2 and 20 for midpoint,
-    which damps that velocity least. With this bound ``hanging`` at 1e5 N/m and a cantilever have a smaller error than with r =
-    1 over 2 to 100 iterations a step, and do not tear, as they do with a weight of 0.03. If an energy is concave somewhere, as
-    that of hinges is, it may not converge with a small weight.
-
-    ``residual`` is the larger of the primal and the dual residual. Each is the largest acceleration of any vertex, relative to
-    that of :class:`warpcloth.numerics.iterate.ResidualScale`: the forces max(1, 1/r)·DᵀW²(Dx − z) and DᵀW²(z − z before),
-    divided by the masses. The factor max(1, 1/r) weights the primal residual by at least the stiffness k, by which the forces
-    of U at Dx and at z differ: otherwise a small weight would look like convergence. With energies that are not split, the dual
-    residual is at least the unbalanced acceleration of the last step.
+    ``residual`` is the larger of the primal and the dual residual, the largest accelerations by the forces max(1, 1/r)·DᵀW²(Dx
+    − z) and DᵀW²(z − z before), relative to :class:`warpcloth.numerics.iterate.ResidualScale`.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
         tolerance: Tolerance of both residuals.
         weight: r = W²/(kA) > 0 for all elements, or ``"auto"``.
-
-    Raises:
-        ValueError: If an option is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -123,7 +89,7 @@ class ADMM(ImplicitStep):
     weight: float | Literal["auto"] = ranged("auto", above=0.0, word="auto")
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model``.
 
         Raises:
             ValueError: A term has infinite stiffness, or is a :class:`warpcloth.RigidCluster`.
@@ -138,7 +104,6 @@ class ADMMStepper(ImplicitStepper):
     Attributes:
         correction: x − x̃ of the last step, (N,) [m].
         primal, dual: Residuals at the end of the last step, (B,).
-        iterations: Iterations of the last step.
     """
 
     def __init__(self, options, model):
@@ -213,7 +178,6 @@ class ADMMStepper(ImplicitStepper):
         self._move()
 
     def _ratios_of(self, elements, scale):
-        """Returns r of each element, (E,)."""
         model, weight = self.model, self.options.weight
         if weight != "auto":
             return np.full(elements.count, weight, dtype=model.numpy_dtype)
@@ -221,7 +185,7 @@ class ADMMStepper(ImplicitStepper):
         return np.maximum(best_weights(model, elements, self.he, scale), least).astype(model.numpy_dtype)
 
     def _split_of(self, elements, ratio, scale):
-        """Returns the struct of z, u, Dx − z and z − z before of a term, all 0."""
+        """Returns the struct of z, u, Dx − z and z − z before, all 0."""
         model, kind = self.model, wp.types.matrix((elements.term.rows, 3), self.model.dtype)
         of = kernels.admm_elements(elements.term, model.dtype)()
         of.stiffness, of.ratio, of.scale = elements.stiffness, model.per_element(ratio), model.per_element(scale)
@@ -239,7 +203,6 @@ class ADMMStepper(ImplicitStepper):
             self.model.launch(start, elements.count, [elements.stencil, elements.rest, self.state.x], [of])
 
     def _launch_local(self):
-        """Launches z and u, the forces of the gaps and of the changes, and the right-hand side of the linear system."""
         model = self.model
         sums = [self._gaps, self._changes, self._force]
         for array in sums:

@@ -1,4 +1,4 @@
-"""Constrained dynamics: implicit Euler for positions and for the multipliers of compliant constraints."""
+"""Constrained dynamics: implicit Euler with multipliers of compliant constraints."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -36,40 +36,32 @@ class ConstrainedDynamics(ImplicitStep):
     """Implicit Euler with compliant constraints and multipliers λ (Servin, Lacoursière and Melin 2006, *Interactive simulation
     of elastic deformable materials*; Tournier et al. 2015, *Stable constrained dynamics*), from x = x̃ and λ = 0.
 
-    An energy ½kA·C² is a constraint C with compliance 1/(kA), 0 for infinite stiffness, and λ = −kAh²C. With J = ∂C/∂x and
-    α̃ = 1/(kAh²) each iteration solves
+    An energy ½kA·C² is a constraint C with λ = −kAh²C. With J = ∂C/∂x and α̃ = 1/(kAh²), 0 for infinite stiffness, each
+    iteration solves
 
         [M̃, −Jᵀ; J, α̃][Δx; Δλ] = −[M(x − x̃) − Jᵀλ; C(x) + α̃λ]
 
-    through (J M̃⁻¹Jᵀ + α̃)Δλ = −(C + α̃λ) + J M̃⁻¹(M(x − x̃) − Jᵀλ). Springs and hinges have the published scalar C; other
-    terms have the rows C = y − p(y) with p fixed in an iteration, as in projective dynamics. A limit has no rows inside its
-    range, and sliding friction has those of a softer spring to its anchor. The system admits any stiffness. The fixed point is
-    the x(t+h) of :class:`warpcloth.Newton`, and for infinite stiffness the point of C = 0 that is nearest to x̃.
+    Springs and hinges have a scalar C; other terms have the rows C = y − p(y) with p fixed in an iteration; sliding friction
+    has those of a softer spring to its anchor. The fixed point is the x(t+h) of :class:`warpcloth.Newton`, and for infinite
+    stiffness the point of C = 0 that is nearest to x̃.
 
-    One iteration with M̃ = M is the method as published. It leaves out −λ∂²C, so a spring overshoots perpendicular to itself if
-    its tension is above about m l/h². More iterations therefore need a safeguard. Geometric stiffness (Tournier et al. 2015)
-    adds the positive part of that matrix to M̃; here exactly, as rows B of compliance 1 with BᵀB = [−λ∂²C]₊, which keep M
-    diagonal and conserve linear momentum to rounding. A line search is possible because Δx, a Gauss–Newton step, is a descent
-    direction of 1/(2h²)‖x − x̃‖²_M + U.
+    One iteration with M̃ = M is the published method. It leaves out −λ∂²C, so a spring overshoots perpendicular to itself if
+    its tension is above about m l/h². More iterations need a safeguard: geometric stiffness adds [−λ∂²C]₊ to M̃; a line search
+    on 1/(2h²)‖x − x̃‖²_M + U shortens Δx.
+
+    Constraints may be redundant: α̃ of a hard one is at least ε^0.7 of the diagonal of J W Jᵀ, so a gap of that fraction
+    (1e-11, in float32 1e-5) of the move that they cause in a step remains. Those that contradict one another end at a
+    compromise; the status says so, and their violation is the residual. A hard spring of rest length 0 may not converge.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
         iterations: Maximum number of iterations in a step.
-        tolerance: Tolerance of the residual, the larger of two accelerations, relative to that of
-            :class:`warpcloth.numerics.iterate.ResidualScale`: the largest unbalanced one of a vertex,
-            ‖M(x − x̃) − Jᵀλ‖/(m h²), and the largest one with which a single constraint would reach C + α̃λ = 0 in a step.
+        tolerance: Tolerance of the residual, relative to :class:`warpcloth.numerics.iterate.ResidualScale`: the largest
+            unbalanced acceleration of a vertex, ‖M(x − x̃) − Jᵀλ‖/(m h²), or the largest one with which a single constraint
+            would reach C + α̃λ = 0 in a step.
         stabilisation: ``"none"``, ``"geometric-stiffness"`` or ``"line-search"``, which is for finite stiffness.
         linear: ``"cg"`` solves by conjugate gradients over λ; on meshes of 200 vertices and more over positions, with
             multigrid, unless rigid clusters, plates or self-contact have rows. ``"factorised"`` factorises on the host.
-
-    Both linear solvers take redundant constraints: α̃ of a hard one is at least ε^0.7 of the diagonal of J W Jᵀ, so that the
-    smallest of all possible λ is found, and hard constraints keep a gap of that fraction of the move that they cause in a step
-    (1e-11, in float32 1e-5). Hard constraints that contradict one another end at a compromise; the status says so, and their
-    violation is the residual. A constraint between pins alone is left out, because it can move nothing. A hard spring of rest
-    length 0 has no direction and may not converge; XPBD takes it.
-
-    Raises:
-        ValueError: If an option is not allowed.
     """
 
     name = "constrained-dynamics"
@@ -99,7 +91,7 @@ class ConstrainedDynamics(ImplicitStep):
     linear: Literal["cg", "factorised"] = "cg"
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model``.
 
         Raises:
             ValueError: A term has no constraint, or infinite stiffness where that is not allowed.
@@ -117,7 +109,6 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
     Attributes:
         constraints: The :class:`warpcloth.numerics.constraints.Constraints`, with λ of the last step.
         correction: x − x̃ of the last step, (N,) [m].
-        iterations: Iterations of the last step.
     """
 
     def __init__(self, options, model):
@@ -126,7 +117,6 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self.ready()
 
     def _build(self):
-        """Allocates and captures everything for the present number of rows."""
         options, model, device = self.options, self.model, self.model.device
         self.constraints = Constraints(model, self.he, options.stabilisation == "geometric-stiffness")
         self._sums, self._row_sums = Sums(model), RowSums(model, self.constraints.per_copy)
@@ -180,7 +170,7 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._stuck = self._stepped.read() == 0.0
 
     def constraint_forces(self, collider=None):
-        """See :meth:`Stepper.constraint_forces`: adds −Jᵀλ/hₑ², from M(x − x̃) = Jᵀλ."""
+        """See :meth:`Stepper.constraint_forces`: adds −Jᵀλ/hₑ²."""
         model, constraints = self.model, self.constraints
         of_terms = [part for part in constraints.parts if part.elements is not None]
         hard = [part for part in of_terms if part.elements.hard and collider in (None, part.elements.collider)]
@@ -217,7 +207,6 @@ class ConstrainedDynamicsStepper(ImplicitStepper):
         self._launch_linearise()
 
     def _launch_linearise(self):
-        """Launches J, both residuals and the right-hand side at d and λ."""
         constraints, model = self.constraints, self.model
         constraints.launch_linearise(self.state.x, self.correction)
         constraints.launch_moves(constraints.multipliers, self._moves)

@@ -1,4 +1,4 @@
-"""Steps whose length follows from an estimate of their error, by step doubling."""
+"""Steps whose length follows from an estimate of their error."""
 
 from dataclasses import replace
 from functools import partial
@@ -23,14 +23,13 @@ SURE = 0.8
 
 
 class Length:
-    """The length of the steps of an :class:`ErrorStepper`, as a part of its state.
+    """The length of the steps of an :class:`ErrorStepper`.
 
     Attributes:
-        k: A frame has 2^k steps of the next length.
+        k: A frame has 2^k steps of the next length; ``shortest`` is the largest so far.
         at: Position in the frame, in units of the shortest step.
-        shortest: The largest k so far.
-        taken, rejected: Number of steps taken so far, and of pairs of steps whose error was too large.
-        tried: Number of all steps so far, those taken, those rejected and those that estimate errors.
+        taken, rejected: Number of steps taken, and of pairs of steps whose error was too large.
+        tried: Number of all steps, with those that estimate errors.
     """
 
     names = "k", "at", "shortest", "taken", "rejected", "tried"
@@ -58,34 +57,24 @@ class ErrorStepper(Stepper):
     """Takes two steps of h at a time, with h = frame/2^k as long as their error allows; all copies take the same steps.
 
     The error is estimated by step doubling (Hairer, Nørsett and Wanner 1993, *Solving ordinary differential equations I*,
-    II.4). Each step of a method of order p has an error C h^(p+1). From the same state, one step of 2h and two of h differ by
-    (2^(p+1) − 2) C h^(p+1), and the two have an error of 2C h^(p+1), so that
+    II.4), for a method of order p by
 
         e = max ‖x(two steps) − x(one step)‖/(2^p − 1)    over the vertices of all copies [m]
 
-    The two are taken if e ≤ ``error``. Else h is halved, and the first of the two is now the one step of 2h. Two steps of twice
-    the length come next if 2^(p+1) e ≤ 0.8 ``error``, where they fit into the frame. A motion of a given error has the fewest
-    steps if all have an equal error. Where the motion is smooth, h is proportional to ``error``^(1/(p+1)), and the error of
-    the motion to ``error``^(p/(p+1)): with Euler to its square root.
-
-    Each length has a stepper of its own, which is a plain one with 2^k steps a frame. At most four are kept. Between steps the
-    state is in ``state``, whose counts are in units of the shortest step; a stepper takes it over before a step, so that
-    rejected steps leave no trace.
+    The two are taken if e ≤ ``error``, else h is halved. Two steps of twice the length come next if 2^(p+1) e ≤ 0.8 ``error``,
+    where they fit into the frame. Each length has a stepper of its own, at most four of which are kept; the state is copied to
+    it before a step.
 
     Args:
-        options: The record of the solver, with ``error``.
         bind: Function (record) → the stepper of a record with ``substeps`` on the model.
-        model: The model.
 
     Attributes:
-        model, declared: The model as it was bound; the stepper of each length has its own model of the steps.
+        model, declared: The model as it was bound; the stepper of each length has its own.
         length: :class:`Length`.
         reported: The stepper that is always kept, whose contact has the present state after each step and frame.
-        iterations: Iterations of all steps that the last frame or step needed, over the number of those taken.
-        order: Order p of the integrator.
+        iterations: Iterations of all steps of the last frame, over the number of those taken.
         steps_per_frame: Number of steps of the last frame.
-        h: The shortest step so far [s].
-        he: Effective step of the shortest possible step [s].
+        h, he: The shortest step so far, and the effective step of the shortest possible one [s].
     """
 
     uniform = True  # `iterations` is a mean
@@ -109,7 +98,7 @@ class ErrorStepper(Stepper):
         self._compare = Segment(model.device, self._launch_compare)
 
     def _stepper(self, k):
-        """Returns the stepper with 2^k steps a frame, and drops the one that was used least recently if there are too many."""
+        """Returns the stepper with 2^k steps a frame; drops the least recently used one."""
         found = self._kept.pop(k, None)
         if found is None:
             if len(self._kept) == KEPT:
@@ -122,7 +111,6 @@ class ErrorStepper(Stepper):
     # The state of this stepper and that of one with steps of one length.
 
     def _between(self, stepper, take):
-        """Returns the segment that copies arrays of the state to a stepper, or back from it with ``take``."""
         unit = 2**SHORTEST // stepper.steps_per_frame
 
         def launch():
@@ -147,7 +135,7 @@ class ErrorStepper(Stepper):
             launch(kernels.scale_steps, inputs=[a, times, parts], outputs=[b])
 
     def _states(self, stepper):
-        """Returns pairs of states, of this stepper and of another one: of the shares of threads, then the whole."""
+        """Returns pairs of states, of this and another stepper: of threads, then the whole."""
         mine, its = self.state, stepper.state
         return [*zip(mine.shares, its.shares, strict=True), (mine, its)]
 
@@ -165,14 +153,13 @@ class ErrorStepper(Stepper):
                 b.parts[name].assign(a.parts[name])
 
     def _report(self):
-        """Gives the present state to the stepper whose contact and counts others read."""
         if self._reports:
             self._copy(self.reported)
 
     # Steps.
 
     def _find(self):
-        """Finds k of the next two steps, and returns the stepper that has taken them."""
+        """Takes the next two steps with a length that their error allows; returns their stepper."""
         if not self.length.at:
             self._taken = self._iterations = 0
         length, alive = self.length, [result is not Result.DIVERGED for result in self.state.results]
@@ -193,7 +180,6 @@ class ErrorStepper(Stepper):
             wp.copy(self._whole, self._half)
 
     def _try(self, k):
-        """Takes a step of h from the present state, and returns the stepper that did."""
         stepper = self._stepper(k)
         self._copy(stepper)
         self._step(stepper)
@@ -209,7 +195,6 @@ class ErrorStepper(Stepper):
         self._sums.largest(self._ones, self._apart, self._largest.array)
 
     def _end(self):
-        """Notes that two steps were taken, and decides on the next ones."""
         length, k, missed = self.length, self._k, ~(self._error <= 1.0)
         state = self.state
         for copies in state.shares or [state]:
@@ -240,7 +225,6 @@ class ErrorStepper(Stepper):
         self._report()
 
     def frame(self):
-        """Takes the steps up to the end of the frame."""
         while self._planned:
             self.step()
             if not (self._planned or self.length.at):
@@ -260,10 +244,10 @@ class ErrorStepper(Stepper):
                 return
 
     def reset(self, mask=None, positions=None, velocities=None):
-        """See :meth:`Stepper.reset`; between frames only. Steps start with their first length again if all copies do.
+        """See :meth:`Stepper.reset`. Steps start with their first length again if all copies do.
 
         Raises:
-            ValueError: It is within a frame, or see there.
+            ValueError: It is within a frame, or as there.
         """
         if self._planned or self.length.at:
             raise ValueError("reset is within a frame; with error it must come at the end of one")
@@ -295,7 +279,6 @@ class ErrorStepper(Stepper):
 
     @property
     def kept(self):
-        """Number of steppers that are kept."""
         return len(self._kept)
 
     @property
@@ -325,7 +308,7 @@ class ErrorStepper(Stepper):
 
     @property
     def inside(self):
-        """See :attr:`Stepper.inside`, with steps of which ``steps_per_frame`` are a frame."""
+        """See :attr:`Stepper.inside`."""
         self._report()
         of = self.reported.steps_per_frame
         return [(copy, c, step * self.steps_per_frame // of, *rest) for copy, c, step, *rest in self.reported.inside]

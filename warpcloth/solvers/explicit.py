@@ -1,4 +1,4 @@
-"""Explicit integration: symplectic and forward Euler, and the largest stable step of symplectic Euler."""
+"""Explicit integration, and the largest stable step of symplectic Euler."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -31,16 +31,13 @@ class Explicit(Step):
     """Explicit Euler: symplectic, v += h a(x), then x += h v; or forward, x += h v and v += h a, both from the old x and v.
 
     On x″ = −ω²x the symplectic scheme conserves v² + ω²x² − hω²xv and is stable for h < 2/ω; forward Euler multiplies the
-    energy by 1 + h²ω² in each step, so that no h is stable (Provot 1995; Hairer, Lubich and Wanner 2006, *Geometric numerical
+    energy by 1 + h²ω² in each step, so no h is stable (Provot 1995; Hairer, Lubich and Wanner 2006, *Geometric numerical
     integration*).
 
     Attributes:
         dt, substeps: See :class:`Step`.
         scheme: ``"symplectic"`` or ``"forward"``.
-        above_limit: ``"refuse"`` or ``"allow"``: whether a step that is unstable about the rest shape is refused.
-
-    Raises:
-        ValueError: If an option is not allowed.
+        above_limit: ``"refuse"`` or ``"allow"`` steps that are unstable about the rest shape.
 
     Examples:
         >>> import warpcloth as wc
@@ -82,12 +79,12 @@ class Explicit(Step):
         return replace(self, above_limit="allow")
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model``.
 
         Without a step it takes the fewest substeps that respect both limits of :func:`step_limits`, the first by 10 %.
 
         Warns:
-            UserWarning: The step is above the limit in motion, see :func:`step_limits`.
+            UserWarning: The step is above the limit in motion.
 
         Raises:
             ValueError: The step is above the limit about the rest shape and that is not allowed, or a stiffness is infinite.
@@ -128,11 +125,7 @@ class Explicit(Step):
 
 
 def _refuse_strong_air(model, h):
-    """Refuses steps in which the force of air at their start would more than stop a vertex in the wind, or turn it back.
-
-    Raises:
-        ValueError: hΣ½ρAC|u|/3m is above 1 at a vertex, u the wind less the velocity at the start.
-    """
+    """Refuses steps in which the force of air at their start would more than stop a vertex in the wind: hΣ½ρAC|u|/3m > 1."""
     v = model.velocities.numpy().astype(np.float64)
     for elements in (each for each in model.terms if each.term is AIR):
         rest, stencil = host_values(elements.rest).astype(np.float64), host_values(elements.stencil)
@@ -158,14 +151,10 @@ def step_limits(model):
     """Returns the largest stable steps of symplectic Euler [s], about the rest shape and in motion.
 
     The first is the h at which the largest eigenvalue of M⁻¹(h²K + 2hC), found by Lanczos iteration, is 4, with K = ∂²U/∂x² and
-    the damping matrix C at rest. Without damping it is 2/ω. The second uses Gershgorin's bound in place of the eigenvalue, the
-    maximum over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over elements and their vertices. For springs that is 2·Σk/m, a bound in
-    any motion, as it is for quadratic bending. The Hessian of dihedral bending grows as the cloth folds or is compressed, and
-    that of membranes as they stretch. Both are taken at rest, so the second limit is no bound for scenes with them. Both limits
-    include contact, and strain and spring limits with their stiffness beyond the range.
-
-    Returns:
-        (rest, motion); infinite if nothing is stiff.
+    the damping matrix C at rest. The second uses Gershgorin's bound, the maximum over vertices of Σ‖∂²uₑ/∂xᵢ∂xⱼ‖/m, summed over
+    elements and their vertices. It bounds any motion of springs and quadratic bending, but not of dihedral bending and
+    membranes, whose Hessians at rest it takes. Both include contact, and strain and spring limits with their stiffness beyond
+    the range, and are infinite if nothing is stiff.
 
     Raises:
         ValueError: A stiffness is infinite.
@@ -176,7 +165,7 @@ def step_limits(model):
 
 @in_turn
 def limit_in_motion(model):
-    """Returns the second of :func:`step_limits`, which is smaller and much cheaper to compute.
+    """Returns the second of :func:`step_limits`, the smaller and cheaper one.
 
     Raises:
         ValueError: A stiffness is infinite.
@@ -185,12 +174,6 @@ def limit_in_motion(model):
 
 
 class _Limits:
-    """The limits of :func:`step_limits`, each computed when it is first asked for.
-
-    Raises:
-        ValueError: A stiffness is infinite.
-    """
-
     def __init__(self, model):
         Explicit.refuse(model)
         self.model, self._unlike = model, [_Linearised(one) for one in _unlike(model)]
@@ -210,10 +193,7 @@ class _Limits:
 
 
 def _with_pairs(model, h):
-    """Returns the step limit with self-contact, from the limit h without: that of 4/h² + 4kA/m, a layer on either side.
-
-    By Gershgorin, the pairs of a vertex and those of the other layer add 2kA on each side.
-    """
+    """Returns the step limit with self-contact, from the limit h without: that of 4/h² + 4kA/m, by Gershgorin."""
     declared = model.scene.self_contact
     if declared is None:
         return h
@@ -237,8 +217,6 @@ def _unlike(model):
 
 
 class _Linearised:
-    """The stiffness and the damping of a model of one copy about the rest shape."""
-
     def __init__(self, model):
         self._model, self._x, self._pushes = model, model.array(model.rest_points, model.vec3), _of_meshes(model)
         self._stiff = [elements.at_limit(model.rest_points) for elements in model.terms]
@@ -248,7 +226,6 @@ class _Linearised:
 
     @cached_property
     def motion(self):
-        """The second of :func:`step_limits`."""
         w = self._model.inverse_mass.numpy()
         k, c = (norms(self._model, terms, self._x) * w if terms else 0.0 for terms in (self._stiff, self._damping))
         return float(np.min(_root(k + self._pushes * w, c), initial=np.inf))
@@ -266,17 +243,13 @@ class _Linearised:
 
 
 def _of_meshes(model):
-    """Returns kA of each vertex of a copy (n,) [N/m], once for each mesh among the colliders, as other colliders have it.
-
-    The contact of meshes is pairs, not terms.
-    """
+    """Returns kA of each vertex of a copy (n,) [N/m], once for each mesh collider."""
     scene, count = model.scene, len(model.scene.meshes) if model.colliders is not None else 0
     areas = scene.mesh.vertex_areas if model.order is None else scene.mesh.vertex_areas[model.order]
     return count * scene.contact.stiffness * areas if count else np.zeros(len(areas))
 
 
 def _at_rest(K, C):
-    """Returns the first of :func:`step_limits` from the matrices of :class:`_Linearised`."""
     if C is None:
         return float(_root(0.0 if K is None else largest(K)[0], 0.0))
     h = _root(*(largest(matrix)[0] for matrix in (K, C)))
@@ -296,10 +269,6 @@ def _root(k, c):
 
 class ExplicitStepper(LaunchedStepper):
     """:class:`Explicit` on a model.
-
-    Args:
-        options, model: As for every stepper.
-        backend: See :func:`warpcloth.fast.plan.plan`.
 
     Attributes:
         plan: The :class:`warpcloth.fast.plan.Plan`, whose ``record`` says how steps are taken.

@@ -8,8 +8,8 @@ class Benchmark:
     """A scene of several sizes that `warpcloth bench` runs with a solver.
 
     Attributes:
-        options: Options of the solver; without a step for a limited solver, which takes the fewest stable substeps.
-        cpu, cuda: Resolutions of the scene at which a frame takes less than about a second on one core, and on an H200.
+        options: Options of the solver; a limited one takes the fewest stable substeps if they have none.
+        cpu, cuda: Resolutions at which a frame takes less than about a second on one core, and on a GPU.
         scene: Name of the scene.
     """
 
@@ -24,15 +24,12 @@ class Facts:
     """Settings by which a solver is measured.
 
     Attributes:
-        method: The method, in a few words for tables.
-        suits, weakness: The scenes that it suits, and where it fails or is slow, with measured figures, for tables.
+        method, suits, weakness: Words for tables.
         benchmarks: The :class:`Benchmark` settings.
-        runs: Options of settings that trade speed for accuracy: those near the Pareto front of error and time on ``hanging``
-            with 32² and 64² vertices. Substeps are per 1/60 s; for a limited solver ``fewest``, a multiple of the fewest stable
-            substeps, replaces them, and steps by ``error`` have none.
-        one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler. Tolerances are
-            so small that they never end a step.
-        limits: Names of the limits, see :data:`warpcloth.lab.stability_limits.LIMITS`, that maps of stability draw.
+        runs: Options near the Pareto front of error and time on ``hanging``. Substeps are per 1/60 s; for a limited solver
+            ``fewest``, a multiple of the fewest stable substeps, replaces them.
+        one_step: Options, without step and iterations, of the settings that minimise one step of implicit Euler.
+        limits: Names of the :data:`warpcloth.lab.stability_limits.LIMITS` that maps of stability draw.
     """
 
     method: str = ""

@@ -1,4 +1,4 @@
-"""Hierarchical position based dynamics: PBD that sweeps over coarse levels before fine ones."""
+"""Hierarchical position based dynamics."""
 
 from dataclasses import dataclass
 
@@ -19,26 +19,18 @@ from .step import Step
 class HierarchicalPBD(Step):
     """Hierarchical position based dynamics (Müller 2008, *Hierarchical position based dynamics*).
 
-    A sweep of :class:`warpcloth.PBD` carries information over one or a few constraints, so that finer cloth stretches more.
-    Here a step first sweeps over levels with fewer vertices, the coarsest first. The vertices that a level leaves out then
-    follow by dᵢ = Σ (dⱼ/Lᵢⱼ) / Σ (1/Lᵢⱼ) over the vertices j of the level that they are linked to, d = x − x̃. The sweeps of
-    PBD over all terms come last. Each level costs a quarter of the next finer one in a sheet, a half in a chain.
+    A step first sweeps over levels with fewer vertices, the coarsest first, so that fine cloth stretches less than with
+    :class:`warpcloth.PBD`. The vertices that a level leaves out follow by dᵢ = Σ (dⱼ/Lᵢⱼ) / Σ (1/Lᵢⱼ) over the vertices j of
+    the level that they are linked to, d = x − x̃. The sweeps of PBD over all terms come last.
 
-    The constraints of a level are one-sided: ‖xᵢ − xⱼ‖ ≤ L with L the length of a path at rest: the shortest over finer bounds,
-    or a shorter, straight one over triangles that keep their shape, where the rest shape is flat. These are the triangles of
-    membranes and ``StrainLimit``, and those of springs whose stiffnesses differ by a factor of 4 at most. So cloth that meets
-    its constraints is not moved, and the levels do not resist folding, or shear of a net. Springs, limits with
-    σ_max and membranes give bounds; bending, attachments and damping take part in the last sweeps only. Without bounds the
-    solver is PBD. The stiffness of a bound is that of its path in series, scaled so that a level keeps Σ kL² of the finer one;
-    it is infinite if that of the cloth is. A vertex of a level has the mass of the vertices that follow it too, Mⱼ = mⱼ + Σ wᵢⱼ
-    mᵢ, so that linear momentum is conserved; angular momentum is not.
+    The constraints of a level are ‖xᵢ − xⱼ‖ ≤ L with L the length of a path at rest: the shortest over finer bounds, or a
+    straight one over triangles of membranes, strain limits or springs of like stiffness, where the rest shape is flat. So
+    levels do not resist folding, or shear of a net. Springs, limits with σ_max and membranes give bounds; without bounds the
+    solver is PBD. The stiffness of a bound is that of its path, scaled so that a level keeps Σ kL² of the finer one. A vertex
+    of a level has the mass Mⱼ = mⱼ + Σ wᵢⱼ mᵢ, so linear momentum is conserved; angular momentum is not.
 
-    It has drawbacks. Soft cloth is stiffer than with PBD, because the corrections of all levels add up: a chain of 80 springs
-    whose exact stretch is 40 % stretches by 4.7 % with PBD (4 × 20 sweeps a frame) and by 1.1 % here. Cloth that starts with
-    large stretch is flung, because one step corrects all of it. Stiff cloth is flung too if steps are much shorter than it
-    needs, because the levels then add energy. Vertices that follow a level move unevenly, most of all near pins, and the last
-    sweeps must smooth that. So levels help if large errors extend over many vertices. If x̃ already nearly meets the
-    constraints, PBD alone leaves smaller errors. Repeating the levels in a step was no better in the same time.
+    Soft cloth is stiffer than with PBD. Cloth that starts with large stretch is flung, and so is stiff cloth if steps are much
+    shorter than it needs.
 
     Attributes:
         dt, substeps: See :class:`Step`.
@@ -46,9 +38,6 @@ class HierarchicalPBD(Step):
         coarse_iterations: Sweeps over each level.
         levels: Maximum number of levels above the finest; 0 is PBD, None means all levels that have bounds.
         relaxation: ω > 0, a factor on every move of a sweep.
-
-    Raises:
-        ValueError: If an option is not allowed.
     """
 
     name = "hierarchical-pbd"
@@ -68,7 +57,7 @@ class HierarchicalPBD(Step):
     relaxation: float = ranged(1.0, above=0.0)
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model``.
 
         Raises:
             ValueError: A term has infinite stiffness and neither projection, scalar constraint nor ``prox``.
@@ -81,8 +70,8 @@ class HierarchicalPBDStepper(LaunchedStepper):
     """:class:`HierarchicalPBD` on a model.
 
     Attributes:
-        levels: The :class:`warpcloth.numerics.hierarchy.Level` of each level above the finest, finer ones first.
-        sweep: The :class:`warpcloth.numerics.sweeps.GaussSeidelSweep` over all terms, with x − x̃ of the last step.
+        levels: The :class:`warpcloth.numerics.hierarchy.Level` above the finest, finer ones first.
+        sweep: The sweep over all terms, with x − x̃ of the last step.
     """
 
     hard_pairs = True
@@ -99,7 +88,7 @@ class HierarchicalPBDStepper(LaunchedStepper):
         return model.with_terms(self.sweep.elements)
 
     def _on_level(self, level):
-        """Returns the sweep over a level, and the arguments of the launch that interpolates to the vertices that it drops."""
+        """Returns the sweep over a level, and the launch that interpolates to the vertices left out."""
         model, d = self.model, self.sweep.correction
         given = on_device(model, level), self.state.x, self.h, "coloured", self.options.relaxation
         sweep = GaussSeidelSweep(*given, correction=d, follows=False)
@@ -110,7 +99,6 @@ class HierarchicalPBDStepper(LaunchedStepper):
         return sweep, (model.kernel(follow, model.dtype), (model.copies, len(dropped)), given, [d])
 
     def _launch_start(self):
-        """Launches the prediction, and the sweeps over the levels, the coarsest first."""
         self.launch_prediction()
         self.sweep.launch_start()
         for sweep, followers in reversed(self._coarse):

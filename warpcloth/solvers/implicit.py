@@ -10,9 +10,8 @@ from .solver import Stepper
 class ImplicitStepper(Stepper):
     """A solver that iterates on the correction d = x − x̃ until its residual is below a tolerance.
 
-    A subclass has ``correction`` (N,) [m] and the methods ``start``, ``measure`` and ``iterate`` of
-    :func:`warpcloth.numerics.iterate.iterate`, where ``start`` includes the prediction, or its own :meth:`minimise`. Its
-    constructor ends with :meth:`ready`.
+    A subclass has ``correction`` (N,) [m] and the methods ``start`` (with the prediction), ``measure`` and ``iterate`` of
+    :func:`warpcloth.numerics.iterate.iterate`, or its own :meth:`minimise`. Its constructor ends with :meth:`ready`.
     """
 
     def __init__(self, options, model):
@@ -20,7 +19,7 @@ class ImplicitStepper(Stepper):
         self.iterations = 0
 
     def ready(self):
-        """Captures the graph of the end of a step, and starts the integrator, which may step."""
+        """Captures the end of a step, and starts the integrator, which may step."""
         self._record_end()
         self.integrator.start()
 

@@ -1,4 +1,4 @@
-"""Implicit Euler as the minimisation of 1/(2h²)‖x − x̃‖²_M + U(x), by Newton's method."""
+"""Implicit Euler by Newton's method."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -20,31 +20,24 @@ from .step import ImplicitStep
 class Newton(ImplicitStep):
     """Implicit Euler: x(t+h) minimises 1/(2h²)‖x − x̃‖²_M + U(x), x̃ = x + h v + h² g (Baraff and Witkin 1998).
 
-    It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Each step
-    multiplies the energy of an oscillation by 1/(1 + ω²h²). Linear momentum is conserved to rounding, whatever the tolerance;
-    angular momentum is not. Without contact and rigid clusters a step starts from the x − x̃ of the last one where this lowers
-    the function, else from x̃. In contact it starts from x̃, outside colliders, from x(t), or from the last x − x̃, wherever the
-    function is lowest. From x(t) it takes an iteration at least, so that slow motion goes on.
+    It stays at a state in exact balance even if that is not a minimum, such as a straight chain under compression. Linear
+    momentum is conserved to rounding, whatever the tolerance; angular momentum is not. Without contact and rigid clusters a
+    step starts from the last x − x̃ where this lowers the function, else from x̃; in contact from x̃, x(t) or the last x − x̃,
+    wherever the function is lowest. From x(t) it takes an iteration at least.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
         tolerance: Tolerance of the residual, which is the largest unbalanced acceleration of any vertex, ‖∇ᵢ‖/mᵢ, divided by
-            gravity and what loads and wind add to it; without these by the radius of the cloth over the square of the duration,
-            see :class:`warpcloth.numerics.iterate.ResidualScale`. If rounding leaves a larger residual, as in stiff cloth in
-            float32, a step ends when no progress is possible, and its result says so.
+            gravity and what loads and wind add to it; without these by the radius of the cloth over the square of the duration
+            (:class:`warpcloth.numerics.iterate.ResidualScale`). If rounding leaves a larger residual, a step ends when no
+            progress is possible, and its result says so.
         iterations: Maximum number of Newton iterations in a step. If cloth snaps from one fold to another, a step may take more
-            than 100; in ``flag`` one takes 137.
+            than 100.
         hessian: Treatment of an indefinite Hessian (Choi and Ko 2002 for springs). ``"clamp"`` and ``"absolute"`` make the
-            block of each element semi-definite in every iteration; ``"adaptive"`` reduces its negative part by quarters, only
-            as far as the matrix needs to be definite, and restores a quarter in each further iteration; ``"raw"`` changes
-            nothing.
-        linear: ``"cg"`` solves by conjugate gradients, to the accuracy that the Newton iteration needs, and meshes of 200
-            vertices and more with a multigrid cycle as preconditioner where this takes less work. ``"factorised"``
-            factorises on the host, which is 3 to 6 times slower for ``hanging`` with 32² and 64² vertices, but takes any
-            stiffness.
-
-    Raises:
-        ValueError: If an option is not allowed.
+            block of each element semi-definite; ``"adaptive"`` reduces its negative part by quarters, only as far as the matrix
+            needs to be definite; ``"raw"`` changes nothing.
+        linear: ``"cg"`` solves by conjugate gradients, with multigrid as preconditioner on meshes of 200 vertices and more
+            where this takes less work. ``"factorised"`` factorises on the host, which is slower, but takes any stiffness.
 
     Examples:
         >>> import warpcloth as wc
@@ -82,7 +75,7 @@ class Newton(ImplicitStep):
     linear: Literal["cg", "factorised"] = "cg"
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model``.
 
         Raises:
             ValueError: A term has infinite stiffness.

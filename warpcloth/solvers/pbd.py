@@ -1,4 +1,4 @@
-"""Position based dynamics: predict, then move the vertices onto their constraints, and take velocities from the move."""
+"""Position based dynamics."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -17,30 +17,28 @@ class PBD(Step):
     """Position based dynamics (Müller et al. 2006).
 
     A sweep moves the vertices of each constraint by W GᵀΔλ, Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y), with inverse masses W and α̃ =
-    1/(kAh²). For infinite stiffness k, the classical method, they move fully onto the constraint. For finite stiffness they
-    move by the fraction s = w/(w + α̃), w = G W Gᵀ, by which a single element would move in a step. If every sweep corrects by
-    s, cloth becomes stiffer with more iterations n and smaller h: one hanging mass stretches by g h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest.
-    If every sweep corrects by s′ = 1 − (1−s)^(1/n), all sweeps together correct by s, and the mass stretches by g h²(1−s)/s =
-    mg/k for any n; where constraints share vertices, the result still depends on n.
+    1/(kAh²). For infinite stiffness k they move fully onto the constraint, else by the fraction s = w/(w + α̃), w = G W Gᵀ. If
+    every sweep corrects by s, cloth becomes stiffer with more iterations n and smaller h: one hanging mass stretches by g
+    h²(1−s)ⁿ/(1−(1−s)ⁿ) at rest. If every sweep corrects by s′ = 1 − (1−s)^(1/n), it stretches by mg/k for any n; where
+    constraints share vertices, the result still depends on n.
 
     Jacobi sweeps add up all corrections and then move the vertices. If they move by ω times the sum, they diverge iff ω
-    λ_max(D⁻¹JWJᵀ) > 2. If corrections are averaged by vertex, (Σx_new + αx)/(n + α) with the n constraints of the vertex,
-    sweeps converge for every α ≥ 0, but do not conserve momentum. If they are averaged by constraint, with the factor 1/max n
-    for all vertices of a constraint, sweeps conserve linear momentum. Gauss–Seidel sweeps also conserve linear momentum, and
-    converge in fewer sweeps; their order changes the result.
+    λ_max(D⁻¹JWJᵀ) > 2. Averaged by vertex, (Σx_new + αx)/(n + α) with the n constraints of the vertex, they converge for every
+    α ≥ 0, but do not conserve momentum. Averaged by constraint, with the factor 1/max n for all its vertices, they conserve
+    linear momentum. So do Gauss–Seidel sweeps, which converge faster; their order changes the result.
 
     Attributes:
         dt, substeps: See :class:`Step`.
         iterations: Sweeps a step.
         sweep: Jacobi ``"vertex-averaged"``, ``"constraint-averaged"`` or plain ``"jacobi"``; Gauss–Seidel ``"coloured"``, or
-            ``"sequential"``: elements in the order of the scene, by one thread; on a GPU it suits small scenes only.
+            ``"sequential"``: elements in the order of the scene, by one thread.
         alpha: α ≥ 0, weight of the old position when averaging by vertex.
         relaxation: ω > 0, a factor on every move.
         correction: ``"per-sweep"`` corrects constraints of finite stiffness by s in each sweep, ``"per-step"`` by s in each
             step, which is s′ in each sweep.
 
     Raises:
-        ValueError: If an option is not allowed.
+        ValueError: An option is not allowed, or ``alpha`` is given without ``"vertex-averaged"``.
 
     Examples:
         >>> import warpcloth as wc
@@ -89,7 +87,7 @@ class PBD(Step):
         return self.sweep in IN_PLACE
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model``.
 
         Raises:
             ValueError: A term has infinite stiffness and neither projection, scalar constraint nor ``prox``.

@@ -1,4 +1,4 @@
-"""Projective dynamics: implicit Euler by projections of the elements and one constant matrix, factorised once."""
+"""Projective dynamics: implicit Euler by projections and one constant matrix."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -35,21 +35,17 @@ ACCELERATIONS = ("none", "chebyshev", "anderson", "l-bfgs")
 class ProjectiveDynamics(ImplicitStep):
     """Implicit Euler by alternating local and global steps, from x = x̃ (Liu et al. 2013, Bouaziz et al. 2014).
 
-    For energies ½kA‖y − p(y)‖², y = Gx: with the projections p of all elements fixed, the objective of implicit Euler has its
-    minimum at S x = (M/h²) x̃ + Σ k A Gᵀp, with the matrix S = M/h² + Σ k A GᵀG. S is the same for all three coordinates and
-    all steps, and is factorised once. As ∂u/∂y = y − p(y), one iteration is d ← d − S⁻¹∇φ(d) with d = x − x̃, so that later
-    iterations correct the rounding of earlier ones. The objective φ never rises, and the fixed point is the x(t+h) of
-    :class:`warpcloth.Newton`.
+    For energies ½kA‖y − p(y)‖², y = Gx, with the projections p of all elements fixed, the objective φ of implicit Euler has its
+    minimum at S x = (M/h²) x̃ + Σ k A Gᵀp, with the constant matrix S = M/h² + Σ k A GᵀG. As ∂u/∂y = y − p(y), one iteration is
+    d ← d − S⁻¹∇φ(d) with d = x − x̃. φ never rises, and the fixed point is the x(t+h) of :class:`warpcloth.Newton`.
 
-    An energy without a projection has k A s GᵀG in S, with the curvature s = ‖∂²u/∂y²‖ at rest. The iteration is the same (Liu
-    et al. 2017), but a step may raise φ where the curvature is larger than at rest. If both the plain and the accelerated step
-    raise φ, the iterate is kept and the step length is halved. Air has no part in S, because its curvature changes in each
-    step; the iteration converges without it where hΣ½ρAC|u|/3m < 1, summed over the triangles of each vertex.
+    An energy without a projection has k A s GᵀG in S, with the curvature s = ‖∂²u/∂y²‖ at rest (Liu et al. 2017). If a step
+    raises φ, its length is halved. Air has no part in S; the iteration converges where hΣ½ρAC|u|/3m < 1, summed over the
+    triangles of each vertex.
 
-    Motion perpendicular to stiff elements converges slowly. For one spring with a fixed end, of length l and rest length L, the
-    error perpendicular to it shrinks by the factor k(L/l)/(m/h² + k) in each iteration; the error along it is gone after one.
-    The accelerations make up for this. If the accelerated iterate has a larger φ than the plain one from the same point, the
-    plain one is taken. Chebyshev needs a bound of that factor and takes 1 − min m/(h²D), D the row sums of |S|.
+    For one spring with a fixed end, of length l and rest length L, the error perpendicular to it shrinks only by the factor
+    k(L/l)/(m/h² + k) in each iteration, which acceleration improves. Chebyshev takes its bound 1 − min m/(h²D), D the row sums
+    of |S|. The plain step is taken where it has the smaller φ.
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
@@ -58,14 +54,9 @@ class ProjectiveDynamics(ImplicitStep):
         acceleration: ``"none"``; ``"chebyshev"`` (Wang 2015); ``"anderson"`` (Peng et al. 2018), in the norm of the matrix;
             ``"l-bfgs"`` (Liu et al. 2017), with the matrix as first Hessian.
         window: Number of iterations that Anderson and L-BFGS use.
-        linear: ``"factorised"``, or ``"jacobi"``, which replaces the matrix by the diagonal of its row sums Dᵢ = Σⱼ|Sᵢⱼ| (Wang
-            2015 for Chebyshev). Because D ≥ S, φ still falls, but more slowly. An iteration then carries information to
-            neighbouring vertices only, and linear momentum is not conserved before convergence. On CUDA,
-            ``"factorised"`` computes B∇φ by a few cycles of multigrid instead of S⁻¹∇φ. B is constant and 0.6 S⁻¹ ≤ B ≤ S⁻¹
-            (about), so that φ never rises either. Up to 300 vertices B is S⁻¹.
-
-    Raises:
-        ValueError: If an option is not allowed.
+        linear: ``"factorised"``, or ``"jacobi"``, which replaces S by the diagonal of its row sums Dᵢ = Σⱼ|Sᵢⱼ| (Wang 2015 for
+            Chebyshev): slower, and linear momentum is not conserved before convergence. On CUDA, above 300 vertices,
+            ``"factorised"`` replaces S⁻¹ by a few cycles of multigrid, a constant B with about 0.6 S⁻¹ ≤ B ≤ S⁻¹.
 
     Examples:
         >>> import warpcloth as wc
@@ -102,7 +93,7 @@ class ProjectiveDynamics(ImplicitStep):
     linear: Literal["factorised", "jacobi"] = "factorised"
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model``.
 
         Raises:
             ValueError: A term has infinite stiffness, or cells with an energy that is not quadratic.
@@ -117,7 +108,6 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
     Attributes:
         correction: x − x̃ of the last step, (N,) [m].
         gradient, w: ∇φ there, (N,) [N], and S⁻¹∇φ (N,) [m].
-        sums, inertia: :class:`warpcloth.core.sums.Sums` and :class:`warpcloth.numerics.inertia.Inertia`.
     """
 
     def __init__(self, options, model):
@@ -186,10 +176,9 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._move()
 
     def slowest(self):
-        """Returns an upper bound (B,) of the factor by which a plain iteration multiplies the error.
+        """Returns an upper bound (B,) of the factor by which a plain iteration multiplies the error, if nothing is compressed.
 
-        That is 1 − (1 − ε) min s mᵢ/Σⱼ|Sᵢⱼ|, with the relative error ε of solves. S is at most its row sums, and the Hessian is
-        at least s M if nothing is compressed.
+        That is 1 − (1 − ε) min s mᵢ/Σⱼ|Sᵢⱼ|, with the relative error ε of solves.
         """
         mass, free = (array.numpy().reshape(self._sizes.shape) for array in (self.model.mass, self.model.inverse_mass))
         part = np.where(free > 0.0, self.inertia.s * mass.astype(np.float64) / self._sizes, 1.0)
@@ -213,13 +202,11 @@ class ProjectiveDynamicsStepper(ImplicitStepper):
         self._launch_gradient()
 
     def launch_plain_step(self, out):
-        """Launches out = d − w."""
         model = self.model
         given = [self.correction, self.w, self._active.array, model.per_copy]
         model.launch(self._plain_step, model.count, given, [out])
 
     def _launch_gradient(self):
-        """Launches ∇φ at d, and the largest unbalanced acceleration."""
         self.gradient.zero_()
         self._gradient_of.add(self.state.x, self.gradient, self.correction)
         self.inertia.add(self.correction, self.gradient)

@@ -1,4 +1,4 @@
-"""The base classes of bound solvers: the state, the step and the frame."""
+"""The base classes of bound solvers."""
 
 import numpy as np
 import warp as wp
@@ -26,14 +26,11 @@ class Stepper:
         h: Step [s].
         declared: The model as it was bound.
         model: The model of the steps: with damping, with contact that has rest states of its own, and in the order of sweeps.
-            It is made once, by the constructor.
         elements: The elements of ``model`` copy by copy, in the order of the scene.
-        integrator: The integrator, see :mod:`warpcloth.numerics.integrators`, which computes x̃, and the new state from the
-            minimiser; None for solvers without x̃.
+        integrator: It computes x̃, and the new state from the minimiser; None for solvers without x̃.
         he: Effective step hₑ of the integrator [s], else h.
-        steps_per_frame: Number of steps per frame.
         colliders: :class:`warpcloth.contact.collider_steps.ColliderSteps`, or None if the scene has none.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None if cloth passes through itself.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None if contact has no pairs.
         results: The worst :class:`warpcloth.core.status.Result` of each copy so far, a list of B.
         residual: The largest residual of each copy so far, (B,); 0 for methods that have none.
         predicted: x̃ of the last step (N,) [m]; None for solvers without x̃.
@@ -41,7 +38,7 @@ class Stepper:
         unfiltered: Positions at the end of the last step before contact changed them (N,) [m]; None without contact.
         iterations: Number of iterations or sweeps of the last step; 1 for methods that do not iterate.
         even: Whether all steps have the same length.
-        factorise_seconds: Time of the factorisation of constant matrices [s]; 0 for methods that have none.
+        factorise_seconds: Time of the factorisation of constant matrices [s].
     """
 
     factorise_seconds = 0.0
@@ -82,17 +79,14 @@ class Stepper:
                 self.unfiltered = model.vectors()
 
     def arranged(self, model):
-        """Returns the model with its elements in the order of the steps, which sweeps determine; called once."""
         return model
 
     @property
     def filter(self):
-        """The :class:`warpcloth.contact.self_filter.SelfFilter`, or one that does nothing."""
         return filter_of(self.pairs)
 
     @property
     def results(self):
-        """The worst result of each copy so far."""
         return self.state.results
 
     @results.setter
@@ -123,23 +117,23 @@ class Stepper:
 
     @property
     def x_before(self):
-        """Positions at the start of the step, (N,) vectors [m], or None if there are no colliders."""
+        """Positions at the start of the step, (N,) [m], or None without colliders."""
         return None if self.colliders is None else self.colliders.x_before
 
     def follow_contact(self):
-        """Makes steps keep their initial positions and the changes of the filter, and refresh contact in every step.
+        """Makes steps refresh contact, and keep their initial positions and the changes of the filter in :attr:`colliders`.
 
-        The motion does not change. Call it before reading these from :attr:`colliders`, and take steps one by one.
+        Call it before reading these, and take steps one by one. The motion does not change.
         """
         self.colliders.note_pushes()
         self.colliders.follow()
 
     def launch_pins(self, parts=1):
-        """Launches the move of pins with keyframes by h/``parts``; all calls must have the same ``parts``."""
+        """Launches the move of pins by h/``parts``; all calls must have the same ``parts``."""
         self.launch_pins_of(*self.state, parts)
 
     def launch_pins_of(self, x, v, parts=1):
-        """Launches the move of pins in x and v (N,), see `launch_pins`, and counts the step."""
+        """Launches the move of pins in x and v (N,), and counts the step."""
         model, count = self.model, self.count
         if model.pins is not None:
             move = model.kernel(kernels.move_pins, model.dtype)
@@ -150,12 +144,12 @@ class Stepper:
 
     @property
     def loads_at_end(self):
-        """Whether steps evaluate loads at their end, not in the middle or at the start."""
+        """Whether steps evaluate loads at their end."""
         return self.integrator is not None and self.integrator.parts == 1
 
     @property
     def shares(self):
-        """The steppers that share the batch, each with its range of copies: (stepper, first, end)."""
+        """The steppers that share the batch, with their ranges of copies: (stepper, first, end)."""
         return [(self, 0, self.model.copies)]
 
     @property
@@ -165,8 +159,6 @@ class Stepper:
 
     def constraint_forces(self, collider=None):
         """Returns a function (array) that launches array (N,) −= f [N], the forces of hard terms in the last step.
-
-        The forces follow from the multipliers.
 
         Args:
             collider: Index of the collider whose contact forces to take, or None for all hard terms.
@@ -180,7 +172,7 @@ class Stepper:
         )
 
     def launch_prediction(self):
-        """Launches the updates at the start of a step, x = x̃, and the move of pins to the end of the step."""
+        """Launches the start of a step: x = x̃, with pins at the end of the step."""
         self.model.refresh(STEP, self.integrator.moment)
         if self.pairs is not None:
             self.pairs.launch_begin(self.state.x)
@@ -191,12 +183,12 @@ class Stepper:
             self.colliders.launch_clear(self.model.terms, self.state.x)
 
     def launch_first(self, correction):
-        """Launches the first d = x − x̃ of a step: 0, or as near to it as pairs stay apart, which are then listed there."""
+        """Launches the first d = x − x̃ of a step: 0, or as near to it as pairs stay apart."""
         self.filter.launch_start(self.state.x, correction)
         self.filter.launch_trial(self.state.x, correction)
 
     def launch_finish(self, correction):
-        """Launches x and v at the end of the step, from x̃ and the correction d = x − x̃ of the minimiser (N,) [m]."""
+        """Launches x and v at the end of the step, from x̃ and d = x − x̃ of the minimiser (N,) [m]."""
         self.correction = correction
         wp.copy(self.predicted, self.state.x)
         self.integrator.launch_finish(correction)
@@ -208,14 +200,14 @@ class Stepper:
         self.filter.launch_end(*self.state, self.integrator.move, self.integrator.parts)
 
     def launch_end_of(self, x, v):
-        """Launches the end of an explicit step in x and v (N,): the move of pins, and the filters of contact."""
+        """Launches the end of an explicit step in x and v (N,): pins, and the filters."""
         self.launch_pins_of(x, v)
         if self.colliders is not None:
             self.colliders.launch_end(x, v)
         self.filter.launch_end(x, v)
 
     def take(self, steps):
-        """Calls ``steps``, and repeats it from the same state with more memory while the list of pairs overflows."""
+        """Calls ``steps``, again from the same state with more memory while the list of pairs overflows."""
         if self.pairs is None:
             steps()
             return
@@ -233,7 +225,7 @@ class Stepper:
             steps()
 
     def record_again(self):
-        """Captures the launches of steps again, after the arrays of pairs were replaced."""
+        """Captures the launches of steps again, after the arrays of pairs changed."""
         raise NotImplementedError  # every solver that takes self-contact has its own
 
     def step(self):
@@ -241,36 +233,35 @@ class Stepper:
         raise NotImplementedError  # every solver has its own
 
     def prepare_frame(self):
-        """Captures the graphs of `frame`, which must happen in the main thread; by default, the first `frame` does it."""
+        """Captures the graphs of `frame`, in the main thread."""
 
     @in_turn
     def frame(self):
-        """Takes the steps of one frame, with the same bits as `steps_of_frame`."""
+        """Takes the steps of one frame."""
         for _ in self.steps_of_frame():
             pass
 
     def steps_of_frame(self):
-        """Takes the steps of one frame one by one, and yields after each."""
+        """Takes the steps of one frame, and yields after each."""
         for _ in range(self.steps_per_frame):
             self.step()
             yield
 
     @in_turn
     def reset(self, mask=None, positions=None, velocities=None):
-        """Resets copies to their start, by one launch or, with free axes, two; they then repeat their first steps bit for bit.
+        """Resets copies to their start; they then repeat their first steps bit for bit. Other copies do not change.
 
-        Keyframes, ``results`` and ``residual`` of these copies start again as well. Other copies are not affected. Calls after
-        the first allocate nothing. If all arguments are on the device and the solver has no residual, the host does not wait,
-        unless positions are given with colliders, because it checks these.
+        Keyframes, ``results`` and ``residual`` of these copies start again as well. Calls after the first allocate nothing. If
+        all arguments are on the device and the solver has no residual, the host does not wait, unless positions are given with
+        colliders.
+
+        Arguments are Warp arrays, in the precision of the model if on the device, or anything that NumPy converts.
 
         Args:
-            mask: Which copies to reset, (B,) booleans; None for all.
+            mask: Copies to reset, (B,) booleans; None for all.
             positions: Initial positions (B, n, 3) [m], by default those of the model; any finite values for other copies. Rest
                 states that follow from the initial positions do not change, and vertices with keyframes start at these.
             velocities: Initial velocities (B, n, 3) [m/s]; those of pinned vertices are ignored.
-
-        Each is a Warp array or anything that NumPy converts to an array. A Warp array on the device must have the precision of
-        the model, and is read in place.
 
         Raises:
             ValueError: An argument is not allowed, a free vertex of one of these copies would start inside a collider, or
@@ -286,7 +277,7 @@ LAUNCHES = 64
 
 
 class LaunchedStepper(Stepper):
-    """A solver whose steps consist of launches only, so that a frame is a few graphs of several steps each.
+    """A solver whose steps consist of launches only, so that a frame is a few graphs.
 
     The constructor of a subclass ends with `record`, and with an integrator with ``integrator.start()``.
     """
@@ -318,14 +309,13 @@ class LaunchedStepper(Stepper):
         self._record_step()
 
     def launch_steps(self, steps):
-        """Launches this number of steps."""
         for _ in range(steps):
             for launch, times in self.parts:
                 for _ in range(times):
                     launch()
 
     def _record_frame(self):
-        """Captures the segments of a frame, on first use, and returns them with the number of replays of each."""
+        """Returns the segments of a frame with the number of replays of each."""
         steps = self.steps_per_frame
         chunk = min(steps, LAUNCHES // max(self._size, 1))
         if chunk < 2:
@@ -361,4 +351,4 @@ class LaunchedStepper(Stepper):
         self._replay(self._frame)
 
     def note(self):
-        """Notes how the steps since the last call ended, for methods with a residual."""
+        """Notes how the steps since the last call ended."""

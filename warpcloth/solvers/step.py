@@ -1,4 +1,4 @@
-"""The base classes of the records of solvers: the step, the needs of every term and the facts; and the catalogue by name."""
+"""The base classes of the records of solvers, and their catalogue by name."""
 
 import math
 from dataclasses import dataclass, fields
@@ -28,13 +28,10 @@ _STEPS_A_SECOND = 240
 
 
 def register(record):
-    """Adds the record of a solver to :data:`SOLVERS`, so that the command line, benchmarks and charts know it by its ``name``.
+    """Adds the record of a solver to :data:`SOLVERS`, where commands find it by its ``name``; also a decorator.
 
     Args:
         record: A frozen dataclass that derives from :class:`Step` and has a ``name``.
-
-    Returns:
-        The same class, so that this can be used as a decorator.
 
     Raises:
         ValueError: It is not such a class, or another one of that name is registered.
@@ -64,17 +61,17 @@ class Step:
         staggered: Whether velocities are half a step behind positions in time.
         closes: Whether a step may close the gap of a constraint regardless of its stiffness.
         residual: The :class:`warpcloth.core.status.Residual` that its steps report, or None.
-        name: Its name on the command line and in benchmarks and charts; each record has its own.
-        needs: What it needs of every term, of :mod:`warpcloth.terms.needs`. Errors name the first need that is not met.
-        facts: Its :class:`warpcloth.solvers.facts.Facts` for benchmarks and charts.
+        name: Its name on the command line and in charts.
+        needs: Needs of every term, of :mod:`warpcloth.terms.needs`. Errors name the first that is not met.
+        facts: Its :class:`warpcloth.solvers.facts.Facts`.
         touches_itself: Whether it supports self-contact.
         locks: Whether it supports locked coordinates, by ``free_axes`` or the axes of pins.
-        limited: Whether it refuses steps above a stability limit, see :meth:`step_limits`.
+        limited: Whether it refuses steps above a stability limit.
         step_options: Names of the options that set the step, of which at most one may be given.
-        double_on_cpu: Whether runs on the CPU are in float64 by default, see :meth:`precision_on`.
+        double_on_cpu: Whether runs on the CPU are in float64 by default.
 
     Raises:
-        ValueError: Both are given, or the given one is not above 0.
+        ValueError: An option is not allowed, or two that set the step are given.
     """
 
     ordered: ClassVar[bool] = False
@@ -99,10 +96,7 @@ class Step:
 
     @classmethod
     def precision_on(cls, device: str, dtype: Precision | None = None) -> Precision:
-        """Returns the precision of runs: ``dtype``, or if that is None the default of the solver on a device.
-
-        The default is float64 on the CPU if it costs at most 15 % of the time there, see ``benchmarks/precision.py``, and
-        float32 otherwise. All that runs a solver takes its default from here.
+        """Returns the precision of runs, by default float64 on the CPU if the solver is ``double_on_cpu``, else float32.
 
         Args:
             device: A Warp device.
@@ -117,7 +111,7 @@ class Step:
         return dtype
 
     def residual_on(self, model: Model) -> Residual | None:
-        """Returns the residual that its steps report on a model; it may depend on the terms."""
+        """Returns the residual that its steps report on a model."""
         return self.residual
 
     @property
@@ -126,7 +120,7 @@ class Step:
         return True
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model`` and allocates all arrays.
 
         Raises:
             ValueError: A term lacks a property that the solver needs.
@@ -144,7 +138,7 @@ class Step:
             instead: A value of the option without these needs, as text.
 
         Raises:
-            ValueError: It cannot. The message names the term or field of the scene, the solver and what would work.
+            ValueError: It cannot. The message names the term or field of the scene, and what would work.
         """
         if not isinstance(model, Model):
             given = "a Scene" if isinstance(model, Scene) else shown(model)
@@ -189,7 +183,7 @@ class Step:
 
     @classmethod
     def step_limits(cls, model: Model) -> tuple[float, float]:
-        """Returns the largest stable steps [s] on a model, about the rest shape and in motion, for a ``limited`` solver."""
+        """Returns the largest stable steps [s] about the rest shape and in motion, for a ``limited`` solver."""
         raise NotImplementedError
 
     def stable(self, h: float, limit: float) -> bool:
@@ -197,11 +191,11 @@ class Step:
         return h < limit
 
     def without_limits(self) -> "Step":
-        """Returns the record without its check of limits, for stability maps and for callers that check limits themselves."""
+        """Returns the record without its check of limits."""
         return self
 
     def _on(self, stepper, model):
-        """Returns the :class:`Stepper` of type ``stepper`` on a model, or one that divides its copies among threads."""
+        """Returns the stepper on a model, or one that divides its copies among threads."""
         return ThreadedStepper(self, stepper, model) if model.threads > 1 else stepper(self, model)
 
     def __post_init__(self):
@@ -218,7 +212,6 @@ class Step:
 
     @property
     def step_given(self) -> bool:
-        """Whether an option sets the step."""
         return any(getattr(self, name) is not None for name in self.step_options)
 
     def per_frame(self, fps: float) -> int:
@@ -245,25 +238,18 @@ class Step:
 class ImplicitStep(Step):
     """The step of a solver that minimises 1/(2hₑ²)‖x − x̃‖²_M + U(x); ``integrator`` determines hₑ and x̃.
 
-    At most one of ``dt``, ``substeps`` and ``error`` may be given; without one, the step is about 1/240 s.
-
     On x″ = −ω²x implicit Euler, of first order, multiplies the energy by 1/(1 + ω²h²) in each step. Midpoint, of second order,
-    conserves the energy, and does not damp the noise of stiff springs. BDF2, of second order, multiplies the energy by about
-    1 − ω⁴h⁴/2 if ωh is small, and damps stiff modes almost at once. All three are stable for every h if the motion is linear
-    and steps converge; in free fall, midpoint and BDF2 are exact. Midpoint needs enough iterations, and steps that resolve
-    rotations: with 4 substeps a frame ``hanging`` diverges with projective dynamics and ADMM, and on finer meshes with XPBD.
-    With midpoint, the sweeps of XPBD alternate in direction, because in one fixed order they diverged at every step tried.
-    When a solver with BDF2 is bound, it takes two Euler steps to find the past state.
+    conserves the energy, and does not damp the noise of stiff springs; it may diverge with too few iterations, or with steps
+    that do not resolve rotations. BDF2, of second order, multiplies the energy by about 1 − ω⁴h⁴/2 if ωh is small, and damps
+    stiff modes almost at once; ``bind`` takes two Euler steps to find its past state. All three are stable for every h if the
+    motion is linear and steps converge.
 
     Attributes:
         dt, substeps: See :class:`Step`.
         integrator: ``"euler"``, ``"midpoint"`` or ``"bdf2"``, see :mod:`warpcloth.numerics.integrators`.
-        error: Tolerance [m] of the error that two steps together add to the position of any vertex of any copy. All copies then
-            take steps of h = frame/2^k, k from 1 to 10, by an estimate of that error, see
+        error: In place of ``dt`` and ``substeps``, the error [m] that two steps together may add to the position of any vertex
+            of any copy. All copies then take steps of h = frame/2^k, k from 1 to 10, see
             :class:`warpcloth.solvers.error_steps.ErrorStepper`. BDF2 does not take it.
-
-    Raises:
-        ValueError: If an option is not allowed.
     """
 
     step_options: ClassVar[tuple[str, ...]] = ("dt", "substeps", "error")
@@ -283,7 +269,7 @@ class ImplicitStep(Step):
         """Returns the number of steps per frame at ``fps``, with ``error`` the largest one.
 
         Raises:
-            ValueError: See :meth:`Step.per_frame`.
+            ValueError: As :meth:`Step.per_frame`.
         """
         return super().per_frame(fps) if self.error is None else 2**SHORTEST
 
@@ -294,7 +280,6 @@ class ImplicitStep(Step):
 
     @property
     def damps(self) -> bool:
-        """Whether its steps damp frequencies that they do not resolve; those of midpoint do not."""
         return INTEGRATORS[self.integrator].damps
 
     def refuse_hard(self, model):
@@ -305,7 +290,7 @@ class ImplicitStep(Step):
 
 
 def fewest_substeps(fps, rest, motion):
-    """Returns the fewest steps per frame with a step 10 % below the limit ``rest`` [s] about rest, and below ``motion`` [s].
+    """Returns the fewest steps per frame with a step 10 % below the limit ``rest`` [s], and below ``motion`` [s].
 
     Raises:
         ValueError: They would be more than a solver takes.

@@ -14,11 +14,6 @@ from .solver import Stepper
 class ThreadedStepper(Stepper):
     """A batch that several threads share, each with a stepper for a range of copies.
 
-    Args:
-        options: The record of the solver.
-        stepper: The class of the steppers.
-        model: The model.
-
     Attributes:
         model, declared: The model as it was bound; each part has its own model of the steps.
         parts: The stepper of each thread. Its state is a view of ``state``.

@@ -1,4 +1,4 @@
-"""Extended position based dynamics: projections with compliance and multipliers that converge to the material's stiffness."""
+"""Extended position based dynamics."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -28,38 +28,35 @@ from .step import ImplicitStep
 class XPBD(ImplicitStep):
     """Extended position based dynamics (Macklin et al. 2016, *XPBD*), from x = x̃ and λ = 0 in each step.
 
-    With form ``"vector"`` the constraint of an element is p(y) − y, whose Jacobian is the constant G of weights:
-    Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y − α̃λ), λ += Δλ, x += W Gᵀ Δλ, α̃ = 1/(kAh²). As M(x − x̃) = Gᵀλ holds throughout, its
-    fixed point for finite stiffness is implicit Euler, the x(t+h) of :class:`warpcloth.Newton`. Form ``"scalar"`` is the
-    published one on C = ‖y − p(y)‖ with its changing gradient, Δλ = −(C + α̃λ)/(Σw‖∇C‖² + α̃): its fixed point misses
-    implicit Euler because ∇C changes within the step. Terms with only one of the two forms use that one: dihedral bending the
-    scalar form, quadratic bending and attachments the vector form. Energies with neither, such as
-    :class:`warpcloth.OrthotropicMembrane`, take a step of Newton's method in each element, and share that fixed point.
+    With form ``"vector"`` the constraint of an element is p(y) − y, with the constant Jacobian G:
 
-    One hanging mass stretches by mg/k at rest, with any number of iterations and any step. With few iterations cloth is too
-    soft, and finer cloth is softer; more substeps help more than more iterations (Macklin et al. 2019, *Small steps*):
-    ``hanging`` with 32² vertices stretches by 26 % with 4 × 20 a frame and by 5 % with 80 × 1. Infinite stiffness is α̃ = 0:
-    constraints are met, but not at the positions nearest to x̃, because λ keeps parts of earlier directions.
+        Δλ = (G W Gᵀ + α̃)⁻¹(p(y) − y − α̃λ), λ += Δλ, x += W Gᵀ Δλ, α̃ = 1/(kAh²)
 
-    With midpoint, Gauss–Seidel sweeps alternate between forward and backward. In one fixed order, their one-sided error would
-    add energy to the motion: ``hanging`` with 32² vertices would diverge in most settings. Alternating sweeps converge more
-    slowly, so the integrators that damp keep one order.
+    As M(x − x̃) = Gᵀλ holds throughout, its fixed point for finite stiffness is the x(t+h) of :class:`warpcloth.Newton`. Form
+    ``"scalar"`` is the published one on C = ‖y − p(y)‖, Δλ = −(C + α̃λ)/(Σw‖∇C‖² + α̃): its fixed point misses implicit Euler
+    because ∇C changes within the step. Dihedral bending has the scalar form only, quadratic bending and attachments the vector
+    form. Energies with neither, such as :class:`warpcloth.OrthotropicMembrane`, take a step of Newton's method in each element,
+    with the fixed point of the vector form.
 
-    ``residual`` says how far from implicit Euler a step ended: the largest unbalanced acceleration ‖∇ᵢ‖/mᵢ relative to that of
-    :class:`warpcloth.numerics.iterate.ResidualScale`. With infinite stiffness that force is not defined, and the residual is
-    the largest move of the last sweep, divided by h².
+    With few iterations cloth is too soft, and finer cloth is softer; more substeps help more than more iterations (Macklin et
+    al. 2019, *Small steps*). Constraints of infinite stiffness are met, but not at the positions nearest to x̃. With midpoint,
+    Gauss–Seidel sweeps go forward and backward in turn, because one order would add energy.
+
+    ``residual`` is the largest unbalanced acceleration ‖∇ᵢ‖/mᵢ at the end of a step, relative to
+    :class:`warpcloth.numerics.iterate.ResidualScale`. With infinite stiffness it is the largest move of the last sweep, divided
+    by h².
 
     Attributes:
         dt, substeps, integrator, error: See :class:`ImplicitStep`.
-        iterations: Sweeps a step; with midpoint an even number.
-        sweep: Gauss–Seidel ``"coloured"``; Gauss–Seidel ``"sequential"``, which takes elements in the order of the scene, by
-            one thread, and on a GPU suits small scenes only; or Jacobi ``"constraint-averaged"``, which divides each Δλ by the
-            largest number of constraints at any of its vertices and takes about thirty times as many sweeps on ``hanging``.
+        iterations: Sweeps a step; with midpoint an even number for Gauss–Seidel.
+        sweep: Gauss–Seidel ``"coloured"`` or ``"sequential"``, elements in the order of the scene, by one thread; or Jacobi
+            ``"constraint-averaged"``, which divides each Δλ by the largest number of constraints at any of its vertices and
+            needs many more sweeps.
         form: ``"vector"`` or ``"scalar"``.
         relaxation: ω > 0, a factor on every Δλ.
 
     Raises:
-        ValueError: If an option is not allowed.
+        ValueError: An option is not allowed.
 
     Examples:
         >>> import warpcloth as wc
@@ -115,7 +112,7 @@ class XPBD(ImplicitStep):
         return self.residual
 
     def bind(self, model: Model) -> Stepper:
-        """Binds the solver to ``model`` and allocates all arrays that steps need.
+        """Binds the solver to ``model``.
 
         Raises:
             ValueError: A term has infinite stiffness, and neither projection, scalar constraint nor ``prox``, or an integrator
@@ -163,12 +160,10 @@ class XPBDStepper(LaunchedStepper):
         self.sweep.launch_start()
 
     def _launch_to_and_fro(self):
-        """Launches one sweep forward and one backward."""
         self.sweep.launch()
         self.sweep.launch(backward=True)
 
     def _launch_last(self):
-        """Launches the end of a step and its residual: the unbalanced force, or with hard constraints the last move."""
         model, d = self.model, self.sweep.correction
         self._force.zero_()
         if self._gradient is None:
@@ -187,7 +182,7 @@ class XPBDStepper(LaunchedStepper):
         self.model.launch(self._add_momentum, self.model.count, given, [self._force])
 
     def constraint_forces(self, collider=None):
-        """See :meth:`Stepper.constraint_forces`: adds −Gᵀλ/hₑ², as M(x − x̃) = Gᵀλ holds after any number of sweeps."""
+        """See :meth:`Stepper.constraint_forces`: adds −Gᵀλ/hₑ²."""
         model, pulls = self.model, []
         for elements, values, key in self.sweep.with_multipliers():
             if not elements.hard or collider not in (None, elements.collider):
