@@ -1,4 +1,4 @@
-"""Contact on a device: motion of colliders, anchors of friction, self-contact, and the filters of steps."""
+"""Contact on a device."""
 
 from ..base.catalogue import imported_on_use
 

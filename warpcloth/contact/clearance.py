@@ -1,4 +1,4 @@
-"""The test whether a step may come near colliders that stand, without which their contact is neither refreshed nor filtered."""
+"""The test whether a step may come near colliders that stand."""
 
 import numpy as np
 import warp as wp
@@ -9,9 +9,7 @@ from ..kernels.contact.colliders import filters, shapes
 
 
 class Clearance:
-    """Tells the steps in which vertices may come near a collider. In all others contact has no force, and the filter no effect.
-
-    A step after one that came near also refreshes contact, which leaves anchors and half-spaces behind.
+    """Tells the steps in which vertices may come near a collider. In others contact has no force, and the filter no effect.
 
     Attributes:
         near: 1 for copies in which a vertex may come near a collider in this step, (B,) int32.
@@ -43,11 +41,11 @@ class Clearance:
         self._find_near = model.kernel(near_colliders, model.dtype)
 
     def follow(self):
-        """Makes all steps refresh contact, because others read it."""
+        """Makes all steps refresh contact."""
         self._clear.followed.fill_(1)
 
     def launch_begin(self, x, v):
-        """Launches the test at the start of a step at x with v, (N,)."""
+        """Launches the test at x with v, (N,)."""
         wp.copy(self._due, self._clear.some)
         self._clear.some.zero_()
         self.near.zero_()
@@ -55,11 +53,10 @@ class Clearance:
         wp.copy(self._clear.before, self.near)
 
     def launch_refresh(self, launch):
-        """Calls ``launch`` if the step refreshes contact."""
         wp.capture_if(self._due, launch)
 
     def launch_end(self, x, end, launch):
-        """Calls ``launch`` if a vertex may have come near a collider on its way from x to ``end`` (N,)."""
+        """Calls ``launch`` if a vertex may have come near a collider between x and ``end`` (N,)."""
         wp.copy(self._ended, self._due)
         self._find(x, None, end, self._ended)
         wp.capture_if(self._ended, launch)

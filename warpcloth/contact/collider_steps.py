@@ -25,19 +25,17 @@ CLOTH = "other cloth"  # that held a vertex back in a collider
 
 
 def cut_share(model, cut, steps):
-    """Returns the fraction of the moves of free vertices that were ``cut``, (B,), in all ``steps``, (B,)."""
+    """Returns the fraction of the moves of free vertices that were cut, (B,)."""
     free = (model.inverse_mass.numpy().reshape(model.copies, -1) > 0.0).sum(axis=1)
     return cut.numpy() / np.maximum(steps.numpy().astype(np.float64) * free, 1.0)
 
 
 def launch_pose(kernel, colliders, h, x, v, model, elements):
-    """Launches the rest states of contact ``elements`` by :func:`warpcloth.kernels.contact.colliders.pose_collider`."""
     given = [elements.stencil, colliders, *model.free_gravity, x, v, elements.collider, h]
     model.launch(kernel, elements.count, given, [elements.rest])
 
 
 def launch_anchors(kernel, colliders, anchors, x, model, elements):
-    """Launches the rest states of friction, and its anchors, by :func:`warpcloth.kernels.contact.anchors.anchor_vertices`."""
     given = [elements.stencil, colliders, x, elements.collider, model.colliders.distance]
     model.launch(kernel, elements.count, given, [anchors, elements.rest])
 
@@ -45,30 +43,22 @@ def launch_anchors(kernel, colliders, anchors, x, model, elements):
 class ColliderSteps:
     """The motion of colliders in one solver's steps, and the friction and filter of those that are not meshes.
 
-    At the start of a step, a ``Refresh`` of the terms moves colliders, stores positions and sets anchors of friction. At its
-    end, :meth:`launch_end` moves vertices out of colliders. Meshes have no terms, see :mod:`.self_steps`; without any, the
-    solver calls :meth:`launch_start` itself.
-
     Args:
-        model: The model of a scene with colliders.
         state: The state of the solver, to which arrays are added.
         h: Time step [s].
-        steps_per_frame: Steps per frame.
-        part: The time within a step at which forces are evaluated, from 0 to 1. It is 0 for explicit steps, whose contact is
-            ``bounded``: it has no logarithm.
+        part: The fraction of the step after which forces are evaluated; 0 for explicit steps, whose contact is ``bounded``: it
+            has no logarithm.
 
     Attributes:
-        terms: The elements of the model. Those of contact have rest states of their own.
+        terms: The elements of the model; those of contact have rest states of their own, whose refresh moves the colliders.
         x_before: Positions at the start of the step, (N,) [m].
         poses, shapes, filter, notes: Structs of :mod:`warpcloth.kernels.contact.colliders` and ``collider_filter``.
-        anchors: The anchors of friction by the index of each collider with friction; rows of ``anchor_rows`` (C, N).
+        anchors: Rows of ``anchor_rows`` (C, N) by the index of the collider, for friction.
         least: The smallest distance from a collider at which a vertex may end a step [m].
-        moved_by_terms: Whether the refresh of a term moves the colliders.
         near: See :class:`.Clearance`; None if all steps refresh contact.
         steps: The number of steps so far, (B,) int32.
         correction: x − x̃ of steps with contact (N,) [m], None if explicit. ``he`` is their effective step [s].
-        pushed, kicked: What the filter changed in positions [m] and velocities [m/s] since both were last 0, (N,) float64,
-            after :meth:`note_pushes`.
+        pushed, kicked: Changes by the filter in positions [m] and velocities [m/s] since both were last 0, (N,) float64.
     """
 
     def __init__(self, model, state, h, steps_per_frame, part):
@@ -115,11 +105,9 @@ class ColliderSteps:
 
     @property
     def solid(self):
-        """The elements of contact, which keep vertices out of colliders."""
         return [elements for elements in self.terms if elements.term.gap]
 
     def _bound(self, elements, c, state):
-        """Returns elements of contact or friction with collider c that have rest states of their own."""
         model, declared = self.model, self.model.colliders
         first = all(each.refresh is None or each.collider is None for each in self.terms)
         term = elements.term.bounded if self.bounded else elements.term
@@ -138,7 +126,7 @@ class ColliderSteps:
         return replace(elements, term=term, rest=wp.clone(elements.rest), refresh=refresh, clear=clear)
 
     def _refresh(self, first, launch, v, model, elements, moment):
-        """Launches what the start of a step needs. The first of the terms also moves the colliders, once for all terms."""
+        """Launches the start of a step. The first of the terms also moves the colliders."""
         if first:
             self.launch_start(moment.x)
             if self._clearance is not None:
@@ -157,7 +145,7 @@ class ColliderSteps:
 
     @contextmanager
     def reading_anchors(self):
-        """Within this context, refreshing terms does not change the anchors; the steps themselves do."""
+        """Within this context, refreshing terms does not change the anchors."""
         self._reads = True
         try:
             yield
@@ -165,44 +153,41 @@ class ColliderSteps:
             self._reads = False
 
     def follow(self):
-        """Allocates what :meth:`reading_anchors` needs, and makes all steps refresh contact."""
+        """Makes all steps refresh contact, and allows :meth:`reading_anchors`."""
         if self._clearance is not None:
             self._clearance.follow()
         if self._spare is None:
             self._spare = wp.zeros(self.model.count, dtype=self._anchor_type, device=self.model.device)
 
     def launch_start(self, x):
-        """Launches :meth:`launch_move`, and a copy of x (N,) to ``x_before``."""
         self.launch_move()
         wp.copy(self.x_before, x)
 
     def launch_move(self):
-        """Launches the poses of colliders in a step."""
         self.model.launch(self._move, self._dim, self._given, [self.poses])
 
     def launch_clear(self, terms, x):
-        """Launches the distances by which vertices of ``terms`` can move from x̃ before they touch."""
+        """Launches the distances by which vertices can move from x̃ before they touch."""
         for elements in terms:
             if elements.clear is not None:
                 kernel = self.model.kernel(find_clear, elements.term, self.model.dtype)
                 self.model.launch(kernel, elements.count, [elements.stencil, elements.rest, x], [elements.clear])
 
     def launch_count(self):
-        """Launches an increment of ``steps``."""
         self.model.launch(self._count, self.model.copies, [], [self.steps])
 
     @property
     def drift(self):
-        """An upper bound on the distance by which a point of a collider moves in a step [m]."""
+        """Upper bound of the move of a point of a collider in a step [m]."""
         return max(collider.centred().most_move for collider in self.model.scene.colliders) / self.steps_per_frame
 
     def note_pushes(self):
-        """Allocates ``pushed`` and ``kicked``, to which the filter then adds. Graphs must be recorded again."""
+        """Makes the filter add to ``pushed`` and ``kicked``. Graphs must be recorded again."""
         self.pushed, self.kicked = (wp.zeros(self.model.count, dtype=wp.vec3d, device=self.model.device) for _ in range(2))
         self.notes.pushed, self.notes.kicked = self.pushed, self.kicked
 
     def launch_end(self, x, v, move=None):
-        """Moves vertices that would end in a collider that is no mesh, or cross it, out; corrects x, v and ``move``, (N,)."""
+        """Moves vertices that would end in, or cross, a collider that is no mesh out; corrects x, v and ``move``, (N,)."""
         if self._clearance is None:
             self._launch_end(x, v, move)
         else:
@@ -229,7 +214,7 @@ class ColliderSteps:
     # For self-contact, which can hold vertices back inside a collider that moves onto them.
 
     def end_again(self):
-        """Prepares :meth:`launch_out` and :meth:`launch_inside`. From now on the latter counts the step."""
+        """Prepares :meth:`launch_out` and :meth:`launch_inside`, which then counts the step."""
         device, model, self._again = self.model.device, self.model, True
         self._fixed = wp.zeros(model.count, dtype=model.dtype, device=device)
         inside = wp.zeros(self._dim, dtype=wp.int64, device=device)
@@ -240,17 +225,16 @@ class ColliderSteps:
         self._launch_filter(self.model.inverse_mass, x, v, None, self._unread)
 
     def launch_inside(self, x, v):
-        """Notes vertices that end the step inside colliders, without moving them, and counts the step."""
+        """Notes vertices inside colliders, without moving them, and counts the step."""
         self._launch_filter(self._fixed, x, v, None, self.notes)
         self.launch_count()
 
     @property
     def share(self):
-        """The fraction of the moves of free vertices, in all steps, that the filter cut short, (B,)."""
         return cut_share(self.model, self.notes.cut, self.steps)
 
     def inside(self):
-        """The first vertex that ended a step inside each collider: (copy, collider, step, vertex, what held it back).
+        """The first vertex that ended a step inside each collider: (copy, collider, step, vertex, held by).
 
         The last is the index of another collider, CLOTH, or None for a vertex that is not free.
         """
@@ -265,6 +249,5 @@ class ColliderSteps:
         return found
 
     def start_again(self):
-        """Clears counts and anchors."""
         for array in (self.steps, self.notes.cut, self.notes.inside, *self.anchors.values()):
             array.zero_()

@@ -1,4 +1,4 @@
-"""Work of moving colliders, work against friction, and work of the collider filter, summed over steps."""
+"""Work of colliders, against friction, and of the filter."""
 
 import warp as wp
 
@@ -13,17 +13,15 @@ from .present import ColliderPulls, PresentContact
 
 
 def launch_mean(model, a, b, out):
-    """Launches out = ½(a + b), (N,)."""
     out.zero_()
     for each in (a, b):
         model.launch(model.kernel(add_scaled, model.dtype), model.count, [each, 0.5], [out])
 
 
 class ColliderWork:
-    """Sums the work of colliders but meshes over steps, from the forces that the steps used.
+    """Sums the work of colliders but meshes over steps.
 
     Args:
-        colliders: The :class:`.ColliderSteps` of the stepper.
         terms: The elements as its steps take them.
         cuts: The :class:`FilterWork` of the stepper, which must be launched before.
         of_colliders, against_friction, of_filter: Sums per vertex, (N,) float64 [J].
@@ -48,7 +46,7 @@ class ColliderWork:
         self._add = model.kernel(kernels.add_collider_work, model.dtype)
 
     def begin(self, found, vertices):
-        """Sets the state before the first step from the pulls ``found``, of which it takes the slice ``vertices``."""
+        """Sets the state before the first step from ``vertices`` of the pulls ``found``."""
         if self._at_end:
             for before, now in zip(self._before, (found[c] for c in self.pulls.solid), strict=True):
                 wp.copy(before.all, now.all[vertices])
@@ -84,10 +82,9 @@ class ColliderWork:
 class PairWork:
     """Sums the work of meshes on cloth, and the work against friction of pairs, over steps.
 
-    Work is ∂U/∂y times the travel of the meshes in a step, with y = Σ wᵢxᵢ of each pair where the step evaluates forces.
+    Work is ∂U/∂y times the travel of the meshes in a step, y = Σ wᵢxᵢ of each pair.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`.
         against_friction: Sums per vertex of the cloth, (N,) float64 [J]. The part of meshes is in ``against_meshes``.
 
     Attributes:
@@ -102,7 +99,6 @@ class PairWork:
         self._pulls, self._rub = model.vectors(), model.kernel(add_rubbing_work, model.dtype)
 
     def launch(self):
-        """Launches the sums after a step, before pairs are listed anew."""
         stepper, pairs, x = self._stepper, self._stepper.pairs, self._stepper.state.x
         friction, acting = pairs.friction, self._positions(x)
         if self._moves:
@@ -115,7 +111,6 @@ class PairWork:
                 pairs.launch_work(self.against_meshes, [friction])
 
     def _positions(self, x):
-        """Returns the positions at which the last step, which ended at x (N,), evaluated forces [m]."""
         stepper, model, integrator = self._stepper, self._stepper.model, self._stepper.integrator
         if (integrator is not None and integrator.parts == 1) or not (self._moves or stepper.pairs.friction):
             return x
@@ -126,7 +121,7 @@ class PairWork:
         return self._x
 
     def sums(self):
-        """Returns the work of meshes, and the part of meshes in the work against friction, (B,) [J], and resets both to 0."""
+        """Returns the work of meshes, and their part in the work against friction, (B,) [J], and resets both."""
         sums = self.of_meshes, self.against_meshes
         found = [array.numpy().sum(axis=1) for array in sums]
         for array in sums:
@@ -135,15 +130,14 @@ class PairWork:
 
 
 class FilterWork:
-    """Sums the energy that the collider filter adds to the cloth, see :meth:`launch`.
+    """Sums the energy that the collider filter adds to the cloth.
 
     Args:
-        stepper: The :class:`warpcloth.solvers.solver.Stepper`, with contact.
         of_filter: Sums per vertex, (N,) float64 [J].
 
     Attributes:
         uncut: Positions (N,) [m] after the last step without the filter.
-        cuts: UNCUT or NOW of :mod:`warpcloth.kernels.contact.collider_work`, or 1, for each vertex, (N,) int32.
+        cuts: UNCUT, NOW or 1 for each vertex, (N,) int32.
     """
 
     def __init__(self, stepper, of_filter):
@@ -162,7 +156,6 @@ class FilterWork:
         self._add, self._stored = model.kernel(kernels.add_filter_work, model.dtype), kernels.add_stored
 
     def begin(self):
-        """Begins from the present state."""
         self.cuts.zero_()
         for array in (self._stepper.colliders.pushed, self._stepper.colliders.kicked):
             array.zero_()
@@ -171,11 +164,7 @@ class FilterWork:
             wp.copy(before, now)
 
     def launch(self):
-        """Launches the sums after a step: ½Σ m v² − Σ (m g + f)·x + U without contact, minus that of the unfiltered step.
-
-        So is the change of the energy of contact in a filtered step, minus the work along the unfiltered one, which
-        :class:`ColliderWork` adds.
-        """
+        """Launches the sums after a step: ½Σ m v² − Σ (m g + f)·x + U without contact, minus that of the unfiltered step."""
         model, colliders, (x, v) = self.model, self._stepper.colliders, self._stepper.state
         force = None if model.loads is None else model.loads.force
         given = [model.mass, model.gravity, model.per_copy, x, v, force]
@@ -192,7 +181,7 @@ class FilterWork:
         self._contact.add(self._stepper.state.x, self._scratch)
 
     def elastic(self):
-        """Returns the part of the sums from U without contact, (B,) [J], and resets it to 0."""
+        """Returns the part of the sums from U without contact, (B,) [J], and resets it."""
         found = self._found.numpy() - self._without.numpy()
         for array in (self._found, self._without):
             array.zero_()

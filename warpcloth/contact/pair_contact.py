@@ -23,18 +23,14 @@ class PairContact(DynamicElements):
     """Contact of cloth with itself: the potential of :mod:`warpcloth.kernels.contact.pair_potential`.
 
     Args:
-        surface: The :class:`.ContactSurface`.
         bounded: Whether contact is that of explicit steps, without the logarithm.
-        laws: :class:`warpcloth.kernels.contact.pair_potential.Laws`.
         listed: Whether there are listed pairs, (1,) int32.
 
     Attributes:
         obstacles: Positions (V,) [m] with the obstacles where forces are evaluated.
         least: The least gap [m] of a filter that keeps all pairs apart wherever forces are computed, otherwise 0.
-        lists: The listed pairs.
         slots: Number of slots that the next :meth:`hold` allocates.
-        most: The largest number of contacts so far, including those that did not fit, a mirror of (1,) int32.
-        turn: The number of sweeps of the step that count towards EVERY, (1,) int32.
+        most: The largest number of contacts so far, also of those that did not fit, a mirror of (1,) int32.
     """
 
     def __init__(self, surface, bounded, laws, listed):
@@ -84,21 +80,20 @@ class PairContact(DynamicElements):
             self._hold_followed()
 
     def _launch_found(self, x, correction=None, goal=None, move=None):
-        """Finds the contacts with a force at x, or x + correction, and those that may have one at goal + move."""
+        """Finds the contacts with a force at x + correction, and possible ones at goal + move."""
         self.launch_none()
         x, goal = self._whole(x, self.obstacles), self._whole(goal, self._goal)
         given = {"x": x, "correction": correction, "goal": goal, "move": move}
         wp.capture_if(self.present, self._launch_listed, **given)
 
     def _whole(self, x, whole):
-        """Returns positions of the cloth (N,) with the obstacles behind them, or x if it is None or has them."""
         if whole is None or x is None or len(x) == self.surface.count:
             return x
         wp.copy(whole, x, count=len(x))
         return whole
 
     def launch_obstacles(self, positions):
-        """Takes the positions of the obstacles where the step evaluates its forces, (B·m,) [m]."""
+        """Takes positions of the obstacles, (B·m,) [m]."""
         for whole in (self.obstacles, self._goal):
             wp.copy(self.surface.behind(whole), positions)
 
@@ -122,7 +117,7 @@ class PairContact(DynamicElements):
             self.launch_corners()
 
     def launch_rows(self, x, d=None):
-        """Finds the contacts at x, or x + d."""
+        """Finds the contacts at x + d."""
         self._launch_found(x, d)
 
     def launch_forces(self, x, correction):
@@ -135,8 +130,8 @@ class PairContact(DynamicElements):
     def follow(self, start, launch, positions):
         """Prepares sweeps, which take contacts at ``positions`` (V,) [m] that follow their iterates.
 
-        ``start()`` moves meshes there to where forces are evaluated, and cloth out of their way; ``launch(x, correction)``
-        moves them towards x + correction, as far as pairs stay apart.
+        ``start()`` moves meshes there, and cloth out of their way; ``launch(x, correction)`` moves them towards x + correction,
+        as far as pairs stay apart.
         """
         self._start, self._follow, self._positions = start, launch, positions
 
@@ -164,7 +159,6 @@ class PairContact(DynamicElements):
         super().launch_sweep(x, correction, h, adds, backward, follows)
 
     def _launch_follow(self, x, correction, h, adds):
-        """Finds the contacts where the iterate is now; those that add forces take over those of the last ones."""
         followed = self.data.followed
         wp.copy(followed.rows, self.lists.rows)
         self._follow(x, correction)
@@ -184,7 +178,6 @@ class PairContact(DynamicElements):
             self._launch_all(potential.STARTING, x, correction, h)
 
     def _launch_all(self, mode, x, correction, h):
-        """Launches a sweep that removes all forces, or adds those at their start."""
         self.data.followed.mode.fill_(int(mode))
         super().launch_sweep(x, correction, h, True, False, False)
         self.data.followed.mode.zero_()

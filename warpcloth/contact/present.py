@@ -1,4 +1,4 @@
-"""Contact and friction in the current state of a solver: energies, and forces on each collider."""
+"""Energies of contact, and forces on colliders, in the current state of a solver."""
 
 from dataclasses import replace
 from functools import partial
@@ -18,11 +18,10 @@ class PresentContact:
     """The elements of a model for the current poses of colliders, and the anchors of the next step.
 
     Args:
-        model: The model.
-        parts: Tuples (:class:`.ColliderSteps`, first copy, last copy + 1), for all copies; empty for colliders at their start.
+        parts: Tuples (:class:`.ColliderSteps`, first copy, last copy + 1); empty for colliders at their start.
 
     Attributes:
-        terms: The elements of all terms; contact and friction have their own rest states.
+        terms: The elements of all terms.
     """
 
     def __init__(self, model, parts=()):
@@ -55,7 +54,7 @@ class PresentContact:
         return own
 
     def launch(self, x, v):
-        """Launches the rest states at positions x (N,) [m] and velocities v (N,) [m/s]."""
+        """Launches the rest states at x (N,) [m] and v (N,) [m/s]."""
         if not self._launches:
             return
         for steps, first, end in self._parts:
@@ -75,7 +74,7 @@ class PresentContact:
 
 
 class ColliderPulls:
-    """∂U/∂x of contact and friction with each collider, which is the force of the cloth on it.
+    """∂U/∂x of contact and friction with each collider, the force of the cloth on it.
 
     Args:
         terms: Elements; those of soft contact and of friction are used.
@@ -85,7 +84,6 @@ class ColliderPulls:
     Attributes:
         found: A :func:`warpcloth.kernels.contact.collider_work.collider_pulls` for each collider.
         solid: The indices of the colliders that are not meshes.
-        hard: Whether their contact is hard.
     """
 
     def __init__(self, model, terms, hard=None, pairs=None):

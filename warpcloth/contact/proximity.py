@@ -1,4 +1,4 @@
-"""Finds vertex–triangle pairs and edge–edge pairs that are near one another, on the device and in a fixed order."""
+"""Lists near vertex–triangle pairs and edge–edge pairs, on the device and in a fixed order."""
 
 import numpy as np
 import warp as wp
@@ -31,24 +31,20 @@ class Proximity:
     :meth:`launch_kept` lists again. Pairs with a common vertex or with coordinates that are not finite are not listed.
 
     Args:
-        surface: The :class:`.ContactSurface`, with V vertices.
         distance: The contact distance r [m].
         skin: The list is complete until two vertices have approached one another by it [m].
         of_meshes: The contact distance of cloth with meshes [m].
 
     Attributes:
-        capacity: Number of pairs that fit.
         stencils: (capacity,) vertices (v, a, b, c) of vertex–triangle pairs, sorted, then (a, b, c, d) of edges ab and cd.
         distances: (capacity,) r_c of each pair [m].
         counts: (2,) int32, numbers of pairs of each kind, which may exceed the capacity.
         rows: Pairs rows[i] to rows[i+1] are the vertex–triangle pairs of vertex i; those of edges follow, by their first edge.
         found: Positions of the last list, (V,) [m]. After setting them, call :meth:`launch_kept` before the list is used.
-        flag, copies: (1,) and (B,) int32, see :meth:`moved`.
         kept: The ``part`` of :meth:`moved` up to which a list serves for another round of the filter.
         listed: Positions (V,) [m] of the list that is in the arrays.
         pieces: The connected piece of each vertex of a copy of the cloth, −1 without an element, (n,).
         drift: Motion of each piece of all copies since ``found`` [m].
-        alike: See :meth:`launch_along` [m].
     """
 
     def __init__(self, surface, distance, skin, of_meshes=0.0):
@@ -101,7 +97,7 @@ class Proximity:
         self._allocate(max(1024, 4 * model.count))
 
     def _connected(self, edges):
-        """The piece of each vertex (−1 without an element), and rest points relative to the middle of their piece."""
+        """Returns :attr:`pieces`, and rest points relative to the middle of their piece."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -113,7 +109,6 @@ class Proximity:
         return np.where(sizes[piece] > 1, piece, -1).astype(np.int32), points - middle[piece]
 
     def _set_pieces(self, piece):
-        """Numbers the pieces of all copies, and takes vertices of each for its drift, by multiples of the golden ratio."""
         model, surface = self.model, self.surface
         used, numbers = np.unique(piece[piece >= 0], return_inverse=True)
         number = np.full(len(piece), -1)
@@ -140,7 +135,7 @@ class Proximity:
         self.drift = self._pieces.drift
 
     def _set_clusters(self, points):
-        """Divides each piece of the cloth into clusters of vertices, in cubes of CLUSTER edges at rest, for all copies."""
+        """Divides pieces into clusters of vertices, in cubes of CLUSTER edges at rest."""
         model, n, device = self.model, self.model.per_copy, self.model.device
         copies, used = np.arange(model.copies)[:, None], np.flatnonzero(self.pieces >= 0)
         cubes = np.floor(points[used] / (CLUSTER * np.median(self.surface.edge_lengths))).astype(np.int64)
@@ -207,13 +202,12 @@ class Proximity:
         self.listed.fill_(np.nan)
 
     def launch_moved(self, x):
-        """Launches the detection at x (V,) in ``copies``, after :meth:`moved`, and at the previous positions in the others."""
+        """Launches the detection at x (V,) in ``copies``, after :meth:`moved`, and at ``found`` in the others."""
         given = [x, None, 1.0, self.copies, self.surface.layout]
         self._launch(piece_motion.add_positions, self._vertices, given, [self.found])
         self.launch(self.found)
 
     def launch(self, x):
-        """Launches the detection at positions x (V,)."""
         pairs, N = self._pairs, self._vertices
         if x is not self.found:
             wp.copy(self.found, x)
@@ -227,13 +221,13 @@ class Proximity:
         self._launch(kernels.write_pairs, N + self._edges, [self._surface, N, self._triangles], [pairs])
 
     def searches(self, take, name):
-        """Returns the kernels of :func:`warpcloth.kernels.contact.proximity.search_pairs` for vertices and for edges."""
+        """Returns the kernels of :func:`warpcloth.kernels.contact.proximity.search_pairs`."""
         return [self.model.kernel(kernels.search_pairs, self.model.dtype, each, take, name) for each in (False, True)]
 
     def launch_along(self, x, p, searches, out):
         """Launches ``searches`` of pairs whose boxes meet while vertices move from x (V,) by p [m], (V,) or (N,).
 
-        Pairs of the cloth may be left out whose sides move by at most ``alike`` relative to one another, from ``found`` on.
+        Pairs of the cloth are left out whose sides move by at most ``alike`` [m] relative to one another.
         """
         if not self.surface.meets_itself:
             self._launch_grid(self._along, x, p, searches, out)
@@ -284,8 +278,8 @@ class Proximity:
         """Launches flag = 1 if pairs may be missing at x (V,), else 0, and returns it; ``copies`` is 1 for copies with such.
 
         The flag is 0 while each vertex has moved by at most ``part`` of the skin since the last list, relative to the drift of
-        its piece, the median motion of some of its vertices, and two pieces have approached one another by at most twice that
-        and the excess of the distance of their boxes over the contact distance and the skin.
+        its piece, and two pieces have approached one another by at most twice that and the excess of the distance of their
+        boxes over the contact distance and the skin.
 
         Args:
             x: Positions (V,) [m].
@@ -298,7 +292,7 @@ class Proximity:
         return self.flag
 
     def launch_moved_since(self, x, part, active, flag, correction=None):
-        """Launches ``flag`` (1,) = 1 where :meth:`moved` sets it, at x (V,) + ``correction`` (N,); else it stays."""
+        """Launches ``flag`` (1,) = 1 where :meth:`moved` sets it, at x (V,) + ``correction`` (N,)."""
         for array in (self.copies, self._due):
             array.zero_()
         self._launch_moved_since(x, part, active, flag, correction)

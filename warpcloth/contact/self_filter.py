@@ -1,4 +1,4 @@
-"""The filter of self-contact: it shortens moves that would cross, in the steps of a solver and in its iterates."""
+"""The filter of self-contact: it shortens moves that would cross, in steps and in iterates."""
 
 from functools import partial
 
@@ -24,7 +24,7 @@ class SelfFilter:
     Attributes:
         back: d of the start of the step (N,) [m], after :meth:`launch_start`.
         fraction: The fraction of the last direction that pairs left each copy, (B,).
-        moves_together: Whether moves are measured relative to their mean, as nothing is pinned, locked or a collider.
+        moves_together: Whether moves are measured relative to their mean.
     """
 
     def __init__(self, contact, colliders):
@@ -68,16 +68,14 @@ class SelfFilter:
         self.model.launch(self._kernels[factory], dim, inputs, outputs)
 
     def launch_begin(self):
-        """Stores how many moves colliders have cut before the step."""
         if self._cut_before is not None:
             wp.copy(self._cut_before, self._colliders.notes.cut)
 
     def launch_end(self, x, v, move=None, parts=1):
         """Moves the cloth from the start of the step towards x, as far as pairs stay apart; corrects x, v and ``move``, (N,).
 
-        If iterates stay apart, the move starts at the last one, which may be inside a collider. So a copy of which vertices
-        left a collider, and which does not arrive at x, moves again from the start of the step. Pins have moved in ``parts``
-        equal parts of the step.
+        If iterates stay apart, the move starts at the last one. If a vertex left a collider, and its copy does not arrive at x,
+        the copy moves again from the start of the step. Pins have moved in ``parts`` equal parts.
         """
         model = self.model
         if self._cut_before is not None and self._surface.moves:
@@ -111,10 +109,6 @@ class SelfFilter:
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
 
     def _launch_from_start(self, x):
-        """Moves copies again of which a vertex left a collider and which are not at the target.
-
-        Meshes move again too, and what their first move noted of these copies is taken back.
-        """
         self._walking.zero_()
         self._proceed.zero_()
         given = [x, self._target, self._cut_before, self._colliders.notes.cut, self.model.per_copy]
@@ -136,7 +130,6 @@ class SelfFilter:
         self._launch_rounds(x)
 
     def _launch_divide(self, start):
-        """Finds the copies that are ``_near`` something; others end at the target, as in a run of their own."""
         model, contact = self.model, self._contact
         self._near.zero_()
         model.launch(self_filter.copies_with_pairs, len(contact.pairs.stencils), [contact.pairs], [self._near])
@@ -158,7 +151,7 @@ class SelfFilter:
     def launch_fresh(self, x, launch, active=None, part=None):
         """Calls ``launch`` with x if ``active`` copies (B,), or any, have moved by ``part`` of the skin.
 
-        By default the next round can miss no pair; with ½ none is missing at x.
+        By default another round misses no pair; with ½ none is missing at x.
         """
         proximity = self._contact.proximity
         wp.capture_if(proximity.moved(x, part or proximity.kept, active), launch, x=x)
@@ -168,7 +161,6 @@ class SelfFilter:
         self._contact.launch_sides(x)
 
     def _launch_rounds(self, x):
-        """Moves x towards the target in copies that are ``_walking``."""
         self._rounds.zero_()
         self._cuts.zero_()
         self._proceed.fill_(1)
@@ -200,7 +192,6 @@ class SelfFilter:
         self._launch(self_filter.find_held, model.count, given, [self._mobile, self._within])
 
     def _launch_let_out(self, x):
-        """Moves vertices that are held back towards the outside, and other cloth out of their way."""
         model, out = self.model, self._outside
         self._launch_sides(x)
         self._add(out, x, -1.0, self._pushed)
@@ -231,7 +222,6 @@ class SelfFilter:
         wp.capture_while(self._changed, self._launch_cuts, given=given)
 
     def _launch_cuts(self, given):
-        """Cuts the moves of pairs that would come too near, which may leave other pairs that do."""
         model, given = self.model, [*given, self._contact.least]
         self._launch(self_planes.cut_by_planes, len(self._contact.pairs.stencils), given, [self._share, self._least_share])
         self._changed.zero_()
@@ -258,15 +248,11 @@ class SelfFilter:
         self._launch(factory, self._surface.count - self.model.count, inputs, outputs)
 
     def launch_meshes(self):
-        """Moves meshes, and cloth out of their way, to where the step evaluates forces."""
+        """Moves meshes, and cloth out of their way, to where forces are evaluated."""
         self._launch_meshes(self._contact.placed[1])
 
     def _launch_meshes(self, goal, lists=False, active=None):
-        """Moves meshes to their ``goal`` (B·m,) [m], and cloth that would be in their way, in the positions of the step.
-
-        It ``lists`` pairs there first, if they may have moved since their sides were computed. Copies that are not ``active``
-        (B,) stay; None for all.
-        """
+        """Moves meshes to their ``goal`` (B·m,) [m], and cloth out of their way, in ``active`` copies (B,)."""
         if not self._surface.moves:
             return
         x = self._contact.x_before
@@ -302,7 +288,7 @@ class SelfFilter:
         self.model.launch(self_filter.end_move, self.model.copies, given, out)
 
     def _launch_shapes(self):
-        """Carries cloth along with the shapes that move onto it, as far as pairs stay apart, in the positions of the step."""
+        """Carries cloth along with shapes that move onto it."""
         model, x, colliders = self.model, self._contact.x_before, self._colliders
         for array in (self._moves, self._carried, self._keys, self._changed):
             array.zero_()
@@ -318,7 +304,6 @@ class SelfFilter:
         self._launch_rounds(x)
 
     def _launch_carry_on(self):
-        """Finds the moves of cloth that is listed with carried cloth, and pushes what would come too near apart."""
         self._changed.fill_(1)
         wp.capture_while(self._changed, self._launch_carriers, of_meshes=False)
         self._launch_pushes(self.model.inverse_mass, self._moves, opens=True)
@@ -356,8 +341,8 @@ class SelfFilter:
         """Sets d so that base + d is base if pairs stay apart on the way there, else the start of the step.
 
         Pins with keyframes are at base in any case. If pairs do not stay apart on the way of the pins alone, other vertices
-        move towards base too, and then what is still in the way of pins moves ahead of them. Vertices stop at the contact
-        distance of colliders: a descent from inside would take many iterations to get out.
+        move towards base too, and then those in the way of pins move ahead of them. Vertices stop at the contact distance of
+        colliders.
         """
         x, direction = self._contact.x_before, self._direction
         self.launch_meshes()
@@ -377,13 +362,12 @@ class SelfFilter:
         self._add(d, direction, 1.0, d)
 
     def _launch_clear(self, x, inverse_mass):
-        """Moves vertices with an ``inverse_mass`` above 0 to the contact distance of colliders."""
         for elements in self._touching:
             kernel = self.model.kernel(move_clear, elements.term, self.model.dtype)
             self.model.launch(kernel, elements.count, [elements.stencil, elements.rest, inverse_mass], [x])
 
     def launch_touching(self, active, touching, some):
-        """Sets ``touching`` (B,): whether copies are ``active`` (B,), and near colliders or in contact; ``some``: any is."""
+        """Sets ``touching`` (B,): ``active`` copies (B,) near colliders or in contact; ``some``: any is."""
         model, contact, colliders = self.model, self._contact.contact, self._colliders
         near = None if colliders is None else colliders.near
         always = colliders is not None and near is None
@@ -402,7 +386,7 @@ class SelfFilter:
     def launch_whole(self, direction, wanted, some):
         """Limits the direction as :meth:`launch_limit` if it is ``whole``, and clears ``wanted`` (B,) of copies that it stops.
 
-        ``some`` (1,) is 1 if a copy is still wanted, else 0.
+        ``some`` (1,) is 1 if a copy is still wanted.
         """
         self.launch_limit(direction, whole=True)
         some.zero_()
@@ -414,7 +398,7 @@ class SelfFilter:
         self._launch(self_filter.aim, model.count, given, [p])
 
     def _launch_pins(self, x):
-        """Moves the cloth with its pins, then pins with cloth in their way ahead of them; sets directions from there."""
+        """Moves the cloth with its pins, then pins with cloth in their way ahead of them."""
         self._launch_rounds(x)
         self._launch_begin_push()
         wp.capture_while(self._proceed, self._launch_pins_on, x=x)
@@ -448,20 +432,20 @@ class SelfFilter:
         self.model.launch(self_filter.end_move, self.model.copies, given, out)
 
     def launch_between(self, before, d):
-        """Moves d towards ``before`` (N,), whose pairs are listed, so that pairs stay apart on the way to d."""
+        """Moves d towards ``before`` (N,), so that pairs stay apart on the way to d."""
         self._add(d, before, -1.0, self._direction)
         self.launch_limit(self._direction)
         self._add(before, self._direction, 1.0, d)
 
     def launch_trial(self, base, d, active=None):
-        """Lists the pairs at base + d again, in copies that are ``active`` (B,), if any may be missing there."""
+        """Lists the pairs at base + d again, in ``active`` copies (B,), if any may be missing."""
         self._add(base, d, 1.0, self._contact.x_before, active)
         self.launch_fresh(self._contact.x_before, self._contact.relist, active, 0.5)
 
     def launch_limit(self, direction, whole=False):
         """Shortens the directions of copies from the positions of :meth:`launch_trial`, so that pairs stay apart all along.
 
-        All of a copy move by the same fraction, as others would stretch stiff cloth; with ``whole`` it is 0 if not 1.
+        All vertices of a copy move by the same fraction; with ``whole`` it is 0 if not 1.
         """
         contact, proximity, target = self._contact, self._contact.proximity, self._other
 
@@ -492,13 +476,12 @@ class SelfFilter:
             self._contact.proximity.launch_moved_since(x, 0.5, None, near, d)
 
     def launch_near_trial(self, base, d):
-        """Launches :meth:`launch_trial` if :meth:`launch_look` found that pairs may be near."""
         wp.capture_if(self._contact.near.array, self.launch_trial, base=base, d=d)
 
     def launch_follow(self, base, d):
         """Moves the positions of the iterate towards base + d as :meth:`launch_limit` allows, and lists their pairs.
 
-        Copies without pairs at the start of the step stay there, as in a run of one copy, which takes no contacts then.
+        Copies without pairs at the start of the step stay there.
         """
         x, direction, listed = self._contact.x_before, self._direction, self._contact.with_pairs
         self._add(base, x, -1.0, direction)

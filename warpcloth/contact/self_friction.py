@@ -10,7 +10,7 @@ from ..kernels.pairs import Pairs
 
 
 class Slips:
-    """Contacts of a step, and the stretch of the friction spring of each at its end, which the next step takes over.
+    """Contacts of a step, and the stretch of the friction spring of each at its end, for the next step.
 
     Attributes:
         room: The number of contacts that fit.
@@ -35,13 +35,11 @@ class Slips:
     # As a part of a state.
 
     def copy(self):
-        """Returns an equal object with arrays of its own."""
         other = Slips(self.model, self.room)
         other.assign(self)
         return other
 
     def assign(self, other):
-        """Copies the values of another object of the same model."""
         if other.room == self.room:
             for name, array in other._arrays.items():
                 wp.copy(self._arrays[name], array)
@@ -49,7 +47,7 @@ class Slips:
             self.from_host(other.to_host())
 
     def to_host(self):
-        """Returns copies of the arrays, by name, without empty slots. Contacts are numbered in the order of ``corners``."""
+        """Returns copies of the arrays, by name, without empty slots, contacts in the order of ``corners``."""
         found = {name: array.numpy() for name, array in self._arrays.items()}
         slots, corners = np.divmod(found["corners"][: found["first"][-1]], 4)
         used, at, slots = np.unique(slots, return_index=True, return_inverse=True)
@@ -58,7 +56,6 @@ class Slips:
         return found | {"first": np.array(found["first"]), "corners": (4 * ranks[slots] + corners).astype(np.int32)}
 
     def from_host(self, values):
-        """Sets everything to what :meth:`to_host` returned."""
         if len(values["slips"]) > self.room:
             self.grow(len(values["slips"]))
         self._write(values)
@@ -71,14 +68,11 @@ class Slips:
 
 
 class SelfFriction(DynamicElements):
-    """Friction between parts of cloth in contact, and the stretch of its springs.
+    """Friction between parts of cloth in contact.
 
     Args:
-        surface: The :class:`.ContactSurface`.
-        slips: :class:`Slips`, a part of the state of the solver.
         keys: Number of keys that contacts may have.
         steps: Steps since the start of each copy, (B,) int32.
-        law: The :class:`warpcloth.kernels.coulomb.Law` of friction.
         friction: μ of cloth with cloth, then that of each obstacle of a copy, (1 + m,).
         bounded: Whether contact has no logarithm, as in explicit steps.
         ahead: The fraction of the step after which it evaluates forces.
@@ -117,7 +111,7 @@ class SelfFriction(DynamicElements):
         self.hold_pairs(self.new_pairs(room, keys, self.surface.layout), data)
 
     def launch_begin(self, touching, contacts, x):
-        """At the start of a step, at x (V,): takes the contacts there, and the slips of the last step."""
+        """Takes the contacts at the start of a step, at x (V,), and the slips of the last step."""
         kept = self._kept
         self.present.fill_(1)
         wp.copy(self.start, x)
@@ -129,7 +123,6 @@ class SelfFriction(DynamicElements):
         self._launch(kernels.set_anchors, self.pairs.threads, given, [self.data])
 
     def launch_none(self):
-        """Empties the lists of this step and of the last one."""
         super().launch_none()
         self.present.zero_()
         self._kept.pairs.first.zero_()
@@ -138,13 +131,13 @@ class SelfFriction(DynamicElements):
         self._launch(kernels.find_friction, self.pairs.threads, [self.pairs, self.data, x, correction], [self.forces])
 
     def launch_acting(self, x, out):
-        """Sets out (N,) to ∂U/∂x at the positions x (N,) at which the step evaluated its forces."""
+        """Sets out (N,) to ∂U/∂x at the x (N,) of the last forces."""
         self.launch(x)
         out.zero_()
         self.add_gradient(out)
 
     def launch_end(self, x):
-        """Stores the pairs of the step and the stretch of their springs at x, for the next step."""
+        """Stores the pairs of the step and the stretch of their springs at x."""
         kept = self._kept
         given = [self.pairs, self.data, self.start, self._moves, x, self._rings]
         self._launch(kernels.end_friction, self.pairs.threads, given, [kept.pairs, kept.slips])

@@ -1,7 +1,4 @@
-"""Checks that cloth with self-contact does not start with intersections or gaps that are too small.
-
-Everything is computed in float64, without exact predicates.
-"""
+"""Checks, in float64, that cloth with self-contact does not start with intersections or too small gaps."""
 
 from typing import NamedTuple
 
@@ -15,11 +12,10 @@ from .start_layers import apart
 def check_start(contact, state):
     """Checks that cloth does not start with intersections, or with gaps below the least gap of the filter.
 
-    Pieces that only touch or coincide are moved apart in the state and in the model of :class:`.SelfSteps`, see
-    :func:`.start_layers.apart`.
+    Pieces that only touch or coincide are moved apart in the state and in the model of :class:`.SelfSteps`.
 
     Raises:
-        ValueError: Cloth intersects cloth, or touches it and cannot be moved apart; the message names the first pair.
+        ValueError: Cloth intersects cloth, or touches it and cannot be moved apart.
     """
     start = _too_near(contact, state.x)
     moved = _moved(contact, state.x, start) if len(start.near) else None
@@ -33,10 +29,10 @@ def check_start(contact, state):
 
 
 def check_reset(contact, mask, x):
-    """Checks the positions x (B·n, 3) [m] of copies in ``mask`` (B,), as :func:`check_start`, but moves nothing.
+    """Checks the positions x (B·n, 3) [m] of copies in ``mask`` (B,), but moves nothing.
 
     Raises:
-        ValueError: Cloth intersects or nearly touches cloth; the message names the first pair.
+        ValueError: Cloth intersects or nearly touches cloth.
     """
     model = contact.model
     x = np.where(np.repeat(mask, model.per_copy)[:, None], x, np.nan)  # NaN has no pairs
@@ -47,12 +43,10 @@ def check_reset(contact, mask, x):
 
 
 class _Start(NamedTuple):
-    """Pairs that are too near at a start, and intersections.
+    """Pairs (m, 4) that are too near at a start, the ``split`` vertex–triangle pairs first, and intersections.
 
     Attributes:
-        near: Pairs below the smallest distance, (m, 4).
-        split: The number of vertex–triangle pairs among them, which come first.
-        gaps: Their vectors from the second side to the first, (m, 3) [m]; 0 within rounding.
+        gaps: Vectors from the second side to the first, (m, 3) [m]; 0 within rounding.
         through: Edges that intersect triangles, or touch them at a side.
         least: The smallest distance [m].
     """
@@ -69,7 +63,6 @@ class _Start(NamedTuple):
 
 
 def _moved(contact, x, start):
-    """Returns positions (N,) at which the pairs of a :class:`_Start` that touch are apart, or None."""
     model, mesh = contact.model, contact.model.scene.mesh
     n, copies, pieces = model.per_copy, np.arange(model.copies), contact.proximity.pieces
     first = np.full(pieces.max() + 2, n)  # vertex of each piece in the scene, by which pieces are in order
@@ -107,7 +100,7 @@ def _of_copy(model, vertex):
 
 
 def _too_near(contact, x):
-    """Returns the :class:`_Start` at x (N,). An edge that intersects a triangle is near one of its edges, so it is listed."""
+    """Returns the :class:`_Start` at x (N,)."""
     points = x.numpy().astype(np.float64)
     contact.launch_begin_at_start(x, _longest_edge(contact.model, points))
     of_vertices, of_edges = contact.proximity.counts.numpy()
@@ -131,7 +124,6 @@ def _too_near(contact, x):
 
 
 def _may_cross(contact, x):
-    """Returns the bits of :func:`warpcloth.kernels.contact.start_crossings.find_crossings` of all listed pairs at x (N,)."""
     model, pairs = contact.model, contact.pairs
     triangles = np.asarray(model.in_model(model.scene.mesh.triangles), dtype=np.int32)
     order = np.argsort(triangles, axis=None, kind="stable")
@@ -145,7 +137,6 @@ def _may_cross(contact, x):
 
 
 def _refuse_meshes(contact, stencils, gaps, least):
-    """Raises ValueError if cloth starts at a mesh, with a gap below ``least`` [m]."""
     model, surface = contact.model, contact.surface
     for k in np.flatnonzero((gaps < least) & (stencils >= model.count).any(axis=1))[:1]:
         s = stencils[k]
@@ -158,7 +149,6 @@ def _refuse_meshes(contact, stencils, gaps, least):
 
 
 def _longest_edge(model, points):
-    """Length [m] of the longest edge of all copies at the start, which may be longer than at rest."""
     points = points.reshape(model.copies, -1, 3)[:, model.in_model(model.scene.mesh.edges)]
     lengths = np.linalg.norm(points[:, :, 1] - points[:, :, 0], axis=2)
     return lengths.max(initial=0.0, where=np.isfinite(lengths))
@@ -182,9 +172,8 @@ def _triangles_of(model, edges):
 def crossings(points, edges, triangles):
     """Returns the edges (E, 2) that intersect one of the ``triangles`` (E, m, 3) of each, with that: [(edge, triangle), …].
 
-    An edge that crosses the plane of a triangle does so at a point of its own, which must be inside the triangle; so rounding
-    does not count it in several triangles of a row. If an edge in the plane touches the triangle, the gap to a side or corner
-    is 0.
+    An edge that crosses the plane of a triangle does so at a point of its own, so rounding does not count it in several
+    triangles of a row.
     """
     edges = np.repeat(edges, triangles.shape[1], axis=0)
     triangles = triangles.reshape(-1, 3)

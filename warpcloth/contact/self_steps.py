@@ -1,4 +1,4 @@
-"""Self-contact in the steps of a solver: the pairs that are near at the start of a step."""
+"""Self-contact in the steps of a solver."""
 
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -35,7 +35,7 @@ THICK = 0.5  # the smallest skin, over the contact distance; see ``kept`` of :cl
 
 
 class FirstGap(NamedTuple):
-    """The first frame with a small gap in a copy, and a vertex of the pair in the order of the model."""
+    """The first frame with a small gap in a copy, and a vertex of the pair."""
 
     copy: int
     frame: int
@@ -58,27 +58,20 @@ class SelfSteps:
     the filter keeps pairs apart.
 
     Args:
-        model: The model of a scene with self-contact.
         state: The state of the solver, to which arrays are added.
         h: Time step [s].
-        steps_per_frame: Steps per frame.
         bounded: Whether contact has no logarithm, as in explicit steps.
-        colliders: The :class:`.ColliderSteps` of the solver, or None.
 
     Attributes:
-        surface: The :class:`.ContactSurface`.
         distance, max_distance: The smaller and the larger contact distance of cloth with itself and with meshes [m].
         least: The least gap of the filter [m].
         placed: Positions of meshes at the start of the step, where it evaluates forces, and at its end, (B·m,) [m].
         forces: The :class:`.Dynamic` of ``contact`` and ``friction``, which may be None.
         pairs, begun: The listed pairs, and their gaps at ``begun_at`` (V,).
         x_before: Positions at the start of the step, or of an iterate, with the obstacles behind them, (V,) [m].
-        held: :class:`warpcloth.kernels.contact.self_filter.HeldPins`.
-        near: What :meth:`.SelfFilter.launch_look` found, a mirror of (1,) int32.
-        lists: The number of lists made so far, (B,) int32.
-        most_listed: The largest number of pairs in a list so far, (B,) int32.
+        near: The result of :meth:`.SelfFilter.launch_look`, a mirror of (1,) int32.
+        lists, most_listed: The number of lists so far, and the largest number of pairs in one, (B,) int32.
         listed, with_pairs: 1 if the last list has pairs, (1,) int32; and for each copy at the start of the step, (B,).
-        far: 1 if unlisted pairs may meet on the way of the last :meth:`launch_near`, (1,) int32.
         stale: Whether lists have grown outside of steps, so that graphs must be recorded again.
     """
 
@@ -140,17 +133,13 @@ class SelfSteps:
         self.start_again()
 
     def refuse_reset(self, mask, x):
-        """Makes :func:`.self_start.check_reset`; returns whether graphs must be recorded again.
-
-        Raises:
-            ValueError: Cloth crosses or nearly touches cloth at the positions x (B·n, 3) of copies in ``mask`` (B,).
-        """
+        """Makes :func:`.self_start.check_reset`; returns whether graphs must be recorded again."""
         before = self.capacities
         check_reset(self, mask, x)
         return self.capacities != before
 
     def at_start(self):
-        """Returns, at the start, U [J] and the number of pairs that touch times ½Σ(r − d)² [m²], both (B,)."""
+        """Returns U [J] at the start, and the number of pairs that touch times ½Σ(r − d)² [m²], both (B,)."""
         x, energy = self.model.positions, self.model.scalars()
         with self.looking():
             self.launch_begin(x)
@@ -166,7 +155,6 @@ class SelfSteps:
 
     @contextmanager
     def looking(self):
-        """Restores the state at the end of this context."""
         kept = [wp.clone(array) for array in self._carried]
         try:
             yield
@@ -175,7 +163,6 @@ class SelfSteps:
                 wp.copy(array, before)
 
     def _make_room(self, x):
-        """Grows the lists for the pairs at the start x (N,), before :meth:`_hold` allocates most of what pairs take."""
         wp.copy(self.x_before, x, count=self.model.count)
         self.proximity.launch(self.x_before)
         if self.proximity.overflowed:
@@ -201,14 +188,13 @@ class SelfSteps:
 
     @property
     def capacities(self):
-        """The numbers of pairs and contacts that fit."""
         return len(self.pairs.stencils), self.contact.capacity
 
     def grow(self):
         """Makes room for pairs and contacts that did not fit. Graphs must then be recorded again.
 
         Raises:
-            Stopped: There is no memory for them.
+            Stopped: There is not enough memory.
         """
         try:
             self.grow_to(*self._wanted)
@@ -216,7 +202,6 @@ class SelfSteps:
             raise Stopped(str(error)) from None
 
     def grow_to(self, pairs, contacts=0):
-        """Makes room for 1.5 times the ``pairs`` and ``contacts`` that do not fit."""
         if pairs > len(self.pairs.stencils):
             self.proximity.grow(pairs)
         if contacts > self.contact.capacity:
@@ -240,17 +225,15 @@ class SelfSteps:
 
     @property
     def share(self):
-        """The fraction of the moves of free vertices, in all steps, that the filter cut short, (B,)."""
         return cut_share(self.model, self.cut, self.steps)
 
     @property
     def most(self):
-        """The largest number of pairs in a list so far."""
         return int(self._most.read().max())
 
     @property
     def least_gap(self):
-        """The smallest distance of a pair in any frame that a step has followed, (B,) [m]; infinite without pairs."""
+        """The smallest distance of a pair in any frame, (B,) [m]; infinite without pairs."""
         return _gaps(self._notes.nearest)
 
     @property
@@ -287,19 +270,18 @@ class SelfSteps:
         return found
 
     def in_frame(self):
-        """Returns the pairs listed, the pairs in contact and the least gap [m] at the last :meth:`launch_begin`, each (B,)."""
+        """Returns the pairs listed, the pairs in contact and the least gap [m] at the start of the last step, each (B,)."""
         counts = wp.zeros((self.model.copies, 2), dtype=wp.int32, device=self.model.device)
         notes = filled(gap_notes.GapNotes, nearest=self.model.scalars(), counts=counts)
         self._launch_notes(self.begun_at, 1, notes)
         return *counts.numpy().T, _gaps(notes.nearest)
 
     def start_again(self):
-        """Clears counts and the list."""
         for array in (self.cut, self.steps, self.held.first, self.held.farthest, self.first_forced, *self._carried):
             array.zero_()
 
     def launch_begin(self, x):
-        """Lists the pairs near x (N,) at the start of a step, unless the filter can miss none with the last list."""
+        """Lists the pairs near x (N,) at the start of a step, unless the last list serves."""
         wp.copy(self.x_before, x, count=self.model.count)
         if self.surface.moves:
             if not self._colliders.moved_by_terms:
@@ -327,7 +309,7 @@ class SelfSteps:
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
     def launch_near(self, x, listed, others):
-        """Calls ``others`` if pairs that are not listed may meet on the way to x (V,), else ``listed`` if any is listed."""
+        """Calls ``others`` if unlisted pairs may meet on the way to x (V,), else ``listed`` if any is listed."""
         self.far.zero_()
         self.proximity.launch_moved_since(x, 0.5, None, self.far)
         wp.capture_if(self.far, others, lambda: wp.capture_if(self.listed, listed))
@@ -342,7 +324,6 @@ class SelfSteps:
         self._launch_obstacles()
 
     def _launch_obstacles(self):
-        """Places the obstacles of a step, at its start where pairs are listed."""
         self.surface.launch_positions(self._colliders, self._ahead, self.placed)
         wp.copy(self.surface.behind(self.x_before), self.placed[0])
         self.contact.launch_obstacles(self.placed[1])
@@ -357,7 +338,7 @@ class SelfSteps:
             self.model.launch(keep_forces, each.capacity, given, [each.forces])
 
     def launch_present(self, x):
-        """Lists pairs and contacts at x (N,), with meshes at the end of the last step. Poses that sums need are kept."""
+        """Lists pairs and contacts at x (N,), with meshes at the end of the last step; poses do not change."""
         if not self.surface.moves:
             self.launch_begin(x)
             self.contact.launch_rows(x)
@@ -383,7 +364,7 @@ class SelfSteps:
 
     @property
     def forced(self):
-        """The copies in which a mesh went through cloth: (copy, first frame, mesh, or None if several move)."""
+        """Copies in which a mesh went through cloth: (copy, first frame, mesh, or None if several move)."""
         moving = [c for c, each in enumerate(self.model.scene.colliders) if each.is_mesh and each.moves]
         mesh = moving[0] if len(moving) == 1 else None
         return [(c, int(gap_notes.FIRST) - int(note), mesh) for c, note in enumerate(self.first_forced.numpy()) if note]
@@ -393,7 +374,7 @@ class SelfSteps:
         self._launch(gap_notes.note_gaps, len(self.pairs.stencils), given, [notes])
 
     def launch_begin_at_start(self, x, longest):
-        """Lists all pairs near x (N,) at the start of a run, and makes room. The longest edge is ``longest`` [m]."""
+        """Lists all pairs near x (N,) at the start of a run, with edges up to ``longest`` [m], and makes room."""
         self.proximity.set_skin(max(self.skin, SKIN * longest))
         if self.surface.moves:
             self._colliders.launch_move()
@@ -406,7 +387,7 @@ class SelfSteps:
         self.proximity.set_skin(self.skin)
 
     def launch_list(self, x):
-        """Lists the pairs again at x, in copies that have moved by :meth:`.Proximity.moved`; counts a list if one has."""
+        """Lists the pairs again at x, in copies that have moved; counts a list if one has."""
         self.proximity.launch_moved(x)
         given = [self.proximity.counts, self.proximity.flag]
         self.model.launch(self_pairs.note_list, self.model.copies, given, [self.most_listed, self.lists, self.listed])
@@ -421,12 +402,10 @@ class SelfSteps:
         self._launch(self_pairs.begin_pairs, self.pairs.threads, [self.pairs, self.begun_at], [self.begun])
 
     def relist(self, x):
-        """Lists the pairs again at x, and computes their sides and gaps."""
         self.launch_list(x)
         self.launch_sides(x, self.proximity.copies)
 
 
 def _gaps(nearest):
-    """Returns distances [m], given an array of their inverses on the device."""
     with np.errstate(divide="ignore"):
         return 1.0 / nearest.numpy()

@@ -1,4 +1,4 @@
-"""Moves pieces of cloth that touch or coincide at the start apart, along their normals."""
+"""Moves pieces of cloth that touch at the start apart."""
 
 import itertools
 
@@ -6,12 +6,15 @@ import numpy as np
 
 
 def apart(points, triangles, sides, gaps, piece, fixed, r):
-    """Returns positions at which pieces that touched are apart, or None if they cannot be moved so.
+    """Returns positions (N, 3) [m] at which pieces that touched are apart, or None.
 
     Touching pieces become layers, r apart or, if there are more than three, as far as moves of at most r allow. A piece lies
     above another where its touching vertices are, or the vertices beside them, if these are farther than r from the other.
     Pieces that coincide with opposite normals move to the sides that they face; of those with equal normals the later one lies
     above. Vertices of touching elements move along their normals; those of pieces with a fixed one stay.
+
+    It is None if a piece touches itself, if touching pieces cannot be layers, if two that must stay touch, or if a normal is
+    not defined.
 
     Args:
         points: (N, 3) [m].
@@ -21,10 +24,6 @@ def apart(points, triangles, sides, gaps, piece, fixed, r):
         piece: The piece of each vertex, (N,).
         fixed: Whether a vertex must stay, (N,).
         r: The contact distance [m].
-
-    Returns:
-        (N, 3) [m], or None if a piece touches itself, if touching pieces cannot be layers, if two that must stay touch, or if a
-        normal is not defined.
     """
     pairs = piece[sides[:, :, 0]]
     if (pairs[:, 0] == pairs[:, 1]).any():
@@ -56,10 +55,9 @@ def apart(points, triangles, sides, gaps, piece, fixed, r):
 
 
 def _offsets(turns, above, stay):
-    """Returns the move of each piece along its own normals, over the contact distance, by piece; or None.
+    """Returns the move of each piece along its own normals, over the contact distance; 0 of those that ``stay``; or None.
 
-    ``turns`` is 1 for two pieces with like normals, else −1, and ``above`` is 1 if the second is above the first along the
-    normals of the first, else −1; both by pairs. Pieces in ``stay`` have the offset 0.
+    By pairs, ``turns`` is 1 for like normals, else −1, and ``above`` is 1 if the second is above the first, else −1.
     """
     offsets, beside = {}, {}
     for first, second in turns:
@@ -97,13 +95,11 @@ def _normals(points, triangles):
 
 
 def _around(points, triangles):
-    """Returns the mean of the centres of the triangles of each vertex, (N, 3)."""
     counts = np.bincount(triangles.ravel(), minlength=len(points))
     return _sums(points[triangles].mean(axis=1), triangles, len(points)) / np.maximum(counts, 1)[:, None]
 
 
 def _sums(values, triangles, n):
-    """Returns the sums (n, 3) of the values (T, 3) of the triangles of each vertex."""
     found = np.zeros((n, 3))
     np.add.at(found, triangles, values[:, None])
     return found

@@ -16,21 +16,17 @@ class ContactSurface:
     """The vertices, edges and triangles of the cloth, and behind them those of the mesh colliders, of all copies.
 
     Vertices of a mesh that coincide at all frames are one. Elements of the cloth with a vertex that cannot move do not meet
-    meshes: pins may be inside a body.
+    meshes.
 
     Attributes:
-        meets_itself: Whether cloth meets cloth.
         obstacles: The number m of vertices of meshes in a copy.
         count: The number of vertices of all copies, N + B·m.
-        layout: The :class:`warpcloth.kernels.pairs.Layout`.
-        of_obstacles: The :class:`warpcloth.kernels.contact.obstacles.Obstacles`.
         items: Vertices of the triangles, then of the edges, of all copies, each with 2·copy + kind, (items, 4) int32.
         triangles, edges: The numbers of both, over all copies.
         groups: The group of each item, (items,), and ``vertex_groups`` that of each vertex of a copy, (n + m,).
         edge_lengths: Lengths of the edges of the cloth at rest [m].
         rest: Rest positions of the vertices of a copy (n + m, 3) [m].
         colliders: The index of the collider of each obstacle of a copy, (m,).
-        moves: Whether a mesh moves or deforms.
         width: The largest area of an edge of the cloth over its length [m].
         moves_of_step: Moves of obstacles in the step, (B·m,) [m].
     """
@@ -94,7 +90,7 @@ class ContactSurface:
         self._find = model.kernel(kernels.find_obstacles, model.dtype)
 
     def friction(self):
-        """The law of friction, and μ of cloth with cloth, then that of each obstacle of a copy, (1 + m,). None: no friction.
+        """The law of friction, and μ of cloth with cloth, then that of each obstacle of a copy, (1 + m,); or None.
 
         Raises:
             ValueError: There are several laws.
@@ -111,8 +107,7 @@ class ContactSurface:
     def areas(self):
         """Rest areas of vertices, and of each edge at them, (n + m,) [m²], those of the cloth in the order of the model.
 
-        The energy of a vertex of a mesh keeps it out of large triangles of the cloth, and does not press: its area is at most
-        the mean of those of the cloth.
+        The area of a vertex of a mesh is at most the mean of those of the cloth.
         """
         mesh, n = self.model.scene.mesh, self.model.per_copy
         of_cloth = np.empty(n)
@@ -140,20 +135,17 @@ class ContactSurface:
         return np.concatenate([piece, piece.max(initial=-1) + 1 + of_collider])
 
     def of_model(self, values):
-        """Values of vertices of a copy (n + m, …) for all vertices (N + B·m, …)."""
         n, copies = self.model.per_copy, (self.model.copies, *[1] * (values.ndim - 1))
         return np.concatenate([np.tile(values[:n], copies), np.tile(values[n:], copies)])
 
     def vectors(self):
-        """Returns zero vectors for the vertices of the surface of all copies, (N + B·m,)."""
         return wp.zeros(self.count, dtype=self.model.vec3, device=self.model.device)
 
     def behind(self, whole):
-        """Returns the part (B·m,) of an array (N + B·m,) for the obstacles."""
         return whole[self.model.count :]
 
     def launch_positions(self, colliders, ahead, placed):
-        """Places obstacles at the start of a step, ``ahead`` half steps later, and at its end, (B·m,) [m]; and finds moves."""
+        """Sets obstacles at the start of a step, ``ahead`` half steps later, and at its end, (B·m,) [m]; and finds moves."""
         model = self.model
         given = [self.layout, self.of_obstacles, model.colliders.meshes.geometry, colliders.poses, colliders.steps]
         given += [2 * colliders.steps_per_frame, ahead]
@@ -161,7 +153,7 @@ class ContactSurface:
 
 
 def _welded(collider):
-    """The vertices of a mesh collider that triangles use, their positions (m, 3) and these triangles (T, 3)."""
+    """Returns the vertices of a mesh collider, their positions (m, 3) and triangles (T, 3)."""
     welded = collider.welded
     _, first, triangles = np.unique(welded, return_index=True, return_inverse=True)
     vertices = collider.triangles.ravel()[first]
