@@ -1,7 +1,4 @@
-"""The catalogue of energies: each has a file with its record, and a line here.
-
-:data:`TERMS` has them by name; :func:`register` adds one from outside.
-"""
+"""The catalogue of energies, :data:`TERMS`; :func:`register` adds one from outside."""
 
 from ..base.catalogue import Catalogue, imported_on_use
 from ..base.extensions import note

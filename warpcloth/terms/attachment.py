@@ -21,7 +21,6 @@ class Attachment(Damped):
         stiffness: k [N/m], one or (E,).
         targets: Positions (E, 3) [m], or one for all (3,); by default the positions at the start.
         damping: β [N·s/m], one or (E,): a force −βv, also in rigid motion.
-        name: Label among terms.
     """
 
     term: ClassVar[Term] = ATTACHMENT

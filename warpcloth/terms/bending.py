@@ -1,4 +1,4 @@
-"""The base class of bending energies over hinges, edges with two adjacent triangles."""
+"""Bending energies over hinges."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from .declared import Damped
 
 @dataclass(frozen=True, kw_only=True)
 class Bending(Damped):
-    """The base class of bending energies over hinges.
+    """The base class of bending energies over hinges, edges with two triangles.
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], one or (E,) in the order of ``mesh.hinges``.

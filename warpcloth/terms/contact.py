@@ -1,4 +1,4 @@
-"""Contact and friction of vertices with one collider, which a scene makes."""
+"""Contact and friction of vertices with one collider."""
 
 from dataclasses import dataclass, field
 
@@ -22,7 +22,7 @@ class VertexContact(Declared):
         areas: A (E,) [m²].
         distance: r [m].
         pose, solid, core, radius: Pose and shape of the collider at the start.
-        collider: Index of the collider in the scene.
+        collider: Its index in the scene.
     """
 
     vertices: np.ndarray = field(default_factory=lambda: np.empty(0, np.int32))
@@ -36,7 +36,6 @@ class VertexContact(Declared):
 
     @property
     def term(self) -> Term:
-        """Contact with this shape."""
         return contact(self.solid)
 
     def stencil(self, mesh: Mesh) -> np.ndarray:

@@ -20,7 +20,6 @@ class CorotatedMembrane(Membrane):
         stiffness: k = Et = 2μ [N/m], Young's modulus times thickness, one or (T,); ``math.inf`` for solvers that take hard
             constraints.
         damping: β [N·s/m], one or (T,): a stress βĖ, E the Green strain ½(FᵀF − I).
-        name: Label among terms.
     """
 
     term: ClassVar[Term] = COROTATED_MEMBRANE

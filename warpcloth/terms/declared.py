@@ -1,4 +1,4 @@
-"""The base classes of records of energies: fields, their checks, and elements on a mesh."""
+"""The base classes of records of energies."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -17,12 +17,11 @@ class Elements:
     """The elements of one term on one mesh, as NumPy arrays.
 
     Attributes:
-        label: Name within the scene.
         stencil: Vertices of each element, (E, K) int32.
         stiffness: One value, (E,), or (C,) with cells [unit of the term].
         rest: Rest states (E, P); with sparse cells (C, P).
         damping: One value or (E,) [unit of the term, times s].
-        cells: Offsets (C+1,) of cells: elements cells[c] to cells[c+1] − 1 are the vertices of cell c; or None.
+        cells: Offsets (C+1,): elements cells[c] to cells[c+1] − 1 are the vertices of cell c; or None.
         weights: Weights (E, M) of the vertices of sparse cells (:mod:`.sparse`), or None.
         refresh: The :class:`warpcloth.terms.refresh.Refresh` of a changing rest state, or None.
     """
@@ -40,9 +39,7 @@ class Elements:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Metadata of a numeric field in SI units: one value, or one per element.
-
-    Checks, ``vary`` and USD attributes follow from it.
+    """Metadata of a numeric field in SI units, from which checks, ``vary`` and USD attributes follow.
 
     Attributes:
         rule: The rule for values in error messages, such as "must be above 0".
@@ -69,12 +66,12 @@ class Indices:
 
 
 def quantity(rule, holds, shape=()):
-    """Returns the ``metadata`` of a field that is a :class:`Quantity`."""
+    """Returns the ``metadata`` of a :class:`Quantity`."""
     return {"quantity": Quantity(rule, holds, shape)}
 
 
 def indices(each=1, text=""):
-    """Returns the ``metadata`` of a field that is :class:`Indices`."""
+    """Returns the ``metadata`` of :class:`Indices`."""
     return {"indices": Indices(each, text)}
 
 
@@ -164,7 +161,7 @@ class Declared:
         return replace(found, stencil=found.stencil + np.int32(first))
 
     def elements_on(self, mesh: Mesh, positions: np.ndarray) -> Elements:
-        """Returns the elements on a mesh, that of the part."""
+        """Returns the elements on the mesh of the part."""
         stencil = self.stencil(mesh)
         if len(stencil) == 0:
             raise ValueError(f"{self.label} has no elements on this mesh of {len(mesh.triangles)} triangles; leave it out")
@@ -187,10 +184,9 @@ class Declared:
         return self.term.rest_state(mesh.points, stencil)
 
     def held(self, mesh: Mesh, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the pairs of vertices whose distance the term keeps, by default none.
+        """Returns the pairs of vertices whose distance the term keeps, (m, 2), and their K, (m,) [N/m]; by default none.
 
-        Returns:
-            (pairs (m, 2), K (m,) [N/m]): K is force per width and strain of a sheet.
+        K is force per width and strain of a sheet.
         """
         return np.empty((0, 2), dtype=np.int32), np.empty(0)
 
@@ -199,7 +195,7 @@ class Declared:
 class Damped(Declared):
     """The base class of terms with damping β, which adds the dissipation Σ (Aβ/2hₑ)‖s(y) − s(yₙ)‖² to each step.
 
-    s is an invariant such as a length, by ``term.dissipation`` (:class:`warpcloth.kernels.term.Dissipation`).
+    s is an invariant such as a length, by :class:`warpcloth.kernels.term.Dissipation`.
 
     Attributes:
         damping: β, one or (E,) [unit of the term, per unit of s², times s].
@@ -221,9 +217,7 @@ def own_indices(name, given):
 
 
 def own_stencil(label, parameter, given, vertices, count):
-    """Returns indices below ``count`` (E, ``vertices``), or (E,) of one vertex, as (E, ``vertices``) int32; refuses pairs of
-    one vertex.
-    """
+    """Returns indices below ``count`` as (E, ``vertices``) int32, also of (E,) for one vertex; refuses pairs of one vertex."""
     stencil = as_array(given)
     if vertices == 1 and stencil.ndim == 1:
         stencil = stencil[:, None]

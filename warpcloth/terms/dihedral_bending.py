@@ -15,7 +15,6 @@ class DihedralBending(Bending):
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated as in :class:`warpcloth.QuadraticBending`.
         damping: β [N·m·s] on the rate of θ.
-        name: Label among terms.
     """
 
     term: ClassVar[Term] = DIHEDRAL_BENDING

@@ -1,4 +1,4 @@
-"""The base class of limits, whose energy is 0 in a range about the rest shape."""
+"""The base class of limits."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Loads: forces on vertices, tractions on edges and pressures on triangles."""
+"""Loads on vertices, edges and triangles."""
 
 import warnings
 from collections.abc import Iterable, Sequence
@@ -23,7 +23,6 @@ class Load:
         acts_on: Its elements, for messages.
         vertices: Indices (p,), or a selection of the mesh such as ``"x == 1"``.
         keyframes: Values at frames 0 … F−1, (F, …), linear in between, constant after.
-        name: Label among loads.
 
     Raises:
         ValueError: A value is not allowed. The scene checks vertices and lengths.
@@ -47,18 +46,17 @@ class Load:
 
     @property
     def label(self) -> str:
-        """The name, or else that of the class."""
         return self.name or type(self).__name__
 
     def elements(self, mesh: Mesh) -> np.ndarray:
-        """Returns the elements that it acts on: vertices (p,), edges (E, 2) or triangles (T, 3)."""
+        """Returns the vertices (p,), edges (E, 2) or triangles (T, 3) that it acts on."""
         raise NotImplementedError  # every load has its own
 
     def of_elements(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         """Returns the elements, and the keyframes of each, (F, count, …), F = 1 if constant.
 
         Raises:
-            ValueError: There are no elements, or there is another number of values.
+            ValueError: There are no elements, or another number of values.
         """
         found, values = self.elements(mesh), self._values()
         if not len(found):
@@ -137,10 +135,8 @@ class Pressure(Load):
     """Pressure on triangles along their normals: a force pAn/3 on each corner, with the current area A and normal n.
 
     Triangles that wind against their neighbours are turned over, the fewer in each piece, with a warning; a one-sided surface
-    is refused.
-
-    With free edges, pressure has no energy, so it is evaluated once per step: at x for explicit steps and implicit Euler, at x
-    + ½h v for midpoint, at 2xₙ − xₙ₋₁ for BDF2, which keeps their order.
+    is refused. Pressure is evaluated once per step: at x for explicit steps and implicit Euler, at x + ½h v for midpoint, at
+    2xₙ − xₙ₋₁ for BDF2.
 
     Attributes:
         vertices: A triangle is loaded if all its corners are among these.
@@ -180,7 +176,7 @@ LOADS = {kind.__name__: kind for kind in (Force, Traction, Pressure)}
 
 
 def checked_loads(loads: Any, mesh: Mesh) -> Loads:
-    """Returns one load or several as :class:`Loads`; refuses what is none or does not fit the mesh."""
+    """Returns one load or several as :class:`Loads`; refuses others, and those that do not fit the mesh."""
     if not isinstance(loads, Iterable):
         loads = (loads,)
     loads = Loads(loads)

@@ -1,4 +1,4 @@
-"""The base classes of membranes, energies of the deformation gradient F (3×2) of triangles."""
+"""The base classes of membranes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ Own = TypeVar("Own", bound="IsotropicMembrane")
 
 @dataclass(frozen=True, kw_only=True)
 class Membrane(Damped):
-    """A membrane, whose energy and stress :func:`warpcloth.analyze` can measure.
+    """An energy of the deformation gradient F (3×2) of triangles, which :func:`warpcloth.analyze` can measure.
 
     Attributes:
         material: Name on the command line, or None.
@@ -65,7 +65,7 @@ class IsotropicMembrane(Membrane):
 
 
 def membrane_stiffness(cls, youngs_modulus, thickness):
-    """Returns Et [N/m], and checks both."""
+    """Returns Et [N/m]; checks both."""
     given = {"youngs_modulus": youngs_modulus, "thickness": thickness}
     modulus, t = (numeric(f"{cls.__name__}.{name}", value, "be a number") for name, value in given.items())
     refuse(f"{cls.__name__}.youngs_modulus", modulus, ~(modulus >= 0.0), "must be 0 or more")

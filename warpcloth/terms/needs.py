@@ -1,4 +1,4 @@
-"""The properties that a solver may need of every term, and the error for a term that lacks one."""
+"""The properties that a solver may need of every term."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,9 +11,8 @@ class Need:
     """A property that a solver needs of every term.
 
     Attributes:
-        met: (elements) → whether a term has it; ``elements`` is :class:`warpcloth.model.elements.DeviceElements`, or has
-            ``term``, ``hard`` and ``damping`` (or None).
-        lack: Words for a term without it, with {label}, for the message.
+        met: (elements) → whether a term has it; ``elements`` has ``term``, ``hard`` and ``damping`` (or None).
+        lack: Words for a term without it, with {label}.
         remedy: A change that helps, or "".
     """
 
@@ -95,8 +94,7 @@ def refuse_unmet(terms, solver, needs, others):
     """Checks that every term meets the needs of a solver.
 
     Raises:
-        ValueError: A term does not. The message names the term, the solver, the first unmet need, and solvers of ``others`` or
-            changes that work.
+        ValueError: A term does not. The message names the term, the need, and solvers of ``others`` or changes that work.
     """
     for elements in terms:
         need = lacks(elements, needs)

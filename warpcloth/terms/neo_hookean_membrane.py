@@ -20,7 +20,6 @@ class NeoHookeanMembrane(IsotropicMembrane):
             ν²).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ, E the Green strain ½(FᵀF − I).
-        name: Label among terms.
     """
 
     term: ClassVar[Term] = NEO_HOOKEAN_MEMBRANE

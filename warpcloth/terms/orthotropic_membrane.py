@@ -21,10 +21,9 @@ Own = TypeVar("Own", bound="OrthotropicMembrane")
 class OrthotropicMembrane(Woven, Membrane):
     """A St. Venant–Kirchhoff membrane along warp and weft, U = Σ ½AεᵀCε.
 
-    ε = (E₁₁, E₂₂, 2E₁₂) is the Green strain ½(FᵀF − I) along warp (1) and weft (2), and A the rest area of a triangle. With
-    k₁ = E₁t/(1 − ν₁₂ν₂₁), εᵀCε is k₁E₁₁² + (E₂/E₁)k₁E₂₂² + 2ν₂₁k₁E₁₁E₂₂ + 4GtE₁₂². It collapses under large compression.
-
-    E₁ and E₂ are moduli of strips along warp or weft that narrow freely.
+    ε = (E₁₁, E₂₂, 2E₁₂) is the Green strain ½(FᵀF − I) along warp (1) and weft (2), and A the rest area of a triangle. With k₁
+    = E₁t/(1 − ν₁₂ν₂₁), εᵀCε is k₁E₁₁² + (E₂/E₁)k₁E₂₂² + 2ν₂₁k₁E₁₁E₂₂ + 4GtE₁₂². It collapses under large compression. E₁ and E₂
+    are moduli of strips that narrow freely.
 
     Attributes:
         stiffness: E₁t [N/m], Young's modulus along the warp times thickness, one or (T,).
@@ -35,7 +34,6 @@ class OrthotropicMembrane(Woven, Membrane):
             and t does not.
         warp_angle: Angle [rad] from there to the warp in the triangle, counter-clockwise from the front, one or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ.
-        name: Label among terms.
 
     Raises:
         ValueError: A value is not allowed, or the energy would not be positive definite.
@@ -85,7 +83,7 @@ class OrthotropicMembrane(Woven, Membrane):
         return cls(stiffness=E1, **ratios, poisson_ratio=poisson_ratio, warp=direction, **fields)
 
     def isotropic(self: Own) -> Own:
-        """Returns the isotropic membrane with √(E₁E₂)t and Poisson's ratio √(ν₁₂ν₂₁)."""
+        """Returns the isotropic membrane with √(E₁E₂)t and ν = √(ν₁₂ν₂₁)."""
         ratio = self._numeric("poisson_ratio") * np.sqrt(self._numeric("weft_ratio"))
         return replace(super().isotropic(), poisson_ratio=ratio[()])
 

@@ -14,11 +14,9 @@ class QuadraticBending(Bending):
 
     Attributes:
         stiffness: D, the bending stiffness of the plate [N·m], calibrated on an equilateral mesh, whose Poisson's ratio is
-            −1/3. Other meshes are not isotropic. A grid with one diagonal per cell has 3 D curved along its diagonals, D folded
-            about them or curved along rows, and 0.75 D curved 15° off the rows, away from the diagonals. Alternating diagonals
-            have 1 to 1.5 D.
+            −1/3. Other meshes are not isotropic: a grid with one diagonal per cell has 0.75 to 3 D, with alternating diagonals
+            1 to 1.5 D, by the direction.
         damping: β [N·m·s] on the rate of ‖y‖, |e|·|θ| for a small angle θ.
-        name: Label among terms.
 
     Examples:
         >>> import warpcloth as wc

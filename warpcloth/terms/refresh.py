@@ -1,8 +1,4 @@
-"""Updates of rest states during a run: when, and by which launch.
-
-A solver calls :meth:`warpcloth.model.model.Model.refresh` at the start of each step and before every evaluation of an energy, a
-force or a projection.
-"""
+"""Updates of rest states during a run, by :meth:`warpcloth.model.model.Model.refresh`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,7 +14,7 @@ class Moment(NamedTuple):
     """The state from which elements are refreshed.
 
     Attributes:
-        x: Positions (N,) vectors [m].
+        x: Positions (N,) [m].
         correction: d (N,) [m] of an evaluation at x + d, or None.
         move: Array (N,) with d = scale·move a displacement [m], for integrators that take rates from x − d too; or None.
         scale: 1, or a time [s] if ``move`` is a velocity.
@@ -51,11 +47,11 @@ class Moment(NamedTuple):
 class Refresh:
     """The update of a term's elements during a run.
 
-    It writes rest states, and may write stencils in arrays of maximum length, with stiffness 0 of unused elements. But solvers
-    read stencils only when they are bound, for incidences on CUDA, the pattern of the Hessian, colours and constant matrices.
+    It writes rest states. It may write stencils in arrays of maximum length, with stiffness 0 of unused elements, but solvers
+    read stencils only when they are bound.
 
     Attributes:
-        when: :data:`STEP` or :data:`EVALUATION`.
+        when: :data:`STEP` or :data:`EVALUATION`: at the start of each step, or before every evaluation.
         launch: Function (model, elements, moment) that launches kernels which write the arrays of ``elements``; it is captured,
             so it must neither read on the host nor allocate.
         arrays: Arrays that it reads, (B·E,), in the order of elements.

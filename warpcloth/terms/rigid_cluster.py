@@ -23,8 +23,8 @@ class RigidCluster(Declared):
     2005).
 
     Bodies are joined at shared vertices, which have their whole mass in each. In the fit, a pinned vertex has a thousand times
-    the mass of the rest of its body. A body on a line has no orientation about it. Newton's Hessian κM also resists rigid
-    motion: steps with κh² near 1 or above take more iterations, and ``equilibrium`` may use them up.
+    the mass of the rest of its body. A body on a line has no orientation about it. Newton's method takes more iterations where
+    κh² is near 1 or above, and ``equilibrium`` may use them up.
 
     Attributes:
         vertices: Vertices of the bodies, one after the other, (E,); a list of an array per body; a selection such as ``"x <
@@ -32,7 +32,6 @@ class RigidCluster(Declared):
         sizes: Numbers of vertices of the bodies in one array, (C,).
         stiffness: κ [1/s²], one or (C,), the squared frequency of a vertex about its position in the body; infinite for solvers
             that take hard constraints.
-        name: Label among terms.
     """
 
     term: ClassVar[Term] = RIGID_CLUSTER

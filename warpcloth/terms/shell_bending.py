@@ -1,4 +1,4 @@
-"""Bending of an isotropic or orthotropic shell with a curved rest shape, on any mesh."""
+"""Bending of a shell with a curved rest shape, on any mesh."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -27,10 +27,7 @@ class ShellBending(PlateBending):
         poisson_ratio: ν, above −1 and below 1, one or (T,).
         weft_ratio: D₂/D₁, one or (T,).
         twist_ratio: D₆₆/D₁, one or (T,); ½(1 − ν)√(D₂/D₁) if None.
-        warp: Vector along the warp, (3,) or (T, 3), projected to each triangle; by default where the texture coordinate s grows
-            and t is constant. Isotropic shells need neither.
-        warp_angle: Angle [rad] from there to the warp in the triangle, counter-clockwise from the front, one or (T,).
-        name: Label among terms.
+        warp, warp_angle: As of :class:`warpcloth.OrthotropicMembrane`; isotropic shells need neither.
 
     Examples:
         >>> import warpcloth as wc

@@ -13,9 +13,9 @@ from .refresh import EVALUATION, Refresh
 class Sparse(Declared):
     """An energy U = Σ_c k A u(y_c) of cells with any number of vertices, y = Dx with a sparse D.
 
-    A subclass defines ``operator`` and ``rest``, and no ``stencil``. Its ``term`` has ``vertices`` 0 and ``weight`` None; a
-    quadratic one sets ``cells``, ``project``, ``linear`` and ``quadratic``, and all solvers take it. Others go to Explicit and
-    Newton, and with a ``curvature`` to ProjectiveDynamics and ADMM.
+    A subclass defines ``operator`` and ``rest``, and no ``stencil``. Its ``term`` has ``vertices`` 0 and ``weight`` None. A
+    quadratic one sets ``cells``, ``project``, ``linear`` and ``quadratic``, for all solvers. Others go to Explicit and Newton,
+    and with a ``curvature`` to ProjectiveDynamics and ADMM.
     """
 
     def operator(self, mesh):
@@ -23,7 +23,6 @@ class Sparse(Declared):
         raise NotImplementedError  # every energy has its own
 
     def rest(self, mesh, positions, stencil):
-        """Returns the rest states (C, P) of the cells."""
         raise NotImplementedError
 
     def elements_on(self, mesh, positions):

@@ -24,7 +24,6 @@ class Spring(Damped):
         stiffness: k [N/m], one or (E,); ``math.inf`` for solvers that take hard constraints.
         rest_lengths: L [m], one or (E,); by default the lengths in the rest shape.
         damping: β [N·s/m], one or (E,): a force −β dl/dt along the spring.
-        name: Label among terms.
 
     Examples:
         >>> import warpcloth as wc
@@ -55,7 +54,7 @@ class Spring(Damped):
 
 
 def pairs_on(mesh, label, pairs):
-    """Returns the pairs of :class:`Spring` on a mesh, (E, 2) int32."""
+    """Returns the pairs of :class:`Spring`, (E, 2) int32."""
     kinds = (pairs,) if isinstance(pairs, str) else pairs
     if isinstance(kinds, (tuple, list)) and kinds and all(isinstance(kind, str) for kind in kinds):
         found = [mesh.springs(kind) for kind in kinds]

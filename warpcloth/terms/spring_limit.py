@@ -20,9 +20,7 @@ class SpringLimit(Limit):
     Attributes:
         least, most: σ_min, σ_max, ratios to the rest length L, each one or (E,); at least one.
         pairs: Pairs of vertices as of :class:`warpcloth.Spring`.
-        stiffness: k [N/m] beyond a limit, one or (E,); infinite for solvers that take hard constraints, finite for those that
-            need forces.
-        name: Label among terms.
+        stiffness: k [N/m] beyond a limit, one or (E,), by default infinite; finite for solvers that need forces.
     """
 
     term: ClassVar[Term] = SPRING_LIMIT

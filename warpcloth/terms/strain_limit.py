@@ -19,9 +19,8 @@ class StrainLimit(Limit):
     Attributes:
         least, most: Bounds σ_min, σ_max of the singular values σᵢ of the deformation gradient F, each one or (T,); at least
             one.
-        stiffness: k [N/m] beyond a limit, one or (T,), as of :class:`warpcloth.CorotatedMembrane`; infinite for solvers that
-            take hard constraints, finite for those that need forces.
-        name: Label among terms.
+        stiffness: k [N/m] beyond a limit, one or (T,), as of :class:`warpcloth.CorotatedMembrane`, by default infinite; finite
+            for solvers that need forces.
     """
 
     term: ClassVar[Term] = STRAIN_LIMIT

@@ -19,7 +19,6 @@ class StVKMembrane(IsotropicMembrane):
             ν²).
         poisson_ratio: ν, above −1 and below 1, one or (T,).
         damping: β [N·s/m], one or (T,): a stress βĖ.
-        name: Label among terms.
     """
 
     term: ClassVar[Term] = STVK_MEMBRANE

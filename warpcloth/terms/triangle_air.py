@@ -49,8 +49,6 @@ class TriangleAir(Declared):
 
 
 class _Freeze:
-    """Launches the forces of a step; its first call, by the model, copies keyframes."""
-
     def __init__(self, keyframes, blow):
         self._keyframes, self._blow, self._held = keyframes, blow, {}
 

@@ -20,9 +20,7 @@ class Woven(Declared):
 
     Attributes:
         weft_ratio: Stiffness along weft over that along warp, one or (T,).
-        warp: Vector along the warp, (3,) or (T, 3), projected to each triangle; by default where the texture coordinate s grows
-            and t does not.
-        warp_angle: Angle [rad] from there to the warp in the triangle, counter-clockwise from the front, one or (T,).
+        warp, warp_angle: As of :class:`warpcloth.OrthotropicMembrane`.
     """
 
     # The field with the stiffness of shear or twist over that along warp; None for that of an isotropic sheet.
@@ -36,7 +34,7 @@ class Woven(Declared):
 
     @property
     def anisotropic(self) -> bool:
-        """Whether weft, or shear and twist, are not as stiff as in an isotropic sheet."""
+        """Whether it is not as stiff as an isotropic sheet along weft, or in shear or twist."""
         return getattr(self, self.shearing) is not None or bool((self._numeric("weft_ratio") != 1.0).any())
 
     def isotropic(self: Own) -> Own:
@@ -76,5 +74,5 @@ def along_s(x: np.ndarray, st: np.ndarray) -> np.ndarray:
 
 
 def isotropic_twist(ratio: Any, weft: Any) -> Any:
-    """Returns D₆₆/D₁ = ½(1 − ν)√(D₂/D₁) where it is not declared, from ν and D₂/D₁."""
+    """Returns D₆₆/D₁ = ½(1 − ν)√(D₂/D₁), from ν and D₂/D₁."""
     return 0.5 * (1.0 - ratio) * np.sqrt(weft)
