@@ -1,1 +1,1 @@
-"""Scenes, colliders and contact: the records that a user declares."""
+"""The records that a user declares."""

@@ -20,7 +20,7 @@ class Air:
 
     Attributes:
         wind: [m/s], (3,), or (T, 3) of triangles; or a Warp function of a position ``wp.vec3`` [m] and a time ``float`` [s],
-            float32, that returns a ``wp.vec3``, called at the centres of triangles when forces are taken.
+            float32, that returns a ``wp.vec3``, called at the centres of triangles.
         keyframes: (F, 3) [m/s], in place of ``wind``: a uniform wind at frames 0 … F−1, linear between, constant after.
         density: ρ [kg/m³].
         normal_drag: C_n, by default that of a flat plate across the wind.
@@ -80,7 +80,6 @@ class Air:
 
     @property
     def changes(self) -> bool:
-        """Whether the wind depends on the time."""
         return self.keyframes is not None or self.blow is not None
 
     @property

@@ -1,4 +1,4 @@
-"""Colliders: static or moving shapes, and the contact of cloth with them."""
+"""Colliders and the contact of cloth with them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -45,10 +45,10 @@ class Contact:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Collider:
-    """A frame that moves by keyframes, and a shape in it.
+    """A shape in a frame that moves by keyframes.
 
-    A subclass has a ``solid``, a :class:`warpcloth.kernels.terms.contact.Solid`, whose device function gives the signed
-    distance d of a point and ∇d from the numbers in ``core``.
+    A subclass has a ``solid``, a :class:`warpcloth.kernels.terms.contact.Solid`, which gives the signed distance d of a point
+    and ∇d from the numbers in ``core``.
 
     Attributes:
         position: Position of its centre, (3,) or at frames 0 … F−1 (F, 3) [m].
@@ -91,7 +91,6 @@ class Collider:
 
     @property
     def label(self) -> str:
-        """The name, or the name of the class."""
         return self.name or type(self).__name__
 
     @property
@@ -107,7 +106,7 @@ class Collider:
     def clearing_gap(self, edge: float) -> float:
         """Returns the gap d = √(R² + L²/3) − R of vertices [m] that keeps a triangle with the longest edge L [m] outside.
 
-        R is the radius of rounding, 0 for a box; each point of the triangle is within L/√3 of a vertex.
+        R is the radius of rounding, 0 for a box.
         """
         half, radius = self.core
         return 0.0 if np.isinf(half[0]) else float(np.sqrt(radius**2 + edge**2 / 3.0) - radius)
@@ -130,16 +129,14 @@ class Collider:
 
     @property
     def moves(self) -> bool:
-        """Whether it has more than one keyframe."""
         return len(self.poses) > 1
 
     def at_last(self) -> "Collider":
-        """Returns a static collider at the last keyframe."""
         position, rotation = np.atleast_2d(self.position)[-1], np.atleast_2d(self.rotation)[-1]
         return replace(self, position=position, rotation=rotation)
 
     def centred(self) -> "Collider":
-        """Returns this collider with its frame at the centre of its shape, as float32 needs."""
+        """Returns this collider with its frame at the centre of its shape, for float32."""
         return self
 
     @property
@@ -171,7 +168,7 @@ class Collider:
         return _distances(self.solid, local.reshape(-1, 3), half, radius).reshape(local.shape[:-1])
 
     def is_near(self, points: np.ndarray, distance: float, frame: int = 0) -> bool:
-        """Returns whether one of points (n, 3) [m] is nearer than a distance [m], or inside, at a frame."""
+        """Returns whether one of points (n, 3) [m] is nearer than a distance [m], or inside."""
         return bool((self.distances(points, frame) < distance).any())
 
 
@@ -301,7 +298,6 @@ def _product(p, q):
 
 
 def turned(q, vectors):
-    """Returns vectors (…, 3) rotated by a quaternion."""
     t = 2.0 * np.cross(q[:3], vectors)
     return vectors + q[3] * t + np.cross(q[:3], t)
 
@@ -322,11 +318,7 @@ def default_stiffness(distance: float, weight: float, stiffness: float, size: fl
 
 
 def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:
-    """Returns colliders as a tuple.
-
-    Raises:
-        ValueError: They are not a list of colliders.
-    """
+    """Returns colliders as a tuple; refuses others."""
     if isinstance(given, Collider) or not isinstance(given, Iterable):
         raise ValueError(f"colliders is {shown(given)}; it must be a list of colliders, such as [Plane()]")
     colliders = tuple(given)
@@ -337,7 +329,7 @@ def checked_colliders(given: Iterable[Collider]) -> tuple[Collider, ...]:
 
 
 def refuse_inside(colliders: Sequence[Collider], positions: np.ndarray, free: np.ndarray, copy: str = "") -> None:
-    """Raises ValueError with the first free vertex of positions (n, 3) [m] in a collider, and a ``copy`` in words, or ""."""
+    """Raises ValueError with the first free vertex of positions (n, 3) [m] in a collider, and ``copy``, words or ""."""
     for collider in colliders:
         found = collider.distances(positions)
         for vertex in np.flatnonzero(free & ~(found > 0.0))[:1]:

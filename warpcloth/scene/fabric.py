@@ -71,7 +71,7 @@ class Fabric:
                 number(f"Fabric.{field.name}", value, above=None if field.name == "poisson_ratio" else 0.0)
 
     def membrane(self, **given: Any) -> "OrthotropicMembrane":
-        """The :class:`warpcloth.OrthotropicMembrane` of the fabric, with further fields such as ``warp_angle``.
+        """The :class:`warpcloth.OrthotropicMembrane` of the fabric, with further fields.
 
         Raises:
             ValueError: A number is None, or the moduli are not positive definite.
@@ -81,7 +81,7 @@ class Fabric:
         return energies.OrthotropicMembrane.from_moduli(warp, weft, shear, ratio, direction, **given)
 
     def bending(self, **given: Any) -> "PlateBending":
-        """The :class:`warpcloth.PlateBending` of the fabric, with further fields such as ``warp_angle``.
+        """The :class:`warpcloth.PlateBending` of the fabric, with further fields.
 
         D₁₂ is √(ν₁₂ν₂₁ D₁D₂), as of one material. D₆₆ is Gt t²/12, without thickness the default of the class.
 

@@ -40,9 +40,8 @@ def read_fabrics(path: FilePath) -> dict[str, Fabric]:
     """Reads fabrics from a file, by name.
 
     A .json file is a material of ARCSim: density [kg/m²], stretching [N/m], bending [N·m], named as the file. A .csv file has a
-    fabric in each row, with a column ``name`` and columns of KES-F or FAST, named as in docs/fabrics.md.
-
-    ``notes`` says what was derived and ignored.
+    fabric in each row, with a column ``name`` and columns of KES-F or FAST, named as in docs/fabrics.md. ``notes`` says what
+    was derived and ignored.
 
     Raises:
         OSError: The file cannot be read.

@@ -1,9 +1,7 @@
 """Counts the degrees of freedom that hard and stiff edges leave, by the rank of the Jacobian of their lengths.
 
-E edges of n vertices remove at most E of 3n degrees of freedom (Maxwell 1864, *On the calculation of the equilibrium and
-stiffness of frames*). A triangulated disc keeps 3 plus one for each boundary edge, 6 of them rigid motion. Closed surfaces are
-rigid (Gluck 1975, *Almost all simply connected closed surfaces are rigid*), and grids with both diagonals. The count holds in
-general position; flat or evenly curved cloth may have more.
+E edges of n vertices remove at most E of 3n degrees of freedom (Maxwell 1864). Closed surfaces are rigid in general position
+(Gluck 1975, *Almost all simply connected closed surfaces are rigid*); flat or evenly curved cloth may have more freedom.
 """
 
 from dataclasses import dataclass
@@ -32,7 +30,7 @@ class Freedom:
         rank: Rank of the Jacobian of the lengths.
         left: ``coordinates`` − ``rank``.
         rigid: Degrees of freedom of the pieces as rigid bodies on their pins.
-        counted: Whether ``rank`` is only bounded by the number of edges, as the mesh is too large.
+        counted: Whether ``rank`` is the bound by the number of edges, as the mesh is too large.
     """
 
     edges: int
@@ -52,9 +50,9 @@ class Freedom:
 def freedom(scene):
     """Counts the degrees of freedom that hard and stiff edges of a scene leave.
 
-    Springs hold their pairs, membranes the edges of triangles. A net about a fold of radius r = 4h strains by (h/r)²/24. An
-    edge is stiff if that costs more than bending and weight, K/2·((h/r)²/24)² > D/2r² + ρgL, with K = 2k/√3 for springs and Et
-    for membranes, D of all bending terms, and L the diagonal of the bounding box. Limits and rigid clusters are ignored.
+    Springs hold their pairs, membranes the edges of triangles. An edge is stiff if the strain (h/r)²/24 of a net about a fold
+    of radius r = 4h costs more than bending and weight, K/2·((h/r)²/24)² > D/2r² + ρgL, with K = 2k/√3 for springs and Et for
+    membranes, D of all bending terms, and L the diagonal of the bounding box. Limits and rigid clusters are ignored.
     """
     mesh = scene.mesh
     pairs, hard = _held(scene)

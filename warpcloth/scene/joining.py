@@ -1,4 +1,4 @@
-"""Several cloths in one scene: each keeps its own masses, terms, pins and loads."""
+"""Several cloths in one scene."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,9 +16,7 @@ _WHOLE = ("colliders", "contact", "self_contact", "air")
 
 
 def fields_of_cloths(cloths, whole):
-    """Returns the fields of a scene of several cloths, without pins; refuses fields that may not be set, and differing ones of
-    the whole.
-    """
+    """Returns the fields of a scene of several cloths, without pins; refuses fields that may not be set or that differ."""
     if not (isinstance(cloths, Mapping) and cloths and all(hasattr(cloth, "mesh") for cloth in cloths.values())):
         raise ValueError(f"cloths is {shown(cloths)}; it must be a mapping of names to scenes, with one cloth or more")
     allowed = (*_COMMON, *_WHOLE, "terms", "name", "thickness")
@@ -51,7 +49,7 @@ def fields_of_cloths(cloths, whole):
 
 
 def pins_of_cloths(cloths):
-    """Returns vertices of the joined mesh (p,), keyframes (F, p, 3) [m] or None, and axes."""
+    """Returns vertices (p,), keyframes (F, p, 3) [m] or None, and axes, on the joined mesh."""
     firsts = np.cumsum([0, *(len(cloth.mesh.points) for cloth in cloths)])
     vertices = np.concatenate([cloth.pins.vertices + first for cloth, first in zip(cloths, firsts[:-1], strict=True)])
     axes = ["".join(axis for axis, holds in zip("xyz", held, strict=True) if holds) for c in cloths for held in c.pins.held]

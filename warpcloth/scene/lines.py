@@ -1,4 +1,4 @@
-"""Finds the lines to draw for strings and bars."""
+"""Lines to draw for strings and bars."""
 
 import numpy as np
 

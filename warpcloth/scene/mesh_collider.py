@@ -135,14 +135,13 @@ class MeshCollider(Collider):
 
     @cached_property
     def _doubled(self):
-        """Whether triangles share a directed side, as coinciding fronts and backs do."""
         return bool((np.diff(self._directed_sides[0]) == 0).any())
 
     @cached_property
     def faces_inwards(self) -> bool:
         """Whether it is closed with its fronts inwards, so that all else is solid.
 
-        What a front and a back with other diagonals enclose is thin beside their sides, and does not count.
+        The thin volume between a front and a back with other diagonals does not count.
         """
         vertices = first_extended(self.frames)
         size, corners = np.ptp(vertices, axis=0).max(), vertices[self.triangles]
@@ -152,7 +151,6 @@ class MeshCollider(Collider):
 
     @cached_property
     def _uncovered(self):
-        """The triangles, less those that coincide with reversed ones."""
         at = self.welded.argmin(axis=1)[:, None]
         second, third = (np.take_along_axis(self.welded, (at + k) % 3, axis=1)[:, 0] for k in (1, 2))
         turns = np.where(second < third, 1, -1)

@@ -44,7 +44,7 @@ def mesh_scene(
 
 
 def warn_of_unit(path: FilePath, scene: Scene, metres: float, remedy: str) -> None:
-    """Warns if a cloth is above 20 m or 20 kg, with a likely unit; ``remedy`` sets the metres per unit."""
+    """Warns if a cloth is above 20 m or 20 kg, with a likely unit and the ``remedy``."""
     size, mass = float(np.ptp(scene.mesh.points, axis=0).max()), float(scene.vertex_masses.sum())
     if size <= _LARGE and mass <= _HEAVY:
         return

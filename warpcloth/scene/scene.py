@@ -1,4 +1,4 @@
-"""Scenes: data that any solver which supports the terms runs."""
+"""The scene, which any solver that supports its terms runs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, InitVar, dataclass, fields, replace
@@ -64,16 +64,16 @@ class Pins:
 
     @property
     def clamped(self) -> np.ndarray:
-        """Vertices that are held along every axis, (c,)."""
+        """Vertices held along every axis, (c,)."""
         return self.vertices[self.held.all(axis=1)]
 
     @property
     def moves(self) -> bool:
-        """Whether keyframes move pins of a scene along an axis that they hold."""
+        """Whether keyframes move pins along an axis that they hold."""
         return self.keyframes is not None and bool((self.keyframes != self.keyframes[:1])[:, self.held].any())
 
     def refuse_far(self, positions: np.ndarray, copy: str = "") -> None:
-        """Checks that pins start at their first keyframe, from ``positions`` (n, 3) [m] at the start.
+        """Checks that pins start at their first keyframe, from ``positions`` (n, 3) [m].
 
         Raises:
             ValueError: They do not; the message says by how far.
@@ -95,24 +95,24 @@ class Scene:
         mesh: The :class:`Mesh`; its points are the rest shape.
         density: Mass per area [kg/m²], lumped by thirds of triangles; for an edge mesh mass per length [kg/m], by halves of
             edges.
-        masses: Mass of each vertex, (n,) [kg], in place of ``density``; or None. :attr:`vertex_masses` has either.
+        masses: Mass of each vertex, (n,) [kg], in place of ``density``; or None.
         positions: Positions at the start, (n, 3) [m], by default at rest.
         velocities: Velocities at the start, (n, 3) [m/s], by default 0; those of pins are ignored.
         terms: The energies.
         pins: :class:`Pins`, or indices or a selection of fixed vertices.
         gravity: Acceleration (3,) [m/s²], by default 9.81 down the up axis of the mesh, or y.
-        duration: Duration [s], a whole number of frames.
+        duration: [s], a whole number of frames.
         fps: Frames per second.
         name: Name in reports and files.
         stage: The :class:`warpcloth.usd.StageMesh` of ``mesh``, over which animations are layers; or None.
-        free_axes: Axes along which each vertex may move, (n, 3) booleans, as for planes of symmetry and rails; by default all.
-            Without a free axis a vertex is a fixed pin. Values of pins are ignored.
+        free_axes: Axes along which each vertex may move, (n, 3) booleans; by default all. Without a free axis a vertex is a
+            fixed pin. Values of pins are ignored.
         loads: :class:`Force`, :class:`Traction`, :class:`Pressure`.
-        colliders: The colliders, such as :class:`warpcloth.Sphere`; pins do not collide.
+        colliders: Such as :class:`warpcloth.Sphere`; pins do not collide.
         contact: The :class:`warpcloth.Contact` with all colliders, by default at half of the thickness, or 1 mm without one,
             with a computed stiffness.
         self_contact: The :class:`warpcloth.SelfContact` of the cloth, or None; its stiffness is then computed.
-        air: The :class:`warpcloth.Air` with its wind, or None.
+        air: The :class:`warpcloth.Air`, or None.
         cloths: Names of the cloths that :meth:`join` joined, each a part of the mesh and a prim in files; else empty.
         fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, which sets ``density``, ``terms`` and ``thickness``.
         warp: Vector along the warp of ``fabric``, (3,) or (T, 3), projected to each triangle; by default along the texture
@@ -181,7 +181,7 @@ class Scene:
 
     @property
     def declared(self) -> tuple[object, ...]:
-        """Pins, terms, loads and colliders, which may do work on the cloth."""
+        """Pins, terms, loads and colliders."""
         return (self.pins, *self.terms, self.loads, *self.colliders, self.air)
 
     def __post_init__(self, fabric: Fabric | str | None, warp: ArrayLike | None) -> None:
@@ -306,7 +306,6 @@ class Scene:
         return replace(contact, stiffness=found)
 
     def _with_distance(self, contact, name, thicknesses):
-        """Returns contact with its own distance, that number of thicknesses, or `DISTANCE`."""
         if contact.distance is not None:
             return contact
         if _is_nan(self.thickness):
@@ -332,7 +331,7 @@ class Scene:
 
     @property
     def contact_terms(self) -> tuple[VertexContact, ...]:
-        """Terms of all colliders but meshes: contact of free vertices, and friction."""
+        """Contact of free vertices and friction, of all colliders but meshes."""
         if not self.colliders or self.contact is None or self.contact.stiffness is None:
             return ()
         areas, mass = self.touching_areas, self._areal_mass
@@ -364,7 +363,7 @@ class Scene:
 
     @property
     def air_terms(self) -> tuple[TriangleAir, ...]:
-        """The term of the air, if there is some that resists."""
+        """The term of the air, if any."""
         air = self.air
         if air is None or not air.density:
             return ()
@@ -374,12 +373,12 @@ class Scene:
 
     @property
     def rubbing(self) -> list[int]:
-        """Indices of the colliders that have friction."""
+        """Indices of colliders with friction."""
         return [c for c, collider in enumerate(self.colliders) if collider.friction]
 
     @property
     def meshes(self) -> list[int]:
-        """Indices of the colliders that are meshes."""
+        """Indices of mesh colliders."""
         return [c for c, collider in enumerate(self.colliders) if collider.is_mesh]
 
     @property
@@ -391,7 +390,7 @@ class Scene:
         """Checks that no free vertex is inside a collider at ``positions`` (n, 3) [m].
 
         Raises:
-            ValueError: One is; the message names it and the collider.
+            ValueError: One is.
         """
         free = np.ones(len(positions), dtype=bool)
         free[self.fixed] = False
@@ -444,7 +443,7 @@ class Scene:
 
     @property
     def frames(self) -> int:
-        """Number of frames, without frame 0, the start."""
+        """Number of frames after the start."""
         return round(self.duration * self.fps)
 
     @property
@@ -463,10 +462,8 @@ class Scene:
         order: ArrayLike | None = None,
         threads: int = 1,
     ) -> Model:
-        """Builds the :class:`warpcloth.model.model.Model` of this scene on a device.
-
-        The default of ``dtype`` is float32; :meth:`warpcloth.solvers.step.Step.precision_on` is that of
-        :func:`warpcloth.simulate`.
+        """Builds the :class:`warpcloth.model.model.Model` of this scene on a device; unlike :func:`warpcloth.simulate`, in
+        float32 by default.
         """
         return Model(self, device=device, dtype=dtype, copies=copies, vary=vary, order=order, threads=threads)
 
@@ -497,7 +494,6 @@ class Scene:
         return "\n".join(lines + [f"  {_described(each)}" for each in (*self.terms, *self.loads)])
 
     def _cuts(self):
-        """Yields lines about shapes that may cut into triangles between vertices."""
         edge = self.mesh.edge_lengths.max()
         if self.contact is None or not len(self.mesh.triangles):
             return
@@ -525,9 +521,7 @@ def _checked_axes(free_axes, n):
 
 
 def checked_pins(pins: Any, mesh: Mesh) -> Pins:
-    """Returns `Pins` with int32 indices of a mesh, from pins, indices or a selection; refuses repeated vertices, wrong
-    keyframes and axes.
-    """
+    """Returns `Pins` with int32 indices of a mesh; refuses repeated vertices, wrong keyframes and axes."""
     pins = pins if isinstance(pins, Pins) else Pins([] if pins is None else pins)
     vertices = distinct_vertices("pins.vertices", pins.vertices, mesh)
     keyframes = pins.keyframes

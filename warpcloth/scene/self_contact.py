@@ -13,18 +13,17 @@ HELD = ("fail", "allow")
 class SelfContact:
     """Contact of cloth with itself and with other pieces of cloth, with the φ of :class:`warpcloth.Contact`.
 
-    The energy is a function of the positions alone, U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)), over
-    vertices v and faces, edges and vertices F near v, and over pairs of edges e and f, see
-    :mod:`warpcloth.kernels.contact.pair_potential`. :class:`warpcloth.Explicit` leaves out the second sum. Elements with a
-    common vertex, or of one piece and nearer than 2r at rest, have no energy. A filter at the end of each step shortens moves
-    that would cross, so cloth never passes through cloth. A start in which cloth crosses cloth is refused. Pieces that touch at
-    the start are moved apart along normals, by at most r.
+    The energy is U = Σᵥ ½ k aᵥ Σ_F m φ(d(v, F)) + Σ k (π/2) bₑ b_f φ(4 D(e, f)), over vertices v and faces, edges and vertices
+    F near v, and over pairs of edges e and f (:mod:`warpcloth.kernels.contact.pair_potential`). :class:`warpcloth.Explicit`
+    leaves out the second sum. Elements with a common vertex, or of one piece and nearer than 2r at rest, have no energy. A
+    filter at the end of each step shortens moves that would cross, so cloth never passes through cloth. A start in which cloth
+    crosses cloth is refused. Pieces that touch at the start are moved apart along normals, by at most r.
 
     Attributes:
         distance: Contact distance r [m]; by default the thickness of the scene, or 1 mm without one.
         stiffness: k [Pa/m], by default that of :class:`warpcloth.Contact`.
         friction: Coefficient μ of friction.
-        held_pins: If cloth holds pins back from their keyframes, the run is not usable with ``"fail"``, and may be with
+        held_pins: Whether a run in which cloth holds pins back from their keyframes is unusable, ``"fail"``, or may be usable,
             ``"allow"``.
 
     Raises:

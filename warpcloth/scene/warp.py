@@ -1,4 +1,4 @@
-"""The warp of a fabric on a mesh: along the texture coordinate s, else along an axis."""
+"""The warp of a fabric on a mesh."""
 
 import warnings
 
