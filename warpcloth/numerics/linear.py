@@ -23,9 +23,9 @@ AT_ONCE = 4
 class ConjugateGradients:
     """Solves A x = b for each copy by conjugate gradients from x = 0, on the device; it may be captured.
 
-    The preconditioner P is the inverse diagonal blocks, a cycle of ``multigrid``, or for each copy what a ``choice`` says. A copy
-    ends when √(rᵀPr) has fallen to its tolerance times the first value, or at a direction of negative curvature. In that case x
-    is a descent direction of ½xᵀAx − bᵀx, and ``negative`` is 1 (Steihaug 1983).
+    The preconditioner P is the inverse diagonal blocks, a cycle of ``multigrid``, or for each copy what a ``choice`` says. A
+    copy ends when √(rᵀPr) has fallen to its tolerance times the first value, or at a direction of negative curvature. In that
+    case x is a descent direction of ½xᵀAx − bᵀx, and ``negative`` is 1 (Steihaug 1983).
 
     Args:
         matrix: A, such as a :class:`warpcloth.core.hessian.Hessian`. Its ``block_rows`` is None if it has none.
@@ -221,7 +221,7 @@ class Factorised:
         return self._mirrors[array.ptr]
 
     def _factor(self, copy, values, coupling, shift=0.0, unresolved=0.0):
-        """Returns the factors of a copy's matrix plus ``shift`` times its largest diagonal entry and ``unresolved`` [N/m]; or None."""
+        """Returns factors of a copy's matrix + ``shift`` times its largest diagonal entry + ``unresolved`` [N/m]; or None."""
         from scipy.sparse import identity
 
         columns = self._columns(copy, values, coupling)

@@ -159,9 +159,9 @@ class Minimiser:
     def minimise(self, tolerance, iterations, scale):
         """Iterates until every copy has converged, or rounding allows no further progress.
 
-        A copy has converged if max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a, a = ``scale`` (B,) [m/s²], above 0. Rounding allows no progress if
-        ‖∇φ‖ is within four times its rounding, and an iteration lowered φ by no more than rounding. The norm alone would not do,
-        because the noise of stiff directions may hide the error of soft ones.
+        A copy has converged if max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a, a = ``scale`` (B,) [m/s²], above 0. Rounding allows no progress
+        if ‖∇φ‖ is within four times its rounding, and an iteration lowered φ by no more than rounding. The norm alone would not
+        do, because the noise of stiff directions may hide the error of soft ones.
 
         If the linear solver runs on the device, so does the loop: the host waits once in ``AT_ONCE`` iterations.
 
@@ -198,8 +198,8 @@ class Minimiser:
     def curves_down(self, tolerance):
         """Returns whether the raw Hessian at d = 0 of a copy has a negative eigenvalue that ``tolerance`` does not explain.
 
-        An equilibrium may have an unbalanced force of ``tolerance`` times the scale and the mass of the cloth. In an edge it can lower
-        an eigenvalue by the force over the edge length [N/m].
+        An equilibrium may have an unbalanced force of ``tolerance`` times the scale and the mass of the cloth. In an edge it
+        can lower an eigenvalue by the force over the edge length [N/m].
         """
         self._assemble_raw()
         unresolved = tolerance * float((self.scale * self.model.mass.numpy().reshape(self.model.copies, -1).sum(axis=1)).max())
@@ -257,8 +257,8 @@ class Minimiser:
     def _launch_apart(self):
         """Launches the start from the start of the step or from the last d, as far as pairs stay apart.
 
-        Cloth at rest is almost in balance at the start of the step, while contact would push it back from x̃, h²g below. Cloth that
-        slides is so at the last d.
+        Cloth at rest is almost in balance at the start of the step, while contact would push it back from x̃, h²g below. Cloth
+        that slides is so at the last d.
         """
         for goal, stays in (self.filter.back, 1), (self.right, 0):
             self.filter.launch_aim(goal, self.correction, self.search.direction)
@@ -346,8 +346,8 @@ class Minimiser:
     def _launch_mean(self, direction):
         """Launches p −= Σ m(d + p)/Σ m for a direction p of steps of free cloth.
 
-        Only inertia changes with a move of the whole cloth, so that Σ∇φ = s Σ m d, and Σ m d = 0 at the minimum: the momentum of the
-        cloth. A conjugate gradient solve leaves an error of it. Without it φ at d + p is lower.
+        Only inertia changes with a move of the whole cloth, so that Σ∇φ = s Σ m d, and Σ m d = 0 at the minimum: the momentum
+        of the cloth. A conjugate gradient solve leaves an error of it. Without it φ at d + p is lower.
         """
         inertia, search, lanes = self.search.inertia, self.search, self.search.lanes
         if self._inverse_total is None or inertia.s == 0.0 or inertia.load != 0.0:
