@@ -539,16 +539,18 @@ def copies_with_pairs(
 @wp.kernel(module="warpcloth.self_contact", enable_backward=False)
 def divide_copies(
     # state in
-    far: wp.array(dtype=wp.int32),
-    # in and out
-    walk: wp.array(dtype=wp.int32),
+    fraction: wp.array(dtype=wp.float64),
     # out
+    walk: wp.array(dtype=wp.int32),
     stand: wp.array(dtype=wp.int32),
+    some: wp.array(dtype=wp.int32),
 ):
-    """Kernel over copies: ``walk`` becomes 1 where ``far`` is; ``stand`` is 1 in the others."""
+    """Kernel over copies: ``walk`` is 1 where a part of the way is left, ``stand`` elsewhere; ``some`` is 1 if one walks."""
     c = wp.tid()
-    walk[c] = wp.max(walk[c], far[c])
+    walk[c] = wp.where(fraction[c] < ONE, 1, 0)
     stand[c] = 1 - walk[c]
+    if walk[c] != 0:
+        some[0] = 1
 
 
 @cache

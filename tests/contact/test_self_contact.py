@@ -567,13 +567,28 @@ def test_lists_are_kept(count, device):
     assert (pairs.proximity.stencils.numpy()[:number] == listed[:number]).all()
 
 
-def test_a_list_serves_for_two_rounds(device):
-    """Of sheets that move apart by five rounds, whose first uses the list of the start; they end where they should."""
+def test_a_way_on_which_all_stay_apart_needs_no_list(device):
     pairs = pairs_of(layers(gap=6e-3), device, dtype="float32")
     model, lists = pairs.model, pairs.lists.numpy()[0]
-    start, way = model.positions.numpy(), np.array([0.36, 0.48, 0.8])
-    away = 4.5 * ROUND * pairs.skin * np.sign(start[:, 1:2] - start[:, 1].mean()) * way
-    x = model.array(start + away, model.vec3)
+    start = model.positions.numpy()
+    x = model.array(start + 9.0 * pairs.skin * np.sign(start[:, 1:2] - start[:, 1].mean()) * [0.36, 0.48, 0.8], model.vec3)
+    target = x.numpy().copy()
+    pairs.filter.launch_end(x, model.vectors())
+    np.testing.assert_array_equal(x.numpy(), target)
+    assert pairs.lists.numpy()[0] == lists
+
+
+def test_a_list_serves_for_two_rounds(device):
+    """Of sheets that slide by five rounds, whose first uses the list of the start; they end where they should.
+
+    They come nearer than pairs may in one round.
+    """
+    gap = 6e-3
+    pairs = pairs_of(layers(gap=gap), device, dtype="float32")
+    model, lists = pairs.model, pairs.lists.numpy()[0]
+    start = model.positions.numpy()
+    side = np.sign(start[:, 1:2] - start[:, 1].mean())
+    x = model.array(start + side * (4.5 * ROUND * pairs.skin * np.array([0.6, 0.0, 0.8]) - [0.0, 0.475 * gap, 0.0]), model.vec3)
     target = x.numpy().copy()
     pairs.filter.launch_end(x, model.vectors())
     np.testing.assert_array_equal(x.numpy(), target)

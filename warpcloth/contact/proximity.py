@@ -227,10 +227,18 @@ class Proximity:
     def launch_along(self, x, p, searches, out):
         """Launches ``searches`` of pairs whose boxes meet while vertices move from x (V,) by p [m], (V,) or (N,).
 
-        Pairs of the cloth are left out whose sides move by at most ``alike`` [m] relative to one another.
+        Call :meth:`launch_apart` before. Pairs of the cloth may be left out whose sides move by at most ``alike`` [m] relative
+        to one another.
+        """
+        self._launch_grid(self._along, x, p, searches, out)
+
+    def launch_apart(self, x, p, far):
+        """Sets ``far`` (1,) to 0 if pairs that are not listed stay apart while vertices move from x (V,) by p [m], else to 1.
+
+        They do if all cloth that may come near moves by at most ``alike`` [m] relative to one another, from ``found`` on. If
+        cloth does not meet itself, ``far`` does not change.
         """
         if not self.surface.meets_itself:
-            self._launch_grid(self._along, x, p, searches, out)
             return
         motion, model = self._motion, self.model
         for array, start in ((motion.lowest, np.inf), (motion.highest, -np.inf)):
@@ -243,7 +251,7 @@ class Proximity:
         self._launch(local_motion.bound_moves, self._vertices, [x], [motion])
         given = [self._along, x, self._grid.size, self._triangles]
         self._launch(proximity_grid.note_large, self._edges, given, [motion])
-        wp.capture_if(motion.some, lambda: self._launch_grid(self._along, x, p, searches, out))
+        wp.copy(far, motion.some)
 
     def _launch_grid(self, surface, x, p, searches, out):
         grid, items, model = self._grid, self._triangles + self._edges, self.model

@@ -56,8 +56,8 @@ class SelfFilter:
             self._within, self._turns = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
             self._pushed = model.vectors()
             self._make(self_filter.find_held, self_filter.push_pairs)
+        self._prepare_advance()
         if contact.surface.moves:
-            self._prepare_advance()
             self._prepare_carrying()
         self._count = model.kernel(count_step)
 
@@ -82,8 +82,10 @@ class SelfFilter:
             wp.copy(self._forced_before, self._contact.first_forced)
         self._launch_meshes(self._contact.placed[2], lists=True)
         self._put(self._other, x)
-        walk = partial(self._launch_end, x, v, move, parts)
-        self._contact.launch_near(self._other, walk, walk)
+        self._add(self._other, self._contact.x_before, -1.0, self._direction)
+        self._proceed.zero_()
+        self._launch_fraction(self._direction, self._other, self._launch_divide)
+        wp.capture_if(self._proceed, partial(self._launch_end, x, v, move, parts))
         if self._lets_out:
             self._colliders.launch_inside(x, self._from)
         model.launch(self._count, model.copies, [], [self._contact.steps])
@@ -94,7 +96,7 @@ class SelfFilter:
     def _launch_end(self, x, v, move, parts):
         model, start = self.model, self._contact.x_before
         wp.copy(self._target, x)
-        self._launch_divide(start)
+        self._add(self._target, None, 1.0, start, self._stands)
         wp.copy(self._walking, self._near)
         self._launch_rounds(start)
         if self._cut_before is not None:
@@ -107,6 +109,10 @@ class SelfFilter:
         wp.copy(x, start, count=model.count)
         given = [model.inverse_mass, model.mobility, self._target, x, self._contact.h, self._contact.h / parts]
         self._launch(self_filter.end_filter, model.count, given, [v, move, self._contact.cut, self._contact.held])
+
+    def _launch_divide(self):
+        out = [self._near, self._stands, self._proceed]
+        self.model.launch(self_filter.divide_copies, self.model.copies, [self.fraction], out)
 
     def _launch_from_start(self, x):
         self._walking.zero_()
@@ -128,13 +134,6 @@ class SelfFilter:
             self._launch_meshes(self._contact.placed[2], lists=True, active=self._again)
             wp.copy(self._walking, self._again)
         self._launch_rounds(x)
-
-    def _launch_divide(self, start):
-        model, contact = self.model, self._contact
-        self._near.zero_()
-        model.launch(self_filter.copies_with_pairs, len(contact.pairs.stencils), [contact.pairs], [self._near])
-        model.launch(self_filter.divide_copies, model.copies, [contact.proximity.copies], [self._near, self._stands])
-        self._add(self._target, None, 1.0, start, self._stands)
 
     def launch_hold(self, x, v, hard):
         """Shortens moves of pins to x that other pins are in the way of; corrects v. ``hard`` pairs are constraints."""
@@ -229,6 +228,7 @@ class SelfFilter:
 
     def _prepare_advance(self):
         model = self.model
+        self._direction = model.vectors()
         self._make(self_filter.scale_directions, advance_listed)
         self._advances, self._advance = self._contact.proximity.searches(take_advance, "advance"), advances(model.dtype)()
         self.fraction = self._advance.fraction = model.scalars()
@@ -325,8 +325,7 @@ class SelfFilter:
         self._touching = () if self._colliders is None else self._colliders.solid
         model = self.model
         self._contact.contact.least = self._contact.least
-        self._prepare_advance()
-        self._direction, self.back = model.vectors(), model.vectors()
+        self.back = model.vectors()
         if self._lets_out:
             if self._moves is None:
                 self._prepare_carrying()
@@ -447,22 +446,28 @@ class SelfFilter:
 
         All vertices of a copy move by the same fraction; with ``whole`` it is 0 if not 1.
         """
-        contact, proximity, target = self._contact, self._contact.proximity, self._other
+        given = [self.fraction, self._surface.layout, whole]
+        scale = partial(self._launch, self_filter.scale_directions, len(direction), given, [direction])
+        self._add(self._contact.x_before, direction, 1.0, self._other)
+        self._launch_fraction(direction, self._other, scale)
+
+    def _launch_fraction(self, direction, end, then):
+        """Finds the ``fraction`` of the ``direction`` to ``end`` along which pairs stay apart; calls ``then`` unless all do."""
+        contact, advance = self._contact, self._advance
 
         def far():
-            proximity.launch_along(contact.x_before, direction, self._advances, self._advance)
+            contact.proximity.launch_along(contact.x_before, direction, self._advances, advance)
             listed()
 
         def listed():
             given = [contact.pairs, contact.begun.gap, contact.begun_at, contact.x_before]
-            self._launch(advance_listed, len(contact.pairs.stencils), given, [self._advance])
-            given = [self.fraction, self._surface.layout, whole]
-            self._launch(self_filter.scale_directions, len(direction), given, [direction])
+            self._launch(advance_listed, len(contact.pairs.stencils), given, [advance])
+            then()
 
         self.fraction.fill_(1.0)
-        self._advance.direction = direction
-        self._add(contact.x_before, direction, 1.0, target)
-        contact.launch_near(target, listed, far)
+        advance.direction = direction
+        contact.launch_far(end, direction)
+        wp.capture_if(contact.far, far, lambda: wp.capture_if(contact.listed, listed))
 
     def launch_look(self, base, ends):
         """Sets ``near`` to 0 if no pair is listed, and none can be missing at base + d for d of ``ends``, else to 1.

@@ -19,6 +19,7 @@ from ..kernels.contact.piece_motion import add_positions
 from ..kernels.contact.self_filter import HeldPins, copies_with_pairs
 from ..kernels.pairs import Pairs
 from ..kernels.terms.contact import FLOOR
+from ..mesh.mesh import areas_of
 from .collider_steps import cut_share
 from .pair_contact import PairContact
 from .proximity import Proximity
@@ -27,11 +28,26 @@ from .self_friction import SelfFriction, Slips
 from .self_start import check_reset, check_start
 from .surface import ContactSurface
 
-# The skin, over the longest edge of the rest shape. All pairs nearer than the contact distance plus the skin are listed. It
-# must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one of them. It must
-# be below 0.5, the height of a right-angled triangle with a longest side of 1, so that a flat grid has no pairs.
+# The skin, over the longest edge of the rest shape. All pairs nearer than the contact distance plus the skin are listed. At the
+# start of a run it must exceed 0.29: an edge that passes through a triangle with sides of at most 1 is nearer than this to one
+# of them.
 SKIN = 0.35
+FLAT = 0.9  # lists have no neighbours in cloth that is flat until it is shorter than this, over its rest length
 THICK = 0.5  # the smallest skin, over the contact distance; see ``kept`` of :class:`.proximity.Proximity`
+
+
+def skin_of(mesh, distance, largest):
+    """Returns the skin [m] for a contact distance of cloth with itself, and the largest one with anything [m].
+
+    Elements at the height H of a triangle from one another are listed if they are nearer than min(r, H/2) and the skin.
+    """
+    skin = SKIN * mesh.edge_lengths.max()
+    if len(mesh.triangles):
+        corners = mesh.points[mesh.triangles]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        height = np.median(2.0 * areas_of(mesh.points, mesh.triangles) / sides)
+        skin = min(skin, FLAT * height - min(distance, 0.5 * height))
+    return float(max(skin, THICK * largest))
 
 
 class FirstGap(NamedTuple):
@@ -72,6 +88,7 @@ class SelfSteps:
         near: The result of :meth:`.SelfFilter.launch_look`, a mirror of (1,) int32.
         lists, most_listed: The number of lists so far, and the largest number of pairs in one, (B,) int32.
         listed, with_pairs: 1 if the last list has pairs, (1,) int32; and for each copy at the start of the step, (B,).
+        far: 1 if unlisted pairs may meet on the way of the last :meth:`launch_far`, (1,) int32.
         stale: Whether lists have grown outside of steps, so that graphs must be recorded again.
     """
 
@@ -86,7 +103,7 @@ class SelfSteps:
         self.distance, self.max_distance = min(filter(None, distances)), max(distances)
         self.least, self.per_frame = FLOOR * self.distance, steps_per_frame
         self._laws = filled(Laws, distance=wp.vec2d(*distances), stiffness=wp.vec2d(*stiffnesses), width=surface.width)
-        self.skin = max(SKIN * float(scene.mesh.edge_lengths.max()), THICK * self.max_distance)
+        self.skin = skin_of(scene.mesh, distances[0], self.max_distance)
         self.proximity = Proximity(surface, distances[0], self.skin, distances[1])
         self.x_before, self.begun_at = surface.vectors(), surface.vectors()
         self.cut = state.add("vertices kept apart", model.scalars(wp.int64), Count(sums=True))
@@ -308,11 +325,11 @@ class SelfSteps:
             self.contact.launch_rows(x)
             self.friction.launch_begin(self.contact.pairs, self.contact.data, x)
 
-    def launch_near(self, x, listed, others):
-        """Calls ``others`` if unlisted pairs may meet on the way to x (V,), else ``listed`` if any is listed."""
+    def launch_far(self, end, p):
+        """Sets ``far`` to 0 if unlisted pairs stay apart on the way from ``x_before`` by p (N,) to ``end`` (V,)."""
         self.far.zero_()
-        self.proximity.launch_moved_since(x, 0.5, None, self.far)
-        wp.capture_if(self.far, others, lambda: wp.capture_if(self.listed, listed))
+        self.proximity.launch_moved_since(end, 0.5, None, self.far)
+        wp.capture_if(self.far, self.proximity.launch_apart, x=self.x_before, p=p, far=self.far)
 
     # Obstacles.
 

@@ -12,7 +12,7 @@ Vertices can move along the line of flight only. Otherwise sheets could tip and 
 import numpy as np
 
 from ..base.turns import in_turn
-from ..contact.self_steps import SKIN
+from ..contact.self_steps import skin_of
 from ..kernels.terms.contact import FLOOR
 from ..mesh.mesh import Mesh
 from ..scene.scene import Scene
@@ -28,7 +28,7 @@ SIDE = 0.1  # of the sheets [m]
 # Rotation of one sheet relative to the other [°]: without the filter, all vertices are in contact at once, as in the theory;
 # with it, they are in general position.
 TURN = {"without": 0.0, "filter": 5.0}
-LISTED = DISTANCE + SKIN * 0.5 * SIDE * np.sqrt(2.0)  # from which pairs are listed [m]
+LISTED = DISTANCE + skin_of(Mesh.grid(3, 3, size=SIDE), DISTANCE, DISTANCE)  # from which pairs are listed [m]
 STEPS = np.geomspace(5e-4, 1.0 / 24.0, 7)  # [s]
 SPEEDS = np.geomspace(0.1, 100.0, 10)  # [m/s]
 PHASES = np.arange(4) / 4.0  # of a step, by which sheets start farther apart

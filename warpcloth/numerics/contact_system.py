@@ -26,14 +26,14 @@ class CorrectedSystem(ConjugateGradients):
     """Solves (A + D) w = b, D the semi-definite matrix of contact, by conjugate gradients with A⁻¹ as preconditioner.
 
     A p follows from the residuals, so that an iteration costs a solve with A and a product with D. All of it is one segment if
-    solves with A may be captured; else there are segments between them.
+    solves with A may be captured.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        x, d: x̃ and the correction (N,) [m], at which D is found; the caller's arrays, read only.
+        x, d: x̃ and the correction (N,) [m], at which D is found; read only.
         linear: Solves with A, ``solve(b, x)``, and says whether that is ``capturable``.
-        b, w: The right-hand side (N,) [N], and A⁻¹ b (N,) [m], which is replaced; the caller's arrays.
-        wanted: Which copies to solve for, (B,) int32; the caller's array.
+        b, w: The right-hand side (N,) [N], and A⁻¹ b (N,) [m], which is replaced.
+        wanted: Which copies to solve for, (B,) int32.
 
     Attributes:
         matrix: D, a :class:`warpcloth.core.hessian.Hessian`.
@@ -59,7 +59,7 @@ class CorrectedSystem(ConjugateGradients):
         return Segment(self.model.device, launch) if whole == self._linear.capturable else launch
 
     def _launch_all(self):
-        """Launches w = (A + D)⁻¹ b, given w = A⁻¹ b."""
+        """w = (A + D)⁻¹ b, given w = A⁻¹ b."""
         self._begin()
         wp.capture_while(self._solves.proceed, self._launch_next)
 
@@ -90,16 +90,15 @@ class CorrectedSystem(ConjugateGradients):
         self._launch(kernels.advance, self._dim, given, [solves, self._w, self.r, self.z, self._parts])
 
     def _add(self, step, change, out):
-        """Launches ``out`` += step·``change``, with the step of the copy (B,)."""
+        """``out`` += step·``change``, with the step of the copy (B,)."""
         self._launch_on(add_step, self.model.count, [step, change, self.model.per_copy], [out])
 
     def _launch_back(self, direction):
-        """Launches ``direction`` = −w."""
         direction.zero_()
         self._add(self._minus, self._w, direction)
 
     def _launch_step(self, step, direction, active):
-        """Launches w = −step·``direction`` in copies that are ``active`` (B,); the step of others is 0."""
+        """w = −step·``direction`` in copies that are ``active`` (B,); the step of others is 0."""
         self._launch_on(plain_step, self.model.count, [self._w, self._w, active, self.model.per_copy], [self._w])
         self._launch_on(negate, self.model.copies, [step], [self._back])
         self._add(self._back, direction, self._w)
@@ -110,13 +109,11 @@ class ContactSystem(CorrectedSystem):
 
     The curvature of contact has no bound, so no constant matrix is an upper bound of the Hessian. A copy where φ rose is
     ``careful`` in the next 4 iterations, after a second rise in 16, and so on: w is then also shortened until φ falls. With
-    self-contact all solves are accurate, because a rough w runs into pairs, which then stop the whole copy. In other copies the
-    blocks of vertices near colliders are those of :func:`warpcloth.kernels.contact.clear_elements.add_hessian`.
-    Without :meth:`start`, all copies always are careful.
+    self-contact all solves are accurate, because a rough w runs into pairs, which then stop the whole copy. Without
+    :meth:`start`, all copies always are careful.
 
     Args:
         given: The arguments of :class:`CorrectedSystem`, with b = ∇φ.
-        sums: :class:`warpcloth.core.sums.Sums`.
         s: Weight of the inertia [1/s²].
         pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, or None.
 
@@ -150,7 +147,6 @@ class ContactSystem(CorrectedSystem):
         self.matrix.assemble(self.x, 0.0, self._d, self._launch_touching)
 
     def _launch_touching(self, values):
-        """Adds the blocks of vertices near colliders."""
         for elements, kernel in self._touching:
             given = [*elements.arguments, elements.clear, self._diagonal, self.x, self._d, self._b]
             given += [self._inertia, self._marks.array, self.model.per_copy]
@@ -190,10 +186,6 @@ class ContactSystem(CorrectedSystem):
 
 class PairSystem(CorrectedSystem):
     """Lowers ψ(d) = ½(d − c)ᵀA(d − c) + U(d), U the energy of dynamic elements, by Newton's method with a line search.
-
-    Args:
-        given: The arguments of :class:`CorrectedSystem`, with b = ∇ψ.
-        sums, pairs: See :class:`ContactSystem`.
 
     Attributes:
         correct: Function that replaces w = A⁻¹ ∇ψ by t (A + D)⁻¹ ∇ψ at d, 0 < t ≤ 1. Away from other cloth U is 0, and w stays.
@@ -238,7 +230,6 @@ class PairSystem(CorrectedSystem):
         self.matrix.assemble_after_gradient(self.x, 0.0, self._d)
 
     def _launch_trial(self):
-        """Launches U and ∂U/∂x at the trial d + step·p."""
         given = [self._d, self._direction, self.model.per_copy]
         self._launch_on(set_trial, self.model.count, given, [self._state, self._trial, self._pull])
         self._pairs.filter.launch_trial(self.x, self._trial)

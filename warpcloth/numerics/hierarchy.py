@@ -1,10 +1,9 @@
 """A hierarchy of coarser levels of a cloth, whose constraints span many vertices (Müller 2008).
 
-A bound is a pair of vertices with a largest distance, see ``max_lengths`` of :class:`warpcloth.kernels.term.Term`. A level
-keeps an independent set of vertices of the finer level, so that every dropped vertex is linked to a kept one; all pins are
-kept. A bound between kept vertices is the length of a path at rest: that over up to two dropped ones, or a shorter, straight
-one over triangles that keep their shape. So a cloth that meets all finer bounds meets it too, on any mesh and in any shape.
-Paths over edges alone are longer on irregular meshes, by 4 to 14 % on each level, more than the strain that is left.
+A bound is a pair of vertices with a largest distance. A level keeps an independent set of vertices of the finer level, so that
+every dropped vertex is linked to a kept one; all pins are kept. A bound between kept vertices is the length of a path at rest:
+over up to two dropped ones, or a shorter, straight one over triangles that keep their shape. So a cloth that meets all finer
+bounds meets it too. Paths over edges alone are 4 to 14 % longer on each level of irregular meshes.
 """
 
 from dataclasses import dataclass, replace
@@ -57,8 +56,8 @@ class Level:
 
     Attributes:
         bounds: The :class:`Bounds` between kept vertices, a tuple (soft, hard).
-        inverse_mass: (B, n) [1/kg]. The mass of a kept vertex includes its weights of the dropped ones that follow it, so that
-            a move of the level has the momentum of the move of all of them. 0 for pins.
+        inverse_mass: (B, n) [1/kg], 0 for pins. The mass of a kept vertex includes its weights of the dropped ones that follow
+            it, so that a move of the level has the momentum of the move of all of them.
         dropped: The vertices (D,) of the finer level that this one drops.
         offsets, parents, weights: For each dropped vertex, the kept vertices that it follows, and weights with sum 1, as CSR.
     """
@@ -72,15 +71,7 @@ class Level:
 
 
 def levels(model, most=None):
-    """Returns the levels above the finest, finer ones first: as many as have bounds, or ``most`` of them.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        most: Number of levels, or None.
-
-    Returns:
-        A list of :class:`Level`, empty without bounds on vertices that move.
-    """
+    """Returns a list of :class:`Level` above the finest, finer ones first: as many as have bounds, or ``most`` of them."""
     n, inverse = model.per_copy, model.inverse_mass.numpy().reshape(model.copies, -1).astype(np.float64)
     free = inverse[0] > 0.0
     mass = np.where(free, model.mass.numpy().reshape(inverse.shape), 0.0).astype(np.float64)
@@ -107,8 +98,10 @@ def levels(model, most=None):
 
 
 def _finest(model, free):
-    """Returns the bounds of a model's terms, (soft, hard), apart because a hard bound must not merge with a soft one; and the
-    :class:`warpcloth.numerics.unfolding.UnfoldedSurface` of each, or None."""
+    """Returns the bounds of a model's terms, (soft, hard), and the :class:`.unfolding.UnfoldedSurface` of each, or None.
+
+    They are apart because a hard bound must not merge with a soft one.
+    """
     n, soft, hard = model.per_copy, [], []
     points, sheets = model.rest_points, ([], [])
     for elements in model.terms:
@@ -279,7 +272,7 @@ def _spread(first, count):
 def _coarser(bounds, kept, free, surface):
     """Returns bounds between kept vertices: direct, over one dropped vertex, and over two by the nearest kept ones of each.
 
-    Those with a shorter, straight path over the ``surface``, if not None, have its length.
+    Those with a shorter, straight path over the ``surface`` have its length.
     """
     n = len(kept)
     inside = kept[bounds.pairs]
@@ -339,7 +332,7 @@ def _scaled(coarse, fine, free):
 
 
 def on_device(model, level):
-    """Returns the model of a level: the same vertices and kernels, with the masses and the bounds of the level."""
+    """Returns the model of a level: the same vertices and kernels, with its masses and bounds."""
     bounds = _joined(level.bounds, model.copies)
     E, B = len(bounds), model.copies
     with np.errstate(divide="ignore"):

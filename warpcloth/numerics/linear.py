@@ -21,23 +21,19 @@ AT_ONCE = 4
 
 
 class ConjugateGradients:
-    """Solves A x = b for each copy by conjugate gradients.
+    """Solves A x = b for each copy by conjugate gradients from x = 0, on the device; it may be captured.
 
-    The preconditioner P is the inverse diagonal blocks, a cycle of ``multigrid``, or for each copy what a ``choice`` says.
-    It runs on the device from x = 0 and may be captured. A copy ends when √(rᵀPr) has fallen to its tolerance times the first
-    value, or at a direction of negative curvature. In that case x is still a descent direction of ½xᵀAx − bᵀx, and ``negative``
-    is 1 (Steihaug 1983).
+    The preconditioner P is the inverse diagonal blocks, a cycle of ``multigrid``, or for each copy what a ``choice`` says. A
+    copy ends when √(rᵀPr) has fallen to its tolerance times the first value, or at a direction of negative curvature. In that
+    case x is a descent direction of ½xᵀAx − bᵀx, and ``negative`` is 1 (Steihaug 1983).
 
     Args:
-        matrix: A, an object with ``count``, ``per_copy``, ``vector``, ``block``, ``prepare``, ``multiply`` and
-            ``invert_diagonal``, such as :class:`warpcloth.core.hessian.Hessian`. ``block_rows`` is None if it has none.
+        matrix: A, such as a :class:`warpcloth.core.hessian.Hessian`. Its ``block_rows`` is None if it has none.
         iterations: Maximum number of iterations of one solve.
-        multigrid: A :class:`warpcloth.numerics.multigrid.Multigrid` of the matrix, or None.
-        choice: A :class:`warpcloth.numerics.preconditioner_choice.PreconditionerChoice`, or None.
 
     Attributes:
         iteration: Number of iterations of the last solve, (B,) int32.
-        outdated: Copies of which the next solve with coarse matrices computes them again, (B,) int32; None without a choice.
+        outdated: Copies of which the next solve computes coarse matrices again, (B,) int32; None without a choice.
     """
 
     capturable = True
@@ -91,7 +87,7 @@ class ConjugateGradients:
             self.multigrid.update()
 
     def solve(self, b, x, wanted):
-        """Solves for x = A⁻¹ b to the relative ``tolerance`` (B,), for the copies that are ``wanted`` (B,); others keep x."""
+        """Solves to the relative ``tolerance`` (B,) for the copies that are ``wanted`` (B,); others keep x."""
         choice = self.choice
         if choice is None:
             self.update()
@@ -130,7 +126,7 @@ class ConjugateGradients:
         self._launch(linear.start_solves, self._dim, given, [x, self.r, self.z, self.p, self._parts, self._solves])
 
     def _refine(self, active):
-        """Launches z = P r by multigrid and the parts of rᵀz, after the sweep in which z = S r."""
+        """z = P r by multigrid and the parts of rᵀz, after the sweep in which z = S r."""
         self.multigrid.refine(self.r, self.z, active)
         self._launch_dot(self.r, self.z, active, self._parts)
 
@@ -145,7 +141,7 @@ class ConjugateGradients:
                 self._refine(self.active)
 
     def _launch_product(self, before, p):
-        """Launches p = z + ratio·``before``, q = A p and the parts of pᵀq; ``before`` may be p."""
+        """p = z + ratio·``before``, q = A p and the parts of pᵀq; ``before`` may be p."""
         matrix = self.matrix
         if self._turn_and_multiply is not None:
             given = [matrix.block_rows(), self.z, before, self._parts, matrix.per_copy, self._row_threads]
@@ -159,18 +155,14 @@ class ConjugateGradients:
         self._launch_dot(p, self.q, self._solves.next_active, self._pq_parts)
 
     def _launch_dot(self, a, b, active, parts):
-        """Launches the parts of aᵀb in the copies that are ``active`` (B,)."""
         self._launch(linear.dot_parts, self._dim, [a, b, active, self.matrix.per_copy, self._lanes], [parts])
 
 
 class Factorised:
     """Solves A x = b by a sparse factorisation on the host (scipy's SuperLU in symmetric mode), for any stiffness.
 
-    Pivots are taken from the diagonal, so that their signs are those of the eigenvalues (Sylvester's law of inertia):
-    ``negative`` is 1 for a copy with a negative one. This may fail if an indefinite matrix has two pivots near 0.
-
-    Args:
-        hessian: The :class:`warpcloth.core.hessian.Hessian`.
+    Pivots are on the diagonal, so that their signs are those of the eigenvalues (Sylvester's law of inertia): ``negative`` is 1
+    for a copy with a negative one. This may fail if an indefinite matrix has two pivots near 0.
     """
 
     capturable, outdated = False, None
@@ -188,7 +180,7 @@ class Factorised:
         """Does nothing: each solve factorises."""
 
     def solve(self, b, x, wanted):
-        """Solves for x = A⁻¹ b in float64; 0 if A is singular or not finite. Copies that are not ``wanted`` keep x."""
+        """Solves in float64; 0 if A is singular or not finite. Copies that are not ``wanted`` keep x."""
         right, left, wanted = (self._mirror(array) for array in (b, x, wanted))
         sides = right.read().astype(np.float64).reshape(self.model.copies, -1)
         solution, negative = left.read().astype(np.float64).reshape(sides.shape), np.zeros(self.model.copies, dtype=bool)
@@ -210,13 +202,12 @@ class Factorised:
         return any(factor is not None and bool((factor.U.diagonal() < 0.0).any()) for factor in factors)
 
     def lowest_eigenvalue(self, copy=0):
-        """Returns the lowest eigenvalue of a copy's matrix over free coordinates [N/m], see :func:`lowest_eigenvalue`."""
+        """Returns the lowest eigenvalue of a copy's matrix over free coordinates [N/m]."""
         columns, n = self._columns(copy, self.values.read(), self.hessian.coupling()), 3 * self.model.per_copy
         free = np.flatnonzero(self.model.coordinate_mobility()[copy * n : (copy + 1) * n])
         return lowest_eigenvalue(columns[free][:, free])
 
     def _columns(self, copy, values, coupling):
-        """Returns a copy's matrix in compressed columns."""
         matrix = self.matrices[copy]
         matrix.data[:] = values[self.starts[copy] : self.starts[copy + 1]]
         if coupling is None:
@@ -225,16 +216,12 @@ class Factorised:
         return matrix.tocsc() + coupling[own, own]
 
     def _mirror(self, array):
-        """Returns the mirror of an array, built on first use."""
         if array.ptr not in self._mirrors:
             self._mirrors[array.ptr] = Mirror(array)
         return self._mirrors[array.ptr]
 
     def _factor(self, copy, values, coupling, shift=0.0, unresolved=0.0):
-        """Returns the factors of a copy's matrix, or None if it is singular or not finite.
-
-        ``shift`` times its largest diagonal entry, plus ``unresolved`` [N/m], is added to the diagonal.
-        """
+        """Returns factors of a copy's matrix + ``shift`` times its largest diagonal entry + ``unresolved`` [N/m]; or None."""
         from scipy.sparse import identity
 
         columns = self._columns(copy, values, coupling)
@@ -261,17 +248,14 @@ def symmetric_factors(columns):
 
 
 def lowest_eigenvalue(matrix):
-    """Returns the lowest eigenvalue of a sparse symmetric matrix, by Lanczos iterations with (A + σI)⁻¹.
+    """Returns the lowest eigenvalue of a sparse symmetric matrix (n, n), by Lanczos iterations with (A + σI)⁻¹.
 
-    σ starts at 1000 ε times the largest diagonal entry and grows tenfold until A + σI has no negative pivot. Then no eigenvalue
-    is below −σ, so that the lowest is the one nearest to −σ, and few iterations find it (Ericsson and Ruhe 1980).
-
-    Args:
-        matrix: A, scipy (n, n).
+    σ starts at 1000 ε times the largest diagonal entry and grows tenfold until A + σI has no negative pivot. Then the lowest
+    eigenvalue is the one nearest to −σ (Ericsson and Ruhe 1980).
 
     Returns:
-        float: Accurate to about 1e-10 (λ + σ), where σ is at most 10 |λ| or 1000 ε times the largest diagonal entry. Infinite
-            if n is 0, NaN if an entry is not finite.
+        float: Accurate to about 1e-10 (λ + σ), σ at most 10 |λ| or 1000 ε times the largest diagonal entry. Infinite if n is 0,
+            NaN if an entry is not finite.
     """
     from scipy.sparse import identity
     from scipy.sparse.linalg import LinearOperator, eigsh
@@ -303,7 +287,7 @@ class FactorisedRows:
 
     Args:
         matrix: The :class:`warpcloth.numerics.constraints.Constraints`.
-        arrays: The arguments b, x and wanted of :meth:`solve`, which then allocates nothing.
+        arrays: The arguments b, x and wanted of :meth:`solve`.
     """
 
     capturable = False
@@ -315,7 +299,7 @@ class FactorisedRows:
             matrix.matrices()  # so that it allocates now
 
     def solve(self, b, x, wanted):
-        """Solves for x = A⁻¹ b of each copy that is ``wanted``, NaN if A or b is not finite; others get 0."""
+        """Solves for the copies that are ``wanted``, NaN if A or b is not finite; others get 0."""
         from scipy.sparse import diags
 
         right, left, wanted = (self._mirrors[array.ptr] for array in (b, x, wanted))
@@ -350,12 +334,12 @@ class CholeskyFactor:
     """Solves A x = b for a constant symmetric positive definite A by cholespy: CHOLMOD on the CPU, its own kernels on CUDA.
 
     A is factorised once, in double precision. Solves run on the device, without copies of vectors. On the CPU cholespy gets
-    NumPy's views of the vectors, which cost 7 µs a solve. Warp's own export of two arrays costs 40 µs.
+    NumPy's views of the vectors, which cost 7 µs a solve; Warp's export of two arrays costs 40 µs.
 
     Args:
         matrix: A, a scipy sparse matrix (n, n), n at least 1.
         device: The Warp device of the vectors.
-        dtype: Their scalar type, ``wp.float32`` or ``wp.float64``.
+        dtype: ``wp.float32`` or ``wp.float64``.
 
     Attributes:
         seconds: Time of the factorisation [s].
@@ -393,10 +377,7 @@ class CholeskyFactor:
 
 
 class LUFactor:
-    """Solves A x = b as :class:`CholeskyFactor` does, by scipy's SuperLU on the host, in double precision.
-
-    Arguments and what is raised are those of :class:`CholeskyFactor`.
-    """
+    """As :class:`CholeskyFactor`, by scipy's SuperLU on the host."""
 
     def __init__(self, matrix, device, dtype):
         try:
@@ -419,12 +400,11 @@ class CopyFactors:
     """Solves A x = b for each copy with a constant scalar matrix; copies with equal matrices share one factorisation.
 
     Args:
-        model: The :class:`warpcloth.model.model.Model`.
         matrices: A of each copy, scipy matrices (n, n) of one pattern.
 
     Attributes:
         seconds: Time of the factorisations [s].
-        error: See :class:`warpcloth.numerics.constant_multigrid.CopyCycles`, here 0.
+        error: 0.
 
     Raises:
         ValueError: A matrix is not finite or not positive definite.
@@ -444,12 +424,11 @@ class CopyFactors:
         self._parts = {}
 
     def solve(self, b, x):
-        """Solves for x = A⁻¹ b, both (N,) vectors, from the host. NaN in b gives NaN in x of that copy."""
+        """x = A⁻¹ b, both (N,) vectors, from the host. NaN in b gives NaN in x of that copy."""
         for factor, right, left in zip(self.factors, self._of_copies(b), self._of_copies(x), strict=True):
             factor.solve(right, left)
 
     def _of_copies(self, array):
-        """Returns the parts of an array that belong to each copy, built on first use."""
         if array.ptr not in self._parts:
             n = self.per_copy
             self._parts[array.ptr] = [array[first : first + n] for first in range(0, len(array), n)]
@@ -461,8 +440,7 @@ class AxisSolves:
 
     Args:
         model, matrices: See :class:`CopyFactors`.
-        solver: Class that solves without locks, :class:`CopyFactors` or
-            :class:`warpcloth.numerics.constant_multigrid.CopyCycles`.
+        solver: Class that solves without locks.
 
     Attributes:
         seconds, error: The sum and the largest of those of its solvers.
@@ -482,7 +460,7 @@ class AxisSolves:
         self.error = np.max([factors.error for factors, _ in self._parts], axis=0)
 
     def solve(self, b, x):
-        """Solves for x = A⁻¹ b of free coordinates, both (N,) vectors, from the host; x = b for the others."""
+        """x = A⁻¹ b of free coordinates, both (N,) vectors, from the host; x = b for the others."""
         for factors, taken in self._parts:
             factors.solve(b, self._found)
             self.model.launch(self._take, self.model.count, [self._found, taken], [x])
@@ -491,20 +469,15 @@ class AxisSolves:
 def solve_copies(model, matrices):
     """Returns what solves A x = b for each copy with a constant scalar matrix: factors on the CPU, cycles of multigrid on CUDA.
 
-    Factors are solved on one copy after another. On an H100 that takes 4 to 35 times as long as cycles with one copy of 8² to
-    256² vertices, on a core of a CPU 0.15 to 0.3 times as long.
+    Factors are solved one copy after another. On an H100 that takes 4 to 35 times as long as cycles with one copy of 8² to 256²
+    vertices, on a core of a CPU 0.15 to 0.3 times as long.
     """
     solver = CopyCycles if model.device.is_cuda else CopyFactors
     return solver(model, matrices) if model.mobility is None else AxisSolves(model, matrices, solver)
 
 
 class DiagonalScaling:
-    """Computes x = D⁻¹ b, the step of a Jacobi iteration, on the device; it may be captured.
-
-    Args:
-        model: The :class:`warpcloth.model.model.Model`.
-        diagonal: D of each copy, (B, n), above 0.
-    """
+    """Launches x = D⁻¹ b with a diagonal D (B, n) above 0; it may be captured."""
 
     seconds, error, capturable = 0.0, 0.0, True  # there is nothing to factorise
 
@@ -513,7 +486,7 @@ class DiagonalScaling:
         self._scale = model.kernel(scale, model.dtype)
 
     def solve(self, b, x):
-        """Launches x = D⁻¹ b, both (N,) vectors."""
+        """x = D⁻¹ b, both (N,) vectors."""
         self.model.launch(self._scale, self.model.count, [self._inverse, b], [x])
 
 

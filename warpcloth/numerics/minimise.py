@@ -34,18 +34,16 @@ POLICIES = {
 def _resembles_the_last_step(model):
     """Whether the correction of a step is a good start of the next one.
 
-    After an impact it is not: long midpoint steps would gain energy. In rigid clusters of 1e12 N/m its rounding would hide the
-    descent.
+    After an impact it is not: long midpoint steps would gain energy. In rigid clusters its rounding would hide the descent.
     """
     touches = model.scene.self_contact is not None or model.colliders is not None
     return not touches and all(elements.cells is None for elements in model.terms)
 
 
 def _free_axes(model, near):
-    """Returns which axes are those of moves of the whole cloth that change no energy, (3,) booleans.
+    """Returns along which axes moves of the whole cloth change no energy, (3,) booleans.
 
-    Terms with stencils of one vertex, meshes and air hold the cloth in space; so do pins and locks, by axes, and contact with
-    other colliders where copies may be ``near``, or everywhere if that is None.
+    Terms of one vertex, meshes, air, pins and locks hold the cloth, and so does contact where copies are ``near`` (None: all).
     """
     held = any(collider.is_mesh for collider in model.scene.colliders) or any(
         near is None
@@ -57,20 +55,20 @@ def _free_axes(model, near):
 
 
 class Minimiser:
-    """Minimises φ(d) of each copy; the docstring of the module has the equation.
+    """Minimises φ(d) of each copy.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
-        base: The positions at d = 0, (N,) vectors [m]; the caller's array, read only.
-        hessian: ``"adaptive"`` (raw, but its negative part is reduced where the matrix is indefinite), ``"raw"``, ``"clamp"``
-            or ``"absolute"``.
+        base: The positions at d = 0, (N,) vectors [m]; read only.
+        hessian: ``"adaptive"`` (raw, its negative part reduced where the matrix is indefinite), ``"raw"``, ``"clamp"`` or
+            ``"absolute"``.
         linear: ``"cg"`` or ``"factorised"``.
         s: Weight of the inertia, 1/h² [1/s²].
         linear_iterations: Maximum number of iterations of a conjugate gradient solve.
-        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter bounds steps; or None.
+        pairs: :class:`warpcloth.contact.self_steps.SelfSteps`, whose filter bounds steps; or None. A descent then starts at the
+            start of the step or at the last d.
         last: The array for d (N,) [m], which holds that of the last step. Without contact a descent starts there if φ is lower
-            than at d = 0. None: every descent starts from d = 0. With pairs a descent starts where
-            :meth:`warpcloth.contact.self_filter.SelfFilter.launch_start` says, at the start of the step, or at the last d.
+            than at d = 0. None: every descent starts from d = 0.
         colliders: The :class:`warpcloth.contact.collider_steps.ColliderSteps`, or None. Near them a descent without pairs
             starts from d = 0, their contact distance, the start of the step or the last d, wherever φ is lowest. d = 0 may be
             so deep inside that rounding of the way out moves cloth along the collider.
@@ -79,7 +77,7 @@ class Minimiser:
         correction: d (N,) [m].
         residual: The largest unbalanced acceleration of each copy divided by ``scale``, (B,), after :meth:`minimise`.
         kept: Arrays (B,) by name that one :meth:`minimise` passes to the next, besides ``last``.
-        scale: The acceleration by which the residual of each copy is divided, (B,) [m/s²], as last given.
+        scale: The acceleration by which residuals are divided, (B,) [m/s²].
         iterations: Number of Newton iterations of the last :meth:`minimise`.
     """
 
@@ -125,7 +123,6 @@ class Minimiser:
         self.residual, self.iterations = np.zeros(model.copies), 0
 
     def _allocate_progress(self):
-        """Allocates what the kernels know of the descent, and what the host reads of it."""
         model, flag = self.model, partial(wp.zeros, 1, dtype=wp.int32, device=self.model.device)
         self._progress, self._limits = kernels.DescentState(), kernels.Limits()
         for name in ("active", "stays", "end", "iterations"):
@@ -162,9 +159,8 @@ class Minimiser:
     def minimise(self, tolerance, iterations, scale):
         """Iterates until every copy has converged, or rounding allows no further progress.
 
-        A copy has converged if max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a, with the acceleration a = ``scale`` (B,) [m/s²], above 0.
-        Rounding allows no progress if ‖∇φ‖ is within its rounding, four times that of
-        :func:`warpcloth.kernels.linear.rounding`, and an iteration lowered φ by no more than rounding. The norm alone would not
+        A copy has converged if max ‖∇φᵢ‖/mᵢ ≤ ``tolerance``·a, a = ``scale`` (B,) [m/s²], above 0. Rounding allows no progress
+        if ‖∇φ‖ is within four times its rounding, and an iteration lowered φ by no more than rounding. The norm alone would not
         do, because the noise of stiff directions may hide the error of soft ones.
 
         If the linear solver runs on the device, so does the loop: the host waits once in ``AT_ONCE`` iterations.
@@ -202,9 +198,8 @@ class Minimiser:
     def curves_down(self, tolerance):
         """Returns whether the raw Hessian at d = 0 of a copy has a negative eigenvalue that ``tolerance`` does not explain.
 
-        An equilibrium to ``tolerance`` may have an unbalanced force of ``tolerance`` times the scale and the mass of the cloth.
-        Such a force in an edge can lower an eigenvalue by the force over the edge length [N/m]. A sheet without bending
-        stiffness has no other resistance to motion out of its plane.
+        An equilibrium may have an unbalanced force of ``tolerance`` times the scale and the mass of the cloth. In an edge it
+        can lower an eigenvalue by the force over the edge length [N/m].
         """
         self._assemble_raw()
         unresolved = tolerance * float((self.scale * self.model.mass.numpy().reshape(self.model.copies, -1).sum(axis=1)).max())
@@ -235,7 +230,7 @@ class Minimiser:
     # What the segments record.
 
     def _launch_start(self):
-        """Launches the start where φ is lowest: d = 0, the last d, outside colliders, or the start of the step."""
+        """Launches the start where φ is lowest."""
         if self._last:
             wp.copy(self.right, self.correction)
         self.clear()
@@ -262,8 +257,8 @@ class Minimiser:
     def _launch_apart(self):
         """Launches the start from the start of the step or from the last d, as far as pairs stay apart.
 
-        Cloth at rest is almost in balance at the start of the step, while x̃ is h²g below, from where contact would push it
-        back. Cloth that slides is so at the last d, which does not stop what is slower than the tolerance.
+        Cloth at rest is almost in balance at the start of the step, while contact would push it back from x̃, h²g below. Cloth
+        that slides is so at the last d.
         """
         for goal, stays in (self.filter.back, 1), (self.right, 0):
             self.filter.launch_aim(goal, self.correction, self.search.direction)
@@ -351,9 +346,8 @@ class Minimiser:
     def _launch_mean(self, direction):
         """Launches p −= Σ m(d + p)/Σ m for a direction p of steps of free cloth.
 
-        No energy but inertia changes with a move of the whole cloth, so that Σ∇φ = s Σ m d, and Σ m d = 0 at the minimum: the
-        momentum of the cloth. A conjugate gradient solve leaves an error of it. Without that d + p has a lower φ, wherever the
-        solve ended, and shorter steps along p keep Σ m d = 0.
+        Only inertia changes with a move of the whole cloth, so that Σ∇φ = s Σ m d, and Σ m d = 0 at the minimum: the momentum
+        of the cloth. A conjugate gradient solve leaves an error of it. Without it φ at d + p is lower.
         """
         inertia, search, lanes = self.search.inertia, self.search, self.search.lanes
         if self._inverse_total is None or inertia.s == 0.0 or inertia.load != 0.0:

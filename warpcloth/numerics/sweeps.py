@@ -30,8 +30,7 @@ def colours(constraints, free):
 
     Args:
         constraints: Vertices of each element, (E, K) or a list of E arrays.
-        free: Which vertices are free, (n,). Elements of one colour may share pinned ones, so that the hinges of ``bunny`` need
-            17 colours instead of 20.
+        free: Which vertices are free, (n,).
     """
     sizes = [len(vertices) for vertices in constraints]
     elements, vertices = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes), np.concatenate(constraints)
@@ -50,9 +49,7 @@ def colours(constraints, free):
 
 
 class _Sweep:
-    """The base class of sweeps over all constraints of a model, term by term as declared, which update d = x − x̃.
-
-    Dynamic elements are swept after the others.
+    """The base class of sweeps over all constraints, term by term as declared, then dynamic ones, which update d = x − x̃.
 
     Args:
         model: The :class:`warpcloth.model.model.Model`.
@@ -89,8 +86,6 @@ class _Sweep:
 
 class JacobiSweep(_Sweep):
     """Jacobi sweeps, in which all constraints see the positions before the sweep.
-
-    ``launch_start``, ``launch`` and ``parts`` are those of :class:`warpcloth.core.jacobi_sweeps.JacobiSweeps`.
 
     Args:
         model, x, h, relaxation, scalar, multipliers: See :class:`_Sweep`.
