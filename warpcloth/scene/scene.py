@@ -111,7 +111,7 @@ class Scene:
         colliders: Such as :class:`warpcloth.Sphere`; pins do not collide.
         contact: The :class:`warpcloth.Contact` with all colliders, by default at half of the thickness, or 1 mm without one,
             with a computed stiffness.
-        self_contact: The :class:`warpcloth.SelfContact` of the cloth, or None; its stiffness is then computed.
+        self_contact: The :class:`warpcloth.SelfContact` of the cloth, by default with a computed stiffness, or None.
         air: The :class:`warpcloth.Air`, or None.
         cloths: Names of the cloths that :meth:`join` joined, each a part of the mesh and a prim in files; else empty.
         fabric: A :class:`Fabric`, or its name in ``warpcloth.fabrics``, which sets ``density``, ``terms`` and ``thickness``.
