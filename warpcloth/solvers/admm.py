@@ -47,9 +47,10 @@ class ADMM(ImplicitStep):
     Sparse energies and self-contact are not split: their Hessian, or a bound of it, is added to that matrix. The fixed point is
     the x(t+h) of :class:`warpcloth.Newton`.
 
-    With too large a weight the iteration stalls, with too small a one it oscillates, and may not converge for concave energies
-    such as hinges. ``"auto"`` is r = 1/(2hₑω) for each element, where ω² is the largest eigenvalue of M⁻¹ s k A DᵀD of the
-    element alone; with n iterations at least min(c/n, 1), c = 2 for Euler, 4 for BDF2, 20 for midpoint.
+    An iteration multiplies the error of a mode with s = h²ω² by (1 + r²s)/((1 + rs)(1 + r)), which is smallest for r = 1/√s.
+    With a small weight it oscillates, and may not converge for concave energies such as hinges. ``"auto"`` is r = 1/(2hₑω) for
+    each element, where ω² is the largest eigenvalue of M⁻¹ s k A DᵀD of the element alone; with n iterations at least min(c/n,
+    1), c = 2 for Euler, 4 for BDF2, 20 for midpoint.
 
     ``residual`` is the larger of the primal and the dual residual, the largest accelerations by the forces max(1, 1/r)·DᵀW²(Dx
     − z) and DᵀW²(z − z before), relative to :class:`warpcloth.numerics.iterate.ResidualScale`.

@@ -41,13 +41,14 @@ class ConstrainedDynamics(ImplicitStep):
 
         [M̃, −Jᵀ; J, α̃][Δx; Δλ] = −[M(x − x̃) − Jᵀλ; C(x) + α̃λ]
 
+    through (J M̃⁻¹Jᵀ + α̃)Δλ = −(C + α̃λ) + J M̃⁻¹(M(x − x̃) − Jᵀλ).
     Springs and hinges have a scalar C; other terms have the rows C = y − p(y) with p fixed in an iteration; sliding friction
     has those of a softer spring to its anchor. The fixed point is the x(t+h) of :class:`warpcloth.Newton`, and for infinite
     stiffness the point of C = 0 that is nearest to x̃.
 
     One iteration with M̃ = M is the published method. It leaves out −λ∂²C, so a spring overshoots perpendicular to itself if
-    its tension is above about m l/h². More iterations need a safeguard: geometric stiffness adds [−λ∂²C]₊ to M̃; a line search
-    on 1/(2h²)‖x − x̃‖²_M + U shortens Δx.
+    its tension is above about m l/h². More iterations need a safeguard: geometric stiffness (Tournier et al. 2015) adds
+    [−λ∂²C]₊ to M̃; a line search on 1/(2h²)‖x − x̃‖²_M + U shortens Δx.
 
     Constraints may be redundant: α̃ of a hard one is at least ε^0.7 of the diagonal of J W Jᵀ, so a gap of that fraction
     (1e-11, in float32 1e-5) of the move that they cause in a step remains. Those that contradict one another end at a
