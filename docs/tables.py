@@ -174,17 +174,20 @@ def fabric_sources():
 
 
 TABLES = {
-    "fabrics": measured_fabrics,
-    "fabric sources": fabric_sources,
     "energies": energies,
     "solvers": solvers,
     "methods": methods,
     "residuals": residuals,
+}
+# Tables that the site alone has. Their markers in the checkout have nothing between them.
+IN_SITE = {
+    "options": options,
+    "solver options": solver_options,
+    "fabrics": measured_fabrics,
+    "fabric sources": fabric_sources,
     "attributes": attributes,
     "term attributes": term_attributes,
 }
-# Tables that the site alone has. Their markers in the checkout have nothing between them.
-IN_SITE = {"options": options, "solver options": solver_options}
 
 
 def filled(text, tables=TABLES):
