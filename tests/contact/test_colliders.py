@@ -11,10 +11,10 @@ import trimesh
 import warp as wp
 
 import warpcloth as wc
-from support.layers import DENSITY, GRAVITY, R, after_frames, falling, ground, positions
+from support.layers import DENSITY, GRAVITY, R, falling, ground, positions
 from support.rows import table
 from support.shapes import TILTED, Torus
-from support.steps import stopped_and_resumed
+from support.steps import after_frames, stopped_and_resumed
 from warpcloth.cli import main
 from warpcloth.contact.clearance import Clearance
 from warpcloth.core.energy import Energy
@@ -419,11 +419,9 @@ MESHED = {
 
 @pytest.mark.parametrize("name", MESHED)
 def test_an_equilibrium_on_a_mesh_is_that_on_its_shape(name):
-    """A sheet that lies on it, at r − w/k, or hangs over it by its corners.
-
-    By contact of vertices alone, the middles of flat triangles of this size dip 2 mm into the ball and more; those of its mesh
-    lie deeper than the ball by the sagitta of a circumscribed circle, L/√3 in radius.
-    """
+    """A sheet that lies on it, at r − w/k, or hangs over it by its corners."""
+    # By contact of vertices alone, the middles of flat triangles of this size dip 2 mm into the ball and more; those of its
+    # mesh lie deeper than the ball by the sagitta of a circumscribed circle, L/√3 in radius.
     shape, *mesh = MESHED[name]
     fields = {"height": 0.02} if name == "plane" else {"height": 0.0, "pins": [0, 6, 42, 48]}
     scenes = [falling([each], n=7, **fields) for each in (shape, wc.MeshCollider(*mesh, position=shape.position))]

@@ -156,12 +156,10 @@ def test_the_gap_under_a_pressure(name, pressure, gap, mesh, device):
     constrained_dynamics=wc.ConstrainedDynamics(substeps=4),
 )
 def test_a_pressure_holds_a_sheet_where_it_balances(solver, gravity, device, pressure=14.715, k=1e7, r=1e-3):
-    """The gap r − p/k and the force pA, with hardly any gravity or none.
-
-    x̃ is 0.7 mm deep in the plane, where contact gives 1e7 m/s², but the residual is relative to p/ρ. The stiffness k/ρ is above
-    the inertia 1/h², so that a residual of 1e-3 p/ρ leaves 1e-3 p/k at the most, and as much again of velocity from the step
-    before.
-    """
+    """The gap r − p/k and the force pA, with hardly any gravity or none."""
+    # x̃ is 0.7 mm deep in the plane, where contact gives 1e7 m/s², but the residual is relative to p/ρ. The stiffness k/ρ is
+    # above the inertia 1/h², so that a residual of 1e-3 p/ρ leaves 1e-3 p/k at the most, and as much again of velocity from the
+    # step before.
     fields = {"gravity": (0.0, -gravity, 0.0), "loads": [wc.Pressure(vertices="all", pressure=-pressure)], "duration": 0.2}
     scene = sheet(r - pressure / k, contact=wc.Contact(distance=r, stiffness=k), **fields)
     animation = wc.simulate(scene, solver, dtype="float64", device=device, record="reactions")
@@ -259,10 +257,8 @@ def test_a_belt_presses_on_a_drum(softer, device):
 
 
 def critical(friction, radius, length=1.0):
-    """The overhang of a limp sheet beyond the flat top at which it slips off a round edge [m], of any radius.
-
-    Along the edge dT/dθ = μ(T + R cos θ) − R sin θ, with T over the weight per area, from μ times what lies on the top.
-    """
+    """The overhang of a limp sheet beyond the flat top at which it slips off a round edge [m], of any radius."""
+    # Along the edge dT/dθ = μ(T + R cos θ) − R sin θ, with T over the weight per area, from μ times what lies on the top.
 
     def pulls(over):
         along = solve_ivp(

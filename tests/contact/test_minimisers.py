@@ -8,8 +8,9 @@ import pytest
 import trimesh
 
 import warpcloth as wc
-from support.layers import GRAVITY, after_frames, cloth, ground, layers, rubbing, stack
+from support.layers import GRAVITY, cloth, ground, layers, rubbing, stack
 from support.rows import slow_but, table
+from support.steps import after_frames
 from warpcloth.core.energy import Energy
 from warpcloth.core.status import Result
 
@@ -37,10 +38,8 @@ def stretched(gravity, friction):
 
 
 def roofed(gravity, friction):
-    """A sheet in tension on a flat roof with two edges, where it slides by 3 mm.
-
-    Over many edges, and from 300 m/s² on, φ has several minima.
-    """
+    """A sheet in tension on a flat roof with two edges, where it slides by 3 mm."""
+    # Over many edges, and from 300 m/s² on, φ has several minima.
     grid, slope = wc.Mesh.grid(8, 8, size=0.5), 0.1
     x, _, z = grid.points.T
     top, foot = 0.5 / 7.0 * 1.5, 1.0

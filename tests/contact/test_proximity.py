@@ -260,10 +260,8 @@ MOVES = {
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("name", MOVES)
 def test_moves_stop_at_pairs_that_were_far_apart(name, dtype, device):
-    """Two sheets of 3 × 3 vertices, 0.2 m apart, keep a tenth of it; another sheet, and a copy without moves, change nothing.
-
-    The first is smaller and below the inside of a triangle of the second, so that no edges cross.
-    """
+    """Two sheets of 3 × 3 vertices, 0.2 m apart, keep a tenth; another sheet, and a copy without moves, change nothing."""
+    # The first is smaller and below the inside of a triangle of the second, so that no edges cross.
     gap, few = 0.2, wc.Mesh.grid(3, 3, size=0.02)
     starts, scales = np.array([[0.004, 0.0, 0.001], [0.0, gap, 0.0], [5.0, 0.0, 0.0]]), np.array([0.1, 1.0, 1.0])
     points = few.points * scales[:, None, None] + starts[:, None]

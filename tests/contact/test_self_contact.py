@@ -13,9 +13,10 @@ import warpcloth as wc
 from support.contacts import begin, energy, gradient, pairs_of, slope_of
 from support.crossings import crossed
 from support.judges import barrier_slope
-from support.layers import DENSITY, GRAVITY, after_frames, cloth, folded, ground, layers, positions, rubbing, slope
+from support.layers import DENSITY, GRAVITY, cloth, folded, ground, layers, positions, rubbing, slope
 from support.rows import table
 from support.scenes import scene
+from support.steps import after_frames
 from warpcloth.contact.proximity import ROUND
 from warpcloth.contact.self_start import crossings
 from warpcloth.core.hessian import Hessian
@@ -92,11 +93,9 @@ def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
 @pytest.mark.parametrize(("gap", "turn"), [(4e-3, 17.0), (1e-3, 17.0), (1e-4, 17.0), (1e-3, 0.0)])
 @pytest.mark.parametrize("move", ["any", "sliding"])
 def test_the_matrix_is_the_derivative_of_the_forces(gap, turn, move, device):
-    """By central differences over η, with errors of (pη/d)² and, by rounding of x, ε‖H‖x/η; also of sheets that slide.
-
-    Below r/4 = 1.25 mm edges act too, without a turn nearly parallel ones. With fixed weights and normals nothing resists
-    sliding.
-    """
+    """By central differences over η, with errors of (pη/d)² and, by rounding of x, ε‖H‖x/η; also of sheets that slide."""
+    # Below r/4 = 1.25 mm edges act too, without a turn nearly parallel ones. With fixed weights and normals nothing resists
+    # sliding.
     scene, rng, eta = layers(turn=turn, gap=gap), np.random.default_rng(1), 1e-5 * gap
     x = scene.positions + 0.1 * gap * rng.normal(size=scene.positions.shape)
     pairs = pairs_of(scene, device)
@@ -130,10 +129,8 @@ REBOUNDING |= {"newton": EXACT, "xpbd": wc.XPBD(substeps=10, iterations=4)}
 
 @pytest.mark.parametrize("name", REBOUNDING)
 def test_momentum_is_kept(name, device):
-    """Σp of two sheets that rebound with no vertex cut; ΣL by explicit steps and midpoint. To rounding, and 1e-13 of a step.
-
-    Euler's implicit steps, d ← (d + hḋ + Kr)/(1 + K) within r with K = 2kh²/ρ = 23, leave flat sheets 5 mm/s each of 0.2 m/s.
-    """
+    """Σp of two sheets that rebound with no vertex cut; ΣL by explicit steps and midpoint. To rounding, and 1e-13 of a step."""
+    # Euler's implicit steps, d ← (d + hḋ + Kr)/(1 + K) within r with K = 2kh²/ρ = 23, leave flat sheets 5 mm/s each of 0.2 m/s.
     scene, turns = layers(n=4, turn=17.0, gap=6e-3, speed=0.2), name in ("explicit", "midpoint")
     stepper = after_frames(scene, REBOUNDING[name], 3, device=device, dtype="float64")
     x, v = (array.numpy() for array in stepper.state)
@@ -190,10 +187,8 @@ def test_a_stack_rests(dtype, mesh, device):
 @pytest.mark.host
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_a_sheet_rests_far_from_the_origin(dtype, device):
-    """At 50 m, in float64 where it does at the origin: φ bears the weight at a third of r.
-
-    In float32 the least gap f is 6 units in the last place, and ψ, which begins at 2f = 0.72 r, bears most of it above r/2.
-    """
+    """At 50 m, in float64 where it does at the origin: φ bears the weight at a third of r."""
+    # In float32 the least gap f is 6 units in the last place, and ψ, which begins at 2f = 0.72 r, bears most of it above r/2.
     r, k, w = 1e-4, 2e4, DENSITY * GRAVITY
     two = layers(n=4, gap=0.9 * r, distance=r, stiffness=k, gravity=(0.0, -GRAVITY, 0.0), pins=np.arange(16))
     two = replace(two, positions=two.positions + np.array([0.0, 50.0, 0.0]), free_axes=np.tile([False, True, False], (32, 1)))
@@ -473,11 +468,9 @@ IMPACTS = {
 
 @pytest.mark.parametrize(("make", "substeps", "steps", "tolerance"), IMPACTS.values(), ids=IMPACTS)
 def test_impact_converges(make, substeps, steps, tolerance, device):
-    """Where a step presses sheets flat, so that edges cross at small gaps, and a filter at single vertices would stall descent.
-
-    Short steps stop the sheets with a pressure of ρv/h = 4600 Pa, where φ has 250 kr = 625 Pa at the least gap of the filter.
-    They end at a residual of 0.35 m/s², 5e-6 of v/h.
-    """
+    """Where a step presses sheets flat, so that edges cross at small gaps, and a filter at single vertices would stall."""
+    # Short steps stop the sheets with a pressure of ρv/h = 4600 Pa, where φ has 250 kr = 625 Pa at the least gap of the filter.
+    # They end at a residual of 0.35 m/s², 5e-6 of v/h.
     solver = wc.Newton(substeps=substeps, tolerance=tolerance)
     assert after_frames(make(), solver, steps=steps, device=device, dtype="float64").results == [Result.CONVERGED]
 

@@ -95,10 +95,8 @@ def test_none_of_it_without_self_contact(device):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_frames_too_coarse_for_the_gap_are_named(dtype, device, tmp_path):
-    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 16 m this is less than 4 · 2⁻¹⁹ m, from frame 4 on.
-
-    Frames in memory have the precision of the run, those in a file are float32.
-    """
+    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 16 m this is less than 4 · 2⁻¹⁹ m, from frame 4 on."""
+    # Frames in memory have the precision of the run, those in a file are float32.
     # They are too soft to push one another apart in the meantime.
     scene = sheets(gap=6e-6, turn=0.0, stiffness=1e-6, velocities=np.tile([100.0, 0.0, 0.0], (32, 1)))
 

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 import warpcloth as wc
 from support.contacts import begin, energy, gradient, pairs_of, slope_of
 from support.laws import EXTRA, Sticky
-from support.layers import GRAVITY, after_frames, cloth, ground, positions, rubbing, slope
+from support.layers import GRAVITY, cloth, ground, positions, rubbing, slope
 from support.rows import table
+from support.steps import after_frames
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.block_rows import block_rows
 from warpcloth.kernels.v_cycle import subtract_product
@@ -134,10 +135,8 @@ def test_slides(name, layers, law, error, device):
     [*product(SOLVERS, ["float64"]), ("newton", "float32"), ("xpbd", "float32")],
 )
 def test_sticks(name, dtype, device):
-    """At tan θ = 0.9 μ implicit steps end at rest; in float32 some coordinates of 0.5 m move by a last place a frame.
-
-    Explicit steps swing about there, as nothing damps them: by no more than ε = 0.1 r μ, at a speed of no more than √(k/ρ) ε.
-    """
+    """At tan θ = 0.9 μ implicit steps end at rest; in float32 some coordinates of 0.5 m move by a last place a frame."""
+    # Explicit steps swing about there, as nothing damps them: by no more than ε = 0.1 r μ, at a speed of no more than √(k/ρ) ε.
     solver = wc.Newton(substeps=10) if (name, dtype) == ("newton", "float32") else SOLVERS[name]
     stepper = after_frames(slope(0.27), solver, device=device, dtype=dtype)
     start, ends = stepper.state.x.numpy().copy(), list(positions(stepper, 24))
@@ -166,11 +165,9 @@ def test_momentum_and_energy(name, device):
 
 @table("name", ["xpbd"], ["explicit", "newton", "xpbd"])
 def test_energy_becomes_heat(name, device):
-    """What a sheet that slides down a slope loses is μ mg cos θ times its way, and it never gains: to 3 % of the heat.
-
-    Implicit steps damp 1.8 % at the end. Explicit steps damp nothing: the sheet bounces, so that N is not its weight, by 2.6 %,
-    but the heat is all that it loses, to 0.002 in these steps.
-    """
+    """What a sheet that slides down a slope loses is μ mg cos θ times its way, and it never gains: to 3 % of the heat."""
+    # Implicit steps damp 1.8 % at the end. Explicit steps damp nothing: the sheet bounces, so that N is not its weight, by 2.6
+    # %, but the heat is all that it loses, to 0.002 in these steps.
     scene = slope(0.6, duration=0.25)
     mass = scene.vertex_masses[4:, None]
     run = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64", record="energies")

@@ -9,8 +9,9 @@ import warp as wp
 
 import warpcloth as wc
 from support.contacts import energy, gradient, slope_of
-from support.layers import after_frames, cloth, ground, positions, stack
+from support.layers import cloth, ground, positions, stack
 from support.pairs import between_edges, detect, from_triangle
+from support.steps import after_frames
 from warpcloth.contact.proximity import MAX_MOVE, Proximity
 from warpcloth.contact.surface import ContactSurface
 from warpcloth.core.hessian import Hessian
@@ -200,10 +201,8 @@ def test_a_copy_that_needs_more_rounds_changes_no_other(device):
 
 @pytest.mark.parametrize("itself", [False, True])
 def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
-    """Triangles of two sizes, which are in several levels of the grid, two copies, and pins, which meet no mesh.
-
-    None is missing after cloth and meshes have moved as far as a list is kept, and cloth has then moved by a round.
-    """
+    """Triangles of two sizes, which are in several levels of the grid, two copies, and pins, which meet no mesh."""
+    # None is missing after cloth and meshes have moved as far as a list is kept, and cloth has then moved by a round.
     scene = sheet([ground(0.2, 14), ground(0.4, position=(0.0, -0.02, 0.0))], pins=[0, 1, 6, 7])
     model, skin = scene.build(copies=2, dtype="float64", device=device), 0.01
     surface = ContactSurface(model, itself)
@@ -288,10 +287,8 @@ def test_a_copy_without_pairs_does_not_follow_what_another_has(solver, device):
 
 
 def test_a_copy_that_stays_apart_does_not_walk_with_another(device):
-    """Two sheets approach each other, in one copy too slowly to meet; it moves as alone, to the bit, 100 m from the origin.
-
-    Rounding decides it: of twelve directions of one of the sheets this one alone differed where both copies walked in rounds.
-    """
+    """Two sheets approach each other, in one copy too slowly to meet; it moves as alone, to the bit, 100 m from the origin."""
+    # Rounding decides it: of twelve directions of one of the sheets this one alone differed where both copies walked in rounds.
     grid = wc.Mesh.grid(8, 8, size=0.4)
     points = grid.points - grid.points.mean(axis=0)
     turned = points @ np.linalg.qr(np.random.default_rng(6).normal(size=(3, 3)))[0]

@@ -15,7 +15,7 @@ import warp as wp
 
 import warpcloth as wc
 from support.rows import slow_but
-from support.setups import SOLVERS, allocations, square
+from support.setups import SOLVERS, allocated, square
 from support.sheets import SPRINGS, declared
 from warpcloth.cli import main
 from warpcloth.core.thread_pool import ThreadPool
@@ -80,8 +80,7 @@ def test_threads_allocate_nothing(name, device):
     record = replace(SOLVERS[name], substeps=2)
     stepper = record.bind(square(solver=record, damping=0.01, fps=300.0).build(device=device, copies=2, threads=2))
     stepper.frame()
-    with wp.ScopedMemoryTracker("frames", print=False) as tracker:
-        assert allocations(tracker, lambda: [stepper.frame() for _ in range(2)]) == 0
+    assert allocated(lambda: [stepper.frame() for _ in range(2)], device) == 0
 
 
 @pytest.mark.parametrize("order", [1, -1])

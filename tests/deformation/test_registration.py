@@ -42,10 +42,8 @@ def errors(found, true):
 
 @pytest.mark.parametrize(("noise", "pinned"), [(0.0, False), (1e-3, True), (1e-3, False)])
 def test_it_follows_the_vertices_of_a_known_motion(noise, pinned):
-    """Along the normal within the sagitta of an edge, h²κ/8 = 3 mm, and the noise; along the surface within 1/40 of an edge.
-
-    It does so without pins, because the outline is seen.
-    """
+    """Along the normal within the sagitta of an edge, h²κ/8 = 3 mm, and the noise; along the surface within 1/40 of an edge."""
+    # It does so without pins, because the outline is seen.
     true = bent()
     seen = scan(TEMPLATE, true, 1 / 24, SPACING, noise, 0.1, 0.1)
     edge = np.flatnonzero(TEMPLATE.points[:, 0] == 0.0)
@@ -64,16 +62,14 @@ def test_it_follows_the_vertices_of_a_known_motion(noise, pinned):
 
 @pytest.mark.parametrize(("frames", "whole"), [(1, True), (4, True), (4, False)])
 def test_folds_are_not_cut(frames, whole):
-    """A pleated strip, whose edges have their full length and turn at each crease, seen at its own vertices.
-
-    It starts with the angle of 1 rad at creases. Or it starts flat and reaches that in 4 equal steps of δ, of which the first
-    two may lack three columns. At its true positions distances and strain are 0, so that the energy is that of cells,
-    0.12 Σ_c Σ w ‖e − ê‖². Of its edges ê, 0.9 are those of the last frame, off by 2 sin(δ/4) h for each of the two edges of a
-    cell along the strip, of length h, and 0.1 are those at rest with the rotation of the middle, off by 2 sin(¼) h. With
-    w = d/h inside and half of it on the border, of d the distance of rows, all vertices add less than
-    0.12 · 2 (0.9 · 2 sin(δ/4) + 0.1 · 2 sin(¼))² · area.
-    The minimum lies below, of the energy of triangles, 2 Σ area Σ (σ − 1)², and the mean squared distance over α.
-    """
+    """A pleated strip, whose edges have their full length and turn at each crease, seen at its own vertices."""
+    # It starts with the angle of 1 rad at creases. Or it starts flat and reaches that in 4 equal steps of δ, of which the first
+    # two may lack three columns. At its true positions distances and strain are 0, so that the energy is that of cells, 0.12
+    # Σ_c Σ w ‖e − ê‖². Of its edges ê, 0.9 are those of the last frame, off by 2 sin(δ/4) h for each of the two edges of a cell
+    # along the strip, of length h, and 0.1 are those at rest with the rotation of the middle, off by 2 sin(¼) h. With w = d/h
+    # inside and half of it on the border, of d the distance of rows, all vertices add less than 0.12 · 2 (0.9 · 2 sin(δ/4) +
+    # 0.1 · 2 sin(¼))² · area. The minimum lies below, of the energy of triangles, 2 Σ area Σ (σ − 1)², and the mean squared
+    # distance over α.
     count, alpha = 12, 1e-3
     mesh = wc.Mesh.grid(count + 1, 5, size=(1.0, 0.4))
     column = np.rint(count * mesh.points[:, 0]).astype(int)

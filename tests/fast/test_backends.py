@@ -10,7 +10,7 @@ import warp as wp
 import warpcloth as wc
 from support.energies import damping_forces
 from support.rows import slow_but
-from support.setups import SOLVERS, allocations, square
+from support.setups import SOLVERS, allocated, square
 from support.sheets import SPRINGS, TERMS, N, declared
 from warpcloth.core.gradient import Gradient
 from warpcloth.core.status import Result
@@ -326,8 +326,7 @@ def test_a_frame_allocates_nothing(name, device):
     record = replace(SOLVERS[name], substeps=5)
     stepper = record.bind(square(solver=record, damping=0.01, fps=120.0, pins="corners").build(device=device))
     stepper.frame()
-    with wp.ScopedMemoryTracker("frames", print=False) as tracker:
-        assert allocations(tracker, lambda: [stepper.frame() for _ in range(3)]) == 0
+    assert allocated(lambda: [stepper.frame() for _ in range(3)], device) == 0
 
 
 SWEEPS = {
@@ -470,10 +469,8 @@ def test_the_residual_is_that_of_the_worst_step(device):
 @pytest.mark.parametrize("backend", slow_but(["core", "blocks"], ["core", "blocks", "gather"]), indirect=True)
 @pytest.mark.parametrize(("away", "substeps"), [(0.0, 64), (128.0, 64), (4096.0, 512)])
 def test_motion_does_not_depend_on_where_the_origin_is(away, substeps, backend, device):
-    """Far from it positions are kept to more digits than x has; frames are steps, and a run repeats itself, to the bit.
-
-    Farther, steps of less than the unit of what is packed too.
-    """
+    """Far from it positions are kept to more digits than x has; frames are steps, and a run repeats itself, to the bit."""
+    # Farther, steps of less than the unit of what is packed too.
     sheet = wc.Mesh.grid(17, 17)  # of positions that float32 has in both
 
     def stepper_of(away, dtype):

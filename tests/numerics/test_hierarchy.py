@@ -86,10 +86,8 @@ def lengths_of(points, pairs):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_levels_of_any_mesh(name):
-    """Each drops vertices linked to what it keeps, none of which are linked; weights are 1 in all; ways have their length.
-
-    In a flat sheet of triangles that keep their shape none is shorter than the distance, else none than over links.
-    """
+    """Each drops vertices linked to what it keeps, none of which are linked; weights are 1 in all; ways have their length."""
+    # In a flat sheet of triangles that keep their shape none is shorter than the distance, else none than over links.
     scene = SCENES[name]
     model = scene.build(dtype="float64")
     n, found = model.per_copy, levels(model)
@@ -205,10 +203,8 @@ def test_what_meets_the_constraints_is_left_alone(device):
 
 
 def test_bent_sheets_meet_the_bounds_of_the_flat_one():
-    """A ring with a slit, rolled to a cone that overlaps by a third of a turn, which parts the sides of the slit.
-
-    Cones and cylinders are isometric to the plane, so that no vertices are farther apart than the shortest path in the sheet.
-    """
+    """A ring with a slit, rolled to a cone that overlaps by a third of a turn, which parts the sides of the slit."""
+    # Cones and cylinders are isometric to the plane, so that no vertices are farther apart than the shortest path in the sheet.
     mesh = wc.Mesh.grid(6, 41, pattern="alternating")
     across, along = (mesh.points / np.ptp(mesh.points, axis=0).clip(1e-9)).T[::2]
     r, turn = 0.4 + 0.6 * across, 0.98 * np.pi * (2.0 * along - 1.0)
@@ -249,10 +245,8 @@ def test_straight_paths_cross_what_keeps_its_shape():
 
 @pytest.mark.parametrize("kind", ["grid", "jittered", "random"])
 def test_levels_gain_as_much_on_any_mesh(kind, device):
-    """RMS strain of a hard net that swings by two corners, that of PBD over that with levels: 3 or more at equal settings.
-
-    With the lengths of paths over links alone it is 7.6, 1.4 and 1.5.
-    """
+    """RMS strain of a hard net that swings by two corners, that of PBD over that with levels: 3 or more at equal settings."""
+    # With the lengths of paths over links alone it is 7.6, 1.4 and 1.5.
     mesh = wc.Mesh.grid(17, 17, pattern="alternating") if kind == "grid" else uneven(17, kind)
     pins = [int(np.abs(mesh.points - corner).sum(axis=1).argmin()) for corner in ([0.0, 0, 0], [1.0, 0, 0])]
     hung = wc.Scene(mesh, masses=np.full(len(mesh.points), 1.0), terms=[wc.Spring(stiffness=np.inf)], pins=pins)
@@ -260,7 +254,6 @@ def test_levels_gain_as_much_on_any_mesh(kind, device):
     for solver in (wc.PBD, wc.HierarchicalPBD):
         run = wc.simulate(hung, solver(substeps=4, iterations=5), device=device, dtype="float64", frames=40)
         strain.append(np.mean([(lengths_of(x, mesh.edges) / mesh.edge_lengths - 1.0) ** 2 for x in run.points[1:]]))
-    print(kind, np.sqrt(strain[0] / strain[1]))
     assert strain[0] > 9.0 * strain[1]
 
 
@@ -341,7 +334,6 @@ def test_stretch_grows_with_resolution_only_without_levels(device):
             hung = replace(hung, positions=hung.mesh.points[:, [1, 0, 2]])  # level, so that it swings
             animation = wc.simulate(hung, solver(substeps=1, iterations=10), device=device, dtype="float64", frames=60)
             stretch[solver, n] = max(lengths_of(x, hung.mesh.edges).sum() for x in animation.points) - 1.0
-    print(stretch)
     assert stretch[wc.PBD, 64] > 3.0 * stretch[wc.PBD, 16]
     assert stretch[wc.HierarchicalPBD, 256] < 0.1 * stretch[wc.PBD, 256]
 

@@ -91,10 +91,8 @@ def test_order_on_an_oscillator(name, integrator, device):
 @each_integrator
 @each_method
 def test_energy_of_an_oscillator(name, integrator, omega_h, device):
-    """With w = v + iωu, z = iωh: Euler w/(1 − z), midpoint w(1 + z/2)/(1 − z/2), which keeps |w|, BDF2 the roots of its law.
-
-    (3/2 − z)r² − 2r + 1/2 = 0, from v₋₁ and u₋₁ of two steps of Euler of 2h/3, w₀/(1 − 2z/3)ⁿ.
-    """
+    """With w = v + iωu, z = iωh: Euler w/(1 − z), midpoint w(1 + z/2)/(1 − z/2), which keeps |w|, BDF2 the roots of its law."""
+    # (3/2 − z)r² − 2r + 1/2 = 0, from v₋₁ and u₋₁ of two steps of Euler of 2h/3, w₀/(1 − 2z/3)ⁿ.
     h, steps = 0.1, 20
     omega, z = omega_h / h, 1j * omega_h
     scene = oscillator(omega, h, stretch=0.01, speed=0.02)  # so little that x̃ does not pass the pin
@@ -180,10 +178,9 @@ def true_end(damping):
 @each_integrator
 @each_method
 def test_order_on_a_net_whose_pins_move(name, integrator, damping, device):
-    """Slopes 1 and 2 of x and v against an independent integration; midpoint with pins at tₙ, not tₙ + h/2, would lose one.
-
-    Damped, so would midpoint with s of the mean state taken for the mean of s; and BDF2 that knows no past of pins loses both.
-    """
+    """Slopes 1 and 2 of x and v against an independent integration; midpoint with pins at tₙ, not tₙ + h/2, would lose one."""
+    # Damped, so would midpoint with s of the mean state taken for the mean of s; and BDF2 that knows no past of pins loses
+    # both.
     scene, substeps, errors = held(damping), [8, 16] if integrator == "bdf2" else [6, 12], []
     free = np.setdiff1d(np.arange(16), scene.pins.vertices)
     for steps in substeps:
@@ -284,17 +281,3 @@ def test_no_code_outside_the_class_knows_its_name(integrator, device, monkeypatc
     expected, euler = run(integrator), run("euler")
     monkeypatch.setitem(INTEGRATORS, "euler", INTEGRATORS[integrator])
     assert np.array_equal(run("euler"), expected) and not np.array_equal(euler, expected)
-
-
-def test_midpoint_refuses_an_odd_number_of_sweeps():
-    with pytest.raises(ValueError, match="sweeps go forward and backward in turn, so that it must be even"):
-        wc.XPBD(substeps=1, iterations=5, integrator="midpoint")
-    wc.XPBD(substeps=1, iterations=5, integrator="midpoint", sweep="constraint-averaged")
-
-
-@pytest.mark.parametrize("integrator", ["midpoint", "bdf2"])
-def test_hard_constraints_need_euler(integrator, device):
-    """Hard constraints jump where velocities do not; XPBD, the one implicit solver that takes them, says so."""
-    scene = replace(held(), terms=[wc.Spring(pairs="structural", stiffness=np.inf)])
-    with pytest.raises(ValueError, match=f"XPBD with integrator='{integrator}' cannot take Spring with infinite stiffness"):
-        bound(scene, SOLVERS["xpbd"], device, integrator=integrator)

@@ -18,11 +18,9 @@ LENGTH = 0.25
 
 
 def sagging(stiffness, apart):
-    """A crumpled sheet, which descends slowly, beside a spring at rest and one between pins that is too long by ``apart`` [m].
-
-    The first of these has no force but what its length is rounded by, the other one has a large energy that stays. The corners
-    of the sheet are pinned, for where inertia alone resists it would descend for ever.
-    """
+    """A crumpled sheet, which descends slowly, beside a spring at rest and one between pins, too long by ``apart`` [m]."""
+    # The first of these has no force but what its length is rounded by, the other one has a large energy that stays. The
+    # corners of the sheet are pinned, for where inertia alone resists it would descend for ever.
     grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
     corner = LENGTH * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     points = np.concatenate([grid.points, np.add(corner, [3.0, 0.0, 0.0]), np.add(corner, [6.0, 0.0, 0.0])])
@@ -53,13 +51,11 @@ def energies(scene, corrections, device):
 
 
 def test_a_descent_ends_where_it_gains_what_rounding_loses(device):
-    """What rounding d loses is measured in float64, by adding roundings of ε|d| to the d of the end and subtracting them.
-
-    The mean of both has no part of first order. That part is as large, because the end is not quite the minimum. Roundings are
-    even in ±½ε, and have squares of ε²/12; the spacing of numbers in float32 is ½ε|d| to ε|d|. The estimate adds up worst cases
-    of ε over the N = 13 blocks of a row of bending, multiples of I, by their Frobenius norms: √3·12·N as much, of which the
-    descent takes a tenth.
-    """
+    """What rounding d loses is measured in float64, by adding roundings of ε|d| to the d of the end and subtracting them."""
+    # The mean of both has no part of first order. That part is as large, because the end is not quite the minimum. Roundings
+    # are even in ±½ε, and have squares of ε²/12; the spacing of numbers in float32 is ½ε|d| to ε|d|. The estimate adds up worst
+    # cases of ε over the N = 13 blocks of a row of bending, multiples of I, by their Frobenius norms: √3·12·N as much, of which
+    # the descent takes a tenth.
     scene, random = sagging(1e4, 0.0), np.random.default_rng(0)
     minimiser, result = descent(scene, device)
     assert result is Result.ROUNDED
@@ -84,10 +80,8 @@ def test_a_descent_goes_on_where_a_large_energy_hides_its_gains(device):
 
 
 def test_a_step_that_raises_the_energy_is_shortened(device):
-    """Where the slope falls to 0.84 of it, which would do if rounding hid the rise of 1e-5; energies are known to 1e-16.
-
-    A spring from a pin 1 m beside the line of the steps has two wells, which an attachment makes unequal.
-    """
+    """Where the slope falls to 0.84 of it, which would do if rounding hid the rise of 1e-5; energies are known to 1e-16."""
+    # A spring from a pin 1 m beside the line of the steps has two wells, which an attachment makes unequal.
 
     def energy(t):
         return 0.5 * (np.hypot(1.0, t) - 1.4) ** 2 + 0.01 * (t + 3.0) ** 2
@@ -125,10 +119,9 @@ STIFF = {
 
 @pytest.mark.parametrize("name", STIFF)
 def test_steps_of_stiff_cloth_are_exact_to_the_rounding_of_positions(name, device):
-    """Steps in float32, each against a converged one in float64 from the same state.
-
-    x̃ and x̃ + d are each rounded by up to ½ε|x|; a fifth of their sum is for roundings of d, of the mass and of the rest state.
-    """
+    """Steps in float32, each against a converged one in float64 from the same state."""
+    # x̃ and x̃ + d are each rounded by up to ½ε|x|; a fifth of their sum is for roundings of d, of the mass and of the rest
+    # state.
     terms, bound = STIFF[name]
     scene = wc.Scene(GRID, density=0.15, terms=terms, pins="z == 0")
     found, exact = (
@@ -165,11 +158,9 @@ def test_a_quadratic_energy_takes_one_whole_step(apart, device):
 
 @pytest.mark.parametrize("method", ["cg", "factorised"])
 def test_each_copy_ends_by_itself(method, device):
-    """Crumpled sheets of unlike stiffness beside one in balance and one that is not finite, to the bits of each alone.
-
-    The raw Hessian of the crumpled ones has negative curvatures, and they take more iterations than the loop on the device does
-    before the host looks.
-    """
+    """Crumpled sheets of unlike stiffness beside one in balance and one that is not finite, to the bits of each alone."""
+    # The raw Hessian of the crumpled ones has negative curvatures, and they take more iterations than the loop on the device
+    # does before the host looks.
     grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
     crumpled = 0.3 * grid.points + 0.05 * np.random.default_rng(0).normal(size=grid.points.shape)
     start = np.stack([crumpled, grid.points, crumpled, crumpled])

@@ -11,6 +11,7 @@ import warpcloth as wc
 from support.continuum import flat, hill, jittered
 from support.rows import slow_but
 from support.scenes import scene
+from support.steps import after_frames
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.linear import turn_and_multiply
 from warpcloth.kernels.multigrid import OMEGA
@@ -35,10 +36,8 @@ MESHES = {
 
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 def test_levels_interpolate_affine_functions(mesh):
-    """Weights sum to 1, kept vertices keep their values, and flat meshes interpolate positions but for the added moments, 1e-4.
-
-    A vertex of a curved mesh lies off the plane of its parents by about κL²/2.
-    """
+    """Weights sum to 1, kept vertices keep values, and flat meshes interpolate positions but for the added moments, 1e-4."""
+    # A vertex of a curved mesh lies off the plane of its parents by about κL²/2.
     free = np.ones(len(mesh.points), dtype=bool)
     free[3] = False
     found = interpolations(mesh.points, neighbours(mesh), free, 4)
@@ -275,9 +274,7 @@ def test_each_copy_chooses_what_costs_less(device):
     declared, stiffness = scene("hanging", n=24), [1.0, 1e5]
 
     def ends(**build):
-        stepper = wc.Newton(substeps=8).bind(declared.build(device=device, dtype="float64", **build))
-        for _ in range(2):
-            stepper.frame()
+        stepper = after_frames(declared, wc.Newton(substeps=8), 2, device=device, dtype="float64", **build)
         first = stepper.state.x.numpy()
         stepper.reset()
         for _ in range(2):

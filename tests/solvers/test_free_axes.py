@@ -9,7 +9,7 @@ import warpcloth as wc
 from support import setups
 from support.rows import slow_but
 from support.setups import MAIN, square
-from support.steps import after_one_step, newton_step, swinging
+from support.steps import after_steps, newton_step, spring, swinging
 
 # Eight substeps, for Explicit is not stable with fewer.
 SOLVERS = {name: replace(solver, substeps=8) for name, solver in setups.SOLVERS.items()}
@@ -18,10 +18,8 @@ N = 9  # vertices a side; odd, so that the cloth has a middle column
 
 
 def halves():
-    """A sheet that is pulled together along x, the indices of its half x ≤ 0, and that half by itself.
-
-    Springs along the cut have half the stiffness, lumped masses half the mass, and vertices there do not move along x.
-    """
+    """A sheet that is pulled together along x, the indices of its half x ≤ 0, and that half by itself."""
+    # Springs along the cut have half the stiffness, lumped masses half the mass, and vertices there do not move along x.
     grid = wc.Mesh.grid(N, N, pattern="alternating")
     mesh = wc.Mesh(grid.points - grid.points.mean(axis=0), triangles=grid.triangles)
     x = mesh.points[:, 0]
@@ -37,10 +35,8 @@ def halves():
     stiffness = np.where(cut[part.edges].all(axis=1), 50.0, 100.0)
     free = np.ones((len(kept), 3), dtype=bool)
     free[cut, 0] = False
-    half = wc.Scene(
-        part, terms=[wc.Spring(stiffness=stiffness)], pins=[0], velocities=velocities[kept], free_axes=free, **given
-    )
-    return whole, kept, half
+    given |= {"velocities": velocities[kept], "free_axes": free}
+    return whole, kept, wc.Scene(part, terms=[wc.Spring(stiffness=stiffness)], pins=[0], **given)
 
 
 def rails(declared, seed=0):
@@ -112,47 +108,36 @@ def membrane():
     ),
 )
 def test_all_meet(name, scene, device):
-    """At the minimum over the coordinates that are free, where the gradient along them is 0.
-
-    ADMM does not take bodies; constrained dynamics converges slowly where a limit turns, without locks too.
-    """
+    """At the minimum over the coordinates that are free, where the gradient along them is 0."""
+    # ADMM does not take bodies; constrained dynamics converges slowly where a limit turns, without locks too.
     declared = rails(replace(swinging(8), fps=120.0) if scene == "springs" else membrane())
     left_out = {wc.ADMM: wc.RigidCluster, wc.ConstrainedDynamics: wc.StrainLimit}.get(type(MINIMISE[name]), ())
     declared = replace(declared, terms=[term for term in declared.terms if not isinstance(term, left_out)])
     newton = newton_step(declared, device)
-    x, stepper = after_one_step(declared, MINIMISE[name], device)
+    x, stepper = after_steps(declared, MINIMISE[name], device)
     assert np.abs(x - newton).max() < 1e-8
     assert stepper.residual[0] < 1e-6
     if name == "newton":  # which says for all that the locks matter
         assert np.abs(newton_step(replace(declared, free_axes=None), device) - newton).max() > 1e-3
 
 
+RAIL = {"free_axes": [[True] * 3, [False, True, False]], "gravity": (0.0, -9.81, 0.0)}
 PROJECT = {name: solver for name, solver in LOCKING.items() if isinstance(solver, (wc.PBD, wc.HierarchicalPBD, wc.XPBD))}
 
 
 @pytest.mark.parametrize("name", PROJECT)
 def test_a_hard_spring_holds_a_bead_on_its_rail(name, device):
     """Of length 1, from the origin to (0.6, y): y ends at −0.8, by corrections that shrink by 1 − y² or more in a sweep."""
-    bead = wc.Scene(
-        wc.Mesh.chain(2),
-        masses=[1.0, 1.0],
-        positions=[[0.0, 0.0, 0.0], [0.6, -0.7, 0.0]],
-        terms=[wc.Spring(stiffness=np.inf)],
-        pins=[0],
-        free_axes=[[True] * 3, [False, True, False]],
-    )
-    x, _ = after_one_step(bead, replace(PROJECT[name], iterations=100), device)
+    x, _ = after_steps(spring((0.6, -0.7, 0.0), np.inf, **RAIL), replace(PROJECT[name], iterations=100), device)
     np.testing.assert_allclose(x[1], [0.6, -0.8, 0.0], rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", slow_but(("newton", "xpbd"), MAIN))
 def test_vertices_without_a_free_axis_are_pins(name, device):
     """To the bit, and to every solver."""
-    declared = square(solver=SOLVERS[name])
-    pinned, corner = replace(declared, pins=[0, 5]), np.ones((36, 3), dtype=bool)
-    corner[5] = False
-    locked = replace(declared, pins=[0], free_axes=corner)
-    runs = [wc.simulate(each, SOLVERS[name], device=device, frames=4).points[-1] for each in (pinned, locked)]
+    declared, free = square(solver=SOLVERS[name]), np.repeat(np.arange(36)[:, None] != 5, 3, axis=1)
+    scenes = replace(declared, pins=[0, 5]), replace(declared, pins=[0], free_axes=free)
+    runs = [wc.simulate(each, SOLVERS[name], device=device, frames=4).points[-1] for each in scenes]
     assert (runs[0] == runs[1]).all()
 
 
@@ -269,16 +254,8 @@ def test_handles_hold_all_axes():
 
 def test_a_bead_on_a_rail_comes_to_rest(device):
     """Its spring of length 1 goes from the origin to (1, y): k(1 − 1/l)y = −mg with l² = 1 + y²; U″ = k(1 − 1/l³)."""
-    bead = wc.Scene(
-        wc.Mesh.chain(2),
-        masses=[1.0, 1.0],
-        positions=[[0.0, 0.0, 0.0], [1.0, -0.1, 0.0]],
-        terms=[wc.Spring(stiffness=100.0)],
-        pins=[0],
-        free_axes=[[True] * 3, [False, True, False]],
-    )
     for linear in ("factorised", "cg"):
-        rest = wc.equilibrium(bead, device=device, linear=linear)
+        rest = wc.equilibrium(spring((1.0, -0.1, 0.0), **RAIL), device=device, linear=linear)
         x, y, z = rest.points[1]
         length = np.hypot(1.0, y)
         assert (x, z) == (1.0, 0.0)
@@ -290,16 +267,12 @@ def test_a_bead_on_a_rail_comes_to_rest(device):
 @pytest.mark.parametrize("name", slow_but([name for name in MAIN if name != "explicit"], LOCKING))
 def test_without_locks_nothing_is_there(name, device):
     """No bytes, kernels or launches more where every axis is free."""
-    reports, launches = [], []
+    found = []
     for free_axes in (None, np.ones((36, 3), dtype=bool)):
         model = square(solver=SOLVERS[name], free_axes=free_axes).build(device=device)
-        stepper = SOLVERS[name].bind(model)
-        stepper.step()
-        reports.append(model.report())
-        launches.append(model.launches[0])
-    assert model.mobility is None
-    assert reports[0] == reports[1]
-    assert launches[0] == launches[1]
+        SOLVERS[name].bind(model).step()
+        found.append((model.report(), model.launches[0]))
+    assert model.mobility is None and found[0] == found[1]
 
 
 @pytest.mark.host
@@ -315,13 +288,10 @@ def test_who_cannot_refuses():
 @pytest.mark.host
 def test_bad_masks_are_refused():
     rule = r"it must be an array \(36, 3\) of truth values, one for each axis of each vertex$"
-    for free_axes, given in [
-        (np.ones((35, 3), dtype=bool), r"has shape \(35, 3\); "),
-        (np.ones((36, 3)), r"is array\(.*; "),
-        ([[True], [True, False]], r"is \[\[True\], \[True, False\]\]; "),
-        ("x", "is 'x'; "),
-    ]:
-        with pytest.raises(ValueError, match=f"^free_axes {given}{rule}"):
+    shape, numbers, ragged = np.ones((35, 3), dtype=bool), np.ones((36, 3)), [[True], [True, False]]
+    sentences = r"has shape \(35, 3\)", r"is array\(.*", r"is \[\[True\], \[True, False\]\]", "is 'x'"
+    for free_axes, sentence in zip((shape, numbers, ragged, "x"), sentences, strict=True):
+        with pytest.raises(ValueError, match=f"^free_axes {sentence}; {rule}"):
             square(free_axes=free_axes)
     with pytest.raises(ValueError, match="vertex 0 has mass 0"):
         rails(wc.Scene(wc.Mesh.chain(2), masses=[0.0, 1.0], terms=[wc.Spring(stiffness=1.0)]), seed=3)

@@ -9,6 +9,7 @@ import warp as wp
 import warpcloth as wc
 from support.rows import slow_but
 from support.setups import MAIN, SOLVERS
+from support.steps import after_frames
 from warpcloth.terms.refresh import EVALUATION, STEP, Refresh
 
 LIFT = 0.05
@@ -58,23 +59,12 @@ class Floor(wc.Attachment):
 
 
 def scene(term, positions=MESH.points, velocities=((0.4, 0.1, -0.3), (0.0, 0.0, 0.0))):
-    return wc.Scene(
-        MESH,
-        masses=[2.0, 1.0],
-        positions=positions,
-        velocities=velocities,
-        terms=[term],
-        pins=[1],
-        gravity=(0.0, 0.0, 0.0),
-        fps=100.0,
-        duration=0.1,
-    )
+    fields = {"terms": [term], "pins": [1], "gravity": (0.0, 0.0, 0.0), "fps": 100.0, "duration": 0.1}
+    return wc.Scene(MESH, masses=[2.0, 1.0], positions=positions, velocities=velocities, **fields)
 
 
 def state_after(steps, solver, scene, device):
-    stepper = solver.bind(scene.build(device=device, dtype="float64"))
-    for _ in range(steps):
-        stepper.step()
+    stepper = after_frames(scene, solver, steps=steps, device=device, dtype="float64")
     return stepper.state.x.numpy().copy(), stepper.state.v.numpy().copy()
 
 

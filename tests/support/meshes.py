@@ -39,3 +39,10 @@ def joined(*parts):
     firsts = np.cumsum([0, *(len(points) for points, _ in parts)])
     triangles = [triangles + first for (_, triangles), first in zip(parts, firsts, strict=False)]
     return np.concatenate([points for points, _ in parts]), np.concatenate(triangles)
+
+
+def rolled(points, radius, degrees=0.0):
+    """Rolled up along the direction at an angle to x, (n, 3): an isometry of the plane y = 0."""
+    across, up = np.array([np.cos(np.radians(degrees)), 0.0, np.sin(np.radians(degrees))]), np.array([0.0, 1.0, 0.0])
+    along, arc = np.cross(across, up), (points @ across)[:, None]
+    return radius * (np.sin(arc / radius) * across + (1.0 - np.cos(arc / radius)) * up) + (points @ along)[:, None] * along

@@ -11,7 +11,8 @@ from pxr import Usd, UsdGeom
 import warpcloth as wc
 from support.energies import energy_and_gradient
 from support.rows import slow_but
-from support.setups import allocations
+from support.setups import allocated
+from support.steps import after_frames
 from support.usd_validation import validate
 from warpcloth.core.status import Result
 from warpcloth.numerics.constraints import Constraints
@@ -196,9 +197,9 @@ def test_a_compound_pendulum_has_its_period(solver, device):
     omega = np.sqrt(9.81 * (1.0 * 0.5 + 2.0 * 1.0) / (1.0 * 0.25 + 2.0 * 1.0)) * (1.0 - 0.05**2 / 16)
     errors = []
     for substeps in (10, 20, 40):
-        stepper = replace(solver, substeps=substeps).bind(pendulum(fps=20.0).build(device=device, dtype="float64"))
-        for _ in range(10 * substeps):
-            stepper.step()
+        stepper = after_frames(
+            pendulum(fps=20.0), replace(solver, substeps=substeps), steps=10 * substeps, device=device, dtype="float64"
+        )
         x = stepper.state.x.numpy()[2]
         errors.append(abs(np.arctan2(x[0], -x[1]) - 0.05 * np.cos(omega * 0.5)))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(1.0, abs=0.15)
@@ -207,15 +208,13 @@ def test_a_compound_pendulum_has_its_period(solver, device):
 
 @pytest.mark.parametrize(("substeps", "iterations"), [(1, 1), (4, 1), (1, 10)])
 def test_a_soft_body_hangs_as_deep_as_its_stiffness_says(substeps, iterations, device):
-    """XPBD, whatever step and iterations: a vertex below a pinned one of weight 1000 comes to rest 1.001 g/κ lower.
-
-    A single iteration leaves a thousandth of what it moves, gh².
-    """
+    """XPBD, whatever step and iterations: a vertex below a pinned one of weight 1000 comes to rest 1.001 g/κ lower."""
+    # A single iteration leaves a thousandth of what it moves, gh².
     kappa = 2000.0
     scene = body([[0.0, 0, 0], [0, -1.0, 0]], masses=[0.0, 3.0], stiffness=kappa, pins=[0], gravity=(0, -9.81, 0))
-    stepper = wc.XPBD(substeps=substeps, iterations=iterations).bind(scene.build(device=device, dtype="float64"))
-    for _ in range(600 * substeps):
-        stepper.step()
+    stepper = after_frames(
+        scene, wc.XPBD(substeps=substeps, iterations=iterations), steps=600 * substeps, device=device, dtype="float64"
+    )
     assert -1.0 - stepper.state.x.numpy()[1, 1] == pytest.approx(
         1.001 * 9.81 / kappa, abs=1.01e-3 * 9.81 * stepper.h**2 if iterations == 1 else 1e-9
     )
@@ -269,9 +268,7 @@ def test_soft_bodies_meet_at_one_minimiser(integrator, device):
     """After three steps all who minimise are where Newton is, to 1e-8 m; vector XPBD as its fixed point is implicit Euler."""
     ends = {}
     for name, solver in SOFT.items():
-        stepper = replace(solver, integrator=integrator).bind(jelly().build(device=device, dtype="float64"))
-        for _ in range(3):
-            stepper.step()
+        stepper = after_frames(jelly(), replace(solver, integrator=integrator), steps=3, device=device, dtype="float64")
         ends[name] = stepper.state.x.numpy()
         assert "xpbd" in name or stepper.results == [Result.CONVERGED], name
     for name, x in ends.items():
@@ -322,8 +319,7 @@ def test_copies_with_their_own_bodies(solver, device):
 def test_a_step_allocates_nothing(solver, device):
     stepper = solver(substeps=1).bind(jelly(fps=240.0).build(device=device))
     stepper.step()
-    with wp.ScopedMemoryTracker("steps", print=False) as tracker:
-        assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
+    assert allocated(lambda: [stepper.step() for _ in range(10)], device) == 0
 
 
 def test_bodies_by_selections_are_those_by_indices(device):
@@ -389,9 +385,7 @@ def test_degenerate_bodies(dtype, device):
         velocities=np.random.default_rng(0).normal(size=(7, 3)),
     )
     for solver in (wc.PBD(substeps=2), wc.XPBD(substeps=2), wc.PBD(substeps=2, sweep="vertex-averaged")):
-        stepper = solver.bind(scene.build(device=device, dtype=dtype))
-        for _ in range(120):
-            stepper.step()
+        stepper = after_frames(scene, solver, steps=120, device=device, dtype=dtype)
         x = stepper.state.x.numpy()
         assert np.isfinite(x).all() and (x[5:] == points[5:].astype(dtype)).all()
         assert np.abs(x[:5].mean(axis=0)[1] - points[:5].mean(axis=0)[1]) > 1.0

@@ -106,7 +106,6 @@ def test_tension_gives_back_the_moduli(name, ratio, device):
         F = gradients(mesh, rest.points)
         along, across = F[:, 0, 0] - 1.0, F[:, 2, 1] - 1.0
         errors.append(max(np.abs(along / strain - 1.0).max(), np.abs(across / strain + ratio).max()))
-    print(f"{name} ν={ratio:g}: errors {errors}")
     # St. Venant–Kirchhoff: f = Et(e + 3/2 e²); the others are less curved. The targets are 1e-4 strains away from infinity.
     assert errors[0] <= 2.0 * 1e-3 and errors[1] <= 2.0 * 1e-4
 
@@ -136,7 +135,6 @@ def test_a_strip_hanging_in_its_plane_is_of_second_order(name, device):
         narrower = (move[0, at, 1] - move[-1, at, 1]) / (weight * 3.0 * width)
         errors.append((abs(longer - 1.0), abs(narrower - ratio)))
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    print(f"{name}: errors {errors}, orders {orders.tolist()}")
     assert orders[:, 0].min() > 1.7 and errors[-1][0] < 2.5e-5
     # Second order too, down to what the strain, 1e-6, leaves.
     assert max(error for _, error in errors) < 1e-5 and errors[-1][1] < 3e-6
@@ -175,7 +173,6 @@ def test_neo_hookean_recovers(start, ratio, device):
         rest = wc.equilibrium(scene, tolerance=1e-9, device=device)
         assert rest.status.result in SETTLED, rest.status
         error = np.abs(stretches(mesh, rest.points) - 1.0).max()
-        print(f"{start}, ν={ratio:g}: {rest.iterations} iterations, stretches off by {error:.1e}")
         # Without bending stiffness it ends crumpled, where a stretch differs from 1 by the square of a move.
         assert error < 1e-4
 
@@ -329,19 +326,6 @@ def test_explicit_steps_count_limits_as_reached(limit, material, device):
     models = (flung("irregular", term).build(device=device, dtype="float64", copies=2) for term in (limit, material))
     of_limit, of_material = (step_limits(model) for model in models)
     assert of_limit == pytest.approx(of_material, rel=1e-6) and 0.0 < of_limit[0] < 1.0
-
-
-@pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1)])
-@pytest.mark.parametrize("kind", [wc.SpringLimit, wc.StrainLimit])
-def test_hard_limits_are_refused_where_forces_are_needed(kind, solver, device):
-    with pytest.raises(ValueError, match=f"cannot take {kind.__name__} with infinite stiffness; PBD"):
-        solver.bind(flung("alternating", kind(most=1.1)).build(device=device))
-
-
-@pytest.mark.parametrize("solver", [wc.PBD(substeps=1), wc.XPBD(substeps=1)])
-def test_infinite_stiffness_is_refused_where_no_projection_is(solver, device):
-    with pytest.raises(ValueError, match="cannot take StVKMembrane with infinite stiffness, as its"):
-        solver.bind(flung("alternating", wc.StVKMembrane(stiffness=np.inf)).build(device=device))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

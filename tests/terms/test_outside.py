@@ -10,7 +10,7 @@ import warpcloth as wc
 from support.command_line import refused, run
 from support.outside import FILES, Plane
 from support.rows import slow_but
-from support.steps import after_one_step, newton_step
+from support.steps import after_steps, newton_step
 from warpcloth import terms
 from warpcloth.base import extensions
 from warpcloth.solvers import SOLVERS
@@ -66,7 +66,7 @@ ITERATED = {
 @pytest.mark.parametrize("name", slow_but(list(ITERATED)[:1], ITERATED))
 def test_solvers_that_minimise_meet(name, device):
     solver = SOLVERS[name](substeps=1, **ITERATED[name])
-    x, _ = after_one_step(sheet(), solver, device)
+    x, _ = after_steps(sheet(), solver, device)
     assert np.abs(x - newton_step(sheet(), device)).max() < 1e-8
 
 

@@ -14,7 +14,7 @@ from support.continuum import hill, turn
 from support.continuum import jittered as irregular
 from support.energies import energy_and_gradient, every_dtype
 from support.energies import eps as eps_of
-from support.steps import after_one_step
+from support.steps import after_steps
 from warpcloth.core.hessian import Hessian
 from warpcloth.lab import elastica
 from warpcloth.mesh.curvature import curvature_operator
@@ -32,10 +32,8 @@ def _triangulated(points):
 
 
 def _scattered(n, stretch=0.0):
-    """Vertices of a grid moved by up to a quarter of their distances, but for the outline and the middle.
-
-    With ``stretch`` s the distances at the outline are (1 + s)/(1 − s) times those in the middle.
-    """
+    """Vertices of a grid moved by up to a quarter of their distances, but for the outline and the middle."""
+    # With ``stretch`` s the distances at the outline are (1 + s)/(1 − s) times those in the middle.
     line = np.linspace(0.0, 1.0, n)
     line = line + stretch * np.sin(2.0 * np.pi * line) / (2.0 * np.pi)
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
@@ -94,10 +92,8 @@ def model_of(mesh, bending, device, dtype="float64", **given):
 @each_material
 @each_mesh
 def test_a_surface_of_constant_curvature_costs_what_a_plate_does(pattern, material, device):
-    """½κᵀCκ per area, whatever the mesh, boundary included: to rounding, as second derivatives of a quadratic are exact.
-
-    An entry of y sums up positions over squares of lengths; the shortest altitude a has κ rounded by some ε/a².
-    """
+    """½κᵀCκ per area, whatever the mesh, boundary included: to rounding, as second derivatives of a quadratic are exact."""
+    # An entry of y sums up positions over squares of lengths; the shortest altitude a has κ rounded by some ε/a².
     mesh, (bending, (D1, D2, D12, D66)) = mesh_of(pattern, 11), MATERIALS[material]
     model, (x, _, z) = model_of(mesh, bending, device), mesh.points.T
     for name, (kx, kz, kxz) in CURVATURES.items():
@@ -240,10 +236,8 @@ STRIPS = {
     ("strip", "pattern"), [("warp", "diagonal"), ("weft", "alternating"), ("45°", "diagonal"), ("45°", "alternating")]
 )
 def test_a_strip_over_a_bar_is_the_elastica(strip, pattern, device):
-    """Both ends of a strip hang over a bar, where it is level by symmetry: H/W of the elastica to 0.2 %.
-
-    The membrane, kL²/D = 1e6, takes 1e-5 of that.
-    """
+    """Both ends of a strip hang over a bar, where it is level by symmetry: H/W of the elastica to 0.2 %."""
+    # The membrane, kL²/D = 1e6, takes 1e-5 of that.
     material, ratio = STRIPS[strip]
     given = wc.Mesh.grid(2 * ELEMENTS + 1, 5, size=(2.0, 4.0 / ELEMENTS), pattern=pattern)
     mesh = wc.Mesh(given.points - [1.0, 0.0, 0.0], given.triangles)
@@ -258,10 +252,8 @@ def test_a_strip_over_a_bar_is_the_elastica(strip, pattern, device):
 
 @pytest.mark.slow
 def test_drapes_of_all_patterns_come_together(device):
-    """A sheet of 0.3 m hangs from its corners, which are moved together by 15 %: each mesh continues the one of half its size.
-
-    The root of the mean square distance between any two falls from 4.3 to 0.71 and 0.13 mm. With hinges it stays at 0.88 mm.
-    """
+    """A sheet of 0.3 m hangs from corners that are moved together by 15 %: each mesh continues the one of half its size."""
+    # The root of the mean square distance between any two falls from 4.3 to 0.71 and 0.13 mm. With hinges it stays at 0.88 mm.
     size, patterns = 0.3, ("diagonal", "alternating", "equilateral", "jittered")
     line = np.linspace(1e-6, size - 1e-6, 9)
     at = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
@@ -289,7 +281,6 @@ def test_drapes_of_all_patterns_come_together(device):
             found = np.array([shapes[pattern](at) for pattern in patterns])
             pairs = np.linalg.norm(found[:, None] - found, axis=-1)
             apart[bending.label, n] = float(np.sqrt((pairs**2).mean(axis=-1)).max())
-    print(apart)
     plates, hinges = ([apart[label, n] for n in (17, 33)] for label in ("PlateBending", "DihedralBending"))
     assert plates[1] < 2e-4 and plates[0] / plates[1] > 3.0
     assert hinges[1] > 4.0 * plates[1]
@@ -298,12 +289,10 @@ def test_drapes_of_all_patterns_come_together(device):
 @pytest.mark.slow
 @pytest.mark.parametrize("over", [0.95, 1.2])
 def test_wrinkles_of_a_stretched_sheet(over, device):
-    """λ = 2√π (DL²/T)^¼ to 5 % (Cerda and Mahadevan 2003, *Geometry and physics of wrinkling*).
-
-    The sheet is stretched between hinged ends L apart, and its sides are brought together by ``over`` times what buckles it, a
-    stress of N = 2π√(DT)/L, the least of Dk² + T(π/L)²/k² over the wave number k. A stress of 1.018 N also lets 5½ waves
-    buckle, which are stable too; so the shape of least energy of three starts counts.
-    """
+    """λ = 2√π (DL²/T)^¼ to 5 % (Cerda and Mahadevan 2003, *Geometry and physics of wrinkling*)."""
+    # The sheet is stretched between hinged ends L apart, and its sides are brought together by ``over`` times what buckles it,
+    # a stress of N = 2π√(DT)/L, the least of Dk² + T(π/L)²/k² over the wave number k. A stress of 1.018 N also lets 5½ waves
+    # buckle, which are stable too; so the shape of least energy of three starts counts.
     L, Y, stretch = 0.2, 100.0, 1.01
     T = 0.5 * Y * (stretch**2 - 1.0)
     known, width = 0.2 * L, L  # five waves
@@ -371,19 +360,19 @@ def test_all_meet(name, device):
     """1e-8 m from Newton in float64, 1e-4 m in float32 with one sweep and one matrix; without the plate it is elsewhere."""
     solver, declared = MEET[name], swinging()
     newton = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised", integrator=solver.integrator)
-    exact, _ = after_one_step(declared, newton, device)
-    assert np.abs(after_one_step(declared, solver, device)[0] - exact).max() < 1e-8
+    exact, _ = after_steps(declared, newton, device)
+    assert np.abs(after_steps(declared, solver, device)[0] - exact).max() < 1e-8
     if "factorised" not in name and "coloured" not in name:  # whose kernels other rows have in float32
-        assert np.abs(after_one_step(declared, solver, device, "float32")[0] - exact).max() < 1e-4
-    assert np.abs(after_one_step(replace(declared, terms=declared.terms[:1]), newton, device)[0] - exact).max() > 1e-4
+        assert np.abs(after_steps(declared, solver, device, "float32")[0] - exact).max() < 1e-4
+    assert np.abs(after_steps(replace(declared, terms=declared.terms[:1]), newton, device)[0] - exact).max() > 1e-4
 
 
 @pytest.mark.parametrize("solver", [wc.ProjectiveDynamics(substeps=1), wc.ADMM(substeps=1)], ids=["pd", "admm"])
 def test_a_plate_alone_takes_one_solve(solver, device):
     """All of U is in the constant matrix."""
     declared = replace(swinging(), terms=swinging().terms[1:])
-    exact, _ = after_one_step(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)
-    found, stepper = after_one_step(declared, replace(solver, tolerance=1e-9), device)
+    exact, _ = after_steps(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)
+    found, stepper = after_steps(declared, replace(solver, tolerance=1e-9), device)
     assert np.abs(found - exact).max() < 1e-10 and stepper.iterations <= 3
 
 
@@ -395,10 +384,10 @@ def test_a_run_ends_well_with_the_others(device):
 def test_copies_vary_in_what_the_weights_hold(device):
     declared, solver = swinging(), wc.ProjectiveDynamics(substeps=1, iterations=50)
     vary = {"PlateBending.poisson_ratio": [0.3, -0.4], "PlateBending.stiffness": [1e-3, 2e-3]}
-    both, _ = after_one_step(declared, solver, device, copies=2, vary=vary)
+    both, _ = after_steps(declared, solver, device, copies=2, vary=vary)
     bending = replace(declared.terms[1], poisson_ratio=-0.4, stiffness=2e-3)
     alone = [
-        after_one_step(replace(declared, terms=[declared.terms[0], each]), solver, device)[0]
+        after_steps(replace(declared, terms=[declared.terms[0], each]), solver, device)[0]
         for each in (declared.terms[1], bending)
     ]
     assert np.abs(both - np.concatenate(alone)).max() < 1e-10 and np.abs(alone[1] - alone[0]).max() > 1e-5

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, diags_array
 
 import warpcloth as wc
 from support.energies import FEW, energy_and_gradient, eps, every_dtype
-from support.steps import after_one_step, newton_step
+from support.steps import after_frames, after_steps, newton_step
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.term import Term
 from warpcloth.solvers import SOLVERS
@@ -131,9 +131,7 @@ def test_explicit_steps_end_where_newton_does(device):
     for substeps in (64, 128):
         ends = []
         for solver in (wc.Newton(substeps=substeps, tolerance=1e-9), wc.Explicit(substeps=substeps)):
-            stepper = solver.bind(sheet().build(device=device, dtype="float64"))
-            for _ in range(6):
-                stepper.frame()
+            stepper = after_frames(sheet(), solver, 6, device=device, dtype="float64")
             ends.append(stepper.state.x.numpy())
         apart.append(np.abs(ends[0] - ends[1]).max())
     assert apart[0] < 0.03 and apart[0] / apart[1] == pytest.approx(2.0, rel=0.2)
@@ -144,10 +142,10 @@ def test_newton_finds_the_minimum(options, device):
     """Its Hessian is that of the cells: within a few iterations at rounding, and as many copies as alone."""
     exact = newton_step(sheet(), device)
     solver = wc.Newton(substeps=1, tolerance=1e-10, **options)
-    x, stepper = after_one_step(sheet(), solver, device)
+    x, stepper = after_steps(sheet(), solver, device)
     assert np.abs(x - exact).max() < 1e-9 and stepper.iterations < 30
-    both, _ = after_one_step(sheet(), solver, device, copies=2, vary={"Laplacian.stiffness": [20.0, 80.0]})
-    stiffer, _ = after_one_step(sheet([wc.Spring(stiffness=50.0), Laplacian(stiffness=80.0)]), solver, device)
+    both, _ = after_steps(sheet(), solver, device, copies=2, vary={"Laplacian.stiffness": [20.0, 80.0]})
+    stiffer, _ = after_steps(sheet([wc.Spring(stiffness=50.0), Laplacian(stiffness=80.0)]), solver, device)
     assert np.abs(both - np.vstack([exact, stiffer])).max() < 1e-8
     assert np.abs(stiffer - exact).max() > 1e-4
 

@@ -1085,10 +1085,8 @@ GATHERED += [(term, "float32") for term in DECLARABLE if term.name in ("Spring",
     ids=lambda value: getattr(value, "name", value),
 )
 def test_gathering_is_scattering(term, dtype, device, monkeypatch):
-    """The sum over the stencils of a vertex, the way of a GPU, is the sum over stencils; and each run gives the same bits.
-
-    Also that of several threads a vertex: 4 in float32, 3 in float64. The slots of a vertex may be a multiple of them or not.
-    """
+    """The sum over the stencils of a vertex, the way of a GPU, is the sum over stencils; and each run gives the same bits."""
+    # Also that of several threads a vertex: 4 in float32, 3 in float64. The slots of a vertex may be a multiple of them or not.
     monkeypatch.setattr(quadratic, "CHUNK", 7)  # of matrices, which are then added up in several
     random = np.random.default_rng(8)
     mesh = rest_mesh()
@@ -1150,11 +1148,9 @@ def test_a_copy_gathers_the_bits_of_a_model_of_its_own(name, dtype, device):
 
 
 def test_bending_that_gathers_by_element_has_no_net_force(device):
-    """But for what the forces of elements are rounded by, which is small beside what the products of a matrix are.
-
-    Of a sheet that curves by 0.01 of an edge these are 100 times as large as the force, and what one vertex rounds no other
-    takes back.
-    """
+    """But for what the forces of elements are rounded by, which is small beside what the products of a matrix are."""
+    # Of a sheet that curves by 0.01 of an edge these are 100 times as large as the force, and what one vertex rounds no other
+    # takes back.
     mesh, radius = wc.Mesh.grid(12, 12, size=1.0), 100.0 / 11.0
     x, _y, z = mesh.points.T
     rolled = np.column_stack([radius * np.sin(x / radius), radius * (1.0 - np.cos(x / radius)), z])
