@@ -10,7 +10,7 @@ import trimesh
 import warp as wp
 
 import warpcloth as wc
-from support.contacts import begin, energy, gradient, pairs_of, slope_of
+from support.contacts import begin, energy, gradient, hessian_times, pairs_of, slope_of
 from support.crossings import crossed
 from support.judges import barrier_slope
 from support.layers import DENSITY, GRAVITY, cloth, folded, ground, layers, positions, rubbing, slope
@@ -19,9 +19,7 @@ from support.scenes import scene
 from support.steps import after_frames
 from warpcloth.contact.proximity import ROUND
 from warpcloth.contact.self_start import crossings
-from warpcloth.core.hessian import Hessian
 from warpcloth.core.status import Result
-from warpcloth.kernels.term import HessianPolicy
 from warpcloth.scenes import drape, knot, loop
 
 SLOW = pytest.mark.slow
@@ -61,10 +59,7 @@ def contacts_at(pairs, x):
     return by_key
 
 
-@pytest.mark.parametrize(
-    ("bounded", "gap", "least"),
-    [(False, 4e-3, 0.0), (False, 1.2e-3, 0.0), (True, 4e-3, 0.0), (True, 1.2e-3, 0.0), (False, 1.2e-3, 1e-3)],
-)
+@pytest.mark.parametrize(("bounded", "gap", "least"), [*product((False, True), (4e-3, 1.2e-3), [0.0]), (False, 1.2e-3, 1e-3)])
 def test_forces_are_the_gradient_and_balance(bounded, gap, least, device):
     """By central differences to O(η²); ΣF = 0, Σ x × F = 0 to rounding; along p, kAφ′ of a vertex grows by kAφ″ Σ wᵢn·pᵢ."""
     scene, rng, eta = layers(turn=17.0, gap=gap), np.random.default_rng(1), 1e-7
@@ -100,17 +95,12 @@ def test_the_matrix_is_the_derivative_of_the_forces(gap, turn, move, device):
     x = scene.positions + 0.1 * gap * rng.normal(size=scene.positions.shape)
     pairs = pairs_of(scene, device)
     begin(pairs, x)
-    model = pairs.model
     p = rng.normal(size=x.shape) if move == "any" else np.arange(len(x))[:, None] // 36 * [1.0, 0.0, 0.3]
-    expected, found = slope_of(gradient, pairs, x, p, eta), model.vectors()
-    hessian = Hessian(model, HessianPolicy.RAW, terms=[], dynamic=pairs.forces.terms)
-    hessian.prepare()
-    hessian.assemble(model.array(x, model.vec3), 0.0)
-    hessian.multiply(model.array(p, model.vec3), found, wp.ones(1, dtype=wp.int32, device=device))
+    expected, (found, hessian) = slope_of(gradient, pairs, x, p, eta), hessian_times(pairs, x, p)
     dense = ((hessian.matrix() + hessian.coupling()) @ p.ravel()).reshape(-1, 3)
     rounding = np.finfo(float).eps * np.abs(hessian.values.numpy()).max()
-    assert found.numpy() == pytest.approx(dense, abs=1e2 * rounding)
-    assert found.numpy() == pytest.approx(expected, abs=1e-7 * np.abs(expected).max() + rounding * np.abs(x).max() / eta)
+    assert found == pytest.approx(dense, abs=1e2 * rounding)
+    assert found == pytest.approx(expected, abs=1e-7 * np.abs(expected).max() + rounding * np.abs(x).max() / eta)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
@@ -207,19 +197,15 @@ def test_a_sheet_rests_far_from_the_origin(dtype, device):
 
 def test_impact_far_from_the_origin_in_float32(device, n=24, edge=4e-3, far=4.0):
     """Strains are those of float64 but for the rounding of positions, ½ulp at each end and axis, in flight and after impact."""
-    length, there = edge * (n - 1), np.array([far, 0.0, far])
+    length = edge * (n - 1)
     mesh, radius, distance = wc.Mesh.grid(n, n, size=length, pattern="alternating"), 0.3 * length, 0.4 * edge
-    scene = wc.Scene(
-        mesh,
-        density=0.15,
-        terms=[wc.Spring(pairs=("structural", "shear"), stiffness=300.0), wc.QuadraticBending(stiffness=1e-5)],
-        positions=mesh.points + there + [-0.5 * length, 2.0 * radius + 2.0 * distance, -0.5 * length],
-        colliders=[wc.Sphere(radius=radius, position=(far, radius, far), friction=0.3)],
-        contact=wc.Contact(distance=distance),
-        self_contact=wc.SelfContact(distance=distance, friction=0.3),
-    )
-    options = {"frames": 4, "device": device}
-    found = [wc.simulate(scene, wc.Newton(substeps=4), dtype=dtype, **options) for dtype in ("float32", "float64")]
+    terms = [wc.Spring(pairs=("structural", "shear"), stiffness=300.0), wc.QuadraticBending(stiffness=1e-5)]
+    positions = mesh.points + np.array([far - 0.5 * length, 2.0 * radius + 2.0 * distance, far - 0.5 * length])
+    ball = wc.Sphere(radius=radius, position=(far, radius, far), friction=0.3)
+    contacts = {"contact": wc.Contact(distance=distance), "self_contact": wc.SelfContact(distance=distance, friction=0.3)}
+    scene = cloth(mesh, terms=terms, positions=positions, colliders=[ball], **contacts)
+    run = partial(wc.simulate, scene, wc.Newton(substeps=4), frames=4, device=device)
+    found = [run(dtype=dtype) for dtype in ("float32", "float64")]
     ends = [np.asarray(each.points, dtype=np.float64)[:, mesh.edges] for each in found]
     strains = [np.linalg.norm(x[:, :, 1] - x[:, :, 0], axis=2) / mesh.edge_lengths - 1.0 for x in ends]
     assert np.abs(strains[1][-1]).max() > 1e-3
@@ -402,12 +388,9 @@ def test_a_copy_that_moves_again_moves_no_other(device, r=5e-3):
     velocities[1, :, 1] = -15.0
 
     def ends(velocities):
-        count = len(velocities)
-        model = scene.build(device=device, dtype="float64", copies=count, vary={"velocities": velocities})
-        stepper = wc.Newton(substeps=1).bind(model)
-        for _ in range(3):
-            stepper.step()
-        return stepper.state.x.numpy().reshape(count, -1, 3), stepper.colliders.notes.cut.numpy()
+        build = {"device": device, "dtype": "float64", "copies": len(velocities), "vary": {"velocities": velocities}}
+        stepper = after_frames(scene, wc.Newton(substeps=1), steps=3, **build)
+        return stepper.state.x.numpy().reshape(len(velocities), -1, 3), stepper.colliders.notes.cut.numpy()
 
     both, cut = ends(velocities)
     assert cut[0] == 0 < cut[1]
@@ -489,14 +472,10 @@ def test_free_fall(name, device):
 def test_free_fall_of_a_stack(solver, device, fps=48):
     """Sheets that fall together at their contact distance, with a pinned piece far away, move as without the filter."""
     pinned = wc.Mesh([[5.0, 0.0, 0.0], [5.1, 0.0, 0.0], [5.0, 0.0, 0.1]], [[0, 1, 2]])
-    scene = cloth(
-        wc.Mesh.join({"sheets": layers(3, n=5, size=0.2, gap=2e-3).mesh, "pinned": pinned}),
-        velocities=np.vstack([np.tile([0.0, -3.0, 0.0], (75, 1)), np.zeros((3, 3))]),
-        terms=[wc.Spring(stiffness=100.0)],
-        pins="part(pinned)",
-        self_contact=wc.SelfContact(distance=2e-3),
-        fps=fps,
-    )
+    mesh = wc.Mesh.join({"sheets": layers(3, n=5, size=0.2, gap=2e-3).mesh, "pinned": pinned})
+    velocities = np.vstack([np.tile([0.0, -3.0, 0.0], (75, 1)), np.zeros((3, 3))])
+    fields = {"pins": "part(pinned)", "self_contact": wc.SelfContact(distance=2e-3), "fps": fps}
+    scene = cloth(mesh, velocities=velocities, terms=[wc.Spring(stiffness=100.0)], **fields)
     run = wc.simulate(scene, solver, device=device, dtype="float64", frames=8)
     fall = 3.0 * 8 / fps + GRAVITY / fps**2 * 8 * 9 / 2  # implicit Euler
     assert run.cut == 0.0
@@ -727,20 +706,25 @@ def test_sweeps_over_coarse_levels_find_no_contacts_anew(device):
     assert len(stepper.levels) > 1 and stepper.pairs.contact.turn.numpy() == [3]
 
 
+def start_of_step(scene, moving, rise, device):
+    """Where a step starts whose pin ends at its keyframe, and others at the prediction ``rise`` [m] higher; nothing crosses."""
+    pairs = pairs_of(scene, device)
+    base, d = scene.positions.copy(), pairs.model.vectors()
+    base[moving, 1] += rise
+    base[scene.pins.vertices] = scene.pins.keyframes[-1]
+    pairs.filter.launch_start(pairs.model.array(base, pairs.model.vec3), d)
+    assert crossed(base + d.numpy(), scene.mesh.triangles) == 0
+    return base + d.numpy()
+
+
 @pytest.mark.parametrize(("way", "walks"), [(0.01, False), (-0.05, True)])
 def test_where_a_step_with_moving_pins_starts(way, walks, device):
     """Where sheets would pass through one another: cloth stays as its pin moves, but follows a pin that goes through cloth."""
     pin = 36 + 14
     frames = layers().positions[[pin]] + np.array([0.0, 1.0, 0.0]) * np.array([0.0, way])[:, None, None]
     scene = layers(pins=wc.Pins([pin], frames), duration=1.0 / 24.0)
-    pairs = pairs_of(scene, device)
-    base, d = scene.positions.copy(), pairs.model.vectors()
-    base[36:, 1] -= 0.05
-    base[pin] = frames[-1]
-    pairs.filter.launch_start(pairs.model.array(base, pairs.model.vec3), d)
-    start, stayed = base + d.numpy(), scene.positions.copy()
-    stayed[pin] = base[pin]
-    assert crossed(start, scene.mesh.triangles) == 0
+    start, stayed = start_of_step(scene, slice(36, 72), -0.05, device), scene.positions.copy()
+    stayed[pin] = frames[-1]
     if walks:
         assert (np.abs(start - scene.positions).max(axis=1)[36:] > 1e-3).all()
     else:
@@ -753,13 +737,7 @@ def test_a_pin_pushes_cloth_that_goes_the_other_way(device):
     positions = above_a_triangle(scene.positions)
     frames = positions[[pin]] - np.array([0.0, 1.0, 0.0]) * np.array([0.0, 0.01])[:, None, None]
     scene = replace(scene, positions=positions, pins=wc.Pins([pin], frames), duration=1.0 / 24.0)
-    pairs = pairs_of(scene, device)
-    base, d = positions.copy(), pairs.model.vectors()
-    base[:36, 1] += 0.05
-    base[pin] = frames[-1]
-    pairs.filter.launch_start(pairs.model.array(base, pairs.model.vec3), d)
-    start = base + d.numpy()
-    assert crossed(start, scene.mesh.triangles) == 0
+    start = start_of_step(scene, slice(36), 0.05, device)
     np.testing.assert_allclose(start[pin], frames[-1, 0], atol=1e-12)
 
 
@@ -821,8 +799,11 @@ def test_resets_that_are_refused(name, device):
 @each_solver
 def test_nothing_is_there_without(name, device):
     stepper = after_frames(layers(self_contact=None), SOLVERS[name], device=device)
-    assert stepper.pairs is None
-    assert not any("pairs" in kernel for kernel in stepper.model.kernels)
+    assert stepper.pairs is None and not any("pairs" in kernel for kernel in stepper.model.kernels)
+    if name == "newton":
+        stepper = after_frames(rubbing(friction=0.0), SOLVERS[name], 1, device=device)
+        assert stepper.pairs.friction is None and not stepper.state.parts
+        assert not any("friction" in kernel for kernel in stepper.model.kernels)
 
 
 def test_default_stiffness():

@@ -235,9 +235,3 @@ def test_cards_stand_for_a_minute(device):
     """From 30 s on they move by less than 1e-7 m, some last places of coordinates."""
     stepper = after_frames(cards.scene(), SOLVERS["xpbd"], 720, device=device, dtype="float32")
     assert np.ptp(list(positions(stepper, 720)), axis=0).max() < 1e-7
-
-
-def test_nothing_is_there_without(device):
-    stepper = after_frames(rubbing(friction=0.0), SOLVERS["newton"], 1, device=device)
-    assert stepper.pairs.friction is None and not stepper.state.parts
-    assert not any("friction" in kernel for kernel in stepper.model.kernels)

@@ -8,16 +8,14 @@ import trimesh
 import warp as wp
 
 import warpcloth as wc
-from support.contacts import energy, gradient, slope_of
+from support.contacts import energy, gradient, hessian_times, slope_of
 from support.layers import cloth, ground, positions, stack
 from support.pairs import between_edges, detect, from_triangle
 from support.steps import after_frames
 from warpcloth.contact.proximity import MAX_MOVE, Proximity
 from warpcloth.contact.surface import ContactSurface
-from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.contact.obstacles import CLOTH, OBSTACLE
 from warpcloth.kernels.contact.pair_potential import CLOSE
-from warpcloth.kernels.term import HessianPolicy
 
 R = 3e-3
 
@@ -48,17 +46,14 @@ def test_forces_and_matrix_are_derivatives_of_the_energy(cells, gap, device):
         step[i, axis] = 1.0
         # Third derivatives of φ are of the order of kA/r², and U is rounded.
         assert found[i, axis] == pytest.approx(slope_of(energy, stepper.pairs, x, step, eta), abs=1e-6 * np.abs(found).max())
-    model, product, near = stepper.model, stepper.model.vectors(), 1e-6 * gap * R
-    hessian = Hessian(model, HessianPolicy.RAW, terms=[], dynamic=stepper.pairs.forces.terms)
-    hessian.prepare()
+    near = 1e-6 * gap * R
     for _ in range(3):
         p = rng.normal(size=x.shape)
         expected = slope_of(gradient, stepper.pairs, x, p, near)
-        hessian.assemble(model.array(x, model.vec3), 0.0)
-        hessian.multiply(model.array(p, model.vec3), product, wp.ones(1, dtype=wp.int32, device=device))
+        found, hessian = hessian_times(stepper.pairs, x, p)
         # The error is of (p near/d)², and of x, rounded, times the matrix over near.
         rounding = np.finfo(float).eps * np.abs(hessian.values.numpy()).max() * np.abs(x).max() / near
-        assert product.numpy() == pytest.approx(expected, abs=1e-7 * np.abs(expected).max() + rounding)
+        assert found == pytest.approx(expected, abs=1e-7 * np.abs(expected).max() + rounding)
 
 
 @pytest.mark.parametrize("cells", (2, 9, 40))
@@ -264,25 +259,17 @@ def test_the_gap_of_edges_is_reported_where_they_do_not_act(start, device):
 def test_a_copy_without_pairs_does_not_follow_what_another_has(solver, device):
     """Two sheets fall on a mesh, one as fast that it has pairs first; the other moves as alone, to the bit."""
     grid, mesh = wc.Mesh.grid(8, 8, size=0.3), wc.Mesh.grid(5, 5, size=0.5)
-    positions = grid.points - grid.points.mean(axis=0) + [0.0, 0.03, 0.0]
-    scene = wc.Scene(
-        grid,
-        positions=positions,
-        density=0.15,
-        terms=[wc.Spring(stiffness=300.0)],
-        fps=24.0,
-        contact=wc.Contact(distance=4e-3, stiffness=1e4),
-        colliders=[wc.MeshCollider(mesh.points - mesh.points.mean(axis=0), mesh.triangles)],
-    )
+    start = grid.points - grid.points.mean(axis=0) + [0.0, 0.03, 0.0]
+    colliders = [wc.MeshCollider(mesh.points - mesh.points.mean(axis=0), mesh.triangles)]
+    fields = {"colliders": colliders, "contact": wc.Contact(distance=4e-3, stiffness=1e4), "fps": 24.0}
+    scene = cloth(grid, terms=[wc.Spring(stiffness=300.0)], positions=start, **fields)
     falls = np.array([[0.0, -3.0, 0.0], [1.0, -8.0, 0.0]])[:, None]
     velocities = 0.2 * np.random.default_rng(0).normal(size=(2, 64, 3)) + falls
     found = []
     for copies in (1, 2):
-        stepper = solver.bind(scene.build(copies=copies, dtype="float64", device=device))
+        stepper = after_frames(scene, solver, copies=copies, dtype="float64", device=device)
         stepper.reset(None, None, velocities[:copies])
-        for _ in range(2):
-            stepper.frame()
-        found.append(stepper.state.x.numpy()[:64])
+        found.append(list(positions(stepper, 2))[-1][:64])
     assert (found[0] == found[1]).all()
 
 

@@ -1,7 +1,5 @@
 """As-rigid-as-possible deformation against plain NumPy, libigl, the KKT system and closed forms."""
 
-import io
-import re
 import warnings
 from functools import cache
 
@@ -19,6 +17,7 @@ import warpcloth as wc
 from support import matrices
 from support.meshes import kite
 from support.rows import slow_but
+from support.setups import allocated
 from warpcloth.deformation import arap as module
 from warpcloth.numerics import linear
 
@@ -259,11 +258,16 @@ def test_a_rigid_motion_of_the_handles_is_followed_exactly(name, energy, weights
     assert np.abs(found.energies).max() < 20 * eps**2 * np.abs(arap.laplacian).sum()
 
 
+def squares(n):
+    """A mesh of two, and its points."""
+    square = wc.Mesh.grid(n, n)
+    points = np.concatenate([square.points, square.points + np.array([5.0, 0.0, 0.0])])
+    return wc.Mesh(points, np.concatenate([square.triangles, square.triangles + n * n])), points
+
+
 def test_parts_follow_their_own_handles(device):
     """Two squares, one moved and turned, the other held by a single vertex, and so only moved."""
-    square = wc.Mesh.grid(4, 4)
-    points = np.concatenate([square.points, square.points + np.array([5.0, 0.0, 0.0])])
-    mesh = wc.Mesh(points, np.concatenate([square.triangles, square.triangles + 16]))
+    mesh, points = squares(4)
     Q = Rotation.from_rotvec([0.0, 0.0, 1.0]).as_matrix()
     targets = np.concatenate([points[:4] @ Q.T, [points[20] + [0.0, 1.0, 0.0]]])
     found = wc.Arap(mesh, [0, 1, 2, 3, 20], device=device).solve(targets)
@@ -335,13 +339,9 @@ def test_frames_reuse_factors_and_arrays(device, monkeypatch):
     arap = wc.Arap(mesh, handles, device=device)
     frames = [mesh.points[handles] + part * (targets - mesh.points[handles]) for part in (0.2, 0.6, 1.0)]
     arap.solve(frames[0], initial=mesh.points)
-    with wp.ScopedMemoryTracker("frames", print=False) as tracker:
-        tracker.clear()
-        found = [arap.solve(frame, initial=mesh.points) for frame in frames]
-        report = io.StringIO()
-        tracker.report(file=report)
-    allocations = re.search(r"Total allocations:\s+\S+\s+(\d+)", report.getvalue())
-    assert (allocations is None or allocations[1] == "0") and len(factored) == 1
+    found = []
+    assert allocated(lambda: found.extend(arap.solve(frame, initial=mesh.points) for frame in frames), device) == 0
+    assert len(factored) == 1
     fresh = wc.Arap(mesh, handles, device=device).solve(frames[-1], initial=mesh.points)
     assert np.array_equal(found[-1].points, fresh.points) and np.array_equal(found[-1].energies, fresh.energies)
 
@@ -380,7 +380,7 @@ def test_rows_of_the_laplacian_sum_to_zero_and_it_is_linearly_precise(weights, d
     assert abs(L - L.T).max() < 10 * EPS * size
     inside = np.setdiff1d(np.arange(len(mesh.points)), mesh.boundary)
     of_linear = np.abs((L @ mesh.points)[inside]).max()
-    assert (of_linear < 1e-12 * size) == (weights in ("cotangent", "intrinsic"))
+    assert of_linear < 1e-12 * size if weights in ("cotangent", "intrinsic") else of_linear > 0.01
     # No flip helps an edge of the boundary.
     off = coo_matrix(L)
     off = off.data[(off.row != off.col) & (np.isin(off.row, inside) | np.isin(off.col, inside))]
@@ -390,45 +390,32 @@ def test_rows_of_the_laplacian_sum_to_zero_and_it_is_linearly_precise(weights, d
 # --- what is refused
 
 
-def two_squares():
-    square = wc.Mesh.grid(3, 3)
-    points = np.concatenate([square.points, square.points + np.array([5.0, 0.0, 0.0])])
-    return wc.Mesh(points, np.concatenate([square.triangles, square.triangles + 9]))
-
-
 def with_isolated():
     return wc.Mesh([[0.0, 0, 0], [1.0, 0, 0], [9.0, 9, 9], [0.0, 1, 0], [8.0, 9, 9]], [[0, 1, 3]])
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("mesh", "handles", "options", "message"),
     [
-        (lambda: wc.Arap(kite(60.0), []), r"handles is \[\], which names no vertex"),
-        (lambda: wc.Arap(kite(60.0), "y > 100"), "handles is 'y > 100', which names no vertex"),
-        (lambda: wc.Arap(kite(60.0), [0, 4]), r"handles\[1\] is 4; it must lie in 0 … 3"),
-        (lambda: wc.Arap(kite(60.0), [-1]), r"handles\[0\] is -1"),
-        (lambda: wc.Arap(kite(60.0), [2, 1, 2]), "handles names vertex 2 twice"),
-        (lambda: wc.Arap(kite(60.0), [0.5]), r"handles has shape \(1,\) and type float64; it must be a list of whole numbers"),
-        (lambda: wc.Arap(kite(60.0), [0], weights="cot"), "weights is 'cot'; it must be one of"),
-        (lambda: wc.Arap(kite(60.0), [0], energy="rims"), "energy is 'rims'; it must be one of"),
-        (lambda: wc.Arap(kite(60.0), [0], dtype="float16"), "dtype is 'float16'"),
-        (lambda: wc.Arap(kite(60.0), [0], weights="intrinsic", energy="spokes_and_rims"), "weights is 'intrinsic'; energy = "),
-        (lambda: wc.Arap(kite(60.0), [0], weights="uniform", energy="spokes_and_rims"), 'takes "cotangent"'),
-        (lambda: wc.Arap(wc.Mesh.chain(3), [0]), "weights is 'cotangent', which needs triangles"),
-        (
-            lambda: wc.Arap(with_isolated(), [0]),
-            r"vertex 2 is in no triangle and on no edge \(isolated vertices of the mesh: 2\)",
-        ),
-        (lambda: wc.Arap(two_squares(), [0]), "handles leave 1 of the 2 parts .* with 9 vertices, such as vertex 9"),
-        (
-            lambda: wc.Mesh([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]], [[0, 1, 2]]),
-            r"triangles\[0\] is \[0, 1, 2\]; it must be higher",
-        ),
+        (kite(60.0), [], {}, r"handles is \[\], which names no vertex"),
+        (kite(60.0), "y > 100", {}, "handles is 'y > 100', which names no vertex"),
+        (kite(60.0), [0, 4], {}, r"handles\[1\] is 4; it must lie in 0 … 3"),
+        (kite(60.0), [-1], {}, r"handles\[0\] is -1"),
+        (kite(60.0), [2, 1, 2], {}, "handles names vertex 2 twice"),
+        (kite(60.0), [0.5], {}, r"handles has shape \(1,\) and type float64; it must be a list of whole numbers"),
+        (kite(60.0), [0], {"weights": "cot"}, "weights is 'cot'; it must be one of"),
+        (kite(60.0), [0], {"energy": "rims"}, "energy is 'rims'; it must be one of"),
+        (kite(60.0), [0], {"dtype": "float16"}, "dtype is 'float16'"),
+        (kite(60.0), [0], {"weights": "intrinsic", "energy": "spokes_and_rims"}, "weights is 'intrinsic'; energy = "),
+        (kite(60.0), [0], {"weights": "uniform", "energy": "spokes_and_rims"}, 'takes "cotangent"'),
+        (wc.Mesh.chain(3), [0], {}, "weights is 'cotangent', which needs triangles"),
+        (with_isolated(), [0], {}, r"vertex 2 is in no triangle and on no edge \(isolated vertices of the mesh: 2\)"),
+        (squares(3)[0], [0], {}, "handles leave 1 of the 2 parts .* with 9 vertices, such as vertex 9"),
     ],
 )
-def test_what_cannot_be_bent_is_refused(make, message):
+def test_what_cannot_be_bent_is_refused(mesh, handles, options, message):
     with pytest.raises(ValueError, match=message):
-        make()
+        wc.Arap(mesh, handles, **options)
 
 
 @pytest.mark.parametrize(

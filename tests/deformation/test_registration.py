@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.continuum import corner_normals
+from support.mesh_texts import obj
 from warpcloth.cli import main
 from warpcloth.lab.scans import scan, write_capture
 from warpcloth.mesh.mesh import Surface
@@ -25,17 +27,9 @@ def bent(frames=4):
     return np.array(found)
 
 
-def normals(x):
-    a, b, c = x[TEMPLATE.triangles].transpose(1, 0, 2)
-    sums = np.zeros_like(x)
-    for corner in TEMPLATE.triangles.T:
-        np.add.at(sums, corner, np.cross(b - a, c - a))
-    return sums / np.linalg.norm(sums, axis=1)[:, None]
-
-
 def errors(found, true):
     """RMS error along the normal and along the surface [m]."""
-    apart, normal = found - true, np.array([normals(x) for x in true])
+    apart, normal = found - true, np.array([corner_normals(TEMPLATE, x) for x in true])
     along = np.einsum("fki,fki->fk", apart, normal)
     return np.sqrt(np.mean(along**2)), np.sqrt(np.mean(np.sum(apart**2, axis=2) - along**2))
 
@@ -121,17 +115,14 @@ def test_missing_frames_are_interpolated_and_files_are_written(tmp_path, capsys)
     true = bent()
     write_capture(scan(TEMPLATE, true, 1 / 24, SPACING), tmp_path / "seen", scale=1e-3)
     (tmp_path / "seen" / "seen_0002.ply").unlink()
-    lines = [f"v {x:.17g} {y:.17g} {z:.17g}" for x, y, z in true[0]]
-    lines += [f"f {i + 1} {j + 1} {k + 1}" for i, j, k in TEMPLATE.triangles]
-    (tmp_path / "first.obj").write_text("\n".join(lines) + "\n")
+    (tmp_path / "first.obj").write_text(obj(true[0], TEMPLATE.triangles))
     words = ["resample", str(tmp_path / "seen"), "--onto", str(tmp_path / "first.obj"), "-o", str(tmp_path / "x.usdc")]
     assert main([*words, "--fps", "24", "--scale", "0.001", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["frames"] == 4 and facts["missing"] == [2] and facts["not_converged"] == 0 and facts["rms"] < 1.5e-3
     sequence = wc.open_sequence(tmp_path / "x.usdc")
-    assert np.allclose(sequence.times, np.arange(4) / 24) and np.allclose(
-        sequence[2], 0.5 * (sequence[1] + sequence[3]), atol=1e-6
-    )
+    assert np.allclose(sequence.times, np.arange(4) / 24)
+    assert np.allclose(sequence[2], 0.5 * (sequence[1] + sequence[3]), atol=1e-6)
     distances = np.asarray(wc.usd.FrameSequence(tmp_path / "x.usdc", attribute="primvars:captureDistance"))
     assert (distances[2] == -1.0).all() and 0.0 <= distances[[0, 1, 3]].min() and distances.max() < 0.02
     for wrong, sentence in (  # wrong outputs with nothing to read: they are refused before the capture

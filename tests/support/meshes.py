@@ -46,3 +46,12 @@ def rolled(points, radius, degrees=0.0):
     across, up = np.array([np.cos(np.radians(degrees)), 0.0, np.sin(np.radians(degrees))]), np.array([0.0, 1.0, 0.0])
     along, arc = np.cross(across, up), (points @ across)[:, None]
     return radius * (np.sin(arc / radius) * across + (1.0 - np.cos(arc / radius)) * up) + (points @ along)[:, None] * along
+
+
+def irregular(nx=7, ny=6, size=1.0):
+    """A flat jittered sheet in the plane y = 0; its outline stays a rectangle."""
+    grid = wc.Mesh.grid(nx, ny, size=size, pattern="alternating")
+    jitter = np.random.default_rng(0).uniform(-0.25, 0.25, (nx * ny, 3)) * np.divide(size, (nx - 1, ny - 1)).mean()
+    jitter[:, 1] = 0.0
+    jitter[grid.boundary] = 0.0
+    return wc.Mesh(grid.points + jitter, grid.triangles)

@@ -14,7 +14,8 @@ from support.continuum import hill, turn
 from support.continuum import jittered as irregular
 from support.energies import energy_and_gradient, every_dtype
 from support.energies import eps as eps_of
-from support.steps import after_steps
+from support.meshes import rolled
+from support.steps import after_steps, newton_step
 from warpcloth.core.hessian import Hessian
 from warpcloth.lab import elastica
 from warpcloth.mesh.curvature import curvature_operator
@@ -73,16 +74,10 @@ MATERIALS = {
     "orthotropic": (wc.PlateBending.from_stiffnesses(**ORTHOTROPIC, direction=(1.0, 0.0, 0.0)), tuple(ORTHOTROPIC.values())),
 }
 each_material = pytest.mark.parametrize("material", MATERIALS)
-CURVATURES = {
-    "cylinder": (1.0, 0.0, 0.0),
-    **{
-        f"cylinder at {a}°": (np.cos(np.radians(a)) ** 2, np.sin(np.radians(a)) ** 2, 0.5 * np.sin(np.radians(2 * a)))
-        for a in (30, 45, 135)
-    },
-    "twist": (0.0, 0.0, 1.0),
-    "saddle": (1.0, -1.0, 0.0),
-    "dome": (1.0, 1.0, 0.0),
-}
+TURNS = np.radians([0.0, 30.0, 45.0, 135.0])
+# Of cylinders along some directions, a twist, a saddle and a dome.
+CURVATURES = [*np.stack([np.cos(TURNS) ** 2, np.sin(TURNS) ** 2, 0.5 * np.sin(2.0 * TURNS)], axis=1)]
+CURVATURES += [(0.0, 0.0, 1.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0)]
 
 
 def model_of(mesh, bending, device, dtype="float64", **given):
@@ -96,10 +91,10 @@ def test_a_surface_of_constant_curvature_costs_what_a_plate_does(pattern, materi
     # An entry of y sums up positions over squares of lengths; the shortest altitude a has κ rounded by some ε/a².
     mesh, (bending, (D1, D2, D12, D66)) = mesh_of(pattern, 11), MATERIALS[material]
     model, (x, _, z) = model_of(mesh, bending, device), mesh.points.T
-    for name, (kx, kz, kxz) in CURVATURES.items():
+    for kx, kz, kxz in CURVATURES:
         lifted = mesh.points + np.outer(0.5 * kx * x**2 + 0.5 * kz * z**2 + kxz * x * z, [0.0, 1.0, 0.0])
         expected = 0.5 * (D1 * kx**2 + D2 * kz**2 + 2.0 * D12 * kx * kz + 4.0 * D66 * kxz**2)
-        assert energy_and_gradient(model, lifted)[0][0] == pytest.approx(expected, rel=1e-8), name
+        assert energy_and_gradient(model, lifted)[0][0] == pytest.approx(expected, rel=1e-8), (kx, kz, kxz)
 
 
 @pytest.mark.parametrize("degrees", [0, 25, 45, 90])
@@ -107,11 +102,8 @@ def test_a_surface_of_constant_curvature_costs_what_a_plate_does(pattern, materi
 def test_a_sheet_rolled_up_without_stretch_is_a_cylinder(pattern, degrees, device):
     """Chords differ from arcs: a second derivative over a patch of size s, two edges, is off by (s/R)²/12."""
     mesh, radius = mesh_of(pattern, 21), 2.0
-    along = np.array([np.cos(np.radians(degrees)), 0.0, np.sin(np.radians(degrees))])
-    arc, across = mesh.points @ along, np.cross(along, [0.0, 1.0, 0.0])
-    rolled = np.outer(radius * np.sin(arc / radius), along) + np.outer(mesh.points @ across, across)
-    rolled += np.outer(radius * (1.0 - np.cos(arc / radius)), [0.0, 1.0, 0.0])
-    energy = energy_and_gradient(model_of(mesh, MATERIALS["0.3"][0], device), rolled)[0][0]
+    model = model_of(mesh, MATERIALS["0.3"][0], device)
+    energy = energy_and_gradient(model, rolled(mesh.points, radius, degrees))[0][0]
     assert energy == pytest.approx(0.5 * D / radius**2, rel=2.0 * (2.0 * mesh.edge_lengths.max() / radius) ** 2 / 12.0)
     assert energy == pytest.approx(0.5 * D / radius**2, rel=1.5e-3)
 
@@ -207,9 +199,7 @@ def test_only_lengths_of_the_rest_shape_count():
     folded = flat.points.copy()
     beyond = folded[:, 0] > 0.5
     folded[beyond] = np.stack([np.full(beyond.sum(), 0.5), folded[beyond, 0] - 0.5, folded[beyond, 2]], axis=1)
-    one, other = (
-        wc.PlateBending(stiffness=D, poisson_ratio=0.3).operator(wc.Mesh(p, flat.triangles)) for p in (flat.points, folded)
-    )
+    one, other = (MATERIALS["0.3"][0].operator(wc.Mesh(points, flat.triangles)) for points in (flat.points, folded))
     assert abs(one - other).max() < 1e3 * EPS * abs(one).max()
 
 
@@ -347,15 +337,10 @@ MEET = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(
-            name, marks=() if name == "newton" else [pytest.mark.host] + [pytest.mark.slow] * (name != "xpbd sequential")
-        )
-        for name in MEET
-    ],
-)
+ELSEWHERE = {name: [pytest.mark.host] + [pytest.mark.slow] * (name != "xpbd sequential") for name in MEET if name != "newton"}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=ELSEWHERE.get(name, ())) for name in MEET])
 def test_all_meet(name, device):
     """1e-8 m from Newton in float64, 1e-4 m in float32 with one sweep and one matrix; without the plate it is elsewhere."""
     solver, declared = MEET[name], swinging()
@@ -371,7 +356,7 @@ def test_all_meet(name, device):
 def test_a_plate_alone_takes_one_solve(solver, device):
     """All of U is in the constant matrix."""
     declared = replace(swinging(), terms=swinging().terms[1:])
-    exact, _ = after_steps(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)
+    exact = newton_step(declared, device)
     found, stepper = after_steps(declared, replace(solver, tolerance=1e-9), device)
     assert np.abs(found - exact).max() < 1e-10 and stepper.iterations <= 3
 
@@ -385,11 +370,9 @@ def test_copies_vary_in_what_the_weights_hold(device):
     declared, solver = swinging(), wc.ProjectiveDynamics(substeps=1, iterations=50)
     vary = {"PlateBending.poisson_ratio": [0.3, -0.4], "PlateBending.stiffness": [1e-3, 2e-3]}
     both, _ = after_steps(declared, solver, device, copies=2, vary=vary)
-    bending = replace(declared.terms[1], poisson_ratio=-0.4, stiffness=2e-3)
-    alone = [
-        after_steps(replace(declared, terms=[declared.terms[0], each]), solver, device)[0]
-        for each in (declared.terms[1], bending)
-    ]
+    springs, bending = declared.terms
+    both_terms = bending, replace(bending, poisson_ratio=-0.4, stiffness=2e-3)
+    alone = [after_steps(replace(declared, terms=[springs, each]), solver, device)[0] for each in both_terms]
     assert np.abs(both - np.concatenate(alone)).max() < 1e-10 and np.abs(alone[1] - alone[0]).max() > 1e-5
 
 
