@@ -97,8 +97,7 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
     assert np.abs(force.sum(axis=0)).max() < 1e-13 * total
     hessian = Hessian(pairs.model, terms=[], dynamic=pairs.forces.terms)
     hessian.assemble(pairs.model.array(x, pairs.model.vec3), 0.0)
-    H = (hessian.matrix() + hessian.coupling()).toarray()
-    friction = pairs.friction.matrix().toarray()
+    H, friction = (hessian.matrix() + hessian.coupling()).toarray(), pairs.friction.matrix().toarray()
     assert H == pytest.approx(pairs.contact.matrix().toarray() + friction, abs=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(friction).min() > -1e-12 * np.abs(friction).max()
 
@@ -113,13 +112,10 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
 
 SLIDING = [("explicit", 1, float, 1e-3), ("newton", 1, Sticky, 1e-3), ("xpbd", 2, float, 5e-3)]
 SLIDING += [("midpoint", 1, float, 1e-2), ("bdf2", 1, float, 1e-2)]
+SLIDES = dict.fromkeys([*SLIDING, *product(SOLVERS, [1], (float, Sticky), [1e-3]), ("newton", 2, float, 5e-3)])
 
 
-@table(
-    "name, layers, law, error",
-    SLIDING,
-    [*dict.fromkeys([*SLIDING, *product(SOLVERS, [1], (float, Sticky), [1e-3]), ("newton", 2, float, 5e-3)])],
-)
+@table("name, layers, law, error", SLIDING, SLIDES)
 def test_slides(name, layers, law, error, device):
     """All sheets have a = g sin θ − μ(g cos θ + a_y), less ke/2ρ if springs bear e more: half of the area is of the ground."""
     solver = SOLVERS[name] if name in SOLVERS else wc.Newton(substeps=10, integrator=name)
@@ -210,10 +206,8 @@ def test_a_plate_that_tilts_carries_what_sticks(name, device):
     pose, slips = {"rotation": turn.as_quat(), "friction": 5.0}, []
     fields = {"bending": 1e-3, "contact": wc.Contact(distance=5e-3, stiffness=1e4), "fps": 24.0}
     solver = wc.Newton(substeps=2) if name == "newton" else wc.XPBD(substeps=2, iterations=100)
-    for collider in (
-        ground(0.6, 3, position=np.zeros(3), **pose),
-        wc.Box(size=(0.6, 0.1, 0.6), position=turn.apply([0.0, -0.05, 0.0]), **pose),
-    ):
+    box = wc.Box(size=(0.6, 0.1, 0.6), position=turn.apply([0.0, -0.05, 0.0]), **pose)
+    for collider in (ground(0.6, 3, position=np.zeros(3), **pose), box):
         scene = cloth(sheet, positions=x, colliders=[collider], **fields)
         stepper = after_frames(scene, solver, frames, dtype="float64", device=device)
         slips.append((turn[-1].inv().apply(stepper.state.x.numpy()) - x)[:, [0, 2]].mean(axis=0))

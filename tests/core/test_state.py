@@ -52,10 +52,8 @@ def test_from_a_state_on_all_bits_are_the_same(name, offset, dtype, device):
 def test_states_of_a_shared_batch_go_with_the_whole(device):
     if device != "cpu":
         pytest.skip("threads are for the CPU")
-    model = moved().build(copies=3, threads=2)
-    stepper = wc.XPBD(substeps=1, iterations=2, integrator="bdf2").bind(model)
-    before = steps(stepper, 2)
-    after = steps(stepper, 2)
+    stepper = wc.XPBD(substeps=1, iterations=2, integrator="bdf2").bind(moved().build(copies=3, threads=2))
+    before, after = steps(stepper, 2), steps(stepper, 2)
     stepper.state.assign(before)
     assert stepper.state == before and steps(stepper, 2) == after
     stepper.state.from_host(before.to_host())
@@ -68,10 +66,8 @@ def test_states_of_a_shared_batch_go_with_the_whole(device):
 def test_the_state_of_a_shared_batch_says_how_its_steps_ended(device):
     if device != "cpu":
         pytest.skip("threads are for the CPU")
-    one, two = (
-        wc.Newton(substeps=1, iterations=1, tolerance=1e-12).bind(moved().build(copies=3, threads=threads))
-        for threads in (1, 2)
-    )
+    solver = wc.Newton(substeps=1, iterations=1, tolerance=1e-12)
+    one, two = (solver.bind(moved().build(copies=3, threads=threads)) for threads in (1, 2))
     of_one, of_two = steps(one, 1), steps(two, 1)
     assert of_one.results == of_two.results == two.results == [Result.ITERATIONS_USED_UP] * 3
     assert np.array_equal(of_one.residual, of_two.residual) and np.array_equal(of_two.residual, two.residual)

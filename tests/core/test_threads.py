@@ -17,6 +17,7 @@ import warpcloth as wc
 from support.rows import slow_but
 from support.setups import SOLVERS, allocated, square
 from support.sheets import SPRINGS, declared
+from support.steps import after_frames
 from warpcloth.cli import main
 from warpcloth.core.thread_pool import ThreadPool
 from warpcloth.lab import benchmarks
@@ -46,12 +47,9 @@ def test_copies_shared_out_are_those_of_one_thread(name, device):
     """To the bit, of uneven shares and of more threads than copies; when some are put back, too."""
     record = replace(SOLVERS[name], substeps=2)
     scene = square(solver=record, damping=0.01, fps=300.0, pins="corners")
-    steppers = [record.bind(scene.build(device=device, copies=3, vary=VARY, threads=threads)) for threads in (1, 2, 5)]
-    places = np.tile(scene.mesh.points + 0.01, (3, 1, 1))
-    given = {"positions": None if "bdf2" in name else places}
+    given = {"positions": None if "bdf2" in name else np.tile(scene.mesh.points + 0.01, (3, 1, 1))}
+    steppers = [after_frames(scene, record, 1, 1, device=device, copies=3, vary=VARY, threads=each) for each in (1, 2, 5)]
     for stepper in steppers:
-        stepper.frame()
-        stepper.step()
         stepper.reset(np.array([True, False, True]), **given)
         stepper.step()
     assert same(steppers)
@@ -67,19 +65,15 @@ def test_copies_of_stiffness_by_element_are_those_of_one_thread(device):
     values[1] *= random.uniform(0.5, 2.0, values[1].shape)
     values[2, ::2] = 0.0
     vary = {"QuadraticBending.stiffness": values}
-    record = wc.Explicit(substeps=8, above_limit="allow")
-    steppers = [record.bind(scene.build(device=device, copies=3, vary=vary, threads=threads)) for threads in (1, 2, 3)]
-    for stepper in steppers:
-        stepper.frame()
-    assert same(steppers)
+    record, build = wc.Explicit(substeps=8, above_limit="allow"), {"device": device, "copies": 3, "vary": vary}
+    assert same([after_frames(scene, record, 1, threads=threads, **build) for threads in (1, 2, 3)])
 
 
 @pytest.mark.parametrize("name", ["explicit", "xpbd"])
 @pytest.mark.slow
 def test_threads_allocate_nothing(name, device):
     record = replace(SOLVERS[name], substeps=2)
-    stepper = record.bind(square(solver=record, damping=0.01, fps=300.0).build(device=device, copies=2, threads=2))
-    stepper.frame()
+    stepper = after_frames(square(solver=record, damping=0.01, fps=300.0), record, 1, device=device, copies=2, threads=2)
     assert allocated(lambda: [stepper.frame() for _ in range(2)], device) == 0
 
 
@@ -159,9 +153,7 @@ def test_steppers_of_one_model_have_threads_of_their_own(device):
 
 def test_threads_that_nobody_needs_end(device):
     before = threading.enumerate()
-    model = square().build(device=device, threads=2, copies=2)
-    stepper = wc.PBD(substeps=1).bind(model)
-    stepper.frame()
+    stepper = after_frames(square(), wc.PBD(substeps=1), 1, device=device, threads=2, copies=2)
     started = [thread for thread in threading.enumerate() if thread not in before]
     assert started
     del stepper
@@ -218,8 +210,8 @@ def test_simulate_and_bench_take_threads(device, capsys, monkeypatch):
 @pytest.mark.filterwarnings("ignore:.*fork")
 def test_a_forked_process_has_threads_of_its_own(device):
     """Those of its parent are not there."""
-    stepper = wc.Explicit(substeps=8, above_limit="allow").bind(declared([SPRINGS]).build(device=device, copies=2, threads=2))
-    stepper.frame()
+    record = wc.Explicit(substeps=8, above_limit="allow")
+    stepper = after_frames(declared([SPRINGS]), record, 1, device=device, copies=2, threads=2)
     ours, theirs = os.pipe()  # the child's end is closed when it ends
     child = os.fork()
     if child == 0:

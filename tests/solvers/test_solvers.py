@@ -393,9 +393,11 @@ def test_a_frame_is_a_whole_number_of_steps(device):
 @pytest.mark.parametrize("name", slow_but(("explicit", "newton", "xpbd"), SOLVERS))
 def test_a_step_allocates_nothing(name, device):
     """Of arrays of Warp; what scipy allocates to factorise on the host is outside the tracker's sight."""
-    scene = square(solver=SOLVERS[name], damping=0.01, fps=600.0, pins="corners")
-    stepper = after_frames(scene, SOLVERS[name], steps=1, device=device, dtype="float64")
+    solver = replace(SOLVERS[name], substeps=5)
+    scene = square(solver=solver, damping=0.01, fps=120.0, pins="corners")
+    stepper = after_frames(scene, solver, frames=1, steps=5, device=device, dtype="float64")
     assert allocated(lambda: [stepper.step() for _ in range(10)], device) == 0
+    assert allocated(lambda: [stepper.frame() for _ in range(3)], device) == 0
 
 
 @pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in MAIN], RUNS))
